@@ -1,0 +1,236 @@
+"""Cubature: few weighted points that reproduce the reduced forces of many.
+
+The cost of a step grows with the number of points at which stress is evaluated. The reduced force of pose t is f_t = sum_p w_p P(F_tp) grad b(X_p), linear in the
+weights, so sparse non-negative weights are sought that give the same forces over a set of training poses (An, Kim and James 2008), the same volume, and
+exactly as many as asked for.
+
+Why not `scipy.optimize.nnls` on the whole problem: it stops at its own number of points (as many as there are rows), and every step solves a full
+least-squares problem. The active-set method here (Lawson and Hanson 1974) adds the most useful point at a time to a growing Cholesky-sized normal system,
+stops at the count asked for, and sees the forces through a few seeded random projections per pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from softmode.errors import BasisError, ConfigError
+
+Array = NDArray[np.float64]
+
+POISSON_RATIO = 0.4
+"""Poisson's ratio of the training material; the points serve any other."""
+_ROWS_PER_POSE = 8
+_POSE_COUNT = 192
+_HELD_OUT_COUNT = 24
+_TEST_COUNT = 128
+_MOMENT_COUNT = 6
+_MOMENT_WEIGHT = 3.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cubature:
+    """Chosen points, their weights, and what was lost."""
+
+    index: NDArray[np.intp]
+    """Rows of the full quadrature, ascending, shape (C,)."""
+    weights: Array
+    """Volumes [m^3], > 0, sum = the volume of the full quadrature, shape (C,)."""
+    force_error: float
+    """Root mean square over held-out poses of |f - f_full| / |f_full|, in the energy norm (components over the functions' rms gradients: the error in
+    the displacement that the force would cause)."""
+    stiffness_error: float
+    """Relative error of the linearised (rest) force over random small deformations, root mean square."""
+    trade_off: dict[int, float]
+    """Held-out force error when the choice stops at fewer points."""
+
+
+def select_cubature(
+    weights: Array, grad_basis: Array, count: int, *, stiffness_scale: Array | None = None, seed: int = 0
+) -> Cubature:
+    """Choose `count` points whose weighted stresses reproduce the reduced forces of all points.
+
+    Training poses: a random stretch (principal stretches 0.6..1.6) with random modal displacements on top, whose mean strain runs from 2 % to
+    40 %. Rotations and translations add nothing: the energy is objective, so forces turn with the pose. The first moments
+    sum_p w_p grad b are fitted too, so that every homogeneous deformation keeps its force.
+
+    Args:
+        weights: Full weights [m^3], shape (P,).
+        grad_basis: Basis gradients [1/m], shape (P, n, 3).
+        count: Number of points to keep.
+        stiffness_scale: Relative Young's modulus per point, shape (P,); ones when None.
+        seed: Seed of the poses and projections.
+
+    Returns:
+        The cubature; all points with their own weights when count >= P.
+
+    Raises:
+        ConfigError: If count is less than 8.
+        BasisError: If the forces are not finite.
+    """
+    if count < 8:
+        raise ConfigError(f"cubature_count: expected at least 8, got {count}")
+    point_count, function_count = grad_basis.shape[:2]
+    if count >= point_count:
+        return Cubature(
+            index=np.arange(point_count), weights=weights.copy(), force_error=0.0, stiffness_error=0.0, trade_off={}
+        )
+    rng = np.random.default_rng(seed)
+    modulus = np.ones(point_count) if stiffness_scale is None else np.asarray(stiffness_scale, dtype=np.float64)
+    fraction = weights / weights.sum()
+    # Functions without gradient carry no force. The others count per unit of rms gradient: the length of a force is then its energy norm.
+    gradient = np.asarray(grad_basis, dtype=np.float64).transpose(1, 2, 0)
+    slope = np.sqrt(np.square(gradient).sum(axis=1) @ (fraction * modulus))
+    live = slope > 1e-9 * slope.max()
+    slope = slope[live]
+    gradient = np.ascontiguousarray(gradient[live] / slope[:, None, None])  # (n, 3, P)
+    if not np.isfinite(gradient).all():
+        raise BasisError("grad_basis: not all finite")
+    full = _Sampler(gradient, fraction * modulus)
+
+    # Rows: the virtual work of each pose's stress on a few random test displacements, per unit of the pose's force.
+    tests = rng.normal(size=(3 * _TEST_COUNT, len(slope))) @ gradient.reshape(len(slope), -1) / np.sqrt(_ROWS_PER_POSE)
+    tests = tests.reshape(_TEST_COUNT, 9, point_count)
+    moments = tests[:_MOMENT_COUNT].reshape(-1, point_count)
+    rows = [_MOMENT_WEIGHT * np.ones((1, point_count)), _MOMENT_WEIGHT * moments / np.sqrt((moments**2 @ fraction).mean())]
+    for pose in _poses(_POSE_COUNT, slope, rng):
+        stress = full.stress(pose)
+        picked = tests[rng.choice(_TEST_COUNT, _ROWS_PER_POSE, replace=False)]
+        work = np.einsum("rcp,cp->rp", picked, stress.reshape(9, -1)) * modulus
+        rows.append(work / np.linalg.norm(full.force(stress)))
+    columns = np.ascontiguousarray(np.concatenate(rows).T)
+    sizes = {k for k in (32, 64, 96, 128, 192, 256, 384) if k < count} | {count}
+    path = _nonnegative_path(columns, fraction @ columns, sizes, rng)
+
+    fresh = np.random.default_rng([seed, 1])
+    held_out = _poses(_HELD_OUT_COUNT, slope, fresh)
+    small = [(np.eye(3), 1e-5 * fresh.normal(size=(len(slope), 3))) for _ in range(8)]
+    reference = [full.force(full.stress(pose)) for pose in held_out + small]
+    errors, linear = {}, 0.0
+    for size, (index, value) in path.items():
+        few = _Sampler(gradient[:, :, index], value * modulus[index])
+        found = [few.force(few.stress(pose)) for pose in held_out + small]
+        ratio = np.array([np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in zip(found, reference, strict=True)])
+        errors[size] = float(np.sqrt((ratio[:_HELD_OUT_COUNT] ** 2).mean()))
+        linear = float(np.sqrt((ratio[_HELD_OUT_COUNT:] ** 2).mean()))
+    index, value = path[max(path)]
+    order = np.argsort(index)
+    return Cubature(
+        index=index[order],
+        weights=value[order] * weights.sum(),
+        force_error=errors[max(path)],
+        stiffness_error=linear,
+        trade_off=errors,
+    )
+
+
+def _poses(count: int, slope: Array, rng: np.random.Generator) -> list[tuple[Array, Array]]:
+    """Return (A, s): deformation gradients A (I + sum_k s_k grad b_k / slope_k), a random stretch after random modal strains."""
+    poses = []
+    for k in range(count):
+        frame = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        stretch = frame @ np.diag(np.exp(rng.uniform(np.log(0.6), np.log(1.6), size=3))) @ frame.T
+        # Odd poses favour the smooth functions, as real motions do; even ones strain all functions alike.
+        strain = rng.normal(size=(len(slope), 3)) / (slope ** (k % 2))[:, None]
+        strain *= 0.02 * 20.0 ** ((k + 0.5) / count) / np.linalg.norm(strain)
+        poses.append((stretch if k % 3 else np.eye(3), strain))
+    return poses
+
+
+class _Sampler:
+    """Stresses and forces of a set of weighted points."""
+
+    def __init__(self, gradient: Array, weights: Array) -> None:
+        self.gradient = np.ascontiguousarray(gradient).reshape(len(gradient), -1)  # (n, 3 P)
+        self.weights = weights
+
+    def stress(self, pose: tuple[Array, Array]) -> Array:
+        """Return P(F), shape (3, 3, P), for E = 1."""
+        stretch, strain = pose
+        inner = (strain.T @ self.gradient).reshape(3, 3, -1)
+        inner[range(3), range(3)] += 1.0
+        return _stress((stretch @ inner.reshape(3, -1)).reshape(3, 3, -1))
+
+    def force(self, stress: Array) -> Array:
+        """Return sum_p w_p P_p grad b_p, shape (3, n)."""
+        return (stress * self.weights).reshape(3, -1) @ self.gradient.T
+
+
+def _stress(f: Array) -> Array:
+    """Return the first Piola-Kirchhoff stress (3, 3, P) of stable Neo-Hookean material with origin term (Smith et al. 2018) for E = 1."""
+    mu = 1.0 / (2.0 * (1.0 + POISSON_RATIO))
+    lame = POISSON_RATIO / ((1.0 + POISSON_RATIO) * (1.0 - 2.0 * POISSON_RATIO))
+    m, k = 4.0 / 3.0 * mu, lame + 5.0 / 6.0 * mu
+    rest = 1.0 + m / k - m / (4.0 * k)
+    cofactor = np.empty_like(f)
+    for i in range(3):
+        a, b = f[(i + 1) % 3], f[(i + 2) % 3]
+        for j in range(3):
+            p, q = (j + 1) % 3, (j + 2) % 3
+            cofactor[i, j] = a[p] * b[q] - a[q] * b[p]
+    volume = (f[0] * cofactor[0]).sum(axis=0)
+    trace = np.einsum("ijp,ijp->p", f, f)
+    return (m * (1.0 - 1.0 / (trace + 1.0))) * f + (k * (volume - rest)) * cofactor
+
+
+def _nonnegative_path(
+    columns: Array, target: Array, sizes: set[int], rng: np.random.Generator
+) -> dict[int, tuple[NDArray[np.intp], Array]]:
+    """Grow a non-negative least-squares solution of  x @ columns = target,  sum x = 1.
+
+    Candidates are searched in eight interleaved random groups, one per step: a fresh group costs an eighth of the search and loses nothing visible.
+
+    Returns:
+        For each size reached: indices and weights.
+    """
+    group = [np.sort(g) for g in np.array_split(rng.permutation(len(columns)), 8)]
+    stored = [np.ascontiguousarray(columns[g]) for g in group]
+    inverse_length = 1.0 / np.maximum(np.linalg.norm(columns, axis=1), 1e-300)
+    top = max(sizes)
+    chosen = np.zeros(0, dtype=np.intp)
+    value = np.zeros(0)
+    support = np.empty((top, columns.shape[1]))
+    gram = np.empty((top, top))
+    right = np.empty(top)
+    active = np.zeros(len(columns), dtype=bool)
+    path: dict[int, tuple[NDArray[np.intp], Array]] = {}
+    residual = target.copy()
+    idle, step = 0, 0
+    while len(chosen) < top and idle < len(group) and step < 8 * top:
+        candidates, stack = group[step % len(group)], stored[step % len(group)]
+        step += 1
+        gain = np.where(active[candidates], -np.inf, (stack @ residual) * inverse_length[candidates])
+        if not gain.max() > 1e-12:
+            idle += 1
+            continue
+        idle = 0
+        best = candidates[gain.argmax()]
+        k = len(chosen)
+        chosen, value, active[best] = np.append(chosen, best), np.append(value, 0.0), True
+        support[k] = columns[best]
+        gram[k, : k + 1] = gram[: k + 1, k] = support[: k + 1] @ columns[best]
+        gram[k, k] *= 1.0 + 1e-12
+        right[k] = columns[best] @ target
+        while True:
+            k = len(chosen)
+            trial = linalg.solve(gram[:k, :k], right[:k], assume_a="pos", check_finite=False)
+            if (trial > 0.0).all():
+                value = trial
+                break
+            # Walk to the first weight that vanishes and drop it.
+            negative = np.flatnonzero(trial <= 0.0)
+            reach = value[negative] / np.maximum(value[negative] - trial[negative], 1e-300)
+            value = value + reach.min() * (trial - value)
+            value[negative[reach.argmin()]] = 0.0
+            keep = np.flatnonzero(value > 0.0)
+            active[chosen[value <= 0.0]] = False
+            chosen, value, k = chosen[keep], value[keep], len(keep)
+            support[:k], right[:k], gram[:k, :k] = support[keep], right[keep], gram[np.ix_(keep, keep)]
+        residual = target - value @ support[: len(chosen)]
+        if len(chosen) in sizes:
+            path[len(chosen)] = (chosen, value / value.sum())
+    path[len(chosen)] = (chosen, value / value.sum())
+    return path

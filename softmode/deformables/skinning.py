@@ -1,0 +1,155 @@
+"""Forward skinning on the device: points, and splat means with F Sigma F^T, from the reduced coordinates q.
+
+x(X) = X + sum_k b_k(X) q_k and F(X) = I + sum_k q_k grad b_k(X)^T. The displacement q carries the whole rigid motion of
+a body, metres of it, while splats are millimetres in size: positions are summed in float64 and rounded once at the end.
+"""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
+
+from softmode.deformables import skinning_kernels as kernels
+from softmode.errors import BasisError
+
+STRETCH_LIMIT = 3.0
+"""Largest principal stretch that a splat follows; see `limited_stretch`."""
+
+
+class SkinSplats:
+    """The splats of one object with the basis that moves them; worlds share it.
+
+    Args:
+        means: Rest centres in the body frame [m], shape (N, 3).
+        covariances: Rest covariances [m^2], shape (N, 3, 3).
+        basis: Basis values at the rest centres, shape (N, n).
+        grad_basis: Basis gradients at the rest centres [1/m], shape (N, n, 3).
+        stretch_limit: Largest principal stretch that a splat follows.
+        device: Warp device.
+
+    Raises:
+        BasisError: If the shapes do not belong together.
+    """
+
+    def __init__(
+        self,
+        means: ArrayLike,
+        covariances: ArrayLike,
+        basis: ArrayLike,
+        grad_basis: ArrayLike,
+        *,
+        stretch_limit: float = STRETCH_LIMIT,
+        device: Any = None,
+    ) -> None:
+        """Upload the rest state."""
+        x, s = np.asarray(means, dtype=np.float64), np.asarray(covariances, dtype=np.float64)
+        b, g = np.asarray(basis, dtype=np.float64), np.asarray(grad_basis, dtype=np.float64)
+        n = len(x)
+        if x.shape != (n, 3) or s.shape != (n, 3, 3) or b.ndim != 2 or len(b) != n or g.shape != (*b.shape, 3):
+            raise BasisError(
+                f"means {x.shape}, covariances {s.shape}, basis {b.shape}, grad_basis {g.shape} do not belong together",
+                hint="Expected (N, 3), (N, 3, 3), (N, n) and (N, n, 3)",
+            )
+        self.stretch_limit = float(stretch_limit)
+        self.device = wp.get_device(device)
+        six = np.stack([s[:, 0, 0], s[:, 0, 1], s[:, 0, 2], s[:, 1, 1], s[:, 1, 2], s[:, 2, 2]], axis=1)
+        basis4 = np.concatenate([g, b[..., None]], axis=2).astype(np.float32)
+        self.rest_means = wp.array(x.astype(np.float32), dtype=wp.vec3, device=self.device)
+        self.rest_covariances = wp.array(six.astype(np.float32), dtype=kernels.vec6, device=self.device)
+        self.basis = wp.array(basis4, dtype=wp.vec4, device=self.device)
+        self.mean_gradient = wp.array(g.mean(axis=0).astype(np.float32), dtype=wp.vec3, device=self.device)
+
+    @property
+    def count(self) -> int:
+        """Number of splats N."""
+        return self.rest_means.shape[0]
+
+    @property
+    def function_count(self) -> int:
+        """Number of basis functions n."""
+        return self.basis.shape[1]
+
+    def launch(
+        self,
+        q: wp.array,
+        function_start: wp.array,
+        means: wp.array,
+        covariances: wp.array,
+        *,
+        first_splat: int = 0,
+    ) -> None:
+        """Write the deformed means and covariances of all worlds; capturable.
+
+        Args:
+            q: Reduced coordinates of all instances [m], flat vec3d.
+            function_start: First entry of q of this object's instance in each world, int32, shape (world_count,).
+            means: Output centres [m], vec3, shape (world_count, total splats).
+            covariances: Output covariances [m^2], vec6, shape (world_count, total splats).
+            first_splat: Column where this object's splats begin.
+        """
+        wp.launch(
+            kernels.skin_splats,
+            dim=(function_start.shape[0], self.count),
+            inputs=[
+                self.rest_means,
+                self.rest_covariances,
+                self.basis,
+                self.stretch_limit,
+                function_start,
+                q,
+                first_splat,
+            ],
+            outputs=[means, covariances],
+            device=self.device,
+        )
+
+    def launch_rotation(
+        self, q: wp.array, function_start: wp.array, rotations: wp.array, *, object_index: int = 0
+    ) -> None:
+        """Write the object's mean rotation in every world; turns view-dependent colour with the object.
+
+        Args:
+            q: Reduced coordinates of all instances [m], flat vec3d.
+            function_start: First entry of q of this object's instance in each world, int32, shape (world_count,).
+            rotations: Output quaternions, shape (world_count, object_count).
+            object_index: Column of this object.
+        """
+        wp.launch(
+            kernels.mean_rotation,
+            dim=function_start.shape[0],
+            inputs=[self.mean_gradient, function_start, q, object_index],
+            outputs=[rotations],
+            device=self.device,
+        )
+
+
+def skin_points(
+    rest_points: wp.array,
+    basis: wp.array,
+    function_start: wp.array,
+    q: wp.array,
+    qd: wp.array,
+    point_start: wp.array,
+    positions: wp.array,
+    velocities: wp.array,
+) -> None:
+    """Write positions and velocities of the points of all instances of one body; capturable.
+
+    Args:
+        rest_points: Rest positions in the body frame [m], vec3, shape (S,).
+        basis: Basis values, float32, shape (S, n).
+        function_start: First entry of q of each instance, int32, shape (instance_count,).
+        q: Reduced coordinates of all instances [m], flat vec3d.
+        qd: Their velocities [m/s], flat vec3d.
+        point_start: First output entry of each instance, int32, shape (instance_count,).
+        positions: Output positions [m], flat vec3.
+        velocities: Output velocities [m/s], flat vec3.
+    """
+    wp.launch(
+        kernels.skin_points,
+        dim=(function_start.shape[0], rest_points.shape[0]),
+        inputs=[rest_points, basis, function_start, q, qd, point_start],
+        outputs=[positions, velocities],
+        device=rest_points.device,
+    )

@@ -1,0 +1,803 @@
+"""SolverReduced: the implicit reduced step as a Newton solver, for several bodies and worlds, captured as a graph."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+from newton.solvers import SolverBase
+
+from softmode.deformables import contact, kernels
+from softmode.deformables.body import ReducedBody
+from softmode.deformables.factor import LANES, BlockCholesky, pad, vec8
+from softmode.deformables.materials import HessianBlocks, Material
+from softmode.errors import ConfigError
+
+NAMESPACE = "softmode"
+_INSTANCE = f"{NAMESPACE}:instance"
+_FUNCTION = f"{NAMESPACE}:function"
+_PIN = f"{NAMESPACE}:pin"
+
+CONTACT_STIFFNESS_FLOOR = 5.0e7
+"""Least contact stiffness per area [Pa/m]: 25 kPa, a firm grasp, sinks 0.5 mm deep."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverReducedOptions:
+    """How a step is solved."""
+
+    iteration_max: int = 20
+    """Newton iterations at most."""
+    tolerance: float = 1.0e-5
+    """Newton stops when every body moved less than this fraction of its size (rms) in an iteration."""
+    step_length_min: float = 2.0**-10
+    """Shortest step the line search tries."""
+    contact_max: int = 256
+    """Contacts per instance at most; more raise the overflow flag and drop those that do not touch yet."""
+    contact_margin: float = 0.01
+    """Detection distance as a fraction of the body size, on top of twice the motion of the step."""
+    contact_smoothing: float = 1.0e-3
+    """Range of the C2 onset of the contact penalty as a fraction of the body size."""
+    stick_velocity: float = 1.0e-4
+    """Slip velocity [m/s] below which friction counts as sticking."""
+
+    def __post_init__(self) -> None:
+        """Check every range."""
+        for name, low in (("iteration_max", 1), ("contact_max", 1)):
+            if getattr(self, name) < low:
+                raise ConfigError(f"{name} must be at least {low}, got {getattr(self, name)}")
+        for name in ("tolerance", "step_length_min", "contact_margin", "contact_smoothing", "stick_velocity"):
+            if not 0.0 < getattr(self, name) < float("inf"):
+                raise ConfigError(f"{name} must be a finite number > 0, got {getattr(self, name)!r}")
+
+
+def body_key(body: ReducedBody) -> int:
+    """Return the number that ties an instance in a model to its body: 62 bits of the body's fingerprint."""
+    return int.from_bytes(hashlib.sha256(body.fingerprint.encode()).digest()[:8], "little") >> 2
+
+
+def register_custom_attributes(builder: newton.ModelBuilder) -> None:
+    """Declare the attributes of reduced bodies on a builder; once per builder, also on the one that replicates."""
+    if f"{NAMESPACE}:q" in builder.custom_attributes:
+        return
+    attribute = newton.ModelBuilder.CustomAttribute
+    assignment = newton.Model.AttributeAssignment
+    for name in ("instance", "function", "pin"):
+        builder.add_custom_frequency(newton.ModelBuilder.CustomFrequency(name=name, namespace=NAMESPACE))
+
+    def declare(name: str, dtype: Any, frequency: str, **options: Any) -> None:
+        builder.add_custom_attribute(
+            attribute(name=name, dtype=dtype, frequency=frequency, namespace=NAMESPACE, **options)
+        )
+
+    declare("instance_world", wp.int32, _INSTANCE, references="world")
+    declare("body_key", wp.int64, _INSTANCE)
+    declare("function_start", wp.int32, _INSTANCE, references=_FUNCTION)
+    declare("particle_start", wp.int32, _INSTANCE, references="particle")
+    declare("material_model", wp.int32, _INSTANCE)
+    for name in ("youngs_modulus", "poissons_ratio", "density", "viscosity", "mass_damping", "friction"):
+        declare(name, wp.float32, _INSTANCE)
+    declare("contact_stiffness", wp.float32, _INSTANCE)
+    declare("q", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
+    declare("qd", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
+    declare("pin_instance", wp.int32, _PIN, references=_INSTANCE)
+    declare("pin_point", wp.vec3d, _PIN)
+    declare("pin_stiffness", wp.float32, _PIN)
+    declare("pin_target", wp.vec3d, _PIN, assignment=assignment.CONTROL)
+
+
+def contact_stiffness(body: ReducedBody, material: Material) -> float:
+    """Return the default contact stiffness per area [Pa/m]: twenty times the bulk's, and never under the floor."""
+    nu = material.poissons_ratio
+    wave = material.youngs_modulus * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
+    return max(20.0 * wave / float(np.linalg.norm(np.ptp(body.bounds, axis=0))), CONTACT_STIFFNESS_FLOOR)
+
+
+def add_reduced_body(
+    builder: newton.ModelBuilder,
+    body: ReducedBody,
+    *,
+    material: Material | None = None,
+    position: Sequence[float] = (0.0, 0.0, 0.0),
+    rotation: np.ndarray | None = None,
+    velocity: Sequence[float] = (0.0, 0.0, 0.0),
+    angular_velocity: Sequence[float] = (0.0, 0.0, 0.0),
+    contact_stiffness_per_area: float | None = None,
+    particle_radius: float | None = None,
+) -> int:
+    """Add a body to a world; its surface samples become Newton particles.
+
+    Args:
+        builder: Builder of the world; the attributes are registered if they are not yet.
+        body: The reduced body.
+        material: Its material; default ``Material()``.
+        position: Where the body's centre of mass rests [m].
+        rotation: Rotation matrix of the rest pose, shape (3, 3); default identity.
+        velocity: Initial velocity of the centre of mass [m/s].
+        angular_velocity: Initial angular velocity [rad/s].
+        contact_stiffness_per_area: Penalty stiffness of contact [Pa/m]; default :func:`contact_stiffness`.
+        particle_radius: Radius of the particles for viewers and picking [m]; default half their spacing.
+
+    Returns:
+        Index of the instance in this builder.
+
+    Raises:
+        ConfigError: If the pose or a stiffness is not finite or the rotation is no rotation.
+    """
+    register_custom_attributes(builder)
+    material = material or Material()
+    R = np.eye(3) if rotation is None else np.asarray(rotation, float)
+    p = np.asarray(position, float)
+    if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=1e-5) or np.linalg.det(R) < 0:
+        raise ConfigError("rotation must be a rotation matrix of shape (3, 3)", hint="orthonormalise it")
+    if p.shape != (3,) or not np.isfinite(p).all():
+        raise ConfigError(f"position must be three finite numbers [m], got {position!r}")
+    stiffness = contact_stiffness(body, material) if contact_stiffness_per_area is None else contact_stiffness_per_area
+    if not 0.0 < stiffness < np.inf:
+        raise ConfigError(f"contact_stiffness_per_area must be a finite number > 0 [Pa/m], got {stiffness!r}")
+
+    omega = np.asarray(angular_velocity, float)
+    spin = np.array([[0, -omega[2], omega[1]], [omega[2], 0, -omega[0]], [-omega[1], omega[0], 0]])
+    q = body.affine(R, p)
+    # the velocity field v + omega x (R X) as coordinates: affine() of I + A subtracts the identity again
+    qd = body.affine(np.eye(3) + spin @ R, np.asarray(velocity, float))
+    x = body.surface_points @ R.T + p
+    v = np.asarray(velocity, float) + x @ spin.T - p @ spin.T
+    radius = 0.5 * float(np.sqrt(body.surface_areas.mean())) if particle_radius is None else particle_radius
+    mass = material.density * body.volume / body.surface_count
+
+    particle_start = builder.particle_count
+    builder.add_particles(
+        pos=[wp.vec3(*row) for row in x],
+        vel=[wp.vec3(*row) for row in v],
+        mass=[mass] * body.surface_count,
+        radius=[radius] * body.surface_count,
+    )
+    function_start = len(builder.custom_attributes[f"{NAMESPACE}:q"].values or [])
+    builder.add_custom_values_batch(
+        [{f"{NAMESPACE}:q": wp.vec3d(*a), f"{NAMESPACE}:qd": wp.vec3d(*b)} for a, b in zip(q, qd, strict=True)]
+    )
+    values = {
+        "body_key": body_key(body),
+        "function_start": function_start,
+        "particle_start": particle_start,
+        "material_model": int(material.model),
+        "contact_stiffness": float(stiffness),
+    }
+    for name in ("youngs_modulus", "poissons_ratio", "density", "viscosity", "mass_damping", "friction"):
+        values[name] = getattr(material, name)
+    index = builder.add_custom_values(**{f"{NAMESPACE}:{name}": value for name, value in values.items()})
+    return index[f"{NAMESPACE}:function_start"]
+
+
+def add_pins(
+    builder: newton.ModelBuilder,
+    instance: int,
+    points: np.ndarray,
+    *,
+    stiffness: float | np.ndarray,
+    targets: np.ndarray | None = None,
+) -> None:
+    """Pin rest points of a body to targets in the world by springs (soft boundary conditions).
+
+    Args:
+        builder: Builder that holds the instance.
+        instance: Index from :func:`add_reduced_body`.
+        points: Rest points in the body frame [m], shape (pin_count, 3).
+        stiffness: Spring stiffness [N/m], a number or one per pin; scale it with a volume or an area for a clamp.
+        targets: World positions [m], shape (pin_count, 3); default: the points themselves. Move them at run time
+            through ``control.softmode.pin_target``.
+
+    Raises:
+        ConfigError: If there is no point, a shape does not fit, or a stiffness is negative.
+    """
+    X = np.atleast_2d(np.asarray(points, float))
+    T = X if targets is None else np.atleast_2d(np.asarray(targets, float))
+    k = np.broadcast_to(np.asarray(stiffness, float), (len(X),))
+    if X.ndim != 2 or X.shape[1:] != (3,) or T.shape != X.shape or len(X) == 0:
+        raise ConfigError(f"points and targets must have shape (pin_count > 0, 3), got {X.shape} and {T.shape}")
+    if not (np.isfinite(k).all() and (k >= 0).all() and np.isfinite(X).all() and np.isfinite(T).all()):
+        raise ConfigError("stiffness must be finite and >= 0 [N/m], points and targets finite [m]")
+    builder.add_custom_values_batch(
+        [
+            {
+                f"{NAMESPACE}:pin_instance": instance,
+                f"{NAMESPACE}:pin_point": wp.vec3d(*a),
+                f"{NAMESPACE}:pin_stiffness": float(b),
+                f"{NAMESPACE}:pin_target": wp.vec3d(*c),
+            }
+            for a, b, c in zip(X, k, T, strict=True)
+        ]
+    )
+
+
+class RigidDofs:
+    """Joint dofs that take part in the solve: per world r = dt * joint velocity and its quadratic model.
+
+    Empty (``count_max`` 0) while rigid bodies move as prescribed; ``coupling`` fills one in.
+    """
+
+    def __init__(self, model: newton.Model, world_count: int, counts: np.ndarray, dof_start: np.ndarray) -> None:
+        """Allocate for ``counts`` dofs per world, the first of them at ``dof_start``."""
+        device = model.device
+        self.count_max = int(counts.max(initial=0))
+        size = max(self.count_max, 1)
+        self.count = wp.array(counts, dtype=int, device=device)
+        self.dof_start = wp.array(dof_start, dtype=int, device=device)
+        self.inertia = wp.zeros((world_count, size, size), dtype=wp.float64, device=device)
+        self.predicted = wp.zeros((world_count, size), dtype=wp.float64, device=device)
+        self.r = wp.zeros_like(self.predicted)
+        self.trial = wp.zeros_like(self.predicted)
+        self.gradient = wp.zeros_like(self.predicted)
+        self.direction = wp.zeros_like(self.predicted)
+        self.matrix = wp.zeros_like(self.inertia)
+        articulation, link = _link_table(model)
+        start, count = _articulation_dofs(model)
+        self.body_articulation = wp.array(articulation, dtype=int, device=device)
+        self.body_link = wp.array(link, dtype=int, device=device)
+        self.articulation_dof_start = wp.array(start, dtype=int, device=device)
+        self.articulation_dof_count = wp.array(count, dtype=int, device=device)
+        links, dofs = model.max_joints_per_articulation, model.max_dofs_per_articulation
+        shape = (max(model.articulation_count, 1), max(6 * links, 6), max(dofs, 1))
+        self.jacobian = wp.zeros(shape, dtype=float, device=device)
+
+
+def _articulation_dofs(model: newton.Model) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first joint dof and the dof count of every articulation."""
+    if model.articulation_count == 0:
+        return np.zeros(1, int), np.zeros(1, int)
+    joint_start = model.articulation_start.numpy()[: model.articulation_count]
+    joint_end = model.articulation_end.numpy()[: model.articulation_count]
+    dof = np.append(model.joint_qd_start.numpy()[: model.joint_count], model.joint_dof_count)
+    return dof[joint_start], dof[joint_end] - dof[joint_start]
+
+
+def _link_table(model: newton.Model) -> tuple[np.ndarray, np.ndarray]:
+    """Return the articulation of every rigid body and its row block in that articulation's Jacobian."""
+    articulation = np.full(max(model.body_count, 1), -1)
+    link = np.zeros(max(model.body_count, 1), int)
+    if model.articulation_count:
+        child = model.joint_child.numpy()
+        starts, ends = model.articulation_start.numpy(), model.articulation_end.numpy()
+        for a in range(model.articulation_count):
+            for joint in range(int(starts[a]), int(ends[a])):
+                articulation[child[joint]] = a
+                link[child[joint]] = joint - starts[a]
+    return articulation, link
+
+
+class SolverReduced(SolverBase):
+    """Implicit Euler on the reduced coordinates of every soft body of a model.
+
+    Rigid shapes are obstacles that move as their bodies do in ``state_in``; for two-way contact with MuJoCo use
+    :class:`softmode.deformables.coupling.SolverCoupledReduced`.
+
+    A step costs no host read-back and may be captured with ``wp.ScopedCapture`` on CPU and CUDA.
+
+    Args:
+        model: Finalised model that holds bodies added by :func:`add_reduced_body`.
+        bodies: The reduced bodies used in the model, in any order.
+        options: How the step is solved.
+
+    Raises:
+        ConfigError: If a body of the model is not among ``bodies``, or a shape type cannot be touched.
+    """
+
+    register_custom_attributes = staticmethod(register_custom_attributes)
+
+    def __init__(
+        self, model: newton.Model, bodies: Sequence[ReducedBody], *, options: SolverReducedOptions | None = None
+    ) -> None:
+        """Lay out tables and buffers; see the class."""
+        super().__init__(model)
+        self.options = options or SolverReducedOptions()
+        if not hasattr(model, NAMESPACE):
+            raise ConfigError("model holds no reduced body", hint="call add_reduced_body before finalize")
+        self._build_tables(list(bodies))
+        self._build_buffers()
+        self.attach_rigid(RigidDofs(model, self.world_count, np.zeros(self.world_count, int), np.zeros(self.world_count, int)))
+        self.refresh()
+
+    # -- host side tables ---------------------------------------------------------------------------------------------
+
+    def _build_tables(self, bodies: list[ReducedBody]) -> None:
+        """Concatenate the bases of all assets and lay out the instances."""
+        data = getattr(self.model, NAMESPACE)
+        keys = {body_key(body): a for a, body in enumerate(bodies)}
+        wanted = data.body_key.numpy()
+        missing = [int(k) for k in wanted if int(k) not in keys]
+        if missing:
+            raise ConfigError(
+                f"{len(missing)} instance(s) of the model use a body that is not in bodies",
+                hint="pass every ReducedBody given to add_reduced_body",
+            )
+        self.bodies = bodies
+        self.asset = np.array([keys[int(k)] for k in wanted])
+        world = data.instance_world.numpy()
+        if (world < 0).any() and self.model.world_count > 1:
+            raise ConfigError("a reduced body lies outside all worlds", hint="add it to the builder that is replicated")
+        self.instance_world = np.maximum(world, 0)
+        if (np.diff(self.instance_world) < 0).any():
+            raise ConfigError("instances are not ordered by world", hint="add bodies to one world before the next")
+        self.instance_count, self.world_count = len(wanted), max(self.model.world_count, 1)
+        counts = np.bincount(self.instance_world, minlength=self.world_count)
+        self.instance_start = np.concatenate([[0], np.cumsum(counts)])
+
+        self.stride = pad(max(body.function_count for body in bodies))
+        point_start, row_start = [], []
+        gradients, rows, means = [], [], []
+        points = samples = 0
+        for body in bodies:
+            point_start.append(points)
+            row_start.append(samples)
+            points += body.point_count
+            samples += body.surface_count
+            gradients.append(self._padded(body.grad_basis))
+            rows.append(self._padded(body.surface_basis))
+            means.append(self._padded(body.mean_basis[None]))
+        pin_rows, pin_points = self._pin_rows(data)
+        grad = np.concatenate(gradients)
+        device = self.model.device
+
+        def table(values: Any, dtype: Any) -> wp.array:
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+        def joined(name: str) -> np.ndarray:
+            return np.concatenate([getattr(body, name) for body in bodies])
+
+        self.grad_basis = table(grad.astype(np.float32), wp.vec3)
+        by_component = np.moveaxis(grad, -1, 0).reshape(3, len(grad), -1, LANES)
+        self.grad_basis8 = table(by_component.astype(np.float32), vec8)
+        self.point_weight = table(joined("weights"), wp.float64)
+        self.stiffness_scale = table(joined("stiffness_scale").astype(np.float32), float)
+        basis_rows = np.concatenate([*rows, pin_rows]).astype(np.float32)
+        self.row_basis = table(basis_rows, float)
+        self.row_basis8 = table(basis_rows.reshape(len(basis_rows), -1, LANES), vec8)
+        self.row_point = table(np.concatenate([joined("surface_points"), pin_points]), wp.vec3d)
+        self.row_area = table(np.append(joined("surface_areas"), np.zeros(len(pin_points))).astype(np.float32), float)
+        self.mean_basis = table(np.concatenate(means), wp.float64)
+
+        def per_instance(values: Sequence[int]) -> wp.array:
+            return table(np.asarray(values)[self.asset], int)
+
+        self.world = table(self.instance_world, int)
+        self.world_instances = table(self.instance_start, int)
+        self.instance_asset = table(self.asset, int)
+        self.function_count = per_instance([body.function_count for body in bodies])
+        self.point_start, self.point_count = per_instance(point_start), per_instance([b.point_count for b in bodies])
+        self.row_start, self.sample_count = per_instance(row_start), per_instance([b.surface_count for b in bodies])
+        self.point_max = max(body.point_count for body in bodies)
+        self.sample_max = max(body.surface_count for body in bodies)
+        self.size = np.array([np.linalg.norm(np.ptp(body.bounds, axis=0)) for body in bodies])[self.asset]
+        self.parameters = data
+        self.mass = wp.zeros(self.instance_count, dtype=wp.float64, device=device)
+        self.tolerance = table((self.options.tolerance * self.size).astype(np.float32), float)
+        self.margin = table((self.options.contact_margin * self.size).astype(np.float32), float)
+        self.smoothing = table((self.options.contact_smoothing * self.size).astype(np.float32), float)
+        self.rigid_tolerance = float(self.options.tolerance * self.size.min())
+        self.candidate = table(self._candidates(), int)
+
+    def _padded(self, values: np.ndarray) -> np.ndarray:
+        """Pad the function axis (the second) of basis values with zeros to the stride."""
+        widths = [(0, 0)] * values.ndim
+        widths[1] = (0, self.stride - values.shape[1])
+        return np.pad(np.asarray(values, float), widths)
+
+    def _pin_rows(self, data: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Evaluate the basis at the pins and sort them by instance."""
+        device = self.model.device
+        owner = data.pin_instance.numpy() if hasattr(data, "pin_instance") else np.zeros(0, int)
+        points = data.pin_point.numpy().reshape(-1, 3) if len(owner) else np.zeros((0, 3))
+        counts = np.bincount(owner, minlength=self.instance_count) if len(owner) else np.zeros(self.instance_count, int)
+        if (np.diff(owner) < 0).any():
+            raise ConfigError("pins are not ordered by instance", hint="add the pins of one body before the next")
+        rows = np.zeros((len(owner), self.stride))
+        known: dict[tuple[int, bytes], np.ndarray] = {}
+        for i in range(self.instance_count):
+            mine = owner == i
+            key = (int(self.asset[i]), points[mine].tobytes())
+            if mine.any() and key not in known:
+                known[key] = self._padded(self.bodies[self.asset[i]].evaluate(points[mine])[0])
+            if mine.any():
+                rows[mine] = known[key]
+        first_row = sum(body.surface_count for body in self.bodies)
+        self.pin_max = int(counts.max(initial=0))
+        self.pin_count = wp.array(counts, dtype=int, device=device)
+        self.pin_start = wp.array(np.concatenate([[0], np.cumsum(counts)[:-1]]), dtype=int, device=device)
+        self.pin_row = wp.array(first_row + np.arange(max(len(owner), 1)), dtype=int, device=device)
+        return rows, points
+
+    def _candidates(self) -> np.ndarray:
+        """List, per instance, the shapes of its world that collide with particles."""
+        model = self.model
+        if model.shape_count == 0:
+            return np.full((self.instance_count, 1), -1)
+        flags, kinds, worlds = model.shape_flags.numpy(), model.shape_type.numpy(), model.shape_world.numpy()
+        solid = (flags & int(newton.ShapeFlags.COLLIDE_PARTICLES)) != 0
+        supported = [int(kind) for kind in contact.SUPPORTED_SHAPES]
+        for shape in np.flatnonzero(solid & ~np.isin(kinds, supported)):
+            raise ConfigError(
+                f"shape {shape} ({model.shape_label[shape]!r}) is a {newton.GeoType(int(kinds[shape])).name.lower()}, "
+                "which a soft body cannot touch",
+                hint="use a plane, box, sphere, capsule, cylinder or mesh, or clear its COLLIDE_PARTICLES flag",
+            )
+        lists = [np.flatnonzero(solid & ((worlds == -1) | (worlds == w))) for w in self.instance_world]
+        out = np.full((self.instance_count, max(max(map(len, lists)), 1)), -1)
+        for i, shapes in enumerate(lists):
+            out[i, : len(shapes)] = shapes
+        return out
+
+    def _build_buffers(self) -> None:
+        """Allocate everything a step writes."""
+        device = self.model.device
+        instances, worlds = self.instance_count, self.world_count
+        entries = self.options.contact_max + self.pin_max
+        self.entry_max = entries
+
+        def zeros(shape: tuple[int, ...], dtype: Any) -> wp.array:
+            return wp.zeros(shape, dtype=dtype, device=device)
+
+        functions = (instances, self.stride)
+        self.q_start, self.q_inertial = zeros(functions, wp.vec3d), zeros(functions, wp.vec3d)
+        self.q, self.q_trial = zeros(functions, wp.vec3d), zeros(functions, wp.vec3d)
+        self.force, self.gradient = zeros(functions, wp.vec3d), zeros(functions, wp.vec3d)
+        self.point_energy = zeros((instances, self.point_max), wp.float64)
+        self.point_stress = zeros((instances, self.point_max), wp.mat33d)
+        self.point_hessian = zeros((instances, self.point_max), HessianBlocks)
+        samples = (instances, self.sample_max)
+        self.sample_position, self.sample_drift = zeros(samples, wp.vec3d), zeros(samples, wp.vec3)
+        self.lower, self.upper = zeros((instances,), wp.vec3), zeros((instances,), wp.vec3)
+        self.near = zeros(self.candidate.shape, int)
+        slots = (instances, self.sample_max, contact.SLOTS)
+        self.slot_shape, self.slot_gap = zeros(slots, int), zeros(slots, wp.float64)
+        self.slot_normal = zeros(slots, wp.vec3)
+        self.entry_count = zeros((instances,), int)
+        self.entry_row, self.entry_shape = zeros((instances, entries), int), zeros((instances, entries), int)
+        self.entry_arm = zeros((instances, entries), wp.vec3)
+        self.entry_normal, self.entry_offset = zeros((instances, entries), wp.vec3d), zeros((instances, entries), wp.vec3d)
+        self.entry_stiffness = zeros((instances, entries), wp.float64)
+        self.entry_friction = zeros((instances, entries), wp.float64)
+        self.entry_normal_force = zeros((instances, entries), wp.float64)
+        self.entry_energy = zeros((instances, entries), wp.float64)
+        self.entry_force = zeros((instances, entries), wp.vec3d)
+        self.entry_hessian = zeros((instances, entries), wp.mat33)
+        self.instance_force = zeros((instances,), wp.vec3d)
+        self.body_wrench = zeros((max(self.model.body_count, 1),), wp.spatial_vector)
+        self.active, self.searching = zeros((worlds,), int), zeros((worlds,), int)
+        self.any_active, self.any_searching = zeros((1,), int), zeros((1,), int)
+        self.potential, self.potential_trial = zeros((worlds,), wp.float64), zeros((worlds,), wp.float64)
+        self.slope, self.step_length = zeros((worlds,), wp.float64), zeros((worlds,), wp.float64)
+        self.iteration, self.status = zeros((worlds,), int), zeros((worlds,), int)
+
+    def attach_rigid(self, rigid: RigidDofs) -> None:
+        """Let the joint dofs of ``rigid`` take part in the solve."""
+        self.rigid = rigid
+        device = self.model.device
+        shape = (self.instance_count, self.entry_max, max(rigid.count_max, 1))
+        self.entry_jacobian = wp.zeros(shape, dtype=wp.vec3, device=device)
+        self.entry_coupling = wp.zeros(shape, dtype=wp.vec3, device=device)
+        self.system = BlockCholesky(self.world, 3 * self.stride, rigid.count_max + 1, device)
+
+    def refresh(self) -> None:
+        """Read back what the model's parameters decide on the host: masses from densities."""
+        volumes = np.array([body.volume for body in self.bodies])[self.asset]
+        self.mass.assign(self.parameters.density.numpy() * volumes)
+
+    def notify_model_changed(self, flags: int) -> None:
+        """Follow changes of the model; material arrays are read live, masses are recomputed."""
+        self.refresh()
+
+    # -- the step -----------------------------------------------------------------------------------------------------
+
+    def step(
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        control: newton.Control | None,
+        contacts: newton.Contacts | None,
+        dt: float,
+        *,
+        observables: Any = None,
+    ) -> None:
+        """Advance every soft body by ``dt`` [s]; rigid bodies move as prescribed by ``state_in``.
+
+        ``contacts`` is not read: contacts between soft bodies and shapes are found by the solver itself.
+        """
+        self.validate_observables(observables, contacts)
+        self.begin(state_in, dt)
+        self.detect(state_in, control, dt, prescribed=True)
+        self.minimise(dt)
+        self.finish(state_out, dt)
+
+    def begin(self, state: newton.State, dt: float) -> None:
+        """Read the state and predict."""
+        data = getattr(state, NAMESPACE)
+        self.status.zero_()
+        self._launch(
+            kernels.begin_step,
+            (self.instance_count, self.stride),
+            [self.parameters.function_start, self.function_count, self.instance_asset, self.world, self.mass]
+            + [self.row_start, self.sample_count, self.parameters.particle_start, self.mean_basis, self.row_basis]
+            + [self.model.gravity, data.q, data.qd, state.particle_f, wp.float64(dt)],
+            [self.q_start, self.q_inertial, self.q, self.force],
+        )
+
+    def detect(self, state: newton.State, control: newton.Control | None, dt: float, *, prescribed: bool) -> None:
+        """Find the contacts of the step and write them behind the pins as entries."""
+        model, data = self.model, self.parameters
+        instances = self.instance_count
+        samples = (instances, self.sample_max)
+        self._launch(
+            contact.place_samples,
+            samples,
+            [self.function_count, self.row_start, self.sample_count, self.row_point, self.row_basis]
+            + [self.q_start, self.q_inertial],
+            [self.sample_position, self.sample_drift],
+        )
+        if self.pin_max:
+            targets = getattr(control if control is not None else model, NAMESPACE).pin_target
+            self._launch(
+                contact.gather_pins,
+                (instances, self.pin_max),
+                [self.function_count, self.pin_count, self.pin_start, self.pin_row, data.pin_stiffness, targets]
+                + [self.row_point, self.row_basis, self.q_start],
+                [self.entry_row, self.entry_shape, self.entry_offset, self.entry_stiffness],
+            )
+        if model.shape_count == 0:
+            wp.copy(self.entry_count, self.pin_count)
+            return
+        self._launch(
+            contact.bound_samples,
+            instances,
+            [self.sample_count, self.sample_position, self.sample_drift, self.margin],
+            [self.lower, self.upper],
+        )
+        self._launch(
+            contact.cull_shapes,
+            self.candidate.shape,
+            [self.candidate, model.shape_type, model.shape_body, model.shape_transform, model.shape_collision_radius]
+            + [state.body_q, state.body_qd, self.lower, self.upper, float(dt)],
+            [self.near],
+        )
+        self._launch(
+            contact.find_contacts,
+            samples,
+            [self.sample_count, self.margin, self.candidate, self.near, model.shape_type, model.shape_scale]
+            + [model.shape_source_ptr, model.shape_margin, model.shape_body, model.shape_transform]
+            + [state.body_q, state.body_qd, model.body_com, self.sample_position, self.sample_drift, float(dt)],
+            [self.slot_shape, self.slot_gap, self.slot_normal],
+        )
+        self._launch(
+            contact.gather_entries,
+            instances,
+            [self.world, self.row_start, self.sample_count, data.contact_stiffness, data.friction, self.pin_count]
+            + [self.entry_max, self.row_area, model.shape_body, model.shape_material_mu]
+            + [state.body_q, state.body_qd, model.body_com, int(prescribed)]
+            + [self.sample_position, self.slot_shape, self.slot_gap, self.slot_normal, float(dt)]
+            + [kernels.WORLD_CONTACT_OVERFLOW],
+            [self.entry_count, self.entry_row, self.entry_shape, self.entry_arm, self.entry_normal]
+            + [self.entry_offset, self.entry_stiffness, self.entry_friction, self.status],
+        )
+        rigid = self.rigid
+        if rigid.count_max:
+            self._launch(
+                contact.entry_jacobians,
+                (instances, self.entry_max, rigid.count_max),
+                [self.world, self.entry_count, rigid.count, rigid.dof_start, model.shape_body]
+                + [rigid.body_articulation, rigid.body_link, rigid.articulation_dof_start]
+                + [rigid.articulation_dof_count, rigid.jacobian, self.entry_shape, self.entry_arm],
+                [self.entry_jacobian],
+            )
+
+    def minimise(self, dt: float) -> None:
+        """Minimise the incremental potential of every world by Newton with a line search."""
+        self.active.fill_(1)
+        self.iteration.zero_()
+        self.any_active.fill_(1)
+        wp.capture_while(self.any_active, self._newton_iteration, dt=dt)
+
+    def _newton_iteration(self, dt: float) -> None:
+        """Take one Newton step in every world that is not done."""
+        self._evaluate(self.active, self.q, self.rigid.r, dt, derivatives=True)
+        self._sum_potential(self.active, self.q, self.rigid.r, dt, self.potential)
+        self._assemble(dt)
+        self._solve()
+        self._begin_search()
+        wp.capture_while(self.any_searching, self._try_step, dt=dt)
+        self._finish_iteration()
+
+    def _evaluate(self, selected: wp.array, q: wp.array, r: wp.array, dt: float, *, derivatives: bool) -> None:
+        """Evaluate elastic points and point constraints at q, r in the selected worlds."""
+        data = self.parameters
+        self._launch(
+            kernels.evaluate_points,
+            (self.instance_count, self.point_max),
+            [self.world, self.function_count, self.point_start, self.point_count, data.material_model]
+            + [data.youngs_modulus, data.poissons_ratio, data.viscosity, self.grad_basis, self.point_weight]
+            + [self.stiffness_scale, selected, self.q_start, q, wp.float64(dt), int(derivatives)],
+            [self.point_energy, self.point_stress, self.point_hessian],
+        )
+        self._launch(
+            contact.evaluate_entries,
+            (self.instance_count, self.entry_max),
+            [self.world, self.function_count, self.pin_count, self.smoothing]
+            + [wp.float64(self.options.stick_velocity * dt), self.row_basis, selected, self.q_start, q, r]
+            + [self.rigid.count, self.entry_count, self.entry_row, self.entry_normal, self.entry_offset]
+            + [self.entry_stiffness, self.entry_friction, self.entry_jacobian, int(derivatives)],
+            [self.entry_normal_force, self.entry_energy, self.entry_force, self.entry_hessian, self.entry_coupling],
+        )
+
+    def _sum_potential(self, selected: wp.array, q: wp.array, r: wp.array, dt: float, out: wp.array) -> None:
+        """Sum the potential of the selected worlds."""
+        self._launch(
+            kernels.sum_potential,
+            self.world_count,
+            [self.function_count, self.point_count, self.mass, self.parameters.mass_damping, self.world_instances]
+            + [self.rigid.count, selected, self.q_start, self.q_inertial, q, self.force, self.point_energy]
+            + [self.entry_count, self.entry_energy, self.rigid.inertia, self.rigid.predicted, r, wp.float64(dt)],
+            [out],
+        )
+
+    def _assemble(self, dt: float) -> None:
+        """Gather gradient and Hessian into the block systems [K | C | -g] and the rigid part."""
+        instances, blocks = self.instance_count, self.stride // LANES
+        damping = self.parameters.mass_damping
+        self._launch(
+            kernels.gather_gradient,
+            (instances, self.stride),
+            [self.world, self.function_count, self.point_start, self.point_count, self.mass, damping]
+            + [self.grad_basis, self.row_basis, self.active, self.q_start, self.q_inertial, self.q, self.force]
+            + [self.point_stress, self.entry_count, self.entry_row, self.entry_force, wp.float64(dt)],
+            [self.gradient],
+        )
+        self._launch(
+            kernels.assemble_hessian,
+            (instances, 6, blocks, blocks),
+            [self.world, self.function_count, self.point_start, self.point_count, self.mass, damping]
+            + [self.grad_basis, self.grad_basis8, self.row_basis, self.row_basis8, self.active]
+            + [self.point_hessian, self.entry_count, self.entry_row, self.entry_hessian, float(dt)],
+            [self.system.matrix],
+        )
+        self._launch(
+            kernels.assemble_columns,
+            (instances, 3 * self.stride, self.system.column_block_count),
+            [self.world, self.function_count, self.stride, self.row_basis, self.active, self.gradient]
+            + [self.entry_count, self.entry_row, self.entry_coupling, self.rigid.count_max],
+            [self.system.matrix],
+        )
+        rigid = self.rigid
+        if rigid.count_max:
+            self._launch(
+                kernels.assemble_rigid,
+                (self.world_count, rigid.count_max),
+                [self.world_instances, rigid.count, self.active, rigid.inertia, rigid.predicted, rigid.r]
+                + [self.entry_count, self.entry_force, self.entry_jacobian, self.entry_coupling],
+                [rigid.gradient, rigid.matrix],
+            )
+
+    def _solve(self) -> None:
+        """Factor every body, condense onto the rigid dofs, solve those, substitute back."""
+        rigid, system = self.rigid, self.system
+        system.factor(self.active)
+        if rigid.count_max:
+            self._launch(
+                kernels.condense,
+                (self.world_count, rigid.count_max),
+                [self.world_instances, rigid.count, rigid.count_max, self.active, rigid.gradient, system.matrix]
+                + [system.size, rigid.matrix],
+                [rigid.direction],
+            )
+            self._launch(kernels.solve_rigid, self.world_count, [rigid.count, self.active, rigid.matrix, rigid.direction])
+        self.direction = system.solve(self.active, rigid.count_max, rigid.direction, rigid.count_max)
+
+    def _begin_search(self) -> None:
+        """Start the line search of every active world."""
+        self.any_searching.zero_()
+        self._launch(
+            kernels.begin_search,
+            self.world_count,
+            [self.function_count, self.stride, self.world_instances, self.rigid.count, self.active, self.gradient]
+            + [self.direction, self.rigid.gradient, self.rigid.direction],
+            [self.slope, self.step_length, self.searching, self.any_searching],
+        )
+
+    def _try_step(self, dt: float) -> None:
+        """Evaluate one trial step in every searching world and accept or halve it."""
+        rigid = self.rigid
+        self._launch(
+            kernels.trial_functions,
+            (self.instance_count, self.stride),
+            [self.world, self.function_count, self.stride, self.searching, self.step_length, self.q, self.direction],
+            [self.q_trial],
+        )
+        if rigid.count_max:
+            self._launch(
+                kernels.trial_rigid,
+                (self.world_count, rigid.count_max),
+                [rigid.count, self.searching, self.step_length, rigid.r, rigid.direction],
+                [rigid.trial],
+            )
+        self._evaluate(self.searching, self.q_trial, rigid.trial, dt, derivatives=False)
+        self._sum_potential(self.searching, self.q_trial, rigid.trial, dt, self.potential_trial)
+        self.any_searching.zero_()
+        self._launch(
+            kernels.judge_trial,
+            self.world_count,
+            [self.potential, self.potential_trial, self.slope, wp.float64(self.options.step_length_min)],
+            [self.step_length, self.searching, self.any_searching],
+        )
+
+    def _finish_iteration(self) -> None:
+        """Take the accepted steps and see which worlds are done."""
+        self.any_active.zero_()
+        self._launch(
+            kernels.finish_iteration,
+            self.world_count,
+            [self.function_count, self.stride, self.tolerance, self.world_instances, self.rigid.count]
+            + [self.rigid_tolerance, self.options.iteration_max, self.step_length, self.q_trial, self.rigid.trial],
+            [self.active, self.q, self.rigid.r, self.iteration, self.status, self.any_active],
+        )
+
+    def finish(self, state: newton.State, dt: float) -> None:
+        """Write coordinates, velocities and particles, and sum the contact reactions."""
+        data, instances = self.parameters, self.instance_count
+        self._launch(
+            kernels.check_finite,
+            self.world_count,
+            [self.function_count, self.world_instances, self.rigid.count, self.q, self.rigid.r],
+            [self.status],
+        )
+        out = getattr(state, NAMESPACE)
+        self._launch(
+            kernels.end_step,
+            (instances, self.stride),
+            [data.function_start, self.function_count, self.world, self.status, self.q_start, self.q, wp.float64(dt)],
+            [out.q, out.qd],
+        )
+        self.body_wrench.zero_()
+        self._launch(
+            contact.sum_reactions,
+            self.world_count,
+            [self.world_instances, self.model.shape_body, self.pin_count, self.entry_count, self.entry_shape]
+            + [self.entry_arm, self.entry_force],
+            [self.body_wrench, self.instance_force],
+        )
+        self.update_particles(state)
+
+    def update_particles(self, state: newton.State) -> None:
+        """Move the surface particles of ``state`` to where its reduced coordinates put them."""
+        data, out = self.parameters, getattr(state, NAMESPACE)
+        self._launch(
+            kernels.skin_samples,
+            (self.instance_count, self.sample_max),
+            [data.function_start, self.function_count, self.row_start, self.sample_count, data.particle_start]
+            + [self.row_point, self.row_basis, out.q, out.qd],
+            [state.particle_q, state.particle_qd],
+        )
+
+    def reset(self, state: newton.State, world_mask: wp.array | None = None, flags: Any = None) -> None:
+        """Put the bodies of the chosen worlds back to the model's initial pose, at rest as authored.
+
+        Args:
+            state: State to reset in place.
+            world_mask: Boolean mask of shape (world_count + 1,), the last entry for entities outside worlds; or None
+                for all.
+            flags: Accepted for the contract; reduced coordinates are always reset.
+        """
+        if world_mask is None:
+            world_mask = wp.full(self.world_count + 1, True, dtype=bool, device=self.model.device)
+        initial, out = self.parameters, getattr(state, NAMESPACE)
+        self._launch(
+            kernels.reset_functions,
+            (self.instance_count, self.stride),
+            [initial.function_start, self.function_count, self.world, world_mask, initial.q, initial.qd],
+            [out.q, out.qd],
+        )
+        self.update_particles(state)
+
+    def _launch(self, kernel: wp.Kernel, dim: Any, inputs: list[Any], outputs: Sequence[Any] = ()) -> None:
+        """Launch on the model's device."""
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=list(outputs), device=self.model.device)

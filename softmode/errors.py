@@ -1,0 +1,46 @@
+"""Typed errors of softmode: each says what is wrong and how to mend it."""
+
+from __future__ import annotations
+
+
+class SoftmodeError(Exception):
+    """Base of all errors that softmode raises on purpose.
+
+    Args:
+        message: What is wrong; names the argument or the file, what was expected and what was given.
+        hint: The remedy, as an imperative.
+    """
+
+    def __init__(self, message: str, *, hint: str = "") -> None:
+        """Store the message and the remedy."""
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+
+    def __str__(self) -> str:
+        """Return the message followed by the remedy."""
+        return f"{self.message.rstrip('.')}. {self.hint}" if self.hint else self.message
+
+
+class AssetError(SoftmodeError, ValueError):
+    """An asset (splat, mesh, saved body) cannot be read or holds no usable object."""
+
+
+class MaterialError(SoftmodeError, ValueError):
+    """A material parameter lies outside its admissible range."""
+
+
+class BasisError(SoftmodeError, ValueError):
+    """A reduced basis cannot be built or evaluated for the given points."""
+
+
+class ConfigError(SoftmodeError, ValueError):
+    """An option or argument is unknown or outside its range."""
+
+
+class MissingExtraError(SoftmodeError, ImportError):
+    """An optional dependency is absent."""
+
+
+class SolverDiverged(SoftmodeError, RuntimeError):
+    """A step produced no finite state."""

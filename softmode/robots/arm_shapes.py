@@ -1,0 +1,190 @@
+"""What the arm looks like: the primitives of each link, which also give it its inertia."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import newton
+import warp as wp
+
+if TYPE_CHECKING:
+    from softmode.robots.arm import ArmDescription, GripperDescription
+
+_WHITE = (0.90, 0.91, 0.92)
+_GRAPHITE = (0.16, 0.17, 0.19)
+_ACCENT = (0.95, 0.42, 0.10)
+_STEEL = (0.62, 0.64, 0.67)
+_RUBBER = (0.10, 0.10, 0.11)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """One primitive of a link: centre in the link's frame, long axis y or z, and what it is for."""
+
+    kind: Literal["capsule", "cylinder", "box"]
+    center: tuple[float, float, float]
+    size: tuple[float, ...]
+    """Capsule and cylinder: radius, half length without caps. Box: half sizes. [m]"""
+    color: tuple[float, float, float] = _WHITE
+    axis: Literal["y", "z"] = "z"
+    touch: bool = False
+    name: str = ""
+
+    @property
+    def volume(self) -> float:
+        """Volume [m^3]."""
+        if self.kind == "box":
+            return 8.0 * self.size[0] * self.size[1] * self.size[2]
+        radius, half = self.size
+        tube = 2.0 * math.pi * radius**2 * half
+        return tube + 4.0 / 3.0 * math.pi * radius**3 if self.kind == "capsule" else tube
+
+
+_PEDESTAL_HEIGHT = 0.14
+"""Height of the first axis' bearing above the mounting plane [m]."""
+
+
+def base_parts(arm: ArmDescription) -> list[Part]:
+    """Return the shapes of the static base."""
+    middle = 0.5 * (0.025 + _PEDESTAL_HEIGHT)
+    return [
+        Part(kind="box", center=(0.0, 0.0, 0.0125), size=(0.105, 0.095, 0.0125), color=_GRAPHITE, name="plate"),
+        Part(kind="cylinder", center=(0.0, 0.0, middle), size=(0.078, middle - 0.025), color=_WHITE, name="pedestal"),
+        Part(
+            kind="cylinder",
+            center=(0.0, 0.0, _PEDESTAL_HEIGHT + 0.004),
+            size=(0.074, 0.004),
+            color=_ACCENT,
+            name="ring",
+        ),
+    ]
+
+
+def arm_links(arm: ArmDescription) -> tuple[list[float], list[tuple[float, float, float]], list[list[Part]]]:
+    """Return, per joint, its offset along the parent's z [m], its axis, and the shapes of the link behind it."""
+    along_z, along_y = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
+    half_upper, half_fore = 0.5 * arm.upper_arm_length, 0.5 * arm.forearm_length
+    neck = arm.shoulder_height - _PEDESTAL_HEIGHT
+    offsets = [_PEDESTAL_HEIGHT, neck, half_upper, half_upper, half_fore, half_fore, arm.flange_length]
+    axes = [along_z, along_y, along_z, along_y, along_z, along_y, along_z]
+
+    def sleeve(length: float, radius: float, color: tuple[float, float, float] = _WHITE) -> Part:
+        """A tube from the link's origin along z, without caps."""
+        return Part(kind="cylinder", center=(0.0, 0.0, 0.5 * length), size=(radius, 0.5 * length), color=color)
+
+    def hub(z: float, radius: float, half: float) -> list[Part]:
+        """A joint housing across the arm with coloured end caps."""
+        caps = [
+            Part(
+                kind="cylinder",
+                center=(0.0, side * (half + 0.006), z),
+                size=(0.8 * radius, 0.006),
+                color=_ACCENT,
+                axis="y",
+            )
+            for side in (1.0, -1.0)
+        ]
+        return [Part(kind="cylinder", center=(0.0, 0.0, z), size=(radius, half), color=_GRAPHITE, axis="y"), *caps]
+
+    def ring(z: float, radius: float) -> Part:
+        return Part(kind="cylinder", center=(0.0, 0.0, z), size=(radius, 0.004), color=_STEEL)
+
+    flange = arm.flange_length
+    links = [
+        [sleeve(neck, 0.068), *hub(neck, 0.070, 0.068)],
+        [_capsule_along_z(0.0, half_upper, 0.058), ring(half_upper, 0.056)],
+        [_capsule_along_z(0.0, half_upper, 0.054), *hub(half_upper, 0.060, 0.060)],
+        [_capsule_along_z(0.0, half_fore, 0.050), ring(half_fore, 0.048)],
+        [_capsule_along_z(0.0, half_fore, 0.046), *hub(half_fore, 0.050, 0.050)],
+        [_capsule_along_z(0.0, 0.4 * flange, 0.042), sleeve(flange - 0.004, 0.040)],
+        _hand_parts(arm),
+    ]
+    return offsets, axes, links
+
+
+def _hand_parts(arm: ArmDescription) -> list[Part]:
+    """Return the shapes of the hand; the last one is the palm."""
+    length = arm.hand_length
+    half_width = 0.5 * arm.gripper.stroke + 0.022
+    half_height = max(0.5 * (length - 0.026), 0.005)
+    return [
+        Part(kind="cylinder", center=(0.0, 0.0, 0.010), size=(0.040, 0.010), color=_STEEL, name="flange"),
+        Part(kind="cylinder", center=(0.0, 0.0, 0.024), size=(0.036, 0.006), color=_ACCENT, name="ring"),
+        *(
+            Part(
+                kind="cylinder",
+                center=(0.0, side * half_width, 0.5 * (length + 0.026)),
+                size=(0.026, half_height),
+                color=_GRAPHITE,
+                name="side",
+            )
+            for side in (1.0, -1.0)
+        ),
+        Part(
+            kind="box",
+            center=(0.0, 0.0, 0.5 * (length + 0.026)),
+            size=(0.026, half_width, half_height),
+            color=_WHITE,
+            touch=True,
+            name="palm",
+        ),
+    ]
+
+
+def finger_parts(gripper: GripperDescription, side: float) -> list[Part]:
+    """Return the shapes of one finger, its pad first; at zero the pad's face lies in the plane y = 0."""
+    width, thickness, height = gripper.pad_size
+    length = gripper.finger_length
+    back = 0.009
+    return [
+        Part(
+            kind="box",
+            center=(0.0, side * 0.5 * thickness, length - 0.5 * height),
+            size=(0.5 * width, 0.5 * thickness, 0.5 * height),
+            color=_RUBBER,
+            touch=True,
+            name="pad",
+        ),
+        Part(
+            kind="box",
+            center=(0.0, side * (thickness + 0.5 * back), 0.5 * length - 0.001),
+            size=(0.46 * width, 0.5 * back, 0.5 * length - 0.001),
+            color=_STEEL,
+            touch=True,
+            name="finger",
+        ),
+        Part(
+            kind="box",
+            center=(0.0, side * (thickness + 0.010), 0.006),
+            size=(0.6 * width, 0.014, 0.006),
+            color=_GRAPHITE,
+            name="carriage",
+        ),
+    ]
+
+
+def _capsule_along_z(start: float, end: float, radius: float) -> Part:
+    """Return a capsule whose end points lie on the link's z axis."""
+    return Part(kind="capsule", center=(0.0, 0.0, 0.5 * (start + end)), size=(radius, 0.5 * (end - start)))
+
+
+def add_part(
+    builder: newton.ModelBuilder,
+    body: int,
+    part: Part,
+    config: newton.ModelBuilder.ShapeConfig,
+    xform: wp.transform,
+    label: str,
+) -> int:
+    """Add one primitive to a body and return its shape index."""
+    # Newton's capsules and cylinders lie along their local z; a quarter turn about x lays them along y.
+    half = math.sqrt(0.5)
+    turn = wp.quat(half, 0.0, 0.0, half) if part.axis == "y" else wp.quat_identity()
+    pose = xform * wp.transform(wp.vec3(*part.center), turn)
+    common = {"xform": pose, "cfg": config, "color": part.color, "label": label}
+    if part.kind == "box":
+        return builder.add_shape_box(body, hx=part.size[0], hy=part.size[1], hz=part.size[2], **common)
+    add = builder.add_shape_capsule if part.kind == "capsule" else builder.add_shape_cylinder
+    return add(body, radius=part.size[0], half_height=part.size[1], **common)

@@ -1,0 +1,248 @@
+"""Delta-pose and delta-joint actions turned into joint position targets, for all worlds in one kernel.
+
+The controller keeps the *commanded* configuration: an action moves the command, never the measured pose, so the arm
+does not creep under a load. The command may lead the measured pose only by a bounded distance (anti-windup), so an arm
+that is held back does not lunge when it is let go.
+
+Newton's own differential inverse kinematics maps a desired tool pose to joint velocities. It is not used here because
+the command itself must be iterated to convergence, clamped to limits and workspace, and held between actions; for a
+serial chain that is one small kernel.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import newton
+import numpy as np
+import warp as wp
+
+from softmode.errors import ConfigError
+from softmode.robots import control_kernels as kernels
+from softmode.robots.arm import ARM_JOINT_COUNT, ArmIndices
+from softmode.robots.checks import require_positive, require_sequence
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmControlOptions:
+    """How actions in [-1, 1] move the command; "per action" is the change of one control step at full deflection."""
+
+    mode: Literal["pose_delta", "joint_delta"] = "pose_delta"
+    """Tool steps (x, y, z, yaw, gripper) with the tool held vertical, or steps of the seven joints and the gripper."""
+    translation_scale: float = 0.015
+    """Tool travel per action and axis [m]."""
+    rotation_scale: float = 0.08
+    """Tool yaw per action [rad]."""
+    joint_scale: float = 0.04
+    """Joint travel per action [rad]."""
+    opening_rate: float = 0.006
+    """Largest change of the commanded opening per action [m]."""
+    workspace_lower: tuple[float, float, float] = (0.25, -0.35, 0.012)
+    """Least commanded tool position, world frame [m]."""
+    workspace_upper: tuple[float, float, float] = (0.65, 0.35, 0.55)
+    """Greatest commanded tool position, world frame [m]."""
+    max_lead: float = 0.06
+    """Largest distance of the commanded tool position from the measured one [m]."""
+    max_lead_angle: float = 0.30
+    """Largest lead of a commanded joint (joint_delta) or of the commanded yaw (pose_delta) [rad]."""
+    squeeze_lead: float = 1.05
+    """Largest lead of the commanded opening while it closes, as a multiple of the one at which the drives saturate."""
+    damping: float = 0.03
+    """Damping lambda of the least squares; metres for positions, with rotations weighted by rotation_weight."""
+    rotation_weight: float = 0.3
+    """Length by which a rotation error counts [m/rad]."""
+    posture_gain: float = 0.05
+    """Share of the distance to the home posture that each iteration removes in the null space."""
+    iterations: int = 6
+    """Damped least-squares iterations per action."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if self.mode not in ("pose_delta", "joint_delta"):
+            raise ConfigError(f"mode is {self.mode!r}", hint="use 'pose_delta' or 'joint_delta'")
+        require_positive(self, "translation_scale", "rotation_scale", "joint_scale", "opening_rate", "max_lead")
+        require_positive(self, "max_lead_angle", "squeeze_lead", "damping", "rotation_weight")
+        require_sequence(self, "workspace_lower", 3)
+        require_sequence(self, "workspace_upper", 3)
+        if not 0.0 <= self.posture_gain <= 1.0:
+            raise ConfigError(f"posture_gain = {self.posture_gain} lies outside 0..1", hint="use 0 to switch it off")
+        if self.iterations < 1:
+            raise ConfigError(
+                f"iterations = {self.iterations} must be at least 1", hint="six are enough for any action"
+            )
+        lower, upper = self.workspace_lower, self.workspace_upper
+        if not all(a < b for a, b in zip(lower, upper, strict=True)):
+            raise ConfigError(
+                f"workspace_lower {lower} is not below workspace_upper {upper}",
+                hint="give two corners (x, y, z) in metres, lower before upper",
+            )
+
+    @property
+    def action_size(self) -> int:
+        """Entries of an action; the last one is the gripper, -1 squeezes and +1 opens."""
+        return 5 if self.mode == "pose_delta" else ARM_JOINT_COUNT + 1
+
+
+class ArmController:
+    """Holds the commanded configuration of one arm in every world and writes the joint targets.
+
+    All methods but the constructor only launch kernels on preallocated arrays, so they can be captured in a graph. A
+    control step reads::
+
+        controller.command(action, state)               # moves the command
+        for i in range(substeps):
+            controller.write_targets(control, (i + 1) / substeps)
+            ...                                         # step the solvers
+        controller.measure(state)                       # tool_pose, opening for the observation
+
+    Args:
+        model: The finalised model; its worlds are copies of the builder that the arm was added to.
+        arm: What `add_arm` returned.
+        options: The action's meaning.
+
+    Attributes:
+        commanded_q: Commanded joint coordinates, (world_count, 9) [rad, m].
+        tool_pose: Measured pose of the tool frame, (world_count,) transforms, of the last `measure` or `command`.
+        opening: Measured distance between the pads [m], (world_count,).
+        target_position: Commanded tool position [m], (world_count,) vec3.
+        target_yaw: Commanded tool yaw [rad], (world_count,); zero in the home pose.
+    """
+
+    def __init__(self, model: newton.Model, arm: ArmIndices, options: ArmControlOptions | None = None) -> None:
+        """Allocate the command of every world and set it to the model's initial coordinates."""
+        self.options = options if options is not None else ArmControlOptions()
+        self.arm = arm
+        self.world_count = max(model.world_count, 1)
+        device = model.device
+        w = self.world_count
+
+        def starts(world_start: wp.array | None, first: int) -> wp.array:
+            assert world_start is not None
+            start = world_start.numpy()
+            # A builder that is finalised without replication keeps everything outside any world.
+            offset = start[:w] if start[w] > start[0] else np.zeros(w, dtype=np.int32)
+            return wp.array(offset + first, dtype=wp.int32, device=device)
+
+        self._joint_start = starts(model.joint_world_start, arm.joint_start)
+        self._coord_start = starts(model.joint_coord_world_start, arm.coord_start)
+        self._dof_start = starts(model.joint_dof_world_start, arm.dof_start)
+        description = arm.description
+        self._chain = kernels.Chain()
+        self._chain.joint_parent_pose = model.joint_X_p
+        self._chain.joint_axis = model.joint_axis
+        self._chain.lower = model.joint_limit_lower
+        self._chain.upper = model.joint_limit_upper
+        self._chain.joint_start = self._joint_start
+        self._chain.coord_start = self._coord_start
+        self._chain.dof_start = self._dof_start
+        self._chain.tool_length = description.tool_length
+        self._chain.home = kernels.vec7(*description.home_joint_q[:ARM_JOINT_COUNT].tolist())
+        self._settings = self._make_settings()
+        self.commanded_q = wp.zeros((w, ARM_JOINT_COUNT + 2), dtype=wp.float32, device=device)
+        self._previous_q = wp.zeros_like(self.commanded_q)
+        self.tool_pose = wp.zeros(w, dtype=wp.transform, device=device)
+        self.opening = wp.zeros(w, dtype=wp.float32, device=device)
+        self.target_position = wp.zeros(w, dtype=wp.vec3, device=device)
+        self.target_yaw = wp.zeros(w, dtype=wp.float32, device=device)
+        self._everywhere = wp.ones(w, dtype=wp.bool, device=device)
+        self._device = device
+        self._reset(model.joint_q, self._everywhere)
+
+    def _make_settings(self):
+        options, gripper = self.options, self.arm.description.gripper
+        settings = kernels.Settings()
+        settings.joint_mode = int(options.mode == "joint_delta")
+        settings.translation_scale = options.translation_scale
+        settings.rotation_scale = options.rotation_scale
+        settings.joint_scale = options.joint_scale
+        settings.opening_rate = options.opening_rate
+        settings.stroke = gripper.stroke
+        # Both drives saturate at an opening error of twice force_limit / stiffness.
+        settings.opening_lead = options.squeeze_lead * 2.0 * gripper.force_limit / gripper.drive_stiffness
+        settings.workspace_lower = wp.vec3(*options.workspace_lower)
+        settings.workspace_upper = wp.vec3(*options.workspace_upper)
+        settings.max_lead = options.max_lead
+        settings.max_lead_angle = options.max_lead_angle
+        settings.damping = options.damping
+        settings.rotation_weight = options.rotation_weight
+        settings.posture_gain = options.posture_gain
+        settings.iterations = options.iterations
+        return settings
+
+    def reset(self, state: newton.State, world_mask: wp.array | None = None) -> None:
+        """Set the command to the measured configuration.
+
+        Args:
+            state: Where joint_q is read.
+            world_mask: Which worlds, (world_count,) bool; all if omitted.
+        """
+        self._reset(state.joint_q, world_mask if world_mask is not None else self._everywhere)
+
+    def _reset(self, joint_q: wp.array | None, world_mask: wp.array) -> None:
+        wp.launch(
+            kernels.reset_command,
+            dim=self.world_count,
+            inputs=[self._chain, joint_q, world_mask],
+            outputs=[
+                self.commanded_q,
+                self._previous_q,
+                self.target_position,
+                self.target_yaw,
+                self.tool_pose,
+                self.opening,
+            ],
+            device=self._device,
+        )
+
+    def command(self, action: wp.array, state: newton.State) -> None:
+        """Move the commanded configuration by one action per world.
+
+        Args:
+            action: Actions in [-1, 1], (world_count, options.action_size) float32; larger values are clamped and values
+                that are not finite count as zero. The gripper entry names an opening which the command approaches at
+                opening_rate: +1 is fully open, -1 squeezes whatever is between the pads with the full drive force.
+            state: The measured state, for the anti-windup.
+        """
+        if action.shape != (self.world_count, self.options.action_size):
+            raise ConfigError(
+                f"action has shape {tuple(action.shape)}",
+                hint=f"expected ({self.world_count}, {self.options.action_size}) in mode {self.options.mode!r}",
+            )
+        wp.launch(
+            kernels.move_command,
+            dim=self.world_count,
+            inputs=[self._chain, self._settings, action, state.joint_q],
+            outputs=[
+                self.commanded_q,
+                self._previous_q,
+                self.target_position,
+                self.target_yaw,
+                self.tool_pose,
+                self.opening,
+            ],
+            device=self._device,
+        )
+
+    def write_targets(self, control: newton.Control, fraction: float = 1.0) -> None:
+        """Write the drives' position targets, on the line from the previous command to the present one.
+
+        Args:
+            control: Where joint_target_q is written.
+            fraction: Share of the control step that the targets should have covered, 0 to 1.
+        """
+        wp.launch(
+            kernels.write_targets,
+            dim=(self.world_count, ARM_JOINT_COUNT + 2),
+            inputs=[self._coord_start, self._previous_q, self.commanded_q, fraction],
+            outputs=[control.joint_target_q],
+            device=self._device,
+        )
+
+    def measure(self, state: newton.State) -> None:
+        """Update `tool_pose` and `opening` from the measured joint coordinates."""
+        wp.launch(
+            kernels.measure,
+            dim=self.world_count,
+            inputs=[self._chain, state.joint_q],
+            outputs=[self.tool_pose, self.opening],
+            device=self._device,
+        )

@@ -1,0 +1,295 @@
+"""The batched tile rasteriser for 3D Gaussian splats: one code path for CPU and CUDA, no host read-back, capturable.
+
+One frame is a fixed launch sequence over all views (worlds x cameras):
+
+    project -> sort by depth -> count tiles -> scan -> emit pairs -> sort by tile (stable) -> ranges -> blend
+
+Sorting whole splats by depth first and their (tile, splat) pairs by tile afterwards keeps the keys at 32 bits. Images
+follow the standard splat formula (Kerbl et al. 2023): alpha = min(0.99, o exp(-d^2/2)), cut below 1/255, front to back
+until less than 1e-4 of the light is left. The antialiased mode (on by default; Yu et al. 2024, "Mip-Splatting") scales
+opacities by the share of the footprint that the pixel filter adds, which is what keeps small images right.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from softmode.errors import ConfigError
+from softmode.splats import rasterizer_kernels as kernels
+from softmode.splats.splats import MAX_SPLATS, Splats
+
+
+@dataclass(frozen=True, kw_only=True)
+class RasterizerOptions:
+    """How splats are drawn; fixed for a rasteriser's life."""
+
+    antialiased: bool = True
+    """Compensate opacity for the pixel filter; False is the classic formula."""
+    dilation: float = 0.3
+    """Variance of the pixel filter [px^2]."""
+    near: float = 0.01
+    """Nearest visible forward depth [m]."""
+    object_ids: bool = False
+    """Write the object of the largest weight per pixel."""
+    tile: int = 8
+    """Tile edge [px], a multiple of the pixels per thread (8 on CPU, 1 on CUDA)."""
+    pairs_per_splat: int = 12
+    """Capacity: tiles that a splat touches on average. When it is exceeded, the farthest splats are left out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplatArrays:
+    """Splats of all objects on the device. Leading sizes are 1 (shared by all worlds) or world_count."""
+
+    means: wp.array
+    """Centres [m], vec3, shape (1 or world_count, N)."""
+    covariances: wp.array
+    """Covariances xx, xy, xz, yy, yz, zz [m^2], vec6, shape (1 or world_count, N)."""
+    opacities: wp.array
+    """Opacities 0..1, shape (1 or world_count, N)."""
+    sh: wp.array
+    """Colour coefficients, vec3, shape (1 or world_count, N, K)."""
+    object_index: wp.array
+    """Object of each splat, int32, shape (N,)."""
+    rotations: wp.array
+    """Rotation of each object's colours, rest frame to world, quat, shape (1 or world_count, object_count)."""
+
+    @classmethod
+    def from_splats(
+        cls,
+        objects: list[Splats] | tuple[Splats, ...],
+        *,
+        world_count: int = 1,
+        sh_degree: int | None = None,
+        device: Any = None,
+    ) -> "SplatArrays":
+        """Upload the objects in their rest state, every world alike; means, covariances and rotations are per world.
+
+        Args:
+            objects: Splats of each object, in the order of their columns.
+            world_count: Number of worlds.
+            sh_degree: Degree kept, 0 to 3; None for the highest of the objects. Lower ones are padded with zeros.
+            device: Warp device.
+        """
+        if not objects:
+            raise ConfigError("objects is empty", hint="Pass at least one Splats")
+        degree = max(splats.sh_degree for splats in objects) if sh_degree is None else sh_degree
+        width = (degree + 1) ** 2
+        sh = [splats.sh[:, :width] for splats in objects]
+        sh = np.concatenate([np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0))) for part in sh])
+        s = np.concatenate([splats.covariances() for splats in objects])
+        six = np.stack([s[:, 0, 0], s[:, 0, 1], s[:, 0, 2], s[:, 1, 1], s[:, 1, 2], s[:, 2, 2]], axis=1)
+        means = np.concatenate([splats.means for splats in objects])
+        index = np.repeat(np.arange(len(objects), dtype=np.int32), [splats.count for splats in objects])
+        identity = np.tile(np.array([0.0, 0.0, 0.0, 1.0], dtype=np.float32), (world_count, len(objects), 1))
+
+        def worlds(array: np.ndarray) -> np.ndarray:
+            return np.repeat(array.astype(np.float32)[None], world_count, axis=0)
+
+        return cls(
+            means=wp.array(worlds(means), dtype=wp.vec3, device=device),
+            covariances=wp.array(worlds(six), dtype=kernels.vec6, device=device),
+            opacities=wp.array(np.concatenate([o.opacities for o in objects])[None], dtype=wp.float32, device=device),
+            sh=wp.array(sh[None], dtype=wp.vec3, device=device),
+            object_index=wp.array(index, dtype=wp.int32, device=device),
+            rotations=wp.array(identity, dtype=wp.quat, device=device),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewArrays:
+    """The views of a frame on the device. Pinhole cameras with OpenCV axes: x right, y down, z forward."""
+
+    world_to_camera: wp.array
+    """Rigid transforms, mat44, shape (view_count,)."""
+    intrinsics: wp.array
+    """fx, fy, cx, cy [px], vec4, shape (view_count,). The centre of the first pixel is (0.5, 0.5)."""
+    world: wp.array
+    """World that each view shows, int32, shape (view_count,)."""
+    background: wp.array
+    """Colour behind everything, vec3, shape (1 or view_count,)."""
+
+
+class SplatRasterizer:
+    """Draws splats into images of one size for a fixed number of views.
+
+    All buffers are allocated once. `render` launches a fixed sequence and reads nothing back, so it can be captured
+    with `wp.ScopedCapture` on CPU and CUDA; run it once before capturing so that its kernels are compiled. Outputs,
+    overwritten by every frame:
+
+    - `rgb`: vec3, shape (view_count, height, width).
+    - `depth`: expected forward depth of what is seen, mesh included [m]; 0 where there is nothing.
+    - `alpha`: coverage by splats.
+    - `object_id`: object of the largest weight, -1 where there is none (only with `options.object_ids`).
+    - `overflow`: int32, shape (1,): pairs left out because the capacity was exceeded; 0 when the frame is complete.
+
+    Args:
+        splat_count: Number of splats per world, all objects together.
+        view_count: Number of views (worlds x cameras).
+        width: Image width [px].
+        height: Image height [px].
+        options: How splats are drawn.
+        device: Warp device.
+
+    Raises:
+        ConfigError: If a size is out of range.
+    """
+
+    def __init__(
+        self,
+        splat_count: int,
+        view_count: int,
+        width: int,
+        height: int,
+        *,
+        options: RasterizerOptions | None = None,
+        device: Any = None,
+    ) -> None:
+        """Allocate the buffers."""
+        self.options = options if options is not None else RasterizerOptions()
+        self.device = wp.get_device(device)
+        tile = self.options.tile
+        self._strip = 8 if self.device.is_cpu else 1
+        self.tile_count = (-(-width // tile) if tile > 0 else 0, -(-height // tile) if tile > 0 else 0)
+        self.splat_count, self.view_count, self.width, self.height = splat_count, view_count, width, height
+        total = splat_count * view_count
+        tiles = self.tile_count[0] * self.tile_count[1] * view_count
+        self.capacity = max(total * self.options.pairs_per_splat, 1024)
+        if not (0 < splat_count <= MAX_SPLATS and view_count > 0 and self.capacity < 2**30 and tiles < 2**31 - 1):
+            raise ConfigError(
+                f"{splat_count} splats in {view_count} views of {self.options.pairs_per_splat} pairs are out of range",
+                hint="Keep splats x views x pairs_per_splat between 1 and 2^30; render fewer views at a time",
+            )
+        if tile <= 0 or tile % self._strip or not (0 < self.tile_count[0] < 256 and 0 < self.tile_count[1] < 256):
+            raise ConfigError(
+                f"images of {width} x {height} px with tiles of {tile} px are out of range",
+                hint=f"Tiles must be a multiple of {self._strip} px and at most 255 along each side",
+            )
+        allocate = functools.partial(wp.zeros, device=self.device)
+        self._center = allocate(total, dtype=wp.vec4)
+        self._shape = allocate(total, dtype=wp.vec4)
+        self._color = allocate(total, dtype=wp.vec3)
+        self._box = allocate(total, dtype=wp.vec4ub)
+        # Radix sort wants twice the entries as its workspace.
+        self._depth_key = allocate(2 * total, dtype=wp.int32)
+        self._order = allocate(2 * total, dtype=wp.int32)
+        self._count = allocate(total, dtype=wp.int32)
+        self._end = allocate(total, dtype=wp.int32)
+        self._pair_tile = allocate(2 * self.capacity, dtype=wp.int32)
+        self._pair_splat = allocate(2 * self.capacity, dtype=wp.int32)
+        self._range = allocate(tiles, dtype=wp.vec2i)
+        self._tile_bits = int(tiles).bit_length()
+        shape = (view_count, height, width)
+        self.rgb = allocate(shape, dtype=wp.vec3)
+        self.depth = allocate(shape, dtype=wp.float32)
+        self.alpha = allocate(shape, dtype=wp.float32)
+        self.object_id = allocate(shape if self.options.object_ids else (1, 1, 1), dtype=wp.int32)
+        self.overflow = allocate(1, dtype=wp.int32)
+        self._no_rgb = allocate((1, 1, 1), dtype=wp.vec3)
+        self._no_depth = allocate((1, 1, 1), dtype=wp.float32)
+
+    def render(
+        self,
+        splats: SplatArrays,
+        views: ViewArrays,
+        *,
+        mesh_rgb: wp.array | None = None,
+        mesh_depth: wp.array | None = None,
+    ) -> None:
+        """Draw one frame of all views into the output arrays.
+
+        Args:
+            splats: The splats of all worlds.
+            views: The cameras.
+            mesh_rgb: Colours of opaque meshes and of the sky around them, vec3, shape (view_count, height, width);
+            replaces
+                the background of the views.
+            mesh_depth: Forward depth of the meshes [m], 0 where there is none. A splat behind a mesh, by its centre, is
+                not drawn.
+
+        Raises:
+            ConfigError: If only one of the mesh images is given, or an array has another shape than the buffers.
+        """
+        images = (self.view_count, self.height, self.width)
+        for name, array, shape in (
+            ("splats.means", splats.means, (splats.means.shape[0], self.splat_count)),
+            ("splats.covariances", splats.covariances, (splats.covariances.shape[0], self.splat_count)),
+            ("splats.opacities", splats.opacities, (splats.opacities.shape[0], self.splat_count)),
+            ("splats.object_index", splats.object_index, (self.splat_count,)),
+            ("views.world_to_camera", views.world_to_camera, (self.view_count,)),
+            ("views.intrinsics", views.intrinsics, (self.view_count,)),
+            ("views.world", views.world, (self.view_count,)),
+            ("mesh_rgb", mesh_rgb, None if mesh_rgb is None and mesh_depth is None else images),
+            ("mesh_depth", mesh_depth, None if mesh_rgb is None and mesh_depth is None else images),
+        ):
+            if shape is not None and (array is None or tuple(array.shape) != shape):
+                given = "None" if array is None else str(tuple(array.shape))
+                raise ConfigError(
+                    f"{name} has shape {given}, expected {shape}", hint="Size the rasteriser for these arrays"
+                )
+        self._project(splats, views)
+        self._bin()
+        self._blend(splats, views, mesh_rgb, mesh_depth)
+
+    def _project(self, splats: SplatArrays, views: ViewArrays) -> None:
+        options = self.options
+        wp.launch(
+            kernels.project,
+            dim=(self.view_count, self.splat_count),
+            inputs=[
+                splats.means, splats.covariances, splats.opacities, splats.sh, splats.object_index, splats.rotations,
+                views.world_to_camera, views.intrinsics, views.world,
+                wp.vec2i(self.width, self.height), options.tile, options.near, options.dilation, options.antialiased,
+            ],
+            outputs=[self._center, self._shape, self._color, self._box, self._depth_key, self._order],
+            device=self.device,
+        )  # fmt: skip
+
+    def _bin(self) -> None:
+        total = self.splat_count * self.view_count
+        tiles = self._range.shape[0]
+        wp.utils.radix_sort_pairs(self._depth_key, self._order, total, end_bit=31)
+        wp.launch(
+            kernels.count_tiles, dim=total, inputs=[self._order, self._box], outputs=[self._count], device=self.device
+        )
+        wp.utils.array_scan(self._count, self._end, inclusive=True)
+        self._pair_tile.fill_(tiles)
+        wp.launch(
+            kernels.emit_pairs,
+            dim=total,
+            inputs=[self._order, self._box, self._end, self.splat_count, wp.vec2i(*self.tile_count), self.capacity],
+            outputs=[self._pair_tile, self._pair_splat, self.overflow],
+            device=self.device,
+        )
+        wp.utils.radix_sort_pairs(self._pair_tile, self._pair_splat, self.capacity, end_bit=self._tile_bits)
+        self._range.zero_()
+        wp.launch(
+            kernels.find_ranges,
+            dim=self.capacity,
+            inputs=[self._pair_tile, tiles, self.capacity],
+            outputs=[self._range],
+            device=self.device,
+        )
+
+    def _blend(
+        self, splats: SplatArrays, views: ViewArrays, mesh_rgb: wp.array | None, mesh_depth: wp.array | None
+    ) -> None:
+        options = self.options
+        tiles = self._range.shape[0]
+        wp.launch(
+            kernels.blend_kernel(self._strip, mesh_depth is not None, options.object_ids),
+            dim=tiles * options.tile * (options.tile // self._strip),
+            inputs=[
+                self._pair_splat, self._range, self._center, self._shape, self._color, splats.object_index,
+                views.background,
+                mesh_rgb if mesh_rgb is not None else self._no_rgb,
+                mesh_depth if mesh_depth is not None else self._no_depth,
+                wp.vec2i(self.width, self.height), wp.vec2i(*self.tile_count), options.tile,
+            ],
+            outputs=[self.rgb, self.depth, self.alpha, self.object_id],
+            device=self.device,
+            block_dim=64,
+        )  # fmt: skip

@@ -1,0 +1,287 @@
+"""`Splats`: the validated arrays of one set of 3D Gaussian splats."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softmode.errors import AssetError, ConfigError
+
+SH_DC = 0.28209479177387814
+"""Value of the constant spherical harmonic: colour = 0.5 + SH_DC * sh[:, 0]."""
+
+MAX_SPLATS = 2**26
+"""Largest number of splats that a reader or a `Splats` accepts."""
+
+UpAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+
+_UP_ROTATIONS: dict[str, list[list[float]]] = {
+    "+z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "-z": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+    "+y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+    "-y": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    "+x": [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
+    "-x": [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
+}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Splats:
+    """One set of 3D Gaussian splats; float32, read-only, validated on construction.
+
+    A splat is an anisotropic Gaussian with covariance R diag(scales^2) R^T. Quaternions are normalised on construction.
+
+    Raises:
+        AssetError: If an array has the wrong shape, holds NaN or infinity, or a scale is not positive.
+    """
+
+    means: np.ndarray
+    """Centres [m], shape (N, 3)."""
+    quats: np.ndarray
+    """Unit quaternions xyzw, principal frame to asset frame, shape (N, 4)."""
+    scales: np.ndarray
+    """Standard deviations along the principal axes, linear [m], shape (N, 3)."""
+    opacities: np.ndarray
+    """Opacities 0..1, shape (N,)."""
+    sh: np.ndarray
+    """Spherical-harmonic coefficients of the colour, shape (N, K, 3), K = (degree + 1)^2 in {1, 4, 9, 16}."""
+    name: str = "splats"
+    """Where the splats come from (a file name); used in messages."""
+
+    def __post_init__(self) -> None:
+        """Convert, validate, normalise and freeze the arrays."""
+        means = self._array("means", (None, 3))
+        count = len(means)
+        if count == 0:
+            raise AssetError(f"{self.name}: holds no splats", hint="Export the asset again with at least one splat")
+        if count > MAX_SPLATS:
+            raise AssetError(f"{self.name}: {count} splats, at most {MAX_SPLATS}", hint="Decimate the asset first")
+        quats = self._array("quats", (count, 4))
+        scales = self._array("scales", (count, 3))
+        opacities = self._array("opacities", (count,))
+        sh = self._array("sh", (count, None, 3))
+        if sh.shape[1] not in (1, 4, 9, 16):
+            raise AssetError(
+                f"{self.name}: sh holds {sh.shape[1]} coefficients per splat, expected 1, 4, 9 or 16",
+                hint="Export with spherical-harmonic degree 0 to 3",
+            )
+        norm = np.linalg.norm(quats.astype(np.float64), axis=1, keepdims=True)
+        self._require(np.asarray(norm[:, 0] > 1e-8), "quats", "a rotation quaternion of length zero")
+        self._require(np.asarray((scales > 0.0).all(axis=1)), "scales", "a scale that is not positive")
+        self._require((opacities >= 0.0) & (opacities <= 1.0), "opacities", "an opacity outside 0..1")
+        quats = (quats / norm).astype(np.float32)
+        arrays = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
+        for field, value in arrays.items():
+            value.setflags(write=False)
+            object.__setattr__(self, field, value)
+
+    def _array(self, field: str, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
+        """Return the field as a fresh contiguous float32 array of the expected shape without NaN or infinity."""
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                value = np.array(getattr(self, field), dtype=np.float32, order="C")
+        except (TypeError, ValueError) as error:
+            raise AssetError(f"{self.name}: {field} is no array of numbers", hint="Pass arrays of float32") from error
+        expected = tuple("N" if size is None else size for size in shape)
+        if value.ndim != len(shape) or any(s is not None and s != v for s, v in zip(shape, value.shape, strict=True)):
+            raise AssetError(
+                f"{self.name}: {field} has shape {value.shape}, expected ({', '.join(map(str, expected))})",
+                hint="All arrays of one asset need the same number of splats",
+            )
+        self._require(np.asarray(np.isfinite(value).all(axis=tuple(range(1, value.ndim)))), field, "NaN or infinity")
+        return value
+
+    def _require(self, good: np.ndarray, field: str, problem: str) -> None:
+        """Raise an AssetError that counts the splats for which `good` is false."""
+        if not good.all():
+            bad = np.flatnonzero(~good)
+            raise AssetError(
+                f"{self.name}: {field} of {len(bad)} of {len(good)} splats holds {problem} (first: splat {bad[0]})",
+                hint="Remove the damaged splats or export the asset again",
+            )
+
+    @property
+    def count(self) -> int:
+        """Number of splats N."""
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        """Spherical-harmonic degree, 0 to 3."""
+        return int(np.sqrt(self.sh.shape[1])) - 1
+
+    def colors(self) -> NDArray[np.float32]:
+        """Return the view-independent colours 0..1 (gamma-encoded), shape (N, 3)."""
+        return np.clip(0.5 + SH_DC * self.sh[:, 0], 0.0, 1.0).astype(np.float32)
+
+    def covariances(self) -> NDArray[np.float64]:
+        """Return the covariances R diag(scales^2) R^T [m^2], shape (N, 3, 3)."""
+        frame = rotations_from_quats(self.quats)
+        return np.einsum("nij,nj,nkj->nik", frame, self.scales.astype(np.float64) ** 2, frame)
+
+    def bounds(self, *, quantile: float = 0.0) -> NDArray[np.float64]:
+        """Return the axis-aligned box of the centres [m], shape (2, 3).
+
+        Args:
+            quantile: Share of splats left out at either end of each axis, 0..0.5; ignores floaters of trained assets.
+        """
+        return np.quantile(self.means.astype(np.float64), [quantile, 1.0 - quantile], axis=0)
+
+    def subset(self, mask: ArrayLike) -> Splats:
+        """Return the splats that a boolean mask or an index array selects, in that order."""
+        index = np.asarray(mask)
+        fields = ("means", "quats", "scales", "opacities", "sh")
+        return replace(self, **{field: getattr(self, field)[index] for field in fields})
+
+    def cropped(self, low: ArrayLike, high: ArrayLike) -> Splats:
+        """Return the splats whose centres lie in the box between `low` and `high` [m], each of shape (3,).
+
+        Cuts an object out of its capture, for example off the ground it was captured on. Infinite bounds are allowed.
+        """
+        inside = (self.means >= np.asarray(low)).all(axis=1) & (self.means <= np.asarray(high)).all(axis=1)
+        return self.subset(inside)
+
+    def with_sh_degree(self, degree: int) -> Splats:
+        """Return the splats with the spherical harmonics cut to `degree` (no more than they have)."""
+        if not 0 <= degree <= 3:
+            raise ConfigError(f"degree must be 0, 1, 2 or 3, got {degree}")
+        return replace(self, sh=self.sh[:, : (degree + 1) ** 2])
+
+    def transformed(
+        self,
+        rotation: ArrayLike | None = None,
+        translation: ArrayLike = (0.0, 0.0, 0.0),
+        scale: float = 1.0,
+    ) -> Splats:
+        """Return the splats after x -> scale * rotation @ x + translation; view-dependent colour turns along.
+
+        Args:
+            rotation: Proper rotation matrix, shape (3, 3); None for the identity.
+            translation: Offset [m], shape (3,).
+            scale: Uniform factor, > 0.
+
+        Raises:
+            ConfigError: If the rotation is not proper orthogonal, or the scale is not positive and finite.
+        """
+        matrix = np.eye(3) if rotation is None else np.asarray(rotation, dtype=np.float64)
+        proper = matrix.shape == (3, 3) and np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-5)
+        if not (proper and np.linalg.det(matrix) > 0.0):
+            raise ConfigError("rotation must be a proper (3, 3) rotation matrix", hint="Pass scale as its own argument")
+        if not (np.isfinite(scale) and scale > 0.0):
+            raise ConfigError(f"scale must be positive and finite, got {scale}")
+        means = scale * self.means.astype(np.float64) @ matrix.T + np.asarray(translation, dtype=np.float64)
+        quats, sh = self.quats, self.sh
+        if rotation is not None:
+            quats = multiply_quats(quat_from_rotation(matrix), self.quats)
+            sh = rotate_sh(self.sh, matrix)
+        return replace(self, means=means, quats=quats, scales=self.scales * np.float32(scale), sh=sh)
+
+    def oriented(self, up: UpAxis) -> Splats:
+        """Return the splats turned so that the asset's `up` axis points along +Z.
+
+        Trained assets mostly come in the OpenCV-like frame of their training cameras, with y down: `up="-y"`.
+
+        Raises:
+            ConfigError: If `up` is not one of "+x", "-x", "+y", "-y", "+z", "-z".
+        """
+        if up not in _UP_ROTATIONS:
+            raise ConfigError(f"up must be one of {', '.join(_UP_ROTATIONS)}, got {up!r}")
+        return self if up == "+z" else self.transformed(rotation=_UP_ROTATIONS[up])
+
+
+def rotations_from_quats(quats: ArrayLike) -> NDArray[np.float64]:
+    """Return rotation matrices, shape (N, 3, 3), of quaternions xyzw, shape (N, 4); normalises them."""
+    q = np.asarray(quats, dtype=np.float64)
+    x, y, z, w = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
+
+
+def quats_from_rotations(rotations: ArrayLike) -> NDArray[np.float64]:
+    """Return unit quaternions xyzw, shape (N, 4), of proper rotation matrices, shape (N, 3, 3).
+
+    Takes the largest of the four squared components as pivot, so no rotation is ill-conditioned.
+    """
+    m = np.asarray(rotations, dtype=np.float64)
+    d = np.diagonal(m, axis1=1, axis2=2)
+    trace = d.sum(axis=1)
+    squares = np.concatenate([1 - trace[:, None] + 2 * d, 1 + trace[:, None]], axis=1)
+    outer = np.empty((len(m), 4, 4))
+    for i in range(4):
+        outer[:, i, i] = squares[:, i]
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        outer[:, i, j] = outer[:, j, i] = m[:, i, j] + m[:, j, i]
+    for i, (j, k) in enumerate(((2, 1), (0, 2), (1, 0))):
+        outer[:, i, 3] = outer[:, 3, i] = m[:, j, k] - m[:, k, j]
+    row = outer[np.arange(len(m)), squares.argmax(axis=1)]
+    return row / np.linalg.norm(row, axis=1, keepdims=True)
+
+
+def quat_from_rotation(rotation: ArrayLike) -> NDArray[np.float64]:
+    """Return the unit quaternion xyzw, shape (4,), of one proper rotation matrix."""
+    return quats_from_rotations(np.asarray(rotation, dtype=np.float64)[None])[0]
+
+
+def multiply_quats(left: ArrayLike, right: ArrayLike) -> NDArray[np.float64]:
+    """Return the Hamilton products left * right of quaternions xyzw; broadcasts over leading axes."""
+    a, b = np.asarray(left, dtype=np.float64), np.asarray(right, dtype=np.float64)
+    xyz = a[..., 3:] * b[..., :3] + b[..., 3:] * a[..., :3] + np.cross(a[..., :3], b[..., :3])
+    w = a[..., 3:] * b[..., 3:] - (a[..., :3] * b[..., :3]).sum(axis=-1, keepdims=True)
+    return np.concatenate([xyz, w], axis=-1)
+
+
+def sh_basis(directions: ArrayLike, count: int) -> NDArray[np.float64]:
+    """Return the real spherical harmonics in the order and with the signs of the splat formats, shape (M, count).
+
+    Args:
+        directions: Unit vectors from the camera to the splat, shape (M, 3).
+        count: Number of functions: 1, 4, 9 or 16.
+    """
+    x, y, z = np.asarray(directions, dtype=np.float64).T
+    xx, yy, zz = x * x, y * y, z * z
+    functions: list[Callable[[], NDArray[np.float64]]] = [
+        lambda: np.full_like(x, SH_DC),
+        lambda: -0.4886025119029199 * y,
+        lambda: 0.4886025119029199 * z,
+        lambda: -0.4886025119029199 * x,
+        lambda: 1.0925484305920792 * x * y,
+        lambda: -1.0925484305920792 * y * z,
+        lambda: 0.31539156525252005 * (2 * zz - xx - yy),
+        lambda: -1.0925484305920792 * x * z,
+        lambda: 0.5462742152960396 * (xx - yy),
+        lambda: -0.5900435899266435 * y * (3 * xx - yy),
+        lambda: 2.890611442640554 * x * y * z,
+        lambda: -0.4570457994644658 * y * (4 * zz - xx - yy),
+        lambda: 0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+        lambda: -0.4570457994644658 * x * (4 * zz - xx - yy),
+        lambda: 1.445305721320277 * z * (xx - yy),
+        lambda: -0.5900435899266435 * x * (xx - 3 * yy),
+    ]
+    return np.stack([function() for function in functions[:count]], axis=1)
+
+
+def rotate_sh(sh: ArrayLike, rotation: ArrayLike) -> NDArray[np.float32]:
+    """Return coefficients of the turned colour function f'(d) = f(R^T d), shape (N, K, 3).
+
+    Each band is closed under rotation, so sampling it in a fixed set of directions gives its rotation matrix exactly.
+    """
+    coefficients = np.asarray(sh, dtype=np.float64)
+    count = coefficients.shape[1]
+    directions = np.random.default_rng(0).normal(size=(32, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    turned = sh_basis(directions @ np.asarray(rotation, dtype=np.float64), count)
+    basis = sh_basis(directions, count)
+    out = coefficients.copy()
+    for band in range(1, int(np.sqrt(count))):
+        part = slice(band * band, (band + 1) ** 2)
+        matrix = np.linalg.lstsq(basis[:, part], turned[:, part], rcond=None)[0]
+        out[:, part] = np.einsum("ab,nbc->nac", matrix, coefficients[:, part])
+    return out.astype(np.float32)

@@ -1,0 +1,172 @@
+"""Skinning kernels against their NumPy twins, and exact affine motion."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+from softmode.deformables.skinning import STRETCH_LIMIT, SkinSplats, skin_points
+from softmode.deformables.skinning_kernels import vec6
+from softmode.errors import BasisError
+
+FLOAT32 = np.finfo(np.float32).eps
+N, M, WORLDS = 60, 12, 3
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
+def device(request: pytest.FixtureRequest) -> str:
+    """Every device that is there."""
+    if request.param != "cpu" and not wp.is_cuda_available():
+        pytest.skip("no CUDA device")
+    return request.param
+
+
+class Case:
+    """Random splats of a few centimetres under the basis {W_j} x {X, Y, Z, 1}, with q of WORLDS instances."""
+
+    def __init__(self, seed: int = 0, amplitude: float = 0.02) -> None:
+        rng = np.random.default_rng(seed)
+        self.means = rng.uniform(-0.04, 0.04, size=(N, 3)).astype(np.float32).astype(np.float64)
+        root = 2e-3 * rng.normal(size=(N, 3, 3))
+        self.covariances = root @ root.transpose(0, 2, 1)
+        x = self.means
+        wave = np.stack([np.ones(N), np.cos(40 * x[:, 0]), np.sin(30 * x[:, 2])], axis=1)
+        slope = np.zeros((N, 3, 3))
+        slope[:, 1, 0] = -40 * np.sin(40 * x[:, 0])
+        slope[:, 2, 2] = 30 * np.cos(30 * x[:, 2])
+        one = np.concatenate([x, np.ones((N, 1))], axis=1)
+        unit = np.concatenate([np.eye(3), np.zeros((1, 3))])
+        self.basis = np.einsum("nj,nc->njc", wave, one).reshape(N, M)
+        self.grad = (
+            np.einsum("njd,nc->njcd", slope, one) + np.einsum("nj,cd->njcd", wave, unit)
+        ).reshape(N, M, 3)  # fmt: skip
+        self.q = amplitude * rng.normal(size=(WORLDS, M, 3))
+        self.qd = rng.normal(size=(WORLDS, M, 3))
+        self.pad = 2
+
+    def flat(self, values: np.ndarray, device: str) -> wp.array:
+        """Return q of all instances in one array with foreign entries before each instance."""
+        padded = np.concatenate([np.full((WORLDS, self.pad, 3), 1e6), values], axis=1)
+        return wp.array(padded.reshape(-1, 3), dtype=wp.vec3d, device=device)
+
+    def starts(self, device: str) -> wp.array:
+        """Return where each instance begins."""
+        return wp.array(self.pad + (M + self.pad) * np.arange(WORLDS), dtype=wp.int32, device=device)
+
+    def skin(self, device: str, **kwargs: Any) -> SkinSplats:
+        """Return the object on the device."""
+        return SkinSplats(self.means, self.covariances, self.basis, self.grad, device=device, **kwargs)
+
+    def gradients(self) -> np.ndarray:
+        """Return F of all worlds and splats."""
+        return np.eye(3) + np.einsum("wka,nkb->wnab", self.q, self.grad)
+
+
+def run(case: Case, device: str, first: int = 0, **kwargs: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return deformed means and covariances, shapes (WORLDS, N, 3) and (WORLDS, N, 3, 3)."""
+    means = wp.zeros((WORLDS, first + N), dtype=wp.vec3, device=device)
+    covariances = wp.zeros((WORLDS, first + N), dtype=vec6, device=device)
+    skin = case.skin(device, **kwargs)
+    skin.launch(case.flat(case.q, device), case.starts(device), means, covariances, first_splat=first)
+    assert not means.numpy()[:, :first].any()
+    six = covariances.numpy()[:, first:]
+    return means.numpy()[:, first:], six[..., [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+
+
+def test_matches_numpy(device: str) -> None:
+    """X + sum b q and F Sigma F^T, in float64 NumPy; rounding of F scales with the sum of |q| |grad b|."""
+    case = Case()
+    means, covariances = run(case, device, first=5, stretch_limit=1e9)
+    np.testing.assert_allclose(means, case.means + np.einsum("nk,wka->wna", case.basis, case.q), atol=4 * FLOAT32 * 0.3)
+    f = case.gradients()
+    size = 1.0 + np.einsum("wka,nkb->wnab", np.abs(case.q), np.abs(case.grad)).max(axis=(2, 3))
+    bound = 40 * FLOAT32 * size**2 * np.abs(case.covariances).max(axis=(1, 2))
+    assert (np.abs(covariances - f @ case.covariances @ f.transpose(0, 1, 3, 2)) < bound[..., None, None]).all()
+
+
+def test_affine_motion_is_exact(device: str) -> None:
+    """q of x = A X + t gives means A X + t and covariances A Sigma A^T, a metre away from home too."""
+    case = Case()
+    a = np.array([[0.9, -0.5, 0.1], [0.4, 1.2, 0.2], [0.0, -0.3, 0.8]])
+    t = np.array([1.5, -2.0, 0.7])
+    case.q[:] = 0.0
+    case.q[:, :3] = (a - np.eye(3)).T
+    case.q[:, 3] = t
+    means, covariances = run(case, device)
+    expected = case.means @ a.T + t
+    np.testing.assert_allclose(means, np.broadcast_to(expected, means.shape), atol=FLOAT32 * np.abs(t).max())
+    sigma = a @ case.covariances @ a.T
+    np.testing.assert_allclose(covariances, np.broadcast_to(sigma, covariances.shape), atol=50 * FLOAT32 * sigma.max())
+
+
+def test_stretch_is_limited_and_compression_is_not(device: str) -> None:
+    """Singular values of F are cut to the limit; below it F is left as it is."""
+    case = Case(amplitude=0.0)
+    case.covariances[:] = 1e-6 * np.eye(3)
+    case.q[:, :3] = np.diag([40.0, 1.0, -0.999])
+    _, covariances = run(case, device)
+    expected = 1e-6 * np.diag([STRETCH_LIMIT, 2.0, 1e-3]) ** 2
+    np.testing.assert_allclose(covariances[0, 0], expected, atol=1e-5 * expected.max())
+    case.q[:, :3] = np.diag([0.5, -0.9, 0.0])
+    _, covariances = run(case, device)
+    expected = 1e-6 * np.diag([1.5, 0.1, 1.0]) ** 2
+    np.testing.assert_allclose(covariances[0, 0], expected, atol=1e-6 * expected.max())
+
+
+def test_worlds_are_independent(device: str) -> None:
+    """World i of three is bitwise the single world with the same q."""
+    case = Case()
+    means, covariances = run(case, device)
+    for world in range(WORLDS):
+        single = Case()
+        single.q[:] = case.q[world]
+        alone = run(single, device)
+        np.testing.assert_array_equal(means[world], alone[0][0])
+        np.testing.assert_array_equal(covariances[world], alone[1][0])
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7, 3.0])
+def test_mean_rotation(device: str, angle: float) -> None:
+    """A rotation with stretch 0.8 in all directions yields that rotation for every world."""
+    case = Case(amplitude=0.0)
+    axis = np.array([0.6, 0.0, 0.8])
+    cross = np.cross(np.eye(3), axis) * -1.0
+    r = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    case.q[:, :3] = (0.8 * r - np.eye(3)).T
+    rotations = wp.zeros((WORLDS, 2), dtype=wp.quat, device=device)
+    case.skin(device).launch_rotation(case.flat(case.q, device), case.starts(device), rotations, object_index=1)
+    expected = np.concatenate([np.sin(angle / 2) * axis, [np.cos(angle / 2)]])
+    got = rotations.numpy()[:, 1]
+    np.testing.assert_allclose(np.abs(got @ expected), 1.0, atol=1e-5)
+
+
+def test_points_match_numpy_and_capture(device: str) -> None:
+    """x = X + sum b q and v = sum b qd; a captured launch repeats it on changed coordinates."""
+    case = Case()
+    q, qd, starts = case.flat(case.q, device), case.flat(case.qd, device), case.starts(device)
+    points = wp.array(case.means, dtype=wp.vec3, device=device)
+    basis = wp.array(case.basis.astype(np.float32), dtype=wp.float32, device=device)
+    point_start = wp.array([3, 3 + N, 3 + 2 * N], dtype=wp.int32, device=device)
+    positions, velocities = (wp.zeros(3 + WORLDS * N, dtype=wp.vec3, device=device) for _ in range(2))
+    arguments = (points, basis, starts, q, qd, point_start, positions, velocities)
+    skin_points(*arguments)
+    with wp.ScopedCapture(device=device) as capture:
+        skin_points(*arguments)
+    for factor in (1.0, -2.0):
+        q.assign(case.flat(factor * case.q, device))
+        wp.capture_launch(capture.graph)
+        x = case.means + factor * np.einsum("nk,wka->wna", case.basis, case.q)
+        v = np.einsum("nk,wka->wna", case.basis, case.qd)
+        assert not positions.numpy()[:3].any()
+        np.testing.assert_allclose(positions.numpy()[3:].reshape(WORLDS, N, 3), x, atol=4 * FLOAT32 * np.abs(x).max())
+        np.testing.assert_allclose(velocities.numpy()[3:].reshape(WORLDS, N, 3), v, atol=8 * FLOAT32 * np.abs(v).max())
+
+
+def test_refuses_shapes_that_do_not_belong_together() -> None:
+    """The message lists the shapes."""
+    case = Case()
+    with pytest.raises(BasisError, match=r"basis \(60, 11\)"):
+        SkinSplats(case.means, case.covariances, case.basis[:, 1:], case.grad, device="cpu")
