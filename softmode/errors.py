@@ -19,7 +19,9 @@ class SoftmodeError(Exception):
 
     def __str__(self) -> str:
         """Return the message followed by the remedy."""
-        return f"{self.message.rstrip('.')}. {self.hint}" if self.hint else self.message
+        if not self.hint:
+            return self.message
+        return f"{self.message.rstrip('.')}. {self.hint[0].upper()}{self.hint[1:]}"
 
 
 class AssetError(SoftmodeError, ValueError):

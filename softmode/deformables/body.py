@@ -1,7 +1,8 @@
 """ReducedBody: the frozen, saveable product of the build, and the way to it.
 
-x(X) = X + sum_k b_k(X) q_k in the body frame (origin: centre of mass). The functions b_k are combinations of the skinning products W_j (X, Y, Z, 1), orthonormal in the
-mass inner product (1 / V) sum_p V_p rho_p b_k b_l = delta_kl: b_0 = 1, b_1..b_3 linear, the others free of mean and linear moment and ordered by the mean square of their gradient.
+x(X) = X + sum_k b_k(X) q_k in the body frame (origin: centre of mass). The functions b_k are combinations of the
+skinning products W_j (X, Y, Z, 1), orthonormal in the mass inner product (1 / V) sum_p V_p rho_p b_k b_l = delta_kl:
+b_0 = 1, b_1..b_3 linear, the others free of mean and linear moment and ordered by the mean square of their gradient.
 So the kinetic energy is mass / 2 |qdot|^2 and |q| is the rms displacement in metres.
 """
 
@@ -23,7 +24,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from softmode.deformables.cubature import select_cubature
 from softmode.deformables.eigenmodes import solve_eigenmodes
@@ -38,11 +39,12 @@ Progress = Callable[[str, float], None]
 FORMAT = "softmode.ReducedBody"
 FORMAT_VERSION = 1
 RANK_TOLERANCE = 1e-5
-"""Directions of the scaled mass Gram matrix under this fraction of the largest are dropped: 1e-5 in the functions themselves, the level at which
-float32 gradients stop telling them apart from the others."""
+"""Directions of the scaled mass Gram matrix under this fraction of the largest are dropped: 1e-5 in the functions
+themselves, the level at which float32 gradients stop telling them apart from the others."""
 REACH = 0.35
-"""How far from its nearest kernel centre a point may lie, as a fraction of the kernel's support. Inside an object the ratio stays under 0.3; beyond, the
-functions grow as extrapolated polynomials do (tenfold at 0.5), so they are held constant."""
+"""How far from its nearest kernel centre a point may lie, as a fraction of the kernel's support. Inside an object the
+ratio stays under 0.3; beyond, the functions grow as extrapolated polynomials do (tenfold at 0.5), so they are held
+constant."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +58,8 @@ class BuildOptions:
     kernel: KernelName = "cubic"
     """Bell of the reproducing kernels."""
     cubature_count: int | None = 256
-    """Points at which a step evaluates stress; None keeps all. `provenance` reports the force error at this and at smaller counts."""
+    """Points at which a step evaluates stress; None keeps all. `provenance` reports the force error at this and at
+    smaller counts."""
     seed: int = 0
     """Seed of every random choice of the build."""
 
@@ -148,8 +151,8 @@ class ReducedBody:
 
         Args:
             points: Rest positions [m], shape (N, 3).
-            outside: "clamp" gives points beyond the kernels' reach the value of the nearest point within reach, with gradient zero, in all functions but
-                the affine ones, which stay exact; "raise" refuses them.
+            outside: "clamp" gives points beyond the kernels' reach the value of the nearest point within reach, with
+                gradient zero, in all functions but the affine ones, which stay exact; "raise" refuses them.
 
         Returns:
             Values (N, n) and gradients [1/m] (N, n, 3).
@@ -163,7 +166,7 @@ class ReducedBody:
         if outside not in ("clamp", "raise"):
             raise ConfigError(f"outside: expected 'clamp' or 'raise', got {outside!r}")
         basis = BasisRKPM(centres=self.centres, radii=self.radii, kernel=self.kernel)
-        distance, nearest = cKDTree(self.centres).query(x)
+        distance, nearest = KDTree(self.centres).query(x)
         ratio = distance / (REACH * basis.support[nearest])
         far = ratio > 1.0
         if far.any() and outside == "raise":
@@ -171,7 +174,9 @@ class ReducedBody:
                 f"points: {int(far.sum())} of {len(x)} lie outside the body (first: row {int(far.argmax())})",
                 hint="Drop them, or pass outside='clamp'.",
             )
-        inner = np.where(far[:, None], self.centres[nearest] + (x - self.centres[nearest]) / np.maximum(ratio, 1.0)[:, None], x)
+        inner = np.where(
+            far[:, None], self.centres[nearest] + (x - self.centres[nearest]) / np.maximum(ratio, 1.0)[:, None], x
+        )
         shape = basis.evaluate(inner)
         weight = shape.value @ self.handles
         slope = np.stack([g @ self.handles for g in shape.gradient], axis=2)
@@ -185,7 +190,7 @@ class ReducedBody:
     def covers(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Return which points (N, 3) the kernels reach, that is, which `evaluate` does not clamp."""
         basis = BasisRKPM(centres=self.centres, radii=self.radii, kernel=self.kernel)
-        distance, nearest = cKDTree(self.centres).query(np.asarray(points, dtype=np.float64))
+        distance, nearest = KDTree(self.centres).query(np.asarray(points, dtype=np.float64))
         return distance <= REACH * basis.support[nearest]
 
     def affine(self, matrix: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
@@ -245,15 +250,21 @@ class ReducedBody:
             raise AssetError(f"body file {path}: not a softmode body", hint=hint)
         version = header.pop("version", None)
         if version != FORMAT_VERSION:
-            raise AssetError(f"body file {path}: format version {version}, this softmode reads {FORMAT_VERSION}", hint=hint)
+            raise AssetError(
+                f"body file {path}: format version {version}, this softmode reads {FORMAT_VERSION}", hint=hint
+            )
         names = {f.name for f in dataclasses.fields(cls)}
         if set(header) | set(stored) != names:
-            raise AssetError(f"body file {path}: fields {sorted(names ^ (set(header) | set(stored)))} do not match", hint=hint)
-        body = cls(**header, **stored)
+            raise AssetError(
+                f"body file {path}: fields {sorted(names ^ (set(header) | set(stored)))} do not match", hint=hint
+            )
         try:
+            body = cls(**header, **stored)
             body.check()
         except BasisError as error:
             raise AssetError(f"body file {path}: {error.message}", hint=hint) from error
+        except (TypeError, IndexError, AttributeError) as error:
+            raise AssetError(f"body file {path}: a field has another type or shape ({error})", hint=hint) from error
         return body
 
     def check(self) -> None:
@@ -262,13 +273,32 @@ class ReducedBody:
         Raises:
             BasisError: If any is wrong.
         """
-        p, s, n, k, m = (len(v) for v in (self.points, self.surface_points, self.mean_basis, self.centres, self.eigenvalues))
+        kinds = {"name": str, "volume": float, "kernel": str, "length": float, "fingerprint": str, "provenance": dict}
+        for name, kind in (kinds | {"build_seconds": float}).items():
+            if not isinstance(getattr(self, name), kind):
+                raise BasisError(f"{name}: expected {kind.__name__}, got {type(getattr(self, name)).__name__}")
+        p, s, n, k, m = (
+            len(v) for v in (self.points, self.surface_points, self.mean_basis, self.centres, self.eigenvalues)
+        )
         expected = {
-            "points": (p, 3), "weights": (p,), "grad_basis": (p, n, 3), "stiffness_scale": (p,), "surface_points": (s, 3),
-            "surface_normals": (s, 3), "surface_areas": (s,), "surface_basis": (s, n), "mean_basis": (n,),
-            "linear_coordinates": (n, 4), "eigenvalues": (m,), "bounds": (2, 3), "offset": (3,), "centres": (k, 3),
-            "radii": (k,), "handles": (k, m), "transform": (4 * m, n),
-        }  # fmt: skip
+            "points": (p, 3),
+            "weights": (p,),
+            "grad_basis": (p, n, 3),
+            "stiffness_scale": (p,),
+            "surface_points": (s, 3),
+            "surface_normals": (s, 3),
+            "surface_areas": (s,),
+            "surface_basis": (s, n),
+            "mean_basis": (n,),
+            "linear_coordinates": (n, 4),
+            "eigenvalues": (m,),
+            "bounds": (2, 3),
+            "offset": (3,),
+            "centres": (k, 3),
+            "radii": (k,),
+            "handles": (k, m),
+            "transform": (4 * m, n),
+        }
         for name, shape in expected.items():
             value = getattr(self, name)
             dtype = np.float32 if name in ("grad_basis", "surface_basis") else np.float64
@@ -276,7 +306,9 @@ class ReducedBody:
                 raise BasisError(f"{name}: expected {np.dtype(dtype)} {shape}, got {value.dtype} {value.shape}")
             if not np.isfinite(value).all():
                 raise BasisError(f"{name}: not all finite")
-        if not (self.volume > 0.0 and (self.weights >= 0.0).all() and abs(self.weights.sum() / self.volume - 1.0) < 1e-6):
+        if not (
+            self.volume > 0.0 and (self.weights >= 0.0).all() and abs(self.weights.sum() / self.volume - 1.0) < 1e-6
+        ):
             raise BasisError(f"weights: expected >= 0 with sum {self.volume}, got sum {self.weights.sum()}")
 
 
@@ -296,9 +328,10 @@ def build_body(
         options: Sizes and seed; defaults when None.
         name: Name for messages and reports.
         stiffness_scale: Young's modulus per quadrature point relative to the body's, shape (P,); ones when None.
-        density_scale: Density per quadrature point relative to any common reference, shape (P,); normalised to volume mean 1.
-        progress: True or False shows a bar or not; None shows one on a terminal when the build exceeds two seconds; a callable receives
-            (stage, fraction done).
+        density_scale: Density per quadrature point relative to any common reference, shape (P,); normalised to volume
+            mean 1.
+        progress: True or False shows a bar or not; None shows one on a terminal when the build exceeds two seconds; a
+            callable receives (stage, fraction done).
 
     Returns:
         The body, in the frame of its centre of mass.
@@ -398,7 +431,8 @@ def cached_body(
 ) -> ReducedBody:
     """Return the body stored under a key, building it once when it is absent or damaged.
 
-    Processes that ask for one key at a time wait for the first: a lock file guards the build, an atomic rename publishes it.
+    Processes that ask for one key at a time wait for the first: a lock file guards the build, an atomic rename
+    publishes it.
 
     Args:
         key: Everything the result depends on; see `fingerprint_of` for what can be hashed.
@@ -428,7 +462,7 @@ def cache_directory() -> Path:
 
 
 def fingerprint_of(*values: Any) -> str:
-    """Return the sha256 of nested scalars, strings, bytes, paths (by content), arrays, dataclasses, sequences and mappings."""
+    """Return the sha256 of nested scalars, strings, bytes, files (paths), arrays, dataclasses, sequences, mappings."""
     digest = hashlib.sha256()
     for value in values:
         _feed(digest, value)
@@ -480,6 +514,7 @@ def _positive_field(name: str, value: ArrayLike | None, count: int) -> Array:
 def _skinning_products(value: Array, gradient: Array, points: Array, length: float) -> tuple[Array, Array]:
     """Return W_j Z_c (N, 4 (m+1)) and gradients (N, 4 (m+1), 3), with Z = (x, y, z, 1), x in units of `length`."""
     count, handles = value.shape
+    value[:, 0], gradient[:, 0] = 1.0, 0.0  # Exact, so that affine motion is; the kernels give it to rounding only.
     z = np.concatenate([points / length, np.ones((count, 1))], axis=1)
     product = value[:, :, None] * z[:, None, :]
     slope = gradient[:, :, None, :] * z[:, None, :, None]
@@ -489,7 +524,7 @@ def _skinning_products(value: Array, gradient: Array, points: Array, length: flo
 
 
 def _orthonormalise(raw: Array, raw_gradient: Array, mass: Array, stiff: Array) -> Array:
-    """Return the transform (R, n): 1, then linear, then the rest by ascending mean square gradient, all mass-orthonormal."""
+    """Return the mass-orthonormal transform (R, n): 1, linear, then the rest by ascending mean square gradient."""
     gram = raw.T @ (mass[:, None] * raw)
     total = len(gram)
     # Handle 0 is constant, so raw functions 0..3 are exactly (x, y, z, 1). Order (1, x, y, z) for Cholesky.

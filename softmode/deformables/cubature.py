@@ -1,12 +1,13 @@
 """Cubature: few weighted points that reproduce the reduced forces of many.
 
-The cost of a step grows with the number of points at which stress is evaluated. The reduced force of pose t is f_t = sum_p w_p P(F_tp) grad b(X_p), linear in the
-weights, so sparse non-negative weights are sought that give the same forces over a set of training poses (An, Kim and James 2008), the same volume, and
-exactly as many as asked for.
+The cost of a step grows with the number of points at which stress is evaluated. The reduced force of pose t is f_t =
+sum_p w_p P(F_tp) grad b(X_p), linear in the weights, so sparse non-negative weights are sought that give the same
+forces over a set of training poses (An, Kim and James 2008), the same volume, and exactly as many as asked for.
 
-Why not `scipy.optimize.nnls` on the whole problem: it stops at its own number of points (as many as there are rows), and every step solves a full
-least-squares problem. The active-set method here (Lawson and Hanson 1974) adds the most useful point at a time to a growing Cholesky-sized normal system,
-stops at the count asked for, and sees the forces through a few seeded random projections per pose.
+Why not `scipy.optimize.nnls` on the whole problem: it stops at its own number of points (as many as there are rows),
+and every step solves a full least-squares problem. The active-set method here (Lawson and Hanson 1974) adds the most
+useful point at a time to a growing Cholesky-sized normal system, stops at the count asked for, and sees the forces
+through a few seeded random projections per pose.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ class Cubature:
     weights: Array
     """Volumes [m^3], > 0, sum = the volume of the full quadrature, shape (C,)."""
     force_error: float
-    """Root mean square over held-out poses of |f - f_full| / |f_full|, in the energy norm (components over the functions' rms gradients: the error in
-    the displacement that the force would cause)."""
+    """Root mean square over held-out poses of |f - f_full| / |f_full|, in the energy norm (components over the
+    functions' rms gradients: the error in the displacement that the force would cause)."""
     stiffness_error: float
     """Relative error of the linearised (rest) force over random small deformations, root mean square."""
     trade_off: dict[int, float]
@@ -53,9 +54,9 @@ def select_cubature(
 ) -> Cubature:
     """Choose `count` points whose weighted stresses reproduce the reduced forces of all points.
 
-    Training poses: a random stretch (principal stretches 0.6..1.6) with random modal displacements on top, whose mean strain runs from 2 % to
-    40 %. Rotations and translations add nothing: the energy is objective, so forces turn with the pose. The first moments
-    sum_p w_p grad b are fitted too, so that every homogeneous deformation keeps its force.
+    Training poses: a random stretch (principal stretches 0.6..1.6) with random modal displacements on top, whose mean
+    strain runs from 2 % to 40 %. Rotations and translations add nothing: the energy is objective, so forces turn with
+    the pose. The first moments sum_p w_p grad b are fitted too, so that every homogeneous deformation keeps its force.
 
     Args:
         weights: Full weights [m^3], shape (P,).
@@ -73,7 +74,7 @@ def select_cubature(
     """
     if count < 8:
         raise ConfigError(f"cubature_count: expected at least 8, got {count}")
-    point_count, function_count = grad_basis.shape[:2]
+    point_count = len(grad_basis)
     if count >= point_count:
         return Cubature(
             index=np.arange(point_count), weights=weights.copy(), force_error=0.0, stiffness_error=0.0, trade_off={}
@@ -81,21 +82,25 @@ def select_cubature(
     rng = np.random.default_rng(seed)
     modulus = np.ones(point_count) if stiffness_scale is None else np.asarray(stiffness_scale, dtype=np.float64)
     fraction = weights / weights.sum()
-    # Functions without gradient carry no force. The others count per unit of rms gradient: the length of a force is then its energy norm.
+    # Functions without gradient carry no force. The others count per unit of rms gradient: the length of a force is
+    # then its energy norm.
     gradient = np.asarray(grad_basis, dtype=np.float64).transpose(1, 2, 0)
+    if not np.isfinite(gradient).all():
+        raise BasisError("grad_basis: not all finite")
     slope = np.sqrt(np.square(gradient).sum(axis=1) @ (fraction * modulus))
     live = slope > 1e-9 * slope.max()
     slope = slope[live]
     gradient = np.ascontiguousarray(gradient[live] / slope[:, None, None])  # (n, 3, P)
-    if not np.isfinite(gradient).all():
-        raise BasisError("grad_basis: not all finite")
     full = _Sampler(gradient, fraction * modulus)
 
     # Rows: the virtual work of each pose's stress on a few random test displacements, per unit of the pose's force.
     tests = rng.normal(size=(3 * _TEST_COUNT, len(slope))) @ gradient.reshape(len(slope), -1) / np.sqrt(_ROWS_PER_POSE)
     tests = tests.reshape(_TEST_COUNT, 9, point_count)
     moments = tests[:_MOMENT_COUNT].reshape(-1, point_count)
-    rows = [_MOMENT_WEIGHT * np.ones((1, point_count)), _MOMENT_WEIGHT * moments / np.sqrt((moments**2 @ fraction).mean())]
+    rows = [
+        _MOMENT_WEIGHT * np.ones((1, point_count)),
+        _MOMENT_WEIGHT * moments / np.sqrt((moments**2 @ fraction).mean()),
+    ]
     for pose in _poses(_POSE_COUNT, slope, rng):
         stress = full.stress(pose)
         picked = tests[rng.choice(_TEST_COUNT, _ROWS_PER_POSE, replace=False)]
@@ -128,7 +133,7 @@ def select_cubature(
 
 
 def _poses(count: int, slope: Array, rng: np.random.Generator) -> list[tuple[Array, Array]]:
-    """Return (A, s): deformation gradients A (I + sum_k s_k grad b_k / slope_k), a random stretch after random modal strains."""
+    """Return (A, s) of F = A (I + sum_k s_k grad b_k / slope_k): random stretches after random modal strains."""
     poses = []
     for k in range(count):
         frame = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -160,7 +165,7 @@ class _Sampler:
 
 
 def _stress(f: Array) -> Array:
-    """Return the first Piola-Kirchhoff stress (3, 3, P) of stable Neo-Hookean material with origin term (Smith et al. 2018) for E = 1."""
+    """Return P(F), (3, 3, P), of stable Neo-Hookean material with origin term (Smith et al. 2018) for E = 1."""
     mu = 1.0 / (2.0 * (1.0 + POISSON_RATIO))
     lame = POISSON_RATIO / ((1.0 + POISSON_RATIO) * (1.0 - 2.0 * POISSON_RATIO))
     m, k = 4.0 / 3.0 * mu, lame + 5.0 / 6.0 * mu
@@ -181,7 +186,8 @@ def _nonnegative_path(
 ) -> dict[int, tuple[NDArray[np.intp], Array]]:
     """Grow a non-negative least-squares solution of  x @ columns = target,  sum x = 1.
 
-    Candidates are searched in eight interleaved random groups, one per step: a fresh group costs an eighth of the search and loses nothing visible.
+    Candidates are searched in eight interleaved random groups, one per step: a fresh group costs an eighth of the
+    search and loses nothing visible.
 
     Returns:
         For each size reached: indices and weights.

@@ -1,11 +1,13 @@
 """Skinning eigenmodes: the smoothest scalar weight functions an object admits.
 
-The weights W_j are the lowest eigenfunctions of the weight-space Hessian (FreeForm eq. 15 and 35, after Benchekroun et al. 2023),
+The weights W_j are the lowest eigenfunctions of the weight-space Hessian (FreeForm eq. 15 and 35, after Benchekroun et
+al. 2023),
 
     H v = omega M v,   H = sum_p V_p s_p grad phi~ grad phi~^T,   M = sum_p V_p phi~ phi~^T,
 
-with s_p the relative stiffness (the factor lambda + 4 mu, divided by its reference value, so that omega is in 1/m^2 and does not
-depend on Young's modulus). For a homogeneous box omega = pi^2 (a^2/Lx^2 + b^2/Ly^2 + c^2/Lz^2) with integers a, b, c.
+with s_p the relative stiffness (the factor lambda + 4 mu, divided by its reference value, so that omega is in 1/m^2
+and does not depend on Young's modulus). For a homogeneous box omega = pi^2 (a^2/Lx^2 + b^2/Ly^2 + c^2/Lz^2) with
+integers a, b, c.
 """
 
 from __future__ import annotations
@@ -37,8 +39,8 @@ def solve_eigenmodes(
 ) -> Eigenmodes:
     """Solve for the smoothest non-constant weight functions.
 
-    The matrices are formed with square roots of the weights, so both are exactly symmetric and positive semidefinite, and LAPACK's
-    subset solver is used: for 200-1000 kernels it beats Lanczos and LOBPCG.
+    The matrices are formed with square roots of the weights, so both are exactly symmetric and positive semidefinite,
+    and LAPACK's subset solver is used: for 200-1000 kernels it beats Lanczos and LOBPCG.
 
     Args:
         shape: Reproducing kernels at the quadrature points, (P, K).
@@ -47,7 +49,8 @@ def solve_eigenmodes(
         stiffness_scale: Relative stiffness, shape (P,); ones when None.
 
     Returns:
-        Modes with sum_p (V_p / V) W_i W_j = delta_ij; in each the entry of largest magnitude over the kernels is positive.
+        Modes with sum_p (V_p / V) W_i W_j = delta_ij; in each the entry of largest magnitude over the kernels is
+        positive.
 
     Raises:
         ConfigError: If the kernels are too few for the modes asked for.
@@ -58,12 +61,15 @@ def solve_eigenmodes(
         raise ConfigError(f"mode_count: expected 1..{kernel_count - 1} for {kernel_count} kernels, got {mode_count}")
     root = np.sqrt(weights / weights.sum())
     mass = _gram(shape.value, root)
-    stiffness = sum(_gram(g, root if stiffness_scale is None else root * np.sqrt(stiffness_scale)) for g in shape.gradient)
+    stiffness = sum(
+        _gram(g, root if stiffness_scale is None else root * np.sqrt(stiffness_scale)) for g in shape.gradient
+    )
     constant = np.ones(kernel_count)
     try:
         values, vectors = linalg.eigh(stiffness, mass, subset_by_index=[0, mode_count], check_finite=False)
     except linalg.LinAlgError:
-        # Kernels that (numerically) repeat each other: a ridge far under the discretisation error restores definiteness.
+        # Kernels that (numerically) repeat each other: a ridge far under the discretisation error restores
+        # definiteness.
         ridge = 1e-12 * np.trace(mass) / kernel_count * np.eye(kernel_count)
         try:
             values, vectors = linalg.eigh(stiffness, mass + ridge, subset_by_index=[0, mode_count], check_finite=False)
@@ -71,7 +77,8 @@ def solve_eigenmodes(
             raise BasisError(
                 f"the mass matrix of {kernel_count} kernels is singular", hint="Use fewer kernels or more points."
             ) from error
-    # The lowest eigenvector is the constant up to rounding: replace it by the exact one and re-orthonormalise the others.
+    # The lowest eigenvector is the constant up to rounding: replace it by the exact one and re-orthonormalise the
+    # others.
     modes = vectors[:, 1:]
     modes = modes - np.outer(constant, constant @ (mass @ modes))
     modes = modes @ np.linalg.inv(np.linalg.cholesky(modes.T @ (mass @ modes))).T

@@ -123,8 +123,8 @@ def invariant_derivatives(material: MaterialParameters, strain: wp.float64, j1: 
         # l/2 [(J - g)^2 - (1 - g)^2] = l/2 (J - 1)^2 - mu (J - 1)
         psi = half * material.mu * strain + half * l * j1 * j1 - material.mu * j1
         return psi, material.mu, wp.float64(0.0), l * j1 - material.mu, l
-    m = wp.float64(4.0 / 3.0) * material.mu
-    l = material.lam + wp.float64(5.0 / 6.0) * material.mu
+    m = wp.float64(4.0) / wp.float64(3.0) * material.mu
+    l = material.lam + wp.float64(5.0) / wp.float64(6.0) * material.mu
     c = strain + wp.float64(4.0)  # I_C + 1
     slope = wp.float64(0.75) * m  # l (a - 1)
     psi = half * m * (strain - wp.log(one + strain / wp.float64(4.0))) + half * l * j1 * j1 - slope * j1

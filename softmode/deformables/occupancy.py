@@ -1,7 +1,7 @@
 """Interior of a shell: the smooth occupancy field that a cloud of Gaussian splats encloses.
 
-A trained splat is a shell of discs without orientation, with stray splats outside, junk inside, and holes where no camera looked. `fill_splats` states
-the rule that turns it into a solid.
+A trained splat is a shell of discs without orientation, with stray splats outside, junk inside, and holes where no
+camera looked. `fill_splats` states the rule that turns it into a solid.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage, sparse
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from softmode.errors import AssetError
@@ -28,7 +28,8 @@ SCALE_LIMIT = 0.25
 SMALL_PART = 0.01
 """Detached parts with less than this fraction of all area are floaters."""
 LINK = 2.0
-"""Splats are linked when closer than this many times their distance to the sixth neighbour (the smaller of the two), or within a half-opaque disc."""
+"""Splats are linked when closer than this many times their distance to the sixth neighbour (the smaller of the two),
+or within a half-opaque disc."""
 PART_LIMIT = 6
 """At most this many parts, the largest by area, are tried as the object."""
 VIEW_COUNT = 96
@@ -62,17 +63,21 @@ def fill_splats(
 ) -> Occupancy:
     """Turn a shell of splats into a level-set function of the solid it encloses.
 
-    1. *Floaters* go: opacity under 0.1, a standard deviation over a quarter of the scene's diagonal, and detached parts (linked when closer than
-       twice their distance to the sixth neighbour, or within the half-opaque disc of one of them) with less than 1 % of the area.
+    1. *Floaters* go: opacity under 0.1, a standard deviation over a quarter of the scene's diagonal, and detached
+       parts (linked when closer than twice their distance to the sixth neighbour, or within the half-opaque disc of
+       one of them) with less than 1 % of the area.
     2. *The object* is the part whose solid holds the largest ball: a floor slab under the object loses, however wide.
-    3. *Samples*: each splat is spread over its disc with one sample per voxel. The surface lies where a splat seen edge-on is half opaque: outside
-       the centre by sigma_n sqrt(2 ln(2 alpha)), zero for flat splats, so the shell's thickness does not inflate the volume.
-    4. *Orientation by views*: 96 orthographic depth buffers tell which samples are seen from where. The normal (the splat's thin axis; of
-       round splats, that of the neighbourhood) points to the side seen more. Samples that no view sees (inside) or seen equally from both sides (open
-       sheets) are dropped.
-    5. *Fill*: with a_i the area of a sample from the local density, solve  lap(chi) = -div(sum_i a_i n_i G(X - X_i))  (Poisson reconstruction with
-       a sine transform). chi is the indicator of the solid smoothed over about one sample spacing; a hole in the shell is closed by a smooth cap.
-    6. *The solid* is chi > the mean of chi over the samples: the connected part that holds the largest ball, without internal voids.
+    3. *Samples*: each splat is spread over its disc with one sample per voxel. The surface lies where a splat seen
+       edge-on is half opaque: outside the centre by sigma_n sqrt(2 ln(2 alpha)), zero for flat splats, so the shell's
+       thickness does not inflate the volume.
+    4. *Orientation by views*: 96 orthographic depth buffers tell which samples are seen from where. The normal (the
+       splat's thin axis; of round splats, that of the neighbourhood) points to the side seen more. Samples that no
+       view sees (inside) or seen equally from both sides (open sheets) are dropped.
+    5. *Fill*: with a_i the area of a sample from the local density, solve  lap(chi) = -div(sum_i a_i n_i G(X - X_i))
+       (Poisson reconstruction with a sine transform). chi is the indicator of the solid smoothed over about one sample
+       spacing; a hole in the shell is closed by a smooth cap.
+    6. *The solid* is chi > the mean of chi over the samples: the connected part that holds the largest ball, without
+       internal voids.
 
     Args:
         means: Splat centres [m], shape (N, 3).
@@ -109,7 +114,7 @@ def fill_splats(
     solid = fill(members[best], resolution)
     chosen = members[best]
 
-    tree = cKDTree(mean[chosen])
+    tree = KDTree(mean[chosen])
     size = np.ptp(mean[chosen], axis=0)
     member, satellite = np.zeros(len(mean), dtype=bool), np.zeros(len(mean), dtype=bool)
     member[chosen] = True
@@ -151,8 +156,9 @@ def _fill_part(mean: Array, scale: Array, axes: Array, opacity: Array, resolutio
     voxel = min(voxel, float(extent.max()) / 12.0)
 
     sample, owner = _spread(mean, scale, axes, voxel)
-    # Samples of one splat are a voxel apart; where splats do not overlap, the gap between them decides how much to smooth.
-    gap = float(np.median(cKDTree(sample).query(sample, k=7)[0][:, 6]))
+    # Samples of one splat are a voxel apart; where splats do not overlap, the gap between them decides how much to
+    # smooth.
+    gap = float(np.median(KDTree(sample).query(sample, k=7)[0][:, 6]))
     sigma = max(1.2 * voxel, 0.6 * gap)
     normal = _normals(mean, scale, axes)
     sign, confidence, seen = _orient(sample, normal[owner], owner, len(mean), max(voxel, gap))
@@ -171,7 +177,8 @@ def _fill_part(mean: Array, scale: Array, axes: Array, opacity: Array, resolutio
     where = (sample - origin) / voxel
     blur = sigma / voxel
     density = ndimage.gaussian_filter(_deposit(where, np.ones(len(sample)), shape), blur, mode="constant")
-    # A plane with one sample per area a shows the density 1 / (a sqrt(2 pi) blur); depositing and reading back widen the filter.
+    # A plane with one sample per area a shows the density 1 / (a sqrt(2 pi) blur); depositing and reading back widen
+    # the filter.
     area = 1.0 / (np.maximum(_read(density, where), 1e-12) * np.sqrt(2.0 * np.pi * (blur**2 + 1.0 / 3.0)))
     weight = area * confidence[owner]
     source = np.zeros(tuple(shape))
@@ -243,7 +250,7 @@ def _validate(
 
 def _typical_spacing(x: Array) -> float:
     """Return the median distance to the sixth neighbour, about one and a half spacings on a surface."""
-    return float(np.median(cKDTree(x).query(x, k=min(7, len(x)))[0][:, -1]))
+    return float(np.median(KDTree(x).query(x, k=min(7, len(x)))[0][:, -1]))
 
 
 def _half_opaque(opacity: Array) -> Array:
@@ -266,7 +273,7 @@ def _split_parts(mean: Array, scale: Array, opacity: Array) -> tuple[NDArray[np.
     x = mean[index]
     disc = scale[index, 0] * _half_opaque(opacity[index])
     # Sixteen neighbours hold a surface together and keep the graph small.
-    distance, other = cKDTree(x).query(x, k=16)
+    distance, other = KDTree(x).query(x, k=16)
     local = distance[:, 6]
     link = LINK * float(np.median(local))
     # The cap keeps a sparse cloud of floaters from linking up into a shell of its own.
@@ -297,11 +304,11 @@ def _spread(mean: Array, scale: Array, axes: Array, voxel: float) -> tuple[Array
 
 
 def _normals(mean: Array, scale: Array, axes: Array) -> Array:
-    """Return unit normals without orientation (N, 3): the thin axis, or the neighbourhood's for splats that are not flat."""
+    """Return unit normals (N, 3) without orientation: the thin axis; of round splats, the neighbourhood's."""
     normal = axes[:, :, 2].copy()
     round_ = np.flatnonzero(scale[:, 2] > 0.5 * scale[:, 1] - 1e-300)
     if len(round_):
-        near = mean[cKDTree(mean).query(mean[round_], k=min(12, len(mean)))[1]]
+        near = mean[KDTree(mean).query(mean[round_], k=min(12, len(mean)))[1]]
         near = near - near.mean(axis=1, keepdims=True)
         normal[round_] = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, 0]
     return normal
@@ -330,7 +337,7 @@ def _orient(
         depth = -(sample @ direction)
         front = np.full(key.max() + 1, np.inf)
         np.minimum.at(front, key, depth)
-        visible = depth <= front[key] + 1.5 * cell
+        visible = depth <= front[key] + 0.75 * cell
         views += visible
         facing = np.where(visible, normal @ direction, 0.0)
         vote += np.bincount(owner, facing, minlength=splat_count)

@@ -1,8 +1,9 @@
 """Quadrature: an object as interior points with weights [m^3] and surface samples with areas [m^2].
 
-Every source ends on the same uniform grid over the bounding box (a grid integrates two to four times better than random points). Each
-cell carries the volume of the object inside it and sits at the centroid of that part, so linear functions are integrated as well at the boundary as
-inside. Meshes are integrated column by column, exactly along z; implicit functions by sub-sampling with a linear boundary layer.
+Every source ends on the same uniform grid over the bounding box (a grid integrates two to four times better than
+random points). Each cell carries the volume of the object inside it and sits at the centroid of that part, so linear
+functions are integrated as well at the boundary as inside. Meshes are integrated column by column, exactly along z;
+implicit functions by sub-sampling with a linear boundary layer.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from softmode.deformables.occupancy import fill_splats
 from softmode.deformables.rkpm import sample_farthest
@@ -82,8 +83,8 @@ def quadrature_from_mesh(
 ) -> Quadrature:
     """Integrate a closed triangle mesh.
 
-    Rays along z through every sub-column give exact chords between crossings (signed, so overlapping parts count once); edge tests use one vertex
-    order per edge, so no ray slips between two triangles.
+    Rays along z through every sub-column give exact chords between crossings (signed, so overlapping parts count
+    once); edge tests use one vertex order per edge, so no ray slips between two triangles.
 
     Args:
         vertices: Vertex positions [m], shape (V, 3).
@@ -96,7 +97,8 @@ def quadrature_from_mesh(
         The quadrature; weights sum to the mesh volume.
 
     Raises:
-        AssetError: If the mesh is empty, not finite, not closed, not consistently oriented, or of zero or negative volume.
+        AssetError: If the mesh is empty, not finite, not closed, not consistently oriented, or of zero or negative
+        volume.
     """
     _check_counts(point_count, surface_count)
     vertex, face = _load_mesh(vertices, faces)
@@ -122,7 +124,8 @@ def quadrature_from_mesh(
     rng = np.random.default_rng(seed)
     candidate_count = _CANDIDATES_PER_SAMPLE * surface_count
     pick = np.searchsorted(
-        np.cumsum(twice_area), (np.arange(candidate_count) + rng.random(candidate_count)) / candidate_count * twice_area.sum()
+        np.cumsum(twice_area),
+        (np.arange(candidate_count) + rng.random(candidate_count)) / candidate_count * twice_area.sum(),
     ).clip(0, len(face) - 1)
     r, t = np.sqrt(rng.random(candidate_count)), rng.random(candidate_count)
     bary = np.stack([1.0 - r, r * (1.0 - t), r * t], axis=1)
@@ -134,7 +137,9 @@ def quadrature_from_mesh(
     })  # fmt: skip
 
 
-def quadrature_from_box(size: ArrayLike, *, point_count: int = 4000, surface_count: int = 400, seed: int = 0) -> Quadrature:
+def quadrature_from_box(
+    size: ArrayLike, *, point_count: int = 4000, surface_count: int = 400, seed: int = 0
+) -> Quadrature:
     """Integrate a box with edges `size` [m] centred at the origin; see `quadrature_from_mesh`."""
     extent = np.asarray(size, dtype=np.float64)
     if extent.shape != (3,) or not (np.isfinite(extent).all() and (extent > 0.0).all()):
@@ -155,7 +160,7 @@ def quadrature_from_sphere(
 def quadrature_from_capsule(
     radius: float, half_height: float, *, point_count: int = 4000, surface_count: int = 400, seed: int = 0
 ) -> Quadrature:
-    """Integrate a capsule along z (a segment of 2 `half_height` [m] swept by `radius` [m]); volume and area are the exact ones."""
+    """Integrate a capsule: a segment of 2 `half_height` [m] along z, swept by `radius` [m]; exact volume and area."""
     if not (np.isfinite(radius) and radius > 0.0):
         raise AssetError(f"radius: expected a positive length [m], got {radius!r}")
     if not (np.isfinite(half_height) and half_height >= 0.0):
@@ -209,7 +214,9 @@ def quadrature_from_implicit(
     _check_counts(point_count, surface_count)
     box = np.array(bounds, dtype=np.float64)
     if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[1] > box[0]).all():
-        raise AssetError(f"bounds: expected finite corners (2, 3) with upper > lower, got {np.asarray(bounds).tolist()}")
+        raise AssetError(
+            f"bounds: expected finite corners (2, 3) with upper > lower, got {np.asarray(bounds).tolist()}"
+        )
 
     def level(x: Array) -> Array:
         value = np.asarray(signed_distance(x), dtype=np.float64)
@@ -219,7 +226,7 @@ def quadrature_from_implicit(
 
     # A coarse pass fits the box to the object and estimates volume and area for the choice of the grid.
     coarse_shape = np.maximum(np.ceil((box[1] - box[0]) / (box[1] - box[0]).max() * 32.0), 4).astype(int)
-    distance, nodes, width, rough_area = _sample_grid(level, box, coarse_shape)
+    distance, value, nodes, width = _sample_grid(level, box, coarse_shape)
     reach = distance < width.max()
     if not (distance < 0.5 * width.max()).any():
         raise AssetError("signed_distance: nothing lies inside the bounds", hint="Check the sign and the bounds.")
@@ -228,9 +235,10 @@ def quadrature_from_implicit(
         np.minimum(box[1], nodes[reach].max(axis=0) + 0.5 * width),
     ])  # fmt: skip
     rough_volume = max(float(_filled(distance, width).sum() * width.prod()), float(width.prod()))
+    rough_area = float((np.abs(distance) < width.max()).sum() * width.prod() / (2.0 * width.max()))
     shape = _grid_shape(box[1] - box[0], volume or rough_volume, area or rough_area, point_count)
 
-    distance, nodes, width, fine_area = _sample_grid(level, box, shape * SUBDIVISION)
+    distance, value, nodes, width = _sample_grid(level, box, shape * SUBDIVISION)
     filled = _filled(distance, width) * width.prod()
     parent = np.arange(len(filled)).reshape(tuple(shape * SUBDIVISION))
     parent = np.stack(np.unravel_index(parent, parent.shape), axis=-1).reshape(-1, 3) // SUBDIVISION
@@ -241,7 +249,7 @@ def quadrature_from_implicit(
         [np.bincount(index[keep], filled[keep] * nodes[keep, d], minlength=int(shape.prod())) for d in range(3)], axis=1
     )
     points, weights, counted = _assemble_cells(cell, first, box[0], box[1], shape)
-    exact_area = area if area is not None else fine_area
+    exact_area = area if area is not None else _surface_area(level, distance, value, nodes, width)
     candidates, normals = _project_surface(level, nodes, distance, width, surface_count, seed)
     surface = _select_surface(candidates, normals, exact_area, surface_count, seed)
     extent = np.stack([candidates.min(axis=0), candidates.max(axis=0)])
@@ -296,13 +304,14 @@ def quadrature_from_points(
     resolution: int = 64,
     seed: int = 0,
 ) -> Quadrature:
-    """Integrate the object whose surface (or surface and interior) a point cloud samples.
+    """Integrate the object whose surface a point cloud samples.
 
-    The points are treated as opaque round splats; see `quadrature_from_splats`. Points that no outside view sees do not matter.
+    The points are treated as opaque splats without extent; see `quadrature_from_splats`. A few points inside do not
+    matter, but a cloud that fills the object comes out too small: its layers behind the surface are seen in part.
 
     Args:
         points: Positions [m], shape (N, 3).
-        radius: How far the surface lies outside the outermost points [m], for instance half the spacing of a volume-filling cloud.
+        radius: How far the surface lies outside the points [m].
         point_count: Target number of quadrature points.
         surface_count: Number of surface samples.
         resolution: Voxels along the longest edge of the occupancy grid.
@@ -464,19 +473,31 @@ def _finish(
 
 def _sample_grid(
     level: Callable[[Array], Array], box: Array, shape: NDArray[np.int64]
-) -> tuple[Array, Array, Array, float]:
-    """Return first-order distances (cells,), cell centres (cells, 3), cell edges (3,) and the surface area [m^2]."""
+) -> tuple[Array, Array, Array, Array]:
+    """Return first-order distances (cells,), level values (cells,), cell centres (cells, 3) and cell edges (3,)."""
     width = (box[1] - box[0]) / shape
     axes = [box[0, d] + (np.arange(shape[d]) + 0.5) * width[d] for d in range(3)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     value = level(nodes).reshape(tuple(shape))
     slope = np.sqrt(sum(g * g for g in np.gradient(value, *width)))
     distance = (value / np.maximum(slope, 1e-3 * slope.max() + 1e-300)).ravel()
-    # Area by the co-area formula, int delta(f) |grad f| dX, with a hat two cells wide for delta: exact for any level function.
-    near = np.abs(distance) < 0.5 * width.max()
-    reach = 2.0 * float(width.max() * (np.median(slope.ravel()[near]) if near.any() else slope.max())) + 1e-300
-    area = float((np.maximum(1.0 - np.abs(value) / reach, 0.0) * slope).sum() / reach * width.prod())
-    return distance, nodes, width, area
+    return distance, value.ravel(), nodes, width
+
+
+def _gradient(level: Callable[[Array], Array], points: Array, step: float) -> Array:
+    """Return central differences of the level function (N, 3)."""
+    shifted = (points[:, None] + np.concatenate([np.eye(3), -np.eye(3)]) * step).reshape(-1, 3)
+    value = level(shifted).reshape(-1, 2, 3)
+    return (value[:, 0] - value[:, 1]) / (2.0 * step)
+
+
+def _surface_area(level: Callable[[Array], Array], distance: Array, value: Array, nodes: Array, width: Array) -> float:
+    """Return the area [m^2] by the co-area formula, int delta(f) |grad f| dX, with a hat for delta."""
+    near = np.flatnonzero(np.abs(distance) < 3.0 * width.max())
+    slope = np.linalg.norm(_gradient(level, nodes[near], 0.25 * float(width.min())), axis=1)
+    reach = 1.5 * float(width.max() * np.median(slope[np.abs(distance[near]) < 0.5 * width.max()]))
+    hat = np.maximum(1.0 - np.abs(value[near]) / reach, 0.0) / reach
+    return float((hat * slope).sum() * width.prod())
 
 
 def _filled(distance: Array, width: Array) -> Array:
@@ -487,7 +508,7 @@ def _filled(distance: Array, width: Array) -> Array:
 def _project_surface(
     level: Callable[[Array], Array], nodes: Array, distance: Array, width: Array, surface_count: int, seed: int
 ) -> tuple[Array, Array]:
-    """Draw points in a thin layer around the zero level and project them on it; the layer makes their density uniform."""
+    """Draw points in a thin layer around the zero level, which makes their density uniform, and project them on it."""
     rng = np.random.default_rng(seed)
     layer = 0.5 * float(width.max())
     near = np.flatnonzero(np.abs(distance) < layer + 0.5 * float(np.linalg.norm(width)))
@@ -496,18 +517,13 @@ def _project_surface(
     x = nodes[pick] + (rng.random((len(pick), 3)) - 0.5) * width
     step = 0.25 * float(width.min())
 
-    def gradient(p: Array) -> Array:
-        shifted = (p[:, None] + np.concatenate([np.eye(3), -np.eye(3)]) * step).reshape(-1, 3)
-        value = level(shifted).reshape(-1, 2, 3)
-        return (value[:, 0] - value[:, 1]) / (2.0 * step)
-
-    value, slope = level(x), gradient(x)
+    value, slope = level(x), _gradient(level, x, step)
     length = np.linalg.norm(slope, axis=1)
     keep = np.abs(value) < layer * length
     x, value, slope = x[keep], value[keep], slope[keep]
     for _ in range(3):
         x = x - slope * (value / np.maximum((slope * slope).sum(axis=1), 1e-300))[:, None]
-        value, slope = level(x), gradient(x)
+        value, slope = level(x), _gradient(level, x, step)
     length = np.linalg.norm(slope, axis=1)
     keep = (length > 0.0) & (np.abs(value) < 0.05 * layer * np.maximum(length, np.median(length)))
     if keep.sum() < surface_count:
@@ -520,16 +536,17 @@ def _select_surface(
 ) -> tuple[Array, Array, Array]:
     """Choose near-uniform samples among uniform candidates, and give each the area of its cell.
 
-    Farthest points in position and (weakly) normal, so that both sides of a thin sheet are sampled, then two Lloyd steps.
+    Farthest points in position and (weakly) normal, so that both sides of a thin sheet are sampled, then two Lloyd
+    steps.
     """
     pitch = 0.35 * np.sqrt(area / count)
     space = np.concatenate([candidates, pitch * normals], axis=1)
     chosen = sample_farthest(space, count, seed=seed)
-    tree = cKDTree(space)
+    tree = KDTree(space)
     for _ in range(2):
-        label = cKDTree(space[chosen]).query(space)[1]
+        label = KDTree(space[chosen]).query(space)[1]
         size = np.bincount(label, minlength=len(chosen))
         mean = np.stack([np.bincount(label, column, minlength=len(chosen)) for column in space.T], axis=1)
         chosen = np.unique(tree.query(mean[size > 0] / size[size > 0, None])[1])
-    size = np.bincount(cKDTree(space[chosen]).query(space)[1], minlength=len(chosen))
+    size = np.bincount(KDTree(space[chosen]).query(space)[1], minlength=len(chosen))
     return candidates[chosen], normals[chosen], size * (area / len(candidates))

@@ -1,11 +1,14 @@
 """Reproducing kernels: shape functions on scattered centres that reproduce every linear function.
 
-Each of the K centres p_k carries a bell phi_k(X) = w(|X - p_k| / R_k). The reproducing kernel is the bell times a correction,
+Each of the K centres p_k carries a bell phi_k(X) = w(|X - p_k| / R_k). The reproducing kernel is the bell times a
+correction,
 
-    phi~_k(X) = phi_k(X) P(xi_k)^T M(X)^-1 P(0),   M(X) = sum_k phi_k P(xi_k) P(xi_k)^T,   P = (1, x, y, z),   xi_k = (X - p_k) / h,
+    phi~_k(X) = phi_k(X) P(xi_k)^T M(X)^-1 P(0),   M(X) = sum_k phi_k P(xi_k) P(xi_k)^T,   P = (1, x, y, z),   xi_k =
+    (X - p_k) / h,
 
-so that sum_k phi~_k = 1 and sum_k phi~_k p_k = X. This is eq. (7-10) of FreeForm: the polynomial space does not change under shift and scale, so the
-local, scaled coordinates give the same functions and a moment matrix with a condition number of order ten.
+so that sum_k phi~_k = 1 and sum_k phi~_k p_k = X. This is eq. (7-10) of FreeForm: the polynomial space does not change
+under shift and scale, so the local, scaled coordinates give the same functions and a moment matrix with a condition
+number of order ten.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from softmode.errors import BasisError, ConfigError
 
@@ -90,10 +93,14 @@ class BasisRKPM:
             raise BasisError(f"points: expected shape (N, 3), got {x.shape}")
         if not np.isfinite(x).all():
             raise BasisError("points: not all finite", hint="Remove the points that hold NaN or infinity.")
+        if not len(x):
+            empty = sparse.csr_matrix((0, self.kernel_count))
+            return ShapeFunctions(empty, (empty, empty, empty))
         step = max(1, _PAIRS_PER_CHUNK // self.kernel_count)
-        parts = [self._evaluate_chunk(x[i : i + step], i) for i in range(0, max(len(x), 1), step)]
+        parts = [self._evaluate_chunk(x[i : i + step], i) for i in range(0, len(x), step)]
         row_count = np.concatenate([p[0] for p in parts])
-        column, value, gradient = (np.concatenate([p[i] for p in parts]) for i in (1, 2, 3))
+        column = np.concatenate([p[1] for p in parts])
+        value, gradient = np.concatenate([p[2] for p in parts]), np.concatenate([p[3] for p in parts])
         start = np.concatenate([[0], np.cumsum(row_count)])
         shape = (len(x), self.kernel_count)
 
@@ -109,7 +116,7 @@ class BasisRKPM:
         distance_sq = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2.0 * (a @ b.T)
         row, column = np.nonzero(distance_sq < self.support**2 * (1.0 + 1e-9))
         count = np.bincount(row, minlength=len(x))
-        if len(x) and count.min() < 4:
+        if count.min() < 4:
             self._raise_uncovered(np.flatnonzero(count < 4) + first, x[count < 4])
         h = float(self.support.mean())
         offset = np.take(x, row, axis=0) - np.take(self.centres, column, axis=0)
@@ -129,7 +136,8 @@ class BasisRKPM:
         c = inverse[:, :, 0]
         s = np.einsum("pi,pi->p", poly, np.take(c, row, axis=0))
         value = w * s
-        # dM_d c = sum_k (d_d w) s P + e_(d+1)/h + M[:, 0] c_(d+1)/h   (because sum_k w s P = M c = e_0);   dc_d = -M^-1 dM_d c.
+        # dM_d c = sum_k (d_d w) s P + e_(d+1)/h + M[:, 0] c_(d+1)/h   (because sum_k w s P = M c = e_0);   dc_d =
+        # -M^-1 dM_d c.
         slope_s = slope * s[:, None]
         dmc = np.empty((len(x), 3, 4))
         for d in range(3):
@@ -220,8 +228,9 @@ def make_basis(
 ) -> BasisRKPM:
     """Place kernels on a point set by farthest point sampling and choose their radii.
 
-    r_k is the distance to the second nearest other centre. The Gaussian, whose flank is narrower, never goes under three
-    point spacings: without that bound its eigenvalues lose a factor of three in accuracy. The spline's floor is 1.5 spacings.
+    r_k is the distance to the second nearest other centre. The Gaussian, whose flank is narrower, never goes under
+    three point spacings: without that bound its eigenvalues lose a factor of three in accuracy. The spline's floor is
+    1.5 spacings.
 
     Args:
         points: Quadrature points [m], shape (P, 3).
@@ -242,8 +251,8 @@ def make_basis(
     if kernel_count < 4:
         raise ConfigError(f"kernel_count: expected at least 4, got {kernel_count}")
     if spacing is None:
-        spacing = float(np.median(cKDTree(x).query(x, k=2)[0][:, 1]))
+        spacing = float(np.median(KDTree(x).query(x, k=2)[0][:, 1]))
     centres = x[sample_farthest(x, kernel_count, seed=seed)]
-    neighbour = cKDTree(centres).query(centres, k=3)[0][:, 2]
+    neighbour = KDTree(centres).query(centres, k=3)[0][:, 2]
     floor = spacing * (3.0 if kernel == "gaussian" else 1.5)
     return BasisRKPM(centres=centres, radii=np.maximum(neighbour, floor), kernel=kernel)

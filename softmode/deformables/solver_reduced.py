@@ -470,7 +470,9 @@ class SolverReduced(SolverBase):
         self.any_active, self.any_searching = zeros((1,), int), zeros((1,), int)
         self.potential, self.potential_trial = zeros((worlds,), wp.float64), zeros((worlds,), wp.float64)
         self.slope, self.step_length = zeros((worlds,), wp.float64), zeros((worlds,), wp.float64)
-        self.iteration, self.status = zeros((worlds,), int), zeros((worlds,), int)
+        self.iteration = zeros((worlds,), int)
+        self.status = zeros((worlds,), int)
+        """Status bits per world (see ``kernels``), gathered over steps until cleared with ``status.zero_()``."""
 
     def attach_rigid(self, rigid: RigidDofs) -> None:
         """Let the joint dofs of ``rigid`` take part in the solve."""
@@ -515,7 +517,6 @@ class SolverReduced(SolverBase):
     def begin(self, state: newton.State, dt: float) -> None:
         """Read the state and predict."""
         data = getattr(state, NAMESPACE)
-        self.status.zero_()
         self._launch(
             kernels.begin_step,
             (self.instance_count, self.stride),

@@ -88,7 +88,7 @@ def test_matches_numpy(device: str) -> None:
 
 
 def test_affine_motion_is_exact(device: str) -> None:
-    """q of x = A X + t gives means A X + t and covariances A Sigma A^T, a metre away from home too."""
+    """Q of x = A X + t gives means A X + t and covariances A Sigma A^T, a metre away from home too."""
     case = Case()
     a = np.array([[0.9, -0.5, 0.1], [0.4, 1.2, 0.2], [0.0, -0.3, 0.8]])
     t = np.array([1.5, -2.0, 0.7])
@@ -133,7 +133,7 @@ def test_mean_rotation(device: str, angle: float) -> None:
     """A rotation with stretch 0.8 in all directions yields that rotation for every world."""
     case = Case(amplitude=0.0)
     axis = np.array([0.6, 0.0, 0.8])
-    cross = np.cross(np.eye(3), axis) * -1.0
+    cross = np.cross(np.eye(3), axis)
     r = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
     case.q[:, :3] = (0.8 * r - np.eye(3)).T
     rotations = wp.zeros((WORLDS, 2), dtype=wp.quat, device=device)
@@ -144,7 +144,7 @@ def test_mean_rotation(device: str, angle: float) -> None:
 
 
 def test_points_match_numpy_and_capture(device: str) -> None:
-    """x = X + sum b q and v = sum b qd; a captured launch repeats it on changed coordinates."""
+    """X = X + sum b q and v = sum b qd; a captured launch repeats it on changed coordinates."""
     case = Case()
     q, qd, starts = case.flat(case.q, device), case.flat(case.qd, device), case.starts(device)
     points = wp.array(case.means, dtype=wp.vec3, device=device)

@@ -283,7 +283,7 @@ def test_playbot() -> None:
 
 
 def try_read(path: Path) -> bool:
-    """Read a file; return whether it loads. Anything but a valid asset or an AssetError with a remedy fails the test."""
+    """Read a file; return whether it loads. Anything but a valid asset or an AssetError with a remedy fails."""
     try:
         splats = read_splats(path)
     except AssetError as error:

@@ -35,7 +35,9 @@ def ball(count: int = 400, seed: int = 0, coefficients: int = 1) -> Splats:
     rng = np.random.default_rng(seed)
     means = rng.normal(size=(count, 3))
     means *= 0.5 * rng.uniform(size=(count, 1)) ** (1 / 3) / np.linalg.norm(means, axis=1, keepdims=True)
-    sh = np.concatenate([rng.uniform(-1, 1.5, size=(count, 1, 3)), 0.3 * rng.normal(size=(count, coefficients - 1, 3))], 1)
+    sh = np.concatenate(
+        [rng.uniform(-1, 1.5, size=(count, 1, 3)), 0.3 * rng.normal(size=(count, coefficients - 1, 3))], 1
+    )
     return Splats(
         means=means,
         quats=rng.normal(size=(count, 4)),
@@ -302,7 +304,7 @@ def test_several_objects_share_a_frame(device: str) -> None:
     ids = rasterizer.object_id.numpy()[0]
     assert set(np.unique(ids)) == {-1, 0, 1}
     depth = rasterizer.depth.numpy()[0]
-    assert np.median(depth[ids == 1]) < 1.3 < 2.0 < np.median(depth[ids == 0])
+    assert np.median(depth[ids == 1]) < 1.5 < 2.5 < np.median(depth[ids == 0])
 
 
 def test_plush_is_solid() -> None:
@@ -312,9 +314,11 @@ def test_plush_is_solid() -> None:
     views = views_of([(0.25, 0.05, 0.04)], 96, 96, "cpu")
     rasterizer.render(SplatArrays.from_splats([plush], device="cpu"), views)
     alpha = rasterizer.alpha.numpy()[0]
-    assert 0.1 < (alpha > 0.99).mean() < 0.6
-    # Between empty and solid lies only the silhouette.
-    assert ((alpha > 0.05) & (alpha < 0.95)).mean() < 0.08
+    covered = alpha > 0.5
+    assert covered.sum() > 500
+    # All but the silhouette, one or two pixels wide, is opaque.
+    inner = covered[1:-1, 1:-1] & covered[2:, 1:-1] & covered[:-2, 1:-1] & covered[1:-1, 2:] & covered[1:-1, :-2]
+    assert np.quantile(alpha[1:-1, 1:-1][inner], 0.1) > 0.98
 
 
 @pytest.mark.parametrize(

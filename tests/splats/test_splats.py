@@ -61,7 +61,14 @@ def test_bad_number_names_field_count_and_remedy(field: str, value: float) -> No
 
 @pytest.mark.parametrize(
     ("field", "shape"),
-    [("means", (50, 2)), ("quats", (50, 3)), ("scales", (49, 3)), ("opacities", (50, 1)), ("sh", (50, 3)), ("sh", (50, 5, 3))],
+    [
+        ("means", (50, 2)),
+        ("quats", (50, 3)),
+        ("scales", (49, 3)),
+        ("opacities", (50, 1)),
+        ("sh", (50, 3)),
+        ("sh", (50, 5, 3)),
+    ],
 )
 def test_bad_shape_names_field(field: str, shape: tuple[int, ...]) -> None:
     """A field of the wrong shape is refused by name."""
@@ -117,7 +124,7 @@ def test_quaternions_agree_with_scipy(seed: int) -> None:
 
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
 def test_transform_moves_gaussians_and_turns_colour(coefficients: int) -> None:
-    """x' = s R x + t, Sigma' = s^2 R Sigma R^T, and the colour seen along R d equals the old colour along d."""
+    """X' = s R x + t, Sigma' = s^2 R Sigma R^T, and the colour seen along R d equals the old colour along d."""
     splats = random_splats(coefficients=coefficients)
     r = Rotation.from_rotvec([0.7, -1.1, 0.4]).as_matrix()
     t = np.array([1.0, -2.0, 0.5])

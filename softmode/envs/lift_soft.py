@@ -1,0 +1,317 @@
+"""LiftSoft: pick a soft object from a table and hold it at a goal height."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from softmode.deformables import kernels
+from softmode.envs.table_scene import TableScene, TableSceneConfig
+from softmode.errors import ConfigError
+from softmode.splats.camera import PinholeCamera
+
+ObservationType = Literal["state", "pixels", "pixels_agent_pos"]
+POINT_COUNT = 16
+"""Surface points of the object in a state observation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiftSoftConfig:
+    """Task, randomisation and pictures of LiftSoft."""
+
+    scene: TableSceneConfig = field(default_factory=TableSceneConfig)
+    """Object, robot and physics."""
+    goal_height: float = 0.15
+    """How far the object's centre of mass is to rise [m]."""
+    goal_tolerance: float = 0.02
+    """Distance from the goal height that counts as there [m]."""
+    hold_steps: int = 15
+    """Control steps in a row at the goal, held by both fingers, that make a success."""
+    position_range: tuple[float, float] = (0.05, 0.08)
+    """Half-width of the object's random position in x and y [m]."""
+    yaw_range: float = np.pi
+    """Half-width of its random yaw [rad]."""
+    youngs_modulus_range: tuple[float, float] = (2.0e4, 2.0e6)
+    """Range of the random Young's modulus [Pa], log-uniform."""
+    image_size: int = 96
+    """Edge of a pixel observation [px]."""
+    render_size: int = 256
+    """Edge of each half of a rendered frame [px]."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        low, high = self.youngs_modulus_range
+        if not 0.0 < low <= high:
+            raise ConfigError(f"youngs_modulus_range must satisfy 0 < low <= high, got {self.youngs_modulus_range}")
+        if not 36 <= self.image_size <= 640:
+            raise ConfigError(f"image_size must lie in 36..640 px, got {self.image_size}")
+        if not 64 <= self.render_size <= 1024:
+            raise ConfigError(f"render_size must lie in 64..1024 px, got {self.render_size}")
+
+
+class LiftSoftEnv(gym.Env):
+    """One arm, one soft object.
+
+    Actions, float32 in [-1, 1]: with ``control_mode="pose_delta"`` (x, y, z, yaw, gripper) steps of the tool, with
+    ``"joint_delta"`` seven joint steps and the gripper; the gripper entry is +1 open, -1 squeeze with full force.
+
+    Observations by ``obs_type``:
+
+    - ``"state"``: float32 vector: proprioception (see below), object centre (3) and velocity (3), 16 surface points
+      (48), goal height (1).
+    - ``"pixels"``: uint8 image (image_size, image_size, 3) of the camera in front.
+    - ``"pixels_agent_pos"``: dict of ``pixels`` and ``agent_pos``, the proprioception: tool position (3) [m], cos and
+      sin of its yaw, opening [m], finger forces (2) [N], joint angles (7) [rad].
+
+    The reward is the sum of ``info["reward_terms"]``: ``reach`` (0..1, tool to object), ``grasp`` (0 or 0.5, both
+    fingers touch), ``lift`` (0..2, share of the goal height while grasped), ``hold`` (0 or 2, at the goal). ``info``
+    also holds ``is_success``, ``object_height`` [m], ``finger_force`` [N], ``youngs_modulus`` [Pa] and, when the episode
+    ended by failure, ``failure``: "dropped" or "diverged". ``solver_status`` carries the solver's flags.
+
+    ``reset`` takes ``options``: ``position`` (x, y) [m], ``yaw`` [rad], ``youngs_modulus`` [Pa]; what is not given is
+    drawn at random from the configured ranges.
+
+    Args:
+        obs_type: What ``reset`` and ``step`` return.
+        render_mode: "rgb_array" or None.
+        control_mode: What actions mean.
+        splat: Splat file of the object; None for the built-in plush.
+        size: Longest edge of the object [m].
+        config: Everything else.
+        device: Warp device.
+        progress: Reports the build of the object.
+
+    Raises:
+        ConfigError: If an option is unknown or out of range.
+        AssetError: If the splat file cannot be used.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012  (gymnasium's own convention)
+
+    def __init__(
+        self,
+        *,
+        obs_type: ObservationType = "state",
+        render_mode: str | None = None,
+        control_mode: Literal["pose_delta", "joint_delta"] | None = None,
+        splat: str | Path | None = None,
+        size: float | None = None,
+        config: LiftSoftConfig | None = None,
+        device: Any = None,
+        progress: Any = None,
+    ) -> None:
+        """Build the scene and the spaces."""
+        if obs_type not in get_args(ObservationType):
+            raise ConfigError(
+                f"obs_type is {obs_type!r}", hint=f"use one of {', '.join(map(repr, get_args(ObservationType)))}"
+            )
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ConfigError(f"render_mode is {render_mode!r}", hint="use 'rgb_array' or None")
+        self.config = _configured(config or LiftSoftConfig(), control_mode, splat, size)
+        self.obs_type, self.render_mode = obs_type, render_mode
+        self.metadata = {**self.metadata, "render_fps": round(self.config.scene.control_hz)}
+        cameras = []
+        if obs_type != "state":
+            cameras.append(_front_camera("pixels", self.config.image_size))
+        if render_mode == "rgb_array":
+            cameras += [_front_camera("front", self.config.render_size), _overview(self.config.render_size)]
+        self.scene = TableScene(self.config.scene, cameras=cameras, device=device, progress=progress)
+        actions = self.config.scene.control.action_size
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (actions,), np.float32)
+        self.observation_space = self._make_observation_space()
+        self._points = _spread(self.scene.soft.body.surface_points, POINT_COUNT)
+        self._rest_height = self.scene.soft.height
+        self._held = 0
+        self._youngs_modulus = self.config.scene.material.youngs_modulus
+
+    def _make_observation_space(self) -> gym.Space:
+        edge = self.config.image_size
+        pixels = gym.spaces.Box(0, 255, (edge, edge, 3), np.uint8)
+        agent = gym.spaces.Box(-np.inf, np.inf, (15,), np.float32)
+        if self.obs_type == "pixels":
+            return pixels
+        if self.obs_type == "pixels_agent_pos":
+            return gym.spaces.Dict({"pixels": pixels, "agent_pos": agent})
+        return gym.spaces.Box(-np.inf, np.inf, (15 + 7 + 3 * POINT_COUNT,), np.float32)
+
+    # -- episode ------------------------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Put the object somewhere else, the arm back home."""
+        super().reset(seed=seed)
+        config, random = self.config, self.np_random
+        x, y = self.config.scene.object_position
+        drawn = {
+            "position": np.array([x, y]) + random.uniform(-1.0, 1.0, 2) * config.position_range,
+            "yaw": random.uniform(-config.yaw_range, config.yaw_range),
+            "youngs_modulus": np.exp(random.uniform(*np.log(config.youngs_modulus_range))),
+        }
+        given = dict(options or {})
+        unknown = sorted(set(given) - set(drawn))
+        if unknown:
+            raise ConfigError(f"unknown reset options {unknown}", hint=f"use any of {sorted(drawn)}")
+        drawn.update(given)
+        position = np.asarray(drawn["position"], float)
+        if position.shape != (2,) or not np.isfinite(position).all():
+            raise ConfigError(f"position must be two finite numbers [m], got {drawn['position']!r}")
+        if not np.isfinite(drawn["yaw"]):
+            raise ConfigError(f"yaw must be finite [rad], got {drawn['yaw']!r}")
+        self._youngs_modulus = float(drawn["youngs_modulus"])
+        self._held = 0
+        self.scene.reset(
+            position=position[None],
+            yaw=np.array([drawn["yaw"]], float),
+            youngs_modulus=np.array([self._youngs_modulus]),
+        )
+        return self._observe(), self._info(self._reward_terms())
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Advance one control step."""
+        action = np.asarray(action, np.float32)
+        if action.shape != self.action_space.shape:
+            raise ConfigError(
+                f"action has shape {action.shape}, expected {self.action_space.shape}",
+                hint="give one number in [-1, 1] per entry of env.action_space",
+            )
+        if not np.isfinite(action).all():
+            raise ConfigError(f"action holds NaN or infinity: {action}", hint="check the policy that produced it")
+        self.scene.step(action[None])
+        at_goal = abs(self._height() - self.config.goal_height) <= self.config.goal_tolerance
+        self._held = self._held + 1 if at_goal and self._grasped() else 0
+        terms = self._reward_terms()
+        info = self._info(terms)
+        failure = self._failure()
+        if failure:
+            info["failure"] = failure
+        return self._observe(), float(sum(terms.values())), failure is not None, False, info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return the view of the camera in front beside an overview, uint8 (render_size, 2 render_size, 3)."""
+        if self.render_mode is None:
+            return None
+        edge = self.config.render_size
+        camera = self.scene.render((edge, edge))
+        return np.concatenate([camera.images("front").numpy()[0], camera.images("overview").numpy()[0]], axis=1)
+
+    # -- parts --------------------------------------------------------------------------------------------------------
+
+    def _height(self) -> float:
+        """Rise of the object's centre of mass above where it rests [m]."""
+        return float(self.scene.object_position.numpy()[0, 2]) - self._rest_height
+
+    def _finger_force(self) -> NDArray[np.float32]:
+        """Size of the contact force on each finger [N], shape (2,)."""
+        return np.linalg.norm(self.scene.finger_force.numpy()[0], axis=1).astype(np.float32)
+
+    def _grasped(self) -> bool:
+        """Whether both fingers feel the object."""
+        return bool((self._finger_force() > 0.02).all())
+
+    def _failure(self) -> str | None:
+        """Name the failure that ends the episode, if any."""
+        if self.scene.status[0] & kernels.WORLD_NOT_FINITE:
+            return "diverged"
+        if not self._height() > -0.05:
+            return "dropped"
+        return None
+
+    def _reward_terms(self) -> dict[str, float]:
+        """Compute the terms of the reward."""
+        tool = self.scene.controller.tool_pose.numpy()[0, :3]
+        reach = 1.0 - np.tanh(10.0 * np.linalg.norm(tool - self.scene.object_position.numpy()[0]))
+        grasped = self._grasped()
+        lift = float(np.clip(self._height() / self.config.goal_height, 0.0, 1.0)) if grasped else 0.0
+        return {
+            "reach": float(reach),
+            "grasp": 0.5 * grasped,
+            "lift": 2.0 * lift,
+            "hold": 2.0 * (self._held > 0),
+        }
+
+    def _info(self, terms: dict[str, float]) -> dict[str, Any]:
+        return {
+            "is_success": self._held >= self.config.hold_steps,
+            "reward_terms": terms,
+            "object_height": self._height(),
+            "finger_force": self._finger_force(),
+            "youngs_modulus": self._youngs_modulus,
+            "solver_status": int(self.scene.status[0]),
+        }
+
+    def _agent_pos(self) -> NDArray[np.float32]:
+        """Return the proprioception."""
+        scene = self.scene
+        pose = scene.controller.tool_pose.numpy()[0]
+        x, y, z, w = pose[3:]
+        forward = np.array([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + z * w)])  # tool x axis on the table
+        heading = -forward / max(float(np.linalg.norm(forward)), 1e-9)
+        coord = scene.arm.coord_start
+        joints = scene.state.joint_q.numpy()[coord : coord + 7]
+        opening = scene.controller.opening.numpy()[0]
+        parts = [pose[:3], heading, [opening], self._finger_force(), joints]
+        return np.concatenate(parts).astype(np.float32)
+
+    def _observe(self) -> Any:
+        """Return the observation of the chosen type, in arrays of its own."""
+        if self.obs_type == "state":
+            scene = self.scene
+            start = int(scene.model.softmode.particle_start.numpy()[0])
+            points = scene.state.particle_q.numpy()[start + self._points]
+            parts = [
+                self._agent_pos(),
+                scene.object_position.numpy()[0],
+                scene.object_velocity.numpy()[0],
+                points.ravel(),
+                [self.config.goal_height],
+            ]
+            return np.concatenate(parts).astype(np.float32)
+        edge = self.config.image_size
+        pixels = self.scene.render((edge, edge)).images("pixels").numpy()[0].copy()
+        if self.obs_type == "pixels":
+            return pixels
+        return {"pixels": pixels, "agent_pos": self._agent_pos()}
+
+
+def _configured(
+    config: LiftSoftConfig, control_mode: str | None, splat: str | Path | None, size: float | None
+) -> LiftSoftConfig:
+    """Return the configuration with the constructor's shortcuts applied."""
+    scene = config.scene
+    if control_mode is not None:
+        scene = replace(scene, control=replace(scene.control, mode=control_mode))
+    if splat is not None or size is not None:
+        thing = scene.object
+        scene = replace(scene, object=replace(thing, splat=splat or thing.splat, size=size or thing.size))
+    return replace(config, scene=scene)
+
+
+def _front_camera(name: str, edge: int) -> PinholeCamera:
+    """Return the camera that looks at the object from the front."""
+    return PinholeCamera.look_at(
+        name, position=(0.98, 0.30, 0.30), target=(0.45, 0.0, 0.115), width=edge, height=edge, fov_y=0.56
+    )
+
+
+def _overview(edge: int) -> PinholeCamera:
+    """Return the camera that sees arm and table."""
+    return PinholeCamera.look_at(
+        "overview", position=(1.12, -0.80, 0.62), target=(0.30, 0.0, 0.23), width=edge, height=edge, fov_y=0.68
+    )
+
+
+def _spread(points: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    """Choose ``count`` points far from each other, the first one first (farthest point sampling)."""
+    chosen = [0]
+    distance = np.linalg.norm(points - points[0], axis=1)
+    for _ in range(count - 1):
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.array(chosen)

@@ -1,0 +1,417 @@
+"""ReducedBody: orthonormal functions, affine closure, files, fingerprints, the cache."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import multiprocessing
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from softmode.deformables.body import (
+    BuildOptions,
+    ReducedBody,
+    build_body,
+    cache_directory,
+    cached_body,
+    fingerprint_of,
+)
+from softmode.deformables.quadrature import (
+    Quadrature,
+    quadrature_from_box,
+    quadrature_from_capsule,
+    quadrature_from_sphere,
+)
+from softmode.errors import AssetError, BasisError, ConfigError, MaterialError
+
+SMALL = BuildOptions(mode_count=4, kernel_count=80, cubature_count=48)
+
+
+def small_quadrature() -> Quadrature:
+    """Return a capsule coarse enough to build in a tenth of a second."""
+    return quadrature_from_capsule(0.02, 0.02, point_count=600, surface_count=60)
+
+
+@pytest.fixture(scope="module")
+def quadrature() -> Quadrature:
+    """Return the capsule once for the module."""
+    return small_quadrature()
+
+
+@pytest.fixture(scope="module")
+def body(quadrature: Quadrature) -> ReducedBody:
+    """Return the capsule's body once for the module."""
+    return build_body(quadrature, SMALL, name="capsule")
+
+
+@pytest.fixture(scope="module", params=["box", "sphere"])
+def default(request) -> tuple[Quadrature, ReducedBody]:
+    """Bodies built with the default options."""
+    found = quadrature_from_box((0.06, 0.05, 0.04)) if request.param == "box" else quadrature_from_sphere(0.03)
+    return found, build_body(found)
+
+
+def same(a: ReducedBody, b: ReducedBody, *, skip: tuple[str, ...] = ()) -> None:
+    """Assert bitwise equality of all fields."""
+    for f in dataclasses.fields(a):
+        if f.name in skip:
+            continue
+        x, y = getattr(a, f.name), getattr(b, f.name)
+        if isinstance(x, np.ndarray):
+            assert x.dtype == y.dtype, f.name
+            np.testing.assert_array_equal(x, y, err_msg=f.name)
+        else:
+            assert x == y, f.name
+
+
+def test_functions_are_mass_orthonormal(default) -> None:
+    """(1/V) sum V_p b_k b_l = delta_kl; the mean of b is (1, 0, 0, ...); the origin is the centre of mass."""
+    quadrature, body = default
+    value, _ = body.evaluate(quadrature.points - body.offset)
+    share = quadrature.weights / quadrature.volume
+    assert np.abs((value * share[:, None]).T @ value - np.eye(body.function_count)).max() < 1e-10
+    np.testing.assert_allclose(share @ value, body.mean_basis, atol=1e-10)
+    assert np.abs(share @ (quadrature.points - body.offset)).max() < 1e-12
+
+
+def test_affine_closure(default) -> None:
+    """x(X) = A X + t to 1e-10 of the size for 100 random maps, inside, on the surface, and far outside; F = A."""
+    quadrature, body = default
+    rng = np.random.default_rng(1)
+    far = 10.0 * body.surface_points
+    points = np.concatenate([quadrature.points - body.offset, body.surface_points, far])
+    value, gradient = body.evaluate(points)
+    for _ in range(100):
+        matrix, shift = rng.normal(size=(3, 3)), rng.normal(size=3)
+        q = body.affine(matrix, shift)
+        size = np.abs(points @ matrix.T).max() + np.abs(shift).max()
+        assert np.abs(points + value @ q - (points @ matrix.T + shift)).max() < 1e-10 * size
+        deformation = np.eye(3) + np.einsum("ki,pkj->pij", q, gradient)
+        assert np.abs(deformation - matrix).max() < 1e-10
+    stored = np.eye(3) + np.einsum("ki,pkj->pij", body.affine(matrix, shift), body.grad_basis)
+    assert np.abs(stored - matrix).max() < 1e-5, "float32 storage"
+    surface = body.surface_points + body.surface_basis @ body.affine(matrix, shift)
+    assert np.abs(surface - (body.surface_points @ matrix.T + shift)).max() < 1e-6 * size
+
+
+def test_linear_coordinates(default) -> None:
+    """sum_k b_k c_kj = (X, Y, Z, 1)_j."""
+    quadrature, body = default
+    points = quadrature.points - body.offset
+    value, _ = body.evaluate(points)
+    expected = np.column_stack([points, np.ones(len(points))])
+    assert np.abs(value @ body.linear_coordinates - expected).max() < 1e-12
+
+
+def test_gradients_match_finite_differences(body: ReducedBody) -> None:
+    """Grad b_k by central differences of step 1e-6 L, to 1e-6 of the largest gradient."""
+    points = body.points[::5]
+    _, gradient = body.evaluate(points)
+    step = 1e-6 * body.length
+    for d in range(3):
+        shift = step * np.eye(3)[d]
+        difference = (body.evaluate(points + shift)[0] - body.evaluate(points - shift)[0]) / (2.0 * step)
+        assert np.abs(difference - gradient[:, :, d]).max() < 1e-6 * np.abs(gradient).max()
+
+
+def test_volume_counts_and_shapes(default) -> None:
+    """Cubature weights are positive and sum to the volume; counts agree; the force error is under 1 %."""
+    quadrature, body = default
+    body.check()
+    assert body.weights.sum() == pytest.approx(quadrature.volume, rel=1e-12)
+    assert (body.weights > 0.0).all()
+    assert body.point_count == BuildOptions().cubature_count
+    assert body.surface_count == len(quadrature.surface_points)
+    assert body.mode_count == 8
+    assert body.function_count <= 36
+    error = body.provenance["cubature_force_error"]
+    assert isinstance(error, float) and error < 0.01
+    np.testing.assert_allclose(body.bounds + body.offset, quadrature.bounds, atol=1e-15)
+
+
+def test_symmetric_object_drops_repeated_functions() -> None:
+    """On a sphere x W_y = y W_x: the rank check removes the repeats, on a box with three unequal edges nothing."""
+    sphere = build_body(quadrature_from_sphere(0.03))
+    box = build_body(quadrature_from_box((0.06, 0.05, 0.04)))
+    assert sphere.function_count < 32
+    assert box.function_count == 36
+
+
+def test_rest_stiffness_is_ordered(body: ReducedBody, quadrature: Quadrature) -> None:
+    """Beyond the affine ones, sum V grad b_k . grad b_l is diagonal and ascending."""
+    _, gradient = body.evaluate(quadrature.points - body.offset)
+    energy = np.einsum("p,pkj,plj->kl", quadrature.weights / quadrature.volume, gradient, gradient)[4:, 4:]
+    assert np.abs(energy - np.diag(np.diag(energy))).max() < 1e-8 * energy.max()
+    assert (np.diff(np.diag(energy)) > -1e-8 * energy.max()).all()
+
+
+def test_density_moves_the_frame(quadrature: Quadrature) -> None:
+    """The origin is the centre of mass, and orthonormality holds with the density."""
+    density = np.where(quadrature.points[:, 2] > 0.0, 3.0, 1.0)
+    body = build_body(quadrature, SMALL, density_scale=density)
+    mass = quadrature.weights * density / (quadrature.weights @ density)
+    np.testing.assert_allclose(body.offset, mass @ quadrature.points, atol=1e-15)
+    value, _ = body.evaluate(quadrature.points - body.offset)
+    assert np.abs((value * mass[:, None]).T @ value - np.eye(body.function_count)).max() < 1e-10
+    np.testing.assert_allclose(mass @ value, body.mean_basis, atol=1e-10)
+
+
+def test_stiffness_field_reaches_the_points(quadrature: Quadrature) -> None:
+    """Cubature points carry the relative modulus of the quadrature point they are."""
+    stiff = np.linspace(1.0, 2.0, len(quadrature.points))
+    body = build_body(quadrature, SMALL, stiffness_scale=stiff)
+    index = np.array([np.abs(quadrature.points - body.offset - p).sum(axis=1).argmin() for p in body.points])
+    np.testing.assert_array_equal(body.stiffness_scale, stiff[index])
+
+
+@pytest.mark.parametrize("field", ["stiffness_scale", "density_scale"])
+@pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])
+def test_bad_fields_are_refused(quadrature: Quadrature, field: str, bad: float) -> None:
+    """Zero, negative, NaN and infinite scales raise MaterialError naming the field and the row."""
+    value = np.ones(len(quadrature.points))
+    value[7] = bad
+    with pytest.raises(MaterialError, match=f"{field}: .* at row 7"):
+        build_body(quadrature, SMALL, **{field: value})
+    with pytest.raises(MaterialError, match=field):
+        build_body(quadrature, SMALL, **{field: np.ones(3)})
+
+
+def test_bad_options_are_refused() -> None:
+    """Counts out of range raise ConfigError."""
+    for options in ({"mode_count": 0}, {"kernel_count": 8}, {"cubature_count": 3}):
+        with pytest.raises(ConfigError, match=next(iter(options))):
+            BuildOptions(**options)
+
+
+def test_object_without_volume_is_refused(quadrature: Quadrature) -> None:
+    """A quadrature with too few points or zero weights cannot be made."""
+    with pytest.raises(AssetError, match="no volume"):
+        dataclasses.replace(quadrature, weights=np.zeros_like(quadrature.weights))
+    with pytest.raises(AssetError, match="no volume"):
+        dataclasses.replace(quadrature, points=quadrature.points[:2], weights=quadrature.weights[:2])
+    with pytest.raises(AssetError, match="points: not all finite"):
+        dataclasses.replace(quadrature, points=quadrature.points * np.nan)
+
+
+def test_evaluate_outside(body: ReducedBody) -> None:
+    """Beyond reach the non-affine functions are constant along rays, or refused; NaN is refused."""
+    far = np.array([[0.0, 0.0, 0.2], [0.0, 0.0, 0.4]])
+    value, gradient = body.evaluate(far)
+    assert not body.covers(far).any() and body.covers(body.points).all() and body.covers(body.surface_points).all()
+    inside = np.abs(body.evaluate(body.surface_points)[0]).max()
+    assert np.abs(value[:, 4:]).max() < 4.0 * inside
+    assert not gradient[:, 4:].any()
+    with pytest.raises(BasisError, match="2 of 2 lie outside"):
+        body.evaluate(far, outside="raise")
+    with pytest.raises(BasisError, match="finite"):
+        body.evaluate(np.array([[np.nan, 0.0, 0.0]]))
+    assert body.evaluate(np.zeros((0, 3)))[0].shape == (0, body.function_count)
+
+
+def test_two_builds_are_bitwise_equal(body: ReducedBody) -> None:
+    """From the asset on, one seed gives one body; only the clock differs."""
+    again = build_body(small_quadrature(), SMALL, name="capsule")
+    times = {k for k in body.provenance if k.startswith("seconds_")}
+    assert {k: v for k, v in again.provenance.items() if k not in times} == {
+        k: v for k, v in body.provenance.items() if k not in times
+    }
+    same(body, again, skip=("provenance", "build_seconds"))
+
+
+def test_fingerprint_follows_every_input(quadrature: Quadrature, body: ReducedBody) -> None:
+    """Name, options, fields and one ulp of a point change it."""
+    points = quadrature.points.copy()
+    points[0, 0] = np.nextafter(points[0, 0], 1.0)
+    found = {
+        body.fingerprint,
+        build_body(quadrature, SMALL, name="other").fingerprint,
+        build_body(quadrature, dataclasses.replace(SMALL, seed=1), name="capsule").fingerprint,
+        build_body(quadrature, dataclasses.replace(SMALL, mode_count=5), name="capsule").fingerprint,
+        build_body(dataclasses.replace(quadrature, points=points), SMALL, name="capsule").fingerprint,
+        build_body(quadrature, SMALL, name="capsule", density_scale=1.0 + points[:, 0]).fingerprint,
+    }
+    assert len(found) == 6
+    assert all(len(f) == 64 for f in found)
+
+
+def test_fingerprint_of_tells_values_apart(tmp_path: Path) -> None:
+    """Types, shapes, nesting and file contents all count; unknown objects are refused."""
+    file = tmp_path / "asset"
+    file.write_bytes(b"one")
+    keys = [1, 1.0, True, "1", None, b"1", [1], [[1]], (1, 1), {"a": 1}, {"b": 1}, np.ones(1), np.ones((1, 1)), file]
+    prints = [fingerprint_of(k) for k in keys] + [fingerprint_of(1, 1), fingerprint_of("a", "b"), fingerprint_of("ab")]
+    file.write_bytes(b"two")
+    prints.append(fingerprint_of(file))
+    assert len(set(prints)) == len(prints)
+    assert fingerprint_of({"a": 1, "b": 2}) == fingerprint_of({"b": 2, "a": 1})
+    with pytest.raises(ConfigError, match="fingerprint"):
+        fingerprint_of(object())
+
+
+def test_file_round_trip_is_exact(body: ReducedBody, tmp_path: Path) -> None:
+    """Save and load give every field back, bit by bit, and leave no other file behind."""
+    path = tmp_path / "deep" / "body.npz"
+    body.save(path)
+    body.save(path)
+    same(body, ReducedBody.load(path))
+    assert [p.name for p in path.parent.iterdir()] == ["body.npz"]
+    with np.load(path, allow_pickle=False) as file:
+        assert all(file[k].dtype.kind in "fu" for k in file.files)
+
+
+def test_failed_save_leaves_the_old_file(body: ReducedBody, tmp_path: Path, monkeypatch) -> None:
+    """An interrupted write neither harms the target nor leaves rubbish."""
+    path = tmp_path / "body.npz"
+    body.save(path)
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("os.replace", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        body.save(path)
+    assert [p.name for p in tmp_path.iterdir()] == ["body.npz"]
+    same(body, ReducedBody.load(path))
+
+
+def test_foreign_and_old_files_are_refused(body: ReducedBody, tmp_path: Path) -> None:
+    """Missing, foreign, old and inconsistent files raise AssetError that names the file."""
+    path = tmp_path / "body.npz"
+
+    def rejects(match: str) -> None:
+        with pytest.raises(AssetError, match=match) as caught:
+            ReducedBody.load(path)
+        assert "body.npz" in str(caught.value) and caught.value.hint
+
+    rejects("does not exist")
+    path.write_bytes(b"")
+    rejects("damaged")
+    path.write_text("not an archive")
+    rejects("damaged")
+    np.savez(path, x=np.ones(3))
+    rejects("not a softmode body")
+    np.savez(path, x=np.array([object()], dtype=object), allow_pickle=True)
+    rejects("damaged|not a softmode body")
+    body.save(path)
+    with np.load(path) as file:
+        stored = {k: file[k] for k in file.files}
+
+    def rewrite(header_change: dict, **arrays) -> None:
+        header = {**json.loads(stored["header"].tobytes()), **header_change}
+        np.savez(path, **{**stored, **arrays, "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)})
+
+    rewrite({"version": 999})
+    rejects("version 999")
+    rewrite({"format": "other"})
+    rejects("not a softmode body")
+    rewrite({}, points=stored["points"][:-1])
+    rejects("points|weights")
+    rewrite({}, weights=stored["weights"] * 2.0)
+    rejects("weights")
+    rewrite({}, radii=stored["radii"] * np.nan)
+    rejects("radii: not all finite")
+    rewrite({"volume": "large"})
+    rejects("volume")
+    np.savez(path, **{k: v for k, v in stored.items() if k != "points"})
+    rejects("points")
+
+
+@given(position=st.floats(0.0, 1.0), change=st.integers(1, 255), cut=st.booleans())
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_damaged_bytes_never_pass_silently(body: ReducedBody, tmp_path: Path, position, change, cut) -> None:
+    """A flipped byte or a truncation raises AssetError, or hits a byte that carries no data; nothing else."""
+    path = tmp_path / "body.npz"
+    body.save(path)
+    data = bytearray(path.read_bytes())
+    at = min(int(position * len(data)), len(data) - 1)
+    if cut:
+        data = data[:at]
+    else:
+        data[at] ^= change
+    path.write_bytes(bytes(data))
+    try:
+        found = ReducedBody.load(path)
+    except AssetError:
+        return
+    same(body, found)
+
+
+def test_cache_builds_once(body: ReducedBody, tmp_path: Path, monkeypatch) -> None:
+    """A second call loads; another key builds; SOFTMODE_CACHE moves the folder."""
+    monkeypatch.setenv("SOFTMODE_CACHE", str(tmp_path))
+    calls = []
+
+    def build() -> ReducedBody:
+        calls.append(1)
+        return body
+
+    same(cached_body(("a", 1), build), body)
+    same(cached_body(("a", 1), build), body)
+    assert len(calls) == 1
+    cached_body(("a", 2), build)
+    assert len(calls) == 2
+    assert cache_directory() == tmp_path
+    assert len(list((tmp_path / "bodies").glob("*.npz"))) == 2
+
+
+def test_damaged_cache_entry_is_rebuilt(body: ReducedBody, tmp_path: Path) -> None:
+    """Rubbish under the right name is replaced."""
+    cached_body(("k",), lambda: body, directory=tmp_path)
+    entry = next(tmp_path.glob("*.npz"))
+    entry.write_bytes(entry.read_bytes()[:1000])
+    same(cached_body(("k",), lambda: body, directory=tmp_path), body)
+    same(ReducedBody.load(entry), body)
+
+
+def test_failed_build_is_not_cached(body: ReducedBody, tmp_path: Path) -> None:
+    """An exception of the build passes through, releases the lock and leaves no entry."""
+
+    def fail() -> ReducedBody:
+        raise AssetError("no volume")
+
+    with pytest.raises(AssetError, match="no volume"):
+        cached_body(("k",), fail, directory=tmp_path)
+    assert not list(tmp_path.glob("*.npz"))
+    same(cached_body(("k",), lambda: body, directory=tmp_path), body)
+
+
+def _race(source: Path, folder: Path, log: Path) -> None:
+    def build() -> ReducedBody:
+        with open(log, "ab") as file:
+            file.write(b"x")
+        time.sleep(0.3)
+        return ReducedBody.load(source)
+
+    cached_body(("race",), build, directory=folder)
+
+
+def test_ten_processes_build_once(body: ReducedBody, tmp_path: Path) -> None:
+    """Ten processes that ask at the same time cause one build, and all succeed."""
+    source, folder, log = tmp_path / "source.npz", tmp_path / "cache", tmp_path / "log"
+    body.save(source)
+    context = multiprocessing.get_context("fork")
+    workers = [context.Process(target=_race, args=(source, folder, log)) for _ in range(10)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join(60)
+    assert [worker.exitcode for worker in workers] == [0] * 10
+    assert log.read_bytes() == b"x"
+    same(ReducedBody.load(next(folder.glob("*.npz"))), body)
+
+
+def test_progress_is_reported(quadrature: Quadrature, capsys) -> None:
+    """A callable receives ascending fractions that end at 1; False prints nothing; True draws a bar on stderr."""
+    seen: list[tuple[str, float]] = []
+    build_body(quadrature, SMALL, progress=lambda stage, fraction: seen.append((stage, fraction)))
+    fractions = [f for _, f in seen]
+    assert fractions == sorted(fractions) and fractions[-1] == 1.0
+    build_body(quadrature, SMALL, progress=False)
+    assert capsys.readouterr().err == ""
+    build_body(quadrature, SMALL, name="bar", progress=True)
+    assert "build bar" in capsys.readouterr().err

@@ -1,0 +1,118 @@
+"""Cubature: exact volume, non-negative weights, small force error on poses it has not seen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from softmode.deformables import cubature
+from softmode.deformables.body import BuildOptions, build_body
+from softmode.deformables.cubature import select_cubature
+from softmode.deformables.materials import MaterialModel
+from softmode.deformables.quadrature import quadrature_from_box
+from softmode.errors import BasisError, ConfigError
+from tests.reference import lame, stress
+
+LENGTH = 0.05
+
+
+@pytest.fixture(scope="module")
+def full() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, weights and basis gradients of a box on the full quadrature."""
+    quadrature = quadrature_from_box((0.06, 0.05, 0.04))
+    body = build_body(quadrature, BuildOptions(cubature_count=None))
+    return quadrature.points, quadrature.weights, body.grad_basis.astype(np.float64)
+
+
+def reduced_force(weights: np.ndarray, grad_basis: np.ndarray, stretch: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """f_k = sum_p w_p P(F_p) grad b_k with F = A (I + sum_k q_k grad b_k^T)."""
+    deformation = stretch @ (np.eye(3) + np.einsum("ki,pkj->pij", q, grad_basis, optimize=True))
+    found = stress(MaterialModel.STABLE_NEO_HOOKEAN_LOG, deformation, *lame(1.0, 0.4))
+    return np.einsum("p,pij,pkj->ki", weights, found, grad_basis, optimize=True)
+
+
+def test_stress_is_that_of_the_reference() -> None:
+    """The vectorised stress agrees with the readable twin for random deformations, inverted ones included."""
+    f = np.random.default_rng(0).normal(size=(20, 3, 3)) + np.eye(3)
+    found = cubature._stress(np.moveaxis(f, 0, 2))
+    expected = stress(MaterialModel.STABLE_NEO_HOOKEAN_LOG, f, *lame(1.0, cubature.POISSON_RATIO))
+    np.testing.assert_allclose(np.moveaxis(found, 2, 0), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_volume_weights_and_count(full) -> None:
+    """Weights are positive and sum to the volume; no point is taken twice."""
+    _, weights, gradient = full
+    found = select_cubature(weights, gradient, 100)
+    assert len(found.index) == len(np.unique(found.index)) == 100
+    assert (found.weights > 0.0).all()
+    assert abs(found.weights.sum() / weights.sum() - 1.0) < 1e-14
+
+
+def test_force_error_on_unseen_large_deformations(full) -> None:
+    """At 256 points the reduced force under random large deformations equals that of all points to 1 % rms."""
+    _, weights, gradient = full
+    found = select_cubature(weights, gradient, 256)
+    slope = np.sqrt(np.einsum("p,pkj->k", weights / weights.sum(), gradient**2))
+    rng = np.random.default_rng(77)
+    errors = []
+    for k in range(10):
+        rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        stretch = rotation * np.sign(np.linalg.det(rotation)) @ np.diag(rng.uniform(0.7, 1.5, size=3))
+        q = np.zeros((len(slope), 3))
+        q[4:] = rng.normal(size=(len(slope) - 4, 3)) / slope[4:, None] ** (1 + k % 2)
+        q *= rng.uniform(0.1, 0.35) / np.linalg.norm(q * slope[:, None])
+        exact = reduced_force(weights, gradient, stretch, q)[1:] / slope[1:, None]
+        few = reduced_force(found.weights, gradient[found.index], stretch, q)[1:] / slope[1:, None]
+        errors.append(np.linalg.norm(few - exact) / np.linalg.norm(exact))
+    assert np.sqrt(np.mean(np.square(errors))) < 0.01
+    assert found.force_error < 0.01
+
+
+def test_more_points_are_better_and_reported(full) -> None:
+    """The reported trade-off falls with the count, and its entry is what a choice of that size reports."""
+    _, weights, gradient = full
+    found = select_cubature(weights, gradient, 192)
+    assert sorted(found.trade_off) == [32, 64, 96, 128, 192]
+    errors = [found.trade_off[k] for k in sorted(found.trade_off)]
+    assert (np.diff(errors) < 0.0).all()
+    assert found.trade_off[192] == found.force_error
+    assert select_cubature(weights, gradient, 64).force_error == found.trade_off[64]
+
+
+def test_homogeneous_stretch_keeps_its_force(full) -> None:
+    """Sum w grad b is fitted directly, so the force of a uniform strain is better than the general error."""
+    _, weights, gradient = full
+    found = select_cubature(weights, gradient, 256)
+    exact = np.einsum("p,pkj->kj", weights, gradient)
+    few = np.einsum("p,pkj->kj", found.weights, gradient[found.index])
+    assert np.linalg.norm(few - exact) < 0.01 * np.linalg.norm(exact)
+
+
+def test_heterogeneous_modulus_is_weighed(full) -> None:
+    """With a stiff inclusion the force error stays small and the volume exact."""
+    points, weights, gradient = full
+    modulus = np.where(np.linalg.norm(points, axis=1) < 0.015, 20.0, 1.0)
+    found = select_cubature(weights, gradient, 256, stiffness_scale=modulus)
+    assert found.force_error < 0.02
+    assert abs(found.weights.sum() / weights.sum() - 1.0) < 1e-14
+
+
+def test_deterministic_and_seeded(full) -> None:
+    """One seed gives bitwise one result; another seed another choice."""
+    _, weights, gradient = full
+    first, again, other = (select_cubature(weights, gradient, 64, seed=s) for s in (0, 0, 1))
+    np.testing.assert_array_equal(first.index, again.index)
+    np.testing.assert_array_equal(first.weights, again.weights)
+    assert not np.array_equal(first.index, other.index)
+
+
+def test_all_points_and_bad_input(full) -> None:
+    """A count beyond P keeps everything; too few points and NaN gradients raise."""
+    _, weights, gradient = full
+    everything = select_cubature(weights, gradient, 10**6)
+    np.testing.assert_array_equal(everything.weights, weights)
+    assert everything.force_error == 0.0
+    with pytest.raises(ConfigError, match="cubature_count"):
+        select_cubature(weights, gradient, 4)
+    with pytest.raises(BasisError, match="grad_basis"):
+        select_cubature(weights, np.full_like(gradient, np.nan), 16)

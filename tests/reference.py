@@ -1,0 +1,215 @@
+"""Readable float64 twins of the device code, in NumPy: what a kernel computes, without how it does it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from softmode.deformables.body import ReducedBody
+from softmode.deformables.materials import Material, MaterialModel
+
+I3 = np.eye(3)
+TRANSPOSE = np.einsum("il,jk->ijkl", I3, I3)
+"""dF^T/dF."""
+
+
+def lame(youngs_modulus: float, poissons_ratio: float) -> tuple[float, float]:
+    """Return mu = E / (2 (1 + nu)) and lambda = E nu / ((1 + nu) (1 - 2 nu)) [Pa]."""
+    e, nu = youngs_modulus, poissons_ratio
+    return e / (2.0 * (1.0 + nu)), e * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
+
+
+def hooke(mu: float, lam: float) -> np.ndarray:
+    """Return dP/dF (3, 3, 3, 3) of Hooke's law: mu (dF + dF^T) + lambda tr(dF) I."""
+    identity = np.einsum("ik,jl->ijkl", I3, I3)
+    return mu * (identity + TRANSPOSE) + lam * np.einsum("ij,kl->ijkl", I3, I3)
+
+
+def cofactor(F: np.ndarray) -> np.ndarray:
+    """Return cof F = dJ/dF, row i the cross product of the other two rows."""
+    return np.stack([np.cross(F[..., (i + 1) % 3, :], F[..., (i + 2) % 3, :]) for i in range(3)], axis=-2)
+
+
+LEVI_CIVITA = np.zeros((3, 3, 3))
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    LEVI_CIVITA[_i, _j, _k], LEVI_CIVITA[_i, _k, _j] = 1.0, -1.0
+
+
+def cofactor_derivative(F: np.ndarray) -> np.ndarray:
+    """Return d(cof F)_ij / dF_kl = eps_ikm eps_jln F_mn."""
+    return np.einsum("ikm,jln,...mn->...ijkl", LEVI_CIVITA, LEVI_CIVITA, F)
+
+
+def _constants(model: MaterialModel, mu: float, lam: float) -> tuple[float, float, float, float]:
+    """Return (a, l, J0, c) of a/2 (I_C - 3) + l/2 [(J - J0)^2 - (1 - J0)^2] - c/2 ln((I_C + 1)/4)."""
+    if model == MaterialModel.STABLE_NEO_HOOKEAN:
+        return mu, lam + mu, 1.0 + mu / (lam + mu), 0.0
+    m, l = 4.0 / 3.0 * mu, lam + 5.0 / 6.0 * mu
+    return m, l, 1.0 + m / l - m / (4.0 * l), m
+
+
+def energy(model: MaterialModel, F: np.ndarray, mu: float, lam: float) -> np.ndarray:
+    """Return Psi(F) [J/m^3]."""
+    a, l, j0, c = _constants(model, mu, lam)
+    ic, j = (F * F).sum(axis=(-2, -1)), np.linalg.det(F)
+    return a / 2 * (ic - 3) + l / 2 * ((j - j0) ** 2 - (1 - j0) ** 2) - c / 2 * np.log((ic + 1) / 4)
+
+
+def stress(model: MaterialModel, F: np.ndarray, mu: float, lam: float) -> np.ndarray:
+    """Return P = dPsi/dF [Pa]."""
+    a, l, j0, c = _constants(model, mu, lam)
+    ic, j = (F * F).sum(axis=(-2, -1))[..., None, None], np.linalg.det(F)[..., None, None]
+    return (a - c / (ic + 1)) * F + l * (j - j0) * cofactor(F)
+
+
+def hessian(model: MaterialModel, F: np.ndarray, mu: float, lam: float) -> np.ndarray:
+    """Return dP/dF (..., 3, 3, 3, 3) [Pa], not projected."""
+    a, l, j0, c = _constants(model, mu, lam)
+    shape = (..., None, None, None, None)
+    ic, j = (F * F).sum(axis=(-2, -1))[shape], np.linalg.det(F)[shape]
+    g = cofactor(F)
+    return (
+        (a - c / (ic + 1)) * np.einsum("ik,jl->ijkl", I3, I3)
+        + 2 * c / (ic + 1) ** 2 * np.einsum("...ij,...kl->...ijkl", F, F)
+        + l * np.einsum("...ij,...kl->...ijkl", g, g)
+        + l * (j - j0) * cofactor_derivative(F)
+    )
+
+
+def projected(H: np.ndarray) -> np.ndarray:
+    """Return the nearest positive semidefinite 9x9 matrices."""
+    matrix = H.reshape(*H.shape[:-4], 9, 9)
+    value, vector = np.linalg.eigh(0.5 * (matrix + np.swapaxes(matrix, -1, -2)))
+    return (vector * np.maximum(value, 0.0)[..., None, :]) @ np.swapaxes(vector, -1, -2)
+
+
+def green_strain(F: np.ndarray) -> np.ndarray:
+    """Return (F^T F - I) / 2."""
+    return 0.5 * (np.swapaxes(F, -1, -2) @ F - I3)
+
+
+def viscous_energy(F: np.ndarray, F_start: np.ndarray, mu: float, viscosity: float, dt: float) -> np.ndarray:
+    """Return the dissipation potential of a step, mu tau / dt |E - E_n|^2 [J/m^3]."""
+    return mu * viscosity / dt * ((green_strain(F) - green_strain(F_start)) ** 2).sum(axis=(-2, -1))
+
+
+def viscous_stress(F: np.ndarray, F_start: np.ndarray, mu: float, viscosity: float, dt: float) -> np.ndarray:
+    """Return its derivative, 2 mu tau / dt F (E - E_n) [Pa]."""
+    return 2.0 * mu * viscosity / dt * F @ (green_strain(F) - green_strain(F_start))
+
+
+def viscous_hessian(F: np.ndarray, mu: float, viscosity: float, dt: float) -> np.ndarray:
+    """Return its Hessian at E = E_n, 2 mu tau / dt F sym(F^T dF), shape (..., 3, 3, 3, 3) [Pa]."""
+    left = np.einsum("...im,...km,jl->...ijkl", F, F, I3)
+    return mu * viscosity / dt * (left + np.einsum("...il,...kj->...ijkl", F, F))
+
+
+def normal_potential(penetration: np.ndarray, eps: float) -> np.ndarray:
+    """Return p^3 / (6 eps) up to p = eps and p^2/2 - eps p/2 + eps^2/6 beyond, 0 for p < 0."""
+    p = np.maximum(penetration, 0.0)
+    return np.where(p < eps, p**3 / (6 * eps), p * p / 2 - eps * p / 2 + eps * eps / 6)
+
+
+def friction_potential(y: np.ndarray, eps: float) -> np.ndarray:
+    """Return f0 of Li et al. 2020, eq. (13): its slope rises smoothly from 0 to 1 over the stick range eps."""
+    return np.where(y < eps, y * y / eps - y**3 / (3 * eps**2) + eps / 3, y)
+
+
+def distance_plane(x: np.ndarray) -> np.ndarray:
+    """Return the signed distance to z = 0."""
+    return x[..., 2]
+
+
+def distance_sphere(x: np.ndarray, radius: float) -> np.ndarray:
+    """Return the signed distance to a sphere."""
+    return np.linalg.norm(x, axis=-1) - radius
+
+
+def distance_capsule(x: np.ndarray, radius: float, half_height: float) -> np.ndarray:
+    """Return the signed distance to a capsule along Z."""
+    core = np.zeros_like(x)
+    core[..., 2] = np.clip(x[..., 2], -half_height, half_height)
+    return np.linalg.norm(x - core, axis=-1) - radius
+
+
+def _distance_to_extents(excess: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(np.maximum(excess, 0.0), axis=-1) + np.minimum(excess.max(axis=-1), 0.0)
+
+
+def distance_box(x: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Return the signed distance to a box."""
+    return _distance_to_extents(np.abs(x) - half)
+
+
+def distance_cylinder(x: np.ndarray, radius: float, half_height: float) -> np.ndarray:
+    """Return the signed distance to a cylinder along Z."""
+    return _distance_to_extents(
+        np.stack([np.hypot(x[..., 0], x[..., 1]) - radius, np.abs(x[..., 2]) - half_height], axis=-1)
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FreeBody:
+    """A free body and the incremental potential of one implicit Euler step, dense.
+
+    E(q) = m/(2 dt^2) |q - q_n - dt v_n|^2 + m alpha/(2 dt) |q - q_n|^2 + sum_p V_p Psi(F_p) - m sum_k bbar_k g . q_k
+    """
+
+    body: ReducedBody
+    material: Material
+    dt: float
+    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def mass(self) -> float:
+        """Mass [kg]."""
+        return self.material.density * self.body.volume
+
+    @property
+    def lame(self) -> tuple[float, float]:
+        """Lame's parameters [Pa]."""
+        return lame(self.material.youngs_modulus, self.material.poissons_ratio)
+
+    def deformation_gradient(self, q: np.ndarray) -> np.ndarray:
+        """Return F = I + sum_k q_k grad b_k^T at the cubature points, shape (P, 3, 3)."""
+        return I3 + np.einsum("kc,pkd->pcd", q, self.body.grad_basis.astype(float))
+
+    def elastic_energy(self, q: np.ndarray) -> float:
+        """Return sum_p V_p Psi(F_p) [J]."""
+        return float(self.body.weights @ energy(self.material.model, self.deformation_gradient(q), *self.lame))
+
+    def elastic_gradient(self, q: np.ndarray) -> np.ndarray:
+        """Return sum_p V_p P_p grad b_k [N], shape (n, 3)."""
+        P = stress(self.material.model, self.deformation_gradient(q), *self.lame)
+        return np.einsum("p,pcd,pkd->kc", self.body.weights, P, self.body.grad_basis.astype(float))
+
+    def residual(self, q: np.ndarray, q_start: np.ndarray, qd_start: np.ndarray) -> np.ndarray:
+        """Return dE/dq [N], shape (n, 3)."""
+        m, h, material = self.mass, self.dt, self.material
+        inertia = m / h**2 * (q - q_start - h * qd_start) + m * material.mass_damping / h * (q - q_start)
+        F, F_start = self.deformation_gradient(q), self.deformation_gradient(q_start)
+        P = viscous_stress(F, F_start, self.lame[0], material.viscosity, h)
+        viscous = np.einsum("p,pcd,pkd->kc", self.body.weights, P, self.body.grad_basis.astype(float))
+        return inertia + self.elastic_gradient(q) + viscous - m * np.outer(self.body.mean_basis, self.gravity)
+
+    def tangent(self, q: np.ndarray) -> np.ndarray:
+        """Return a positive definite approximation of d2E/dq2 [N/m], shape (3 n, 3 n), unknowns point-major."""
+        F = self.deformation_gradient(q)
+        C = projected(hessian(self.material.model, F, *self.lame)).reshape(-1, 3, 3, 3, 3)
+        C = C + viscous_hessian(F, self.lame[0], self.material.viscosity, self.dt)
+        grad = self.body.grad_basis.astype(float)
+        n = grad.shape[1]
+        K = np.einsum("p,pka,pcadb,plb->kcld", self.body.weights, grad, C, grad, optimize=True).reshape(3 * n, 3 * n)
+        return K + self.mass * (1.0 / self.dt + self.material.mass_damping) / self.dt * np.eye(3 * n)
+
+    def step(self, q_start: np.ndarray, qd_start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (q, qd) after one step of implicit Euler, solved to rounding by Newton."""
+        q = q_start + self.dt * qd_start
+        for _ in range(50):
+            r = self.residual(q, q_start, qd_start)
+            dq = -np.linalg.solve(self.tangent(q), r.ravel()).reshape(q.shape)
+            q = q + dq
+            if np.linalg.norm(dq) < 1e-14 * np.linalg.norm(self.body.bounds):
+                break
+        return q, (q - q_start) / self.dt
