@@ -8,9 +8,10 @@ BIN    := $(VENV)/bin
 UV     := $(BIN)/uv
 ARGS   ?=
 
-# The environment checker of stable-baselines3 imports torch; its CPU wheel (200 MB) is enough.
-TORCH       ?= torch==2.13.0
-TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+# The environment checker of stable-baselines3 imports torch; a CPU wheel (200 MB) is enough. Where pip's own settings find
+# no CPU wheel, the default one for Linux brings gigabytes of CUDA libraries: point PIP_EXTRA_INDEX_URL at PyTorch's index
+# of CPU wheels to avoid that.
+TORCH ?= torch==2.13.0
 
 # Compiled kernels and built bodies stay inside the checkout.
 export WARP_CACHE_PATH ?= $(CURDIR)/.cache/warp
@@ -20,7 +21,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 unexport VIRTUAL_ENV
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow lint bench clean
+.PHONY: help lock demo test test-slow lint bench clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -32,18 +33,23 @@ $(VENV)/.created:
 	$(BIN)/python -m pip install --quiet uv
 	@touch $@
 
-# `uv sync` installs what uv.lock pins; where its index is out of reach, pip resolves anew with the machine's own settings.
-$(VENV)/.demo: $(VENV)/.created pyproject.toml uv.lock
-	$(UV) sync --quiet --frozen --inexact --extra demo || $(BIN)/python -m pip install --quiet --editable '.[demo]'
+# constraints.txt pins every dependency, see `make lock`. uv is an order of magnitude faster than pip; where it cannot reach
+# an index, pip installs the same versions with the machine's own settings.
+INSTALL = $(UV) pip install --quiet --python $(BIN)/python --constraint constraints.txt
+
+$(VENV)/.demo: $(VENV)/.created pyproject.toml constraints.txt
+	$(INSTALL) --editable '.[demo]' || $(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[demo]'
 	@touch $@
 
-$(VENV)/.dev: $(VENV)/.created pyproject.toml uv.lock
-	$(UV) sync --quiet --frozen --inexact --extra dev || $(BIN)/python -m pip install --quiet --editable '.[dev]'
-	$(BIN)/python -c 'import torch' 2>/dev/null || \
-	  $(BIN)/python -m pip install --quiet --retries 1 --no-deps --index-url $(TORCH_INDEX) '$(TORCH)' || \
-	  $(BIN)/python -m pip install --quiet '$(TORCH)'
+$(VENV)/.dev: $(VENV)/.created pyproject.toml constraints.txt
+	$(INSTALL) --editable '.[dev]' || $(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[dev]'
+	$(BIN)/python -c 'import torch' 2>/dev/null || $(BIN)/python -m pip install --quiet '$(TORCH)'
 	$(BIN)/python -m pip install --quiet stable-baselines3
 	@touch $@ $(VENV)/.demo
+
+lock: $(VENV)/.created  ## pin the newest versions that pyproject.toml allows
+	$(UV) pip compile --quiet --universal --upgrade --python-version 3.11 --extra demo --extra dev --no-header \
+	  --no-annotate --no-emit-index-url pyproject.toml -o constraints.txt
 
 demo: $(VENV)/.demo  ## play the scripted lift and write out/lift.mp4
 	$(BIN)/softmode play softmode/LiftSoft-v0 --policy scripted --video out/lift.mp4 $(ARGS)

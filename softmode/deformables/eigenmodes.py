@@ -13,6 +13,7 @@ integers a, b, c.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,14 +57,13 @@ def solve_eigenmodes(
         ConfigError: If the kernels are too few for the modes asked for.
         BasisError: If the mass matrix is singular beyond repair.
     """
-    kernel_count = shape.value.shape[1]
+    kernel_count = int(shape.centre_count)
     if not 1 <= mode_count < kernel_count:
         raise ConfigError(f"mode_count: expected 1..{kernel_count - 1} for {kernel_count} kernels, got {mode_count}")
     root = np.sqrt(weights / weights.sum())
     mass = _gram(shape.value, root)
-    stiffness = sum(
-        _gram(g, root if stiffness_scale is None else root * np.sqrt(stiffness_scale)) for g in shape.gradient
-    )
+    stiff_root = root if stiffness_scale is None else root * np.sqrt(stiffness_scale)
+    stiffness = np.sum([_gram(g, stiff_root) for g in shape.gradient], axis=0)
     constant = np.ones(kernel_count)
     try:
         values, vectors = linalg.eigh(stiffness, mass, subset_by_index=[0, mode_count], check_finite=False)
@@ -90,5 +90,6 @@ def solve_eigenmodes(
 def _gram(matrix: object, root: Array) -> Array:
     """Return B^T B for B = diag(root) matrix, as a dense symmetric array."""
     scaled = matrix.multiply(root[:, None]).toarray(order="F")  # type: ignore[attr-defined]
-    upper = linalg.blas.dsyrk(1.0, scaled, trans=1)
+    dsyrk: Any = linalg.get_blas_funcs("syrk", (scaled,))
+    upper = dsyrk(1.0, scaled, trans=1)
     return np.triu(upper) + np.triu(upper, 1).T

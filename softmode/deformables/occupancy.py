@@ -188,11 +188,13 @@ def _fill_part(mean: Array, scale: Array, axes: Array, opacity: Array, resolutio
     chi = _solve_poisson(source)
     level = float(np.average(_read(chi, where), weights=weight))
     solid = chi > level
-    label, count = ndimage.label(solid)
+    labelled: Any = ndimage.label(solid)
+    label, count = labelled
     if not level > 0.15 or count == 0 or float(chi.max()) < 1.3 * level:
         raise _no_volume("the splats enclose nothing")
-    depth = ndimage.distance_transform_edt(solid)
-    balls = np.asarray(ndimage.maximum(depth, label, np.arange(1, count + 1)))
+    depth: Any = ndimage.distance_transform_edt(solid)
+    largest: Any = ndimage.maximum(depth, label, np.arange(1, count + 1))
+    balls = np.asarray(largest)
     main = label == 1 + int(balls.argmax())
     whole = ndimage.binary_fill_holes(main)
     inside = np.argwhere(whole)
@@ -273,7 +275,8 @@ def _split_parts(mean: Array, scale: Array, opacity: Array) -> tuple[NDArray[np.
     x = mean[index]
     disc = scale[index, 0] * _half_opaque(opacity[index])
     # Sixteen neighbours hold a surface together and keep the graph small.
-    distance, other = KDTree(x).query(x, k=16)
+    neighbours: Any = KDTree(x).query(x, k=16)
+    distance, other = neighbours
     local = distance[:, 6]
     link = LINK * float(np.median(local))
     # The cap keeps a sparse cloud of floaters from linking up into a shell of its own.
@@ -282,7 +285,8 @@ def _split_parts(mean: Array, scale: Array, opacity: Array) -> tuple[NDArray[np.
     row = np.repeat(np.arange(len(x)), near.sum(axis=1))
     graph = sparse.csr_matrix((np.ones(len(row)), (row, other[near])), shape=(len(x), len(x)))
     part = np.full(len(mean), -1, dtype=np.intp)
-    part[index] = connected_components(graph, directed=False)[1]
+    found: Any = connected_components(graph, directed=False)
+    part[index] = found[1]
     return part, link, {"faint": int(faint.sum()), "huge": int((huge & ~faint).sum())}
 
 
@@ -377,4 +381,6 @@ def _solve_poisson(source: Array) -> Array:
         shape = [1, 1, 1]
         shape[axis] = n
         eigen = eigen + (2.0 * np.cos(np.pi * np.arange(1, n + 1) / (n + 1)) - 2.0).reshape(shape)
-    return fft.idstn(fft.dstn(source, type=1) / eigen, type=1)
+    spectrum: Any = fft.dstn(source, type=1)
+    solution: Any = fft.idstn(spectrum / eigen, type=1)
+    return solution

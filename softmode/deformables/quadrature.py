@@ -244,10 +244,7 @@ def quadrature_from_implicit(
     parent = np.stack(np.unravel_index(parent, parent.shape), axis=-1).reshape(-1, 3) // SUBDIVISION
     index = np.ravel_multi_index(tuple(parent.T), tuple(shape))
     keep = filled > 0.0
-    cell = np.bincount(index[keep], filled[keep], minlength=int(shape.prod()))
-    first = np.stack(
-        [np.bincount(index[keep], filled[keep] * nodes[keep, d], minlength=int(shape.prod())) for d in range(3)], axis=1
-    )
+    cell, first = _sum_by(index[keep], filled[keep], nodes[keep], int(shape.prod()))
     points, weights, counted = _assemble_cells(cell, first, box[0], box[1], shape)
     exact_area = area if area is not None else _surface_area(level, distance, value, nodes, width)
     candidates, normals = _project_surface(level, nodes, distance, width, surface_count, seed)
@@ -426,9 +423,15 @@ def _integrate_columns(
     fine_xy = column[chord]
     index = np.ravel_multi_index((fine_xy[:, 0] // SUBDIVISION, fine_xy[:, 1] // SUBDIVISION, k), tuple(shape))
     position = np.column_stack([lower[:2] + (fine_xy + 0.5) * width, 0.5 * (low + high)])
-    total = int(shape.prod())
-    first = np.stack([np.bincount(index, volume * position[:, d], minlength=total) for d in range(3)], axis=1)
-    return np.bincount(index, volume, minlength=total), first
+    return _sum_by(index, volume, position, int(shape.prod()))
+
+
+def _sum_by(index: ArrayLike, weight: Array, position: Array, count: int) -> tuple[Array, Array]:
+    """Return per group the sum of weights (count,) and of weighted positions (count, D)."""
+    index = np.asarray(index)
+    total = np.bincount(index, weight, minlength=count).astype(np.float64)
+    first = [np.bincount(index, weight * column, minlength=count).astype(np.float64) for column in position.T]
+    return total, np.stack(first, axis=1)
 
 
 def _assemble_cells(
@@ -544,9 +547,7 @@ def _select_surface(
     chosen = sample_farthest(space, count, seed=seed)
     tree = KDTree(space)
     for _ in range(2):
-        label = KDTree(space[chosen]).query(space)[1]
-        size = np.bincount(label, minlength=len(chosen))
-        mean = np.stack([np.bincount(label, column, minlength=len(chosen)) for column in space.T], axis=1)
-        chosen = np.unique(tree.query(mean[size > 0] / size[size > 0, None])[1])
+        size, total = _sum_by(KDTree(space[chosen]).query(space)[1], np.ones(len(space)), space, len(chosen))
+        chosen = np.unique(tree.query(total[size > 0] / size[size > 0, None])[1])
     size = np.bincount(KDTree(space[chosen]).query(space)[1], minlength=len(chosen))
-    return candidates[chosen], normals[chosen], size * (area / len(candidates))
+    return candidates[chosen], normals[chosen], np.asarray(size * (area / len(candidates)), dtype=np.float64)

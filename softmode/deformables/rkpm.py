@@ -14,7 +14,7 @@ number of order ten.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -43,6 +43,12 @@ class ShapeFunctions:
     """phi~ (N, K)."""
     gradient: tuple[sparse.csr_matrix, sparse.csr_matrix, sparse.csr_matrix]
     """d phi~ / dX_d [1/m], three matrices (N, K) with the pattern of `value`."""
+
+    @property
+    def centre_count(self) -> int:
+        """Number of kernels K."""
+        rows_and_columns: Any = self.value.shape
+        return int(rows_and_columns[1])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -55,7 +55,7 @@ def test_gradient_energy_is_the_eigenvalue() -> None:
     points, weights = box(10)
     shape = make_basis(points, 200).evaluate(points)
     modes = solve_eigenmodes(shape, weights, 8)
-    energy = sum((weights / weights.sum()) @ (g @ modes.coefficients) ** 2 for g in shape.gradient)
+    energy = np.sum([(weights / weights.sum()) @ (g @ modes.coefficients) ** 2 for g in shape.gradient], axis=0)
     np.testing.assert_allclose(energy[1:], modes.eigenvalues[1:], rtol=1e-9)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -276,6 +277,25 @@ def test_object_on_a_wide_floor_is_found() -> None:
     )
     assert found.volume == pytest.approx(SPHERE_VOLUME, rel=0.03)
     assert found.members is not None and found.members[:2000].all() and not found.members[2000:].any()
+
+
+@pytest.mark.parametrize("level", ["4_0", "6_0"])
+def test_trained_splat(level: str) -> None:
+    """Of PLAYBOT (a robot over a floor slab) the robot is filled; levels of detail agree to 10 % in volume."""
+    path = Path(__file__).parents[2].parent / "shared" / "data" / "splats" / "playbot" / level
+    if not path.exists():
+        pytest.skip(f"the PLAYBOT asset is not at {path}")
+    from softmode.splats.formats import read_splats
+
+    splats = read_splats(path)
+    found = quadrature_from_splats(splats.means, splats.scales, splats.quats, splats.opacities)
+    assert found.volume == pytest.approx(0.096, rel=0.1)
+    assert found.report["box_fill"] == pytest.approx(0.32, abs=0.05)
+    assert found.members is not None and found.satellites is not None
+    up = -splats.means[:, 1]
+    assert up[found.members].min() > 0.15, "the floor is no part of the object"
+    assert 0.15 * found.members.sum() < found.satellites.sum() < 0.5 * found.members.sum(), "two hovering hands"
+    assert np.abs(splats.means[found.satellites, 0]).min() > 0.25
 
 
 def test_splats_without_volume_are_refused() -> None:

@@ -1,0 +1,111 @@
+"""Block Cholesky: against dense float64 solves, for several sizes, with columns carried along and worlds left alone."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from softmode.deformables.factor import LANES, BlockCholesky, pad
+
+FLOAT32 = float(np.finfo(np.float32).eps)
+
+
+def positive_definite(rng, count, size, condition):
+    """Return symmetric matrices (count, size, size) with eigenvalues from 1 to the condition number."""
+    Q = np.linalg.qr(rng.normal(size=(count, size, size)))[0]
+    return (Q * np.geomspace(1.0, condition, size)) @ np.swapaxes(Q, 1, 2)
+
+
+def build(A, B, world=None):
+    """Return a BlockCholesky that holds [A | B], with rubbish below the diagonal, which must not be read."""
+    count, size, columns = len(A), A.shape[1], B.shape[2]
+    with wp.ScopedDevice("cpu"):
+        world = wp.array(np.arange(count) if world is None else world, dtype=int)
+        system = BlockCholesky(world, size, columns, "cpu")
+        host = np.zeros((count, size, (size + pad(columns)) // LANES * LANES), np.float32)
+        rows, cols = np.arange(size)[:, None] // LANES, np.arange(size)[None] // LANES
+        host[:, :, :size] = np.where(cols >= rows, A, 1.0e6)
+        host[:, :, size : size + columns] = B
+        system.matrix.assign(host.reshape(count, size, -1, LANES))
+    return system
+
+
+def flags(values):
+    """Return a device array of int flags."""
+    return wp.array(np.asarray(values), dtype=int, device="cpu")
+
+
+def no_tail(count):
+    """Return an empty Schur correction."""
+    return wp.zeros((count, 1), dtype=wp.float64, device="cpu")
+
+
+@pytest.mark.parametrize("count", [0, 1, 8, 9, 100])
+def test_pad(count):
+    """pad(n) is the least multiple of 8 that is >= n."""
+    assert pad(count) % LANES == 0
+    assert 0 <= pad(count) - count < LANES
+
+
+@pytest.mark.parametrize("size", [8, 24, 72, 120])
+@pytest.mark.parametrize("condition", [10.0, 1.0e4])
+def test_solve(size, condition):
+    """A x = b to float32: |x - A^-1 b| <= c eps cond(A) |x|."""
+    rng = np.random.default_rng(size)
+    A, b = positive_definite(rng, 3, size, condition), rng.normal(size=(3, size, 1))
+    system = build(A, b)
+    system.factor(flags([1, 1, 1]))
+    x = system.solve(flags([1, 1, 1]), 0, no_tail(3), 0).numpy().reshape(3, size)
+    expected = np.linalg.solve(A, b)[:, :, 0]
+    assert np.linalg.norm(x - expected) <= 4 * FLOAT32 * condition * np.linalg.norm(expected)
+
+
+def test_factor_carries_the_columns():
+    """[A | B] ends as [U | U^-T B] with A = U^T U."""
+    rng = np.random.default_rng(0)
+    size, columns = 48, 11
+    A, B = positive_definite(rng, 2, size, 100.0), rng.normal(size=(2, size, columns))
+    system = build(A, B)
+    system.factor(flags([1, 1]))
+    Y = system.matrix.numpy().reshape(2, size, -1)[:, :, size : size + columns]
+    U = np.swapaxes(np.linalg.cholesky(A), 1, 2)
+    expected = np.linalg.solve(np.swapaxes(U, 1, 2), B)
+    assert np.abs(Y - expected).max() <= 4 * FLOAT32 * 100.0 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("tail_count", [1, 7, 8, 13])
+def test_back_substitution_with_known_unknowns(tail_count):
+    """[A C; C^T R] [x; t] = [b; ...]: with t known, x = A^-1 (b - C t), b in the column behind C."""
+    rng = np.random.default_rng(tail_count)
+    size = 40
+    A, C = positive_definite(rng, 1, size, 100.0), rng.normal(size=(1, size, tail_count))
+    b, t = rng.normal(size=(1, size, 1)), rng.normal(size=(1, tail_count))
+    system = build(A, np.concatenate([C, b], axis=2))
+    system.factor(flags([1]))
+    tail = wp.array(t, dtype=wp.float64, device="cpu")
+    x = system.solve(flags([1]), tail_count, tail, tail_count).numpy().reshape(size)
+    expected = np.linalg.solve(A[0], b[0, :, 0] - C[0] @ t[0])
+    assert np.linalg.norm(x - expected) <= 4 * FLOAT32 * 100.0 * np.linalg.norm(expected)
+
+
+def test_worlds_that_are_done_are_left_alone():
+    """Systems of an inactive world keep their bits; the others equal a run of their own."""
+    rng = np.random.default_rng(5)
+    A, b = positive_definite(rng, 3, 24, 10.0), rng.normal(size=(3, 24, 1))
+    system = build(A, b, world=[0, 0, 1])
+    before = system.matrix.numpy()
+    system.factor(flags([0, 1]))
+    x = system.solve(flags([0, 1]), 0, no_tail(2), 0).numpy()
+    np.testing.assert_array_equal(system.matrix.numpy()[:2], before[:2])
+    np.testing.assert_array_equal(x[:2], 0.0)
+    alone = build(A[2:], b[2:])
+    alone.factor(flags([1]))
+    np.testing.assert_array_equal(x[2], alone.solve(flags([1]), 0, no_tail(1), 0).numpy()[0])
+
+
+def test_singular_matrix_stays_finite():
+    """A semidefinite matrix (a mode without stiffness) is solved with a floored pivot: finite, no NaN."""
+    A = np.zeros((1, 16, 16))
+    A[0, :8, :8] = np.ones((8, 8))
+    system = build(A, np.ones((1, 16, 1)))
+    system.factor(flags([1]))
+    assert np.isfinite(system.solve(flags([1]), 0, no_tail(1), 0).numpy()).all()
