@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -151,15 +152,25 @@ def distance_cylinder(x: np.ndarray, radius: float, half_height: float) -> np.nd
 
 @dataclass(frozen=True, kw_only=True)
 class FreeBody:
-    """A free body and the incremental potential of one implicit Euler step, dense.
+    """A body without contact and the incremental potential of one implicit Euler step, dense.
 
     E(q) = m/(2 dt^2) |q - q_n - dt v_n|^2 + m alpha/(2 dt) |q - q_n|^2 + sum_p V_p Psi(F_p) - m sum_k bbar_k g . q_k
+    + sum_e k_e/2 |x_e - target_e|^2 over the pins. With dt = inf the inertia is gone and its minimum is the equilibrium.
     """
 
     body: ReducedBody
     material: Material
     dt: float
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    pin_points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    """Rest points (K, 3) [m] that springs pull to where they rest."""
+    pin_stiffness: float = 0.0
+    """Stiffness of each spring [N/m]."""
+
+    @cached_property
+    def pin_basis(self) -> np.ndarray:
+        """Functions at the pins, shape (K, n)."""
+        return self.body.evaluate(self.pin_points)[0] if len(self.pin_points) else np.zeros((0, self.body.function_count))
 
     @property
     def mass(self) -> float:
@@ -187,11 +198,12 @@ class FreeBody:
     def residual(self, q: np.ndarray, q_start: np.ndarray, qd_start: np.ndarray) -> np.ndarray:
         """Return dE/dq [N], shape (n, 3)."""
         m, h, material = self.mass, self.dt, self.material
-        inertia = m / h**2 * (q - q_start - h * qd_start) + m * material.mass_damping / h * (q - q_start)
+        inertia = m / h**2 * (q - q_start) - m / h * qd_start + m * material.mass_damping / h * (q - q_start)
         F, F_start = self.deformation_gradient(q), self.deformation_gradient(q_start)
         P = viscous_stress(F, F_start, self.lame[0], material.viscosity, h)
         viscous = np.einsum("p,pcd,pkd->kc", self.body.weights, P, self.body.grad_basis.astype(float))
-        return inertia + self.elastic_gradient(q) + viscous - m * np.outer(self.body.mean_basis, self.gravity)
+        pins = self.pin_stiffness * self.pin_basis.T @ (self.pin_basis @ q)
+        return inertia + self.elastic_gradient(q) + viscous + pins - m * np.outer(self.body.mean_basis, self.gravity)
 
     def tangent(self, q: np.ndarray) -> np.ndarray:
         """Return a positive definite approximation of d2E/dq2 [N/m], shape (3 n, 3 n), unknowns point-major."""
@@ -201,15 +213,32 @@ class FreeBody:
         grad = self.body.grad_basis.astype(float)
         n = grad.shape[1]
         K = np.einsum("p,pka,pcadb,plb->kcld", self.body.weights, grad, C, grad, optimize=True).reshape(3 * n, 3 * n)
+        K += np.kron(self.pin_stiffness * self.pin_basis.T @ self.pin_basis, I3)
         return K + self.mass * (1.0 / self.dt + self.material.mass_damping) / self.dt * np.eye(3 * n)
+
+    def equilibrium(self) -> np.ndarray:
+        """Return where the body rests: the minimum without inertia."""
+        still = replace(self, dt=np.inf)
+        return still.solve(np.zeros_like(self.body.linear_coordinates[:, :3]), np.zeros((self.body.function_count, 3)))
 
     def step(self, q_start: np.ndarray, qd_start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (q, qd) after one step of implicit Euler, solved to rounding by Newton."""
-        q = q_start + self.dt * qd_start
-        for _ in range(50):
+        q = self.solve(q_start, qd_start)
+        return q, (q - q_start) / self.dt
+
+    def solve(self, q_start: np.ndarray, qd_start: np.ndarray) -> np.ndarray:
+        """Return the minimum of the potential, by full Newton steps from where the body rests or drifts to."""
+        q = q_start + (self.dt * qd_start if np.isfinite(self.dt) else 0.0)
+        for _ in range(100):
             r = self.residual(q, q_start, qd_start)
             dq = -np.linalg.solve(self.tangent(q), r.ravel()).reshape(q.shape)
             q = q + dq
             if np.linalg.norm(dq) < 1e-14 * np.linalg.norm(self.body.bounds):
-                break
-        return q, (q - q_start) / self.dt
+                return q
+        raise RuntimeError("the reference step did not converge")
+
+
+def with_float32(material: Material) -> Material:
+    """Return the material with its numbers rounded to float32, as a Newton model stores them."""
+    names = ("youngs_modulus", "poissons_ratio", "density", "viscosity", "mass_damping", "friction")
+    return replace(material, **{name: float(np.float32(getattr(material, name))) for name in names})

@@ -132,11 +132,11 @@ class Scene:
 
     def q(self, instance: int = 0) -> np.ndarray:
         """Return coordinates (n, 3) [m]."""
-        return self.state.softmode.q.numpy()[self._slice(instance)]
+        return self.state.softmode.q.numpy()[self._slice(instance)].copy()
 
     def qd(self, instance: int = 0) -> np.ndarray:
         """Return velocities (n, 3) [m/s]."""
-        return self.state.softmode.qd.numpy()[self._slice(instance)]
+        return self.state.softmode.qd.numpy()[self._slice(instance)].copy()
 
     def set(self, q: np.ndarray | None = None, qd: np.ndarray | None = None, instance: int = 0) -> None:
         """Set coordinates and velocities of one instance."""

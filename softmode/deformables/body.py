@@ -39,8 +39,10 @@ Progress = Callable[[str, float], None]
 FORMAT = "softmode.ReducedBody"
 FORMAT_VERSION = 1
 RANK_TOLERANCE = 1e-5
-"""Directions of the scaled mass Gram matrix under this fraction of the largest are dropped: 1e-5 in the functions
-themselves, the level at which float32 gradients stop telling them apart from the others."""
+"""Directions of the scaled mass Gram matrix under this fraction of the largest are dropped. That is an amplitude of
+0.3 %, the error of the eigenmodes themselves: on a sphere, where x W_y = y W_x, 8 of 36 functions are such noise.
+Dropping them changes the compliance of a clamped sphere by 0.1 % and cuts the cubature's force error tenfold.
+Rougher functions above the bound matter: a bound of 1e-3 makes a clamped beam half again as stiff."""
 REACH = 0.35
 """How far from its nearest kernel centre a point may lie, as a fraction of the kernel's support. Inside an object the
 ratio stays under 0.3; beyond, the functions grow as extrapolated polynomials do (tenfold at 0.5), so they are held
@@ -54,11 +56,12 @@ class BuildOptions:
     mode_count: int = 8
     """Skinning eigenmodes beside the constant handle; up to 4 (mode_count + 1) functions."""
     kernel_count: int = 400
-    """Reproducing kernels; 400 give the eigenvalues of a box to 0.3 % in 0.1 s."""
+    """Reproducing kernels; 400 give the first 16 eigenvalues of a box to 0.3 % in about 0.1 s."""
     kernel: KernelName = "cubic"
     """Bell of the reproducing kernels."""
     cubature_count: int | None = 256
-    """Points at which a step evaluates stress; None keeps all. `provenance` reports the force error at this and at
+    """Points at which a step evaluates stress; None keeps all. Measured force errors at 256 points: 0.4-0.6 % (box,
+    sphere, beam), 1.5 % (bear, robot); at 384: 0.2-0.3 % and 0.8 %. `provenance` has the body's own at this and at
     smaller counts."""
     seed: int = 0
     """Seed of every random choice of the build."""

@@ -15,7 +15,7 @@ Precision: basis data float32; q, energy and residual float64; the Newton direct
 import warp as wp
 
 from softmode.deformables.factor import LANES, vec8
-from softmode.deformables.materials import HessianBlocks, MaterialParameters, energy, hessian, lame, stress
+from softmode.deformables.materials import MaterialParameters, energy, hessian, lame, stress
 
 wp.set_module_options({"enable_backward": False})
 
@@ -106,7 +106,7 @@ def evaluate_points(
     # Out:
     energy_out: wp.array2d[wp.float64],  # (instance_count, point_max) [J]
     stress_out: wp.array2d[wp.mat33d],  # (instance_count, point_max), V P [N m]
-    hessian_out: wp.array2d[HessianBlocks],  # (instance_count, point_max), V d2Psi/dF2 [N m]
+    hessian_out: wp.array3d[wp.mat33],  # (instance_count, point_max, 6), blocks of V d2Psi/dF2 [N m]
 ):
     """Evaluate V_p Psi(F_p) and, where asked, its derivatives at every cubature point."""
     i, p = wp.tid()
@@ -128,7 +128,12 @@ def evaluate_points(
     energy_out[i, p] = weight * energy(parameters, G, G_start, dt)
     if derivatives != 0:
         stress_out[i, p] = weight * stress(parameters, G, G_start, dt)
-        hessian_out[i, p] = float(weight) * hessian(parameters, G, dt)
+        C = float(weight) * hessian(parameters, G, dt)
+        for pair in range(6):
+            r = 3 * pair
+            hessian_out[i, p, pair] = wp.mat33(
+                C[r, 0], C[r, 1], C[r, 2], C[r + 1, 0], C[r + 1, 1], C[r + 1, 2], C[r + 2, 0], C[r + 2, 1], C[r + 2, 2]
+            )
 
 
 @wp.kernel
@@ -187,7 +192,7 @@ def assemble_hessian(
     row_basis8: wp.array2d[vec8],
     # State in:
     active: wp.array[int],
-    point_hessian: wp.array2d[HessianBlocks],
+    point_hessian: wp.array3d[wp.mat33],  # blocks (c, d) = 00, 01, 02, 11, 12, 22
     entry_count: wp.array[int],
     entry_row: wp.array2d[int],
     entry_hessian: wp.array2d[wp.mat33],
@@ -222,15 +227,14 @@ def assemble_hessian(
     n = function_count[i]
     if k0 < n and LANES * lanes < n:
         for p in range(point_count[i]):
-            C = point_hessian[i, p]
+            C = point_hessian[i, p, pair]
             point = first + p
             gx = grad_basis8[0, point, lanes]
             gy = grad_basis8[1, point, lanes]
             gz = grad_basis8[2, point, lanes]
-            r = 3 * pair
-            ux = C[r, 0] * gx + C[r, 1] * gy + C[r, 2] * gz
-            uy = C[r + 1, 0] * gx + C[r + 1, 1] * gy + C[r + 1, 2] * gz
-            uz = C[r + 2, 0] * gx + C[r + 2, 1] * gy + C[r + 2, 2] * gz
+            ux = C[0, 0] * gx + C[0, 1] * gy + C[0, 2] * gz
+            uy = C[1, 0] * gx + C[1, 1] * gy + C[1, 2] * gz
+            uz = C[2, 0] * gx + C[2, 1] * gy + C[2, 2] * gz
             g = grad_basis[point, k0]
             a0 += g[0] * ux + g[1] * uy + g[2] * uz
             g = grad_basis[point, k0 + 1]
@@ -430,6 +434,18 @@ def solve_rigid(
         solution[w, a] = value / matrix[w, a, a]
 
 
+@wp.func
+def unknown(direction: wp.array2d[vec8], instance: int, blocks: int, function: int):
+    """Return the vec3 of one function out of a component-major solution."""
+    lane = function % LANES
+    block = function / LANES
+    return wp.vec3d(
+        wp.float64(direction[instance, block][lane]),
+        wp.float64(direction[instance, blocks + block][lane]),
+        wp.float64(direction[instance, 2 * blocks + block][lane]),
+    )
+
+
 @wp.kernel
 def trial_functions(
     # Instances:
@@ -449,15 +465,7 @@ def trial_functions(
     w = world[i]
     if searching[w] == 0 or k >= function_count[i]:
         return
-    blocks = stride / LANES
-    lane = k % LANES
-    block = k / LANES
-    dq = wp.vec3d(
-        wp.float64(direction[i, block][lane]),
-        wp.float64(direction[i, blocks + block][lane]),
-        wp.float64(direction[i, 2 * blocks + block][lane]),
-    )
-    q_out[i, k] = q[i, k] + step_length[w] * dq
+    q_out[i, k] = q[i, k] + step_length[w] * unknown(direction, i, stride / LANES, k)
 
 
 @wp.kernel
@@ -531,9 +539,11 @@ def begin_search(
     # Instances:
     function_count: wp.array[int],
     stride: int,
+    tolerance: wp.array[float],  # (instance_count,) [m], root mean square
     # Worlds:
     instance_start: wp.array[int],
     rigid_count: wp.array[int],
+    rigid_tolerance: float,  # [m or rad]
     # State in:
     active: wp.array[int],
     gradient: wp.array2d[wp.vec3d],
@@ -543,25 +553,39 @@ def begin_search(
     # Out:
     slope_out: wp.array[wp.float64],
     step_length_out: wp.array[wp.float64],
+    last_out: wp.array[int],  # (world_count,), 1 where every body moves less than its tolerance
     searching_out: wp.array[int],
     any_searching_out: wp.array[int],
 ):
-    """Compute the slope g . d of each active world and start its line search at alpha = 1."""
+    """Compute the slope g . d of each active world and start its line search at alpha = 1.
+
+    A step below the tolerance is the last one and taken in full: there the change of the potential drowns in rounding.
+    """
     w = wp.tid()
-    searching_out[w] = active[w]
+    searching_out[w] = 0
     if active[w] == 0:
         return
-    wp.atomic_max(any_searching_out, 0, 1)
     slope = wp.float64(0.0)
+    last = int(1)
     blocks = stride / LANES
     for i in range(instance_start[w], instance_start[w + 1]):
+        moved = wp.float64(0.0)
         for k in range(function_count[i]):
-            for c in range(3):
-                slope += gradient[i, k][c] * wp.float64(direction[i, c * blocks + k / LANES][k % LANES])
+            dq = unknown(direction, i, blocks, k)
+            slope += wp.dot(gradient[i, k], dq)
+            moved += wp.length_sq(dq)
+        if not (wp.sqrt(moved) <= wp.float64(tolerance[i])):
+            last = 0
     for j in range(rigid_count[w]):
         slope += rigid_gradient[w, j] * rigid_direction[w, j]
+        if not (wp.abs(rigid_direction[w, j]) <= wp.float64(rigid_tolerance)):
+            last = 0
     slope_out[w] = slope
     step_length_out[w] = wp.float64(1.0)
+    last_out[w] = last
+    if last == 0:
+        searching_out[w] = 1
+        wp.atomic_max(any_searching_out, 0, 1)
 
 
 @wp.kernel
@@ -600,16 +624,15 @@ def finish_iteration(
     # Instances:
     function_count: wp.array[int],
     stride: int,
-    tolerance: wp.array[float],  # (instance_count,) [m], root mean square
     # Worlds:
     instance_start: wp.array[int],
     rigid_count: wp.array[int],
-    rigid_tolerance: float,  # [m or rad]
     iteration_max: int,
     # State in:
     step_length: wp.array[wp.float64],
-    q_trial: wp.array2d[wp.vec3d],
-    r_trial: wp.array2d[wp.float64],
+    direction: wp.array2d[vec8],
+    rigid_direction: wp.array2d[wp.float64],
+    last: wp.array[int],
     # In and out:
     active: wp.array[int],
     q: wp.array2d[wp.vec3d],
@@ -619,32 +642,25 @@ def finish_iteration(
     # Out:
     any_active_out: wp.array[int],
 ):
-    """Take the accepted step and decide whether a world is done: every body moved less than its tolerance."""
+    """Take the accepted step and decide whether a world is done."""
     w = wp.tid()
     if active[w] == 0:
         return
     iteration[w] = iteration[w] + 1
-    if step_length[w] == wp.float64(0.0):
+    alpha = step_length[w]
+    for i in range(instance_start[w], instance_start[w + 1]):
+        for k in range(function_count[i]):
+            q[i, k] = q[i, k] + alpha * unknown(direction, i, stride / LANES, k)
+    for j in range(rigid_count[w]):
+        r[w, j] = r[w, j] + alpha * rigid_direction[w, j]
+    if last[w] == 1:
+        active[w] = 0
+    elif alpha == wp.float64(0.0):
         active[w] = 0
         status[w] = status[w] | WORLD_NO_DESCENT
-        return
-    done = int(1)
-    for i in range(instance_start[w], instance_start[w + 1]):
-        moved = wp.float64(0.0)
-        for k in range(function_count[i]):
-            moved += wp.length_sq(q_trial[i, k] - q[i, k])
-            q[i, k] = q_trial[i, k]
-        if not (wp.sqrt(moved) <= wp.float64(tolerance[i])):
-            done = 0
-    for j in range(rigid_count[w]):
-        if not (wp.abs(r_trial[w, j] - r[w, j]) <= wp.float64(rigid_tolerance)):
-            done = 0
-        r[w, j] = r_trial[w, j]
-    if done == 0 and iteration[w] >= iteration_max:
-        status[w] = status[w] | WORLD_ITERATION_LIMIT
-        done = 1
-    if done == 1:
+    elif iteration[w] >= iteration_max:
         active[w] = 0
+        status[w] = status[w] | WORLD_ITERATION_LIMIT
     else:
         wp.atomic_max(any_active_out, 0, 1)
 

@@ -194,9 +194,9 @@ def _fill_part(mean: Array, scale: Array, axes: Array, opacity: Array, resolutio
         raise _no_volume("the splats enclose nothing")
     depth: Any = ndimage.distance_transform_edt(solid)
     largest: Any = ndimage.maximum(depth, label, np.arange(1, count + 1))
-    balls = np.asarray(largest)
+    balls = np.asarray(largest, dtype=np.float64)
     main = label == 1 + int(balls.argmax())
-    whole = ndimage.binary_fill_holes(main)
+    whole: Any = ndimage.binary_fill_holes(main)
     inside = np.argwhere(whole)
     if len(inside) < 64 or balls.max() < 1.5:
         raise _no_volume(f"{len(inside)} voxels are enclosed")

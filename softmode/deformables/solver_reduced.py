@@ -13,7 +13,7 @@ from newton.solvers import SolverBase
 from softmode.deformables import contact, kernels
 from softmode.deformables.body import ReducedBody
 from softmode.deformables.factor import LANES, BlockCholesky, pad, vec8
-from softmode.deformables.materials import HessianBlocks, Material
+from softmode.deformables.materials import Material
 from softmode.errors import ConfigError
 
 NAMESPACE = "softmode"
@@ -446,7 +446,7 @@ class SolverReduced(SolverBase):
         self.force, self.gradient = zeros(functions, wp.vec3d), zeros(functions, wp.vec3d)
         self.point_energy = zeros((instances, self.point_max), wp.float64)
         self.point_stress = zeros((instances, self.point_max), wp.mat33d)
-        self.point_hessian = zeros((instances, self.point_max), HessianBlocks)
+        self.point_hessian = zeros((instances, self.point_max, 6), wp.mat33)
         samples = (instances, self.sample_max)
         self.sample_position, self.sample_drift = zeros(samples, wp.vec3d), zeros(samples, wp.vec3)
         self.lower, self.upper = zeros((instances,), wp.vec3), zeros((instances,), wp.vec3)
@@ -466,7 +466,7 @@ class SolverReduced(SolverBase):
         self.entry_hessian = zeros((instances, entries), wp.mat33)
         self.instance_force = zeros((instances,), wp.vec3d)
         self.body_wrench = zeros((max(self.model.body_count, 1),), wp.spatial_vector)
-        self.active, self.searching = zeros((worlds,), int), zeros((worlds,), int)
+        self.active, self.searching, self.last = (zeros((worlds,), int) for _ in range(3))
         self.any_active, self.any_searching = zeros((1,), int), zeros((1,), int)
         self.potential, self.potential_trial = zeros((worlds,), wp.float64), zeros((worlds,), wp.float64)
         self.slope, self.step_length = zeros((worlds,), wp.float64), zeros((worlds,), wp.float64)
@@ -621,6 +621,10 @@ class SolverReduced(SolverBase):
             + [self.stiffness_scale, selected, self.q_start, q, wp.float64(dt), int(derivatives)],
             [self.point_energy, self.point_stress, self.point_hessian],
         )
+        self._evaluate_entries(selected, q, r, dt, derivatives=derivatives)
+
+    def _evaluate_entries(self, selected: wp.array, q: wp.array, r: wp.array, dt: float, *, derivatives: bool) -> None:
+        """Evaluate pins and contacts at q, r in the selected worlds."""
         self._launch(
             contact.evaluate_entries,
             (self.instance_count, self.entry_max),
@@ -700,9 +704,10 @@ class SolverReduced(SolverBase):
         self._launch(
             kernels.begin_search,
             self.world_count,
-            [self.function_count, self.stride, self.world_instances, self.rigid.count, self.active, self.gradient]
-            + [self.direction, self.rigid.gradient, self.rigid.direction],
-            [self.slope, self.step_length, self.searching, self.any_searching],
+            [self.function_count, self.stride, self.tolerance, self.world_instances, self.rigid.count]
+            + [self.rigid_tolerance, self.active, self.gradient, self.direction]
+            + [self.rigid.gradient, self.rigid.direction],
+            [self.slope, self.step_length, self.last, self.searching, self.any_searching],
         )
 
     def _try_step(self, dt: float) -> None:
@@ -737,14 +742,16 @@ class SolverReduced(SolverBase):
         self._launch(
             kernels.finish_iteration,
             self.world_count,
-            [self.function_count, self.stride, self.tolerance, self.world_instances, self.rigid.count]
-            + [self.rigid_tolerance, self.options.iteration_max, self.step_length, self.q_trial, self.rigid.trial],
+            [self.function_count, self.stride, self.world_instances, self.rigid.count, self.options.iteration_max]
+            + [self.step_length, self.direction, self.rigid.direction, self.last],
             [self.active, self.q, self.rigid.r, self.iteration, self.status, self.any_active],
         )
 
     def finish(self, state: newton.State, dt: float) -> None:
         """Write coordinates, velocities and particles, and sum the contact reactions."""
         data, instances = self.parameters, self.instance_count
+        self.active.fill_(1)
+        self._evaluate_entries(self.active, self.q, self.rigid.r, dt, derivatives=False)
         self._launch(
             kernels.check_finite,
             self.world_count,

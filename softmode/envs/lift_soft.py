@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from softmode.deformables import kernels
 from softmode.envs.table_scene import TableScene, TableSceneConfig
 from softmode.errors import ConfigError
-from softmode.splats.camera import PinholeCamera
+from softmode.splats.camera import CameraOptions, PinholeCamera
 
 ObservationType = Literal["state", "pixels", "pixels_agent_pos"]
 POINT_COUNT = 16
@@ -43,23 +43,36 @@ class LiftSoftConfig:
     """Edge of a pixel observation [px]."""
     render_size: int = 256
     """Edge of each half of a rendered frame [px]."""
+    mesh_samples: int = 1
+    """Rays per pixel for robot and table, in observations and renderings: 1, or 4 for smooth edges."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         low, high = self.youngs_modulus_range
-        if not 0.0 < low <= high:
+        if not 0.0 < low <= high < np.inf:
             raise ConfigError(f"youngs_modulus_range must satisfy 0 < low <= high, got {self.youngs_modulus_range}")
+        if not 0.0 < self.goal_height <= 0.4:
+            raise ConfigError(f"goal_height must lie in 0..0.4 m, got {self.goal_height}")
+        if not 0.0 < self.goal_tolerance < self.goal_height:
+            raise ConfigError(f"goal_tolerance must lie in 0..goal_height, got {self.goal_tolerance}")
+        if self.hold_steps < 1:
+            raise ConfigError(f"hold_steps must be at least 1, got {self.hold_steps}")
+        if not (min(self.position_range) >= 0.0 and self.yaw_range >= 0.0):
+            raise ConfigError(f"position_range {self.position_range} and yaw_range {self.yaw_range} must be >= 0")
         if not 36 <= self.image_size <= 640:
             raise ConfigError(f"image_size must lie in 36..640 px, got {self.image_size}")
         if not 64 <= self.render_size <= 1024:
             raise ConfigError(f"render_size must lie in 64..1024 px, got {self.render_size}")
+        if self.mesh_samples not in (1, 4):
+            raise ConfigError(f"mesh_samples must be 1 or 4, got {self.mesh_samples}")
 
 
-class LiftSoftEnv(gym.Env):
+class LiftSoftEnv(gym.Env, gym.utils.EzPickle):
     """One arm, one soft object.
 
-    Actions, float32 in [-1, 1]: with ``control_mode="pose_delta"`` (x, y, z, yaw, gripper) steps of the tool, with
-    ``"joint_delta"`` seven joint steps and the gripper; the gripper entry is +1 open, -1 squeeze with full force.
+    Actions, float32 in [-1, 1], larger ones are clamped: with ``control_mode="pose_delta"`` (x, y, z, yaw, gripper)
+    steps of the tool, with ``"joint_delta"`` seven joint steps and the gripper; the gripper entry is +1 open, -1 squeeze
+    with full force.
 
     Observations by ``obs_type``:
 
@@ -69,10 +82,13 @@ class LiftSoftEnv(gym.Env):
     - ``"pixels_agent_pos"``: dict of ``pixels`` and ``agent_pos``, the proprioception: tool position (3) [m], cos and
       sin of its yaw, opening [m], finger forces (2) [N], joint angles (7) [rad].
 
+    Numbers beyond the bounds of ``observation_space`` (an object thrown off the table) are clipped to them.
+
     The reward is the sum of ``info["reward_terms"]``: ``reach`` (0..1, tool to object), ``grasp`` (0 or 0.5, both
     fingers touch), ``lift`` (0..2, share of the goal height while grasped), ``hold`` (0 or 2, at the goal). ``info``
-    also holds ``is_success``, ``object_height`` [m], ``finger_force`` [N], ``youngs_modulus`` [Pa] and, when the episode
-    ended by failure, ``failure``: "dropped" or "diverged". ``solver_status`` carries the solver's flags.
+    also holds ``is_success`` (the object is held at the goal, and has been for ``hold_steps`` steps), ``object_height``
+    (rise of its centre of mass [m]), ``finger_force`` [N], ``youngs_modulus`` [Pa] and ``solver_status`` (the solver's
+    flags). An episode terminates only by failure, named by ``failure``: "dropped" (off the table) or "diverged".
 
     ``reset`` takes ``options``: ``position`` (x, y) [m], ``yaw`` [rad], ``youngs_modulus`` [Pa]; what is not given is
     drawn at random from the configured ranges.
@@ -85,7 +101,7 @@ class LiftSoftEnv(gym.Env):
         size: Longest edge of the object [m].
         config: Everything else.
         device: Warp device.
-        progress: Reports the build of the object.
+        progress: Reports the build of the object: a callable (stage, fraction), or True or False for a bar or none.
 
     Raises:
         ConfigError: If an option is unknown or out of range.
@@ -107,6 +123,17 @@ class LiftSoftEnv(gym.Env):
         progress: Any = None,
     ) -> None:
         """Build the scene and the spaces."""
+        # What a copy is made from when the environment is pickled; a callback cannot travel.
+        gym.utils.EzPickle.__init__(
+            self,
+            obs_type=obs_type,
+            render_mode=render_mode,
+            control_mode=control_mode,
+            splat=splat,
+            size=size,
+            config=config,
+            device=None if device is None else str(device),
+        )
         if obs_type not in get_args(ObservationType):
             raise ConfigError(
                 f"obs_type is {obs_type!r}", hint=f"use one of {', '.join(map(repr, get_args(ObservationType)))}"
@@ -121,7 +148,13 @@ class LiftSoftEnv(gym.Env):
             cameras.append(_front_camera("pixels", self.config.image_size))
         if render_mode == "rgb_array":
             cameras += [_front_camera("front", self.config.render_size), _overview(self.config.render_size)]
-        self.scene = TableScene(self.config.scene, cameras=cameras, device=device, progress=progress)
+        self.scene = TableScene(
+            self.config.scene,
+            cameras=cameras,
+            camera_options=CameraOptions(mesh_samples=self.config.mesh_samples),
+            device=device,
+            progress=progress,
+        )
         actions = self.config.scene.control.action_size
         self.action_space = gym.spaces.Box(-1.0, 1.0, (actions,), np.float32)
         self.observation_space = self._make_observation_space()
@@ -131,14 +164,21 @@ class LiftSoftEnv(gym.Env):
         self._youngs_modulus = self.config.scene.material.youngs_modulus
 
     def _make_observation_space(self) -> gym.Space:
+        """Return the space of the chosen type; every bound is finite."""
         edge = self.config.image_size
         pixels = gym.spaces.Box(0, 255, (edge, edge, 3), np.uint8)
-        agent = gym.spaces.Box(-np.inf, np.inf, (15,), np.float32)
         if self.obs_type == "pixels":
             return pixels
-        if self.obs_type == "pixels_agent_pos":
-            return gym.spaces.Dict({"pixels": pixels, "agent_pos": agent})
-        return gym.spaces.Box(-np.inf, np.inf, (15 + 7 + 3 * POINT_COUNT,), np.float32)
+        reach, force, angle = 2.0, 200.0, 3.5  # [m], [N], [rad]
+        low = [-reach] * 3 + [-1.0] * 2 + [-0.1] + [0.0] * 2 + [-angle] * 7
+        high = [reach] * 3 + [1.0] * 2 + [0.5] + [force] * 2 + [angle] * 7
+        if self.obs_type == "state":
+            bound = [reach] * 3 + [20.0] * 3 + [reach] * 3 * POINT_COUNT  # centre, velocity [m/s], points
+            low += [-x for x in bound] + [0.0]
+            high += [*bound, 1.0]
+        numbers = gym.spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
+        self._bounds = numbers.low, numbers.high
+        return numbers if self.obs_type == "state" else gym.spaces.Dict({"pixels": pixels, "agent_pos": numbers})
 
     # -- episode ------------------------------------------------------------------------------------------------------
 
@@ -154,28 +194,53 @@ class LiftSoftEnv(gym.Env):
             "yaw": random.uniform(-config.yaw_range, config.yaw_range),
             "youngs_modulus": np.exp(random.uniform(*np.log(config.youngs_modulus_range))),
         }
-        given = dict(options or {})
-        unknown = sorted(set(given) - set(drawn))
-        if unknown:
-            raise ConfigError(f"unknown reset options {unknown}", hint=f"use any of {sorted(drawn)}")
-        drawn.update(given)
-        position = np.asarray(drawn["position"], float)
-        if position.shape != (2,) or not np.isfinite(position).all():
-            raise ConfigError(f"position must be two finite numbers [m], got {drawn['position']!r}")
-        if not np.isfinite(drawn["yaw"]):
-            raise ConfigError(f"yaw must be finite [rad], got {drawn['yaw']!r}")
+        drawn.update(self._checked_options(options))
         self._youngs_modulus = float(drawn["youngs_modulus"])
         self._held = 0
         self.scene.reset(
-            position=position[None],
+            position=np.array([drawn["position"]], float),
             yaw=np.array([drawn["yaw"]], float),
             youngs_modulus=np.array([self._youngs_modulus]),
         )
         return self._observe(), self._info(self._reward_terms())
 
+    def _checked_options(self, options: Mapping[str, Any] | None) -> dict[str, Any]:
+        """Return the options of a reset, or raise before anything changes."""
+        given = dict(options or {})
+        unknown = sorted(set(given) - {"position", "yaw", "youngs_modulus"})
+        if unknown:
+            raise ConfigError(f"unknown reset options {unknown}", hint="use position, yaw and youngs_modulus")
+        sizes = {"position": 2, "yaw": 1, "youngs_modulus": 1}
+        for name, value in given.items():
+            try:
+                number = np.asarray(value, float).reshape(-1)
+            except (TypeError, ValueError):
+                number = np.empty(0)
+            if number.shape != (sizes[name],) or not np.isfinite(number).all():
+                raise ConfigError(f"{name} must be {'two' if sizes[name] == 2 else 'one'} finite, got {value!r}")
+            given[name] = number if sizes[name] == 2 else float(number[0])
+        if "position" in given:
+            control = self.config.scene.control
+            low, high = control.workspace_lower[:2], control.workspace_upper[:2]
+            if not ((given["position"] >= low) & (given["position"] <= high)).all():
+                raise ConfigError(
+                    f"position {given['position'].tolist()} lies outside the workspace",
+                    hint=f"stay within {low} to {high} m",
+                )
+        if "youngs_modulus" in given:
+            replace(self.config.scene.material, youngs_modulus=given["youngs_modulus"])  # checks its range
+        return given
+
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Advance one control step."""
-        action = np.asarray(action, np.float32)
+        """Advance one control step.
+
+        Raises:
+            ConfigError: If the action has another shape or holds NaN; nothing has moved then.
+        """
+        try:
+            action = np.asarray(action, np.float32)
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"action is no array of numbers: {error}", hint="give one number per entry") from error
         if action.shape != self.action_space.shape:
             raise ConfigError(
                 f"action has shape {action.shape}, expected {self.action_space.shape}",
@@ -184,7 +249,7 @@ class LiftSoftEnv(gym.Env):
         if not np.isfinite(action).all():
             raise ConfigError(f"action holds NaN or infinity: {action}", hint="check the policy that produced it")
         self.scene.step(action[None])
-        at_goal = abs(self._height() - self.config.goal_height) <= self.config.goal_tolerance
+        at_goal = abs(self.rise() - self.config.goal_height) <= self.config.goal_tolerance
         self._held = self._held + 1 if at_goal and self._grasped() else 0
         terms = self._reward_terms()
         info = self._info(terms)
@@ -203,7 +268,7 @@ class LiftSoftEnv(gym.Env):
 
     # -- parts --------------------------------------------------------------------------------------------------------
 
-    def _height(self) -> float:
+    def rise(self) -> float:
         """Rise of the object's centre of mass above where it rests [m]."""
         return float(self.scene.object_position.numpy()[0, 2]) - self._rest_height
 
@@ -219,16 +284,17 @@ class LiftSoftEnv(gym.Env):
         """Name the failure that ends the episode, if any."""
         if self.scene.status[0] & kernels.WORLD_NOT_FINITE:
             return "diverged"
-        if not self._height() > -0.05:
+        if not self.rise() > -0.05:
             return "dropped"
         return None
 
     def _reward_terms(self) -> dict[str, float]:
         """Compute the terms of the reward."""
         tool = self.scene.controller.tool_pose.numpy()[0, :3]
-        reach = 1.0 - np.tanh(10.0 * np.linalg.norm(tool - self.scene.object_position.numpy()[0]))
+        distance = np.linalg.norm(tool - self.scene.object_position.numpy()[0])
+        reach = 1.0 - np.tanh(10.0 * distance) if np.isfinite(distance) else 0.0
         grasped = self._grasped()
-        lift = float(np.clip(self._height() / self.config.goal_height, 0.0, 1.0)) if grasped else 0.0
+        lift = float(np.clip(self.rise() / self.config.goal_height, 0.0, 1.0)) if grasped else 0.0
         return {
             "reach": float(reach),
             "grasp": 0.5 * grasped,
@@ -240,13 +306,13 @@ class LiftSoftEnv(gym.Env):
         return {
             "is_success": self._held >= self.config.hold_steps,
             "reward_terms": terms,
-            "object_height": self._height(),
+            "object_height": self.rise(),
             "finger_force": self._finger_force(),
             "youngs_modulus": self._youngs_modulus,
             "solver_status": int(self.scene.status[0]),
         }
 
-    def _agent_pos(self) -> NDArray[np.float32]:
+    def _agent_pos(self) -> NDArray[np.float64]:
         """Return the proprioception."""
         scene = self.scene
         pose = scene.controller.tool_pose.numpy()[0]
@@ -256,8 +322,11 @@ class LiftSoftEnv(gym.Env):
         coord = scene.arm.coord_start
         joints = scene.state.joint_q.numpy()[coord : coord + 7]
         opening = scene.controller.opening.numpy()[0]
-        parts = [pose[:3], heading, [opening], self._finger_force(), joints]
-        return np.concatenate(parts).astype(np.float32)
+        return np.concatenate([pose[:3], heading, [opening], self._finger_force(), joints])
+
+    def _bounded(self, numbers: NDArray[Any]) -> NDArray[np.float32]:
+        """Return the numbers as a float32 array inside the bounds of the observation space, zero where not finite."""
+        return np.clip(np.nan_to_num(numbers.astype(np.float32), nan=0.0), *self._bounds)
 
     def _observe(self) -> Any:
         """Return the observation of the chosen type, in arrays of its own."""
@@ -272,12 +341,12 @@ class LiftSoftEnv(gym.Env):
                 points.ravel(),
                 [self.config.goal_height],
             ]
-            return np.concatenate(parts).astype(np.float32)
+            return self._bounded(np.concatenate(parts))
         edge = self.config.image_size
         pixels = self.scene.render((edge, edge)).images("pixels").numpy()[0].copy()
         if self.obs_type == "pixels":
             return pixels
-        return {"pixels": pixels, "agent_pos": self._agent_pos()}
+        return {"pixels": pixels, "agent_pos": self._bounded(self._agent_pos())}
 
 
 def _configured(
@@ -288,22 +357,22 @@ def _configured(
     if control_mode is not None:
         scene = replace(scene, control=replace(scene.control, mode=control_mode))
     if splat is not None or size is not None:
-        thing = scene.object
-        scene = replace(scene, object=replace(thing, splat=splat or thing.splat, size=size or thing.size))
+        given = {name: value for name, value in (("splat", splat), ("size", size)) if value is not None}
+        scene = replace(scene, object=replace(scene.object, **given))
     return replace(config, scene=scene)
 
 
 def _front_camera(name: str, edge: int) -> PinholeCamera:
     """Return the camera that looks at the object from the front."""
     return PinholeCamera.look_at(
-        name, position=(0.98, 0.30, 0.30), target=(0.45, 0.0, 0.115), width=edge, height=edge, fov_y=0.56
+        name, position=(0.86, 0.34, 0.25), target=(0.44, 0.0, 0.11), width=edge, height=edge, fov_y=0.60
     )
 
 
 def _overview(edge: int) -> PinholeCamera:
     """Return the camera that sees arm and table."""
     return PinholeCamera.look_at(
-        "overview", position=(1.12, -0.80, 0.62), target=(0.30, 0.0, 0.23), width=edge, height=edge, fov_y=0.68
+        "overview", position=(1.05, -0.85, 0.60), target=(0.30, 0.0, 0.25), width=edge, height=edge, fov_y=0.60
     )
 
 

@@ -2,33 +2,49 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 
 from softmode.deformables.body import BuildOptions, ReducedBody, build_body, cached_body
 from softmode.deformables.quadrature import Quadrature, quadrature_from_splats
 from softmode.errors import AssetError, ConfigError
-from softmode.splats import Splats, make_plush, read_splats
+from softmode.splats import Splats, make_plush, read_splats, split_components
+from softmode.splats.splats import UpAxis
+
+Part = Literal["thickest", "tallest", "largest", "all"]
+Pose = Literal["stable", "captured"]
+
+STABLE_TILT = 0.1
+"""A pose is stable if tilting the object by this angle [rad] in any direction raises its centre of mass."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectConfig:
-    """Which soft object, how large, how finely reduced."""
+    """Which soft object, how large, how finely reduced. `part`, `up`, `crop` and `pose` concern splat files only."""
 
     splat: str | Path | None = None
     """Splat file (INRIA .ply, SOG v2); None for the built-in plush."""
     size: float = 0.08
-    """Longest edge of the object's bounding box [m]; the gripper opens 0.09 m."""
-    up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] = "-y"
-    """Axis of the splat file that points up; trained captures mostly have y down. The plush stands as it is."""
+    """Longest edge of the object's bounding box, upright [m]; the gripper opens 0.09 m."""
+    up: UpAxis = "-y"
+    """Axis of the splat file that points up; trained captures mostly have y down."""
     crop: tuple[float, float, float, float, float, float] | None = None
     """Box (x0, y0, z0, x1, y1, z1) of the file, after turning it up, outside which splats are dropped; cuts an object
-    off the ground it was captured on."""
+    off what it touched when it was captured."""
+    part: Part = "thickest"
+    """Which of the capture's separate parts is the object: the one with the largest least spread, so that neither the
+    ground it was captured on, wide but thin, nor loose small parts win; the one with the greatest height; the one with
+    most splats; or whatever there is."""
+    pose: Pose = "stable"
+    """"stable" lays an object that cannot stand as captured (on a pointed foot, say) on the side that needs the least
+    turn; "captured" lets it topple."""
     build: BuildOptions = field(default_factory=BuildOptions)
     """How the body is reduced."""
 
@@ -38,6 +54,11 @@ class ObjectConfig:
             raise ConfigError(f"size must lie in 0.005..1 m, got {self.size!r}", hint="give the longest edge in metres")
         if self.crop is not None and not all(a < b for a, b in zip(self.crop[:3], self.crop[3:], strict=True)):
             raise ConfigError(f"crop {self.crop} is empty", hint="give x0 y0 z0 x1 y1 z1 with every 0 below its 1")
+        for name, known in (("up", UpAxis), ("part", Part), ("pose", Pose)):
+            if getattr(self, name) not in get_args(known):
+                raise ConfigError(
+                    f"{name} is {getattr(self, name)!r}", hint=f"use one of {', '.join(map(repr, get_args(known)))}"
+                )
 
 
 @dataclass(frozen=True)
@@ -67,21 +88,93 @@ def load_object(config: ObjectConfig, progress: Callable[[str, float], None] | b
         AssetError: If the file cannot be read or encloses no volume.
     """
     splats = _read(config)
-    quadrature: list[Quadrature] = []
-
-    def fill() -> Quadrature:
-        if not quadrature:
-            quadrature.append(quadrature_from_splats(splats.means, splats.scales, splats.quats, splats.opacities))
-        return quadrature[0]
-
-    name = "plush" if config.splat is None else Path(config.splat).name
-    key = ("splats", splats.means, splats.scales, splats.quats, splats.opacities, config.build)
-    body = cached_body(key, lambda: build_body(fill(), config.build, name=name, progress=progress))
-    kept = _drawn(splats, body)
-    shown = splats.subset(kept)
-    shown = shown.transformed(translation=-body.offset)
+    body = _body(splats, config, progress)
+    turn = np.array(json.loads(str(body.provenance["turn"])))
+    if not np.array_equal(turn, np.eye(3)):
+        splats = splats.transformed(rotation=turn)
+    shown = splats.subset(_drawn(splats, body)).transformed(translation=-body.offset)
     basis, grad_basis = body.evaluate(shown.means)
     return SoftObject(body, shown, basis, grad_basis, float(-body.surface_points[:, 2].min()))
+
+
+def choose_part(splats: Splats, rule: Part) -> Splats:
+    """Return the part of a capture that is the object, by the rule of `ObjectConfig.part`.
+
+    Raises:
+        AssetError: If the capture holds no connected part.
+    """
+    if rule == "all":
+        return splats
+    parts = split_components(splats)
+    if not parts:
+        raise AssetError(f"{splats.name}: no part of it hangs together", hint="use part 'all', or export it again")
+    if rule == "largest":
+        return parts[0]
+    if rule == "tallest":
+        return max(parts, key=lambda part: float(np.ptp(part.bounds(quantile=0.005)[:, 2])))
+    return max(parts, key=lambda part: float(np.linalg.eigvalsh(np.cov(part.means.astype(np.float64).T))[0]))
+
+
+def stable_rotation(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return the least rotation after which an object stands stably, None if it does so already or never does.
+
+    The height of the centre of mass above a plane with outward normal n below the object is h(n) = max_i n . X_i. The
+    object rests on a face of its convex hull, and does so stably if h grows when n is tilted.
+
+    Args:
+        points: Surface samples relative to the centre of mass [m], shape (S, 3).
+    """
+    try:
+        equations = ConvexHull(points).equations
+    except QhullError:
+        return None
+    down = np.array([[0.0, 0.0, -1.0]])
+    candidates = np.concatenate([down, equations[:, :3]])
+    height = (candidates @ points.T).max(axis=1)
+    side = np.cross(candidates, np.where(np.abs(candidates[:, :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    other = np.cross(candidates, side)
+    stable = np.ones(len(candidates), bool)
+    for azimuth in np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False):
+        tilted = np.cos(STABLE_TILT) * candidates + np.sin(STABLE_TILT) * (
+            np.cos(azimuth) * side + np.sin(azimuth) * other
+        )
+        stable &= (tilted @ points.T).max(axis=1) > height
+    if stable[0] or not stable.any():
+        return None
+    normal = candidates[stable][(candidates[stable] @ down[0]).argmax()]
+    axis, cosine = np.cross(normal, down[0]), float(normal @ down[0])
+    if np.linalg.norm(axis) < 1e-9:  # upside down: any horizontal axis will do
+        return np.diag([1.0, -1.0, -1.0])
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + cross + cross @ cross / (1.0 + cosine)
+
+
+def _body(splats: Splats, config: ObjectConfig, progress: Callable[[str, float], None] | bool | None) -> ReducedBody:
+    """Build the body of the solid that the splats enclose, or recall it; its provenance holds the turn to its pose."""
+    name = "plush" if config.splat is None else Path(config.splat).name
+
+    def fill(turned: Splats) -> Quadrature:
+        try:
+            return quadrature_from_splats(turned.means, turned.scales, turned.quats, turned.opacities)
+        except AssetError as error:
+            raise AssetError(f"{splats.name}: {error.message}", hint=error.hint) from error
+
+    def build() -> ReducedBody:
+        quadrature, turn = fill(splats), None
+        if config.splat is not None and config.pose == "stable":
+            centre = quadrature.weights @ quadrature.points / quadrature.volume
+            turn = stable_rotation(quadrature.surface_points - centre)
+        if turn is not None:
+            quadrature = fill(splats.transformed(rotation=turn))
+        body = build_body(quadrature, config.build, name=name, progress=progress)
+        rows = np.eye(3).tolist() if turn is None else turn.tolist()
+        return replace(body, provenance={**body.provenance, "turn": json.dumps(rows)})
+
+    pose = config.pose if config.splat is not None else "captured"
+    key = ("splats", splats.means, splats.scales, splats.quats, splats.opacities, pose, config.build)
+    return cached_body(key, build)
 
 
 def _read(config: ObjectConfig) -> Splats:
@@ -91,9 +184,15 @@ def _read(config: ObjectConfig) -> Splats:
     else:
         splats = read_splats(config.splat).oriented(config.up)
         if config.crop is not None:
-            splats = splats.cropped(config.crop[:3], config.crop[3:])
-            if splats.count == 0:
-                raise AssetError(f"{config.splat}: no splat lies inside crop {config.crop}", hint="widen the box")
+            inside = (splats.means >= config.crop[:3]).all(axis=1) & (splats.means <= config.crop[3:]).all(axis=1)
+            if not inside.any():
+                low, high = np.round(splats.bounds(), 3).tolist()
+                raise AssetError(
+                    f"{splats.name}: no splat lies inside crop {config.crop}",
+                    hint=f"the splats fill {low} to {high} once turned up",
+                )
+            splats = splats.subset(inside)
+        splats = choose_part(splats, config.part)
     low, high = splats.bounds(quantile=0.0 if config.splat is None else 0.002)
     extent = float((high - low).max())
     if not extent > 0.0:

@@ -16,11 +16,24 @@ class ScriptedLift:
 
     The grasp yaw is the one across the object's narrowest horizontal extent that needs the least turn of the wrist. The
     squeeze is regulated on the measured finger forces, because one opening means another force for every stiffness.
+    An object that topples or rolls is waited for, and planned anew where it comes to rest.
 
     Args:
         env: A LiftSoft environment, wrapped or not.
         squeeze: Force of each finger as a multiple of the least that friction needs to carry the weight.
+
+    Raises:
+        ConfigError: If the environment is another one, or its actions are not tool steps.
     """
+
+    CLEARANCE = 0.08
+    """Height above the grasp from which the gripper goes down [m]."""
+    STILL = 0.02
+    """Speed of the object's centre of mass under which it counts as at rest [m/s]."""
+    MOVED = 0.004
+    """Displacement of its centre of mass that calls for a new plan [m]."""
+    PATIENCE = 60
+    """Control steps after which closing without a grip is given up."""
 
     def __init__(self, env: Any, *, squeeze: float = 5.0) -> None:
         """Remember the environment and plan nothing yet."""
@@ -36,46 +49,57 @@ class ScriptedLift:
 
     def reset(self) -> None:
         """Forget the episode; call after ``env.reset``."""
-        self._phase = "align"
+        self._start("align")
         self._grip = 1.0
         self._grasp: tuple[NDArray[np.float64], float] | None = None
-        self._wait = 0
-        self._lost = 0
+        self._planned_at = np.full(3, np.inf)
+
+    def _start(self, phase: str) -> None:
+        """Enter a phase."""
+        self._phase, self._elapsed, self._count = phase, 0, 0
 
     def __call__(self, observation: Any = None) -> NDArray[np.float32]:
         """Return the action for the present state."""
         scene = self.env.scene
-        if self._grasp is None:
-            self._grasp = self._plan()
-        place, yaw = self._grasp
-        options = self.env.config.scene.control
+        centre = scene.object_position.numpy()[0].astype(float)
+        still = np.linalg.norm(scene.object_velocity.numpy()[0]) < self.STILL
         tool = scene.controller.target_position.numpy()[0].astype(float)
-        turn = yaw - float(scene.controller.target_yaw.numpy()[0])
         force = np.linalg.norm(scene.finger_force.numpy()[0], axis=1)
-        goal = place + [0.0, 0.0, 0.08]
+        if self._phase in ("align", "descend") and np.linalg.norm(centre - self._planned_at) > self.MOVED:
+            self._grasp, self._planned_at = self._plan(), centre
+            self._start("align")
+        assert self._grasp is not None
+        place, yaw = self._grasp
+        turn = yaw - float(scene.controller.target_yaw.numpy()[0])
+        self._elapsed += 1
+        goal = place
         if self._phase == "align":
-            if np.linalg.norm((goal - tool)[:2]) < 0.002 and abs(turn) < 0.02:
-                self._phase = "descend"
+            above = place + [0.0, 0.0, self.CLEARANCE]
+            low = tool[2] < above[2] - 0.02  # after a failed grasp: straight up first
+            goal = np.array([*tool[:2], above[2]]) if low else above
+            if still and np.linalg.norm((place - tool)[:2]) < 0.002 and abs(turn) < 0.02:
+                self._start("descend")
         elif self._phase == "descend":
-            goal = place
-            if np.linalg.norm(place - tool) < 0.001:
-                self._wait += 1
-            if self._wait > 4:
-                self._phase = "close"
+            self._count += np.linalg.norm(place - tool) < 0.001
+            if self._count > 4:
+                self._start("close")
         elif self._phase == "close":
-            goal = place
             self._grip = self._regulated(force)
-            self._wait += 1 if force.min() > 0.7 * self._wanted_force() else 0
-            if self._wait > 12:
-                self._phase = "lift"
-        else:
-            self._lost = self._lost + 1 if force.min() < 0.02 else 0
-            if self._lost > 8:
+            self._count += force.min() > 0.7 * self._wanted_force()
+            if self._count > 12:
+                self._start("lift")
+            elif self._elapsed > self.PATIENCE:
                 self.reset()
-                return np.array([0.0, 0.0, 1.0, 0.0, 1.0], np.float32)
+                goal = tool
+        else:
+            self._count = self._count + 1 if force.min() < 0.02 else 0
             self._grip = self._regulated(force)
-            rise = self.env.config.goal_height - self.env._height()
+            rise = self.env.config.goal_height - self.env.rise()
             goal = tool + [0.0, 0.0, np.clip(rise, -0.008, 0.008)]
+            if self._count > 8:
+                self.reset()
+                goal = tool
+        options = self.env.config.scene.control
         move = np.clip((goal - tool) / options.translation_scale, -1.0, 1.0)
         spin = np.clip(turn / options.rotation_scale, -1.0, 1.0)
         return np.array([*move, spin, self._grip], np.float32)
@@ -86,21 +110,18 @@ class ScriptedLift:
         points = scene.state.particle_q.numpy().astype(float)
         top, bottom = points[:, 2].max(), points[:, 2].min()
         depth = min(0.5 * gripper.pad_size[2], 0.5 * (top - bottom))
-        centre_of_mass = scene.object_position.numpy()[0].astype(float)
-        heavy = centre_of_mass[:2]
-        height = max(centre_of_mass[2], bottom + depth, self.env.config.scene.control.workspace_lower[2])
+        centre = scene.object_position.numpy()[0].astype(float)
+        height = max(centre[2], bottom + depth, self.env.config.scene.control.workspace_lower[2])
         near = points[np.abs(points[:, 2] - height) < 0.5 * gripper.pad_size[2]]
         best: tuple[float, float, NDArray[np.float64]] | None = None
         for yaw in np.linspace(-0.5 * np.pi, 0.5 * np.pi, 36, endpoint=False):
-            across = near[:, :2] @ np.array([-np.sin(yaw), np.cos(yaw)])
-            along = near[:, :2] @ np.array([np.cos(yaw), np.sin(yaw)])
-            width = np.ptp(across)
-            cost = width + 0.004 * abs(yaw)
+            forward, sideways = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+            along, across = near[:, :2] @ forward, near[:, :2] @ sideways
+            cost = np.ptp(across) + 0.004 * abs(yaw)
             if best is None or cost < best[0]:
                 middle = 0.5 * (across.max() + across.min())
-                centre = np.clip(heavy @ np.array([np.cos(yaw), np.sin(yaw)]), along.min(), along.max())
-                place = centre * np.array([np.cos(yaw), np.sin(yaw)]) + middle * np.array([-np.sin(yaw), np.cos(yaw)])
-                best = (cost, float(yaw), place)
+                under = np.clip(centre[:2] @ forward, along.min(), along.max())
+                best = (cost, float(yaw), under * forward + middle * sideways)
         assert best is not None
         return np.array([*best[2], height]), best[1]
 

@@ -1,0 +1,122 @@
+"""Time the build of a body and every stage of a substep of LiftSoft, in the middle of a grasp.
+
+Run: ``python benchmarks/step.py [--repeats N] [--device cpu]`` (``make bench``). Medians over graph replays; a CPU device runs
+Warp's kernels on one core. Ratios refer to the whole substep measured in the same run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+
+import numpy as np
+import warp as wp
+
+from softmode.deformables.body import BuildOptions, build_body
+from softmode.deformables.quadrature import quadrature_from_splats
+from softmode.envs.lift_soft import LiftSoftEnv
+from softmode.envs.scripted import ScriptedLift
+from softmode.splats import make_plush
+
+GRASP_STEPS = 55
+"""Control steps of the scripted policy after which the object is held off the table."""
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=200)
+    parser.add_argument("--device", default="cpu")
+    options = parser.parse_args()
+    wp.config.log_level = wp.LOG_WARNING
+    print_build()
+    env = LiftSoftEnv(obs_type="pixels", render_mode="rgb_array", device=options.device)
+    observation, _ = env.reset(seed=0, options={"youngs_modulus": 2.0e5})
+    policy = ScriptedLift(env)
+    iterations = []
+    for _ in range(GRASP_STEPS):
+        observation, *_ = env.step(policy(observation))
+        iterations.append(int(env.scene.solver.reduced.iteration.numpy()[0]))
+    print_substep(env, options.repeats, statistics.mean(iterations[-15:]))
+    print_cameras(env, options.repeats)
+
+
+def print_build() -> None:
+    """Time the build of the default object."""
+    splats = make_plush()
+    clock = time.perf_counter()
+    quadrature = quadrature_from_splats(splats.means, splats.scales, splats.quats, splats.opacities)
+    filled = time.perf_counter() - clock
+    body = build_body(quadrature, BuildOptions(), name="plush", progress=False)
+    print(f"build: quadrature {filled:.2f} s, body {body.build_seconds:.2f} s")
+    print(f"  {len(quadrature.points)} quadrature points, {body.function_count} functions, {body.point_count} cubature")
+    for name, value in body.provenance.items():
+        if name.startswith(("seconds", "cubature")):
+            print(f"  {name}: {value}")
+
+
+def print_substep(env: LiftSoftEnv, repeats: int, iterations: float) -> None:
+    """Time the stages of one substep, each captured on its own, from the same state."""
+    scene = env.scene
+    solver, dt, device = scene.solver, scene.dt, scene.device
+    soft, state, scratch = solver.reduced, scene.state, scene._scratch
+    blank = soft.active
+    blank.fill_(1)
+    whole = measure(lambda: solver.step(state, scratch, scene.control, None, dt), repeats, device)
+    print(f"substep: {whole:.3f} ms, {iterations:.2f} Newton iterations, {int(soft.entry_count.numpy()[0])} contacts")
+    stages: dict[str, Callable[[], None]] = {
+        "MuJoCo step (two per substep)": lambda: solver.rigid.step(state, scratch, scene.control, None, dt),
+        "Jacobian, mass matrix": lambda: solver._linearise(state, dt),
+        "begin": lambda: soft.begin(state, dt),
+        "detect contacts": lambda: soft.detect(state, scene.control, dt, prescribed=False),
+        "evaluate with derivatives (per iteration)": lambda: soft._evaluate(
+            blank, soft.q, soft.rigid.r, dt, derivatives=True
+        ),
+        "evaluate energy (per trial)": lambda: soft._evaluate(blank, soft.q, soft.rigid.r, dt, derivatives=False),
+        "sum potential (per evaluation)": lambda: soft._sum_potential(
+            blank, soft.q, soft.rigid.r, dt, soft.potential
+        ),
+        "assemble (per iteration)": lambda: soft._assemble(dt),
+        "factor and solve (per iteration)": soft._solve,
+        "finish": lambda: soft.finish(scratch, dt),
+    }
+    for name, stage in stages.items():
+        blank.fill_(1)
+        milliseconds = measure(stage, repeats, device)
+        print(f"  {name:<44}{milliseconds:8.3f} ms  {milliseconds / whole:6.1%}")
+    frame = measure(scene._control_step, max(repeats // 10, 5), device)
+    print(f"control step: {frame:.2f} ms for {scene.config.substeps} substeps = {1e3 / scene.config.control_hz / frame:.2f} x real time")
+
+
+def print_cameras(env: LiftSoftEnv, repeats: int) -> None:
+    """Time a frame of every camera."""
+    for size in env.scene.cameras:
+        env.scene.render(size)
+        clock = []
+        for _ in range(max(repeats // 10, 5)):
+            start = time.perf_counter()
+            env.scene.render(size)
+            wp.synchronize_device(env.scene.device)
+            clock.append(1e3 * (time.perf_counter() - start))
+        views = env.scene.cameras[size].view_count
+        print(f"camera {size[0]} px, {views} view(s): {np.median(clock):.2f} ms per frame")
+
+
+def measure(stage: Callable[[], None], repeats: int, device: wp.Device) -> float:
+    """Return the median time [ms] of a captured stage."""
+    stage()
+    with wp.ScopedCapture(device=device) as capture:
+        stage()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        wp.capture_launch(capture.graph)
+        wp.synchronize_device(device)
+        times.append(1e3 * (time.perf_counter() - start))
+    return float(np.median(times))
+
+
+if __name__ == "__main__":
+    main()

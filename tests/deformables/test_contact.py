@@ -1,0 +1,413 @@
+"""Contact with shapes that move as prescribed: distances against closed forms, weight, friction, detection, errors."""
+
+import newton
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+
+from softmode.deformables import contact, kernels
+from softmode.deformables.materials import Material
+from softmode.deformables.solver_reduced import SolverReduced, SolverReducedOptions, add_reduced_body
+from softmode.errors import ConfigError
+from tests import reference
+from tests.scenes import GRAVITY, Scene, cube, rotation
+
+FLOAT32 = float(np.finfo(np.float32).eps)
+EDGE = 0.1
+DOWN = (0.0, 0.0, -GRAVITY)
+ShapeConfig = newton.ModelBuilder.ShapeConfig
+
+
+@wp.kernel
+def _query(
+    shape_type: int,
+    scale: wp.vec3,
+    mesh: wp.uint64,
+    x: wp.array[wp.vec3],
+    reach: float,
+    # Out:
+    distance_out: wp.array[float],
+    normal_out: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    query = contact.query_shape(shape_type, scale, mesh, x[i], reach)
+    distance_out[i] = query.distance
+    normal_out[i] = query.normal
+
+
+@wp.kernel
+def _potentials(
+    x: wp.array[wp.float64],
+    eps: wp.float64,
+    # Out:
+    normal_out: wp.array[wp.vec3d],
+    friction_out: wp.array[wp.vec2d],
+):
+    i = wp.tid()
+    value, slope, curvature = contact.normal_potential(x[i], eps)
+    normal_out[i] = wp.vec3d(value, slope, curvature)
+    f0, f1_over_y = contact.friction_potential(x[i], eps)
+    friction_out[i] = wp.vec2d(f0, f1_over_y)
+
+
+def query(kind, scale, points, *, mesh=0, reach=10.0):
+    """Return distances (N,) and normals (N, 3) of points in the frame of a shape."""
+    with wp.ScopedDevice("cpu"):
+        x = wp.array(points, dtype=wp.vec3)
+        distance, normal = wp.zeros(len(points), dtype=float), wp.zeros(len(points), dtype=wp.vec3)
+        inputs = [int(kind), wp.vec3(*scale), wp.uint64(mesh), x, reach]
+        wp.launch(_query, dim=len(points), inputs=inputs, outputs=[distance, normal])
+    return distance.numpy(), normal.numpy()
+
+
+def box_mesh(half, offset=(0.0, 0.0, 0.0)):
+    """Return a closed triangle mesh of a box, outward oriented."""
+    box = trimesh.creation.box(extents=2.0 * np.asarray(half))
+    return newton.Mesh(np.asarray(box.vertices) + offset, np.asarray(box.faces).ravel())
+
+
+KIND = newton.GeoType
+SHAPES = {
+    "plane": (KIND.PLANE, (0.0, 0.0, 0.0), reference.distance_plane),
+    "sphere": (KIND.SPHERE, (0.3, 0.0, 0.0), lambda x: reference.distance_sphere(x, 0.3)),
+    "capsule": (KIND.CAPSULE, (0.2, 0.3, 0.0), lambda x: reference.distance_capsule(x, 0.2, 0.3)),
+    "cylinder": (KIND.CYLINDER, (0.2, 0.3, 0.0), lambda x: reference.distance_cylinder(x, 0.2, 0.3)),
+    "box": (KIND.BOX, (0.2, 0.3, 0.1), lambda x: reference.distance_box(x, np.array([0.2, 0.3, 0.1]))),
+}
+
+
+# -- distances ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_distance(name):
+    """The signed distance equals the closed form, inside and outside; its gradient is the normal."""
+    kind, scale, distance = SHAPES[name]
+    x = np.random.default_rng(0).uniform(-0.6, 0.6, size=(2000, 3)).astype(np.float32)
+    d, n = query(kind, scale, x)
+    expected = distance(x.astype(float))
+    assert (expected < -0.01).any() and (expected > 0.01).any()
+    np.testing.assert_allclose(d, expected, atol=8 * FLOAT32)
+    np.testing.assert_allclose(np.linalg.norm(n, axis=1), 1.0, atol=8 * FLOAT32)
+    # a step back along the normal by the distance ends on the surface
+    np.testing.assert_allclose(distance(x - d[:, None] * n), 0.0, atol=16 * FLOAT32)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_distance_at_symmetric_points(name):
+    """Centres, axes, faces and edges, where the gradient is not unique: finite distance, unit normal."""
+    kind, scale, distance = SHAPES[name]
+    half = {"plane": 0.0, "sphere": 0.3, "capsule": 0.2, "cylinder": 0.2, "box": 0.2}[name]
+    x = np.array([[0, 0, 0], [half, 0, 0], [-half, 0, 0], [0, 0, 0.05], [0, 0, 0.3], [0, 0.3, 0.1]], np.float32)
+    d, n = query(kind, scale, x)
+    np.testing.assert_allclose(d, distance(x.astype(float)), atol=8 * FLOAT32)
+    np.testing.assert_allclose(np.linalg.norm(n, axis=1), 1.0, atol=8 * FLOAT32)
+
+
+@pytest.mark.parametrize("scale", [(1.0, 1.0, 1.0), (2.0, 2.0, 2.0)], ids=["unit", "scaled"])
+def test_mesh_distance_equals_box(scale):
+    """A box as a triangle mesh has the distances of the box wherever the distance is within reach."""
+    half = np.array([0.2, 0.3, 0.1])
+    mesh = box_mesh(half / scale[0])
+    identity = mesh.finalize(device="cpu")
+    x = np.random.default_rng(1).uniform(-0.6, 0.6, size=(2000, 3)).astype(np.float32)
+    d, n = query(KIND.MESH, scale, x, mesh=identity)
+    expected = reference.distance_box(x.astype(float), half)
+    np.testing.assert_allclose(d, expected, atol=16 * FLOAT32)
+    clear = np.abs(expected) > 1e-4  # nearer, the direction is lost to rounding
+    back = reference.distance_box(x - d[:, None] * n, half)
+    np.testing.assert_allclose(back[clear], 0.0, atol=32 * FLOAT32)
+
+
+def test_mesh_contact_is_not_lost_when_deep():
+    """A point inside a mesh is inside however small the detection distance: d = -0.1 with a reach of 1 mm."""
+    mesh = box_mesh((0.2, 0.2, 0.2))
+    d, _ = query(KIND.MESH, (1, 1, 1), np.array([[0.0, 0.0, 0.1]]), mesh=mesh.finalize(device="cpu"), reach=1e-3)
+    np.testing.assert_allclose(d, -0.1, atol=8 * FLOAT32)
+
+
+# -- potentials -----------------------------------------------------------------------------------------------------------
+
+
+def test_potentials():
+    """psi_n equals p^3/(6 eps), p^2/2 - eps p/2 + eps^2/6, C2 at eps; psi_t is eq. (13) of IPC; slopes by differences."""
+    eps, step = 1.0e-3, 1.0e-9
+    x = np.concatenate([np.linspace(-eps, 4 * eps, 501), [0.0, eps, 0.5 * eps]])
+
+    def evaluate(values):
+        with wp.ScopedDevice("cpu"):
+            normal = wp.zeros(len(values), dtype=wp.vec3d)
+            friction = wp.zeros(len(values), dtype=wp.vec2d)
+            inputs = [wp.array(values, dtype=wp.float64), wp.float64(eps)]
+            wp.launch(_potentials, dim=len(values), inputs=inputs, outputs=[normal, friction])
+        return normal.numpy(), friction.numpy()
+
+    normal, friction = evaluate(x)
+    np.testing.assert_allclose(normal[:, 0], reference.normal_potential(x, eps), atol=1e-15)
+    plus, minus = evaluate(x + step), evaluate(x - step)
+    # Curvature jumps in its own slope only (C2), so differences err by step times 1/eps.
+    np.testing.assert_allclose((plus[0] - minus[0])[:, 0] / (2 * step), normal[:, 1], atol=1e-9)
+    np.testing.assert_allclose((plus[0] - minus[0])[:, 1] / (2 * step), normal[:, 2], atol=2 * step / eps)
+    slip = x > 2 * step
+    np.testing.assert_allclose(friction[slip, 0], reference.friction_potential(x[slip], eps), atol=1e-15)
+    slope = (plus[1] - minus[1])[slip, 0] / (2 * step)
+    np.testing.assert_allclose(slope, (friction[:, 1] * x)[slip], atol=4 * step / eps)
+    assert friction[np.flatnonzero(x > eps)[0], 1] * x[x > eps][0] == pytest.approx(1.0)
+
+
+# -- rest -----------------------------------------------------------------------------------------------------------------
+
+
+def on_shape(add_shape, *, height, material=None, x=0.0, **kw):
+    """Return a scene with a cube just above a fixed shape."""
+    body = cube()
+
+    def populate(world):
+        add_shape(world)
+        add_reduced_body(world, body, material=material, position=(x, 0.0, height + 0.5 * EDGE))
+
+    return Scene(populate, [body], **{"gravity": DOWN, **kw})
+
+
+def settle(scene, steps):
+    """Replay a captured pair of steps; return instance forces (steps / 2, 3) and the union of status bits."""
+    replay = scene.capture()
+    forces, status = [], 0
+    for _ in range(steps // 2):
+        replay()
+        forces.append(scene.reduced.instance_force.numpy()[0].copy())
+        status |= int(scene.reduced.status.numpy()[0])
+    return np.array(forces), status
+
+
+FLOORS = {
+    "plane": (lambda w: w.add_ground_plane(), 0.0),
+    "box": (lambda w: w.add_shape_box(-1, hx=0.3, hy=0.3, hz=0.1), 0.1),
+    "cylinder": (lambda w: w.add_shape_cylinder(-1, radius=0.3, half_height=0.1), 0.1),
+    "sphere": (lambda w: w.add_shape_sphere(-1, radius=2.0), 2.0),
+    "mesh": (lambda w: w.add_shape_mesh(-1, mesh=box_mesh((0.3, 0.3, 0.1))), 0.1),
+}
+
+
+@pytest.mark.parametrize("floor", FLOORS)
+def test_cube_at_rest_carries_its_weight(floor):
+    """Sum of contact forces = m g within 0.1 %, without trembling, no status bit but a converged line search."""
+    add_shape, height = FLOORS[floor]
+    scene = on_shape(add_shape, height=height, material=Material(mass_damping=2.0))
+    forces, status = settle(scene, 500)
+    weight = scene.mass() * GRAVITY
+    np.testing.assert_allclose(forces[-25:].mean(axis=0), [0.0, 0.0, weight], atol=1e-3 * weight)
+    assert forces[-25:].std(axis=0).max() <= 1e-3 * weight
+    assert not status & (kernels.WORLD_ITERATION_LIMIT | kernels.WORLD_NOT_FINITE | kernels.WORLD_CONTACT_OVERFLOW)
+
+
+@pytest.mark.parametrize("offset", [0.0, 100.0])
+def test_rest_far_from_the_origin(offset):
+    """100 m from the origin, positions in float32 have 8 um; the cube still carries its weight to 0.1 %."""
+    scene = on_shape(lambda w: w.add_ground_plane(), height=0.0, material=Material(mass_damping=2.0), x=offset)
+    forces, _ = settle(scene, 400)
+    np.testing.assert_allclose(forces[-25:, 2].mean(), scene.mass() * GRAVITY, rtol=1e-3)
+
+
+def test_stiffness_and_size_of_the_penalty():
+    """At rest under uniform pressure w = m g / A the samples sink p with kappa (p - eps / 2) = w, or p^2 / (2 eps)."""
+    scene = on_shape(lambda w: w.add_ground_plane(), height=0.0, material=Material(youngs_modulus=1.0e7, mass_damping=5.0))
+    settle(scene, 400)
+    kappa = float(scene.model.softmode.contact_stiffness.numpy()[0])
+    eps = float(scene.reduced.smoothing.numpy()[0])
+    pressure = scene.mass() * GRAVITY / EDGE**2
+    p = np.sqrt(2 * eps * pressure / kappa)
+    p = p if p < eps else pressure / kappa + eps / 2
+    bottom = scene.body().surface_normals[:, 2] < -0.9
+    depth = -scene.state.particle_q.numpy()[bottom, 2].astype(float)
+    # E = 10 MPa is stiff but not rigid, and the areas of the samples sum to the face's only on average.
+    assert np.average(depth, weights=scene.body().surface_areas[bottom]) == pytest.approx(p, rel=0.1)
+
+
+# -- friction -------------------------------------------------------------------------------------------------------------
+
+
+def slide(angle, friction, *, tilted_box, time=1.0):
+    """Return displacement [m] and acceleration in the second half [m/s^2] of a cube down a slope, and the scene."""
+    material = Material(youngs_modulus=5.0e5, friction=friction)
+    body, R = cube(), rotation((0, 1, 0), angle)
+    config = ShapeConfig(mu=friction)
+    down = np.array([np.sin(angle), 0.0, -np.cos(angle)])  # in the frame of the slope
+
+    def populate(world):
+        if not tilted_box:
+            world.add_ground_plane(cfg=config)
+            add_reduced_body(world, body, material=material, position=(0.0, 0.0, 0.5 * EDGE))
+            return
+        half = 3.0
+        pose = wp.transform(wp.vec3(*(R @ [0.0, 0.0, -half])), wp.quat_from_axis_angle(wp.vec3(0, 1, 0), float(angle)))
+        world.add_shape_box(-1, xform=pose, hx=half, hy=half, hz=half, cfg=config)
+        add_reduced_body(world, body, material=material, position=R @ [0.0, 0.0, 0.5 * EDGE], rotation=R)
+
+    scene = Scene(populate, [body], gravity=DOWN if tilted_box else GRAVITY * down)
+    along = R @ [1.0, 0.0, 0.0] if tilted_box else np.array([1.0, 0.0, 0.0])
+    replay = scene.capture()
+    x = []
+    for _ in range(round(time / scene.dt / 2)):
+        replay()
+        x.append(along @ scene.centre())
+    half, pair = len(x) // 2, 2 * scene.dt
+    v = np.diff(x) / pair
+    return x[-1], (v[-1] - v[half]) / ((len(v) - 1 - half) * pair), scene
+
+
+@pytest.mark.parametrize("tilted_box", [False, True], ids=["tilted gravity", "tilted box"])
+def test_friction_holds_below_the_cone(tilted_box):
+    """tan(angle) = 0.9 mu: the cube stays but for the creep of smoothed friction, at most the stick velocity."""
+    time = 1.0
+    moved, acceleration, scene = slide(np.arctan(0.45), 0.5, tilted_box=tilted_box, time=time)
+    settling = 1.0e-4  # sinking in and shearing under its weight, rho g L^2 / mu
+    assert abs(moved) <= scene.reduced.options.stick_velocity * time + settling
+    assert abs(acceleration) <= 1e-3 * GRAVITY
+
+
+@pytest.mark.parametrize("tilted_box", [False, True], ids=["tilted gravity", "tilted box"])
+def test_friction_slips_above_the_cone(tilted_box):
+    """tan(angle) = 1.5 mu: a = g (sin - mu cos) within 1 %."""
+    angle = np.arctan(0.75)
+    _, acceleration, _ = slide(angle, 0.5, tilted_box=tilted_box)
+    assert acceleration == pytest.approx(GRAVITY * (np.sin(angle) - 0.5 * np.cos(angle)), rel=1e-2)
+
+
+def test_belt_drags_with_friction():
+    """On a belt of speed u the cube gains mu g t until it moves with the belt: v = min(mu g t, u)."""
+    body, speed, mu = cube(), 0.5, 0.4
+
+    def populate(world):
+        link = world.add_body(is_kinematic=True)
+        world.add_shape_box(link, hx=5.0, hy=1.0, hz=0.1, cfg=ShapeConfig(density=0.0, mu=mu))
+        material = Material(youngs_modulus=5.0e5, friction=mu)
+        add_reduced_body(world, body, material=material, position=(0.0, 0.0, 0.1 + 0.5 * EDGE))
+
+    scene = Scene(populate, [body], gravity=DOWN, dt=0.002)
+    twist = np.zeros((1, 6), np.float32)
+    twist[0, 0] = speed
+    for state in (scene.state, scene.next_state):
+        state.body_qd.assign(twist)
+    half = round(0.5 * speed / (mu * GRAVITY) / scene.dt)
+    scene.step(half)
+    assert scene.qd()[0, 0] == pytest.approx(mu * GRAVITY * half * scene.dt, rel=0.03)  # the contact first has to load
+    scene.step(3 * half)
+    assert scene.qd()[0, 0] == pytest.approx(speed, abs=10 * scene.reduced.options.stick_velocity)
+
+
+# -- detection ------------------------------------------------------------------------------------------------------------
+
+
+def contacts_after_one_step(populate_shape, position):
+    """Return how many contacts a cube at a position finds."""
+    body = cube()
+
+    def populate(world):
+        populate_shape(world)
+        add_reduced_body(world, body, position=position)
+
+    scene = Scene(populate, [body], dt=0.001)
+    scene.step()
+    return int(scene.reduced.entry_count.numpy()[0])
+
+
+def test_mesh_away_from_its_own_origin_is_found():
+    """A mesh whose vertices lie 1 m from the shape's origin is touched where it is."""
+    add = lambda w: w.add_shape_mesh(-1, mesh=box_mesh((0.1, 0.1, 0.1), offset=(1.0, 0.0, 0.0)))  # noqa: E731
+    assert contacts_after_one_step(add, (1.0, 0.0, 0.1 + 0.499 * EDGE)) > 0
+
+
+def test_shape_margin_is_part_of_the_shape():
+    """A sphere with a margin of 5 cm is touched at radius + margin, here 5 mm deep."""
+    add = lambda w: w.add_shape_sphere(-1, radius=0.05, cfg=ShapeConfig(margin=0.05))  # noqa: E731
+    assert contacts_after_one_step(add, (0.0, 0.0, 0.095 + 0.5 * EDGE)) > 0
+
+
+def test_spinning_shape_is_found_in_time():
+    """A box far out on a fast spinning arm that will hit within the step's reach passes the coarse test too."""
+    body, omega, dt = cube(), 100.0, 0.001
+
+    def populate(world):
+        link = world.add_body(is_kinematic=True)
+        pose = wp.transform(wp.vec3(1.0, 0.0, 0.0), wp.quat_identity())
+        world.add_shape_box(link, xform=pose, hx=0.05, hy=0.05, hz=0.05, cfg=ShapeConfig(density=0.0))
+        # the box's face moves at 100 m/s towards y: 0.1 m per step, and is 0.09 m away
+        add_reduced_body(world, body, position=(1.0, 0.05 + 0.09 + 0.5 * EDGE, 0.0))
+
+    scene = Scene(populate, [body], dt=dt)
+    twist = np.zeros((1, 6), np.float32)
+    twist[0, 5] = omega
+    scene.state.body_qd.assign(twist)
+    scene.step()
+    assert scene.reduced.entry_count.numpy()[0] > 0
+
+
+def test_bounded_plane_ends_where_it_ends():
+    """A plane of width 1 holds within 0.5 of its centre and nowhere else."""
+    add = lambda w: w.add_shape_plane(width=1.0, length=1.0)  # noqa: E731
+    assert contacts_after_one_step(add, (0.4, 0.0, 0.499 * EDGE)) > 0
+    assert contacts_after_one_step(add, (0.6, 0.0, 0.499 * EDGE)) == 0
+
+
+def test_shapes_of_other_worlds_are_not_touched():
+    """Each world meets its own shapes and the global ones."""
+    body = cube()
+    builder = newton.ModelBuilder()
+    for height in (0.1, -1.0):  # under the first cube, far from the second
+        world = newton.ModelBuilder()
+        world.add_shape_box(-1, xform=wp.transform(wp.vec3(0, 0, height - 0.1), wp.quat_identity()), hx=1, hy=1, hz=0.1)
+        add_reduced_body(world, body, position=(0.0, 0.0, 0.1 + 0.499 * EDGE))
+        builder.add_world(world)
+    model = builder.finalize(device="cpu")
+    solver = SolverReduced(model, [body])
+    first, second = model.state(), model.state()
+    solver.step(first, second, None, None, 0.001)
+    counts = solver.entry_count.numpy()
+    assert counts[0] > 0 and counts[1] == 0
+
+
+def test_overflow_is_reported():
+    """More contacts than contact_max raise the overflow bit; the touching ones come first and still hold the cube."""
+    options = SolverReducedOptions(contact_max=8)
+    scene = on_shape(lambda w: w.add_ground_plane(), height=-0.001, options=options)
+    scene.step()
+    assert scene.reduced.status.numpy()[0] & kernels.WORLD_CONTACT_OVERFLOW
+    assert scene.reduced.entry_count.numpy()[0] == 8
+    assert scene.reduced.instance_force.numpy()[0, 2] > 0.0
+
+
+def test_worlds_in_contact_are_independent():
+    """World i of 3 on the ground, each dropped differently, equals the single world bit for bit."""
+    batch = on_shape(lambda w: w.add_ground_plane(), height=0.001, world_count=3)
+    alone = on_shape(lambda w: w.add_ground_plane(), height=0.001)
+    states = []
+    for i in range(3):
+        qd = batch.qd(i)
+        qd[0] = [0.3 * i, 0.1, -0.5 * i]
+        batch.set(qd=qd, instance=i)
+        states.append((batch.q(i), qd))
+    batch.step(20)
+    for i, (q, qd) in enumerate(states):
+        alone.restart()
+        alone.set(q=q, qd=qd)
+        alone.step(20)
+        np.testing.assert_array_equal(batch.q(i), alone.q())
+        np.testing.assert_array_equal(batch.reduced.instance_force.numpy()[i], alone.reduced.instance_force.numpy()[0])
+
+
+def test_unsupported_shape():
+    """A shape without closed-form distance is refused with its type and label, unless it does not collide."""
+    body = cube()
+    for flag, refused in ((True, True), (False, False)):
+        builder = newton.ModelBuilder()
+        config = ShapeConfig(has_particle_collision=flag)
+        builder.add_shape_ellipsoid(-1, rx=0.1, ry=0.2, rz=0.3, cfg=config, label="egg")
+        add_reduced_body(builder, body)
+        model = builder.finalize(device="cpu")
+        if refused:
+            with pytest.raises(ConfigError, match=r"egg.*ellipsoid"):
+                SolverReduced(model, [body])
+        else:
+            SolverReduced(model, [body])

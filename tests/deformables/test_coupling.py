@@ -1,0 +1,427 @@
+"""Two-way contact with MuJoCo: derivatives of the joint potential, momentum, squeeze force, batching, faults."""
+
+import newton
+import numpy as np
+import pytest
+
+from softmode.deformables import kernels
+from softmode.deformables.coupling import SolverCoupledReduced
+from softmode.deformables.materials import Material
+from softmode.deformables.solver_reduced import SolverReducedOptions, add_pins, add_reduced_body
+from softmode.errors import ConfigError
+from tests import reference
+from tests.scenes import GRAVITY, GRIPPER, RIGID_GAP, Scene, add_free_box, add_gripper, cube
+
+FLOAT32 = float(np.finfo(np.float32).eps)
+EDGE = 0.1
+DOWN = (0.0, 0.0, -GRAVITY)
+
+
+def impact(ratio, *, offset=(0.0, 0.0), speed=0.5, friction=0.5, dt=0.001, pins=False, **kw):
+    """Return a scene of a free rigid cube, ``ratio`` times as heavy, that falls on a free soft one without gravity."""
+    body = cube()
+    material = Material(friction=friction)
+    half = 0.5 * EDGE
+
+    def populate(world):
+        position = (*offset, EDGE + RIGID_GAP)
+        mass = ratio * material.density * body.volume
+        add_free_box(world, (half,) * 3, mass, position, velocity=(0.0, 0.0, -speed), friction=friction)
+        instance = add_reduced_body(world, body, material=material)
+        if pins:
+            corners = half * np.array([[x, y, -1.0] for x in (-1, 1) for y in (-1, 1)])
+            add_pins(world, instance, corners, stiffness=200.0, targets=corners + 0.003)
+
+    scene = Scene(populate, [body], coupled=True, dt=dt, **kw)
+    return scene, reference.FreeBody(body=body, material=reference.with_float32(material), dt=dt)
+
+
+def totals(scene, twin):
+    """Return linear and angular momentum and energy of the soft and the rigid body together."""
+    p, L = scene.momentum()
+    P, spin, kinetic = scene.rigid_momentum()
+    return p + P, L + spin, scene.kinetic_energy() + kinetic + twin.elastic_energy(scene.q())
+
+
+# -- derivatives ----------------------------------------------------------------------------------------------------------
+
+
+class Potential:
+    """The incremental potential of a step in contact as a function of u = (q, r), through the solver's own kernels."""
+
+    def __init__(self, scene):
+        """Take steps until the bodies touch, then linearise the next one about its start."""
+        self.scene, self.solver = scene, scene.reduced
+        while np.abs(self.solver.instance_force.numpy()).max() < 1.0:
+            scene.step()
+        scene.step()  # reads the contacts of a step that starts in contact
+        self.n = scene.body().function_count
+        self.q = self.solver.q.numpy()[0, : self.n].copy()
+        self.r = self.solver.rigid.r.numpy()[0].copy()
+
+    def put(self, u):
+        """Write u into the solver."""
+        solver = self.solver
+        q = np.zeros((1, solver.stride, 3))
+        q[0, : self.n] = u[: 3 * self.n].reshape(-1, 3)
+        solver.q.assign(q)
+        solver.rigid.r.assign(u[None, 3 * self.n :])
+
+    @property
+    def u(self):
+        """The minimum that the step found."""
+        return np.concatenate([self.q.ravel(), self.r])
+
+    def value(self, u):
+        """Return E(u) with the normal forces of friction as they were last renewed."""
+        solver, dt = self.solver, self.scene.dt
+        self.put(u)
+        solver.active.fill_(1)
+        solver._evaluate(solver.active, solver.q, solver.rigid.r, dt, derivatives=False)
+        solver._sum_potential(solver.active, solver.q, solver.rigid.r, dt, solver.potential)
+        return float(solver.potential.numpy()[0])
+
+    def gradient(self, u):
+        """Return dE/du; renews the normal forces of friction."""
+        solver, dt = self.solver, self.scene.dt
+        self.put(u)
+        solver.active.fill_(1)
+        solver._evaluate(solver.active, solver.q, solver.rigid.r, dt, derivatives=True)
+        solver._assemble(dt)
+        return np.concatenate([solver.gradient.numpy()[0, : self.n].ravel(), solver.rigid.gradient.numpy()[0]])
+
+    def matrix(self):
+        """Return the assembled d2E/du2, unknowns in the order of u."""
+        solver, n = self.solver, self.n
+        system = solver.system.matrix.numpy()[0]
+        system = system.reshape(len(system), -1).astype(float)
+        index = (np.arange(3)[None, :] * solver.stride + np.arange(n)[:, None]).ravel()  # component-major to point-major
+        size = 3 * solver.stride
+        upper = np.triu(system[:, :size])
+        K = (upper + np.triu(upper, 1).T)[np.ix_(index, index)]
+        C = system[index, size : size + len(self.r)]
+        return np.block([[K, C], [C.T, solver.rigid.matrix.numpy()[0]]])
+
+
+def test_gradient_of_the_incremental_potential():
+    """dE/du equals central differences of E, u = (q, r), with contact, friction, pins, viscosity and rigid dofs."""
+    potential = Potential(impact(1.0, offset=(0.02, 0.01), pins=True)[0])
+    assert potential.solver.entry_count.numpy()[0] > 4 + 5
+    rng = np.random.default_rng(0)
+    u = potential.u + 1e-5 * rng.normal(size=potential.u.size)
+    gradient = potential.gradient(u)
+    # Random directions and some single unknowns, the rigid ones all.
+    directions = [rng.normal(size=u.size) for _ in range(10)]
+    directions += list(np.eye(u.size)[-6:]) + list(np.eye(u.size)[:6])
+    step = 1.0e-9  # well inside the stick range, stick_velocity dt = 1e-7 m
+    noise = 16 * np.finfo(float).eps * max(abs(potential.value(u)), 1.0) / step
+    for d in directions:
+        d = d / np.linalg.norm(d)
+        difference = (potential.value(u + step * d) - potential.value(u - step * d)) / (2 * step)
+        # The third derivative of friction, mu f_n / eps^2 per contact, bounds the error of the difference.
+        assert difference == pytest.approx(gradient @ d, rel=1e-5, abs=noise + 1e-5 * np.linalg.norm(gradient))
+
+
+def test_matrix_of_the_incremental_potential():
+    """Columns of the assembled matrix equal gradient differences, (g(u + eps d) - g(u - eps d)) / (2 eps).
+
+    Without friction (its curvature is majorised) and viscosity (Gauss-Newton), and stretched by 2 %, so that no
+    negative eigenvalue of the material is projected away.
+    """
+    scene, _ = impact(1.0, offset=(0.02, 0.01), friction=0.0, pins=True)
+    scene.set_parameter("viscosity", 0.0)
+    potential = Potential(scene)
+    u = potential.u
+    n = potential.n
+    u[: 3 * n] += scene.body().affine(1.02 * np.eye(3)).ravel()
+    potential.gradient(u)
+    matrix = potential.matrix()
+    assert np.abs(matrix[: 3 * n, 3 * n :]).max() > 0.0  # soft and rigid dofs meet
+    rng = np.random.default_rng(0)
+    size = np.abs(matrix).max()
+    step = 1.0e-8  # far inside the range of the contact's onset, 1.7e-4 m
+    for d in [rng.normal(size=u.size) for _ in range(10)] + list(np.eye(u.size)[-6:]):
+        d = d / np.linalg.norm(d)
+        difference = (potential.gradient(u + step * d) - potential.gradient(u - step * d)) / (2 * step)
+        # float32 assembly; the onset p / eps of a contact changes by step / eps of its stiffness.
+        np.testing.assert_allclose(matrix @ d, difference, atol=1e-4 * size)
+
+
+def test_jacobians_move_the_shape():
+    """The rigid part of d is the motion of the shape: the gradient over r of a free box is minus (f, arm cross f)."""
+    potential = Potential(impact(1.0, offset=(0.02, 0.01))[0])
+    solver, scene = potential.solver, potential.scene
+    u = potential.u
+    gradient = potential.gradient(u)[3 * potential.n :]
+    inertia = solver.rigid.inertia.numpy()[0]
+    contact = gradient - inertia @ (potential.r - solver.rigid.predicted.numpy()[0])
+    count = solver.entry_count.numpy()[0]
+    force, arm = solver.entry_force.numpy()[0, :count], solver.entry_arm.numpy()[0, :count]
+    expected = np.concatenate([force.sum(axis=0), np.cross(arm, force).sum(axis=0)])
+    # arms are float32 differences of world positions near 0.1 m
+    np.testing.assert_allclose(contact, expected, atol=1e-5 * np.abs(force).sum() * EDGE + 1e-6 * np.abs(force).sum())
+    assert scene.model.joint_dof_count == 6
+
+
+# -- momentum and energy ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5], ids=["smooth", "rough"])
+@pytest.mark.parametrize("ratio", [0.01, 0.1, 1.0, 100.0])
+def test_central_impact(ratio, friction):
+    """Free bodies without gravity: p is kept to 1e-4 and energy never exceeds the first, at any mass ratio."""
+    scene, twin = impact(ratio, friction=friction)
+    p0, _, e0 = totals(scene, twin)
+    touched = 0.0
+    for _ in range(80):
+        scene.step()
+        p, _, e = totals(scene, twin)
+        touched = max(touched, np.abs(scene.reduced.instance_force.numpy()).max())
+        assert np.abs(p - p0).max() <= 1e-4 * np.abs(p0).max()
+        assert e <= (1.0 + 1e-6) * e0
+    assert touched > 0.0
+
+
+@pytest.mark.parametrize("ratio", [0.01, 1.0, 100.0])
+def test_eccentric_impact(ratio):
+    """Off centre: p to 1e-4, and angular momentum about the origin to 1e-4 plus what implicit Euler loses of the spin.
+
+    L_(n+1) - L_n = -dt^2 sum_k v_k cross f_k(q_(n+1)) in a step (see `spin_left` of the free spin): of first order in dt.
+    Here it is bounded by omega dt of the angular momentum passed on.
+    """
+    scene, twin = impact(ratio, offset=(0.03, 0.02))
+    p0, L0, e0 = totals(scene, twin)
+    soft = []
+    for _ in range(60):
+        scene.step()
+        p, L, e = totals(scene, twin)
+        soft.append(np.linalg.norm(scene.momentum()[1]))
+        assert np.abs(p - p0).max() <= 1e-4 * np.abs(p0).max()
+        assert e <= (1.0 + 1e-6) * e0
+    omega = max(soft) / (scene.mass() * EDGE**2 / 6.0)
+    assert max(soft) > 0.05 * np.linalg.norm(L0) or ratio == 0.01
+    assert np.linalg.norm(L - L0) <= 1e-4 * np.linalg.norm(L0) + omega * scene.dt * max(soft)
+
+
+def test_reactions_are_equal_and_opposite():
+    """In every step: soft dp = dt F, rigid dp = -dt F and dL = dt M of the reported wrench, to 1e-4 of the peak."""
+    scene, _ = impact(1.0, offset=(0.03, 0.02))
+    rows = []
+    for _ in range(40):
+        p, P = scene.momentum()[0], scene.rigid_momentum()[:2]
+        scene.step()
+        force, wrench = scene.reduced.instance_force.numpy()[0], scene.solver.body_wrench.numpy()[0]
+        Q = scene.rigid_momentum()[:2]
+        arm = np.cross(scene.state.body_q.numpy()[0, :3].astype(float), wrench[:3])
+        rows.append(
+            [
+                (scene.momentum()[0] - p) / scene.dt - force,
+                (Q[0] - P[0]) / scene.dt - wrench[:3],
+                ((Q[1] - P[1]) / scene.dt - wrench[3:] - arm) / EDGE,
+                wrench[:3] + force,
+                force,
+            ]
+        )
+    soft, rigid, moment, sum_, force = np.abs(np.array(rows)).max(axis=(0, 2))
+    assert force > 1.0
+    assert sum_ <= 8 * FLOAT32 * force
+    assert rigid <= 1e-4 * force
+    assert moment <= 1e-3 * force  # the box turns during the step, by omega dt
+    assert soft <= 1e-4 * force
+
+
+# -- statics ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mass", [0.1, 1.0, 10.0])
+def test_box_on_cube_on_ground(mass):
+    """A rigid box rests on a soft cube: it is carried with m g, the ground carries both, within 0.1 %."""
+    body = cube()
+
+    def populate(world):
+        add_free_box(world, (0.05, 0.05, 0.02), mass, (0.0, 0.0, EDGE + 0.0202))
+        add_reduced_body(world, body, material=Material(youngs_modulus=5.0e5), position=(0.0, 0.0, 0.0501))
+
+    scene = Scene(populate, [body], coupled=True, gravity=DOWN, ground=0.8)
+    replay = scene.capture()
+    on_box, net = [], []
+    for _ in range(250):
+        replay()
+        on_box.append(scene.solver.body_wrench.numpy()[0, 2])
+        net.append(scene.reduced.instance_force.numpy()[0, 2])
+    assert np.mean(on_box[-50:]) == pytest.approx(mass * GRAVITY, rel=1e-3)
+    assert np.std(on_box[-50:]) <= 1e-3 * mass * GRAVITY
+    ground = np.mean(net[-50:]) + np.mean(on_box[-50:])
+    assert ground == pytest.approx((mass + scene.mass()) * GRAVITY, rel=1e-3)
+
+
+def test_cube_on_rigid_box_on_ground():
+    """A soft cube on a rigid box that stands on the ground is carried with its own weight, within 1 %.
+
+    MuJoCo's contact of box and ground is not part of the joint solve: during the solve the box yields to the cube by
+    dt^2 f / m, which must stay small against the sinking-in; with a box of the cube's own mass it is.
+    """
+    body = cube()
+
+    def populate(world):
+        add_free_box(world, (0.05, 0.05, 0.02), 0.3, (0.0, 0.0, 0.02))
+        add_reduced_body(world, body, material=Material(youngs_modulus=5.0e5), position=(0.0, 0.0, 0.0901))
+
+    scene = Scene(populate, [body], coupled=True, gravity=DOWN, ground=0.8)
+    replay = scene.capture()
+    force = []
+    for _ in range(250):
+        replay()
+        force.append(scene.reduced.instance_force.numpy()[0, 2])
+    weight = scene.mass() * GRAVITY
+    assert np.mean(force[-50:]) == pytest.approx(weight, rel=1e-2)
+    assert np.std(force[-50:]) <= 1e-2 * weight
+
+
+def grasp(youngs_modulus, dt, *, time=1.6, options=None, world_count=1):
+    """Return a gripper that closes on a soft cube in 0.4 s, lifts it from 0.6 s to 1.2 s, and what holds it there."""
+    body = cube(0.06)
+    material = Material(youngs_modulus=youngs_modulus, friction=0.8)
+
+    def populate(world):
+        add_gripper(world, 0.03)
+        add_reduced_body(world, body, material=material, position=(0.0, 0.0, 0.0301))
+
+    scene = Scene(
+        populate, [body], coupled=True, gravity=DOWN, ground=0.8, dt=dt, options=options, world_count=world_count
+    )
+    replay = scene.capture()
+
+    def close(t):
+        lift = GRIPPER["lift"] * min(max(t - 0.6, 0.0) / 0.6, 1.0)
+        squeeze = GRIPPER["squeeze"] * min(t / 0.4, 1.0)
+        scene.control.joint_target_q.assign(np.tile(np.array([lift, squeeze, squeeze], np.float32), world_count))
+        replay()
+
+    return scene, close, round(time / dt / 2)
+
+
+@pytest.mark.parametrize(("youngs_modulus", "dt"), [(5.0e5, 0.004), (5.0e6, 0.004), (5.0e5, 0.001)])
+def test_squeeze_equals_drive(youngs_modulus, dt):
+    """Both fingers press with k (target - q) within 1 %, std < 1 %; friction carries the weight; the cube is lifted."""
+    scene, close, count = grasp(youngs_modulus, dt)
+    height, rows, status = scene.centre()[2], [], 0
+    for k in range(count):
+        close(2 * k * dt)
+        wrench, q = scene.solver.body_wrench.numpy()[:, :3], scene.state.joint_q.numpy()
+        rows.append([wrench[1, 1], -wrench[2, 1], wrench[1:, 2].sum(), q[1], q[2], scene.centre()[2], q[0]])
+        status |= int(scene.reduced.status.numpy()[0])
+    hold = np.array(rows[-round(0.1 / dt) :])
+    for side in (0, 1):
+        drive = GRIPPER["stiffness"] * (GRIPPER["squeeze"] - hold[:, 3 + side])
+        np.testing.assert_allclose(hold[:, side].mean(), drive.mean(), rtol=1e-2)
+        assert hold[:, side].std() <= 1e-2 * drive.mean()
+    # At rest the cube is in equilibrium: no net force along the fingers' axis, its weight across it.
+    weight = scene.mass() * GRAVITY
+    assert abs(hold[:, 0].mean() - hold[:, 1].mean()) <= 1e-2 * hold[:, 0].mean()
+    assert -hold[:, 2].mean() == pytest.approx(weight, rel=1e-2)
+    # It rises with the palm, but for the creep of smoothed friction.
+    creep = scene.reduced.options.stick_velocity * 2.0 * count * dt
+    assert hold[-1, 5] - height == pytest.approx(hold[-1, 6], abs=creep + 1e-3)
+    assert not status & (kernels.WORLD_NOT_FINITE | kernels.WORLD_CONTACT_OVERFLOW)
+
+
+# -- worlds, graphs, faults -------------------------------------------------------------------------------------------------
+
+
+def fling(scene, i, seed):
+    """Give world i an initial velocity of its own."""
+    qd = scene.qd(i)
+    qd[0] = 0.2 * np.random.default_rng(seed).normal(size=3)
+    scene.set(qd=qd, instance=i)
+
+
+def test_captured_graph_equals_eager():
+    """A recorded graph of the coupled step gives the bits of kernel-by-kernel launches, soft and rigid."""
+    scene, _ = impact(1.0, offset=(0.02, 0.0))
+    replay = scene.capture()
+    for _ in range(10):
+        replay()
+    captured = [array.numpy().copy() for array in (scene.state.softmode.q, scene.state.joint_q, scene.state.body_q)]
+    fresh, _ = impact(1.0, offset=(0.02, 0.0))
+    fresh.step(20)
+    for array, expected in zip((fresh.state.softmode.q, fresh.state.joint_q, fresh.state.body_q), captured, strict=True):
+        np.testing.assert_array_equal(array.numpy(), expected)
+
+
+def test_world_of_three_equals_single_world():
+    """World i of 3 coupled worlds, each in a state of its own, equals the single world bit for bit."""
+    batch, _ = impact(1.0, world_count=3)
+    for i in range(3):
+        fling(batch, i, i)
+    batch.step(20)
+    assert np.abs(batch.reduced.instance_force.numpy()).max() > 0.0
+    for i in range(3):
+        alone, _ = impact(1.0)
+        fling(alone, 0, i)
+        alone.step(20)
+        np.testing.assert_array_equal(batch.q(i), alone.q())
+        np.testing.assert_array_equal(batch.state.body_qd.numpy()[i], alone.state.body_qd.numpy()[0])
+
+
+def test_not_a_number_stays_out_of_robots_and_other_worlds():
+    """NaN in one world's soft body is flagged; its rigid body and the other worlds stay finite, these bit for bit."""
+    clean, dirty = (impact(1.0, world_count=3)[0] for _ in range(2))
+    for scene in (clean, dirty):
+        scene.step(3)  # in contact
+    qd = dirty.qd(1)
+    qd[2, 1] = np.nan
+    dirty.set(qd=qd, instance=1)
+    for k in range(3):
+        for scene in (clean, dirty):
+            scene.step()
+        if k == 0:
+            assert dirty.reduced.status.numpy()[1] & kernels.WORLD_NOT_FINITE
+        for i in (0, 2):
+            np.testing.assert_array_equal(dirty.q(i), clean.q(i))
+            np.testing.assert_array_equal(dirty.state.body_q.numpy()[i], clean.state.body_q.numpy()[i])
+            np.testing.assert_array_equal(dirty.state.body_qd.numpy()[i], clean.state.body_qd.numpy()[i])
+    assert np.isfinite(dirty.reduced.body_wrench.numpy()).all()
+    assert np.isfinite(dirty.state.body_q.numpy()).all()
+
+
+def test_reset_restores_both():
+    """reset puts soft and rigid bodies back to the model's initial state; the run that follows repeats the first."""
+    scene, _ = impact(1.0)
+    scene.step(10)
+    first = scene.q(), scene.state.body_q.numpy().copy()
+    scene.solver.reset(scene.state)
+    scene.step(10)
+    np.testing.assert_array_equal(scene.q(), first[0])
+    np.testing.assert_array_equal(scene.state.body_q.numpy(), first[1])
+
+
+def test_external_body_force_is_kept():
+    """state.body_f, as the caller set it, acts once and is left as it was: dv = dt f / m."""
+    scene, _ = impact(1.0, speed=0.0)
+    f = np.zeros((1, 6), np.float32)
+    f[0, 2] = 3.0  # away from the cube
+    scene.state.body_f.assign(f)
+    start = scene.state
+    scene.step()
+    np.testing.assert_array_equal(start.body_f.numpy(), f)
+    mass = float(scene.model.body_mass.numpy()[0])
+    assert scene.rigid_momentum()[0][2] / mass == pytest.approx(scene.dt * 3.0 / mass, rel=1e-4)
+
+
+# -- errors -----------------------------------------------------------------------------------------------------------------
+
+
+def test_model_without_joints():
+    """Nothing to couple: the message names the solver to use."""
+    builder = newton.ModelBuilder()
+    add_reduced_body(builder, cube())
+    with pytest.raises(ConfigError, match="SolverReduced"):
+        SolverCoupledReduced(builder.finalize(device="cpu"), [cube()])
+
+
+def test_options_reach_the_soft_solve():
+    """Options given to the coupled solver rule its soft solve."""
+    scene, _ = impact(1.0, options=SolverReducedOptions(iteration_max=1))
+    scene.step(3)
+    assert scene.reduced.iteration.numpy()[0] == 1
