@@ -43,38 +43,38 @@ def cofactor_derivative(F: np.ndarray) -> np.ndarray:
 
 
 def _constants(model: MaterialModel, mu: float, lam: float) -> tuple[float, float, float, float]:
-    """Return (a, l, J0, c) of a/2 (I_C - 3) + l/2 [(J - J0)^2 - (1 - J0)^2] - c/2 ln((I_C + 1)/4)."""
+    """Return (a, b, J0, c) of a/2 (I_C - 3) + b/2 [(J - J0)^2 - (1 - J0)^2] - c/2 ln((I_C + 1)/4)."""
     if model == MaterialModel.STABLE_NEO_HOOKEAN:
         return mu, lam + mu, 1.0 + mu / (lam + mu), 0.0
-    m, l = 4.0 / 3.0 * mu, lam + 5.0 / 6.0 * mu
-    return m, l, 1.0 + m / l - m / (4.0 * l), m
+    m, bulk = 4.0 / 3.0 * mu, lam + 5.0 / 6.0 * mu
+    return m, bulk, 1.0 + m / bulk - m / (4.0 * bulk), m
 
 
 def energy(model: MaterialModel, F: np.ndarray, mu: float, lam: float) -> np.ndarray:
     """Return Psi(F) [J/m^3]."""
-    a, l, j0, c = _constants(model, mu, lam)
+    a, b, j0, c = _constants(model, mu, lam)
     ic, j = (F * F).sum(axis=(-2, -1)), np.linalg.det(F)
-    return a / 2 * (ic - 3) + l / 2 * ((j - j0) ** 2 - (1 - j0) ** 2) - c / 2 * np.log((ic + 1) / 4)
+    return a / 2 * (ic - 3) + b / 2 * ((j - j0) ** 2 - (1 - j0) ** 2) - c / 2 * np.log((ic + 1) / 4)
 
 
 def stress(model: MaterialModel, F: np.ndarray, mu: float, lam: float) -> np.ndarray:
     """Return P = dPsi/dF [Pa]."""
-    a, l, j0, c = _constants(model, mu, lam)
+    a, b, j0, c = _constants(model, mu, lam)
     ic, j = (F * F).sum(axis=(-2, -1))[..., None, None], np.linalg.det(F)[..., None, None]
-    return (a - c / (ic + 1)) * F + l * (j - j0) * cofactor(F)
+    return (a - c / (ic + 1)) * F + b * (j - j0) * cofactor(F)
 
 
 def hessian(model: MaterialModel, F: np.ndarray, mu: float, lam: float) -> np.ndarray:
     """Return dP/dF (..., 3, 3, 3, 3) [Pa], not projected."""
-    a, l, j0, c = _constants(model, mu, lam)
+    a, b, j0, c = _constants(model, mu, lam)
     shape = (..., None, None, None, None)
     ic, j = (F * F).sum(axis=(-2, -1))[shape], np.linalg.det(F)[shape]
     g = cofactor(F)
     return (
         (a - c / (ic + 1)) * np.einsum("ik,jl->ijkl", I3, I3)
         + 2 * c / (ic + 1) ** 2 * np.einsum("...ij,...kl->...ijkl", F, F)
-        + l * np.einsum("...ij,...kl->...ijkl", g, g)
-        + l * (j - j0) * cofactor_derivative(F)
+        + b * np.einsum("...ij,...kl->...ijkl", g, g)
+        + b * (j - j0) * cofactor_derivative(F)
     )
 
 
@@ -155,7 +155,7 @@ class FreeBody:
     """A body without contact and the incremental potential of one implicit Euler step, dense.
 
     E(q) = m/(2 dt^2) |q - q_n - dt v_n|^2 + m alpha/(2 dt) |q - q_n|^2 + sum_p V_p Psi(F_p) - m sum_k bbar_k g . q_k
-    + sum_e k_e/2 |x_e - target_e|^2 over the pins. With dt = inf the inertia is gone and its minimum is the equilibrium.
+    + sum_e k_e/2 |x_e - target_e|^2 over the pins. With dt = inf inertia is gone and the minimum is the equilibrium.
     """
 
     body: ReducedBody
@@ -170,7 +170,9 @@ class FreeBody:
     @cached_property
     def pin_basis(self) -> np.ndarray:
         """Functions at the pins, shape (K, n)."""
-        return self.body.evaluate(self.pin_points)[0] if len(self.pin_points) else np.zeros((0, self.body.function_count))
+        if len(self.pin_points) == 0:
+            return np.zeros((0, self.body.function_count))
+        return self.body.evaluate(self.pin_points)[0]
 
     @property
     def mass(self) -> float:

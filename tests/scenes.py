@@ -17,7 +17,6 @@ from softmode.deformables.quadrature import quadrature_from_box
 from softmode.deformables.solver_reduced import (
     SolverReduced,
     SolverReducedOptions,
-    add_reduced_body,
     register_custom_attributes,
 )
 
@@ -84,7 +83,7 @@ class Scene:
             builder.add_ground_plane(cfg=newton.ModelBuilder.ShapeConfig(mu=ground))
         self.bodies = list(bodies)
         self.dt = dt
-        self.model = builder.finalize(device="cpu")
+        self.model: Any = builder.finalize(device="cpu")
         self.model.set_gravity(tuple(gravity))
         if finish is not None:
             finish(self.model)
@@ -95,12 +94,13 @@ class Scene:
             self.reduced: SolverReduced = self.solver.reduced
         else:
             self.solver = self.reduced = SolverReduced(self.model, bodies, options=options)
-        self.control = self.model.control()
+        self.control: Any = self.model.control()
         self.restart()
 
     def restart(self) -> None:
         """Return to the initial state."""
-        self.state, self.next_state = self.model.state(), self.model.state()
+        self.state: Any = self.model.state()
+        self.next_state: Any = self.model.state()
         if self.model.joint_count:
             for state in (self.state, self.next_state):
                 newton.eval_fk(self.model, self.model.joint_q, self.model.joint_qd, state)
@@ -232,13 +232,14 @@ def add_free_box(
         inertia=wp.mat33(inertia),
         lock_inertia=True,
     )
-    builder.add_shape_box(body, hx=h[0], hy=h[1], hz=h[2], cfg=newton.ModelBuilder.ShapeConfig(density=0.0, mu=friction))
+    config = newton.ModelBuilder.ShapeConfig(density=0.0, mu=friction)
+    builder.add_shape_box(body, hx=h[0], hy=h[1], hz=h[2], cfg=config)
     builder.joint_qd[-6:-3] = list(velocity)
     return body
 
 
 GRIPPER = {"stiffness": 1000.0, "damping": 20.0, "finger_mass": 0.1, "squeeze": 0.03, "lift": 0.1}
-"""Drive of each finger [N/m, N s/m], its mass [kg], how far past contact it is driven and how high the palm lifts [m]."""
+"""Drive of each finger [N/m, N s/m], its mass [kg], how far past contact it is driven and the palm lifted [m]."""
 
 
 def add_gripper(builder: newton.ModelBuilder, half_width: float, friction: float = 0.8) -> tuple[int, int, int]:

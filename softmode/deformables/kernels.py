@@ -103,6 +103,7 @@ def evaluate_points(
     q: wp.array2d[wp.vec3d],
     dt: wp.float64,
     derivatives: int,
+    renew: wp.array[int],  # (world_count,), whether to evaluate the Hessian too
     # Out:
     energy_out: wp.array2d[wp.float64],  # (instance_count, point_max) [J]
     stress_out: wp.array2d[wp.mat33d],  # (instance_count, point_max), V P [N m]
@@ -128,6 +129,7 @@ def evaluate_points(
     energy_out[i, p] = weight * energy(parameters, G, G_start, dt)
     if derivatives != 0:
         stress_out[i, p] = weight * stress(parameters, G, G_start, dt)
+    if derivatives != 0 and renew[world[i]] != 0:
         C = float(weight) * hessian(parameters, G, dt)
         for pair in range(6):
             r = 3 * pair
@@ -176,8 +178,22 @@ def gather_gradient(
     gradient_out[i, k] = g
 
 
+@wp.func
+def block_pair(pair: int):
+    """Return the components (c, d) of the six blocks 00, 01, 02, 11, 12, 22."""
+    c = int(0)
+    d = pair
+    if pair >= 3:
+        c = 1
+        d = pair - 2
+    if pair == 5:
+        c = 2
+        d = 2
+    return c, d
+
+
 @wp.kernel
-def assemble_hessian(
+def assemble_stiffness(
     # Instances:
     world: wp.array[int],
     function_count: wp.array[int],
@@ -188,30 +204,19 @@ def assemble_hessian(
     # Assets:
     grad_basis: wp.array2d[wp.vec3],  # (point_total, stride)
     grad_basis8: wp.array3d[vec8],  # (3, point_total, stride / 8), the same numbers by component
-    row_basis: wp.array2d[float],
-    row_basis8: wp.array2d[vec8],
     # State in:
     active: wp.array[int],
+    renew: wp.array[int],
     point_hessian: wp.array3d[wp.mat33],  # blocks (c, d) = 00, 01, 02, 11, 12, 22
-    entry_count: wp.array[int],
-    entry_row: wp.array2d[int],
-    entry_hessian: wp.array2d[wp.mat33],
     dt: float,
     # Out:
-    matrix_out: wp.array3d[vec8],  # (instance_count, 3 stride, ...), upper triangle
+    stiffness_out: wp.array3d[vec8],  # (instance_count, 3 stride, 3 stride / 8), upper triangle
 ):
-    """Assemble 8x8 blocks of K = sum_p grad b^T C grad b + sum_e b^T H b, inertia on the diagonal."""
+    """Assemble 8x8 blocks of sum_p grad b^T C grad b with inertia on the diagonal."""
     i, pair, rows, lanes = wp.tid()
-    if active[world[i]] == 0:
+    if active[world[i]] == 0 or renew[world[i]] == 0:
         return
-    c = int(0)
-    d = pair
-    if pair >= 3:
-        c = 1
-        d = pair - 2
-    if pair == 5:
-        c = 2
-        d = 2
+    c, d = block_pair(pair)
     if c == d and lanes < rows:
         return
     k0 = LANES * rows
@@ -251,18 +256,6 @@ def assemble_hessian(
             a6 += g[0] * ux + g[1] * uy + g[2] * uz
             g = grad_basis[point, k0 + 7]
             a7 += g[0] * ux + g[1] * uy + g[2] * uz
-        for e in range(entry_count[i]):
-            row = entry_row[i, e]
-            v = entry_hessian[i, e][c, d] * row_basis8[row, lanes]
-            b = row_basis8[row, rows]
-            a0 += b[0] * v
-            a1 += b[1] * v
-            a2 += b[2] * v
-            a3 += b[3] * v
-            a4 += b[4] * v
-            a5 += b[5] * v
-            a6 += b[6] * v
-            a7 += b[7] * v
     stride = grad_basis.shape[1]
     if c == d and lanes == rows:
         inertia = float(mass[i]) * (1.0 / dt + mass_damping[i]) / dt
@@ -276,6 +269,61 @@ def assemble_hessian(
         a7[7] += wp.where(k0 + 7 < n, inertia, 1.0)
     row = c * stride + k0
     column = d * (stride / LANES) + lanes
+    stiffness_out[i, row, column] = a0
+    stiffness_out[i, row + 1, column] = a1
+    stiffness_out[i, row + 2, column] = a2
+    stiffness_out[i, row + 3, column] = a3
+    stiffness_out[i, row + 4, column] = a4
+    stiffness_out[i, row + 5, column] = a5
+    stiffness_out[i, row + 6, column] = a6
+    stiffness_out[i, row + 7, column] = a7
+
+
+@wp.kernel
+def assemble_matrix(
+    # Instances:
+    world: wp.array[int],
+    stride: int,
+    # Assets:
+    row_basis8: wp.array2d[vec8],
+    # State in:
+    active: wp.array[int],
+    stiffness: wp.array3d[vec8],
+    entry_count: wp.array[int],
+    entry_row: wp.array2d[int],
+    entry_hessian: wp.array2d[wp.mat33],
+    # Out:
+    matrix_out: wp.array3d[vec8],  # (instance_count, 3 stride, ...), upper triangle
+):
+    """Add the pins and contacts, sum_e b^T H b, to 8x8 blocks of the stiffness."""
+    i, pair, rows, lanes = wp.tid()
+    if active[world[i]] == 0:
+        return
+    c, d = block_pair(pair)
+    if c == d and lanes < rows:
+        return
+    row = c * stride + LANES * rows
+    column = d * (stride / LANES) + lanes
+    a0 = stiffness[i, row, column]
+    a1 = stiffness[i, row + 1, column]
+    a2 = stiffness[i, row + 2, column]
+    a3 = stiffness[i, row + 3, column]
+    a4 = stiffness[i, row + 4, column]
+    a5 = stiffness[i, row + 5, column]
+    a6 = stiffness[i, row + 6, column]
+    a7 = stiffness[i, row + 7, column]
+    for e in range(entry_count[i]):
+        basis_row = entry_row[i, e]
+        v = entry_hessian[i, e][c, d] * row_basis8[basis_row, lanes]
+        b = row_basis8[basis_row, rows]
+        a0 += b[0] * v
+        a1 += b[1] * v
+        a2 += b[2] * v
+        a3 += b[3] * v
+        a4 += b[4] * v
+        a5 += b[5] * v
+        a6 += b[6] * v
+        a7 += b[7] * v
     matrix_out[i, row, column] = a0
     matrix_out[i, row + 1, column] = a1
     matrix_out[i, row + 2, column] = a2
@@ -628,6 +676,7 @@ def finish_iteration(
     instance_start: wp.array[int],
     rigid_count: wp.array[int],
     iteration_max: int,
+    renewal: int,
     # State in:
     step_length: wp.array[wp.float64],
     direction: wp.array2d[vec8],
@@ -638,16 +687,21 @@ def finish_iteration(
     q: wp.array2d[wp.vec3d],
     r: wp.array2d[wp.float64],
     iteration: wp.array[int],
+    renew: wp.array[int],
     status: wp.array[int],
     # Out:
     any_active_out: wp.array[int],
 ):
-    """Take the accepted step and decide whether a world is done."""
+    """Take the accepted step and decide whether a world is done and whether its stiffness is to be renewed."""
     w = wp.tid()
     if active[w] == 0:
         return
     iteration[w] = iteration[w] + 1
     alpha = step_length[w]
+    stale = renew[w] == 0
+    renew[w] = 0
+    if iteration[w] % renewal == 0 or alpha < wp.float64(1.0):
+        renew[w] = 1
     for i in range(instance_start[w], instance_start[w + 1]):
         for k in range(function_count[i]):
             q[i, k] = q[i, k] + alpha * unknown(direction, i, stride / LANES, k)
@@ -655,7 +709,7 @@ def finish_iteration(
         r[w, j] = r[w, j] + alpha * rigid_direction[w, j]
     if last[w] == 1:
         active[w] = 0
-    elif alpha == wp.float64(0.0):
+    elif alpha == wp.float64(0.0) and not stale:
         active[w] = 0
         status[w] = status[w] | WORLD_NO_DESCENT
     elif iteration[w] >= iteration_max:

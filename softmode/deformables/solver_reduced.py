@@ -31,6 +31,8 @@ class SolverReducedOptions:
 
     iteration_max: int = 20
     """Newton iterations at most."""
+    stiffness_renewal: int = 5
+    """The elastic Hessian is assembled every so many iterations (contact always is); 1 is Newton's method proper."""
     tolerance: float = 1.0e-5
     """Newton stops when every body moved less than this fraction of its size (rms) in an iteration."""
     step_length_min: float = 2.0**-10
@@ -46,7 +48,7 @@ class SolverReducedOptions:
 
     def __post_init__(self) -> None:
         """Check every range."""
-        for name, low in (("iteration_max", 1), ("contact_max", 1)):
+        for name, low in (("iteration_max", 1), ("stiffness_renewal", 1), ("contact_max", 1)):
             if getattr(self, name) < low:
                 raise ConfigError(f"{name} must be at least {low}, got {getattr(self, name)}")
         for name in ("tolerance", "step_length_min", "contact_margin", "contact_smoothing", "stick_velocity"):
@@ -447,6 +449,8 @@ class SolverReduced(SolverBase):
         self.point_energy = zeros((instances, self.point_max), wp.float64)
         self.point_stress = zeros((instances, self.point_max), wp.mat33d)
         self.point_hessian = zeros((instances, self.point_max, 6), wp.mat33)
+        unknowns = 3 * self.stride
+        self.stiffness = zeros((instances, unknowns, unknowns // LANES), vec8)
         samples = (instances, self.sample_max)
         self.sample_position, self.sample_drift = zeros(samples, wp.vec3d), zeros(samples, wp.vec3)
         self.lower, self.upper = zeros((instances,), wp.vec3), zeros((instances,), wp.vec3)
@@ -466,7 +470,7 @@ class SolverReduced(SolverBase):
         self.entry_hessian = zeros((instances, entries), wp.mat33)
         self.instance_force = zeros((instances,), wp.vec3d)
         self.body_wrench = zeros((max(self.model.body_count, 1),), wp.spatial_vector)
-        self.active, self.searching, self.last = (zeros((worlds,), int) for _ in range(3))
+        self.active, self.searching, self.last, self.renew = (zeros((worlds,), int) for _ in range(4))
         self.any_active, self.any_searching = zeros((1,), int), zeros((1,), int)
         self.potential, self.potential_trial = zeros((worlds,), wp.float64), zeros((worlds,), wp.float64)
         self.slope, self.step_length = zeros((worlds,), wp.float64), zeros((worlds,), wp.float64)
@@ -596,6 +600,7 @@ class SolverReduced(SolverBase):
     def minimise(self, dt: float) -> None:
         """Minimise the incremental potential of every world by Newton with a line search."""
         self.active.fill_(1)
+        self.renew.fill_(1)
         self.iteration.zero_()
         self.any_active.fill_(1)
         wp.capture_while(self.any_active, self._newton_iteration, dt=dt)
@@ -618,7 +623,8 @@ class SolverReduced(SolverBase):
             (self.instance_count, self.point_max),
             [self.world, self.function_count, self.point_start, self.point_count, data.material_model]
             + [data.youngs_modulus, data.poissons_ratio, data.viscosity, self.grad_basis, self.point_weight]
-            + [self.stiffness_scale, selected, self.q_start, q, wp.float64(dt), int(derivatives)],
+            + [self.stiffness_scale, selected, self.q_start, q, wp.float64(dt), int(derivatives)]
+            + [self.renew],
             [self.point_energy, self.point_stress, self.point_hessian],
         )
         self._evaluate_entries(selected, q, r, dt, derivatives=derivatives)
@@ -659,11 +665,17 @@ class SolverReduced(SolverBase):
             [self.gradient],
         )
         self._launch(
-            kernels.assemble_hessian,
+            kernels.assemble_stiffness,
             (instances, 6, blocks, blocks),
             [self.world, self.function_count, self.point_start, self.point_count, self.mass, damping]
-            + [self.grad_basis, self.grad_basis8, self.row_basis, self.row_basis8, self.active]
-            + [self.point_hessian, self.entry_count, self.entry_row, self.entry_hessian, float(dt)],
+            + [self.grad_basis, self.grad_basis8, self.active, self.renew, self.point_hessian, float(dt)],
+            [self.stiffness],
+        )
+        self._launch(
+            kernels.assemble_matrix,
+            (instances, 6, blocks, blocks),
+            [self.world, self.stride, self.row_basis8, self.active, self.stiffness, self.entry_count]
+            + [self.entry_row, self.entry_hessian],
             [self.system.matrix],
         )
         self._launch(
@@ -743,8 +755,8 @@ class SolverReduced(SolverBase):
             kernels.finish_iteration,
             self.world_count,
             [self.function_count, self.stride, self.world_instances, self.rigid.count, self.options.iteration_max]
-            + [self.step_length, self.direction, self.rigid.direction, self.last],
-            [self.active, self.q, self.rigid.r, self.iteration, self.status, self.any_active],
+            + [self.options.stiffness_renewal, self.step_length, self.direction, self.rigid.direction, self.last],
+            [self.active, self.q, self.rigid.r, self.iteration, self.renew, self.status, self.any_active],
         )
 
     def finish(self, state: newton.State, dt: float) -> None:

@@ -1,0 +1,1 @@
+"""Gymnasium environments and the scenes they are made of."""

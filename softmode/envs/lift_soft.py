@@ -71,8 +71,8 @@ class LiftSoftEnv(gym.Env, gym.utils.EzPickle):
     """One arm, one soft object.
 
     Actions, float32 in [-1, 1], larger ones are clamped: with ``control_mode="pose_delta"`` (x, y, z, yaw, gripper)
-    steps of the tool, with ``"joint_delta"`` seven joint steps and the gripper; the gripper entry is +1 open, -1 squeeze
-    with full force.
+    steps of the tool, with ``"joint_delta"`` seven joint steps and the gripper; the gripper entry is +1 open, -1
+    squeeze with full force.
 
     Observations by ``obs_type``:
 
@@ -182,10 +182,9 @@ class LiftSoftEnv(gym.Env, gym.utils.EzPickle):
 
     # -- episode ------------------------------------------------------------------------------------------------------
 
-    def reset(
-        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Put the object somewhere else, the arm back home."""
+        given = self._checked_options(options)
         super().reset(seed=seed)
         config, random = self.config, self.np_random
         x, y = self.config.scene.object_position
@@ -194,7 +193,7 @@ class LiftSoftEnv(gym.Env, gym.utils.EzPickle):
             "yaw": random.uniform(-config.yaw_range, config.yaw_range),
             "youngs_modulus": np.exp(random.uniform(*np.log(config.youngs_modulus_range))),
         }
-        drawn.update(self._checked_options(options))
+        drawn.update(given)
         self._youngs_modulus = float(drawn["youngs_modulus"])
         self._held = 0
         self.scene.reset(
@@ -217,7 +216,9 @@ class LiftSoftEnv(gym.Env, gym.utils.EzPickle):
             except (TypeError, ValueError):
                 number = np.empty(0)
             if number.shape != (sizes[name],) or not np.isfinite(number).all():
-                raise ConfigError(f"{name} must be {'two' if sizes[name] == 2 else 'one'} finite, got {value!r}")
+                raise ConfigError(
+                    f"{name} must be {'two finite numbers' if sizes[name] == 2 else 'a finite number'}, got {value!r}"
+                )
             given[name] = number if sizes[name] == 2 else float(number[0])
         if "position" in given:
             control = self.config.scene.control
@@ -312,7 +313,7 @@ class LiftSoftEnv(gym.Env, gym.utils.EzPickle):
             "solver_status": int(self.scene.status[0]),
         }
 
-    def _agent_pos(self) -> NDArray[np.float64]:
+    def _agent_pos(self) -> NDArray[Any]:
         """Return the proprioception."""
         scene = self.scene
         pose = scene.controller.tool_pose.numpy()[0]

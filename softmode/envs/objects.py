@@ -10,7 +10,7 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from softmode.deformables.body import BuildOptions, ReducedBody, build_body, cached_body
 from softmode.deformables.quadrature import Quadrature, quadrature_from_splats
@@ -98,16 +98,15 @@ def load_object(config: ObjectConfig, progress: Callable[[str, float], None] | b
 
 
 def choose_part(splats: Splats, rule: Part) -> Splats:
-    """Return the part of a capture that is the object, by the rule of `ObjectConfig.part`.
-
-    Raises:
-        AssetError: If the capture holds no connected part.
-    """
+    """Return the part of a capture that is the object, by the rule of `ObjectConfig.part`; all if nothing connects."""
     if rule == "all":
         return splats
-    parts = split_components(splats)
+    # The wider of a fraction of the capture and the capture's own pitch: a small file of one object is sparse.
+    low, high = splats.bounds(quantile=0.01)
+    pitch = np.median(KDTree(splats.means).query(splats.means, k=min(7, splats.count))[0][:, -1])
+    parts = split_components(splats, gap=max(0.015 * float(np.linalg.norm(high - low)), float(pitch), 1.0e-9))
     if not parts:
-        raise AssetError(f"{splats.name}: no part of it hangs together", hint="use part 'all', or export it again")
+        return splats
     if rule == "largest":
         return parts[0]
     if rule == "tallest":
@@ -155,19 +154,17 @@ def _body(splats: Splats, config: ObjectConfig, progress: Callable[[str, float],
     """Build the body of the solid that the splats enclose, or recall it; its provenance holds the turn to its pose."""
     name = "plush" if config.splat is None else Path(config.splat).name
 
-    def fill(turned: Splats) -> Quadrature:
+    def build() -> ReducedBody:
         try:
-            return quadrature_from_splats(turned.means, turned.scales, turned.quats, turned.opacities)
+            quadrature = quadrature_from_splats(splats.means, splats.scales, splats.quats, splats.opacities)
         except AssetError as error:
             raise AssetError(f"{splats.name}: {error.message}", hint=error.hint) from error
-
-    def build() -> ReducedBody:
-        quadrature, turn = fill(splats), None
+        turn = None
         if config.splat is not None and config.pose == "stable":
             centre = quadrature.weights @ quadrature.points / quadrature.volume
             turn = stable_rotation(quadrature.surface_points - centre)
         if turn is not None:
-            quadrature = fill(splats.transformed(rotation=turn))
+            quadrature = _turned(quadrature, turn)
         body = build_body(quadrature, config.build, name=name, progress=progress)
         rows = np.eye(3).tolist() if turn is None else turn.tolist()
         return replace(body, provenance={**body.provenance, "turn": json.dumps(rows)})
@@ -175,6 +172,18 @@ def _body(splats: Splats, config: ObjectConfig, progress: Callable[[str, float],
     pose = config.pose if config.splat is not None else "captured"
     key = ("splats", splats.means, splats.scales, splats.quats, splats.opacities, pose, config.build)
     return cached_body(key, build)
+
+
+def _turned(quadrature: Quadrature, turn: NDArray[np.float64]) -> Quadrature:
+    """Return the quadrature after the rotation; the same points, so that a stable pose stays one."""
+    surface = quadrature.surface_points @ turn.T
+    return replace(
+        quadrature,
+        points=quadrature.points @ turn.T,
+        surface_points=surface,
+        surface_normals=quadrature.surface_normals @ turn.T,
+        bounds=np.stack([surface.min(axis=0), surface.max(axis=0)]),
+    )
 
 
 def _read(config: ObjectConfig) -> Splats:

@@ -74,7 +74,7 @@ class ScriptedLift:
         self._elapsed += 1
         goal = place
         if self._phase == "align":
-            above = place + [0.0, 0.0, self.CLEARANCE]
+            above = place + np.array([0.0, 0.0, self.CLEARANCE])
             low = tool[2] < above[2] - 0.02  # after a failed grasp: straight up first
             goal = np.array([*tool[:2], above[2]]) if low else above
             if still and np.linalg.norm((place - tool)[:2]) < 0.002 and abs(turn) < 0.02:
@@ -95,7 +95,7 @@ class ScriptedLift:
             self._count = self._count + 1 if force.min() < 0.02 else 0
             self._grip = self._regulated(force)
             rise = self.env.config.goal_height - self.env.rise()
-            goal = tool + [0.0, 0.0, np.clip(rise, -0.008, 0.008)]
+            goal = tool + np.array([0.0, 0.0, np.clip(rise, -0.008, 0.008)])
             if self._count > 8:
                 self.reset()
                 goal = tool

@@ -6,11 +6,12 @@ import pytest
 import trimesh
 import warp as wp
 
-from softmode.deformables import contact, kernels
+from softmode.deformables import kernels
 from softmode.deformables.materials import Material
 from softmode.deformables.solver_reduced import SolverReduced, SolverReducedOptions, add_reduced_body
 from softmode.errors import ConfigError
 from tests import reference
+from tests.deformables.probe_kernels import evaluate_potentials, query_points
 from tests.scenes import GRAVITY, Scene, cube, rotation
 
 FLOAT32 = float(np.finfo(np.float32).eps)
@@ -19,45 +20,13 @@ DOWN = (0.0, 0.0, -GRAVITY)
 ShapeConfig = newton.ModelBuilder.ShapeConfig
 
 
-@wp.kernel
-def _query(
-    shape_type: int,
-    scale: wp.vec3,
-    mesh: wp.uint64,
-    x: wp.array[wp.vec3],
-    reach: float,
-    # Out:
-    distance_out: wp.array[float],
-    normal_out: wp.array[wp.vec3],
-):
-    i = wp.tid()
-    query = contact.query_shape(shape_type, scale, mesh, x[i], reach)
-    distance_out[i] = query.distance
-    normal_out[i] = query.normal
-
-
-@wp.kernel
-def _potentials(
-    x: wp.array[wp.float64],
-    eps: wp.float64,
-    # Out:
-    normal_out: wp.array[wp.vec3d],
-    friction_out: wp.array[wp.vec2d],
-):
-    i = wp.tid()
-    value, slope, curvature = contact.normal_potential(x[i], eps)
-    normal_out[i] = wp.vec3d(value, slope, curvature)
-    f0, f1_over_y = contact.friction_potential(x[i], eps)
-    friction_out[i] = wp.vec2d(f0, f1_over_y)
-
-
 def query(kind, scale, points, *, mesh=0, reach=10.0):
     """Return distances (N,) and normals (N, 3) of points in the frame of a shape."""
     with wp.ScopedDevice("cpu"):
         x = wp.array(points, dtype=wp.vec3)
         distance, normal = wp.zeros(len(points), dtype=float), wp.zeros(len(points), dtype=wp.vec3)
         inputs = [int(kind), wp.vec3(*scale), wp.uint64(mesh), x, reach]
-        wp.launch(_query, dim=len(points), inputs=inputs, outputs=[distance, normal])
+        wp.launch(query_points, dim=len(points), inputs=inputs, outputs=[distance, normal])
     return distance.numpy(), normal.numpy()
 
 
@@ -77,7 +46,7 @@ SHAPES = {
 }
 
 
-# -- distances ------------------------------------------------------------------------------------------------------------
+# -- distances ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", SHAPES)
@@ -127,11 +96,11 @@ def test_mesh_contact_is_not_lost_when_deep():
     np.testing.assert_allclose(d, -0.1, atol=8 * FLOAT32)
 
 
-# -- potentials -----------------------------------------------------------------------------------------------------------
+# -- potentials --------------------------------------------------------------------------------------------------------
 
 
 def test_potentials():
-    """psi_n equals p^3/(6 eps), p^2/2 - eps p/2 + eps^2/6, C2 at eps; psi_t is eq. (13) of IPC; slopes by differences."""
+    """psi_n equals p^3/(6 eps), p^2/2 - eps p/2 + eps^2/6, C2 at eps; psi_t is eq. (13) of IPC; both slopes too."""
     eps, step = 1.0e-3, 1.0e-9
     x = np.concatenate([np.linspace(-eps, 4 * eps, 501), [0.0, eps, 0.5 * eps]])
 
@@ -140,7 +109,7 @@ def test_potentials():
             normal = wp.zeros(len(values), dtype=wp.vec3d)
             friction = wp.zeros(len(values), dtype=wp.vec2d)
             inputs = [wp.array(values, dtype=wp.float64), wp.float64(eps)]
-            wp.launch(_potentials, dim=len(values), inputs=inputs, outputs=[normal, friction])
+            wp.launch(evaluate_potentials, dim=len(values), inputs=inputs, outputs=[normal, friction])
         return normal.numpy(), friction.numpy()
 
     normal, friction = evaluate(x)
@@ -156,7 +125,7 @@ def test_potentials():
     assert friction[np.flatnonzero(x > eps)[0], 1] * x[x > eps][0] == pytest.approx(1.0)
 
 
-# -- rest -----------------------------------------------------------------------------------------------------------------
+# -- rest --------------------------------------------------------------------------------------------------------------
 
 
 def on_shape(add_shape, *, height, material=None, x=0.0, **kw):
@@ -212,7 +181,8 @@ def test_rest_far_from_the_origin(offset):
 
 def test_stiffness_and_size_of_the_penalty():
     """At rest under uniform pressure w = m g / A the samples sink p with kappa (p - eps / 2) = w, or p^2 / (2 eps)."""
-    scene = on_shape(lambda w: w.add_ground_plane(), height=0.0, material=Material(youngs_modulus=1.0e7, mass_damping=5.0))
+    material = Material(youngs_modulus=1.0e7, mass_damping=5.0)
+    scene = on_shape(lambda w: w.add_ground_plane(), height=0.0, material=material)
     settle(scene, 400)
     kappa = float(scene.model.softmode.contact_stiffness.numpy()[0])
     eps = float(scene.reduced.smoothing.numpy()[0])
@@ -225,7 +195,7 @@ def test_stiffness_and_size_of_the_penalty():
     assert np.average(depth, weights=scene.body().surface_areas[bottom]) == pytest.approx(p, rel=0.1)
 
 
-# -- friction -------------------------------------------------------------------------------------------------------------
+# -- friction ----------------------------------------------------------------------------------------------------------
 
 
 def slide(angle, friction, *, tilted_box, time=1.0):
@@ -297,7 +267,7 @@ def test_belt_drags_with_friction():
     assert scene.qd()[0, 0] == pytest.approx(speed, abs=10 * scene.reduced.options.stick_velocity)
 
 
-# -- detection ------------------------------------------------------------------------------------------------------------
+# -- detection ---------------------------------------------------------------------------------------------------------
 
 
 def contacts_after_one_step(populate_shape, position):

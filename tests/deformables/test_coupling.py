@@ -26,7 +26,7 @@ def impact(ratio, *, offset=(0.0, 0.0), speed=0.5, friction=0.5, dt=0.001, pins=
     def populate(world):
         position = (*offset, EDGE + RIGID_GAP)
         mass = ratio * material.density * body.volume
-        add_free_box(world, (half,) * 3, mass, position, velocity=(0.0, 0.0, -speed), friction=friction)
+        add_free_box(world, (half,) * 3, mass, position, velocity=(0.0, 0.0, -speed))
         instance = add_reduced_body(world, body, material=material)
         if pins:
             corners = half * np.array([[x, y, -1.0] for x in (-1, 1) for y in (-1, 1)])
@@ -43,7 +43,7 @@ def totals(scene, twin):
     return p + P, L + spin, scene.kinetic_energy() + kinetic + twin.elastic_energy(scene.q())
 
 
-# -- derivatives ----------------------------------------------------------------------------------------------------------
+# -- derivatives -------------------------------------------------------------------------------------------------------
 
 
 class Potential:
@@ -95,7 +95,7 @@ class Potential:
         solver, n = self.solver, self.n
         system = solver.system.matrix.numpy()[0]
         system = system.reshape(len(system), -1).astype(float)
-        index = (np.arange(3)[None, :] * solver.stride + np.arange(n)[:, None]).ravel()  # component-major to point-major
+        index = (np.arange(3)[None, :] * solver.stride + np.arange(n)[:, None]).ravel()  # component- to point-major
         size = 3 * solver.stride
         upper = np.triu(system[:, :size])
         K = (upper + np.triu(upper, 1).T)[np.ix_(index, index)]
@@ -163,7 +163,7 @@ def test_jacobians_move_the_shape():
     assert scene.model.joint_dof_count == 6
 
 
-# -- momentum and energy ----------------------------------------------------------------------------------------------------
+# -- momentum and energy -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.5], ids=["smooth", "rough"])
@@ -186,7 +186,7 @@ def test_central_impact(ratio, friction):
 def test_eccentric_impact(ratio):
     """Off centre: p to 1e-4, and angular momentum about the origin to 1e-4 plus what implicit Euler loses of the spin.
 
-    L_(n+1) - L_n = -dt^2 sum_k v_k cross f_k(q_(n+1)) in a step (see `spin_left` of the free spin): of first order in dt.
+    L_(n+1) - L_n = -dt^2 sum_k v_k cross f_k(q_(n+1)) in a step, of first order in dt, as in the decay of a free spin.
     Here it is bounded by omega dt of the angular momentum passed on.
     """
     scene, twin = impact(ratio, offset=(0.03, 0.02))
@@ -210,7 +210,8 @@ def test_reactions_are_equal_and_opposite():
     for _ in range(40):
         p, P = scene.momentum()[0], scene.rigid_momentum()[:2]
         scene.step()
-        force, wrench = scene.reduced.instance_force.numpy()[0], scene.solver.body_wrench.numpy()[0]
+        force = scene.reduced.instance_force.numpy()[0].copy()
+        wrench = scene.solver.body_wrench.numpy()[0].astype(float)
         Q = scene.rigid_momentum()[:2]
         arm = np.cross(scene.state.body_q.numpy()[0, :3].astype(float), wrench[:3])
         rows.append(
@@ -230,7 +231,7 @@ def test_reactions_are_equal_and_opposite():
     assert soft <= 1e-4 * force
 
 
-# -- statics ----------------------------------------------------------------------------------------------------------------
+# -- statics -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mass", [0.1, 1.0, 10.0])
@@ -326,7 +327,7 @@ def test_squeeze_equals_drive(youngs_modulus, dt):
     assert not status & (kernels.WORLD_NOT_FINITE | kernels.WORLD_CONTACT_OVERFLOW)
 
 
-# -- worlds, graphs, faults -------------------------------------------------------------------------------------------------
+# -- worlds, graphs, faults --------------------------------------------------------------------------------------------
 
 
 def fling(scene, i, seed):
@@ -345,7 +346,8 @@ def test_captured_graph_equals_eager():
     captured = [array.numpy().copy() for array in (scene.state.softmode.q, scene.state.joint_q, scene.state.body_q)]
     fresh, _ = impact(1.0, offset=(0.02, 0.0))
     fresh.step(20)
-    for array, expected in zip((fresh.state.softmode.q, fresh.state.joint_q, fresh.state.body_q), captured, strict=True):
+    eager = (fresh.state.softmode.q, fresh.state.joint_q, fresh.state.body_q)
+    for array, expected in zip(eager, captured, strict=True):
         np.testing.assert_array_equal(array.numpy(), expected)
 
 
@@ -354,8 +356,9 @@ def test_world_of_three_equals_single_world():
     batch, _ = impact(1.0, world_count=3)
     for i in range(3):
         fling(batch, i, i)
-    batch.step(20)
-    assert np.abs(batch.reduced.instance_force.numpy()).max() > 0.0
+    batch.step(5)
+    assert (np.abs(batch.reduced.instance_force.numpy()).max(axis=1) > 0.0).all()
+    batch.step(15)
     for i in range(3):
         alone, _ = impact(1.0)
         fling(alone, 0, i)
@@ -386,7 +389,7 @@ def test_not_a_number_stays_out_of_robots_and_other_worlds():
 
 
 def test_reset_restores_both():
-    """reset puts soft and rigid bodies back to the model's initial state; the run that follows repeats the first."""
+    """A reset puts soft and rigid bodies back to their initial state; the run that follows repeats the first."""
     scene, _ = impact(1.0)
     scene.step(10)
     first = scene.q(), scene.state.body_q.numpy().copy()
@@ -402,14 +405,14 @@ def test_external_body_force_is_kept():
     f = np.zeros((1, 6), np.float32)
     f[0, 2] = 3.0  # away from the cube
     scene.state.body_f.assign(f)
-    start = scene.state
-    scene.step()
-    np.testing.assert_array_equal(start.body_f.numpy(), f)
+    scene.solver.step(scene.state, scene.next_state, scene.control, None, scene.dt)
+    np.testing.assert_array_equal(scene.state.body_f.numpy(), f)
+    scene.state = scene.next_state
     mass = float(scene.model.body_mass.numpy()[0])
     assert scene.rigid_momentum()[0][2] / mass == pytest.approx(scene.dt * 3.0 / mass, rel=1e-4)
 
 
-# -- errors -----------------------------------------------------------------------------------------------------------------
+# -- errors ------------------------------------------------------------------------------------------------------------
 
 
 def test_model_without_joints():

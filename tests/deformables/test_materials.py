@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables import materials
 from softmode.deformables.materials import HessianBlocks, Material, MaterialModel, MaterialParameters
 from softmode.errors import MaterialError
 from tests import reference
+from tests.deformables.probe_kernels import evaluate_materials
 from tests.scenes import random_rotation
 
 MODELS = list(MaterialModel)
@@ -17,25 +17,8 @@ FLOAT32 = float(np.finfo(np.float32).eps)
 FLOAT64 = float(np.finfo(np.float64).eps)
 DT = 0.01
 DIRECTION = 2.0e-3
-"""Relative error allowed of the Hessian, a search direction: `wp.svd3` takes a fixed number of sweeps and leaves off-diagonals
-up to 4e-4 of F (worst of 500 random F; the median is at float32 rounding)."""
-
-
-@wp.kernel
-def _evaluate(
-    parameters: MaterialParameters,
-    G: wp.array[wp.mat33d],
-    G_start: wp.array[wp.mat33d],
-    dt: wp.float64,
-    # Out:
-    energy_out: wp.array[wp.float64],
-    stress_out: wp.array[wp.mat33d],
-    hessian_out: wp.array[HessianBlocks],
-):
-    i = wp.tid()
-    energy_out[i] = materials.energy(parameters, G[i], G_start[i], dt)
-    stress_out[i] = materials.stress(parameters, G[i], G_start[i], dt)
-    hessian_out[i] = materials.hessian(parameters, G[i], dt)
+"""Relative error allowed of the Hessian, a search direction: `wp.svd3` takes a fixed number of sweeps and leaves
+off-diagonals up to 4e-4 of F (worst of 500 random F; the median is at float32 rounding)."""
 
 
 def evaluate(model, F, nu=0.3, *, F_start=None, viscosity=0.0):
@@ -49,7 +32,7 @@ def evaluate(model, F, nu=0.3, *, F_start=None, viscosity=0.0):
     with wp.ScopedDevice("cpu"):
         out = [wp.zeros(len(F), dtype=dtype) for dtype in (wp.float64, wp.mat33d, HessianBlocks)]
         gradients = [wp.array(values - np.eye(3), dtype=wp.mat33d) for values in (F, start)]
-        wp.launch(_evaluate, dim=len(F), inputs=[parameters, *gradients, wp.float64(DT)], outputs=out)
+        wp.launch(evaluate_materials, dim=len(F), inputs=[parameters, *gradients, wp.float64(DT)], outputs=out)
     return out[0].numpy(), out[1].numpy(), unpack(out[2].numpy())
 
 

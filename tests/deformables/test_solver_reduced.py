@@ -29,7 +29,7 @@ G32 = float(np.float32(GRAVITY))
 """Gravity as a Newton model stores it."""
 
 
-def single(material=None, *, body=None, position=(0.0, 0.0, 0.0), rotation=None, velocity=(0, 0, 0), spin=(0, 0, 0), **kw):
+def single(material=None, *, body=None, position=(0, 0, 0), rotation=None, velocity=(0, 0, 0), spin=(0, 0, 0), **kw):
     """Return a scene with one free cube."""
     body = body or cube()
 
@@ -65,11 +65,11 @@ def evaluate_at(scene, q):
     return solver.point_energy.numpy()[0].sum(), solver.gradient.numpy()[0][: len(q)]
 
 
-# -- identities -----------------------------------------------------------------------------------------------------------
+# -- identities --------------------------------------------------------------------------------------------------------
 
 
 def test_affine_closure():
-    """q = affine(A, t) moves every surface sample to A X + t, and F = A at every cubature point."""
+    """The coordinates affine(A, t) move every surface sample to A X + t, and F = A at every cubature point."""
     scene, body = single(), cube()
     rng = np.random.default_rng(0)
     twin = reference.FreeBody(body=body, material=Material(), dt=scene.dt)
@@ -85,7 +85,7 @@ def test_affine_closure():
 
 @pytest.mark.parametrize("offset", [0.0, 5.0, 100.0])
 def test_rigid_motion_costs_no_energy(offset):
-    """U(R X + t) <= 1e-7 E V and |dU/dq| <= 2e-5 E A: float32 gradients see R X with 1e-7, and the offset not at all."""
+    """U(R X + t) <= 1e-7 E V and |dU/dq| <= 2e-5 E A: the float32 gradients do not see the offset."""
     material, body = Material(youngs_modulus=1.0e5), cube()
     scene = single(material)
     rng = np.random.default_rng(1)
@@ -140,12 +140,13 @@ def test_material_models_differ_in_the_solver():
         scene.step()
         ends.append(scene.q())
         material = reference.with_float32(Material(model=model))
-        expected, _ = reference.FreeBody(body=cube(), material=material, dt=scene.dt).step(deformed(cube(), 0.05), 0 * ends[0])
+        twin = reference.FreeBody(body=cube(), material=material, dt=scene.dt)
+        expected, _ = twin.step(deformed(cube(), 0.05), np.zeros_like(ends[0]))
         assert np.linalg.norm(ends[-1] - expected) <= 10 * FINE.tolerance * SIZE
     assert np.linalg.norm(ends[0] - ends[1]) > 1e-4 * SIZE
 
 
-# -- closed forms ---------------------------------------------------------------------------------------------------------
+# -- closed forms ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dt", [0.001, 0.004, 0.02])
@@ -278,7 +279,7 @@ def test_energy_never_rises():
     assert energies[-1] < 0.9 * energies[0]
 
 
-# -- pins and point forces --------------------------------------------------------------------------------------------------
+# -- pins and point forces ---------------------------------------------------------------------------------------------
 
 
 def pinned_bar(dt, **kw):
@@ -344,7 +345,7 @@ def test_pins_follow_their_targets():
     scene.control.softmode.pin_target.assign(corners + shift)
     scene.step(300)
     sag = scene.mass() * G32 / (8 * stiffness)
-    # By symmetry corners deform alike; the cube stretches by a few 1e-4 of its weight over E A, which moves the mean less.
+    # The cube strains by m g / (E L^2), which shifts the mean of its corners by less than m g / (E L).
     deformation = scene.mass() * GRAVITY / (material.youngs_modulus * EDGE)
     np.testing.assert_allclose(scene.centre(), shift - [0, 0, sag], atol=deformation + 1e-5 * SIZE)
 
@@ -368,7 +369,7 @@ def test_point_forces_act_in_full():
     np.testing.assert_allclose(scene.momentum()[0], before, rtol=1e-7)
 
 
-# -- robustness -----------------------------------------------------------------------------------------------------------
+# -- robustness --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("nu", [0.3, 0.45])
@@ -438,7 +439,7 @@ def test_no_false_alarm(omega):
     assert seen == 0
 
 
-# -- worlds, graphs, changes -----------------------------------------------------------------------------------------------
+# -- worlds, graphs, changes -------------------------------------------------------------------------------------------
 
 
 def scatter(scene, seed=0):
@@ -503,7 +504,7 @@ def test_bodies_with_different_function_counts():
 
 
 def test_masked_reset():
-    """reset puts the chosen world back to its initial pose and velocity and leaves the others, bit for bit."""
+    """A reset puts the chosen world back to its initial pose and velocity and leaves the others, bit for bit."""
     scene = single(velocity=(0.0, 1.0, 0.0), gravity=DOWN, world_count=3)
     first = scene.q(1), scene.qd(1)
     scatter(scene)
@@ -555,7 +556,7 @@ def test_not_a_number_stays_in_its_world(array):
         assert np.isfinite(dirty.q(1)).all()
 
 
-# -- errors ---------------------------------------------------------------------------------------------------------------
+# -- errors ------------------------------------------------------------------------------------------------------------
 
 
 def builder_with_cube():

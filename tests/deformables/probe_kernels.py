@@ -1,0 +1,60 @@
+"""Kernels through which the tests reach device functions."""
+
+import warp as wp
+
+from softmode.deformables import contact, materials
+from softmode.deformables.materials import HessianBlocks, MaterialParameters
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def evaluate_materials(
+    parameters: MaterialParameters,
+    G: wp.array[wp.mat33d],
+    G_start: wp.array[wp.mat33d],
+    dt: wp.float64,
+    # Out:
+    energy_out: wp.array[wp.float64],
+    stress_out: wp.array[wp.mat33d],
+    hessian_out: wp.array[HessianBlocks],
+):
+    """Evaluate energy, stress and Hessian of one material at every G = F - I."""
+    i = wp.tid()
+    energy_out[i] = materials.energy(parameters, G[i], G_start[i], dt)
+    stress_out[i] = materials.stress(parameters, G[i], G_start[i], dt)
+    hessian_out[i] = materials.hessian(parameters, G[i], dt)
+
+
+@wp.kernel
+def query_points(
+    shape_type: int,
+    scale: wp.vec3,
+    mesh: wp.uint64,
+    x: wp.array[wp.vec3],
+    reach: float,
+    # Out:
+    distance_out: wp.array[float],
+    normal_out: wp.array[wp.vec3],
+):
+    """Evaluate the distance of every point to one shape."""
+    i = wp.tid()
+    query = contact.query_shape(shape_type, scale, mesh, x[i], reach)
+    distance_out[i] = query.distance
+    normal_out[i] = query.normal
+
+
+@wp.kernel
+def evaluate_potentials(
+    x: wp.array[wp.float64],
+    eps: wp.float64,
+    # Out:
+    normal_out: wp.array[wp.vec3d],
+    friction_out: wp.array[wp.vec2d],
+):
+    """Evaluate both contact potentials: (value, slope, curvature) and (f0, f1 / y)."""
+    i = wp.tid()
+    value, slope, curvature = contact.normal_potential(x[i], eps)
+    normal_out[i] = wp.vec3d(value, slope, curvature)
+    f0, f1_over_y = contact.friction_potential(x[i], eps)
+    friction_out[i] = wp.vec2d(f0, f1_over_y)

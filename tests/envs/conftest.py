@@ -1,0 +1,50 @@
+"""Environments that the tests of this folder share: building one takes seconds, a step milliseconds."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+
+import softmode  # noqa: F401  (registers the environments)
+from softmode.envs.lift_soft import LiftSoftEnv
+
+ROOT = Path(__file__).resolve().parents[2]
+
+# Before the first body is built: the cache lies in the checkout, so that a run leaves nothing outside it.
+os.environ.setdefault("SOFTMODE_CACHE", str(ROOT / ".cache" / "softmode"))
+
+PLAYBOT = ROOT.parent / "shared" / "data" / "splats" / "playbot" / "4_0" / "meta.json"
+"""A trained capture, SOG v2: a robot hovering over a patch of ground, with two loose hands. PLAYBOT by Stephane Agullo,
+CC-BY-4.0."""
+
+
+@pytest.fixture(scope="session")
+def playbot() -> Path:
+    """Return the trained capture, or skip."""
+    if not PLAYBOT.is_file():
+        pytest.skip(f"the trained capture {PLAYBOT} is not there")
+    return PLAYBOT
+
+
+@pytest.fixture(scope="session")
+def make_env() -> Callable[[str], gym.Env]:
+    """Return a function from obs_type to an environment, made once with `gym.make` and rgb_array rendering."""
+
+    @functools.cache
+    def make(obs_type: str) -> gym.Env:
+        return gym.make("softmode/LiftSoft-v0", obs_type=obs_type, render_mode="rgb_array")
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def lift(make_env: Callable[[str], gym.Env]) -> LiftSoftEnv:
+    """Return the bare environment with state observations."""
+    env = make_env("state").unwrapped
+    assert isinstance(env, LiftSoftEnv)
+    return env
