@@ -102,9 +102,9 @@ def play(options: Play) -> int:
     if options.env not in ENVIRONMENTS:
         raise ConfigError(f"unknown environment {options.env!r}", hint=f"use one of {', '.join(ENVIRONMENTS)}")
     if options.episodes < 1:
-        raise ConfigError(f"episodes must be at least 1, got {options.episodes}")
+        raise ConfigError(f"episodes must be at least 1, got {options.episodes}", hint="give a count like 3")
     if options.seed < 0:
-        raise ConfigError(f"seed must not be negative, got {options.seed}")
+        raise ConfigError(f"seed must not be negative, got {options.seed}", hint="give a whole number like 0")
     if options.youngs_modulus is not None and not 0.0 < options.youngs_modulus < float("inf"):
         raise MaterialError(
             f"youngs-modulus must be a finite number > 0, got {options.youngs_modulus}", hint="give it in Pa, like 2e5"

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
+from threadpoolctl import threadpool_limits
 
 from softmode.deformables.cubature import select_cubature
 from softmode.deformables.eigenmodes import solve_eigenmodes

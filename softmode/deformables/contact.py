@@ -19,6 +19,10 @@ from newton import GeoType
 
 wp.set_module_options({"enable_backward": False})
 
+LAG_ITERATIONS = wp.constant(8)
+"""Newton iterations during which the normal force of friction follows the contact; then it is frozen, and what is left is
+the minimisation of one potential."""
+
 SLOTS = 2
 """Contacts kept per surface sample: the deepest two."""
 
@@ -197,6 +201,13 @@ def bound_samples(
     upper_out[i] = upper + grow
 
 
+@wp.func
+def point_velocity(body_q: wp.transform, body_qd: wp.spatial_vector, com: wp.vec3, point: wp.vec3):
+    """Return the velocity [m/s] of a world point that moves with a body."""
+    arm = point - wp.transform_point(body_q, com)
+    return wp.spatial_top(body_qd) + wp.cross(wp.spatial_bottom(body_qd), arm)
+
+
 @wp.kernel
 def cull_shapes(
     # Candidates:
@@ -204,10 +215,13 @@ def cull_shapes(
     shape_type: wp.array[int],
     shape_body: wp.array[int],
     shape_transform: wp.array[wp.transform],
-    shape_radius: wp.array[float],  # bounding sphere [m]
+    shape_lower: wp.array[wp.vec3],  # bounds in the shape's frame [m]
+    shape_upper: wp.array[wp.vec3],
+    shape_margin: wp.array[float],
     # State in:
     body_q: wp.array[wp.transform],
     body_qd: wp.array[wp.spatial_vector],
+    body_com: wp.array[wp.vec3],
     lower: wp.array[wp.vec3],
     upper: wp.array[wp.vec3],
     dt: float,
@@ -224,22 +238,18 @@ def cull_shapes(
         near_out[i, c] = 1
         return
     pose = shape_transform[shape]
-    radius = shape_radius[shape]
+    radius = 0.5 * wp.length(shape_upper[shape] - shape_lower[shape])
     body = shape_body[shape]
     if body >= 0:
         pose = body_q[body] * pose
-        radius += 2.0 * dt * wp.length(wp.spatial_top(body_qd[body]))
-    centre = wp.transform_get_translation(pose)
+    centre = wp.transform_point(pose, 0.5 * (shape_lower[shape] + shape_upper[shape]))
+    reach = radius + shape_margin[shape]
+    if body >= 0:
+        speed = wp.length(point_velocity(body_q[body], body_qd[body], body_com[body], centre))
+        reach += 2.0 * dt * (speed + radius * wp.length(wp.spatial_bottom(body_qd[body])))
     nearest = wp.min(wp.max(centre, lower[i]), upper[i])
-    if wp.length(centre - nearest) <= radius:
+    if wp.length(centre - nearest) <= reach:
         near_out[i, c] = 1
-
-
-@wp.func
-def point_velocity(body_q: wp.transform, body_qd: wp.spatial_vector, com: wp.vec3, point: wp.vec3):
-    """Return the velocity [m/s] of a world point that moves with a body."""
-    arm = point - wp.transform_point(body_q, com)
-    return wp.spatial_top(body_qd) + wp.cross(wp.spatial_bottom(body_qd), arm)
 
 
 @wp.kernel
@@ -254,6 +264,8 @@ def find_contacts(
     shape_scale: wp.array[wp.vec3],
     shape_source: wp.array[wp.uint64],
     shape_margin: wp.array[float],
+    shape_lower: wp.array[wp.vec3],
+    shape_upper: wp.array[wp.vec3],
     shape_body: wp.array[int],
     shape_transform: wp.array[wp.transform],
     # State in:
@@ -291,7 +303,9 @@ def find_contacts(
         # the difference to the shape's origin in float64: far from the world's origin only the offset is large
         origin = wp.transform_get_translation(pose)
         local = wp.quat_rotate_inv(wp.transform_get_rotation(pose), wp.vec3(x - wp.vec3d(origin)))
-        query = query_shape(shape_type[shape], shape_scale[shape], shape_source[shape], local, reach + shape_margin[shape])
+        # inside a mesh the surface may be as far away as the mesh is large
+        far = wp.max(reach + shape_margin[shape], wp.length(shape_upper[shape] - shape_lower[shape]))
+        query = query_shape(shape_type[shape], shape_scale[shape], shape_source[shape], local, far)
         gap = wp.float64(query.distance - shape_margin[shape])
         if gap < wp.float64(reach) and gap < slot_gap_out[i, s, 1]:
             normal = wp.quat_rotate(wp.transform_get_rotation(pose), query.normal)
@@ -469,13 +483,17 @@ def normal_potential(penetration: wp.float64, eps: wp.float64):
 
 @wp.func
 def friction_potential(y: wp.float64, eps: wp.float64):
-    """Return f0(y) and f1(y) / y = f0'(y) / y of the smoothed Coulomb potential with stick range ``eps`` [m]."""
+    """Return f0(y), f1(y) / y and f1'(y), f1 = f0', of the smoothed Coulomb potential with stick range ``eps`` [m]."""
     one = wp.float64(1.0)
     two = wp.float64(2.0)
     three = wp.float64(3.0)
     if y < eps:
-        return y * y / eps - y * y * y / (three * eps * eps) + eps / three, two / eps - y / (eps * eps)
-    return y, one / y
+        return (
+            y * y / eps - y * y * y / (three * eps * eps) + eps / three,
+            two / eps - y / (eps * eps),
+            two / eps - two * y / (eps * eps),
+        )
+    return y, one / y, wp.float64(0.0)
 
 
 @wp.kernel
@@ -502,8 +520,10 @@ def evaluate_entries(
     entry_friction: wp.array2d[wp.float64],
     entry_jacobian: wp.array3d[wp.vec3],
     derivatives: int,
+    iteration: wp.array[int],  # (world_count,)
+    exact: wp.array[int],  # (world_count,), whether friction takes its own curvature
     # In and out:
-    entry_normal_force: wp.array2d[wp.float64],  # lagged: renewed where derivatives are asked
+    entry_normal_force: wp.array2d[wp.float64],  # lagged: renewed where derivatives are asked, until it is frozen
     # Out:
     energy_out: wp.array2d[wp.float64],  # (instance_count, entry_max) [J]
     force_out: wp.array2d[wp.vec3d],  # on the body [N]
@@ -532,20 +552,22 @@ def evaluate_entries(
         n = entry_normal[i, e]
         total = entry_offset[i, e] + d
         psi, slope, curvature = normal_potential(-wp.dot(n, total), wp.float64(smoothing[i]))
-        if derivatives != 0:
+        if derivatives != 0 and iteration[w] <= LAG_ITERATIONS:
             entry_normal_force[i, e] = stiffness * slope
         normal_force = entry_normal_force[i, e]
         # offset = gap n - drift of the shape: the tangential part is the slip of the step
         t = total - wp.dot(n, total) * n
         y = wp.length(t)
-        f0, f1_over_y = friction_potential(y, stick_range)
+        f0, f1_over_y, f1_slope = friction_potential(y, stick_range)
         limit = entry_friction[i, e] * normal_force
         energy_out[i, e] = stiffness * psi + limit * f0
         force_out[i, e] = stiffness * slope * n - limit * f1_over_y * t
-        # f0 is concave in y^2, so its quadratic with curvature f1 / y lies above it: every step lowers the friction
-        # potential, where the exact curvature (zero along a slip) jumps back and forth over the stick range
+        # f0 is concave in y^2, so the quadratic of curvature f1 / y lies above it and its steps cannot overshoot, from
+        # however far away; the potential's own curvature f1' along the slip converges faster once the state is close
         N = wp.outer(n, n)
         H = stiffness * curvature * N + limit * f1_over_y * (identity - N)
+        if exact[w] != 0 and y > wp.float64(0.0):
+            H += limit * (f1_slope - f1_over_y) / (y * y) * wp.outer(t, t)
     if derivatives != 0:
         hessian_out[i, e] = wp.mat33(H)
         for j in range(rigid_count[w]):

@@ -51,7 +51,8 @@ def _effective_inertia(
     articulation_dof_start: wp.array[int],
     damping: wp.array[float],  # (joint_dof_count,), D + K_d
     mass_matrix: wp.array3d[float],  # (articulation_count, dof_max, dof_max)
-    joint_qd: wp.array[float],  # predicted
+    joint_qd_start: wp.array[float],
+    joint_qd_predicted: wp.array[float],
     dt: wp.float64,
     # Out:
     inertia_out: wp.array3d[wp.float64],  # (world_count, rigid_max, rigid_max), M_eff / dt^2
@@ -73,8 +74,10 @@ def _effective_inertia(
         if l == j:
             value += dt * wp.float64(damping[dof])
         inertia_out[w, j, l] = value / (dt * dt)
-    predicted_out[w, j] = dt * wp.float64(joint_qd[dof])
-    r_out[w, j] = dt * wp.float64(joint_qd[dof])
+    predicted_out[w, j] = dt * wp.float64(joint_qd_predicted[dof])
+    # Newton starts from the motion that goes on, as it does for q: in a grasp the contact-free prediction would press
+    # the fingers far into the object
+    r_out[w, j] = dt * wp.float64(joint_qd_start[dof])
 
 
 @wp.kernel
@@ -173,6 +176,7 @@ class SolverCoupledReduced(SolverBase):
         observables: Any = None,
     ) -> None:
         """Advance soft and rigid bodies by ``dt`` [s]."""
+        self.validate_observables(observables, contacts)
         self.rigid.step(state_in, self.predicted_state, control, contacts, dt)
         self._linearise(state_in, dt)
 
@@ -205,7 +209,7 @@ class SolverCoupledReduced(SolverBase):
             _effective_inertia,
             dim=(self.reduced.world_count, dofs.count_max),
             inputs=[dofs.count, dofs.dof_start, self.dof_articulation, dofs.articulation_dof_start, self.damping]
-            + [self.mass_matrix, self.predicted_state.joint_qd, wp.float64(dt)],
+            + [self.mass_matrix, state.joint_qd, self.predicted_state.joint_qd, wp.float64(dt)],
             outputs=[dofs.inertia, dofs.predicted, dofs.r],
             device=model.device,
         )

@@ -24,7 +24,7 @@ WORLD_ITERATION_LIMIT = 1
 WORLD_NO_DESCENT = 2
 """Status bit: the line search found no lower potential and the step was not yet small."""
 WORLD_CONTACT_OVERFLOW = 4
-"""Status bit: an instance had more contacts than its capacity; the shallowest were dropped."""
+"""Status bit: an instance had more contacts than its capacity; near ones were dropped, then the last of the touching."""
 WORLD_NOT_FINITE = 8
 """Status bit: the step produced a value that is not finite; the world kept its state at rest."""
 
@@ -176,6 +176,56 @@ def gather_gradient(
     for e in range(entry_count[i]):
         g -= wp.float64(row_basis[entry_row[i, e], k]) * entry_force[i, e]
     gradient_out[i, k] = g
+
+
+@wp.kernel
+def check_convergence(
+    # Instances:
+    function_count: wp.array[int],
+    mass: wp.array[wp.float64],
+    tolerance: wp.array[float],  # (instance_count,) [m]
+    # Worlds:
+    instance_start: wp.array[int],
+    iteration_max: int,
+    force_tolerance: wp.float64,
+    dt: wp.float64,
+    # State in:
+    gradient: wp.array2d[wp.vec3d],
+    force: wp.array2d[wp.vec3d],
+    entry_count: wp.array[int],
+    entry_force: wp.array2d[wp.vec3d],
+    last: wp.array[int],
+    iteration: wp.array[int],
+    # In and out:
+    active: wp.array[int],
+    status: wp.array[int],
+):
+    """Stop a world whose last step was small and whose residual is small against the forces on each of its bodies.
+
+    The second condition matters in contact: within a step's tolerance friction goes from one side of its cone to the
+    other, and a residual is momentum that the other body receives and this one does not.
+    """
+    w = wp.tid()
+    if active[w] == 0 or iteration[w] == 0:
+        return
+    done = last[w]
+    for i in range(instance_start[w], instance_start[w + 1]):
+        residual = wp.float64(0.0)
+        external = wp.float64(0.0)
+        for k in range(function_count[i]):
+            residual += wp.length_sq(gradient[i, k])
+            external += wp.length_sq(force[i, k])
+        scale = wp.sqrt(external)
+        for e in range(entry_count[i]):
+            scale += wp.length(entry_force[i, e])
+        floor = wp.float64(1.0e-3) * mass[i] * wp.float64(tolerance[i]) / (dt * dt)
+        if entry_count[i] > 0 and not (wp.sqrt(residual) <= force_tolerance * scale + floor):
+            done = 0
+    if done == 1:
+        active[w] = 0
+    elif iteration[w] >= iteration_max:
+        active[w] = 0
+        status[w] = status[w] | WORLD_ITERATION_LIMIT
 
 
 @wp.func
@@ -592,8 +642,10 @@ def begin_search(
     instance_start: wp.array[int],
     rigid_count: wp.array[int],
     rigid_tolerance: float,  # [m or rad]
+    stick_range: wp.float64,  # [m]
     # State in:
     active: wp.array[int],
+    entry_count: wp.array[int],
     gradient: wp.array2d[wp.vec3d],
     direction: wp.array2d[vec8],
     rigid_gradient: wp.array2d[wp.float64],
@@ -607,7 +659,8 @@ def begin_search(
 ):
     """Compute the slope g . d of each active world and start its line search at alpha = 1.
 
-    A step below the tolerance is the last one and taken in full: there the change of the potential drowns in rounding.
+    A step below the tolerance (in contact, far below the stick range too) is taken in full: there the change of the
+    potential drowns in rounding.
     """
     w = wp.tid()
     searching_out[w] = 0
@@ -622,7 +675,10 @@ def begin_search(
             dq = unknown(direction, i, blocks, k)
             slope += wp.dot(gradient[i, k], dq)
             moved += wp.length_sq(dq)
-        if not (wp.sqrt(moved) <= wp.float64(tolerance[i])):
+        limit = wp.float64(tolerance[i])
+        if entry_count[i] > 0:
+            limit = wp.min(limit, wp.float64(0.1) * stick_range)
+        if not (wp.sqrt(moved) <= limit):
             last = 0
     for j in range(rigid_count[w]):
         slope += rigid_gradient[w, j] * rigid_direction[w, j]
@@ -675,8 +731,9 @@ def finish_iteration(
     # Worlds:
     instance_start: wp.array[int],
     rigid_count: wp.array[int],
-    iteration_max: int,
     renewal: int,
+    renewal_distance: wp.float64,  # in tolerances
+    tolerance: wp.array[float],  # (instance_count,) [m]
     # State in:
     step_length: wp.array[wp.float64],
     direction: wp.array2d[vec8],
@@ -688,11 +745,12 @@ def finish_iteration(
     r: wp.array2d[wp.float64],
     iteration: wp.array[int],
     renew: wp.array[int],
+    exact: wp.array[int],
     status: wp.array[int],
     # Out:
     any_active_out: wp.array[int],
 ):
-    """Take the accepted step and decide whether a world is done and whether its stiffness is to be renewed."""
+    """Take the accepted step; say whether the stiffness is to be renewed and how friction is to be linearised."""
     w = wp.tid()
     if active[w] == 0:
         return
@@ -703,18 +761,21 @@ def finish_iteration(
     if iteration[w] % renewal == 0 or alpha < wp.float64(1.0):
         renew[w] = 1
     for i in range(instance_start[w], instance_start[w + 1]):
+        moved = wp.float64(0.0)
         for k in range(function_count[i]):
-            q[i, k] = q[i, k] + alpha * unknown(direction, i, stride / LANES, k)
+            step = alpha * unknown(direction, i, stride / LANES, k)
+            moved += wp.length_sq(step)
+            q[i, k] = q[i, k] + step
+        if wp.sqrt(moved) > renewal_distance * wp.float64(tolerance[i]):
+            renew[w] = 1
     for j in range(rigid_count[w]):
         r[w, j] = r[w, j] + alpha * rigid_direction[w, j]
-    if last[w] == 1:
-        active[w] = 0
-    elif alpha == wp.float64(0.0) and not stale:
+    exact[w] = 0
+    if iteration[w] >= 1 and alpha == wp.float64(1.0):
+        exact[w] = 1
+    if alpha == wp.float64(0.0) and last[w] == 0 and not stale:
         active[w] = 0
         status[w] = status[w] | WORLD_NO_DESCENT
-    elif iteration[w] >= iteration_max:
-        active[w] = 0
-        status[w] = status[w] | WORLD_ITERATION_LIMIT
     else:
         wp.atomic_max(any_active_out, 0, 1)
 

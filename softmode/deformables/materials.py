@@ -110,6 +110,15 @@ def cofactor(F: wp.mat33d):
 
 
 @wp.func
+def log_of_one_plus(x: wp.float64):
+    """Return ln(1 + x) to full relative precision (Kahan's form)."""
+    u = wp.float64(1.0) + x
+    if u == wp.float64(1.0):
+        return x
+    return wp.log(u) * x / (u - wp.float64(1.0))
+
+
+@wp.func
 def invariant_derivatives(material: MaterialParameters, strain: wp.float64, j1: wp.float64):
     """Return psi and the coefficients (s, b, p, l) of its derivatives with respect to I_C and J.
 
@@ -127,7 +136,7 @@ def invariant_derivatives(material: MaterialParameters, strain: wp.float64, j1: 
     l = material.lam + wp.float64(5.0) / wp.float64(6.0) * material.mu
     c = strain + wp.float64(4.0)  # I_C + 1
     slope = wp.float64(0.75) * m  # l (a - 1)
-    psi = half * m * (strain - wp.log(one + strain / wp.float64(4.0))) + half * l * j1 * j1 - slope * j1
+    psi = half * m * (strain - log_of_one_plus(strain / wp.float64(4.0))) + half * l * j1 * j1 - slope * j1
     return psi, m * (one - one / c), wp.float64(2.0) * m / (c * c), l * j1 - slope, l
 
 

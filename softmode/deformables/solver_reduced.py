@@ -32,9 +32,13 @@ class SolverReducedOptions:
     iteration_max: int = 20
     """Newton iterations at most."""
     stiffness_renewal: int = 5
-    """The elastic Hessian is assembled every so many iterations (contact always is); 1 is Newton's method proper."""
+    """The elastic Hessian is assembled every so many iterations at least (contact always is), and"""
+    renewal_distance: float = 1.0e-3
+    """after an iteration that moved a body by more than this fraction of its size (rms). 0 is Newton's method proper."""
     tolerance: float = 1.0e-5
-    """Newton stops when every body moved less than this fraction of its size (rms) in an iteration."""
+    """Newton stops when every body moved less than this fraction of its size (rms) in an iteration, and"""
+    force_tolerance: float = 1.0e-5
+    """when the residual force on every touched or pinned body is below this fraction of the forces on it."""
     step_length_min: float = 2.0**-10
     """Shortest step the line search tries."""
     contact_max: int = 256
@@ -51,7 +55,7 @@ class SolverReducedOptions:
         for name, low in (("iteration_max", 1), ("stiffness_renewal", 1), ("contact_max", 1)):
             if getattr(self, name) < low:
                 raise ConfigError(f"{name} must be at least {low}, got {getattr(self, name)}")
-        for name in ("tolerance", "step_length_min", "contact_margin", "contact_smoothing", "stick_velocity"):
+        for name in ("tolerance", "force_tolerance", "step_length_min", "contact_margin", "contact_smoothing", "stick_velocity"):
             if not 0.0 < getattr(self, name) < float("inf"):
                 raise ConfigError(f"{name} must be a finite number > 0, got {getattr(self, name)!r}")
 
@@ -135,8 +139,9 @@ def add_reduced_body(
     p = np.asarray(position, float)
     if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=1e-5) or np.linalg.det(R) < 0:
         raise ConfigError("rotation must be a rotation matrix of shape (3, 3)", hint="orthonormalise it")
-    if p.shape != (3,) or not np.isfinite(p).all():
-        raise ConfigError(f"position must be three finite numbers [m], got {position!r}")
+    for name, value in (("position", position), ("velocity", velocity), ("angular_velocity", angular_velocity)):
+        if np.shape(value) != (3,) or not np.isfinite(value).all():
+            raise ConfigError(f"{name} must be three finite numbers, got {value!r}")
     stiffness = contact_stiffness(body, material) if contact_stiffness_per_area is None else contact_stiffness_per_area
     if not 0.0 < stiffness < np.inf:
         raise ConfigError(f"contact_stiffness_per_area must be a finite number > 0 [Pa/m], got {stiffness!r}")
@@ -198,7 +203,10 @@ def add_pins(
     """
     X = np.atleast_2d(np.asarray(points, float))
     T = X if targets is None else np.atleast_2d(np.asarray(targets, float))
-    k = np.broadcast_to(np.asarray(stiffness, float), (len(X),))
+    k = np.atleast_1d(np.asarray(stiffness, float))
+    if k.shape not in ((1,), (len(X),)):
+        raise ConfigError(f"stiffness must be one number or one per pin, got shape {k.shape} for {len(X)} pins")
+    k = np.broadcast_to(k, (len(X),))
     if X.ndim != 2 or X.shape[1:] != (3,) or T.shape != X.shape or len(X) == 0:
         raise ConfigError(f"points and targets must have shape (pin_count > 0, 3), got {X.shape} and {T.shape}")
     if not (np.isfinite(k).all() and (k >= 0).all() and np.isfinite(X).all() and np.isfinite(T).all()):
@@ -426,6 +434,21 @@ class SolverReduced(SolverBase):
                 "which a soft body cannot touch",
                 hint="use a plane, box, sphere, capsule, cylinder or mesh, or clear its COLLIDE_PARTICLES flag",
             )
+        scale = model.shape_scale.numpy()
+        meshes = np.isin(kinds, [int(newton.GeoType.MESH), int(newton.GeoType.CONVEX_MESH)])
+        uneven = np.ptp(np.abs(scale), axis=1) > 1e-5 * np.abs(scale).max(axis=1)
+        for shape in np.flatnonzero(solid & meshes & uneven):
+            raise ConfigError(
+                f"shape {shape} ({model.shape_label[shape]!r}) is a mesh scaled by {scale[shape]}, whose distances a soft "
+                "body cannot query",
+                hint="scale the vertices of the mesh instead",
+            )
+        moving = solid & (model.shape_body.numpy() >= 0) & (worlds == -1)
+        if self.world_count > 1 and moving.any():
+            raise ConfigError(
+                f"shape {np.flatnonzero(moving)[0]} belongs to a body outside all worlds and would be pushed by every world",
+                hint="add the body to the builder that is replicated",
+            )
         lists = [np.flatnonzero(solid & ((worlds == -1) | (worlds == w))) for w in self.instance_world]
         out = np.full((self.instance_count, max(max(map(len, lists)), 1)), -1)
         for i, shapes in enumerate(lists):
@@ -470,7 +493,8 @@ class SolverReduced(SolverBase):
         self.entry_hessian = zeros((instances, entries), wp.mat33)
         self.instance_force = zeros((instances,), wp.vec3d)
         self.body_wrench = zeros((max(self.model.body_count, 1),), wp.spatial_vector)
-        self.active, self.searching, self.last, self.renew = (zeros((worlds,), int) for _ in range(4))
+        self.active, self.searching, self.last = (zeros((worlds,), int) for _ in range(3))
+        self.renew, self.exact = zeros((worlds,), int), zeros((worlds,), int)
         self.any_active, self.any_searching = zeros((1,), int), zeros((1,), int)
         self.potential, self.potential_trial = zeros((worlds,), wp.float64), zeros((worlds,), wp.float64)
         self.slope, self.step_length = zeros((worlds,), wp.float64), zeros((worlds,), wp.float64)
@@ -554,6 +578,7 @@ class SolverReduced(SolverBase):
         if model.shape_count == 0:
             wp.copy(self.entry_count, self.pin_count)
             return
+        bounds = (model.shape_collision_aabb_lower, model.shape_collision_aabb_upper)
         self._launch(
             contact.bound_samples,
             instances,
@@ -563,15 +588,15 @@ class SolverReduced(SolverBase):
         self._launch(
             contact.cull_shapes,
             self.candidate.shape,
-            [self.candidate, model.shape_type, model.shape_body, model.shape_transform, model.shape_collision_radius]
-            + [state.body_q, state.body_qd, self.lower, self.upper, float(dt)],
+            [self.candidate, model.shape_type, model.shape_body, model.shape_transform, *bounds, model.shape_margin]
+            + [state.body_q, state.body_qd, model.body_com, self.lower, self.upper, float(dt)],
             [self.near],
         )
         self._launch(
             contact.find_contacts,
             samples,
             [self.sample_count, self.margin, self.candidate, self.near, model.shape_type, model.shape_scale]
-            + [model.shape_source_ptr, model.shape_margin, model.shape_body, model.shape_transform]
+            + [model.shape_source_ptr, model.shape_margin, *bounds, model.shape_body, model.shape_transform]
             + [state.body_q, state.body_qd, model.body_com, self.sample_position, self.sample_drift, float(dt)],
             [self.slot_shape, self.slot_gap, self.slot_normal],
         )
@@ -601,6 +626,7 @@ class SolverReduced(SolverBase):
         """Minimise the incremental potential of every world by Newton with a line search."""
         self.active.fill_(1)
         self.renew.fill_(1)
+        self.exact.zero_()
         self.iteration.zero_()
         self.any_active.fill_(1)
         wp.capture_while(self.any_active, self._newton_iteration, dt=dt)
@@ -608,10 +634,12 @@ class SolverReduced(SolverBase):
     def _newton_iteration(self, dt: float) -> None:
         """Take one Newton step in every world that is not done."""
         self._evaluate(self.active, self.q, self.rigid.r, dt, derivatives=True)
+        self._gather_gradient(dt)
+        self._check_convergence(dt)
         self._sum_potential(self.active, self.q, self.rigid.r, dt, self.potential)
         self._assemble(dt)
         self._solve()
-        self._begin_search()
+        self._begin_search(dt)
         wp.capture_while(self.any_searching, self._try_step, dt=dt)
         self._finish_iteration()
 
@@ -627,17 +655,14 @@ class SolverReduced(SolverBase):
             + [self.renew],
             [self.point_energy, self.point_stress, self.point_hessian],
         )
-        self._evaluate_entries(selected, q, r, dt, derivatives=derivatives)
-
-    def _evaluate_entries(self, selected: wp.array, q: wp.array, r: wp.array, dt: float, *, derivatives: bool) -> None:
-        """Evaluate pins and contacts at q, r in the selected worlds."""
         self._launch(
             contact.evaluate_entries,
             (self.instance_count, self.entry_max),
             [self.world, self.function_count, self.pin_count, self.smoothing]
             + [wp.float64(self.options.stick_velocity * dt), self.row_basis, selected, self.q_start, q, r]
             + [self.rigid.count, self.entry_count, self.entry_row, self.entry_normal, self.entry_offset]
-            + [self.entry_stiffness, self.entry_friction, self.entry_jacobian, int(derivatives)],
+            + [self.entry_stiffness, self.entry_friction, self.entry_jacobian, int(derivatives)]
+            + [self.iteration, self.exact],
             [self.entry_normal_force, self.entry_energy, self.entry_force, self.entry_hessian, self.entry_coupling],
         )
 
@@ -652,22 +677,37 @@ class SolverReduced(SolverBase):
             [out],
         )
 
-    def _assemble(self, dt: float) -> None:
-        """Gather gradient and Hessian into the block systems [K | C | -g] and the rigid part."""
-        instances, blocks = self.instance_count, self.stride // LANES
-        damping = self.parameters.mass_damping
+    def _gather_gradient(self, dt: float) -> None:
+        """Gather the gradient of the potential with respect to q."""
         self._launch(
             kernels.gather_gradient,
-            (instances, self.stride),
-            [self.world, self.function_count, self.point_start, self.point_count, self.mass, damping]
-            + [self.grad_basis, self.row_basis, self.active, self.q_start, self.q_inertial, self.q, self.force]
-            + [self.point_stress, self.entry_count, self.entry_row, self.entry_force, wp.float64(dt)],
+            (self.instance_count, self.stride),
+            [self.world, self.function_count, self.point_start, self.point_count, self.mass]
+            + [self.parameters.mass_damping, self.grad_basis, self.row_basis, self.active, self.q_start]
+            + [self.q_inertial, self.q, self.force, self.point_stress, self.entry_count, self.entry_row]
+            + [self.entry_force, wp.float64(dt)],
             [self.gradient],
         )
+
+    def _check_convergence(self, dt: float) -> None:
+        """Stop the worlds that have converged or used up their iterations."""
+        options = self.options
+        self._launch(
+            kernels.check_convergence,
+            self.world_count,
+            [self.function_count, self.mass, self.tolerance, self.world_instances, options.iteration_max]
+            + [wp.float64(options.force_tolerance), wp.float64(dt), self.gradient, self.force, self.entry_count, self.entry_force]
+            + [self.last, self.iteration],
+            [self.active, self.status],
+        )
+
+    def _assemble(self, dt: float) -> None:
+        """Assemble the Hessian into the block systems [K | C | -g] and the rigid part."""
+        instances, blocks = self.instance_count, self.stride // LANES
         self._launch(
             kernels.assemble_stiffness,
             (instances, 6, blocks, blocks),
-            [self.world, self.function_count, self.point_start, self.point_count, self.mass, damping]
+            [self.world, self.function_count, self.point_start, self.point_count, self.mass, self.parameters.mass_damping]
             + [self.grad_basis, self.grad_basis8, self.active, self.renew, self.point_hessian, float(dt)],
             [self.stiffness],
         )
@@ -710,14 +750,15 @@ class SolverReduced(SolverBase):
             self._launch(kernels.solve_rigid, self.world_count, [rigid.count, self.active, rigid.matrix, rigid.direction])
         self.direction = system.solve(self.active, rigid.count_max, rigid.direction, rigid.count_max)
 
-    def _begin_search(self) -> None:
+    def _begin_search(self, dt: float) -> None:
         """Start the line search of every active world."""
         self.any_searching.zero_()
         self._launch(
             kernels.begin_search,
             self.world_count,
             [self.function_count, self.stride, self.tolerance, self.world_instances, self.rigid.count]
-            + [self.rigid_tolerance, self.active, self.gradient, self.direction]
+            + [self.rigid_tolerance, wp.float64(self.options.stick_velocity * dt), self.active, self.entry_count]
+            + [self.gradient, self.direction]
             + [self.rigid.gradient, self.rigid.direction],
             [self.slope, self.step_length, self.last, self.searching, self.any_searching],
         )
@@ -749,21 +790,22 @@ class SolverReduced(SolverBase):
         )
 
     def _finish_iteration(self) -> None:
-        """Take the accepted steps and see which worlds are done."""
+        """Take the accepted steps."""
+        options = self.options
         self.any_active.zero_()
         self._launch(
             kernels.finish_iteration,
             self.world_count,
-            [self.function_count, self.stride, self.world_instances, self.rigid.count, self.options.iteration_max]
-            + [self.options.stiffness_renewal, self.step_length, self.direction, self.rigid.direction, self.last],
-            [self.active, self.q, self.rigid.r, self.iteration, self.renew, self.status, self.any_active],
+            [self.function_count, self.stride, self.world_instances, self.rigid.count]
+            + [options.stiffness_renewal, wp.float64(options.renewal_distance / options.tolerance), self.tolerance]
+            + [self.step_length, self.direction, self.rigid.direction, self.last],
+            [self.active, self.q, self.rigid.r, self.iteration, self.renew, self.exact]
+            + [self.status, self.any_active],
         )
 
     def finish(self, state: newton.State, dt: float) -> None:
         """Write coordinates, velocities and particles, and sum the contact reactions."""
         data, instances = self.parameters, self.instance_count
-        self.active.fill_(1)
-        self._evaluate_entries(self.active, self.q, self.rigid.r, dt, derivatives=False)
         self._launch(
             kernels.check_finite,
             self.world_count,

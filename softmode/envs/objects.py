@@ -21,6 +21,8 @@ from softmode.splats.splats import UpAxis
 Part = Literal["thickest", "tallest", "largest", "all"]
 Pose = Literal["stable", "captured"]
 
+RECIPE = 3
+"""Part of the cache key; raise it when the way from a splat file to a body changes."""
 STABLE_TILT = 0.1
 """A pose is stable if tilting the object by this angle [rad] in any direction raises its centre of mass."""
 
@@ -134,7 +136,7 @@ def stable_rotation(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     other = np.cross(candidates, side)
     stable = np.ones(len(candidates), bool)
-    for azimuth in np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False):
+    for azimuth in np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False):
         tilted = np.cos(STABLE_TILT) * candidates + np.sin(STABLE_TILT) * (
             np.cos(azimuth) * side + np.sin(azimuth) * other
         )
@@ -170,7 +172,7 @@ def _body(splats: Splats, config: ObjectConfig, progress: Callable[[str, float],
         return replace(body, provenance={**body.provenance, "turn": json.dumps(rows)})
 
     pose = config.pose if config.splat is not None else "captured"
-    key = ("splats", splats.means, splats.scales, splats.quats, splats.opacities, pose, config.build)
+    key = ("splats", RECIPE, splats.means, splats.scales, splats.quats, splats.opacities, pose, config.build)
     return cached_body(key, build)
 
 

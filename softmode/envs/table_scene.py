@@ -190,14 +190,15 @@ class TableScene:
         register_custom_attributes(builder)
         SolverMuJoCo.register_custom_attributes(builder)
         builder.replicate(world, self.world_count)
-        self.model = builder.finalize(device=self.device)
+        self.model: Any = builder.finalize(device=self.device)  # Any: it carries the attributes of soft bodies
 
     def _build_solver(self) -> None:
         """Make the coupled solver, the controller and the buffers of a control step."""
         config, model, worlds = self.config, self.model, self.world_count
         rigid = SolverMuJoCo(model, njmax=64, nconmax=32)
         self.solver = SolverCoupledReduced(model, [self.soft.body], options=config.solver, rigid=rigid)
-        self.state, self._scratch = model.state(), model.state()
+        self.state: Any = model.state()
+        self._scratch: Any = model.state()
         self.control = model.control()
         for state in (self.state, self._scratch):
             newton.eval_fk(model, model.joint_q, model.joint_qd, state)

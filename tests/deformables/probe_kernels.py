@@ -50,11 +50,11 @@ def evaluate_potentials(
     eps: wp.float64,
     # Out:
     normal_out: wp.array[wp.vec3d],
-    friction_out: wp.array[wp.vec2d],
+    friction_out: wp.array[wp.vec3d],
 ):
-    """Evaluate both contact potentials: (value, slope, curvature) and (f0, f1 / y)."""
+    """Evaluate both contact potentials: (value, slope, curvature) and (f0, f1 / y, f1')."""
     i = wp.tid()
     value, slope, curvature = contact.normal_potential(x[i], eps)
     normal_out[i] = wp.vec3d(value, slope, curvature)
-    f0, f1_over_y = contact.friction_potential(x[i], eps)
-    friction_out[i] = wp.vec2d(f0, f1_over_y)
+    f0, f1_over_y, f1_slope = contact.friction_potential(x[i], eps)
+    friction_out[i] = wp.vec3d(f0, f1_over_y, f1_slope)

@@ -90,10 +90,13 @@ def test_mesh_distance_equals_box(scale):
 
 
 def test_mesh_contact_is_not_lost_when_deep():
-    """A point inside a mesh is inside however small the detection distance: d = -0.1 with a reach of 1 mm."""
-    mesh = box_mesh((0.2, 0.2, 0.2))
-    d, _ = query(KIND.MESH, (1, 1, 1), np.array([[0.0, 0.0, 0.1]]), mesh=mesh.finalize(device="cpu"), reach=1e-3)
-    np.testing.assert_allclose(d, -0.1, atol=8 * FLOAT32)
+    """A face 5 cm inside a mesh is in contact however small the detection distance (1.7 mm here)."""
+    mesh = box_mesh((0.1, 0.1, 0.1))
+    scene = on_shape(lambda world: world.add_shape_mesh(-1, mesh=mesh), height=0.05)
+    scene.reduced.begin(scene.state, scene.dt)
+    scene.reduced.detect(scene.state, scene.control, scene.dt, prescribed=True)
+    bottom = cube().surface_points[:, 2] < -0.49 * EDGE
+    assert scene.reduced.entry_count.numpy()[0] >= bottom.sum()
 
 
 # -- potentials --------------------------------------------------------------------------------------------------------
@@ -107,7 +110,7 @@ def test_potentials():
     def evaluate(values):
         with wp.ScopedDevice("cpu"):
             normal = wp.zeros(len(values), dtype=wp.vec3d)
-            friction = wp.zeros(len(values), dtype=wp.vec2d)
+            friction = wp.zeros(len(values), dtype=wp.vec3d)
             inputs = [wp.array(values, dtype=wp.float64), wp.float64(eps)]
             wp.launch(evaluate_potentials, dim=len(values), inputs=inputs, outputs=[normal, friction])
         return normal.numpy(), friction.numpy()
@@ -122,6 +125,8 @@ def test_potentials():
     np.testing.assert_allclose(friction[slip, 0], reference.friction_potential(x[slip], eps), atol=1e-15)
     slope = (plus[1] - minus[1])[slip, 0] / (2 * step)
     np.testing.assert_allclose(slope, (friction[:, 1] * x)[slip], atol=4 * step / eps)
+    force = evaluate(x + step)[1][slip, 1] * (x + step)[slip] - evaluate(x - step)[1][slip, 1] * (x - step)[slip]
+    np.testing.assert_allclose(force / (2 * step), friction[slip, 2], atol=8 * step / eps**2)  # f1' jumps in slope at eps
     assert friction[np.flatnonzero(x > eps)[0], 1] * x[x > eps][0] == pytest.approx(1.0)
 
 

@@ -60,8 +60,9 @@ class Potential:
         self.r = self.solver.rigid.r.numpy()[0].copy()
 
     def put(self, u):
-        """Write u into the solver."""
+        """Write u into the solver and ask for a fresh elastic Hessian."""
         solver = self.solver
+        solver.renew.fill_(1)
         q = np.zeros((1, solver.stride, 3))
         q[0, : self.n] = u[: 3 * self.n].reshape(-1, 3)
         solver.q.assign(q)
@@ -87,6 +88,7 @@ class Potential:
         self.put(u)
         solver.active.fill_(1)
         solver._evaluate(solver.active, solver.q, solver.rigid.r, dt, derivatives=True)
+        solver._gather_gradient(dt)
         solver._assemble(dt)
         return np.concatenate([solver.gradient.numpy()[0, : self.n].ravel(), solver.rigid.gradient.numpy()[0]])
 

@@ -61,6 +61,7 @@ def evaluate_at(scene, q):
     solver.detect(scene.state, scene.control, scene.dt, prescribed=True)
     solver.active.fill_(1)
     solver._evaluate(solver.active, solver.q, solver.rigid.r, scene.dt, derivatives=True)
+    solver._gather_gradient(scene.dt)
     solver._assemble(scene.dt)
     return solver.point_energy.numpy()[0].sum(), solver.gradient.numpy()[0][: len(q)]
 
@@ -244,6 +245,7 @@ def test_inner_forces_have_no_resultant():
     evaluate_at(scene, start)  # sets q_n
     solver.q.assign(np.pad(q, ((0, solver.stride - n), (0, 0)))[None])
     solver._evaluate(solver.active, solver.q, solver.rigid.r, scene.dt, derivatives=True)
+    solver._gather_gradient(scene.dt)
     solver._assemble(scene.dt)
     inertia = scene.mass() / scene.dt**2 * (q - start)
     forces = solver.gradient.numpy()[0][:n] - inertia

@@ -1,0 +1,400 @@
+"""The environment contract of softmode/LiftSoft-v0: checkers, seeding, spaces, reward, errors, episodes' ends."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import pickle
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env, data_equivalence
+
+import softmode
+from softmode.envs.lift_soft import LiftSoftConfig, LiftSoftEnv
+from softmode.errors import ConfigError, MaterialError
+
+ENV_ID = "softmode/LiftSoft-v0"
+OBS_TYPES = ["state", "pixels", "pixels_agent_pos"]
+MakeEnv = Callable[[str], gym.Env]
+
+
+def actions(env: gym.Env, count: int, seed: int = 0) -> np.ndarray:
+    """Return random actions."""
+    assert env.action_space.shape is not None
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, (count, *env.action_space.shape)).astype(np.float32)
+
+
+def rollout(env: gym.Env, count: int, **reset: Any) -> list[Any]:
+    """Return the results of a reset and of `count` steps with random actions."""
+    return [env.reset(**reset), *(env.step(action) for action in actions(env, count))]
+
+
+# -- checkers ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("obs_type", OBS_TYPES)
+def test_gymnasium_checker_has_nothing_to_say(make_env: MakeEnv, obs_type: str) -> None:
+    """`check_env` of gymnasium passes without a warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(make_env(obs_type).unwrapped)
+
+
+@pytest.mark.parametrize("obs_type", OBS_TYPES)
+def test_stable_baselines3_checker_has_nothing_to_say(make_env: MakeEnv, obs_type: str) -> None:
+    """`check_env` of stable-baselines3 passes without a warning."""
+    pytest.importorskip("torch", reason="stable-baselines3 needs torch")
+    checker = pytest.importorskip(
+        "stable_baselines3.common.env_checker", reason="install stable-baselines3 to check its contract"
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        checker.check_env(make_env(obs_type).unwrapped, warn=True, skip_render_check=False)
+
+
+def test_id_is_listed() -> None:
+    """The package registers exactly the environments that it documents."""
+    assert set(softmode.ENVIRONMENTS) == {name for name in gym.registry if name.startswith("softmode/")}
+
+
+@pytest.mark.parametrize("obs_type", OBS_TYPES)
+def test_observations_lie_in_a_finite_space(make_env: MakeEnv, obs_type: str) -> None:
+    """Every observation is contained; no bound is infinite."""
+    env = make_env(obs_type)
+    for result in rollout(env, 5, seed=0):
+        assert env.observation_space.contains(result[0])
+    spaces = env.observation_space.values() if isinstance(env.observation_space, gym.spaces.Dict) else []
+    for space in [*spaces] or [env.observation_space]:
+        assert isinstance(space, gym.spaces.Box)
+        assert np.isfinite(space.low).all() and np.isfinite(space.high).all()
+
+
+# -- seeds and processes ----------------------------------------------------------------------------------------------
+
+
+def digest(env: gym.Env) -> str:
+    """Return the sha256 of all that 30 steps with one seed return, and of the soft body's coordinates after them."""
+    bits = hashlib.sha256()
+    for observation, *rest in rollout(env, 30, seed=7):
+        bits.update(observation["pixels"].tobytes() + observation["agent_pos"].tobytes())
+        bits.update(repr([float(x) for x in rest[:-1]]).encode() + repr(rest[-1]).encode())
+    bits.update(env.unwrapped.scene.state.softmode.q.numpy().tobytes())  # type: ignore[attr-defined]
+    return bits.hexdigest()
+
+
+def test_fresh_processes_repeat_an_episode_bitwise(make_env: MakeEnv) -> None:
+    """One seed gives the same bits in two fresh processes, and in this one, which has played before."""
+    script = (
+        "import gymnasium as gym, softmode\n"
+        "from tests.envs.test_lift_soft import digest\n"
+        f"print(digest(gym.make('{ENV_ID}', obs_type='pixels_agent_pos', render_mode='rgb_array')))\n"
+    )
+    runs = [
+        subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True) for _ in range(2)
+    ]
+    found = [run.stdout.split()[-1] for run in runs]
+    assert found[0] == found[1]
+    assert digest(make_env("pixels_agent_pos")) == found[0]
+
+
+def test_two_instances_are_exactly_equal(lift: LiftSoftEnv) -> None:
+    """Gymnasium's own rule for a registered id: equal seeds and actions give equal observations, rewards and infos."""
+    other = gym.make(ENV_ID)
+    try:
+        first, second = rollout(lift, 20, seed=3), rollout(other, 20, seed=3)
+        assert data_equivalence(first, second, exact=True)
+    finally:
+        other.close()
+
+
+def test_seed_decides_the_draw_and_the_stream_goes_on(lift: LiftSoftEnv) -> None:
+    """A seed repeats its draw; without one the next episode is another."""
+    first = lift.reset(seed=5)[0]
+    second = lift.reset()[0]
+    assert not np.array_equal(first, second)
+    np.testing.assert_array_equal(lift.reset(seed=5)[0], first)
+    np.testing.assert_array_equal(lift.reset()[0], second)
+    assert not np.array_equal(lift.reset(seed=6)[0], first)
+
+
+def test_reset_draws_within_its_ranges(lift: LiftSoftEnv) -> None:
+    """Position and Young's modulus stay inside the configured ranges and use them."""
+    config = lift.config
+    centre, modulus = [], []
+    for seed in range(40):
+        info = lift.reset(seed=seed)[1]
+        centre.append(lift.scene.object_position.numpy()[0, :2].copy())
+        modulus.append(info["youngs_modulus"])
+    offset = (np.array(centre) - config.scene.object_position) / config.position_range
+    low, high = np.log(config.youngs_modulus_range)
+    share = (np.log(modulus) - low) / (high - low)
+    assert np.abs(offset).max() < 1.1  # the centre of mass lies a little beside the middle of the object
+    assert np.ptp(offset, axis=0).min() > 1.5
+    assert share.min() > 0.0 and share.max() < 1.0 and np.ptp(share) > 0.8
+
+
+def test_pickled_environment_plays_the_same_episode(lift: LiftSoftEnv) -> None:
+    """A copy through pickle is made from the same arguments."""
+    env = LiftSoftEnv(control_mode="joint_delta", size=0.06)
+    copy = pickle.loads(pickle.dumps(env))
+    assert copy.config == env.config and copy.action_space == env.action_space
+    assert data_equivalence(rollout(env, 3, seed=1), rollout(copy, 3, seed=1), exact=True)
+
+
+# -- vector environments ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("vector", [gym.vector.SyncVectorEnv, gym.vector.AsyncVectorEnv])
+def test_vector_environments_equal_single_ones(lift: LiftSoftEnv, vector: Any) -> None:
+    """Two copies in a vector environment, in processes or not, return what single ones do; the factory is picklable."""
+    factory = functools.partial(gym.make, f"softmode:{ENV_ID}")  # "softmode:" imports the package in a fresh process
+    pickle.loads(pickle.dumps(factory))
+    extra = {"context": "spawn"} if vector is gym.vector.AsyncVectorEnv else {}  # Warp's threads survive no fork
+    envs = vector([factory, factory], **extra)
+    try:
+        observations, _ = envs.reset(seed=[4, 9])
+        chosen = actions(lift, 3)
+        for action in chosen:
+            observations, rewards, *_ = envs.step(np.stack([action, action]))
+        for k, seed in enumerate((4, 9)):
+            single = rollout(lift, 0, seed=seed)
+            single = [lift.step(action) for action in chosen]
+            np.testing.assert_array_equal(observations[k], single[-1][0])
+            assert rewards[k] == single[-1][1]
+    finally:
+        envs.close()
+
+
+# -- options and errors -----------------------------------------------------------------------------------------------
+
+
+def test_reset_options_place_the_object(lift: LiftSoftEnv) -> None:
+    """Position [m], yaw [rad] and Young's modulus [Pa] are taken as given, in numbers or arrays."""
+    given = {"position": [0.42, -0.05], "yaw": 0.5, "youngs_modulus": 1.0e5}
+    _, info = lift.reset(seed=0, options=given)
+    assert info["youngs_modulus"] == 1.0e5
+    np.testing.assert_allclose(lift.scene.object_position.numpy()[0, :2], given["position"], atol=1e-6)
+    x, y, z, w = lift.scene.object_rotation.numpy()[0, 0]
+    np.testing.assert_allclose([x, y, z, w], [0.0, 0.0, np.sin(0.25), np.cos(0.25)], atol=1e-5)
+    again, _ = lift.reset(options={**given, "position": np.array(given["position"]), "yaw": np.array(0.5)})
+    np.testing.assert_array_equal(again, lift.reset(seed=3, options=given)[0])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"colour": "red"},
+        {"position": [0.45]},
+        {"position": [0.45, np.nan]},
+        {"position": [2.0, 0.0]},
+        {"position": None},
+        {"yaw": np.inf},
+        {"yaw": "left"},
+        {"youngs_modulus": 0.0},
+        {"youngs_modulus": -1.0e5},
+        {"youngs_modulus": np.nan},
+    ],
+)
+def test_bad_reset_options_change_nothing(lift: LiftSoftEnv, options: dict[str, Any]) -> None:
+    """A refused reset names the option, and neither the scene nor the random stream has moved."""
+    lift.reset(seed=2)
+    before, stream = lift.scene.state.softmode.q.numpy().copy(), lift.np_random.bit_generator.state
+    with pytest.raises((ConfigError, MaterialError), match=next(iter(options))):
+        lift.reset(seed=3, options=options)
+    np.testing.assert_array_equal(lift.scene.state.softmode.q.numpy(), before)
+    assert lift.np_random.bit_generator.state == stream
+
+
+@pytest.mark.parametrize(
+    "action",
+    [np.zeros(4), np.zeros((1, 5)), 0.0, [0, 0, np.nan, 0, 0], [np.inf, 0, 0, 0, 0], ["a"] * 5, [[1], [1, 2]], None],
+)
+def test_bad_actions_are_refused_before_anything_moves(lift: LiftSoftEnv, action: Any) -> None:
+    """Wrong shapes, NaN, infinity and things that are no numbers raise ConfigError; the state keeps its bits."""
+    lift.reset(seed=0)
+    before = [lift.scene.state.softmode.q.numpy().copy(), lift.scene.state.joint_q.numpy().copy()]
+    with pytest.raises(ConfigError, match="action"):
+        lift.step(action)
+    np.testing.assert_array_equal(lift.scene.state.softmode.q.numpy(), before[0])
+    np.testing.assert_array_equal(lift.scene.state.joint_q.numpy(), before[1])
+
+
+def test_large_actions_are_clamped(lift: LiftSoftEnv) -> None:
+    """An action beyond 1 does what 1 does."""
+    results = []
+    for size in (1.0, 50.0):
+        lift.reset(seed=0)
+        results.append(lift.step(np.full(5, size, np.float32))[0])
+    np.testing.assert_array_equal(*results)
+
+
+@pytest.mark.parametrize(
+    "given", [{"obs_type": "depth"}, {"render_mode": "human"}, {"control_mode": "torque"}, {"size": 0.0}]
+)
+def test_unknown_arguments_are_refused(given: dict[str, Any]) -> None:
+    """The constructor checks its arguments before it builds."""
+    with pytest.raises(ConfigError, match=next(iter(given)).split("_")[-1]):
+        LiftSoftEnv(**given)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"youngs_modulus_range": (0.0, 1.0e5)},
+        {"youngs_modulus_range": (1.0e5, 1.0e4)},
+        {"goal_height": 0.0},
+        {"goal_tolerance": 0.5},
+        {"hold_steps": 0},
+        {"position_range": (-0.1, 0.0)},
+        {"image_size": 8},
+        {"render_size": 5000},
+        {"mesh_samples": 2},
+    ],
+)
+def test_configuration_is_checked(given: dict[str, Any]) -> None:
+    """Every range of the configuration is checked by name."""
+    with pytest.raises(ConfigError, match=next(iter(given))):
+        LiftSoftConfig(**given)
+
+
+# -- step -------------------------------------------------------------------------------------------------------------
+
+
+def test_results_are_never_reused(make_env: MakeEnv) -> None:
+    """What a step returned does not change with the next steps, be it observation, info or picture."""
+    env = make_env("pixels_agent_pos")
+    observation, info = env.reset(seed=0)
+    frame = env.render()
+    assert isinstance(frame, np.ndarray)
+    kept = [observation["pixels"], observation["agent_pos"], info["finger_force"], frame]
+    copies = [array.copy() for array in kept]
+    for action in actions(env, 5):
+        env.step(action)
+        env.render()
+    for array, copy in zip(kept, copies, strict=True):
+        np.testing.assert_array_equal(array, copy)
+
+
+def test_reward_is_the_sum_of_its_terms(lift: LiftSoftEnv) -> None:
+    """The reward equals the sum of info["reward_terms"]; far from the goal only `reach` pays."""
+    for _, reward, _, _, info in rollout(lift, 10, seed=0)[1:]:
+        terms = info["reward_terms"]
+        assert reward == pytest.approx(sum(terms.values()), abs=1e-12)
+        assert set(terms) == {"reach", "grasp", "lift", "hold"}
+        assert 0.0 < terms["reach"] < 1.0 and terms["grasp"] == terms["lift"] == terms["hold"] == 0.0
+        assert info["is_success"] is False
+
+
+def test_episode_is_truncated_by_its_limit(make_env: MakeEnv) -> None:
+    """`gym.make` ends an idle episode after 150 steps, by truncation."""
+    env = make_env("state")
+    env.reset(seed=0)
+    idle = np.array([0.0, 0.0, 0.0, 0.0, 1.0], np.float32)
+    ends = [env.step(idle)[2:4] for _ in range(150)]
+    assert ends[-1] == (False, True)
+    assert not any(terminated or truncated for terminated, truncated in ends[:-1])
+
+
+def test_an_object_off_the_table_ends_the_episode(lift: LiftSoftEnv) -> None:
+    """Falling 5 cm under the place where it rested terminates with failure "dropped"; free fall takes 0.1 s."""
+    lift.reset(seed=0)
+    idle = np.array([0.0, 0.0, 0.0, 0.0, 1.0], np.float32)
+    lift.step(idle)
+    lift.scene.reset(position=np.array([[0.95, 0.0]]))  # beyond the table's edge at x = 0.85 m
+    steps, terminated = 0, False
+    while not terminated and steps < 10:
+        observation, _, terminated, truncated, info = lift.step(idle)
+        steps += 1
+    fall = np.sqrt(2.0 * 0.05 / 9.81) * lift.config.scene.control_hz
+    assert terminated and not truncated and info["failure"] == "dropped" and not info["is_success"]
+    assert fall - 1 <= steps <= fall + 2
+    assert lift.observation_space.contains(observation)
+
+
+def test_numbers_beyond_the_bounds_are_clipped(lift: LiftSoftEnv) -> None:
+    """Whatever the scene holds, the observation lies in its space; NaN becomes zero."""
+    assert isinstance(lift.observation_space, gym.spaces.Box)
+    wild = np.full(lift.observation_space.shape, np.nan)
+    wild[::2] = 1.0e30
+    wild[1] = -np.inf
+    seen = lift._bounded(wild)
+    assert lift.observation_space.contains(seen)
+    np.testing.assert_array_equal(seen[3::2], 0.0)
+
+
+@pytest.mark.parametrize("modulus", [2.0e4, 2.0e6])
+def test_both_ends_of_the_stiffness_stand_still(lift: LiftSoftEnv, modulus: float) -> None:
+    """Left alone for half a second, the softest and the stiffest object sag little and stay where they are."""
+    lift.reset(seed=0, options={"youngs_modulus": modulus, "position": (0.45, 0.0)})
+    place = lift.scene.object_position.numpy()[0].copy()
+    for _ in range(15):
+        info = lift.step(np.array([0.0, 0.0, 0.0, 0.0, 1.0], np.float32))[-1]
+    moved = lift.scene.object_position.numpy()[0] - place
+    # Its own weight strains an object of height H by at most rho g H / E at the foot.
+    config = lift.config.scene
+    sag = config.material.density * 9.81 * config.object.size / modulus * config.object.size
+    assert np.abs(moved[:2]).max() < 1e-3
+    assert -sag - 1e-3 < moved[2] < 1e-4
+    assert np.linalg.norm(lift.scene.object_velocity.numpy()[0]) < 5e-3
+    assert (info["finger_force"] == 0.0).all()
+
+
+def test_joint_actions_move_the_joints() -> None:
+    """In joint_delta mode an action of 1 commands `joint_scale` per step; the joint gets there within 10 %."""
+    env = LiftSoftEnv(control_mode="joint_delta")
+    env.reset(seed=0)
+    start = env.scene.state.joint_q.numpy()[:9].copy()
+    action = np.zeros(8, np.float32)
+    action[0] = 1.0
+    for _ in range(10):
+        env.step(action)
+    for _ in range(10):
+        env.step(np.zeros(8, np.float32))
+    turned = env.scene.state.joint_q.numpy()[:7] - start[:7]
+    wanted = 10 * env.config.scene.control.joint_scale
+    assert turned[0] == pytest.approx(wanted, rel=0.1)
+    assert np.abs(turned[1:]).max() < 0.02 * wanted
+
+
+# -- pictures ---------------------------------------------------------------------------------------------------------
+
+
+def test_frame_shows_two_views(lift: LiftSoftEnv) -> None:
+    """A frame is uint8 (edge, 2 edge, 3), neither half blank; without a render mode there is none."""
+    lift.reset(seed=0)
+    frame = lift.render()
+    edge = lift.config.render_size
+    assert frame is not None and frame.shape == (edge, 2 * edge, 3) and frame.dtype == np.uint8
+    for half in (frame[:, :edge], frame[:, edge:]):
+        assert len(np.unique(half.reshape(-1, 3), axis=0)) > 50
+    lift.render_mode = None
+    try:
+        assert lift.render() is None
+    finally:
+        lift.render_mode = "rgb_array"
+
+
+def test_camera_sees_where_the_object_is(make_env: MakeEnv) -> None:
+    """Moved to the side, the object moves in the picture; with equal options the picture has equal bits."""
+    env = make_env("pixels")
+    place = {"yaw": 0.0, "youngs_modulus": 1.0e5}
+    left, right, again = (
+        env.reset(seed=0, options={**place, "position": (0.45, y)})[0].astype(int) for y in (-0.05, 0.05, -0.05)
+    )
+    np.testing.assert_array_equal(left, again)
+    changed = np.abs(left - right).sum(axis=2) > 60
+    assert 0.005 < changed.mean() < 0.3
+
+
+def test_close_may_be_called_twice() -> None:
+    """`close` is idempotent."""
+    env = gym.make(ENV_ID)
+    env.close()
+    env.close()

@@ -1,0 +1,85 @@
+"""The scripted policy lifts the object, whatever its stiffness, and a user's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from softmode.envs.lift_soft import LiftSoftEnv
+from softmode.envs.scripted import ScriptedLift
+from softmode.errors import ConfigError
+
+
+def play(env: gym.Env, seed: int, **options: float) -> tuple[dict[str, Any], list[bool]]:
+    """Play one episode; return the last info and whether each step counted as success."""
+    observation, info = env.reset(seed=seed, options=options)
+    policy = ScriptedLift(env)
+    success = []
+    for _ in range(150):
+        observation, _, terminated, _, info = env.step(policy(observation))
+        success.append(info["is_success"])
+        if terminated:
+            break
+    return info, success
+
+
+@pytest.mark.parametrize(("seed", "modulus"), [(0, 2.0e4), (1, 2.0e5), (2, 2.0e6)])
+def test_lifts_soft_and_stiff_objects(lift: LiftSoftEnv, seed: int, modulus: float) -> None:
+    """The object ends at the goal height within the tolerance, in both fingers, the solver without a complaint.
+
+    Success begins after `hold_steps` steps at the goal and lasts to the end.
+    """
+    info, success = play(lift, seed, youngs_modulus=modulus)
+    assert info["is_success"]
+    assert info["object_height"] == pytest.approx(lift.config.goal_height, abs=lift.config.goal_tolerance)
+    assert (info["finger_force"] > 0.5).all()
+    assert info["reward_terms"]["hold"] == 2.0
+    first = success.index(True)
+    assert first >= lift.config.hold_steps and all(success[first:])
+    assert not info["solver_status"] & 8  # WORLD_NOT_FINITE
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("modulus", [None, 2.0e4, 2.0e6])
+def test_succeeds_on_twenty_of_twenty_seeds(lift: LiftSoftEnv, modulus: float | None) -> None:
+    """20 of 20 seeds with random stiffness in 2e4..2e6 Pa, and at either end."""
+    options = {} if modulus is None else {"youngs_modulus": modulus}
+    results = [play(lift, seed, **options)[0]["is_success"] for seed in range(20)]
+    assert sum(results) == 20, [seed for seed, won in enumerate(results) if not won]
+
+
+def test_tries_again_after_a_loss(lift: LiftSoftEnv) -> None:
+    """Knocked out of the gripper and put elsewhere, the object is found and lifted again."""
+    observation, _ = lift.reset(seed=0, options={"youngs_modulus": 2.0e5, "position": (0.45, 0.0)})
+    policy = ScriptedLift(lift)
+    for _ in range(75):
+        observation, *_ = lift.step(policy(observation))
+    assert lift.rise() > 0.02
+    q, qd = lift.scene.state.softmode.q, lift.scene.state.softmode.qd
+    body = lift.scene.soft.body
+    q.assign(body.affine(np.eye(3), (0.47, 0.09, lift.scene.soft.height + 1e-3)))
+    qd.zero_()
+    info: dict[str, Any] = {}
+    for _ in range(150):
+        observation, _, terminated, _, info = lift.step(policy(observation))
+        assert not terminated
+    assert info["is_success"]
+
+
+def test_lifts_a_trained_capture(playbot: Path) -> None:
+    """A robot from a trained splat, which cannot stand on its pointed foot, is lifted from where it lies."""
+    env = gym.make("softmode/LiftSoft-v0", splat=playbot, size=0.08)
+    for seed, modulus in ((0, 3.0e4), (1, 1.0e6)):
+        assert play(env.unwrapped, seed, youngs_modulus=modulus)[0]["is_success"]
+
+
+def test_needs_its_own_environment() -> None:
+    """Another environment or other actions are refused."""
+    with pytest.raises(ConfigError, match="scripted policy"):
+        ScriptedLift(gym.make("CartPole-v1"))
+    with pytest.raises(ConfigError, match="pose_delta"):
+        ScriptedLift(LiftSoftEnv(control_mode="joint_delta"))

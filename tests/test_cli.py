@@ -1,0 +1,242 @@
+"""The command line: what it writes, what it says, how it fails."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+from PIL import Image
+
+from softmode import cli
+from softmode.cli import main
+from softmode.splats import make_plush, write_ply
+
+ROOT = Path(__file__).resolve().parents[1]
+os.environ.setdefault("SOFTMODE_CACHE", str(ROOT / ".cache" / "softmode"))
+PLAYBOT = ROOT.parent / "shared" / "data" / "splats" / "playbot" / "4_0" / "meta.json"
+PLAY = ["play", "softmode/LiftSoft-v0"]
+
+
+def listing(folder: Path) -> list[str]:
+    """Return the names of all files and folders, hidden ones included."""
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """Return a function that shortens the episodes of the environment."""
+    import gymnasium as gym
+
+    def limit(steps: int) -> None:
+        monkeypatch.setattr(gym.spec("softmode/LiftSoft-v0"), "max_episode_steps", steps)
+
+    return limit
+
+
+# -- what it does -----------------------------------------------------------------------------------------------------
+
+
+def test_play_films_an_episode(tmp_path: Path, capfd: pytest.CaptureFixture[str], short: Callable[[int], None]) -> None:
+    """It writes a video of two views and a contact sheet with the umask's permissions, and prints the outcome."""
+    short(6)
+    video = tmp_path / "new" / "lift.mp4"
+    assert main([*PLAY, "--video", str(video), "--seed", "3"]) == 0
+    assert listing(tmp_path) == ["new", "new/lift.mp4", "new/lift.png"]
+    frames = iio.imread(video)
+    assert frames.shape == (6, 256, 512, 3)
+    assert np.ptp(frames[-1]) > 100
+    with Image.open(video.with_suffix(".png")) as sheet:
+        assert sheet.size == (3 * 512, 4 * 256)
+    umask = os.umask(0)
+    os.umask(umask)
+    assert [path.stat().st_mode & 0o777 for path in video.parent.iterdir()] == [0o666 & ~umask] * 2
+    out, err = capfd.readouterr()
+    for words in ("body 'plush'", "built in", "ms per control step", "return", "success: False", "wrote"):
+        assert words in out
+    assert "6/6" in err  # the progress bar
+    assert "Module" not in out + err  # Warp's report on each module
+
+
+def test_play_lifts_a_trained_capture(capsys: pytest.CaptureFixture[str]) -> None:
+    """The scripted policy lifts the robot out of a trained SOG capture."""
+    if not PLAYBOT.is_file():
+        pytest.skip(f"the trained capture {PLAYBOT} is not there")
+    assert main([*PLAY, "--splat", str(PLAYBOT), "--size", "0.08"]) == 0
+    assert "success: True" in capsys.readouterr().out
+
+
+def test_play_lifts_an_inria_ply(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The plush, written as .ply in other units, is read, scaled and lifted."""
+    file = tmp_path / "toy.ply"
+    write_ply(file, make_plush().transformed(scale=7.0))
+    assert main([*PLAY, "--splat", str(file), "--size", "0.075", "--up", "+z"]) == 0
+    out = capsys.readouterr().out
+    assert "body 'toy.ply'" in out and "success: True" in out
+
+
+@pytest.mark.parametrize("policy", ["random", "zero"])
+def test_other_policies_play(policy: str, capsys: pytest.CaptureFixture[str], short: Callable[[int], None]) -> None:
+    """Random and zero actions play several episodes and count the successes."""
+    short(3)
+    assert main([*PLAY, "--policy", policy, "--episodes", "2", "--youngs-modulus", "1e5"]) == 0
+    out = capsys.readouterr().out
+    assert "seed 0: E 1e+05 Pa" in out and "seed 1" in out and "0 of 2 episodes succeeded" in out
+
+
+def test_list_envs_names_every_environment(capsys: pytest.CaptureFixture[str]) -> None:
+    """One line per environment, without loading the simulator."""
+    assert main(["list-envs"]) == 0
+    assert "softmode/LiftSoft-v0  " in capsys.readouterr().out
+
+
+def test_warp_is_left_as_it_was(short: Callable[[int], None]) -> None:
+    """Only the command line quietens Warp: afterwards its log level is the user's own again."""
+    import warp as wp
+
+    short(1)
+    before = wp.config.log_level
+    assert main([*PLAY, "--policy", "zero"]) == 0
+    assert wp.config.log_level == before
+
+
+# -- how it fails -----------------------------------------------------------------------------------------------------
+
+
+def damaged(kind: str, folder: Path) -> str:
+    """Write a splat file that cannot be used; return its path."""
+    path = folder / f"{kind}.ply"
+    if kind == "missing":
+        return str(path)
+    plush = make_plush(count=400)
+    if kind == "flat":  # a sheet encloses nothing
+        means = plush.means * np.array([1.0, 1.0, 0.0], np.float32)
+        plush = type(plush)(means=means, quats=plush.quats, scales=plush.scales, opacities=plush.opacities, sh=plush.sh)
+    write_ply(path, plush)
+    data = path.read_bytes()
+    if kind == "truncated":
+        data = data[: len(data) // 2]
+    elif kind == "nan":
+        data = data[:-4] + np.float32(np.nan).tobytes()
+    path.write_bytes(data)
+    return str(path)
+
+
+FAILURES: dict[str, tuple[list[str], str]] = {
+    "policy": (["--policy", "clever"], "policy"),
+    "episodes": (["--episodes", "0"], "episodes"),
+    "seed": (["--seed", "-1"], "seed"),
+    "modulus": (["--youngs-modulus", "-1"], "youngs-modulus"),
+    "modulus nan": (["--youngs-modulus", "nan"], "youngs-modulus"),
+    "size": (["--size", "0"], "size"),
+    "device": (["--device", "abacus:9"], "abacus:9"),
+    "crop": (["--crop", "0", "0", "0", "1", "-1", "1"], "crop"),
+    "extension": (["--video", "{folder}/film.avi"], "film.avi"),
+    "video is a folder": (["--video", "{folder}/taken.mp4"], "taken.mp4"),
+    "parent is a file": (["--video", "{folder}/file/film.mp4"], "film.mp4"),
+    "missing": (["--splat", "missing"], "missing.ply"),
+    "truncated": (["--splat", "truncated"], "truncated.ply"),
+    "nan": (["--splat", "nan"], "nan.ply"),
+    "flat": (["--splat", "flat"], "flat.ply"),
+}
+
+
+@pytest.mark.parametrize("case", FAILURES)
+def test_expected_errors_are_one_line_and_leave_nothing(
+    case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Exit code 2, one line that names the argument and a remedy, no traceback, no new file and no changed one."""
+    (tmp_path / "file").write_text("kept")
+    (tmp_path / "taken.mp4").mkdir()
+    arguments, name = FAILURES[case]
+    arguments = [word.replace("{folder}", str(tmp_path)) for word in arguments]
+    if arguments[0] == "--splat":
+        arguments[1] = damaged(arguments[1], tmp_path)
+    if arguments[0] != "--video":
+        arguments += ["--video", str(tmp_path / "deep" / "film.mp4")]
+    before = listing(tmp_path)
+    assert main([*PLAY, *arguments]) == 2
+    error = capsys.readouterr().err
+    lines = [line for line in error.splitlines() if line.startswith("softmode: error: ")]
+    assert len(lines) == 1 and name in lines[0] and "Traceback" not in error
+    assert ". " in lines[0]  # the remedy
+    assert listing(tmp_path) == before
+    assert (tmp_path / "file").read_text() == "kept"
+
+
+def test_unknown_environment_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    """The error lists the known ones."""
+    assert main(["play", "softmode/Nothing-v0"]) == 2
+    assert "use one of softmode/LiftSoft-v0" in capsys.readouterr().err.replace("Use", "use")
+
+
+@pytest.mark.parametrize("arguments", [[], ["play"], ["dance"], [*PLAY, "--size", "big"], [*PLAY, "--no-such-option"]])
+def test_wrong_usage_exits_with_two(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """The parser's own errors also exit with 2."""
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("module", "arguments"), [("tyro", []), ("imageio.v2", ["--video", "x.mp4"])])
+def test_missing_extras_name_the_remedy(
+    module: str,
+    arguments: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Without an optional package the error says what to install."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, module, None)
+    assert main([*PLAY, *arguments]) == 2
+    assert "pip install 'softmode[demo]'" in capsys.readouterr().err
+    assert listing(tmp_path) == []
+
+
+@pytest.mark.parametrize(("failure", "code"), [(KeyboardInterrupt, 130), (OSError("No space left on device"), 2)])
+def test_interrupted_film_leaves_the_old_one(
+    failure: Any,
+    code: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    short: Callable[[int], None],
+) -> None:
+    """Ctrl-C or a full disk in mid-episode keeps the files that were there, and leaves none beside them."""
+    short(5)
+    video = tmp_path / "lift.mp4"
+    video.write_bytes(b"old film")
+    video.with_suffix(".png").write_bytes(b"old sheet")
+    add, count = cli._Film.add, [0]
+
+    def fail(film: Any, *arguments: Any) -> None:
+        add(film, *arguments)
+        count[0] += 1
+        if count[0] == 3:
+            raise failure
+
+    monkeypatch.setattr(cli._Film, "add", fail)
+    assert main([*PLAY, "--policy", "zero", "--video", str(video)]) == code
+    assert "softmode: " in capsys.readouterr().err
+    assert listing(tmp_path) == ["lift.mp4", "lift.png"]
+    assert video.read_bytes() == b"old film"
+    assert video.with_suffix(".png").read_bytes() == b"old sheet"
+
+
+def test_installed_command_exits_with_the_code(tmp_path: Path) -> None:
+    """`python -m softmode.cli` hands the exit code to the shell and writes errors to stderr only."""
+    command = [sys.executable, "-m", "softmode.cli", *PLAY, "--policy", "clever"]
+    run = subprocess.run(
+        command, capture_output=True, text=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}
+    )
+    assert run.returncode == 2 and run.stdout == ""
+    assert run.stderr.count("\n") == 1 and run.stderr.startswith("softmode: error: unknown policy")
+    assert listing(tmp_path) == []
