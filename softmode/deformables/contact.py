@@ -373,7 +373,9 @@ def gather_entries(
                     wp.atomic_or(status, world[i], overflow_bit)
                     continue
                 normal = wp.vec3d(slot_normal[i, s, slot])
-                point = wp.vec3(position[i, s] - gap * normal)
+                # both bodies feel the force at the sample, not the shape at its own surface: a pair of forces on two
+                # points would make angular momentum out of friction times penetration
+                point = wp.vec3(position[i, s])
                 drift = wp.vec3()
                 arm = wp.vec3()
                 body = shape_body[shape]

@@ -192,6 +192,7 @@ def check_convergence(
     # State in:
     gradient: wp.array2d[wp.vec3d],
     force: wp.array2d[wp.vec3d],
+    pin_count: wp.array[int],
     entry_count: wp.array[int],
     entry_force: wp.array2d[wp.vec3d],
     last: wp.array[int],
@@ -219,7 +220,7 @@ def check_convergence(
         for e in range(entry_count[i]):
             scale += wp.length(entry_force[i, e])
         floor = wp.float64(1.0e-3) * mass[i] * wp.float64(tolerance[i]) / (dt * dt)
-        if entry_count[i] > 0 and not (wp.sqrt(residual) <= force_tolerance * scale + floor):
+        if entry_count[i] > pin_count[i] and not (wp.sqrt(residual) <= force_tolerance * scale + floor):
             done = 0
     if done == 1:
         active[w] = 0
@@ -645,6 +646,7 @@ def begin_search(
     stick_range: wp.float64,  # [m]
     # State in:
     active: wp.array[int],
+    pin_count: wp.array[int],
     entry_count: wp.array[int],
     gradient: wp.array2d[wp.vec3d],
     direction: wp.array2d[vec8],
@@ -676,7 +678,7 @@ def begin_search(
             slope += wp.dot(gradient[i, k], dq)
             moved += wp.length_sq(dq)
         limit = wp.float64(tolerance[i])
-        if entry_count[i] > 0:
+        if entry_count[i] > pin_count[i]:
             limit = wp.min(limit, wp.float64(0.1) * stick_range)
         if not (wp.sqrt(moved) <= limit):
             last = 0

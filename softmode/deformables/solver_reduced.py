@@ -38,7 +38,7 @@ class SolverReducedOptions:
     tolerance: float = 1.0e-5
     """Newton stops when every body moved less than this fraction of its size (rms) in an iteration, and"""
     force_tolerance: float = 1.0e-5
-    """when the residual force on every touched or pinned body is below this fraction of the forces on it."""
+    """when the residual force on every body near a contact is below this fraction of the forces on it."""
     step_length_min: float = 2.0**-10
     """Shortest step the line search tries."""
     contact_max: int = 256
@@ -696,8 +696,8 @@ class SolverReduced(SolverBase):
             kernels.check_convergence,
             self.world_count,
             [self.function_count, self.mass, self.tolerance, self.world_instances, options.iteration_max]
-            + [wp.float64(options.force_tolerance), wp.float64(dt), self.gradient, self.force, self.entry_count, self.entry_force]
-            + [self.last, self.iteration],
+            + [wp.float64(options.force_tolerance), wp.float64(dt), self.gradient, self.force, self.pin_count]
+            + [self.entry_count, self.entry_force, self.last, self.iteration],
             [self.active, self.status],
         )
 
@@ -757,8 +757,8 @@ class SolverReduced(SolverBase):
             kernels.begin_search,
             self.world_count,
             [self.function_count, self.stride, self.tolerance, self.world_instances, self.rigid.count]
-            + [self.rigid_tolerance, wp.float64(self.options.stick_velocity * dt), self.active, self.entry_count]
-            + [self.gradient, self.direction]
+            + [self.rigid_tolerance, wp.float64(self.options.stick_velocity * dt), self.active, self.pin_count]
+            + [self.entry_count, self.gradient, self.direction]
             + [self.rigid.gradient, self.rigid.direction],
             [self.slope, self.step_length, self.last, self.searching, self.any_searching],
         )

@@ -48,3 +48,9 @@ def lift(make_env: Callable[[str], gym.Env]) -> LiftSoftEnv:
     env = make_env("state").unwrapped
     assert isinstance(env, LiftSoftEnv)
     return env
+
+
+@pytest.fixture(scope="session")
+def joints() -> LiftSoftEnv:
+    """Return an environment whose actions are joint steps, with a smaller object."""
+    return LiftSoftEnv(control_mode="joint_delta", size=0.06)
