@@ -126,7 +126,7 @@ def _play(options: Play, film: _Film | None) -> int:
 
     started = time.perf_counter()
     with _quiet_warp():
-        if not any(Path(wp.config.kernel_cache_dir).glob("wp_softmode.deformables.kernels_*")):
+        if not any(Path(wp.config.kernel_cache_dir or "").glob("wp_softmode.deformables.kernels_*")):
             print("compiling kernels (first run only, a minute or two)", file=sys.stderr, flush=True)
         with _BuildBar() as progress:
             env = gym.make(

@@ -37,14 +37,3 @@ def test_import_loads_nothing_heavy_and_no_driver() -> None:
     """A fresh process that imports the package and its command line has loaded no simulator and no CUDA driver."""
     run = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
-
-
-def test_all_modules_of_the_package_import() -> None:
-    """Every module can be imported by itself in a fresh process, without extras being touched by the cheap ones."""
-    script = (
-        "import importlib, pkgutil, softmode\n"
-        "for module in pkgutil.walk_packages(softmode.__path__, 'softmode.'):\n"
-        "    importlib.import_module(module.name)\n"
-    )
-    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr

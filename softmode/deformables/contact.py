@@ -372,7 +372,8 @@ def gather_entries(
                 if count >= entry_max:
                     wp.atomic_or(status, world[i], overflow_bit)
                     continue
-                normal = wp.vec3d(slot_normal[i, s, slot])
+                # of unit length in float64: what is left of the gap in the slip must not count against the stick range
+                normal = wp.normalize(wp.vec3d(slot_normal[i, s, slot]))
                 # both bodies feel the force at the sample, not the shape at its own surface: a pair of forces on two
                 # points would make angular momentum out of friction times penetration
                 point = wp.vec3(position[i, s])
@@ -568,7 +569,7 @@ def evaluate_entries(
         # however far away; the potential's own curvature f1' along the slip converges faster once the state is close
         N = wp.outer(n, n)
         H = stiffness * curvature * N + limit * f1_over_y * (identity - N)
-        if exact[w] != 0 and y > wp.float64(0.0):
+        if exact[w] != 0 and y > wp.float64(1.0e-9) * stick_range:
             H += limit * (f1_slope - f1_over_y) / (y * y) * wp.outer(t, t)
     if derivatives != 0:
         hessian_out[i, e] = wp.mat33(H)

@@ -64,7 +64,7 @@ def test_tries_again_after_a_loss(lift: LiftSoftEnv) -> None:
     q.assign(body.affine(np.eye(3), (0.47, 0.09, lift.scene.soft.height + 1e-3)))
     qd.zero_()
     info: dict[str, Any] = {}
-    for _ in range(150):
+    for _ in range(125):
         observation, _, terminated, _, info = lift.step(policy(observation))
         assert not terminated
     assert info["is_success"]
