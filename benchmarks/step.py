@@ -1,7 +1,7 @@
 """Time the build of a body and every stage of a substep of LiftSoft, in the middle of a grasp.
 
-Run: ``python benchmarks/step.py [--repeats N] [--device cpu]`` (``make bench``). Medians over graph replays; a CPU device runs
-Warp's kernels on one core. Ratios refer to the whole substep measured in the same run.
+Run: ``python benchmarks/step.py [--repeats N] [--device cpu]`` (``make bench``). Medians over graph replays; a CPU
+device runs Warp's kernels on one core. Ratios refer to the whole substep measured in the same run.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import argparse
 import statistics
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -75,9 +76,7 @@ def print_substep(env: LiftSoftEnv, repeats: int, iterations: float) -> None:
             blank, soft.q, soft.rigid.r, dt, derivatives=True
         ),
         "evaluate energy (per trial)": lambda: soft._evaluate(blank, soft.q, soft.rigid.r, dt, derivatives=False),
-        "sum potential (per evaluation)": lambda: soft._sum_potential(
-            blank, soft.q, soft.rigid.r, dt, soft.potential
-        ),
+        "sum potential (per evaluation)": lambda: soft._sum_potential(blank, soft.q, soft.rigid.r, dt, soft.potential),
         "assemble (per iteration)": lambda: soft._assemble(dt),
         "factor and solve (per iteration)": soft._solve,
         "finish": lambda: soft.finish(scratch, dt),
@@ -87,7 +86,10 @@ def print_substep(env: LiftSoftEnv, repeats: int, iterations: float) -> None:
         milliseconds = measure(stage, repeats, device)
         print(f"  {name:<44}{milliseconds:8.3f} ms  {milliseconds / whole:6.1%}")
     frame = measure(scene._control_step, max(repeats // 10, 5), device)
-    print(f"control step: {frame:.2f} ms for {scene.config.substeps} substeps = {1e3 / scene.config.control_hz / frame:.2f} x real time")
+    print(
+        f"control step: {frame:.2f} ms for {scene.config.substeps} substeps, "
+        f"{1e3 / scene.config.control_hz / frame:.2f} x real time"
+    )
 
 
 def print_cameras(env: LiftSoftEnv, repeats: int) -> None:
@@ -109,10 +111,11 @@ def measure(stage: Callable[[], None], repeats: int, device: wp.Device) -> float
     stage()
     with wp.ScopedCapture(device=device) as capture:
         stage()
+    graph: Any = capture.graph
     times = []
     for _ in range(repeats):
         start = time.perf_counter()
-        wp.capture_launch(capture.graph)
+        wp.capture_launch(graph)
         wp.synchronize_device(device)
         times.append(1e3 * (time.perf_counter() - start))
     return float(np.median(times))

@@ -1,7 +1,8 @@
-"""Time the control step of LiftSoft's scene against the number of worlds: ``python benchmarks/worlds.py --device cuda:0``.
+"""Time the control step of LiftSoft's scene against the number of worlds.
 
-Every world plays the same downward motion with the gripper closing on the object, so that contact is active in all of them.
-Prints milliseconds per control step, world steps per second and, on CUDA, the memory taken.
+Run: ``python benchmarks/worlds.py --device cuda:0 --worlds 1 64 1024``. Every world plays the same downward motion with
+the gripper closing on the object, so that contact is active in all of them. Prints milliseconds per control step, world
+steps per second and, on CUDA, the memory taken.
 """
 
 from __future__ import annotations

@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 # Before the first import of warp: the cache lies in the checkout, so that a run leaves nothing outside it.
-os.environ.setdefault("WARP_CACHE_PATH", str(Path(__file__).resolve().parents[1] / ".cache" / "warp"))
+_CACHE = Path(__file__).resolve().parents[1] / ".cache"
+os.environ.setdefault("WARP_CACHE_PATH", str(_CACHE / "warp"))
+os.environ.setdefault("SOFTMODE_CACHE", str(_CACHE / "softmode"))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -1,0 +1,1 @@
+"""Reduced deformables: the build on the host, the step on the device."""

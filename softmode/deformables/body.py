@@ -14,7 +14,6 @@ import hashlib
 import json
 import os
 import sys
-import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Iterator
@@ -27,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
+from softmode.atomic import atomic_write
 from softmode.deformables.cubature import select_cubature
 from softmode.deformables.eigenmodes import solve_eigenmodes
 from softmode.deformables.quadrature import Quadrature
@@ -217,17 +217,8 @@ class ReducedBody:
             else:
                 header[f.name] = value
         arrays["header"] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-        handle, temporary = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent)
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez(file, **arrays)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, target)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                os.unlink(temporary)
-            raise
+        with atomic_write(target) as file:
+            np.savez(file, **arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> ReducedBody:

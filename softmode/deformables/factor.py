@@ -78,7 +78,9 @@ def _factor_row_block(
     # In and out:
     matrix: wp.array3d[vec8],  # (system_count, N, (N + M) / 8)
     # Out:
-    diagonal_out: wp.array2d[vec8],  # (system_count, N): rows of the 8x8 diagonal blocks of U, inverse pivots on the diagonal
+    diagonal_out: wp.array2d[
+        vec8
+    ],  # (system_count, N): rows of the 8x8 diagonal blocks of U, inverse pivots on the diagonal
 ):
     """Factor the 8x8 diagonal block (every thread its own copy) and solve U_bb^T X = A_bl for one column block."""
     i, offset = wp.tid()

@@ -4,9 +4,9 @@ Each material is isotropic and a function of I_C = |F|^2 and J = det F. Lame's p
 lambda = E nu / ((1 + nu) (1 - 2 nu)); every material agrees with Hooke's law to first order at F = I.
 
 =====================  ==============================================================================================
-stable_neo_hookean     mu/2 (I_C - 3) + (lambda+mu)/2 [(J - g)^2 - (1 - g)^2],  g = 1 + mu/(lambda+mu). FreeForm eq. (16)
-                       with the factor 1/2 on mu that its eq. (26) needs. F = 0 is a strict local minimum: a body
-                       squeezed to a point stays there. Kept for parity with published results.
+stable_neo_hookean     mu/2 (I_C - 3) + (lambda+mu)/2 [(J - g)^2 - (1 - g)^2],  g = 1 + mu/(lambda+mu). FreeForm's
+                       eq. (16) with the factor 1/2 on mu that its eq. (26) needs. F = 0 is a strict local minimum: a
+                       body squeezed to a point stays there. Kept for parity with published results.
 stable_neo_hookean_log m/2 (I_C - 3) + l/2 [(J - a)^2 - (1 - a)^2] - m/2 ln((I_C + 1)/4),  m = 4/3 mu,
                        l = lambda + 5/6 mu, a = 1 + m/l - m/(4 l). Smith, de Goes, Kim 2018, doi:10.1145/3180491: the
                        logarithm is the origin term that removes that minimum. The default.
@@ -61,7 +61,9 @@ class Material:
         for name in ("youngs_modulus", "density"):
             value = getattr(self, name)
             if not 0.0 < value < float("inf"):
-                raise MaterialError(f"{name} must be a finite number > 0, got {value!r}", hint=f"give {name} in SI units")
+                raise MaterialError(
+                    f"{name} must be a finite number > 0, got {value!r}", hint=f"give {name} in SI units"
+                )
         if not -1.0 < self.poissons_ratio < 0.5:
             raise MaterialError(
                 f"poissons_ratio must lie in (-1, 0.5), got {self.poissons_ratio!r}",
@@ -70,7 +72,9 @@ class Material:
         for name in ("viscosity", "mass_damping", "friction"):
             value = getattr(self, name)
             if not 0.0 <= value < float("inf"):
-                raise MaterialError(f"{name} must be a finite number >= 0, got {value!r}", hint="use 0 to switch it off")
+                raise MaterialError(
+                    f"{name} must be a finite number >= 0, got {value!r}", hint="use 0 to switch it off"
+                )
 
 
 @wp.struct
@@ -144,7 +148,12 @@ def invariant_derivatives(material: MaterialParameters, strain: wp.float64, j1: 
 def determinant_minus_one(G: wp.mat33d):
     """Return det(I + G) - 1 without the cancellation of 1 + small - 1."""
     minors = (
-        G[0, 0] * G[1, 1] - G[0, 1] * G[1, 0] + G[1, 1] * G[2, 2] - G[1, 2] * G[2, 1] + G[0, 0] * G[2, 2] - G[0, 2] * G[2, 0]
+        G[0, 0] * G[1, 1]
+        - G[0, 1] * G[1, 0]
+        + G[1, 1] * G[2, 2]
+        - G[1, 2] * G[2, 1]
+        + G[0, 0] * G[2, 2]
+        - G[0, 2] * G[2, 0]
     )
     return wp.trace(G) + minors + wp.determinant(G)
 
@@ -171,7 +180,7 @@ def energy(material: MaterialParameters, G: wp.mat33d, G_start: wp.mat33d, dt: w
         G_start: Displacement gradient at its start.
         dt: Duration of the step [s].
     """
-    psi, s, b, p, l = invariant_derivatives(material, strain_measure(G), determinant_minus_one(G))
+    psi, _s, _b, _p, _l = invariant_derivatives(material, strain_measure(G), determinant_minus_one(G))
     rate = green_strain(G) - green_strain(G_start)
     return psi + material.mu * material.viscosity / dt * wp.ddot(rate, rate)
 
@@ -180,7 +189,7 @@ def energy(material: MaterialParameters, G: wp.mat33d, G_start: wp.mat33d, dt: w
 def stress(material: MaterialParameters, G: wp.mat33d, G_start: wp.mat33d, dt: wp.float64):
     """Return the first Piola-Kirchhoff stress [Pa], the derivative of :func:`energy` with respect to F."""
     F = wp.identity(n=3, dtype=wp.float64) + G
-    psi, s, b, p, l = invariant_derivatives(material, strain_measure(G), determinant_minus_one(G))
+    _psi, s, _b, p, _l = invariant_derivatives(material, strain_measure(G), determinant_minus_one(G))
     rate = green_strain(G) - green_strain(G_start)
     viscous = wp.float64(2.0) * material.mu * material.viscosity / dt
     return s * F + p * cofactor(F) + viscous * (F * rate)
@@ -212,7 +221,7 @@ def hessian(material: MaterialParameters, G: wp.mat33d, dt: wp.float64):
     Gauss-Newton term. The direction needs no more than float32: energy and stress decide the answer in float64.
     """
     F = wp.mat33(wp.identity(n=3, dtype=wp.float64) + G)
-    psi, s64, b64, p64, l64 = invariant_derivatives(material, strain_measure(G), determinant_minus_one(G))
+    _psi, s64, b64, p64, l64 = invariant_derivatives(material, strain_measure(G), determinant_minus_one(G))
     s = float(s64)
     b = float(b64)
     p = float(p64)

@@ -1,6 +1,5 @@
 """SolverReduced: the implicit reduced step as a Newton solver, for several bodies and worlds, captured as a graph."""
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,19 +9,31 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverBase
 
-from softmode.deformables import contact, kernels
+from softmode.deformables import assembly_kernels as assembly
+from softmode.deformables import contact, kernels, status
+from softmode.deformables import search_kernels as search
+from softmode.deformables.authoring import (
+    NAMESPACE,
+    add_pins,
+    add_reduced_body,
+    body_key,
+    contact_stiffness,
+    register_custom_attributes,
+)
 from softmode.deformables.body import ReducedBody
 from softmode.deformables.factor import LANES, BlockCholesky, pad, vec8
-from softmode.deformables.materials import Material
+from softmode.deformables.rigid_dofs import RigidDofs
+from softmode.deformables.shape_queries import SUPPORTED_SHAPES
 from softmode.errors import ConfigError
 
-NAMESPACE = "softmode"
-_INSTANCE = f"{NAMESPACE}:instance"
-_FUNCTION = f"{NAMESPACE}:function"
-_PIN = f"{NAMESPACE}:pin"
-
-CONTACT_STIFFNESS_FLOOR = 5.0e7
-"""Least contact stiffness per area [Pa/m]: 25 kPa, a firm grasp, sinks 0.5 mm deep."""
+__all__ = [
+    "SolverReduced",
+    "SolverReducedOptions",
+    "add_pins",
+    "add_reduced_body",
+    "contact_stiffness",
+    "register_custom_attributes",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +45,7 @@ class SolverReducedOptions:
     stiffness_renewal: int = 5
     """The elastic Hessian is assembled every so many iterations at least (contact always is), and"""
     renewal_distance: float = 1.0e-3
-    """after an iteration that moved a body by more than this fraction of its size (rms). 0 is Newton's method proper."""
+    """after an iteration that moved a body by more than this fraction of its size (rms). 0 is Newton's own method."""
     tolerance: float = 1.0e-5
     """Newton stops when every body moved less than this fraction of its size (rms) in an iteration, and"""
     force_tolerance: float = 1.0e-5
@@ -55,228 +66,16 @@ class SolverReducedOptions:
         for name, low in (("iteration_max", 1), ("stiffness_renewal", 1), ("contact_max", 1)):
             if getattr(self, name) < low:
                 raise ConfigError(f"{name} must be at least {low}, got {getattr(self, name)}")
-        for name in ("tolerance", "force_tolerance", "step_length_min", "contact_margin", "contact_smoothing", "stick_velocity"):
+        for name in (
+            "tolerance",
+            "force_tolerance",
+            "step_length_min",
+            "contact_margin",
+            "contact_smoothing",
+            "stick_velocity",
+        ):
             if not 0.0 < getattr(self, name) < float("inf"):
                 raise ConfigError(f"{name} must be a finite number > 0, got {getattr(self, name)!r}")
-
-
-def body_key(body: ReducedBody) -> int:
-    """Return the number that ties an instance in a model to its body: 62 bits of the body's fingerprint."""
-    return int.from_bytes(hashlib.sha256(body.fingerprint.encode()).digest()[:8], "little") >> 2
-
-
-def register_custom_attributes(builder: newton.ModelBuilder) -> None:
-    """Declare the attributes of reduced bodies on a builder; once per builder, also on the one that replicates."""
-    if f"{NAMESPACE}:q" in builder.custom_attributes:
-        return
-    attribute = newton.ModelBuilder.CustomAttribute
-    assignment = newton.Model.AttributeAssignment
-    for name in ("instance", "function", "pin"):
-        builder.add_custom_frequency(newton.ModelBuilder.CustomFrequency(name=name, namespace=NAMESPACE))
-
-    def declare(name: str, dtype: Any, frequency: str, **options: Any) -> None:
-        builder.add_custom_attribute(
-            attribute(name=name, dtype=dtype, frequency=frequency, namespace=NAMESPACE, **options)
-        )
-
-    declare("instance_world", wp.int32, _INSTANCE, references="world")
-    declare("body_key", wp.int64, _INSTANCE)
-    declare("function_start", wp.int32, _INSTANCE, references=_FUNCTION)
-    declare("particle_start", wp.int32, _INSTANCE, references="particle")
-    declare("material_model", wp.int32, _INSTANCE)
-    for name in ("youngs_modulus", "poissons_ratio", "density", "viscosity", "mass_damping", "friction"):
-        declare(name, wp.float32, _INSTANCE)
-    declare("contact_stiffness", wp.float32, _INSTANCE)
-    declare("q", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
-    declare("qd", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
-    declare("pin_instance", wp.int32, _PIN, references=_INSTANCE)
-    declare("pin_point", wp.vec3d, _PIN)
-    declare("pin_stiffness", wp.float32, _PIN)
-    declare("pin_target", wp.vec3d, _PIN, assignment=assignment.CONTROL)
-
-
-def contact_stiffness(body: ReducedBody, material: Material) -> float:
-    """Return the default contact stiffness per area [Pa/m]: twenty times the bulk's, and never under the floor."""
-    nu = material.poissons_ratio
-    wave = material.youngs_modulus * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
-    return max(20.0 * wave / float(np.linalg.norm(np.ptp(body.bounds, axis=0))), CONTACT_STIFFNESS_FLOOR)
-
-
-def add_reduced_body(
-    builder: newton.ModelBuilder,
-    body: ReducedBody,
-    *,
-    material: Material | None = None,
-    position: Sequence[float] = (0.0, 0.0, 0.0),
-    rotation: np.ndarray | None = None,
-    velocity: Sequence[float] = (0.0, 0.0, 0.0),
-    angular_velocity: Sequence[float] = (0.0, 0.0, 0.0),
-    contact_stiffness_per_area: float | None = None,
-    particle_radius: float | None = None,
-) -> int:
-    """Add a body to a world; its surface samples become Newton particles.
-
-    Args:
-        builder: Builder of the world; the attributes are registered if they are not yet.
-        body: The reduced body.
-        material: Its material; default ``Material()``.
-        position: Where the body's centre of mass rests [m].
-        rotation: Rotation matrix of the rest pose, shape (3, 3); default identity.
-        velocity: Initial velocity of the centre of mass [m/s].
-        angular_velocity: Initial angular velocity [rad/s].
-        contact_stiffness_per_area: Penalty stiffness of contact [Pa/m]; default :func:`contact_stiffness`.
-        particle_radius: Radius of the particles for viewers and picking [m]; default half their spacing.
-
-    Returns:
-        Index of the instance in this builder.
-
-    Raises:
-        ConfigError: If the pose or a stiffness is not finite or the rotation is no rotation.
-    """
-    register_custom_attributes(builder)
-    material = material or Material()
-    R = np.eye(3) if rotation is None else np.asarray(rotation, float)
-    p = np.asarray(position, float)
-    if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=1e-5) or np.linalg.det(R) < 0:
-        raise ConfigError("rotation must be a rotation matrix of shape (3, 3)", hint="orthonormalise it")
-    for name, value in (("position", position), ("velocity", velocity), ("angular_velocity", angular_velocity)):
-        if np.shape(value) != (3,) or not np.isfinite(value).all():
-            raise ConfigError(f"{name} must be three finite numbers, got {value!r}")
-    stiffness = contact_stiffness(body, material) if contact_stiffness_per_area is None else contact_stiffness_per_area
-    if not 0.0 < stiffness < np.inf:
-        raise ConfigError(f"contact_stiffness_per_area must be a finite number > 0 [Pa/m], got {stiffness!r}")
-
-    omega = np.asarray(angular_velocity, float)
-    spin = np.array([[0, -omega[2], omega[1]], [omega[2], 0, -omega[0]], [-omega[1], omega[0], 0]])
-    q = body.affine(R, p)
-    # the velocity field v + omega x (R X) as coordinates: affine() of I + A subtracts the identity again
-    qd = body.affine(np.eye(3) + spin @ R, np.asarray(velocity, float))
-    x = body.surface_points @ R.T + p
-    v = np.asarray(velocity, float) + x @ spin.T - p @ spin.T
-    radius = 0.5 * float(np.sqrt(body.surface_areas.mean())) if particle_radius is None else particle_radius
-    mass = material.density * body.volume / body.surface_count
-
-    particle_start = builder.particle_count
-    builder.add_particles(
-        pos=[wp.vec3(*row) for row in x],
-        vel=[wp.vec3(*row) for row in v],
-        mass=[mass] * body.surface_count,
-        radius=[radius] * body.surface_count,
-    )
-    function_start = len(builder.custom_attributes[f"{NAMESPACE}:q"].values or [])
-    builder.add_custom_values_batch(
-        [{f"{NAMESPACE}:q": wp.vec3d(*a), f"{NAMESPACE}:qd": wp.vec3d(*b)} for a, b in zip(q, qd, strict=True)]
-    )
-    values = {
-        "body_key": body_key(body),
-        "function_start": function_start,
-        "particle_start": particle_start,
-        "material_model": int(material.model),
-        "contact_stiffness": float(stiffness),
-    }
-    for name in ("youngs_modulus", "poissons_ratio", "density", "viscosity", "mass_damping", "friction"):
-        values[name] = getattr(material, name)
-    index = builder.add_custom_values(**{f"{NAMESPACE}:{name}": value for name, value in values.items()})
-    return index[f"{NAMESPACE}:function_start"]
-
-
-def add_pins(
-    builder: newton.ModelBuilder,
-    instance: int,
-    points: np.ndarray,
-    *,
-    stiffness: float | np.ndarray,
-    targets: np.ndarray | None = None,
-) -> None:
-    """Pin rest points of a body to targets in the world by springs (soft boundary conditions).
-
-    Args:
-        builder: Builder that holds the instance.
-        instance: Index from :func:`add_reduced_body`.
-        points: Rest points in the body frame [m], shape (pin_count, 3).
-        stiffness: Spring stiffness [N/m], a number or one per pin; scale it with a volume or an area for a clamp.
-        targets: World positions [m], shape (pin_count, 3); default: the points themselves. Move them at run time
-            through ``control.softmode.pin_target``.
-
-    Raises:
-        ConfigError: If there is no point, a shape does not fit, or a stiffness is negative.
-    """
-    X = np.atleast_2d(np.asarray(points, float))
-    T = X if targets is None else np.atleast_2d(np.asarray(targets, float))
-    k = np.atleast_1d(np.asarray(stiffness, float))
-    if k.shape not in ((1,), (len(X),)):
-        raise ConfigError(f"stiffness must be one number or one per pin, got shape {k.shape} for {len(X)} pins")
-    k = np.broadcast_to(k, (len(X),))
-    if X.ndim != 2 or X.shape[1:] != (3,) or T.shape != X.shape or len(X) == 0:
-        raise ConfigError(f"points and targets must have shape (pin_count > 0, 3), got {X.shape} and {T.shape}")
-    if not (np.isfinite(k).all() and (k >= 0).all() and np.isfinite(X).all() and np.isfinite(T).all()):
-        raise ConfigError("stiffness must be finite and >= 0 [N/m], points and targets finite [m]")
-    builder.add_custom_values_batch(
-        [
-            {
-                f"{NAMESPACE}:pin_instance": instance,
-                f"{NAMESPACE}:pin_point": wp.vec3d(*a),
-                f"{NAMESPACE}:pin_stiffness": float(b),
-                f"{NAMESPACE}:pin_target": wp.vec3d(*c),
-            }
-            for a, b, c in zip(X, k, T, strict=True)
-        ]
-    )
-
-
-class RigidDofs:
-    """Joint dofs that take part in the solve: per world r = dt * joint velocity and its quadratic model.
-
-    Empty (``count_max`` 0) while rigid bodies move as prescribed; ``coupling`` fills one in.
-    """
-
-    def __init__(self, model: newton.Model, world_count: int, counts: np.ndarray, dof_start: np.ndarray) -> None:
-        """Allocate for ``counts`` dofs per world, the first of them at ``dof_start``."""
-        device = model.device
-        self.count_max = int(counts.max(initial=0))
-        size = max(self.count_max, 1)
-        self.count = wp.array(counts, dtype=int, device=device)
-        self.dof_start = wp.array(dof_start, dtype=int, device=device)
-        self.inertia = wp.zeros((world_count, size, size), dtype=wp.float64, device=device)
-        self.predicted = wp.zeros((world_count, size), dtype=wp.float64, device=device)
-        self.r = wp.zeros_like(self.predicted)
-        self.trial = wp.zeros_like(self.predicted)
-        self.gradient = wp.zeros_like(self.predicted)
-        self.direction = wp.zeros_like(self.predicted)
-        self.matrix = wp.zeros_like(self.inertia)
-        articulation, link = _link_table(model)
-        start, count = _articulation_dofs(model)
-        self.body_articulation = wp.array(articulation, dtype=int, device=device)
-        self.body_link = wp.array(link, dtype=int, device=device)
-        self.articulation_dof_start = wp.array(start, dtype=int, device=device)
-        self.articulation_dof_count = wp.array(count, dtype=int, device=device)
-        links, dofs = model.max_joints_per_articulation, model.max_dofs_per_articulation
-        shape = (max(model.articulation_count, 1), max(6 * links, 6), max(dofs, 1))
-        self.jacobian = wp.zeros(shape, dtype=float, device=device)
-
-
-def _articulation_dofs(model: newton.Model) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first joint dof and the dof count of every articulation."""
-    if model.articulation_count == 0:
-        return np.zeros(1, int), np.zeros(1, int)
-    joint_start = model.articulation_start.numpy()[: model.articulation_count]
-    joint_end = model.articulation_end.numpy()[: model.articulation_count]
-    dof = np.append(model.joint_qd_start.numpy()[: model.joint_count], model.joint_dof_count)
-    return dof[joint_start], dof[joint_end] - dof[joint_start]
-
-
-def _link_table(model: newton.Model) -> tuple[np.ndarray, np.ndarray]:
-    """Return the articulation of every rigid body and its row block in that articulation's Jacobian."""
-    articulation = np.full(max(model.body_count, 1), -1)
-    link = np.zeros(max(model.body_count, 1), int)
-    if model.articulation_count:
-        child = model.joint_child.numpy()
-        starts, ends = model.articulation_start.numpy(), model.articulation_end.numpy()
-        for a in range(model.articulation_count):
-            for joint in range(int(starts[a]), int(ends[a])):
-                articulation[child[joint]] = a
-                link[child[joint]] = joint - starts[a]
-    return articulation, link
 
 
 class SolverReduced(SolverBase):
@@ -296,19 +95,25 @@ class SolverReduced(SolverBase):
         ConfigError: If a body of the model is not among ``bodies``, or a shape type cannot be touched.
     """
 
-    register_custom_attributes = staticmethod(register_custom_attributes)
+    @classmethod
+    def register_custom_attributes(cls, builder: newton.ModelBuilder) -> None:
+        """Declare the attributes of reduced bodies on a builder."""
+        register_custom_attributes(builder)
 
     def __init__(
         self, model: newton.Model, bodies: Sequence[ReducedBody], *, options: SolverReducedOptions | None = None
     ) -> None:
         """Lay out tables and buffers; see the class."""
         super().__init__(model)
+        self.model: Any = model
         self.options = options or SolverReducedOptions()
         if not hasattr(model, NAMESPACE):
             raise ConfigError("model holds no reduced body", hint="call add_reduced_body before finalize")
         self._build_tables(list(bodies))
         self._build_buffers()
-        self.attach_rigid(RigidDofs(model, self.world_count, np.zeros(self.world_count, int), np.zeros(self.world_count, int)))
+        self.attach_rigid(
+            RigidDofs(model, self.world_count, np.zeros(self.world_count, int), np.zeros(self.world_count, int))
+        )
         self.refresh()
 
     # -- host side tables ---------------------------------------------------------------------------------------------
@@ -427,7 +232,7 @@ class SolverReduced(SolverBase):
             return np.full((self.instance_count, 1), -1)
         flags, kinds, worlds = model.shape_flags.numpy(), model.shape_type.numpy(), model.shape_world.numpy()
         solid = (flags & int(newton.ShapeFlags.COLLIDE_PARTICLES)) != 0
-        supported = [int(kind) for kind in contact.SUPPORTED_SHAPES]
+        supported = [int(kind) for kind in SUPPORTED_SHAPES]
         for shape in np.flatnonzero(solid & ~np.isin(kinds, supported)):
             raise ConfigError(
                 f"shape {shape} ({model.shape_label[shape]!r}) is a {newton.GeoType(int(kinds[shape])).name.lower()}, "
@@ -439,14 +244,14 @@ class SolverReduced(SolverBase):
         uneven = np.ptp(np.abs(scale), axis=1) > 1e-5 * np.abs(scale).max(axis=1)
         for shape in np.flatnonzero(solid & meshes & uneven):
             raise ConfigError(
-                f"shape {shape} ({model.shape_label[shape]!r}) is a mesh scaled by {scale[shape]}, whose distances a soft "
-                "body cannot query",
+                f"shape {shape} ({model.shape_label[shape]!r}) is a mesh scaled by {scale[shape]}, whose distances "
+                "a soft body cannot query",
                 hint="scale the vertices of the mesh instead",
             )
         moving = solid & (model.shape_body.numpy() >= 0) & (worlds == -1)
         if self.world_count > 1 and moving.any():
             raise ConfigError(
-                f"shape {np.flatnonzero(moving)[0]} belongs to a body outside all worlds and would be pushed by every world",
+                f"shape {np.flatnonzero(moving)[0]} belongs to a body outside all worlds; every world would push it",
                 hint="add the body to the builder that is replicated",
             )
         lists = [np.flatnonzero(solid & ((worlds == -1) | (worlds == w))) for w in self.instance_world]
@@ -484,7 +289,10 @@ class SolverReduced(SolverBase):
         self.entry_count = zeros((instances,), int)
         self.entry_row, self.entry_shape = zeros((instances, entries), int), zeros((instances, entries), int)
         self.entry_arm = zeros((instances, entries), wp.vec3)
-        self.entry_normal, self.entry_offset = zeros((instances, entries), wp.vec3d), zeros((instances, entries), wp.vec3d)
+        self.entry_normal, self.entry_offset = (
+            zeros((instances, entries), wp.vec3d),
+            zeros((instances, entries), wp.vec3d),
+        )
         self.entry_stiffness = zeros((instances, entries), wp.float64)
         self.entry_friction = zeros((instances, entries), wp.float64)
         self.entry_normal_force = zeros((instances, entries), wp.float64)
@@ -500,7 +308,7 @@ class SolverReduced(SolverBase):
         self.slope, self.step_length = zeros((worlds,), wp.float64), zeros((worlds,), wp.float64)
         self.iteration = zeros((worlds,), int)
         self.status = zeros((worlds,), int)
-        """Status bits per world (see ``kernels``), gathered over steps until cleared with ``status.zero_()``."""
+        """Status bits per world (see ``status``), gathered over steps until cleared with ``status.zero_()``."""
 
     def attach_rigid(self, rigid: RigidDofs) -> None:
         """Let the joint dofs of ``rigid`` take part in the solve."""
@@ -548,9 +356,23 @@ class SolverReduced(SolverBase):
         self._launch(
             kernels.begin_step,
             (self.instance_count, self.stride),
-            [self.parameters.function_start, self.function_count, self.instance_asset, self.world, self.mass]
-            + [self.row_start, self.sample_count, self.parameters.particle_start, self.mean_basis, self.row_basis]
-            + [self.model.gravity, data.q, data.qd, state.particle_f, wp.float64(dt)],
+            [
+                self.parameters.function_start,
+                self.function_count,
+                self.instance_asset,
+                self.world,
+                self.mass,
+                self.row_start,
+                self.sample_count,
+                self.parameters.particle_start,
+                self.mean_basis,
+                self.row_basis,
+                self.model.gravity,
+                data.q,
+                data.qd,
+                state.particle_f,
+                wp.float64(dt),
+            ],
             [self.q_start, self.q_inertial, self.q, self.force],
         )
 
@@ -562,8 +384,15 @@ class SolverReduced(SolverBase):
         self._launch(
             contact.place_samples,
             samples,
-            [self.function_count, self.row_start, self.sample_count, self.row_point, self.row_basis]
-            + [self.q_start, self.q_inertial],
+            [
+                self.function_count,
+                self.row_start,
+                self.sample_count,
+                self.row_point,
+                self.row_basis,
+                self.q_start,
+                self.q_inertial,
+            ],
             [self.sample_position, self.sample_drift],
         )
         if self.pin_max:
@@ -571,8 +400,17 @@ class SolverReduced(SolverBase):
             self._launch(
                 contact.gather_pins,
                 (instances, self.pin_max),
-                [self.function_count, self.pin_count, self.pin_start, self.pin_row, data.pin_stiffness, targets]
-                + [self.row_point, self.row_basis, self.q_start],
+                [
+                    self.function_count,
+                    self.pin_count,
+                    self.pin_start,
+                    self.pin_row,
+                    data.pin_stiffness,
+                    targets,
+                    self.row_point,
+                    self.row_basis,
+                    self.q_start,
+                ],
                 [self.entry_row, self.entry_shape, self.entry_offset, self.entry_stiffness],
             )
         if model.shape_count == 0:
@@ -588,37 +426,102 @@ class SolverReduced(SolverBase):
         self._launch(
             contact.cull_shapes,
             self.candidate.shape,
-            [self.candidate, model.shape_type, model.shape_body, model.shape_transform, *bounds, model.shape_margin]
-            + [state.body_q, state.body_qd, model.body_com, self.lower, self.upper, float(dt)],
+            [
+                self.candidate,
+                model.shape_type,
+                model.shape_body,
+                model.shape_transform,
+                *bounds,
+                model.shape_margin,
+                state.body_q,
+                state.body_qd,
+                model.body_com,
+                self.lower,
+                self.upper,
+                float(dt),
+            ],
             [self.near],
         )
         self._launch(
             contact.find_contacts,
             samples,
-            [self.sample_count, self.margin, self.candidate, self.near, model.shape_type, model.shape_scale]
-            + [model.shape_source_ptr, model.shape_margin, *bounds, model.shape_body, model.shape_transform]
-            + [state.body_q, state.body_qd, model.body_com, self.sample_position, self.sample_drift, float(dt)],
+            [
+                self.sample_count,
+                self.margin,
+                self.candidate,
+                self.near,
+                model.shape_type,
+                model.shape_scale,
+                model.shape_source_ptr,
+                model.shape_margin,
+                *bounds,
+                model.shape_body,
+                model.shape_transform,
+                state.body_q,
+                state.body_qd,
+                model.body_com,
+                self.sample_position,
+                self.sample_drift,
+                float(dt),
+            ],
             [self.slot_shape, self.slot_gap, self.slot_normal],
         )
         self._launch(
             contact.gather_entries,
             instances,
-            [self.world, self.row_start, self.sample_count, data.contact_stiffness, data.friction, self.pin_count]
-            + [self.entry_max, self.row_area, model.shape_body, model.shape_material_mu]
-            + [state.body_q, state.body_qd, model.body_com, int(prescribed)]
-            + [self.sample_position, self.slot_shape, self.slot_gap, self.slot_normal, float(dt)]
-            + [kernels.WORLD_CONTACT_OVERFLOW],
-            [self.entry_count, self.entry_row, self.entry_shape, self.entry_arm, self.entry_normal]
-            + [self.entry_offset, self.entry_stiffness, self.entry_friction, self.status],
+            [
+                self.world,
+                self.row_start,
+                self.sample_count,
+                data.contact_stiffness,
+                data.friction,
+                self.pin_count,
+                self.entry_max,
+                self.row_area,
+                model.shape_body,
+                model.shape_material_mu,
+                state.body_q,
+                state.body_qd,
+                model.body_com,
+                int(prescribed),
+                self.sample_position,
+                self.slot_shape,
+                self.slot_gap,
+                self.slot_normal,
+                float(dt),
+                status.WORLD_CONTACT_OVERFLOW,
+            ],
+            [
+                self.entry_count,
+                self.entry_row,
+                self.entry_shape,
+                self.entry_arm,
+                self.entry_normal,
+                self.entry_offset,
+                self.entry_stiffness,
+                self.entry_friction,
+                self.status,
+            ],
         )
         rigid = self.rigid
         if rigid.count_max:
             self._launch(
                 contact.entry_jacobians,
                 (instances, self.entry_max, rigid.count_max),
-                [self.world, self.entry_count, rigid.count, rigid.dof_start, model.shape_body]
-                + [rigid.body_articulation, rigid.body_link, rigid.articulation_dof_start]
-                + [rigid.articulation_dof_count, rigid.jacobian, self.entry_shape, self.entry_arm],
+                [
+                    self.world,
+                    self.entry_count,
+                    rigid.count,
+                    rigid.dof_start,
+                    model.shape_body,
+                    rigid.body_articulation,
+                    rigid.body_link,
+                    rigid.articulation_dof_start,
+                    rigid.articulation_dof_count,
+                    rigid.jacobian,
+                    self.entry_shape,
+                    self.entry_arm,
+                ],
                 [self.entry_jacobian],
             )
 
@@ -649,31 +552,81 @@ class SolverReduced(SolverBase):
         self._launch(
             kernels.evaluate_points,
             (self.instance_count, self.point_max),
-            [self.world, self.function_count, self.point_start, self.point_count, data.material_model]
-            + [data.youngs_modulus, data.poissons_ratio, data.viscosity, self.grad_basis, self.point_weight]
-            + [self.stiffness_scale, selected, self.q_start, q, wp.float64(dt), int(derivatives)]
-            + [self.renew],
+            [
+                self.world,
+                self.function_count,
+                self.point_start,
+                self.point_count,
+                data.material_model,
+                data.youngs_modulus,
+                data.poissons_ratio,
+                data.viscosity,
+                self.grad_basis,
+                self.point_weight,
+                self.stiffness_scale,
+                selected,
+                self.q_start,
+                q,
+                wp.float64(dt),
+                int(derivatives),
+                self.renew,
+            ],
             [self.point_energy, self.point_stress, self.point_hessian],
         )
         self._launch(
             contact.evaluate_entries,
             (self.instance_count, self.entry_max),
-            [self.world, self.function_count, self.pin_count, self.smoothing]
-            + [wp.float64(self.options.stick_velocity * dt), self.row_basis, selected, self.q_start, q, r]
-            + [self.rigid.count, self.entry_count, self.entry_row, self.entry_normal, self.entry_offset]
-            + [self.entry_stiffness, self.entry_friction, self.entry_jacobian, int(derivatives)]
-            + [self.iteration, self.exact],
+            [
+                self.world,
+                self.function_count,
+                self.pin_count,
+                self.smoothing,
+                wp.float64(self.options.stick_velocity * dt),
+                self.row_basis,
+                selected,
+                self.q_start,
+                q,
+                r,
+                self.rigid.count,
+                self.entry_count,
+                self.entry_row,
+                self.entry_normal,
+                self.entry_offset,
+                self.entry_stiffness,
+                self.entry_friction,
+                self.entry_jacobian,
+                int(derivatives),
+                self.iteration,
+                self.exact,
+            ],
             [self.entry_normal_force, self.entry_energy, self.entry_force, self.entry_hessian, self.entry_coupling],
         )
 
     def _sum_potential(self, selected: wp.array, q: wp.array, r: wp.array, dt: float, out: wp.array) -> None:
         """Sum the potential of the selected worlds."""
         self._launch(
-            kernels.sum_potential,
+            search.sum_potential,
             self.world_count,
-            [self.function_count, self.point_count, self.mass, self.parameters.mass_damping, self.world_instances]
-            + [self.rigid.count, selected, self.q_start, self.q_inertial, q, self.force, self.point_energy]
-            + [self.entry_count, self.entry_energy, self.rigid.inertia, self.rigid.predicted, r, wp.float64(dt)],
+            [
+                self.function_count,
+                self.point_count,
+                self.mass,
+                self.parameters.mass_damping,
+                self.world_instances,
+                self.rigid.count,
+                selected,
+                self.q_start,
+                self.q_inertial,
+                q,
+                self.force,
+                self.point_energy,
+                self.entry_count,
+                self.entry_energy,
+                self.rigid.inertia,
+                self.rigid.predicted,
+                r,
+                wp.float64(dt),
+            ],
             [out],
         )
 
@@ -682,10 +635,26 @@ class SolverReduced(SolverBase):
         self._launch(
             kernels.gather_gradient,
             (self.instance_count, self.stride),
-            [self.world, self.function_count, self.point_start, self.point_count, self.mass]
-            + [self.parameters.mass_damping, self.grad_basis, self.row_basis, self.active, self.q_start]
-            + [self.q_inertial, self.q, self.force, self.point_stress, self.entry_count, self.entry_row]
-            + [self.entry_force, wp.float64(dt)],
+            [
+                self.world,
+                self.function_count,
+                self.point_start,
+                self.point_count,
+                self.mass,
+                self.parameters.mass_damping,
+                self.grad_basis,
+                self.row_basis,
+                self.active,
+                self.q_start,
+                self.q_inertial,
+                self.q,
+                self.force,
+                self.point_stress,
+                self.entry_count,
+                self.entry_row,
+                self.entry_force,
+                wp.float64(dt),
+            ],
             [self.gradient],
         )
 
@@ -693,11 +662,24 @@ class SolverReduced(SolverBase):
         """Stop the worlds that have converged or used up their iterations."""
         options = self.options
         self._launch(
-            kernels.check_convergence,
+            search.check_convergence,
             self.world_count,
-            [self.function_count, self.mass, self.tolerance, self.world_instances, options.iteration_max]
-            + [wp.float64(options.force_tolerance), wp.float64(dt), self.gradient, self.force, self.pin_count]
-            + [self.entry_count, self.entry_force, self.last, self.iteration],
+            [
+                self.function_count,
+                self.mass,
+                self.tolerance,
+                self.world_instances,
+                options.iteration_max,
+                wp.float64(options.force_tolerance),
+                wp.float64(dt),
+                self.gradient,
+                self.force,
+                self.pin_count,
+                self.entry_count,
+                self.entry_force,
+                self.last,
+                self.iteration,
+            ],
             [self.active, self.status],
         )
 
@@ -705,33 +687,73 @@ class SolverReduced(SolverBase):
         """Assemble the Hessian into the block systems [K | C | -g] and the rigid part."""
         instances, blocks = self.instance_count, self.stride // LANES
         self._launch(
-            kernels.assemble_stiffness,
+            assembly.assemble_stiffness,
             (instances, 6, blocks, blocks),
-            [self.world, self.function_count, self.point_start, self.point_count, self.mass, self.parameters.mass_damping]
-            + [self.grad_basis, self.grad_basis8, self.active, self.renew, self.point_hessian, float(dt)],
+            [
+                self.world,
+                self.function_count,
+                self.point_start,
+                self.point_count,
+                self.mass,
+                self.parameters.mass_damping,
+                self.grad_basis,
+                self.grad_basis8,
+                self.active,
+                self.renew,
+                self.point_hessian,
+                float(dt),
+            ],
             [self.stiffness],
         )
         self._launch(
-            kernels.assemble_matrix,
+            assembly.assemble_matrix,
             (instances, 6, blocks, blocks),
-            [self.world, self.stride, self.row_basis8, self.active, self.stiffness, self.entry_count]
-            + [self.entry_row, self.entry_hessian],
+            [
+                self.world,
+                self.stride,
+                self.row_basis8,
+                self.active,
+                self.stiffness,
+                self.entry_count,
+                self.entry_row,
+                self.entry_hessian,
+            ],
             [self.system.matrix],
         )
         self._launch(
-            kernels.assemble_columns,
+            assembly.assemble_columns,
             (instances, 3 * self.stride, self.system.column_block_count),
-            [self.world, self.function_count, self.stride, self.row_basis, self.active, self.gradient]
-            + [self.entry_count, self.entry_row, self.entry_coupling, self.rigid.count_max],
+            [
+                self.world,
+                self.function_count,
+                self.stride,
+                self.row_basis,
+                self.active,
+                self.gradient,
+                self.entry_count,
+                self.entry_row,
+                self.entry_coupling,
+                self.rigid.count_max,
+            ],
             [self.system.matrix],
         )
         rigid = self.rigid
         if rigid.count_max:
             self._launch(
-                kernels.assemble_rigid,
+                assembly.assemble_rigid,
                 (self.world_count, rigid.count_max),
-                [self.world_instances, rigid.count, self.active, rigid.inertia, rigid.predicted, rigid.r]
-                + [self.entry_count, self.entry_force, self.entry_jacobian, self.entry_coupling],
+                [
+                    self.world_instances,
+                    rigid.count,
+                    self.active,
+                    rigid.inertia,
+                    rigid.predicted,
+                    rigid.r,
+                    self.entry_count,
+                    self.entry_force,
+                    self.entry_jacobian,
+                    self.entry_coupling,
+                ],
                 [rigid.gradient, rigid.matrix],
             )
 
@@ -741,25 +763,47 @@ class SolverReduced(SolverBase):
         system.factor(self.active)
         if rigid.count_max:
             self._launch(
-                kernels.condense,
+                assembly.condense,
                 (self.world_count, rigid.count_max),
-                [self.world_instances, rigid.count, rigid.count_max, self.active, rigid.gradient, system.matrix]
-                + [system.size, rigid.matrix],
+                [
+                    self.world_instances,
+                    rigid.count,
+                    rigid.count_max,
+                    self.active,
+                    rigid.gradient,
+                    system.matrix,
+                    system.size,
+                    rigid.matrix,
+                ],
                 [rigid.direction],
             )
-            self._launch(kernels.solve_rigid, self.world_count, [rigid.count, self.active, rigid.matrix, rigid.direction])
+            self._launch(
+                assembly.solve_rigid, self.world_count, [rigid.count, self.active, rigid.matrix, rigid.direction]
+            )
         self.direction = system.solve(self.active, rigid.count_max, rigid.direction, rigid.count_max)
 
     def _begin_search(self, dt: float) -> None:
         """Start the line search of every active world."""
         self.any_searching.zero_()
         self._launch(
-            kernels.begin_search,
+            search.begin_search,
             self.world_count,
-            [self.function_count, self.stride, self.tolerance, self.world_instances, self.rigid.count]
-            + [self.rigid_tolerance, wp.float64(self.options.stick_velocity * dt), self.active, self.pin_count]
-            + [self.entry_count, self.gradient, self.direction]
-            + [self.rigid.gradient, self.rigid.direction],
+            [
+                self.function_count,
+                self.stride,
+                self.tolerance,
+                self.world_instances,
+                self.rigid.count,
+                self.rigid_tolerance,
+                wp.float64(self.options.stick_velocity * dt),
+                self.active,
+                self.pin_count,
+                self.entry_count,
+                self.gradient,
+                self.direction,
+                self.rigid.gradient,
+                self.rigid.direction,
+            ],
             [self.slope, self.step_length, self.last, self.searching, self.any_searching],
         )
 
@@ -767,14 +811,14 @@ class SolverReduced(SolverBase):
         """Evaluate one trial step in every searching world and accept or halve it."""
         rigid = self.rigid
         self._launch(
-            kernels.trial_functions,
+            search.trial_functions,
             (self.instance_count, self.stride),
             [self.world, self.function_count, self.stride, self.searching, self.step_length, self.q, self.direction],
             [self.q_trial],
         )
         if rigid.count_max:
             self._launch(
-                kernels.trial_rigid,
+                search.trial_rigid,
                 (self.world_count, rigid.count_max),
                 [rigid.count, self.searching, self.step_length, rigid.r, rigid.direction],
                 [rigid.trial],
@@ -783,7 +827,7 @@ class SolverReduced(SolverBase):
         self._sum_potential(self.searching, self.q_trial, rigid.trial, dt, self.potential_trial)
         self.any_searching.zero_()
         self._launch(
-            kernels.judge_trial,
+            search.judge_trial,
             self.world_count,
             [self.potential, self.potential_trial, self.slope, wp.float64(self.options.step_length_min)],
             [self.step_length, self.searching, self.any_searching],
@@ -794,13 +838,22 @@ class SolverReduced(SolverBase):
         options = self.options
         self.any_active.zero_()
         self._launch(
-            kernels.finish_iteration,
+            search.finish_iteration,
             self.world_count,
-            [self.function_count, self.stride, self.world_instances, self.rigid.count]
-            + [options.stiffness_renewal, wp.float64(options.renewal_distance / options.tolerance), self.tolerance]
-            + [self.step_length, self.direction, self.rigid.direction, self.last],
-            [self.active, self.q, self.rigid.r, self.iteration, self.renew, self.exact]
-            + [self.status, self.any_active],
+            [
+                self.function_count,
+                self.stride,
+                self.world_instances,
+                self.rigid.count,
+                options.stiffness_renewal,
+                wp.float64(options.renewal_distance / options.tolerance),
+                self.tolerance,
+                self.step_length,
+                self.direction,
+                self.rigid.direction,
+                self.last,
+            ],
+            [self.active, self.q, self.rigid.r, self.iteration, self.renew, self.exact, self.status, self.any_active],
         )
 
     def finish(self, state: newton.State, dt: float) -> None:
@@ -823,8 +876,15 @@ class SolverReduced(SolverBase):
         self._launch(
             contact.sum_reactions,
             self.world_count,
-            [self.world_instances, self.model.shape_body, self.pin_count, self.entry_count, self.entry_shape]
-            + [self.entry_arm, self.entry_force],
+            [
+                self.world_instances,
+                self.model.shape_body,
+                self.pin_count,
+                self.entry_count,
+                self.entry_shape,
+                self.entry_arm,
+                self.entry_force,
+            ],
             [self.body_wrench, self.instance_force],
         )
         self.update_particles(state)
@@ -835,13 +895,22 @@ class SolverReduced(SolverBase):
         self._launch(
             kernels.skin_samples,
             (self.instance_count, self.sample_max),
-            [data.function_start, self.function_count, self.row_start, self.sample_count, data.particle_start]
-            + [self.row_point, self.row_basis, out.q, out.qd],
+            [
+                data.function_start,
+                self.function_count,
+                self.row_start,
+                self.sample_count,
+                data.particle_start,
+                self.row_point,
+                self.row_basis,
+                out.q,
+                out.qd,
+            ],
             [state.particle_q, state.particle_qd],
         )
 
     def reset(self, state: newton.State, world_mask: wp.array | None = None, flags: Any = None) -> None:
-        """Put the bodies of the chosen worlds back to the model's initial pose, at rest as authored.
+        """Put the bodies of the chosen worlds back to the model's initial state and clear what those worlds report.
 
         Args:
             state: State to reset in place.
@@ -858,8 +927,14 @@ class SolverReduced(SolverBase):
             [initial.function_start, self.function_count, self.world, world_mask, initial.q, initial.qd],
             [out.q, out.qd],
         )
+        self._launch(
+            kernels.reset_worlds,
+            max(self.world_count, self.instance_count, self.model.body_count),
+            [self.world, self.model.body_world, world_mask],
+            [self.status, self.instance_force, self.body_wrench],
+        )
         self.update_particles(state)
 
-    def _launch(self, kernel: wp.Kernel, dim: Any, inputs: list[Any], outputs: Sequence[Any] = ()) -> None:
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: Sequence[Any] = ()) -> None:
         """Launch on the model's device."""
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=list(outputs), device=self.model.device)

@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.deformables import kernels
+from softmode.deformables import status as bits
 from softmode.envs.table_scene import TableScene, TableSceneConfig
 from softmode.errors import ConfigError
 from softmode.splats.camera import CameraOptions, PinholeCamera
@@ -283,7 +283,7 @@ class LiftSoftEnv(gym.Env, gym.utils.EzPickle):
 
     def _failure(self) -> str | None:
         """Name the failure that ends the episode, if any."""
-        if self.scene.status[0] & kernels.WORLD_NOT_FINITE:
+        if self.scene.status[0] & bits.WORLD_NOT_FINITE:
             return "diverged"
         if not self.rise() > -0.05:
             return "dropped"

@@ -26,6 +26,8 @@ class ScriptedLift:
         ConfigError: If the environment is another one, or its actions are not tool steps.
     """
 
+    PALM_GAP = 0.004
+    """Gap between the object's top and the palm [m]."""
     CLEARANCE = 0.08
     """Height above the grasp from which the gripper goes down [m]."""
     STILL = 0.02
@@ -111,7 +113,9 @@ class ScriptedLift:
         top, bottom = points[:, 2].max(), points[:, 2].min()
         depth = min(0.5 * gripper.pad_size[2], 0.5 * (top - bottom))
         centre = scene.object_position.numpy()[0].astype(float)
-        height = max(centre[2], bottom + depth, self.env.config.scene.control.workspace_lower[2])
+        # at the height of the centre of mass, unless the palm would press on the top
+        under_palm = top - (gripper.finger_length - 0.5 * gripper.pad_size[2]) + self.PALM_GAP
+        height = max(centre[2], bottom + depth, under_palm, self.env.config.scene.control.workspace_lower[2])
         near = points[np.abs(points[:, 2] - height) < 0.5 * gripper.pad_size[2]]
         best: tuple[float, float, NDArray[np.float64]] | None = None
         for yaw in np.linspace(-0.5 * np.pi, 0.5 * np.pi, 36, endpoint=False):

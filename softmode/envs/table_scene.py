@@ -18,14 +18,13 @@ from softmode.deformables.solver_reduced import (
     contact_stiffness,
     register_custom_attributes,
 )
+from softmode.envs import table_kernels as kernels
 from softmode.envs.objects import ObjectConfig, SoftObject, load_object
 from softmode.errors import ConfigError
 from softmode.robots import ArmDescription, add_arm
 from softmode.robots.control import ArmController, ArmControlOptions
 from softmode.splats.camera import CameraOptions, PinholeCamera, SplatCamera
 from softmode.splats.rasterizer import RasterizerOptions, SplatArrays
-
-wp.set_module_options({"enable_backward": False})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,71 +58,6 @@ class TableSceneConfig:
             raise ConfigError(f"control_hz must lie in 1..1000, got {self.control_hz}")
         if not self.table_friction >= 0.0:
             raise ConfigError(f"table_friction must be >= 0, got {self.table_friction}")
-
-
-@wp.kernel
-def _place_objects(
-    # Instances:
-    function_start: wp.array[int],
-    world: wp.array[int],
-    # Asset:
-    linear_coordinates: wp.array2d[wp.float64],  # (function_count, 4)
-    # Reset:
-    world_mask: wp.array[wp.bool],
-    position: wp.array[wp.vec3d],  # (world_count,) [m]
-    yaw: wp.array[wp.float64],  # (world_count,) [rad]
-    # Out:
-    q_out: wp.array[wp.vec3d],
-    qd_out: wp.array[wp.vec3d],
-):
-    """Set q to the rigid placement x = R(yaw) X + position, at rest."""
-    i, k = wp.tid()
-    w = world[i]
-    if not world_mask[w]:
-        return
-    c = wp.cos(yaw[w]) - wp.float64(1.0)
-    s = wp.sin(yaw[w])
-    x = linear_coordinates[k, 0]
-    y = linear_coordinates[k, 1]
-    q_out[function_start[i] + k] = wp.vec3d(c * x - s * y, s * x + c * y, wp.float64(0.0)) + (
-        linear_coordinates[k, 3] * position[w]
-    )
-    qd_out[function_start[i] + k] = wp.vec3d()
-
-
-@wp.kernel
-def _observe_objects(
-    # Instances:
-    function_start: wp.array[int],
-    mean_basis: wp.array[wp.float64],
-    # State in:
-    q: wp.array[wp.vec3d],
-    qd: wp.array[wp.vec3d],
-    # Out:
-    position_out: wp.array[wp.vec3],
-    velocity_out: wp.array[wp.vec3],
-):
-    """Compute position and velocity of the centre of mass: sum_k mean(b_k) q_k."""
-    i = wp.tid()
-    x = wp.vec3d()
-    v = wp.vec3d()
-    for k in range(mean_basis.shape[0]):
-        x += mean_basis[k] * q[function_start[i] + k]
-        v += mean_basis[k] * qd[function_start[i] + k]
-    position_out[i] = wp.vec3(x)
-    velocity_out[i] = wp.vec3(v)
-
-
-@wp.kernel
-def _observe_fingers(
-    finger_body: wp.array2d[int],  # (world_count, 2)
-    body_wrench: wp.array[wp.spatial_vector],
-    # Out:
-    force_out: wp.array2d[wp.vec3],  # (world_count, 2) [N]
-):
-    """Read the force of the soft object on each finger."""
-    w, f = wp.tid()
-    force_out[w, f] = wp.spatial_top(body_wrench[finger_body[w, f]])
 
 
 class TableScene:
@@ -177,7 +111,7 @@ class TableScene:
             hy=0.6,
             hz=0.03,
             cfg=shape,
-            color=(0.78, 0.70, 0.60),
+            color=(0.42, 0.48, 0.54),
             label="table",
         )
         add_reduced_body(
@@ -220,16 +154,16 @@ class TableScene:
         self._place_yaw = wp.zeros(worlds, dtype=wp.float64, device=device)
         self.object_rotation = wp.zeros((worlds, 1), dtype=wp.quat, device=device)
         splats = self.soft.splats
-        self.skin = SkinSplats(
-            splats.means, splats.covariances(), self.soft.basis, self.soft.grad_basis, device=device
-        )
+        self.skin = SkinSplats(splats.means, splats.covariances(), self.soft.basis, self.soft.grad_basis, device=device)
 
     def _build_cameras(self, cameras: Sequence[PinholeCamera], options: CameraOptions | None) -> None:
         """Make one SplatCamera per image size; they share the splats."""
         self.cameras: dict[tuple[int, int], SplatCamera] = {}
         if not cameras:
             return
-        self.splat_arrays = SplatArrays.from_splats([self.soft.splats], world_count=self.world_count, device=self.device)
+        self.splat_arrays = SplatArrays.from_splats(
+            [self.soft.splats], world_count=self.world_count, device=self.device
+        )
         for size in sorted({(camera.width, camera.height) for camera in cameras}):
             mine = [camera for camera in cameras if (camera.width, camera.height) == size]
             self.cameras[size] = SplatCamera(
@@ -268,16 +202,20 @@ class TableScene:
         self.solver.reset(self.state, self._reset_mask)
         data = self.model.softmode
         wp.launch(
-            _place_objects,
+            kernels.place_objects,
             dim=(worlds, self.soft.body.function_count),
-            inputs=[data.function_start, self.solver.reduced.world, self._linear, self._world_mask]
-            + [self._place_position, self._place_yaw],
+            inputs=[
+                data.function_start,
+                self.solver.reduced.world,
+                self._linear,
+                self._world_mask,
+                self._place_position,
+                self._place_yaw,
+            ],
             outputs=[self.state.softmode.q, self.state.softmode.qd],
             device=self.device,
         )
         self.solver.reduced.update_particles(self.state)
-        self.solver.reduced.status.zero_()
-        self.solver.body_wrench.zero_()
         self.controller.reset(self.state, self._world_mask)
         self.controller.write_targets(self.control)
         self._observe()
@@ -333,14 +271,14 @@ class TableScene:
         data, state, worlds = self.model.softmode, self.state, self.world_count
         self.controller.measure(state)
         wp.launch(
-            _observe_objects,
+            kernels.observe_objects,
             dim=worlds,
             inputs=[data.function_start, self._mean_basis, state.softmode.q, state.softmode.qd],
             outputs=[self.object_position, self.object_velocity],
             device=self.device,
         )
         wp.launch(
-            _observe_fingers,
+            kernels.observe_fingers,
             dim=(worlds, 2),
             inputs=[self._finger_body, self.solver.body_wrench],
             outputs=[self.finger_force],
@@ -370,5 +308,5 @@ class TableScene:
 
     @property
     def status(self) -> np.ndarray:
-        """Status bits of the last control step per world, see :mod:`softmode.deformables.kernels`."""
+        """Status bits of the last control step per world, see :mod:`softmode.deformables.status`."""
         return self.solver.reduced.status.numpy()

@@ -18,7 +18,6 @@ import json
 import os
 import re
 import struct
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -29,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from softmode.atomic import atomic_write
 from softmode.errors import AssetError
 from softmode.splats.splats import MAX_SPLATS, Splats
 
@@ -235,22 +235,14 @@ def write_ply(path: str | os.PathLike[str], splats: Splats) -> None:
         table[name] = column
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {splats.count}"]
     header = "\n".join([*lines, *(f"property float {name}" for name in named), "end_header\n"])
-    temporary = ""
     try:
-        with tempfile.NamedTemporaryFile(
-            dir=target.parent, prefix=f".{target.name}.", suffix=".tmp", delete=False
-        ) as file:
-            temporary = file.name
+        with atomic_write(target) as file:
             file.write(header.encode("ascii"))
             file.write(table.tobytes())
-        os.replace(temporary, target)
     except OSError as error:
         raise AssetError(
             f"splat file {target}: cannot be written ({error})", hint="Check the folder and its permissions"
         ) from error
-    finally:
-        if temporary:
-            Path(temporary).unlink(missing_ok=True)
 
 
 _Reader = Callable[[str, int], bytes]

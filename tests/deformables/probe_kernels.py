@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from softmode.deformables import contact, materials
+from softmode.deformables import contact, materials, shape_queries
 from softmode.deformables.materials import HessianBlocks, MaterialParameters
 
 wp.set_module_options({"enable_backward": False})
@@ -39,7 +39,7 @@ def query_points(
 ):
     """Evaluate the distance of every point to one shape."""
     i = wp.tid()
-    query = contact.query_shape(shape_type, scale, mesh, x[i], reach)
+    query = shape_queries.query_shape(shape_type, scale, mesh, x[i], reach)
     distance_out[i] = query.distance
     normal_out[i] = query.normal
 

@@ -6,7 +6,7 @@ import pytest
 import trimesh
 import warp as wp
 
-from softmode.deformables import kernels
+from softmode.deformables import status as bits
 from softmode.deformables.materials import Material
 from softmode.deformables.solver_reduced import SolverReduced, SolverReducedOptions, add_reduced_body
 from softmode.errors import ConfigError
@@ -126,7 +126,9 @@ def test_potentials():
     slope = (plus[1] - minus[1])[slip, 0] / (2 * step)
     np.testing.assert_allclose(slope, (friction[:, 1] * x)[slip], atol=4 * step / eps)
     force = evaluate(x + step)[1][slip, 1] * (x + step)[slip] - evaluate(x - step)[1][slip, 1] * (x - step)[slip]
-    np.testing.assert_allclose(force / (2 * step), friction[slip, 2], atol=8 * step / eps**2)  # f1' jumps in slope at eps
+    np.testing.assert_allclose(
+        force / (2 * step), friction[slip, 2], atol=8 * step / eps**2
+    )  # f1' jumps in slope at eps
     assert friction[np.flatnonzero(x > eps)[0], 1] * x[x > eps][0] == pytest.approx(1.0)
 
 
@@ -173,7 +175,7 @@ def test_cube_at_rest_carries_its_weight(floor):
     weight = scene.mass() * GRAVITY
     np.testing.assert_allclose(forces[-25:].mean(axis=0), [0.0, 0.0, weight], atol=1e-3 * weight)
     assert forces[-25:].std(axis=0).max() <= 1e-3 * weight
-    assert not status & (kernels.WORLD_ITERATION_LIMIT | kernels.WORLD_NOT_FINITE | kernels.WORLD_CONTACT_OVERFLOW)
+    assert not status & (bits.WORLD_ITERATION_LIMIT | bits.WORLD_NOT_FINITE | bits.WORLD_CONTACT_OVERFLOW)
 
 
 @pytest.mark.parametrize("offset", [0.0, 100.0])
@@ -348,7 +350,7 @@ def test_overflow_is_reported():
     options = SolverReducedOptions(contact_max=8)
     scene = on_shape(lambda w: w.add_ground_plane(), height=-0.001, options=options)
     scene.step()
-    assert scene.reduced.status.numpy()[0] & kernels.WORLD_CONTACT_OVERFLOW
+    assert scene.reduced.status.numpy()[0] & bits.WORLD_CONTACT_OVERFLOW
     assert scene.reduced.entry_count.numpy()[0] == 8
     assert scene.reduced.instance_force.numpy()[0, 2] > 0.0
 

@@ -4,7 +4,7 @@ import newton
 import numpy as np
 import pytest
 
-from softmode.deformables import kernels
+from softmode.deformables import status as bits
 from softmode.deformables.coupling import SolverCoupledReduced
 from softmode.deformables.materials import Material
 from softmode.deformables.solver_reduced import SolverReducedOptions, add_pins, add_reduced_body
@@ -189,8 +189,8 @@ def test_eccentric_impact(ratio):
     """Off centre: p to 1e-4, and angular momentum about the origin to 1e-4 plus what implicit Euler loses of the spin.
 
     L_(n+1) - L_n = -dt^2 sum_k v_k cross f_k(q_(n+1)) in a step, of first order in dt, as in the decay of a free spin:
-    bounded by omega dt of the angular momentum passed on. The levers of a step are those of its start, the shape moves on
-    by less than v dt: another v dt of the momentum passed on.
+    bounded by omega dt of the angular momentum passed on. The levers of a step are those of its start, the shape moves
+    on by less than v dt: another v dt of the momentum passed on.
     """
     scene, twin = impact(ratio, offset=(0.03, 0.02))
     p0, L0, e0 = totals(scene, twin)
@@ -328,7 +328,7 @@ def test_squeeze_equals_drive(youngs_modulus, dt):
     # It rises with the palm, but for the creep of smoothed friction.
     creep = scene.reduced.options.stick_velocity * 2.0 * count * dt
     assert hold[-1, 5] - height == pytest.approx(hold[-1, 6], abs=creep + 1e-3)
-    assert not status & (kernels.WORLD_NOT_FINITE | kernels.WORLD_CONTACT_OVERFLOW)
+    assert not status & (bits.WORLD_NOT_FINITE | bits.WORLD_CONTACT_OVERFLOW)
 
 
 # -- worlds, graphs, faults --------------------------------------------------------------------------------------------
@@ -383,7 +383,7 @@ def test_not_a_number_stays_out_of_robots_and_other_worlds():
         for scene in (clean, dirty):
             scene.step()
         if k == 0:
-            assert dirty.reduced.status.numpy()[1] & kernels.WORLD_NOT_FINITE
+            assert dirty.reduced.status.numpy()[1] & bits.WORLD_NOT_FINITE
         for i in (0, 2):
             np.testing.assert_array_equal(dirty.q(i), clean.q(i))
             np.testing.assert_array_equal(dirty.state.body_q.numpy()[i], clean.state.body_q.numpy()[i])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables import kernels
+from softmode.deformables import status as bits
 from softmode.deformables.materials import Material, MaterialModel
 from softmode.deformables.solver_reduced import (
     SolverReduced,
@@ -409,8 +409,8 @@ def test_flat_and_mirrored_bodies_recover(start):
 def test_stiffness_and_step_sizes():
     """E in 1e3..1e9 Pa x dt in 1e-3..3e-2 s, nu 0 and 0.49: finite, at most 20 iterations, never at the limit.
 
-    Except the corner E = 1e9, dt = 3e-2: there stiffness exceeds inertia by 3e7, the inverse of float32's precision, and
-    the direction of the bar's free rotation is noise; it must stay finite and say that it stopped at the limit.
+    Except the corner E = 1e9, dt = 3e-2: there stiffness exceeds inertia by 3e7, the inverse of float32's precision,
+    and the direction of the bar's free rotation is noise; it must stay finite and say that it stopped at the limit.
     """
     body = bar()
     points = np.array([[-0.2, y, z] for y in (-0.05, 0.05) for z in (-0.05, 0.05)])
@@ -431,9 +431,9 @@ def test_stiffness_and_step_sizes():
                 status |= int(np.bitwise_or.reduce(scene.reduced.status.numpy()))
             assert np.isfinite(scene.state.softmode.q.numpy()).all()
             assert most <= 20
-            assert not status & kernels.WORLD_NOT_FINITE
+            assert not status & bits.WORLD_NOT_FINITE
             soft = scene.reduced.status.numpy()[:-1] if dt == 3.0e-2 else scene.reduced.status.numpy()
-            assert not (soft & kernels.WORLD_ITERATION_LIMIT).any()
+            assert not (soft & bits.WORLD_ITERATION_LIMIT).any()
 
 
 @pytest.mark.parametrize("omega", [1.0, 5.0])
@@ -555,7 +555,7 @@ def test_not_a_number_stays_in_its_world(array):
         for scene in (clean, dirty):
             scene.step()
         if _ == 0:
-            assert dirty.reduced.status.numpy()[1] & kernels.WORLD_NOT_FINITE
+            assert dirty.reduced.status.numpy()[1] & bits.WORLD_NOT_FINITE
         assert (dirty.reduced.status.numpy()[[0, 2]] == clean.reduced.status.numpy()[[0, 2]]).all()
         for i in (0, 2):
             np.testing.assert_array_equal(dirty.q(i), clean.q(i))

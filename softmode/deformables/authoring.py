@@ -1,0 +1,185 @@
+"""What a model knows of reduced bodies: Newton custom attributes, and how bodies and pins get into a builder."""
+
+import hashlib
+from collections.abc import Sequence
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from softmode.deformables.body import ReducedBody
+from softmode.deformables.materials import Material
+from softmode.errors import ConfigError
+
+NAMESPACE = "softmode"
+_INSTANCE = f"{NAMESPACE}:instance"
+_FUNCTION = f"{NAMESPACE}:function"
+_PIN = f"{NAMESPACE}:pin"
+
+CONTACT_STIFFNESS_FLOOR = 5.0e7
+"""Least contact stiffness per area [Pa/m]: 25 kPa, a firm grasp, sinks 0.5 mm deep."""
+
+
+def body_key(body: ReducedBody) -> int:
+    """Return the number that ties an instance in a model to its body: 62 bits of the body's fingerprint."""
+    return int.from_bytes(hashlib.sha256(body.fingerprint.encode()).digest()[:8], "little") >> 2
+
+
+def register_custom_attributes(builder: newton.ModelBuilder) -> None:
+    """Declare the attributes of reduced bodies on a builder; once per builder, also on the one that replicates."""
+    if f"{NAMESPACE}:q" in builder.custom_attributes:
+        return
+    attribute = newton.ModelBuilder.CustomAttribute
+    assignment = newton.Model.AttributeAssignment
+    for name in ("instance", "function", "pin"):
+        builder.add_custom_frequency(newton.ModelBuilder.CustomFrequency(name=name, namespace=NAMESPACE))
+
+    def declare(name: str, dtype: Any, frequency: str, **options: Any) -> None:
+        builder.add_custom_attribute(
+            attribute(name=name, dtype=dtype, frequency=frequency, namespace=NAMESPACE, **options)
+        )
+
+    declare("instance_world", wp.int32, _INSTANCE, references="world")
+    declare("body_key", wp.int64, _INSTANCE)
+    declare("function_start", wp.int32, _INSTANCE, references=_FUNCTION)
+    declare("particle_start", wp.int32, _INSTANCE, references="particle")
+    declare("material_model", wp.int32, _INSTANCE)
+    for name in ("youngs_modulus", "poissons_ratio", "density", "viscosity", "mass_damping", "friction"):
+        declare(name, wp.float32, _INSTANCE)
+    declare("contact_stiffness", wp.float32, _INSTANCE)
+    declare("q", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
+    declare("qd", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
+    declare("pin_instance", wp.int32, _PIN, references=_INSTANCE)
+    declare("pin_point", wp.vec3d, _PIN)
+    declare("pin_stiffness", wp.float32, _PIN)
+    declare("pin_target", wp.vec3d, _PIN, assignment=assignment.CONTROL)
+
+
+def contact_stiffness(body: ReducedBody, material: Material) -> float:
+    """Return the default contact stiffness per area [Pa/m]: twenty times the bulk's, and never under the floor."""
+    nu = material.poissons_ratio
+    wave = material.youngs_modulus * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
+    return max(20.0 * wave / float(np.linalg.norm(np.ptp(body.bounds, axis=0))), CONTACT_STIFFNESS_FLOOR)
+
+
+def add_reduced_body(
+    builder: newton.ModelBuilder,
+    body: ReducedBody,
+    *,
+    material: Material | None = None,
+    position: Sequence[float] = (0.0, 0.0, 0.0),
+    rotation: np.ndarray | None = None,
+    velocity: Sequence[float] = (0.0, 0.0, 0.0),
+    angular_velocity: Sequence[float] = (0.0, 0.0, 0.0),
+    contact_stiffness_per_area: float | None = None,
+    particle_radius: float | None = None,
+) -> int:
+    """Add a body to a world; its surface samples become Newton particles.
+
+    Args:
+        builder: Builder of the world; the attributes are registered if they are not yet.
+        body: The reduced body.
+        material: Its material; default ``Material()``.
+        position: Where the body's centre of mass rests [m].
+        rotation: Rotation matrix of the rest pose, shape (3, 3); default identity.
+        velocity: Initial velocity of the centre of mass [m/s].
+        angular_velocity: Initial angular velocity [rad/s].
+        contact_stiffness_per_area: Penalty stiffness of contact [Pa/m]; default :func:`contact_stiffness`.
+        particle_radius: Radius of the particles for viewers and picking [m]; default half their spacing.
+
+    Returns:
+        Index of the instance in this builder.
+
+    Raises:
+        ConfigError: If the pose or a stiffness is not finite or the rotation is no rotation.
+    """
+    register_custom_attributes(builder)
+    material = material or Material()
+    R = np.eye(3) if rotation is None else np.asarray(rotation, float)
+    p = np.asarray(position, float)
+    if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=1e-5) or np.linalg.det(R) < 0:
+        raise ConfigError("rotation must be a rotation matrix of shape (3, 3)", hint="orthonormalise it")
+    for name, value in (("position", position), ("velocity", velocity), ("angular_velocity", angular_velocity)):
+        if np.shape(value) != (3,) or not np.isfinite(value).all():
+            raise ConfigError(f"{name} must be three finite numbers, got {value!r}")
+    stiffness = contact_stiffness(body, material) if contact_stiffness_per_area is None else contact_stiffness_per_area
+    if not 0.0 < stiffness < np.inf:
+        raise ConfigError(f"contact_stiffness_per_area must be a finite number > 0 [Pa/m], got {stiffness!r}")
+
+    omega = np.asarray(angular_velocity, float)
+    spin = np.array([[0, -omega[2], omega[1]], [omega[2], 0, -omega[0]], [-omega[1], omega[0], 0]])
+    q = body.affine(R, p)
+    # the velocity field v + omega x (R X) as coordinates: affine() of I + A subtracts the identity again
+    qd = body.affine(np.eye(3) + spin @ R, np.asarray(velocity, float))
+    x = body.surface_points @ R.T + p
+    v = np.asarray(velocity, float) + x @ spin.T - p @ spin.T
+    radius = 0.5 * float(np.sqrt(body.surface_areas.mean())) if particle_radius is None else particle_radius
+    mass = material.density * body.volume / body.surface_count
+
+    particle_start = builder.particle_count
+    builder.add_particles(
+        pos=[wp.vec3(*row) for row in x],
+        vel=[wp.vec3(*row) for row in v],
+        mass=[mass] * body.surface_count,
+        radius=[radius] * body.surface_count,
+    )
+    function_start = len(builder.custom_attributes[f"{NAMESPACE}:q"].values or [])
+    builder.add_custom_values_batch(
+        [{f"{NAMESPACE}:q": wp.vec3d(*a), f"{NAMESPACE}:qd": wp.vec3d(*b)} for a, b in zip(q, qd, strict=True)]
+    )
+    values = {
+        "body_key": body_key(body),
+        "function_start": function_start,
+        "particle_start": particle_start,
+        "material_model": int(material.model),
+        "contact_stiffness": float(stiffness),
+    }
+    for name in ("youngs_modulus", "poissons_ratio", "density", "viscosity", "mass_damping", "friction"):
+        values[name] = getattr(material, name)
+    index = builder.add_custom_values(**{f"{NAMESPACE}:{name}": value for name, value in values.items()})
+    return index[f"{NAMESPACE}:function_start"]
+
+
+def add_pins(
+    builder: newton.ModelBuilder,
+    instance: int,
+    points: np.ndarray,
+    *,
+    stiffness: float | np.ndarray,
+    targets: np.ndarray | None = None,
+) -> None:
+    """Pin rest points of a body to targets in the world by springs (soft boundary conditions).
+
+    Args:
+        builder: Builder that holds the instance.
+        instance: Index from :func:`add_reduced_body`.
+        points: Rest points in the body frame [m], shape (pin_count, 3).
+        stiffness: Spring stiffness [N/m], a number or one per pin; scale it with a volume or an area for a clamp.
+        targets: World positions [m], shape (pin_count, 3); default: the points themselves. Move them at run time
+            through ``control.softmode.pin_target``.
+
+    Raises:
+        ConfigError: If there is no point, a shape does not fit, or a stiffness is negative.
+    """
+    X = np.atleast_2d(np.asarray(points, float))
+    T = X if targets is None else np.atleast_2d(np.asarray(targets, float))
+    k = np.atleast_1d(np.asarray(stiffness, float))
+    if k.shape not in ((1,), (len(X),)):
+        raise ConfigError(f"stiffness must be one number or one per pin, got shape {k.shape} for {len(X)} pins")
+    k = np.broadcast_to(k, (len(X),))
+    if X.ndim != 2 or X.shape[1:] != (3,) or T.shape != X.shape or len(X) == 0:
+        raise ConfigError(f"points and targets must have shape (pin_count > 0, 3), got {X.shape} and {T.shape}")
+    if not (np.isfinite(k).all() and (k >= 0).all() and np.isfinite(X).all() and np.isfinite(T).all()):
+        raise ConfigError("stiffness must be finite and >= 0 [N/m], points and targets finite [m]")
+    builder.add_custom_values_batch(
+        [
+            {
+                f"{NAMESPACE}:pin_instance": instance,
+                f"{NAMESPACE}:pin_point": wp.vec3d(*a),
+                f"{NAMESPACE}:pin_stiffness": float(b),
+                f"{NAMESPACE}:pin_target": wp.vec3d(*c),
+            }
+            for a, b, c in zip(X, k, T, strict=True)
+        ]
+    )

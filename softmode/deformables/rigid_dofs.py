@@ -1,0 +1,62 @@
+"""The joint dofs that are unknowns of the reduced solve, and where they stand in Newton's arrays."""
+
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+
+class RigidDofs:
+    """Joint dofs that take part in the solve: per world r = dt * joint velocity and its quadratic model.
+
+    Empty (``count_max`` 0) while rigid bodies move as prescribed; ``coupling`` fills one in.
+    """
+
+    def __init__(self, model: newton.Model, world_count: int, counts: np.ndarray, dof_start: np.ndarray) -> None:
+        """Allocate for ``counts`` dofs per world, the first of them at ``dof_start``."""
+        device = model.device
+        self.count_max = int(counts.max(initial=0))
+        size = max(self.count_max, 1)
+        self.count = wp.array(counts, dtype=int, device=device)
+        self.dof_start = wp.array(dof_start, dtype=int, device=device)
+        self.inertia = wp.zeros((world_count, size, size), dtype=wp.float64, device=device)
+        self.predicted = wp.zeros((world_count, size), dtype=wp.float64, device=device)
+        self.r = wp.zeros_like(self.predicted)
+        self.trial = wp.zeros_like(self.predicted)
+        self.gradient = wp.zeros_like(self.predicted)
+        self.direction = wp.zeros_like(self.predicted)
+        self.matrix = wp.zeros_like(self.inertia)
+        articulation, link = _link_table(model)
+        start, count = _articulation_dofs(model)
+        self.body_articulation = wp.array(articulation, dtype=int, device=device)
+        self.body_link = wp.array(link, dtype=int, device=device)
+        self.articulation_dof_start = wp.array(start, dtype=int, device=device)
+        self.articulation_dof_count = wp.array(count, dtype=int, device=device)
+        links, dofs = model.max_joints_per_articulation, model.max_dofs_per_articulation
+        shape = (max(model.articulation_count, 1), max(6 * links, 6), max(dofs, 1))
+        self.jacobian = wp.zeros(shape, dtype=float, device=device)
+
+
+def _articulation_dofs(model: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first joint dof and the dof count of every articulation."""
+    if model.articulation_count == 0:
+        return np.zeros(1, int), np.zeros(1, int)
+    joint_start = model.articulation_start.numpy()[: model.articulation_count]
+    joint_end = model.articulation_end.numpy()[: model.articulation_count]
+    dof = np.append(model.joint_qd_start.numpy()[: model.joint_count], model.joint_dof_count)
+    return dof[joint_start], dof[joint_end] - dof[joint_start]
+
+
+def _link_table(model: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the articulation of every rigid body and its row block in that articulation's Jacobian."""
+    articulation = np.full(max(model.body_count, 1), -1)
+    link = np.zeros(max(model.body_count, 1), int)
+    if model.articulation_count:
+        child = model.joint_child.numpy()
+        starts, ends = model.articulation_start.numpy(), model.articulation_end.numpy()
+        for a in range(model.articulation_count):
+            for joint in range(int(starts[a]), int(ends[a])):
+                articulation[child[joint]] = a
+                link[child[joint]] = joint - starts[a]
+    return articulation, link
