@@ -2,7 +2,7 @@
 
 Run: ``python benchmarks/worlds.py --device cuda:0 --worlds 1 64 1024``. Every world plays the same downward motion with
 the gripper closing on the object, so that contact is active in all of them. Prints milliseconds per control step, world
-steps per second and, on CUDA, the memory taken.
+steps per second, the union of the solver's status bits and, on CUDA, the memory taken.
 """
 
 from __future__ import annotations
@@ -30,15 +30,18 @@ def main() -> None:
             scene.step(grasp_action(scene, step))
         wp.synchronize_device(scene.device)
         clock = time.perf_counter()
+        flags = 0
         for step in range(26, 26 + options.steps):
             scene.step(grasp_action(scene, step))
+            flags |= int(np.bitwise_or.reduce(scene.status))
         wp.synchronize_device(scene.device)
         milliseconds = 1e3 * (time.perf_counter() - clock) / options.steps
         touching = int((np.linalg.norm(scene.finger_force.numpy(), axis=2).min(axis=1) > 0.02).sum())
         memory = f", {wp.get_mempool_used_mem_current(scene.device) / 1e6:.0f} MB" if scene.device.is_cuda else ""
         print(
             f"{count} worlds: {milliseconds:.2f} ms per control step, {1e3 * count / milliseconds:.0f} world steps/s, "
-            f"{touching} grasped, {scene.solver.reduced.iteration.numpy().mean():.2f} iterations{memory}",
+            f"{touching} grasped, {scene.solver.reduced.iteration.numpy().mean():.2f} iterations, "
+            f"status {flags}{memory}",
             flush=True,
         )
         del scene

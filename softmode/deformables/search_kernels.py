@@ -286,7 +286,7 @@ def finish_iteration(
     alpha = step_length[w]
     stale = renew[w] == 0
     renew[w] = 0
-    if iteration[w] % renewal == 0 or alpha < wp.float64(1.0):
+    if iteration[w] % renewal == 0 or alpha == wp.float64(0.0):
         renew[w] = 1
     for i in range(instance_start[w], instance_start[w + 1]):
         moved = wp.float64(0.0)
