@@ -67,22 +67,34 @@ def print_substep(env: LiftSoftEnv, repeats: int, iterations: float) -> None:
     blank.fill_(1)
     whole = measure(lambda: solver.step(state, scratch, scene.control, None, dt), repeats, device)
     print(f"substep: {whole:.3f} ms, {iterations:.2f} Newton iterations, {int(soft.entry_count.numpy()[0])} contacts")
+
+    def renewed(stage: Callable[[], None]) -> None:
+        soft.renew.fill_(1)
+        stage()
+        soft.renew.zero_()
+
     stages: dict[str, Callable[[], None]] = {
         "MuJoCo step (two per substep)": lambda: solver.rigid.step(state, scratch, scene.control, None, dt),
         "Jacobian, mass matrix": lambda: solver._linearise(state, dt),
         "begin": lambda: soft.begin(state, dt),
         "detect contacts": lambda: soft.detect(state, scene.control, dt, prescribed=False),
-        "evaluate with derivatives (per iteration)": lambda: soft._evaluate(
+        "evaluate with Hessian (once or twice)": lambda: renewed(
+            lambda: soft._evaluate(blank, soft.q, soft.rigid.r, dt, derivatives=True)
+        ),
+        "evaluate with gradient (per iteration)": lambda: soft._evaluate(
             blank, soft.q, soft.rigid.r, dt, derivatives=True
         ),
         "evaluate energy (per trial)": lambda: soft._evaluate(blank, soft.q, soft.rigid.r, dt, derivatives=False),
         "sum potential (per evaluation)": lambda: soft._sum_potential(blank, soft.q, soft.rigid.r, dt, soft.potential),
+        "gather gradient (per iteration)": lambda: soft._gather_gradient(dt),
+        "assemble with stiffness (once or twice)": lambda: renewed(lambda: soft._assemble(dt)),
         "assemble (per iteration)": lambda: soft._assemble(dt),
         "factor and solve (per iteration)": soft._solve,
         "finish": lambda: soft.finish(scratch, dt),
     }
     for name, stage in stages.items():
         blank.fill_(1)
+        soft.renew.zero_()
         milliseconds = measure(stage, repeats, device)
         print(f"  {name:<44}{milliseconds:8.3f} ms  {milliseconds / whole:6.1%}")
     frame = measure(scene._control_step, max(repeats // 10, 5), device)

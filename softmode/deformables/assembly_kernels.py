@@ -34,8 +34,7 @@ def assemble_stiffness(
     mass: wp.array[wp.float64],
     mass_damping: wp.array[float],
     # Assets:
-    grad_basis: wp.array2d[wp.vec3],  # (point_total, stride)
-    grad_basis8: wp.array3d[vec8],  # (3, point_total, stride / 8), the same numbers by component
+    grad_basis8: wp.array3d[vec8],  # (stride / 8, point_total, 3), so that a block walks through contiguous memory
     # State in:
     active: wp.array[int],
     renew: wp.array[int],
@@ -64,31 +63,26 @@ def assemble_stiffness(
     n = function_count[i]
     if k0 < n and LANES * lanes < n:
         for p in range(point_count[i]):
-            C = point_hessian[i, p, pair]
+            C = point_hessian[i, pair, p]
             point = first + p
-            gx = grad_basis8[0, point, lanes]
-            gy = grad_basis8[1, point, lanes]
-            gz = grad_basis8[2, point, lanes]
+            gx = grad_basis8[lanes, point, 0]
+            gy = grad_basis8[lanes, point, 1]
+            gz = grad_basis8[lanes, point, 2]
             ux = C[0, 0] * gx + C[0, 1] * gy + C[0, 2] * gz
             uy = C[1, 0] * gx + C[1, 1] * gy + C[1, 2] * gz
             uz = C[2, 0] * gx + C[2, 1] * gy + C[2, 2] * gz
-            g = grad_basis[point, k0]
-            a0 += g[0] * ux + g[1] * uy + g[2] * uz
-            g = grad_basis[point, k0 + 1]
-            a1 += g[0] * ux + g[1] * uy + g[2] * uz
-            g = grad_basis[point, k0 + 2]
-            a2 += g[0] * ux + g[1] * uy + g[2] * uz
-            g = grad_basis[point, k0 + 3]
-            a3 += g[0] * ux + g[1] * uy + g[2] * uz
-            g = grad_basis[point, k0 + 4]
-            a4 += g[0] * ux + g[1] * uy + g[2] * uz
-            g = grad_basis[point, k0 + 5]
-            a5 += g[0] * ux + g[1] * uy + g[2] * uz
-            g = grad_basis[point, k0 + 6]
-            a6 += g[0] * ux + g[1] * uy + g[2] * uz
-            g = grad_basis[point, k0 + 7]
-            a7 += g[0] * ux + g[1] * uy + g[2] * uz
-    stride = grad_basis.shape[1]
+            rx = grad_basis8[rows, point, 0]
+            ry = grad_basis8[rows, point, 1]
+            rz = grad_basis8[rows, point, 2]
+            a0 += rx[0] * ux + ry[0] * uy + rz[0] * uz
+            a1 += rx[1] * ux + ry[1] * uy + rz[1] * uz
+            a2 += rx[2] * ux + ry[2] * uy + rz[2] * uz
+            a3 += rx[3] * ux + ry[3] * uy + rz[3] * uz
+            a4 += rx[4] * ux + ry[4] * uy + rz[4] * uz
+            a5 += rx[5] * ux + ry[5] * uy + rz[5] * uz
+            a6 += rx[6] * ux + ry[6] * uy + rz[6] * uz
+            a7 += rx[7] * ux + ry[7] * uy + rz[7] * uz
+    stride = LANES * grad_basis8.shape[0]
     if c == d and lanes == rows:
         inertia = float(mass[i]) * (1.0 / dt + mass_damping[i]) / dt
         a0[0] += wp.where(k0 < n, inertia, 1.0)

@@ -99,7 +99,7 @@ def evaluate_points(
     # Out:
     energy_out: wp.array2d[wp.float64],  # (instance_count, point_max) [J]
     stress_out: wp.array2d[wp.mat33d],  # (instance_count, point_max), V P [N m]
-    hessian_out: wp.array3d[wp.mat33],  # (instance_count, point_max, 6), blocks of V d2Psi/dF2 [N m]
+    hessian_out: wp.array3d[wp.mat33],  # (instance_count, 6, point_max), blocks of V d2Psi/dF2 [N m]
 ):
     """Evaluate V_p Psi(F_p) and, where asked, its derivatives at every cubature point."""
     i, p = wp.tid()
@@ -125,7 +125,7 @@ def evaluate_points(
         C = float(weight) * hessian(parameters, G, dt)
         for pair in range(6):
             r = 3 * pair
-            hessian_out[i, p, pair] = wp.mat33(
+            hessian_out[i, pair, p] = wp.mat33(
                 C[r, 0], C[r, 1], C[r, 2], C[r + 1, 0], C[r + 1, 1], C[r + 1, 2], C[r + 2, 0], C[r + 2, 1], C[r + 2, 2]
             )
 

@@ -164,8 +164,8 @@ class SolverReduced(SolverBase):
             return np.concatenate([getattr(body, name) for body in bodies])
 
         self.grad_basis = table(grad.astype(np.float32), wp.vec3)
-        by_component = np.moveaxis(grad, -1, 0).reshape(3, len(grad), -1, LANES)
-        self.grad_basis8 = table(by_component.astype(np.float32), vec8)
+        blocks = grad.reshape(len(grad), -1, LANES, 3).transpose(1, 0, 3, 2)
+        self.grad_basis8 = table(blocks.astype(np.float32), vec8)
         self.point_weight = table(joined("weights"), wp.float64)
         self.stiffness_scale = table(joined("stiffness_scale").astype(np.float32), float)
         basis_rows = np.concatenate([*rows, pin_rows]).astype(np.float32)
@@ -276,7 +276,7 @@ class SolverReduced(SolverBase):
         self.force, self.gradient = zeros(functions, wp.vec3d), zeros(functions, wp.vec3d)
         self.point_energy = zeros((instances, self.point_max), wp.float64)
         self.point_stress = zeros((instances, self.point_max), wp.mat33d)
-        self.point_hessian = zeros((instances, self.point_max, 6), wp.mat33)
+        self.point_hessian = zeros((instances, 6, self.point_max), wp.mat33)
         unknowns = 3 * self.stride
         self.stiffness = zeros((instances, unknowns, unknowns // LANES), vec8)
         samples = (instances, self.sample_max)
@@ -696,7 +696,6 @@ class SolverReduced(SolverBase):
                 self.point_count,
                 self.mass,
                 self.parameters.mass_damping,
-                self.grad_basis,
                 self.grad_basis8,
                 self.active,
                 self.renew,
