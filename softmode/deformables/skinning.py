@@ -1,4 +1,4 @@
-"""Forward skinning on the device: points, and splat means with F Sigma F^T, from the reduced coordinates q.
+"""Forward skinning on the device: splat means with F Sigma F^T from the reduced coordinates q.
 
 x(X) = X + sum_k b_k(X) q_k and F(X) = I + sum_k q_k grad b_k(X)^T. The displacement q carries the whole rigid motion of
 a body, metres of it, while splats are millimetres in size: positions are summed in float64 and rounded once at the end.
@@ -122,34 +122,3 @@ class SkinSplats:
             outputs=[rotations],
             device=self.device,
         )
-
-
-def skin_points(
-    rest_points: wp.array,
-    basis: wp.array,
-    function_start: wp.array,
-    q: wp.array,
-    qd: wp.array,
-    point_start: wp.array,
-    positions: wp.array,
-    velocities: wp.array,
-) -> None:
-    """Write positions and velocities of the points of all instances of one body; capturable.
-
-    Args:
-        rest_points: Rest positions in the body frame [m], vec3, shape (S,).
-        basis: Basis values, float32, shape (S, n).
-        function_start: First entry of q of each instance, int32, shape (instance_count,).
-        q: Reduced coordinates of all instances [m], flat vec3d.
-        qd: Their velocities [m/s], flat vec3d.
-        point_start: First output entry of each instance, int32, shape (instance_count,).
-        positions: Output positions [m], flat vec3.
-        velocities: Output velocities [m/s], flat vec3.
-    """
-    wp.launch(
-        kernels.skin_points,
-        dim=(function_start.shape[0], rest_points.shape[0]),
-        inputs=[rest_points, basis, function_start, q, qd, point_start],
-        outputs=[positions, velocities],
-        device=rest_points.device,
-    )

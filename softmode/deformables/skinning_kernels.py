@@ -96,32 +96,3 @@ def mean_rotation(
         if wp.determinant(f) > 1.0e-6:
             f = 0.5 * (f + wp.transpose(wp.inverse(f)))
     rotation_out[world, object_index] = wp.normalize(wp.quat_from_matrix(f))
-
-
-@wp.kernel
-def skin_points(
-    # Object:
-    rest_point: wp.array[wp.vec3],  # (point_count,) [m]
-    basis: wp.array2d[float],  # (point_count, function_count)
-    # State in:
-    function_start: wp.array[int],  # (instance_count,) first entry of q and qd of each instance
-    q_in: wp.array[wp.vec3d],  # [m]
-    qd_in: wp.array[wp.vec3d],  # [m/s]
-    # Out:
-    point_start: wp.array[int],  # (instance_count,) first output entry of each instance
-    position_out: wp.array[wp.vec3],  # [m]
-    velocity_out: wp.array[wp.vec3],  # [m/s]
-):
-    """Compute x = X + sum_k b_k q_k and v = sum_k b_k qd_k."""
-    instance, i = wp.tid()
-    start = function_start[instance]
-    rest = rest_point[i]
-    x = wp.vec3d(wp.float64(rest[0]), wp.float64(rest[1]), wp.float64(rest[2]))
-    v = wp.vec3d()
-    for k in range(basis.shape[1]):
-        value = wp.float64(basis[i, k])
-        x += value * q_in[start + k]
-        v += value * qd_in[start + k]
-    out = point_start[instance] + i
-    position_out[out] = wp.vec3(float(x[0]), float(x[1]), float(x[2]))
-    velocity_out[out] = wp.vec3(float(v[0]), float(v[1]), float(v[2]))

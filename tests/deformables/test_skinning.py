@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.skinning import STRETCH_LIMIT, SkinSplats, skin_points
+from softmode.deformables.skinning import STRETCH_LIMIT, SkinSplats
 from softmode.deformables.skinning_kernels import vec6
 from softmode.errors import BasisError
 
@@ -141,28 +141,6 @@ def test_mean_rotation(device: str, angle: float) -> None:
     expected = np.concatenate([np.sin(angle / 2) * axis, [np.cos(angle / 2)]])
     got = rotations.numpy()[:, 1]
     np.testing.assert_allclose(np.abs(got @ expected), 1.0, atol=1e-5)
-
-
-def test_points_match_numpy_and_capture(device: str) -> None:
-    """X = X + sum b q and v = sum b qd; a captured launch repeats it on changed coordinates."""
-    case = Case()
-    q, qd, starts = case.flat(case.q, device), case.flat(case.qd, device), case.starts(device)
-    points = wp.array(case.means, dtype=wp.vec3, device=device)
-    basis = wp.array(case.basis.astype(np.float32), dtype=wp.float32, device=device)
-    point_start = wp.array([3, 3 + N, 3 + 2 * N], dtype=wp.int32, device=device)
-    positions, velocities = (wp.zeros(3 + WORLDS * N, dtype=wp.vec3, device=device) for _ in range(2))
-    arguments = (points, basis, starts, q, qd, point_start, positions, velocities)
-    skin_points(*arguments)
-    with wp.ScopedCapture(device=device) as capture:
-        skin_points(*arguments)
-    for factor in (1.0, -2.0):
-        q.assign(case.flat(factor * case.q, device))
-        wp.capture_launch(capture.graph)
-        x = case.means + factor * np.einsum("nk,wka->wna", case.basis, case.q)
-        v = np.einsum("nk,wka->wna", case.basis, case.qd)
-        assert not positions.numpy()[:3].any()
-        np.testing.assert_allclose(positions.numpy()[3:].reshape(WORLDS, N, 3), x, atol=4 * FLOAT32 * np.abs(x).max())
-        np.testing.assert_allclose(velocities.numpy()[3:].reshape(WORLDS, N, 3), v, atol=8 * FLOAT32 * np.abs(v).max())
 
 
 def test_refuses_shapes_that_do_not_belong_together() -> None:
