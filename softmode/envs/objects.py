@@ -154,7 +154,10 @@ def stable_rotation(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
 
 def _body(splats: Splats, config: ObjectConfig, progress: Callable[[str, float], None] | bool | None) -> ReducedBody:
     """Build the body of the solid that the splats enclose, or recall it; its provenance holds the turn to its pose."""
-    name = "plush" if config.splat is None else Path(config.splat).name
+    name = "plush"
+    if config.splat is not None:
+        file = Path(config.splat).resolve()
+        name = file.parent.name if file.name == "meta.json" else file.name
 
     def build() -> ReducedBody:
         try:
