@@ -200,13 +200,14 @@ class BasisRKPM:
         )
 
 
-def sample_farthest(points: ArrayLike, count: int, *, seed: int = 0) -> NDArray[np.intp]:
+def sample_farthest(points: ArrayLike, count: int, *, seed: int = 0, first: int | None = None) -> NDArray[np.intp]:
     """Choose `count` points by farthest point sampling.
 
     Args:
         points: Candidates, shape (N, D).
         count: How many; all of them when count >= N.
-        seed: Selects the first point.
+        seed: Selects the first point, unless `first` names it.
+        first: Index of the first point.
 
     Returns:
         Indices in the order chosen, shape (min(count, N),); deterministic, ties go to the lowest index.
@@ -214,7 +215,7 @@ def sample_farthest(points: ArrayLike, count: int, *, seed: int = 0) -> NDArray[
     axes = np.ascontiguousarray(np.asarray(points, dtype=np.float64).T)
     count = min(count, axes.shape[1])
     chosen = np.empty(count, dtype=np.intp)
-    chosen[0] = np.random.default_rng(seed).integers(axes.shape[1])
+    chosen[0] = np.random.default_rng(seed).integers(axes.shape[1]) if first is None else first
     nearest = np.full(axes.shape[1], np.inf)
     distance, scratch = np.empty_like(nearest), np.empty_like(nearest)
     for k in range(count):

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.deformables import status as bits
+from softmode.deformables.rkpm import sample_farthest
 from softmode.envs.table_scene import TableScene, TableSceneConfig
 from softmode.errors import ConfigError
 from softmode.splats.camera import CameraOptions, PinholeCamera
@@ -158,7 +159,7 @@ class LiftSoftEnv(gym.Env, gym.utils.EzPickle):
         actions = self.config.scene.control.action_size
         self.action_space = gym.spaces.Box(-1.0, 1.0, (actions,), np.float32)
         self.observation_space = self._make_observation_space()
-        self._points = _spread(self.scene.soft.body.surface_points, POINT_COUNT)
+        self._points = sample_farthest(self.scene.soft.body.surface_points, POINT_COUNT, first=0)
         self._rest_height = self.scene.soft.height
         self._held = 0
         self._youngs_modulus = self.config.scene.material.youngs_modulus
@@ -375,13 +376,3 @@ def _overview(edge: int) -> PinholeCamera:
     return PinholeCamera.look_at(
         "overview", position=(1.05, -0.85, 0.60), target=(0.30, 0.0, 0.25), width=edge, height=edge, fov_y=0.60
     )
-
-
-def _spread(points: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Choose ``count`` points far from each other, the first one first (farthest point sampling)."""
-    chosen = [0]
-    distance = np.linalg.norm(points - points[0], axis=1)
-    for _ in range(count - 1):
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
-    return np.array(chosen)

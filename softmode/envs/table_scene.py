@@ -1,7 +1,7 @@
 """A robot arm at a table with one soft object, in any number of worlds: model, solver, controller, cameras, graphs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import newton
@@ -222,8 +222,6 @@ class TableScene:
 
     def _set_stiffness(self, mask: np.ndarray, youngs_modulus: np.ndarray) -> None:
         """Change E and the contact stiffness that goes with it in the masked worlds."""
-        from dataclasses import replace
-
         data = self.model.softmode
         modulus, contact = data.youngs_modulus.numpy(), data.contact_stiffness.numpy()
         for w in np.flatnonzero(mask):
