@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from softmode.errors import BasisError, ConfigError
 
@@ -109,7 +110,9 @@ def select_cubature(
             rows.append(np.einsum("rcp,cp->rp", picked, one.reshape(9, -1)) * (factor * modulus))
     columns = np.ascontiguousarray(np.concatenate(rows).T)
     sizes = {k for k in (32, 64, 96, 128, 192, 256, 384) if k < count} | {count}
-    path = _nonnegative_path(columns, fraction @ columns, sizes, rng)
+    # Thousands of small products: threads of a BLAS would wait for each other on a busy machine.
+    with threadpool_limits(limits=1, user_api="blas"):
+        path = _nonnegative_path(columns, fraction @ columns, sizes, rng)
 
     fresh = np.random.default_rng([seed, 1])
     held_out = _poses(_HELD_OUT_COUNT, slope, fresh)
@@ -195,15 +198,14 @@ def _nonnegative_path(
     """Grow a non-negative least-squares solution of  x @ columns = target,  sum x = 1.
 
     Candidates are searched in eight interleaved random groups, one per step: a fresh group costs an eighth of the
-    search and loses nothing visible. The inverse of the normal matrix is bordered and reduced as points come and go.
-    Products are `einsum`, on purpose: thousands of small calls of a threaded BLAS wait for each other on a busy machine
-    (measured: 70 s instead of 2.6 s on two busy cores).
+    search and loses nothing visible; the search, which memory bounds, reads float32. The inverse of the normal matrix
+    is bordered and reduced as points come and go.
 
     Returns:
         For each size reached: indices and weights.
     """
     group = [np.sort(g) for g in np.array_split(rng.permutation(len(columns)), 8)]
-    stored = [np.ascontiguousarray(columns[g]) for g in group]
+    stored = [columns[g].astype(np.float32) for g in group]
     inverse_length = 1.0 / np.maximum(np.linalg.norm(columns, axis=1), 1e-300)
     top = max(sizes)
     chosen = np.zeros(0, dtype=np.intp)
@@ -217,27 +219,27 @@ def _nonnegative_path(
     while len(chosen) < top and idle < len(group) and step < 8 * top:
         candidates, stack = group[step % len(group)], stored[step % len(group)]
         step += 1
-        gain = np.where(active[candidates], -np.inf, _apply(stack, residual) * inverse_length[candidates])
+        gain = np.where(active[candidates], -np.inf, (stack @ residual.astype(np.float32)) * inverse_length[candidates])
         best = candidates[gain.argmax()]
         k = len(chosen)
-        coupling = _apply(support[:k], columns[best])
-        length_sq = _dot(columns[best], columns[best]) * (1.0 + _RIDGE)
-        shadow = _apply(inverse[:k, :k], coupling)
-        rest = length_sq - _dot(coupling, shadow)
+        coupling = support[:k] @ columns[best]
+        length_sq = float(columns[best] @ columns[best]) * (1.0 + _RIDGE)
+        shadow = inverse[:k, :k] @ coupling
+        rest = length_sq - float(coupling @ shadow)
         if not (gain.max() > 1e-12 and rest > _RIDGE * length_sq):
             idle += 1
             continue
         idle = 0
         chosen, value, active[best] = np.append(chosen, best), np.append(value, 0.0), True
-        support[k], right[k] = columns[best], _dot(columns[best], target)
+        support[k], right[k] = columns[best], float(columns[best] @ target)
         normal[k, :k], normal[:k, k], normal[k, k] = coupling, coupling, length_sq
         inverse[:k, :k] += shadow[:, None] * (shadow / rest)
         inverse[k, :k], inverse[:k, k], inverse[k, k] = -shadow / rest, -shadow / rest, 1.0 / rest
         while True:
             k = len(chosen)
-            trial = _apply(inverse[:k, :k], right[:k])
+            trial = inverse[:k, :k] @ right[:k]
             for _ in range(2):  # Refinement repairs what the updates of the inverse lose.
-                trial += _apply(inverse[:k, :k], right[:k] - _apply(normal[:k, :k], trial))
+                trial += inverse[:k, :k] @ (right[:k] - normal[:k, :k] @ trial)
             if (trial > 0.0).all():
                 value = trial
                 break
@@ -253,16 +255,8 @@ def _nonnegative_path(
             normal[: k - 1, : k - 1] = normal[np.ix_(keep, keep)]
             support[: k - 1], right[: k - 1] = support[keep], right[keep]
             chosen, value = chosen[keep], value[keep]
-        residual = target - np.einsum("k,kr->r", value, support[: len(chosen)])
+        residual = target - value @ support[: len(chosen)]
         if len(chosen) in sizes:
             path[len(chosen)] = (chosen, value / value.sum())
     path[len(chosen)] = (chosen, value / value.sum())
     return path
-
-
-def _apply(matrix: Array, vector: Array) -> Array:
-    return np.einsum("ij,j->i", matrix, vector)
-
-
-def _dot(a: Array, b: Array) -> float:
-    return float(np.einsum("i,i->", a, b))

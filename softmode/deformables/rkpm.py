@@ -33,6 +33,7 @@ GAUSSIAN_SUPPORT = 5.0
 CONDITION_LIMIT = 1e8
 """Largest 1-norm condition number of the moment matrix that counts as covered."""
 _PAIRS_PER_CHUNK = 2_000_000
+_BLOCK_POINTS = 64
 
 
 @dataclass(frozen=True)
@@ -44,11 +45,37 @@ class ShapeFunctions:
     gradient: tuple[sparse.csr_matrix, sparse.csr_matrix, sparse.csr_matrix]
     """d phi~ / dX_d [1/m], three matrices (N, K) with the pattern of `value`."""
 
+    points: Array
+    """Where they were evaluated [m], shape (N, 3)."""
+
     @property
     def centre_count(self) -> int:
         """Number of kernels K."""
         rows_and_columns: Any = self.value.shape
         return int(rows_and_columns[1])
+
+    def scaled(self, factor: Array, slope: Array) -> ShapeFunctions:
+        """Return the functions times a scalar field of values (N,) and gradients [1/m] (N, 3)."""
+        row = np.repeat(np.arange(len(factor)), np.diff(self.value.indptr))
+
+        def like(data: Array) -> sparse.csr_matrix:
+            return sparse.csr_matrix((data, self.value.indices, self.value.indptr), shape=self.value.shape)
+
+        gradient = [like(g.data * factor[row] + self.value.data * slope[row, d]) for d, g in enumerate(self.gradient)]
+        return ShapeFunctions(like(self.value.data * factor[row]), (gradient[0], gradient[1], gradient[2]), self.points)
+
+    def blocks(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+        """Split the points into compact groups: rows of each, and the kernels that reach them, both ascending.
+
+        Sums over points are dense within a group and skip the kernels that do not reach it: a tenth of the work of
+        dense matrices, at the same speed per operation.
+        """
+        order = KDTree(self.points, leafsize=_BLOCK_POINTS).indices
+        found = []
+        for rows in np.array_split(order, max(1, len(order) // _BLOCK_POINTS)):
+            rows = np.sort(rows)
+            found.append((rows, np.unique(self.value[rows].indices).astype(np.intp)))
+        return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +128,7 @@ class BasisRKPM:
             raise BasisError("points: not all finite", hint="Remove the points that hold NaN or infinity.")
         if not len(x):
             empty = sparse.csr_matrix((0, self.kernel_count))
-            return ShapeFunctions(empty, (empty, empty, empty))
+            return ShapeFunctions(empty, (empty, empty, empty), x)
         step = max(1, _PAIRS_PER_CHUNK // self.kernel_count)
         parts = [self._evaluate_chunk(x[i : i + step], i) for i in range(0, len(x), step)]
         row_count = np.concatenate([p[0] for p in parts])
@@ -113,7 +140,9 @@ class BasisRKPM:
         def matrix(data: Array) -> sparse.csr_matrix:
             return sparse.csr_matrix((np.ascontiguousarray(data), column, start), shape=shape)
 
-        return ShapeFunctions(matrix(value), (matrix(gradient[:, 0]), matrix(gradient[:, 1]), matrix(gradient[:, 2])))
+        return ShapeFunctions(
+            matrix(value), (matrix(gradient[:, 0]), matrix(gradient[:, 1]), matrix(gradient[:, 2])), x
+        )
 
     def _evaluate_chunk(self, x: Array, first: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
         """Return kernels per point (N,), column of each pair, value (pairs,) and gradient (pairs, 3)."""

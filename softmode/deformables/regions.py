@@ -1,0 +1,170 @@
+"""Regions: parts of a body that a scene holds, moves or grasps, known when the body is built.
+
+A region is a box or a set of points, grown by a radius. Its distance d(X), zero inside, makes weights that vanish on
+the region exactly: a smooth function times d / (d + l) is zero inside and leaves the region's face with a kink, as the
+displacement of a clamped body does (Kantorovich and Krylov 1958; Rvachev and Sheiko 1995, doi:10.1115/1.3005099). No
+kernel of finite width can do either.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
+
+from softmode.errors import BasisError, ConfigError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Region:
+    """A part of a body: all within `radius` of a box, or of any of some points; in asset coordinates."""
+
+    name: str
+    """Name, unique within a body."""
+    box: ArrayLike | None = None
+    """Lower and upper corner [m], shape (2, 3); may be infinite."""
+    points: ArrayLike | None = None
+    """Instead of a box: points [m], shape (N, 3)."""
+    radius: float = 0.0
+    """How far the region reaches beyond the box or the points [m]."""
+    stiffness: float | None = None
+    """None: the region is held or moved exactly. A number kappa / E [1/m^2]: by springs of kappa = stiffness * E per
+    volume [Pa/m^2], the energy kappa / 2 int |x - x_target|^2 dV."""
+
+    def __post_init__(self) -> None:
+        """Check shapes and ranges; store what was given as float64 arrays."""
+        if (self.box is None) == (self.points is None):
+            raise ConfigError(f"region {self.name!r}: expected either a box or points")
+        if not (np.isfinite(self.radius) and self.radius >= 0.0):
+            raise ConfigError(f"region {self.name!r}: radius: expected a length of zero or more, got {self.radius!r}")
+        if self.stiffness is not None and not (np.isfinite(self.stiffness) and self.stiffness > 0.0):
+            raise ConfigError(f"region {self.name!r}: stiffness: expected None or a number > 0, got {self.stiffness!r}")
+        if self.box is not None:
+            box = np.array(self.box, dtype=np.float64)
+            if box.shape != (2, 3) or not (box[1] >= box[0]).all():
+                raise ConfigError(f"region {self.name!r}: box: expected corners (2, 3), upper >= lower, got {self.box}")
+            object.__setattr__(self, "box", box)
+        else:
+            points = np.array(self.points, dtype=np.float64)
+            if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
+                raise ConfigError(f"region {self.name!r}: points: expected finite positions of shape (N > 0, 3)")
+            object.__setattr__(self, "points", points)
+
+    def moved(self, offset: Array, bounds: Array) -> Region:
+        """Return the region less an offset (3,) [m], its box cut to twice the extent of the bounds (2, 3)."""
+        points = None if self.points is None else np.asarray(self.points) - offset
+        box = None
+        if self.box is not None:
+            margin = np.ptp(bounds, axis=0).max()
+            box = np.clip(np.asarray(self.box) - offset, bounds[0] - margin, bounds[1] + margin)
+        return Region(name=self.name, box=box, points=points, radius=self.radius, stiffness=self.stiffness)
+
+    @property
+    def cores(self) -> Array:
+        """The box, or the points as boxes of no extent, shape (C, 2, 3)."""
+        if self.box is not None:
+            return np.asarray(self.box)[None]
+        return np.repeat(np.asarray(self.points)[:, None], 2, axis=1)
+
+    def distance(self, points: Array) -> tuple[Array, Array]:
+        """Return the signed distance [m] (N,), negative inside, and its gradient (N, 3)."""
+        if self.box is not None:
+            lower, upper = np.asarray(self.box)
+            away = points - np.clip(points, lower, upper)
+            outside = np.linalg.norm(away, axis=1)
+            depth = np.minimum(points - lower, upper - points)
+            axis = depth.argmin(axis=1)
+            row = np.arange(len(points))
+            inside = outside <= 0.0
+            found = np.where(inside, -depth[row, axis], outside)
+            gradient = away / np.where(inside, 1.0, outside)[:, None]
+            sign = np.where(upper[axis] - points[row, axis] < points[row, axis] - lower[axis], 1.0, -1.0)
+            gradient[row[inside], axis[inside]] = sign[inside]
+        else:
+            core = np.asarray(self.points)
+            found, nearest = KDTree(core).query(points)
+            found = np.asarray(found, dtype=np.float64)
+            gradient = (points - core[nearest]) / np.maximum(found, 1e-300)[:, None]
+        return found - self.radius, gradient
+
+    def integrate(self, points: Array, weights: Array, spacing: float) -> tuple[Array, Array]:
+        """Return points (N, 3) [m] and volumes (N,) [m^3] that integrate over the region.
+
+        Cells of the quadrature that the face cuts count by the part inside, at its centroid.
+
+        Args:
+            points: Quadrature points [m], shape (P, 3).
+            weights: Their volumes [m^3], shape (P,).
+            spacing: Edge of their cells [m].
+
+        Raises:
+            BasisError: If an exact region holds fewer than four quadrature points, or a soft one none.
+        """
+        distance, normal = self.distance(points)
+        share = np.clip(0.5 - distance / spacing, 0.0, 1.0)
+        found = np.flatnonzero(share > 0.02)
+        needed = 4 if self.stiffness is None else 1
+        if len(found) < needed:
+            raise BasisError(
+                f"region {self.name!r}: holds {len(found)} quadrature points, at least {needed} are needed",
+                hint="Enlarge the region or use more quadrature points; regions are given in asset coordinates.",
+            )
+        shift = np.where(np.abs(distance) < 0.5 * spacing, 0.5 * (distance + 0.5 * spacing), 0.0)
+        return points[found] - (shift[:, None] * normal)[found], weights[found] * share[found]
+
+    def corners(self, points: Array, spacing: float) -> Array:
+        """Return points (6, 3) on or in the region around those given, half a cell out along every axis."""
+        out = []
+        for axis in range(3):
+            for sign in (-1.0, 1.0):
+                corner = points[(sign * points[:, axis]).argmax()].copy()
+                corner[axis] += sign * 0.5 * spacing
+                out.append(corner)
+        found = np.array(out)
+        distance, normal = self.distance(found)
+        return found - np.maximum(distance, 0.0)[:, None] * normal
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """What makes weights vanish on exact regions, and blends between them."""
+
+    regions: tuple[Region, ...]
+    """Exact regions, in the frame of the points to come."""
+    length: float
+    """Distance over which the envelope saturates [m]."""
+
+    def evaluate(self, points: Array) -> tuple[Array, Array, Array, Array]:
+        """Evaluate the envelope and the blends.
+
+        Args:
+            points: Positions [m], shape (N, 3).
+
+        Returns:
+            G = prod_i g_i with g_i = d_i / (d_i + length), zero on every region, (N,), its gradient [1/m] (N, 3);
+            T_i = (1 / g_i) / sum_j (1 / g_j), one on region i and zero on the others, (N, R), its gradient (N, R, 3).
+        """
+        count = len(self.regions)
+        g, slope = np.empty((len(points), count)), np.empty((len(points), count, 3))
+        for i, region in enumerate(self.regions):
+            distance, normal = region.distance(points)
+            distance = np.maximum(distance, 0.0)
+            g[:, i] = distance / (distance + self.length)
+            slope[:, i] = normal * (np.where(distance > 0.0, self.length, 0.0) / (distance + self.length) ** 2)[:, None]
+        # Products without factor i, and their gradients, free of divisions by a vanishing g.
+        others, others_slope = np.ones_like(g), np.zeros_like(slope)
+        for i in range(count):
+            for l in range(count):
+                if l != i:
+                    others_slope[:, i] = others_slope[:, i] * g[:, l, None] + others[:, i, None] * slope[:, l]
+                    others[:, i] *= g[:, l]
+        whole, whole_slope = g[:, 0] * others[:, 0], g[:, 0, None] * others_slope[:, 0]
+        whole_slope = whole_slope + slope[:, 0] * others[:, 0, None]
+        total = np.maximum(others.sum(axis=1), 1e-300)
+        blend = others / total[:, None]
+        blend_slope = (others_slope - blend[:, :, None] * others_slope.sum(axis=1)[:, None]) / total[:, None, None]
+        return whole, whole_slope, blend, blend_slope

@@ -1,0 +1,288 @@
+"""Regions: distances, envelopes and blends, sampling, and bodies whose regions are held or moved exactly."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softmode.deformables.body import BuildOptions, ReducedBody, Region, build_body
+from softmode.deformables.quadrature import Quadrature, quadrature_from_box, quadrature_from_capsule
+from softmode.deformables.region_samples import refine_at_faces
+from softmode.deformables.regions import Envelope
+from softmode.errors import BasisError, ConfigError
+
+INF = np.inf
+OPTIONS = BuildOptions(mode_count=3, kernel_count=120, cubature_count=64)
+LEFT = Region(name="left", box=((-INF, -INF, -INF), (-0.13, INF, INF)))
+RIGHT = Region(name="right", points=[[0.2, 0.01, 0.0], [0.19, -0.013, 0.004]], radius=0.04)
+SOFT = Region(name="foot", box=((0.05, -INF, -INF), (0.1, INF, -0.02)), stiffness=1e4)
+CASES = {"one": (LEFT,), "two": (LEFT, RIGHT), "mixed": (LEFT, SOFT), "soft": (SOFT,)}
+
+
+@pytest.fixture(scope="module")
+def quadrature() -> Quadrature:
+    """Return a short beam, away from the origin."""
+    found = quadrature_from_box((0.4, 0.1, 0.08), point_count=1500, surface_count=60)
+    return dataclasses.replace(found)
+
+
+@pytest.fixture(scope="module", params=list(CASES))
+def body(request, quadrature: Quadrature) -> ReducedBody:
+    """Bodies with one exact region, two, an exact and a soft one, and a soft one."""
+    return build_body(quadrature, OPTIONS, regions=CASES[request.param], progress=False)
+
+
+def exact_rows(body: ReducedBody) -> np.ndarray:
+    """Return the rows of the region points that belong to exact regions."""
+    return np.flatnonzero(body.region_stiffness[body.region_index] == 0.0)
+
+
+def inner_points(region: Region, rng: np.random.Generator) -> np.ndarray:
+    """Return random points (N, 3) of the beam inside a region, its face included."""
+    x = rng.uniform([-0.2, -0.05, -0.04], [0.2, 0.05, 0.04], size=(4000, 3))
+    distance, normal = region.distance(x)
+    return np.concatenate([x[distance <= 0.0], (x - np.maximum(distance, 0.0)[:, None] * normal)[:50]])
+
+
+@pytest.mark.parametrize("region", [LEFT, RIGHT, SOFT, Region(name="r", box=((0, 0, 0), (0.1, 0, 0)), radius=0.02)])
+def test_distance_is_one_lipschitz_and_its_gradient_is_right(region: Region) -> None:
+    """|grad d| = 1; grad d by central differences away from the medial axis; d = 0 on the projection x - d grad d."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-0.3, 0.3, size=(500, 3))
+    distance, gradient = region.distance(x)
+    np.testing.assert_allclose(np.linalg.norm(gradient, axis=1), 1.0, atol=1e-12)
+    step = 1e-7
+    for d in range(3):
+        shift = step * np.eye(3)[d]
+        difference = (region.distance(x + shift)[0] - region.distance(x - shift)[0]) / (2.0 * step)
+        assert (np.abs(difference - gradient[:, d]) < 1e-6).mean() > 0.98
+    outside = distance > 0.0
+    face = (x - distance[:, None] * gradient)[outside]
+    assert np.abs(region.distance(face)[0]).max() < 1e-12
+
+
+def test_envelope_vanishes_on_regions_and_blends_are_a_partition() -> None:
+    """G = 0 on every region and > 0 elsewhere; sum T_i = 1, T_i = 1 on region i; gradients by finite differences."""
+    rng = np.random.default_rng(1)
+    envelope = Envelope((LEFT, RIGHT, Region(name="top", points=[[0.0, 0.0, 0.3]], radius=0.05)), 0.1)
+    x = rng.uniform(-0.3, 0.3, size=(400, 3))
+    value, gradient, blend, blend_gradient = envelope.evaluate(x)
+    outside = np.min([region.distance(x)[0] for region in envelope.regions], axis=0) > 0.0
+    assert (value[outside] > 0.0).all() and not value[~outside].any()
+    np.testing.assert_allclose(blend.sum(axis=1), 1.0, atol=1e-14)
+    for i, region in enumerate(envelope.regions):
+        assert (blend[region.distance(x)[0] <= 0.0, i] == 1.0).all()
+    step = 1e-7
+    kinked = np.min([np.abs(region.distance(x)[0]) for region in envelope.regions], axis=0) < 10 * step
+    for d in range(3):
+        shift = step * np.eye(3)[d]
+        plus, minus = envelope.evaluate(x + shift), envelope.evaluate(x - shift)
+        for found, at in ((gradient[:, d], 0), (blend_gradient[:, :, d], 2)):
+            error = np.abs((plus[at] - minus[at]) / (2.0 * step) - found)
+            assert (error[~kinked] < 1e-5 * np.abs(found).max()).mean() > 0.98
+
+
+def test_identities_hold_with_regions(body: ReducedBody, quadrature: Quadrature) -> None:
+    """(1/V) sum V_p b_k b_l = delta_kl, the mean, linear reproduction, on the quadrature refined at the faces."""
+    body.check()
+    x, volume, parent = refine_at_faces(
+        body.regions, quadrature.points - body.offset, quadrature.weights, quadrature.spacing
+    )
+    assert volume.sum() == pytest.approx(quadrature.volume, rel=1e-12)
+    moment = np.stack([np.bincount(parent, volume * axis) for axis in x.T], axis=1)
+    expected = quadrature.weights[:, None] * (quadrature.points - body.offset)
+    np.testing.assert_allclose(moment, expected, atol=1e-13 * quadrature.volume)
+    value, _ = body.evaluate(x)
+    share = volume / quadrature.volume
+    assert np.abs((value * share[:, None]).T @ value - np.eye(body.function_count)).max() < 1e-10
+    np.testing.assert_allclose(share @ value, body.mean_basis, atol=1e-10)
+    expected = np.column_stack([x, np.ones(len(x))])
+    assert np.abs(value @ body.linear_coordinates - expected).max() < 1e-11
+
+
+def test_affine_motion_is_exact_everywhere(body: ReducedBody, quadrature: Quadrature) -> None:
+    """X goes to A X + t and F = A inside, on the surface and beyond the kernels' reach, however the basis is turned."""
+    rng = np.random.default_rng(2)
+    matrix, shift = rng.normal(size=(3, 3)), rng.normal(size=3)
+    x = np.concatenate([quadrature.points - body.offset, body.surface_points, 10.0 * body.surface_points])
+    value, gradient = body.evaluate(x)
+    q = body.affine(matrix, shift)
+    assert np.abs(x + value @ q - (x @ matrix.T + shift)).max() < 1e-10
+    assert np.abs(np.eye(3) + np.einsum("ki,pkj->pij", q, gradient) - matrix).max() < 1e-9
+    # Beyond reach what is not affine stays as large as it is at the end of the reach: bounded, however far.
+    affine = np.linalg.pinv(body.linear_coordinates)
+    rest = value - np.column_stack([x, np.ones(len(x))]) @ affine
+    count = len(body.surface_points)
+    assert np.abs(rest[-count:]).max() < 50.0 * np.abs(rest[-2 * count : -count]).max()
+    further, _ = body.evaluate(100.0 * body.surface_points)
+    further = further - np.column_stack([10.0 * x[-count:], np.ones(count)]) @ affine
+    assert np.abs(further).max() < 50.0 * np.abs(rest[-2 * count : -count]).max()
+
+
+def test_gradients_match_finite_differences(body: ReducedBody) -> None:
+    """Grad b_k by central differences, away from the faces."""
+    apart = [np.abs(region.distance(body.points)[0]) > 1e-4 for region in body.regions]
+    points = body.points[np.all(apart, axis=0)]
+    _, gradient = body.evaluate(points)
+    step = 1e-6 * body.length
+    for d in range(3):
+        shift = step * np.eye(3)[d]
+        difference = (body.evaluate(points + shift)[0] - body.evaluate(points - shift)[0]) / (2.0 * step)
+        assert np.abs(difference - gradient[:, :, d]).max() < 1e-6 * np.abs(gradient).max()
+
+
+def test_only_driven_functions_live_on_exact_regions(body: ReducedBody) -> None:
+    """Functions from r on are zero all over every exact region, sampled or not; r = 4 per region."""
+    exact = [region for region in body.regions if region.stiffness is None]
+    assert body.driven_count == 4 * len(exact)
+    rng = np.random.default_rng(3)
+    for region in exact:
+        inside = inner_points(region, rng)
+        value, _ = body.evaluate(inside)
+        assert np.abs(value[:, body.driven_count :]).max() < 1e-10 * np.abs(value).max()
+
+
+def test_regions_follow_affine_motions_exactly(body: ReducedBody) -> None:
+    """With q[:r] = driven_affine(A, t) every exact region moves to A_i X + t_i, whatever the free coordinates are."""
+    rng = np.random.default_rng(4)
+    count = len(body.regions)
+    matrix, shift = rng.normal(size=(count, 3, 3)), rng.normal(size=(count, 3))
+    q = rng.normal(size=(body.function_count, 3))
+    q[: body.driven_count] = body.driven_affine(matrix, shift)
+    for i, region in enumerate(body.regions):
+        if region.stiffness is None:
+            x = inner_points(region, rng)
+            assert np.abs(x + body.evaluate(x)[0] @ q - (x @ matrix[i].T + shift[i])).max() < 1e-9
+    target = np.zeros_like(body.region_points)
+    for i in range(count):
+        rows = body.region_rows(body.region_names[i])
+        target[rows] = body.region_points[rows] @ (matrix[i] - np.eye(3)).T + shift[i]
+    np.testing.assert_allclose(body.driven_coordinates(target), q[: body.driven_count], atol=1e-10)
+    # A motion of the whole body moves its regions alike.
+    one = body.affine(matrix[0], shift[0])[: body.driven_count]
+    exact = body.driven_affine(np.tile(matrix[0], (count, 1, 1)), np.tile(shift[0], (count, 1)))
+    np.testing.assert_allclose(one, exact, atol=1e-10)
+
+
+def test_drive_is_least_squares(body: ReducedBody) -> None:
+    """For displacements that no affine motion gives, the residual is orthogonal to the driven functions."""
+    rng = np.random.default_rng(5)
+    u = rng.normal(size=body.region_points.shape)
+    rows = exact_rows(body)
+    basis = body.evaluate(body.region_points[rows])[0][:, : body.driven_count]
+    residual = u[rows] - basis @ body.driven_coordinates(u)
+    assert np.abs(basis.T @ residual).max(initial=0.0) < 1e-9
+
+
+def test_region_volumes(quadrature: Quadrature) -> None:
+    """The weights of a region sum to its volume and first moment, also where its face cuts cells."""
+    for cut in (-0.13, -0.125, -0.121):
+        region = Region(name="r", box=((-INF, -INF, -INF), (cut, INF, INF)), stiffness=1.0)
+        x, w = region.integrate(quadrature.points, quadrature.weights, quadrature.spacing)
+        assert w.sum() == pytest.approx((cut + 0.2) * 0.1 * 0.08, rel=0.01)
+        assert w @ x[:, 0] / w.sum() == pytest.approx(0.5 * (cut - 0.2), rel=0.01)
+
+
+def test_two_builds_are_bitwise_equal_and_files_round_trip(body: ReducedBody, tmp_path: Path) -> None:
+    """One set of inputs gives one body; save and load give every field back, and the same values."""
+    file = tmp_path / "body.npz"
+    body.save(file)
+    loaded = ReducedBody.load(file)
+    quadrature = quadrature_from_box((0.4, 0.1, 0.08), point_count=1500, surface_count=60)
+    regions = next(case for case in CASES.values() if tuple(r.name for r in case) == body.region_names)
+    again = build_body(quadrature, OPTIONS, regions=regions, progress=False)
+    for f in dataclasses.fields(body):
+        value = getattr(body, f.name)
+        for other in (getattr(loaded, f.name), getattr(again, f.name)):
+            if isinstance(value, np.ndarray):
+                np.testing.assert_array_equal(value, other, err_msg=f.name)
+            elif f.name not in ("provenance", "build_seconds"):
+                assert value == other, f.name
+    np.testing.assert_array_equal(body.evaluate(body.points)[0], loaded.evaluate(body.points)[0])
+
+
+def test_fingerprint_follows_regions(quadrature: Quadrature) -> None:
+    """Name, place, radius and stiffness of a region all count."""
+    moved = Region(name="left", box=((-INF, -INF, -INF), (-0.12, INF, INF)))
+    soft = dataclasses.replace(LEFT, stiffness=10.0)
+    wide = dataclasses.replace(LEFT, radius=0.01)
+    cases = [(), (LEFT,), (dataclasses.replace(LEFT, name="other"),), (moved,), (soft,), (wide,), (LEFT, RIGHT)]
+    found = {build_body(quadrature, OPTIONS, regions=case).fingerprint for case in cases}
+    assert len(found) == len(cases)
+
+
+def test_check_refuses_inconsistent_region_fields(quadrature: Quadrature) -> None:
+    """Indices out of range, missing cores and a wrong count of driven functions raise BasisError naming the field."""
+    body = build_body(quadrature, OPTIONS, regions=(LEFT, SOFT))
+    bad = {
+        "driven_count": 5,
+        "region_index": body.region_index + 1,
+        "core_index": np.zeros_like(body.core_index),
+        "handle_degrees": body.handle_degrees + 1,
+        "handle_regions": body.handle_regions + 3,
+        "region_weights": body.region_weights[1:],
+        "drive": body.drive.astype(np.float32),
+        "region_names": ("one",),
+        "region_radii": body.region_radii * np.nan,
+    }
+    for name, value in bad.items():
+        with pytest.raises(BasisError):
+            dataclasses.replace(body, **{name: value}).check()
+
+
+def test_bad_regions_are_refused(quadrature: Quadrature) -> None:
+    """Wrong shapes and ranges raise ConfigError; empty, overlapping and all-embracing regions BasisError."""
+    for bad in (
+        {},
+        {"box": ((0, 0, 0), (1, 1, 1)), "points": [[0, 0, 0]]},
+        {"box": ((1, 0, 0), (0, 1, 1))},
+        {"points": [[0, 0]]},
+        {"points": [[np.nan, 0, 0]]},
+        {"points": [[0, 0, 0]], "radius": -1.0},
+        {"points": [[0, 0, 0]], "stiffness": 0.0},
+    ):
+        with pytest.raises(ConfigError, match="region 'r'"):
+            Region(name="r", **bad)
+    with pytest.raises(ConfigError, match="names must differ"):
+        build_body(quadrature, OPTIONS, regions=(LEFT, LEFT))
+    nowhere = Region(name="nowhere", points=[[9.0, 0.0, 0.0]], radius=0.1)
+    with pytest.raises(BasisError, match="'nowhere': holds 0 quadrature points"):
+        build_body(quadrature, OPTIONS, regions=(nowhere,))
+    with pytest.raises(BasisError, match="overlap"):
+        build_body(quadrature, OPTIONS, regions=(LEFT, dataclasses.replace(LEFT, name="again")))
+    everything = Region(name="all", box=((-INF,) * 3, (INF,) * 3))
+    with pytest.raises(BasisError, match="whole body"):
+        build_body(quadrature, OPTIONS, regions=(everything,))
+    body = build_body(quadrature, OPTIONS, regions=(LEFT,))
+    with pytest.raises(ConfigError, match="left"):
+        body.region_rows("right")
+    with pytest.raises(ConfigError, match="displacements"):
+        body.driven_coordinates(np.zeros((2, 3)))
+    with pytest.raises(ConfigError, match="matrices"):
+        body.driven_affine(np.eye(3), np.zeros(3))
+
+
+def test_capsule_with_a_layer_of_cells_as_region() -> None:
+    """A region one cell thick still has four driven functions, so that it turns out of its plane exactly."""
+    quadrature = quadrature_from_capsule(0.02, 0.02, point_count=800, surface_count=60)
+    top = float(quadrature.points[:, 2].max())
+    region = Region(name="cap", box=((-INF, -INF, top - 1e-6), (INF, INF, INF)))
+    body = build_body(quadrature, OPTIONS, regions=(region,))
+    assert body.driven_count == 4
+
+
+def test_soft_regions_can_move_apart(quadrature: Quadrature) -> None:
+    """Two stiff springs' regions have a weight each: their affine motions are independent up to springs' give."""
+    both = (dataclasses.replace(LEFT, stiffness=1e6), dataclasses.replace(RIGHT, stiffness=1e6))
+    body = build_body(quadrature, OPTIONS, regions=both)
+    assert body.driven_count == 0 and not body.drive.size
+    basis, _ = body.evaluate(body.region_points)
+    target = np.zeros_like(body.region_points)
+    rows = body.region_rows("right")
+    target[rows] = np.cross([1.0, 0.0, 0.0], body.region_points[rows])
+    root = np.sqrt(body.region_weights)[:, None]
+    q = np.linalg.lstsq(root * basis, root * target, rcond=1e-10)[0]
+    assert np.linalg.norm(root * (basis @ q - target)) < 0.05 * np.linalg.norm(root * target)
