@@ -1,6 +1,6 @@
 """Time the build of a body and every stage of a substep of LiftSoft, in the middle of a grasp.
 
-Run: ``python benchmarks/step.py [--repeats N] [--device cpu]`` (``make bench``). Medians over graph replays; a CPU
+Run: ``python benchmarks/grasp.py [--repeats N] [--device cpu]`` (``make bench``). Medians over graph replays; a CPU
 device runs Warp's kernels on one core. Ratios refer to the whole substep measured in the same run.
 """
 
@@ -63,20 +63,20 @@ def print_substep(env: LiftSoftEnv, repeats: int, iterations: float) -> None:
     scene = env.scene
     solver, dt, device = scene.solver, scene.dt, scene.device
     soft, state, scratch = solver.reduced, scene.state, scene._scratch
-    blank = soft.active
+    blank = soft.progress.active
     blank.fill_(1)
     whole = measure(lambda: solver.step(state, scratch, scene.control, None, dt), repeats, device)
-    print(f"substep: {whole:.3f} ms, {iterations:.2f} Newton iterations, {int(soft.entry_count.numpy()[0])} contacts")
+    print(f"substep: {whole:.3f} ms, {iterations:.2f} Newton iterations, {int(soft.entries.count.numpy()[0])} contacts")
 
     def renewed(stage: Callable[[], None]) -> None:
-        soft.renew.fill_(1)
+        soft.progress.renew.fill_(1)
         stage()
-        soft.renew.zero_()
+        soft.progress.renew.zero_()
 
     stages: dict[str, Callable[[], None]] = {
         "MuJoCo step (two per substep)": lambda: solver.rigid.step(state, scratch, scene.control, None, dt),
         "Jacobian, mass matrix": lambda: solver._linearise(state, dt),
-        "begin": lambda: soft.begin(state, dt),
+        "begin": lambda: soft.begin(state, scene.control, dt),
         "detect contacts": lambda: soft.detect(state, scene.control, dt, prescribed=False),
         "evaluate with Hessian (once or twice)": lambda: renewed(
             lambda: soft._evaluate(blank, soft.q, soft.rigid.r, dt, derivatives=True)
@@ -85,7 +85,7 @@ def print_substep(env: LiftSoftEnv, repeats: int, iterations: float) -> None:
             blank, soft.q, soft.rigid.r, dt, derivatives=True
         ),
         "evaluate energy (per trial)": lambda: soft._evaluate(blank, soft.q, soft.rigid.r, dt, derivatives=False),
-        "sum potential (per evaluation)": lambda: soft._sum_potential(blank, soft.q, soft.rigid.r, dt, soft.potential),
+        "sum potential (per evaluation)": lambda: soft._judge_iterate(dt),
         "gather gradient (per iteration)": lambda: soft._gather_gradient(dt),
         "assemble with stiffness (once or twice)": lambda: renewed(lambda: soft._assemble(dt)),
         "assemble (per iteration)": lambda: soft._assemble(dt),
@@ -94,7 +94,7 @@ def print_substep(env: LiftSoftEnv, repeats: int, iterations: float) -> None:
     }
     for name, stage in stages.items():
         blank.fill_(1)
-        soft.renew.zero_()
+        soft.progress.renew.zero_()
         milliseconds = measure(stage, repeats, device)
         print(f"  {name:<44}{milliseconds:8.3f} ms  {milliseconds / whole:6.1%}")
     frame = measure(scene._control_step, max(repeats // 10, 5), device)

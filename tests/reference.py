@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -42,40 +43,93 @@ def cofactor_derivative(F: np.ndarray) -> np.ndarray:
     return np.einsum("ikm,jln,...mn->...ijkl", LEVI_CIVITA, LEVI_CIVITA, F)
 
 
-def _constants(model: MaterialModel, mu: float, lam: float) -> tuple[float, float, float, float]:
-    """Return (a, b, J0, c) of a/2 (I_C - 3) + b/2 [(J - J0)^2 - (1 - J0)^2] - c/2 ln((I_C + 1)/4)."""
+def hooke_moduli(model: MaterialModel, mu: float, lam: float) -> tuple[float, float]:
+    """Return the moduli of Hooke's law that a model obeys at small strain: ARAP has no lambda."""
+    return mu, 0.0 if model == MaterialModel.ARAP else lam
+
+
+def rotation(F: np.ndarray) -> np.ndarray:
+    """Return the rotation nearest to F: the polar factor, with the smallest singular value negated if det F < 0."""
+    U, _, Vt = np.linalg.svd(F)
+    U[..., :, 2] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt))[..., None]
+    return U @ Vt
+
+
+def rotation_derivative(F: np.ndarray) -> np.ndarray:
+    """Return dR_ij / dF_kl. With F = R S and R^T dR = [w]x: (tr(S) I - S) w = the axial vector of R^T dF - dF^T R."""
+    R = rotation(F)
+    S = np.swapaxes(R, -1, -2) @ F
+    S = 0.5 * (S + np.swapaxes(S, -1, -2))
+    axial = -np.einsum("mil,...ki->...mkl", LEVI_CIVITA, R)
+    system = np.trace(S, axis1=-2, axis2=-1)[..., None, None] * I3 - S
+    w = np.linalg.solve(system, axial.reshape(*axial.shape[:-2], 9)).reshape(axial.shape)
+    return -np.einsum("...in,njm,...mkl->...ijkl", R, LEVI_CIVITA, w)
+
+
+def _invariant_slopes(model: MaterialModel, ic: np.ndarray, j: np.ndarray, mu: float, lam: float) -> tuple[Any, ...]:
+    """Return Psi and its derivatives (Psi_I, Psi_II, Psi_J, Psi_JJ) of the part that depends on I_C and J."""
     if model == MaterialModel.STABLE_NEO_HOOKEAN:
-        return mu, lam + mu, 1.0 + mu / (lam + mu), 0.0
-    m, bulk = 4.0 / 3.0 * mu, lam + 5.0 / 6.0 * mu
-    return m, bulk, 1.0 + m / bulk - m / (4.0 * bulk), m
+        j0 = 1 + mu / (lam + mu)
+        psi = mu / 2 * (ic - 3) + (lam + mu) / 2 * ((j - j0) ** 2 - (1 - j0) ** 2)
+        return psi, mu / 2, 0.0, (lam + mu) * (j - j0), lam + mu
+    if model == MaterialModel.STABLE_NEO_HOOKEAN_LOG:
+        m, bulk = 4 / 3 * mu, lam + 5 / 6 * mu
+        j0 = 1 + m / bulk - m / (4 * bulk)
+        psi = m / 2 * (ic - 3 - np.log((ic + 1) / 4)) + bulk / 2 * ((j - j0) ** 2 - (1 - j0) ** 2)
+        return psi, m / 2 * (1 - 1 / (ic + 1)), m / (2 * (ic + 1) ** 2), bulk * (j - j0), bulk
+    if model == MaterialModel.NEO_HOOKEAN:  # beyond its domain: infinite energy, the slopes at J = 1e-9
+        inside = np.maximum(j, 1e-9)
+        log = np.log(inside)
+        psi = np.where(j > 0, mu / 2 * (ic - 3) - mu * log + lam / 2 * log**2, np.inf)
+        return psi, mu / 2, 0.0, (lam * log - mu) / inside, (lam + mu - lam * log) / inside**2
+    if model == MaterialModel.COROTATED:
+        return lam / 2 * (j - 1) ** 2, 0.0, 0.0, lam * (j - 1), lam
+    return 0.0 * j, 0.0, 0.0, 0.0 * j, 0.0
 
 
 def energy(model: MaterialModel, F: np.ndarray, mu: float, lam: float) -> np.ndarray:
     """Return Psi(F) [J/m^3]."""
-    a, b, j0, c = _constants(model, mu, lam)
-    ic, j = (F * F).sum(axis=(-2, -1)), np.linalg.det(F)
-    return a / 2 * (ic - 3) + b / 2 * ((j - j0) ** 2 - (1 - j0) ** 2) - c / 2 * np.log((ic + 1) / 4)
+    psi = _invariant_slopes(model, (F * F).sum(axis=(-2, -1)), np.linalg.det(F), mu, lam)[0]
+    if model in (MaterialModel.ARAP, MaterialModel.COROTATED):
+        psi = psi + mu * ((F - rotation(F)) ** 2).sum(axis=(-2, -1))
+    if model == MaterialModel.STVK:
+        E = green_strain(F)
+        psi = mu * (E**2).sum(axis=(-2, -1)) + lam / 2 * np.trace(E, axis1=-2, axis2=-1) ** 2
+    return psi
 
 
 def stress(model: MaterialModel, F: np.ndarray, mu: float, lam: float) -> np.ndarray:
     """Return P = dPsi/dF [Pa]."""
-    a, b, j0, c = _constants(model, mu, lam)
-    ic, j = (F * F).sum(axis=(-2, -1))[..., None, None], np.linalg.det(F)[..., None, None]
-    return (a - c / (ic + 1)) * F + b * (j - j0) * cofactor(F)
+    shape = (..., None, None)
+    _, d_i, _, d_j, _ = _invariant_slopes(model, (F * F).sum(axis=(-2, -1))[shape], np.linalg.det(F)[shape], mu, lam)
+    P = 2 * d_i * F + d_j * cofactor(F)
+    if model in (MaterialModel.ARAP, MaterialModel.COROTATED):
+        P = P + 2 * mu * (F - rotation(F))
+    if model == MaterialModel.STVK:
+        P = F @ hooke_stress(green_strain(F), mu, lam)
+    return P
 
 
 def hessian(model: MaterialModel, F: np.ndarray, mu: float, lam: float) -> np.ndarray:
     """Return dP/dF (..., 3, 3, 3, 3) [Pa], not projected."""
-    a, b, j0, c = _constants(model, mu, lam)
     shape = (..., None, None, None, None)
-    ic, j = (F * F).sum(axis=(-2, -1))[shape], np.linalg.det(F)[shape]
-    g = cofactor(F)
-    return (
-        (a - c / (ic + 1)) * np.einsum("ik,jl->ijkl", I3, I3)
-        + 2 * c / (ic + 1) ** 2 * np.einsum("...ij,...kl->...ijkl", F, F)
-        + b * np.einsum("...ij,...kl->...ijkl", g, g)
-        + b * (j - j0) * cofactor_derivative(F)
+    _, d_i, d_ii, d_j, d_jj = _invariant_slopes(
+        model, (F * F).sum(axis=(-2, -1))[shape], np.linalg.det(F)[shape], mu, lam
     )
+    g = cofactor(F)
+    identity = np.einsum("ik,jl->ijkl", I3, I3)
+    H = (
+        2 * d_i * identity
+        + 4 * d_ii * np.einsum("...ij,...kl->...ijkl", F, F)
+        + d_jj * np.einsum("...ij,...kl->...ijkl", g, g)
+        + d_j * cofactor_derivative(F)
+    )
+    if model in (MaterialModel.ARAP, MaterialModel.COROTATED):
+        H = H + 2 * mu * (identity - rotation_derivative(F))
+    if model == MaterialModel.STVK:
+        turning = np.einsum("ik,...lj->...ijkl", I3, hooke_stress(green_strain(F), mu, lam))
+        H = turning + hooke_hessian(F, mu, lam)
+    return H
 
 
 def projected(H: np.ndarray) -> np.ndarray:
@@ -90,20 +144,35 @@ def green_strain(F: np.ndarray) -> np.ndarray:
     return 0.5 * (np.swapaxes(F, -1, -2) @ F - I3)
 
 
-def viscous_energy(F: np.ndarray, F_start: np.ndarray, mu: float, viscosity: float, dt: float) -> np.ndarray:
-    """Return the dissipation potential of a step, mu tau / dt |E - E_n|^2 [J/m^3]."""
-    return mu * viscosity / dt * ((green_strain(F) - green_strain(F_start)) ** 2).sum(axis=(-2, -1))
+def hooke_stress(E: np.ndarray, mu: float, lam: float) -> np.ndarray:
+    """Return 2 mu E + lambda tr(E) I [Pa]."""
+    return 2 * mu * E + lam * np.trace(E, axis1=-2, axis2=-1)[..., None, None] * I3
 
 
-def viscous_stress(F: np.ndarray, F_start: np.ndarray, mu: float, viscosity: float, dt: float) -> np.ndarray:
-    """Return its derivative, 2 mu tau / dt F (E - E_n) [Pa]."""
-    return 2.0 * mu * viscosity / dt * F @ (green_strain(F) - green_strain(F_start))
+def hooke_hessian(F: np.ndarray, mu: float, lam: float) -> np.ndarray:
+    """Return the derivative of F (2 mu E + lambda tr(E) I) where the bracket vanishes, (..., 3, 3, 3, 3) [Pa]."""
+    left = np.einsum("...im,...km,jl->...ijkl", F, F, I3) + np.einsum("...il,...kj->...ijkl", F, F)
+    return mu * left + lam * np.einsum("...ij,...kl->...ijkl", F, F)
 
 
-def viscous_hessian(F: np.ndarray, mu: float, viscosity: float, dt: float) -> np.ndarray:
-    """Return its Hessian at E = E_n, 2 mu tau / dt F sym(F^T dF), shape (..., 3, 3, 3, 3) [Pa]."""
-    left = np.einsum("...im,...km,jl->...ijkl", F, F, I3)
-    return mu * viscosity / dt * (left + np.einsum("...il,...kj->...ijkl", F, F))
+def viscous_energy(
+    F: np.ndarray, F_start: np.ndarray, mu: float, lam: float, viscosity: float, dt: float
+) -> np.ndarray:
+    """Return the dissipation potential of a step, tau / dt (mu |D|^2 + lambda/2 tr(D)^2), D = E - E_n [J/m^3]."""
+    D = green_strain(F) - green_strain(F_start)
+    return viscosity / dt * (mu * (D**2).sum(axis=(-2, -1)) + lam / 2 * np.trace(D, axis1=-2, axis2=-1) ** 2)
+
+
+def viscous_stress(
+    F: np.ndarray, F_start: np.ndarray, mu: float, lam: float, viscosity: float, dt: float
+) -> np.ndarray:
+    """Return its derivative, tau / dt F (2 mu D + lambda tr(D) I) [Pa]."""
+    return viscosity / dt * F @ hooke_stress(green_strain(F) - green_strain(F_start), mu, lam)
+
+
+def viscous_hessian(F: np.ndarray, mu: float, lam: float, viscosity: float, dt: float) -> np.ndarray:
+    """Return its Hessian at E = E_n, shape (..., 3, 3, 3, 3) [Pa]."""
+    return viscosity / dt * hooke_hessian(F, mu, lam)
 
 
 def normal_potential(penetration: np.ndarray, eps: float) -> np.ndarray:
@@ -184,6 +253,11 @@ class FreeBody:
         """Lame's parameters [Pa]."""
         return lame(self.material.youngs_modulus, self.material.poissons_ratio)
 
+    @property
+    def hooke_moduli(self) -> tuple[float, float]:
+        """The moduli [Pa] at small strain."""
+        return hooke_moduli(self.material.model, *self.lame)
+
     def deformation_gradient(self, q: np.ndarray) -> np.ndarray:
         """Return F = I + sum_k q_k grad b_k^T at the cubature points, shape (P, 3, 3)."""
         return I3 + np.einsum("kc,pkd->pcd", q, self.body.grad_basis.astype(float))
@@ -202,16 +276,21 @@ class FreeBody:
         m, h, material = self.mass, self.dt, self.material
         inertia = m / h**2 * (q - q_start) - m / h * qd_start + m * material.mass_damping / h * (q - q_start)
         F, F_start = self.deformation_gradient(q), self.deformation_gradient(q_start)
-        P = viscous_stress(F, F_start, self.lame[0], material.viscosity, h)
+        P = viscous_stress(F, F_start, *self.hooke_moduli, material.viscosity, h)
         viscous = np.einsum("p,pcd,pkd->kc", self.body.weights, P, self.body.grad_basis.astype(float))
         pins = self.pin_stiffness * self.pin_basis.T @ (self.pin_basis @ q)
         return inertia + self.elastic_gradient(q) + viscous + pins - m * np.outer(self.body.mean_basis, self.gravity)
 
-    def tangent(self, q: np.ndarray) -> np.ndarray:
-        """Return a positive definite approximation of d2E/dq2 [N/m], shape (3 n, 3 n), unknowns point-major."""
+    def tangent(self, q: np.ndarray, q_start: np.ndarray | None = None) -> np.ndarray:
+        """Return d2E/dq2 [N/m], shape (3 n, 3 n), unknowns point-major; without q_n made positive definite."""
         F = self.deformation_gradient(q)
-        C = projected(hessian(self.material.model, F, *self.lame)).reshape(-1, 3, 3, 3, 3)
-        C = C + viscous_hessian(F, self.lame[0], self.material.viscosity, self.dt)
+        C = hessian(self.material.model, F, *self.lame)
+        if q_start is None:
+            C = projected(C).reshape(-1, 3, 3, 3, 3)
+        else:
+            rate = self.material.viscosity / self.dt * (green_strain(F) - green_strain(self.deformation_gradient(q_start)))
+            C = C + np.einsum("ik,pjl->pijkl", I3, hooke_stress(rate, *self.hooke_moduli))
+        C = C + viscous_hessian(F, *self.hooke_moduli, self.material.viscosity, self.dt)
         grad = self.body.grad_basis.astype(float)
         n = grad.shape[1]
         K = np.einsum("p,pka,pcadb,plb->kcld", self.body.weights, grad, C, grad, optimize=True).reshape(3 * n, 3 * n)
@@ -233,7 +312,10 @@ class FreeBody:
         q = q_start + (self.dt * qd_start if np.isfinite(self.dt) else 0.0)
         for _ in range(100):
             r = self.residual(q, q_start, qd_start)
-            dq = -np.linalg.solve(self.tangent(q), r.ravel()).reshape(q.shape)
+            H = self.tangent(q, q_start)
+            if np.linalg.eigvalsh(H)[0] <= 0.0:
+                H = self.tangent(q)
+            dq = -np.linalg.solve(H, r.ravel()).reshape(q.shape)
             q = q + dq
             if np.linalg.norm(dq) < 1e-14 * np.linalg.norm(self.body.bounds):
                 return q

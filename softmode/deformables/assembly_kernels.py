@@ -1,11 +1,12 @@
 """Device side of the linear system: [K | C | -g] of every body, the rigid part, and its condensation.
 
-Unknowns of one instance are ordered component-major, row = c * stride + k; see ``kernels`` for the potential.
+Unknowns of one instance are ordered component-major in blocks of eight, see ``tables``.
 """
 
 import warp as wp
 
-from softmode.deformables.factor import LANES, vec8
+from softmode.deformables.lanes import LANES, barrier, vec8, vec8d
+from softmode.deformables.tables import Basis, Entries, Instances, Motion, Points, Progress, Rigid
 
 wp.set_module_options({"enable_backward": False})
 
@@ -24,33 +25,45 @@ def block_pair(pair: int):
     return c, d
 
 
+@wp.func
+def block_task(task: int, block_count: int):
+    """Return the component pair, row block and column block of a task, without those below the diagonal.
+
+    The 3 block_count^2 blocks of the pairs 01, 02, 12 come first, then the upper triangles of 00, 11, 22.
+    """
+    square = block_count * block_count
+    if task < 3 * square:
+        pair = task / square
+        rest = task % square
+        return wp.where(pair < 2, pair + 1, 4), rest / block_count, rest % block_count
+    triangle = (square + block_count) / 2
+    diagonal = (task - 3 * square) / triangle
+    lanes = int((task - 3 * square) % triangle)
+    rows = int(0)
+    while lanes >= block_count - rows:
+        lanes -= block_count - rows
+        rows += 1
+    return wp.where(diagonal == 0, 0, wp.where(diagonal == 1, 3, 5)), rows, rows + lanes
+
+
 @wp.kernel
 def assemble_stiffness(
-    # Instances:
-    world: wp.array[int],
-    function_count: wp.array[int],
-    point_start: wp.array[int],
-    point_count: wp.array[int],
-    mass: wp.array[wp.float64],
-    mass_damping: wp.array[float],
-    # Assets:
-    grad_basis8: wp.array3d[vec8],  # (stride / 8, point_total, 3), so that a block walks through contiguous memory
-    # State in:
+    instances: Instances,
+    basis: Basis,
+    points: Points,
     active: wp.array[int],
     renew: wp.array[int],
-    point_hessian: wp.array3d[wp.mat33],  # blocks (c, d) = 00, 01, 02, 11, 12, 22
-    dt: float,
+    chunk_count: int,
     # Out:
-    stiffness_out: wp.array3d[vec8],  # (instance_count, 3 stride, 3 stride / 8), upper triangle
+    stiffness_out: wp.array4d[vec8],  # (instance_count, chunk_count, 3 stride, 3 block_count), upper triangle
 ):
-    """Assemble 8x8 blocks of sum_p grad b^T C grad b with inertia on the diagonal."""
-    i, pair, rows, lanes = wp.tid()
-    if active[world[i]] == 0 or renew[world[i]] == 0:
+    """Assemble 8x8 blocks of sum_p grad b^T C grad b over one chunk of the points."""
+    i, chunk, task = wp.tid()
+    if active[instances.world[i]] == 0 or renew[instances.world[i]] == 0:
         return
+    block_count = basis.row.shape[1]
+    pair, rows, lanes = block_task(task, block_count)
     c, d = block_pair(pair)
-    if c == d and lanes < rows:
-        return
-    k0 = LANES * rows
     a0 = vec8()
     a1 = vec8()
     a2 = vec8()
@@ -59,247 +72,277 @@ def assemble_stiffness(
     a5 = vec8()
     a6 = vec8()
     a7 = vec8()
-    first = point_start[i]
-    n = function_count[i]
-    if k0 < n and LANES * lanes < n:
-        for p in range(point_count[i]):
-            C = point_hessian[i, pair, p]
-            point = first + p
-            gx = grad_basis8[lanes, point, 0]
-            gy = grad_basis8[lanes, point, 1]
-            gz = grad_basis8[lanes, point, 2]
+    first = instances.point_start[i]
+    count = instances.point_count[i]
+    n = instances.function_count[i]
+    if LANES * rows < n and LANES * lanes < n:
+        for p in range(chunk * count / chunk_count, (chunk + 1) * count / chunk_count):
+            C = points.hessian[i, pair, p]
+            gx = basis.gradient_across[lanes, first + p, 0]
+            gy = basis.gradient_across[lanes, first + p, 1]
+            gz = basis.gradient_across[lanes, first + p, 2]
             ux = C[0, 0] * gx + C[0, 1] * gy + C[0, 2] * gz
             uy = C[1, 0] * gx + C[1, 1] * gy + C[1, 2] * gz
             uz = C[2, 0] * gx + C[2, 1] * gy + C[2, 2] * gz
-            rx = grad_basis8[rows, point, 0]
-            ry = grad_basis8[rows, point, 1]
-            rz = grad_basis8[rows, point, 2]
-            a0 += rx[0] * ux + ry[0] * uy + rz[0] * uz
-            a1 += rx[1] * ux + ry[1] * uy + rz[1] * uz
-            a2 += rx[2] * ux + ry[2] * uy + rz[2] * uz
-            a3 += rx[3] * ux + ry[3] * uy + rz[3] * uz
-            a4 += rx[4] * ux + ry[4] * uy + rz[4] * uz
-            a5 += rx[5] * ux + ry[5] * uy + rz[5] * uz
-            a6 += rx[6] * ux + ry[6] * uy + rz[6] * uz
-            a7 += rx[7] * ux + ry[7] * uy + rz[7] * uz
-    stride = LANES * grad_basis8.shape[0]
-    if c == d and lanes == rows:
-        inertia = float(mass[i]) * (1.0 / dt + mass_damping[i]) / dt
-        a0[0] += wp.where(k0 < n, inertia, 1.0)
-        a1[1] += wp.where(k0 + 1 < n, inertia, 1.0)
-        a2[2] += wp.where(k0 + 2 < n, inertia, 1.0)
-        a3[3] += wp.where(k0 + 3 < n, inertia, 1.0)
-        a4[4] += wp.where(k0 + 4 < n, inertia, 1.0)
-        a5[5] += wp.where(k0 + 5 < n, inertia, 1.0)
-        a6[6] += wp.where(k0 + 6 < n, inertia, 1.0)
-        a7[7] += wp.where(k0 + 7 < n, inertia, 1.0)
-    row = c * stride + k0
-    column = d * (stride / LANES) + lanes
-    stiffness_out[i, row, column] = a0
-    stiffness_out[i, row + 1, column] = a1
-    stiffness_out[i, row + 2, column] = a2
-    stiffness_out[i, row + 3, column] = a3
-    stiffness_out[i, row + 4, column] = a4
-    stiffness_out[i, row + 5, column] = a5
-    stiffness_out[i, row + 6, column] = a6
-    stiffness_out[i, row + 7, column] = a7
+            r = basis.gradient_across[rows, first + p, 0]
+            a0 = a0 + r[0] * ux
+            a1 = a1 + r[1] * ux
+            a2 = a2 + r[2] * ux
+            a3 = a3 + r[3] * ux
+            a4 = a4 + r[4] * ux
+            a5 = a5 + r[5] * ux
+            a6 = a6 + r[6] * ux
+            a7 = a7 + r[7] * ux
+            r = basis.gradient_across[rows, first + p, 1]
+            a0 = a0 + r[0] * uy
+            a1 = a1 + r[1] * uy
+            a2 = a2 + r[2] * uy
+            a3 = a3 + r[3] * uy
+            a4 = a4 + r[4] * uy
+            a5 = a5 + r[5] * uy
+            a6 = a6 + r[6] * uy
+            a7 = a7 + r[7] * uy
+            r = basis.gradient_across[rows, first + p, 2]
+            a0 = a0 + r[0] * uz
+            a1 = a1 + r[1] * uz
+            a2 = a2 + r[2] * uz
+            a3 = a3 + r[3] * uz
+            a4 = a4 + r[4] * uz
+            a5 = a5 + r[5] * uz
+            a6 = a6 + r[6] * uz
+            a7 = a7 + r[7] * uz
+    row = LANES * (c * block_count + rows)
+    column = d * block_count + lanes
+    stiffness_out[i, chunk, row, column] = a0
+    stiffness_out[i, chunk, row + 1, column] = a1
+    stiffness_out[i, chunk, row + 2, column] = a2
+    stiffness_out[i, chunk, row + 3, column] = a3
+    stiffness_out[i, chunk, row + 4, column] = a4
+    stiffness_out[i, chunk, row + 5, column] = a5
+    stiffness_out[i, chunk, row + 6, column] = a6
+    stiffness_out[i, chunk, row + 7, column] = a7
+
+
+@wp.kernel
+def assemble_pins(
+    instances: Instances,
+    basis: Basis,
+    first_row: int,
+    pin_stiffness: wp.array[float],  # (pin_total,) [N/m]
+    # Out:
+    pins_out: wp.array3d[vec8],  # (instance_count, stride, block_count), upper triangle
+):
+    """Assemble 8x8 blocks of sum_e k_e b b^T over the pins: the same for x, y and z, and constant."""
+    i, rows, lanes = wp.tid()
+    if lanes < rows:
+        return
+    a0 = vec8()
+    a1 = vec8()
+    a2 = vec8()
+    a3 = vec8()
+    a4 = vec8()
+    a5 = vec8()
+    a6 = vec8()
+    a7 = vec8()
+    for e in range(instances.pin_start[i], instances.pin_start[i] + instances.pin_count[i]):
+        b = pin_stiffness[e] * basis.row[first_row + e, rows]
+        v = basis.row[first_row + e, lanes]
+        a0 = a0 + b[0] * v
+        a1 = a1 + b[1] * v
+        a2 = a2 + b[2] * v
+        a3 = a3 + b[3] * v
+        a4 = a4 + b[4] * v
+        a5 = a5 + b[5] * v
+        a6 = a6 + b[6] * v
+        a7 = a7 + b[7] * v
+    row = LANES * rows
+    pins_out[i, row, lanes] = a0
+    pins_out[i, row + 1, lanes] = a1
+    pins_out[i, row + 2, lanes] = a2
+    pins_out[i, row + 3, lanes] = a3
+    pins_out[i, row + 4, lanes] = a4
+    pins_out[i, row + 5, lanes] = a5
+    pins_out[i, row + 6, lanes] = a6
+    pins_out[i, row + 7, lanes] = a7
 
 
 @wp.kernel
 def assemble_matrix(
-    # Instances:
-    world: wp.array[int],
-    stride: int,
-    # Assets:
-    row_basis8: wp.array2d[vec8],
-    # State in:
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    entries: Entries,
     active: wp.array[int],
-    stiffness: wp.array3d[vec8],
-    entry_count: wp.array[int],
-    entry_row: wp.array2d[int],
-    entry_hessian: wp.array2d[wp.mat33],
+    stiffness: wp.array4d[vec8],
+    pins: wp.array3d[vec8],
+    dt: wp.float64,
+    team: int,
     # Out:
     matrix_out: wp.array3d[vec8],  # (instance_count, 3 stride, ...), upper triangle
 ):
-    """Add the pins and contacts, sum_e b^T H b, to 8x8 blocks of the stiffness."""
-    i, pair, rows, lanes = wp.tid()
-    if active[world[i]] == 0:
+    """Add inertia, pins and contacts, sum_e b^T H b, to the stiffness; driven unknowns stay put."""
+    i, row, member = wp.tid()
+    if active[instances.world[i]] == 0:
         return
-    c, d = block_pair(pair)
-    if c == d and lanes < rows:
-        return
-    row = c * stride + LANES * rows
-    column = d * (stride / LANES) + lanes
-    a0 = stiffness[i, row, column]
-    a1 = stiffness[i, row + 1, column]
-    a2 = stiffness[i, row + 2, column]
-    a3 = stiffness[i, row + 3, column]
-    a4 = stiffness[i, row + 4, column]
-    a5 = stiffness[i, row + 5, column]
-    a6 = stiffness[i, row + 6, column]
-    a7 = stiffness[i, row + 7, column]
-    for e in range(entry_count[i]):
-        basis_row = entry_row[i, e]
-        v = entry_hessian[i, e][c, d] * row_basis8[basis_row, lanes]
-        b = row_basis8[basis_row, rows]
-        a0 += b[0] * v
-        a1 += b[1] * v
-        a2 += b[2] * v
-        a3 += b[3] * v
-        a4 += b[4] * v
-        a5 += b[5] * v
-        a6 += b[6] * v
-        a7 += b[7] * v
-    matrix_out[i, row, column] = a0
-    matrix_out[i, row + 1, column] = a1
-    matrix_out[i, row + 2, column] = a2
-    matrix_out[i, row + 3, column] = a3
-    matrix_out[i, row + 4, column] = a4
-    matrix_out[i, row + 5, column] = a5
-    matrix_out[i, row + 6, column] = a6
-    matrix_out[i, row + 7, column] = a7
+    block_count = basis.row.shape[1]
+    c = row / (LANES * block_count)
+    k = row % (LANES * block_count)
+    driven = instances.driven_count[i]
+    for column in range(member, 3 * block_count, team):
+        d = column / block_count
+        lanes = column % block_count
+        if LANES * column + 7 >= row:
+            value = stiffness[i, 0, row, column]
+            for chunk in range(1, stiffness.shape[1]):
+                value = value + stiffness[i, chunk, row, column]
+            if c == d and instances.pin_count[i] > 0:
+                value = value + pins[i, k, lanes]
+            for e in range(instances.pin_count[i], entries.count[i]):
+                r = entries.row[i, e]
+                b = basis.row[r, k / LANES][k % LANES]
+                value = value + (b * entries.hessian[i, e][c, d]) * basis.row[r, lanes]
+            if k < driven or LANES * lanes < driven:
+                for lane in range(LANES):
+                    if k < driven or LANES * lanes + lane < driven:
+                        value[lane] = 0.0
+            if row / LANES == column:
+                # the padding behind the functions carries inertia alone
+                rate = motion.rate[i] / dt
+                inertia = float(instances.mass[i] * rate * (rate + wp.float64(instances.mass_damping[i])))
+                for lane in range(LANES):
+                    if lane == row % LANES:
+                        value[lane] = value[lane] + inertia
+            matrix_out[i, row, column] = value
 
 
 @wp.kernel
 def assemble_columns(
-    # Instances:
-    world: wp.array[int],
-    function_count: wp.array[int],
-    stride: int,
-    # Assets:
-    row_basis: wp.array2d[float],
-    # State in:
+    instances: Instances,
+    basis: Basis,
+    entries: Entries,
     active: wp.array[int],
-    gradient: wp.array2d[wp.vec3d],
-    entry_count: wp.array[int],
-    entry_row: wp.array2d[int],
-    entry_coupling: wp.array3d[wp.vec3],  # (instance_count, entry_max, rigid_count), H_e J_e
+    gradient: wp.array2d[vec8d],
     rigid_count: int,
     # Out:
     matrix_out: wp.array3d[vec8],
 ):
     """Fill the columns right of K: d2E/dq dr = -sum_e b_k H_e J_e, and -g in column rigid_count."""
-    i, row, block = wp.tid()
-    if active[world[i]] == 0:
+    i, rows, block = wp.tid()
+    if active[instances.world[i]] == 0:
         return
-    c = row / stride
-    k = row % stride
-    value = vec8()
-    if k < function_count[i]:
+    block_count = basis.row.shape[1]
+    c = rows / block_count
+    g = gradient[i, rows]
+    for a in range(LANES):
+        k = LANES * (rows % block_count) + a
+        value = vec8()
         for lane in range(LANES):
             j = LANES * block + lane
             if j == rigid_count:
-                value[lane] = -float(gradient[i, k][c])
-            if j < rigid_count:
+                value[lane] = -float(g[a])
+            if j < rigid_count and k >= instances.driven_count[i]:
                 total = float(0.0)
-                for e in range(entry_count[i]):
-                    total -= row_basis[entry_row[i, e], k] * entry_coupling[i, e, j][c]
+                for e in range(instances.pin_count[i], entries.count[i]):
+                    b = basis.row[entries.row[i, e], rows % block_count]
+                    total -= b[a] * entries.coupling[i, e, j][c]
                 value[lane] = total
-    matrix_out[i, row, 3 * stride / LANES + block] = value
+        matrix_out[i, LANES * rows + a, 3 * block_count + block] = value
 
 
 @wp.kernel
 def assemble_rigid(
-    # Worlds:
-    instance_start: wp.array[int],  # (world_count + 1,)
-    rigid_count: wp.array[int],  # (world_count,)
-    # State in:
-    active: wp.array[int],
-    inertia: wp.array3d[wp.float64],  # (world_count, rigid_max, rigid_max), M_eff / dt^2
-    r_predicted: wp.array2d[wp.float64],
-    r: wp.array2d[wp.float64],
-    entry_count: wp.array[int],
-    entry_force: wp.array2d[wp.vec3d],
-    entry_jacobian: wp.array3d[wp.vec3],  # (instance_count, entry_max, rigid_max)
-    entry_coupling: wp.array3d[wp.vec3],
-    # Out:
-    gradient_out: wp.array2d[wp.float64],
-    matrix_out: wp.array3d[wp.float64],
+    entries: Entries,
+    progress: Progress,
+    # In and out:
+    rigid: Rigid,
 ):
     """Compute gradient and Hessian of the rigid dofs: M_eff/dt^2 (r - r_predicted) + sum_e J_e^T f_e."""
-    w, j = wp.tid()
-    if active[w] == 0 or j >= rigid_count[w]:
+    w, j, l = wp.tid()
+    if progress.active[w] == 0 or j >= rigid.count[w] or l >= rigid.count[w]:
         return
-    g = wp.float64(0.0)
-    for l in range(rigid_count[w]):
-        m = inertia[w, j, l]
-        g += m * (r[w, l] - r_predicted[w, l])
-        h = m
-        for i in range(instance_start[w], instance_start[w + 1]):
-            for e in range(entry_count[i]):
-                h += wp.float64(wp.dot(entry_jacobian[i, e, j], entry_coupling[i, e, l]))
-        matrix_out[w, j, l] = h
-    for i in range(instance_start[w], instance_start[w + 1]):
-        for e in range(entry_count[i]):
-            g += wp.dot(wp.vec3d(entry_jacobian[i, e, j]), entry_force[i, e])
-    gradient_out[w, j] = g
+    first = progress.instance_start[w]
+    end = progress.instance_start[w + 1]
+    h = rigid.inertia[w, j, l]
+    for i in range(first, end):
+        for e in range(entries.count[i]):
+            h += wp.float64(wp.dot(entries.jacobian[i, e, j], entries.coupling[i, e, l]))
+    rigid.matrix[w, j, l] = h
+    if l == 0:
+        g = wp.float64(0.0)
+        for k in range(rigid.count[w]):
+            g += rigid.inertia[w, j, k] * (rigid.r[w, k] - rigid.predicted[w, k])
+        for i in range(first, end):
+            for e in range(entries.count[i]):
+                g += wp.dot(wp.vec3d(entries.jacobian[i, e, j]), entries.force[i, e])
+        rigid.gradient[w, j] = g
 
 
 @wp.kernel
 def condense(
-    # Worlds:
-    instance_start: wp.array[int],
-    rigid_count: wp.array[int],
+    progress: Progress,
     rigid_max: int,
-    # State in:
-    active: wp.array[int],
-    gradient: wp.array2d[wp.float64],
     factored: wp.array3d[vec8],  # [U | Y | y], Y = U^-T C, y = U^-T (-g)
-    row_count: int,
     # In and out:
-    matrix: wp.array3d[wp.float64],  # (world_count, rigid_max, rigid_max)
-    # Out:
-    right_out: wp.array2d[wp.float64],
+    rigid: Rigid,
 ):
     """Subtract the bodies: S = R - sum_i Y_i^T Y_i and s = -g_r - sum_i Y_i^T y_i."""
-    w, j = wp.tid()
-    if active[w] == 0 or j >= rigid_count[w]:
+    w, j, l = wp.tid()
+    # column l = rigid_count is the right-hand side
+    if progress.active[w] == 0 or j >= rigid.count[w] or l > rigid.count[w]:
         return
+    row_count = factored.shape[1]
     first = row_count / LANES
-    right = -gradient[w, j]
-    for i in range(instance_start[w], instance_start[w + 1]):
+    column = l
+    value = -rigid.gradient[w, j]
+    if l == rigid.count[w]:
+        column = rigid_max
+    else:
+        value = rigid.matrix[w, j, l]
+    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
         for row in range(row_count):
             y = factored[i, row, first + j / LANES][j % LANES]
-            if y != 0.0:
-                right -= wp.float64(y) * wp.float64(factored[i, row, first + rigid_max / LANES][rigid_max % LANES])
-                for l in range(rigid_count[w]):
-                    matrix[w, j, l] = matrix[w, j, l] - wp.float64(y) * wp.float64(
-                        factored[i, row, first + l / LANES][l % LANES]
-                    )
-    right_out[w, j] = right
+            value -= wp.float64(y) * wp.float64(factored[i, row, first + column / LANES][column % LANES])
+    if l == rigid.count[w]:
+        rigid.direction[w, j] = value
+    else:
+        rigid.matrix[w, j, l] = value
 
 
 @wp.kernel
 def solve_rigid(
-    # Worlds:
-    rigid_count: wp.array[int],
     active: wp.array[int],
-    # In and out:
-    matrix: wp.array3d[wp.float64],  # overwritten by its lower Cholesky factor
-    # In: right-hand side, out: solution
+    team: int,
+    # In and out: matrix and right-hand side, overwritten by the lower Cholesky factor and the solution
+    matrix: wp.array3d[wp.float64],
+    count: wp.array[int],
     solution: wp.array2d[wp.float64],
 ):
-    """Solve S x = s by Cholesky, one thread per world (S holds one row per rigid dof of a world)."""
-    w = wp.tid()
+    """Solve S x = s by Cholesky, column by column; a team shares the rows below the pivot."""
+    w, lane = wp.tid()
     if active[w] == 0:
         return
-    n = rigid_count[w]
+    n = count[w]
     for a in range(n):
         pivot = matrix[w, a, a]
+        full = pivot
         for s in range(a):
             pivot -= matrix[w, a, s] * matrix[w, a, s]
-        pivot = wp.sqrt(wp.max(pivot, wp.float64(1.0e-12) * wp.abs(matrix[w, a, a])))
-        matrix[w, a, a] = pivot
-        for b in range(a + 1, n):
+        pivot = wp.sqrt(wp.max(pivot, wp.float64(1.0e-12) * wp.abs(full)))
+        barrier()
+        if lane == 0:
+            matrix[w, a, a] = pivot
+            value = solution[w, a]
+            for s in range(a):
+                value -= matrix[w, a, s] * solution[w, s]
+            solution[w, a] = value / pivot
+        for b in range(a + 1 + lane, n, team):
             value = matrix[w, b, a]
             for s in range(a):
                 value -= matrix[w, b, s] * matrix[w, a, s]
             matrix[w, b, a] = value / pivot
-    for a in range(n):
-        value = solution[w, a]
-        for s in range(a):
-            value -= matrix[w, a, s] * solution[w, s]
-        solution[w, a] = value / matrix[w, a, a]
+        barrier()
+    if lane != 0:
+        return
     for reverse in range(n):
         a = n - 1 - reverse
         value = solution[w, a]

@@ -17,6 +17,9 @@ _INSTANCE = f"{NAMESPACE}:instance"
 _FUNCTION = f"{NAMESPACE}:function"
 _PIN = f"{NAMESPACE}:pin"
 
+MATERIAL_FIELDS = ("youngs_modulus", "poissons_ratio", "density", "viscosity", "mass_damping", "friction")
+"""Numbers of a :class:`Material` that a model stores per instance."""
+
 CONTACT_STIFFNESS_FLOOR = 5.0e7
 """Least contact stiffness per area [Pa/m]: 25 kPa, a firm grasp, sinks 0.5 mm deep."""
 
@@ -45,11 +48,16 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
     declare("function_start", wp.int32, _INSTANCE, references=_FUNCTION)
     declare("particle_start", wp.int32, _INSTANCE, references="particle")
     declare("material_model", wp.int32, _INSTANCE)
-    for name in ("youngs_modulus", "poissons_ratio", "density", "viscosity", "mass_damping", "friction"):
+    for name in MATERIAL_FIELDS:
         declare(name, wp.float32, _INSTANCE)
     declare("contact_stiffness", wp.float32, _INSTANCE)
     declare("q", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
     declare("qd", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
+    # the step before, for BDF2 and for Newton's start; dt_before = 0 says that there is none
+    declare("q_before", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
+    declare("qd_before", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
+    declare("dt_before", wp.float64, _INSTANCE, assignment=assignment.STATE)
+    declare("q_driven", wp.vec3d, _FUNCTION, assignment=assignment.CONTROL)
     declare("pin_instance", wp.int32, _PIN, references=_INSTANCE)
     declare("pin_point", wp.vec3d, _PIN)
     declare("pin_stiffness", wp.float32, _PIN)
@@ -126,7 +134,10 @@ def add_reduced_body(
     )
     function_start = len(builder.custom_attributes[f"{NAMESPACE}:q"].values or [])
     builder.add_custom_values_batch(
-        [{f"{NAMESPACE}:q": wp.vec3d(*a), f"{NAMESPACE}:qd": wp.vec3d(*b)} for a, b in zip(q, qd, strict=True)]
+        [
+            {f"{NAMESPACE}:q": wp.vec3d(*a), f"{NAMESPACE}:qd": wp.vec3d(*b), f"{NAMESPACE}:q_driven": wp.vec3d(*a)}
+            for a, b in zip(q, qd, strict=True)
+        ]
     )
     values = {
         "body_key": body_key(body),
@@ -135,7 +146,7 @@ def add_reduced_body(
         "material_model": int(material.model),
         "contact_stiffness": float(stiffness),
     }
-    for name in ("youngs_modulus", "poissons_ratio", "density", "viscosity", "mass_damping", "friction"):
+    for name in MATERIAL_FIELDS:
         values[name] = getattr(material, name)
     index = builder.add_custom_values(**{f"{NAMESPACE}:{name}": value for name, value in values.items()})
     return index[f"{NAMESPACE}:function_start"]

@@ -111,7 +111,7 @@ class SolverCoupledReduced(SolverBase):
         self.rigid.step(state_in, self.predicted_state, control, contacts, dt)
         self._linearise(state_in, dt)
 
-        self.reduced.begin(state_in, dt)
+        self.reduced.begin(state_in, control, dt)
         self.reduced.detect(state_in, control, dt, prescribed=False)
         self.reduced.minimise(dt)
         self.reduced.finish(state_out, dt)

@@ -6,111 +6,120 @@ substitution of every right-hand side, and the half of a Schur complement, come 
 
 Rows are stored as 8-wide vectors. Measured on one CPU core (112 x 256 x 112 product, AVX-512): arithmetic on
 ``wp.types.vector(length=8)`` or 16 reaches 50-150 Gflop/s where ``wp.tile_matmul`` reaches 9, because Warp's CPU tiles
-are scalar loops; on CUDA the same code is a register-blocked product, parallel over systems and column blocks.
+are scalar loops. On CUDA a team of threads shares a system, each with columns of its own, in one launch: with eight
+columns per thread instead one H200 needs ten times as long for a single system of 192 unknowns, twice for 4,096.
 """
+
+from typing import Any
 
 import warp as wp
 
+from softmode.deformables.lanes import LANES, TEAM, barrier, mat88, pad, sum8, vec8
+
+__all__ = ["LANES", "BlockCholesky", "pad", "vec8"]
+
 wp.set_module_options({"enable_backward": False})
-
-LANES = 8
-"""Width of the row vectors; every dimension is padded to a multiple of it."""
-
-vec8 = wp.types.vector(length=LANES, dtype=float)
-mat88 = wp.types.matrix(shape=(LANES, LANES), dtype=float)
-
-
-def pad(count: int) -> int:
-    """Return ``count`` rounded up to a multiple of :data:`LANES`."""
-    return -(-count // LANES) * LANES
 
 
 @wp.kernel
-def _update_row_block(
+def _factor(
     # Selection:
     system_world: wp.array[int],  # (system_count,)
     active: wp.array[int],  # (world_count,)
-    block: int,
-    # In and out:
+    block_count: int,
+    team: int,
+    width: int,
+    # In and out, the same memory in blocks of eight columns, and in units of ``width`` = 8 (vec8) or 1 (float) columns:
     matrix: wp.array3d[vec8],  # (system_count, N, (N + M) / 8)
-):
-    """Subtract sum_s U_sa U_sl, s above the block, from the rows a of one row block (left-looking)."""
-    i, offset = wp.tid()
-    if active[system_world[i]] == 0:
-        return
-    l = block + offset
-    first = LANES * block
-    r0 = vec8()
-    r1 = vec8()
-    r2 = vec8()
-    r3 = vec8()
-    r4 = vec8()
-    r5 = vec8()
-    r6 = vec8()
-    r7 = vec8()
-    for s in range(first):
-        u = matrix[i, s, block]
-        v = matrix[i, s, l]
-        r0 += u[0] * v
-        r1 += u[1] * v
-        r2 += u[2] * v
-        r3 += u[3] * v
-        r4 += u[4] * v
-        r5 += u[5] * v
-        r6 += u[6] * v
-        r7 += u[7] * v
-    matrix[i, first, l] = matrix[i, first, l] - r0
-    matrix[i, first + 1, l] = matrix[i, first + 1, l] - r1
-    matrix[i, first + 2, l] = matrix[i, first + 2, l] - r2
-    matrix[i, first + 3, l] = matrix[i, first + 3, l] - r3
-    matrix[i, first + 4, l] = matrix[i, first + 4, l] - r4
-    matrix[i, first + 5, l] = matrix[i, first + 5, l] - r5
-    matrix[i, first + 6, l] = matrix[i, first + 6, l] - r6
-    matrix[i, first + 7, l] = matrix[i, first + 7, l] - r7
-
-
-@wp.kernel
-def _factor_row_block(
-    # Selection:
-    system_world: wp.array[int],
-    active: wp.array[int],
-    block: int,
-    # In and out:
-    matrix: wp.array3d[vec8],  # (system_count, N, (N + M) / 8)
+    unit: wp.array3d[Any],  # (system_count, N, (N + M) / width)
     # Out:
-    diagonal_out: wp.array2d[
-        vec8
-    ],  # (system_count, N): rows of the 8x8 diagonal blocks of U, inverse pivots on the diagonal
+    diagonal_out: wp.array2d[vec8],  # (system_count, N): rows of the diagonal blocks of U, inverse pivots on the diagonal
+    indefinite_out: wp.array[int],  # (system_count,), 1 where a pivot had to be raised
 ):
-    """Factor the 8x8 diagonal block (every thread its own copy) and solve U_bb^T X = A_bl for one column block."""
-    i, offset = wp.tid()
+    """Factor row block by row block: subtract what is above (left-looking), then solve with the diagonal block."""
+    i, lane = wp.tid()
     if active[system_world[i]] == 0:
         return
-    l = block + offset
-    first = LANES * block
-    U = mat88()
-    for a in range(8):
-        row = matrix[i, first + a, block]
-        pivot = row[a]
-        floor = wp.max(1.0e-6 * wp.abs(pivot), 1.0e-30)
-        for s in range(a):
-            factor = U[s, a]
-            for b in range(8):
-                row[b] -= factor * U[s, b]
-        inverse = 1.0 / wp.sqrt(wp.max(row[a], floor))
-        for b in range(8):
-            U[a, b] = inverse * row[b]
-        diagonal = vec8()
-        for b in range(8):
-            diagonal[b] = U[a, b]
-        diagonal[a] = inverse
-        if offset == 0:
-            diagonal_out[i, first + a] = diagonal
-        else:
-            x = matrix[i, first + a, l]
+    total = unit.shape[2]
+    indefinite = int(0)
+    for block in range(block_count):
+        first = LANES * block
+        for l in range(first / width + lane, total, team):
+            r0 = unit[i, first, l]
+            r1 = unit[i, first + 1, l]
+            r2 = unit[i, first + 2, l]
+            r3 = unit[i, first + 3, l]
+            r4 = unit[i, first + 4, l]
+            r5 = unit[i, first + 5, l]
+            r6 = unit[i, first + 6, l]
+            r7 = unit[i, first + 7, l]
+            for above in range(block):
+                for a in range(8):
+                    s = LANES * above + a
+                    u = matrix[i, s, block]
+                    v = unit[i, s, l]
+                    r0 = r0 - u[0] * v
+                    r1 = r1 - u[1] * v
+                    r2 = r2 - u[2] * v
+                    r3 = r3 - u[3] * v
+                    r4 = r4 - u[4] * v
+                    r5 = r5 - u[5] * v
+                    r6 = r6 - u[6] * v
+                    r7 = r7 - u[7] * v
+            unit[i, first, l] = r0
+            unit[i, first + 1, l] = r1
+            unit[i, first + 2, l] = r2
+            unit[i, first + 3, l] = r3
+            unit[i, first + 4, l] = r4
+            unit[i, first + 5, l] = r5
+            unit[i, first + 6, l] = r6
+            unit[i, first + 7, l] = r7
+        barrier()
+        # every thread factors its own copy of the diagonal block (inverse pivots): cheaper than waiting for one
+        U = mat88()
+        for a in range(8):
+            row = matrix[i, first + a, block]
+            floor = wp.max(1.0e-6 * wp.abs(row[a]), 1.0e-30)
             for s in range(a):
-                x -= U[s, a] * matrix[i, first + s, l]
-            matrix[i, first + a, l] = inverse * x
+                factor = U[s, a]
+                for b in range(8):
+                    row[b] -= factor * U[s, b]
+            if row[a] < floor:
+                indefinite = 1
+            inverse = 1.0 / wp.sqrt(wp.max(row[a], floor))
+            for b in range(8):
+                U[a, b] = inverse * row[b]
+            U[a, a] = inverse
+            if lane == 0:
+                diagonal = vec8()
+                for b in range(8):
+                    diagonal[b] = U[a, b]
+                diagonal_out[i, first + a] = diagonal
+        for l in range((first + LANES) / width + lane, total, team):
+            x0 = U[0, 0] * unit[i, first, l]
+            x1 = U[1, 1] * (unit[i, first + 1, l] - U[0, 1] * x0)
+            x2 = U[2, 2] * (unit[i, first + 2, l] - U[0, 2] * x0 - U[1, 2] * x1)
+            x3 = unit[i, first + 3, l] - U[0, 3] * x0 - U[1, 3] * x1 - U[2, 3] * x2
+            x3 = U[3, 3] * x3
+            x4 = unit[i, first + 4, l] - U[0, 4] * x0 - U[1, 4] * x1 - U[2, 4] * x2 - U[3, 4] * x3
+            x4 = U[4, 4] * x4
+            x5 = unit[i, first + 5, l] - U[0, 5] * x0 - U[1, 5] * x1 - U[2, 5] * x2 - U[3, 5] * x3 - U[4, 5] * x4
+            x5 = U[5, 5] * x5
+            x6 = unit[i, first + 6, l] - U[0, 6] * x0 - U[1, 6] * x1 - U[2, 6] * x2 - U[3, 6] * x3 - U[4, 6] * x4
+            x6 = U[6, 6] * (x6 - U[5, 6] * x5)
+            x7 = unit[i, first + 7, l] - U[0, 7] * x0 - U[1, 7] * x1 - U[2, 7] * x2 - U[3, 7] * x3 - U[4, 7] * x4
+            x7 = U[7, 7] * (x7 - U[5, 7] * x5 - U[6, 7] * x6)
+            unit[i, first, l] = x0
+            unit[i, first + 1, l] = x1
+            unit[i, first + 2, l] = x2
+            unit[i, first + 3, l] = x3
+            unit[i, first + 4, l] = x4
+            unit[i, first + 5, l] = x5
+            unit[i, first + 6, l] = x6
+            unit[i, first + 7, l] = x7
+        barrier()
+    if lane == 0:
+        indefinite_out[i] = indefinite
 
 
 @wp.kernel
@@ -120,39 +129,46 @@ def _back_substitute(
     active: wp.array[int],
     block_count: int,
     column: int,
+    team: int,
     # Factor:
     matrix: wp.array3d[vec8],  # (system_count, N, (N + M) / 8)
     diagonal: wp.array2d[vec8],  # (system_count, N)
     # Schur correction:
     tail: wp.array2d[wp.float64],  # (world_count, tail_count): unknowns already known
     tail_count: int,
+    # Scratch:
+    right: wp.array2d[float],  # (system_count, N)
     # Out:
     solution_out: wp.array2d[vec8],  # (system_count, N / 8)
 ):
     """Solve U x = y - Y t from the last row up; y is right-hand column ``column``, Y the ``tail_count`` first ones."""
-    i = wp.tid()
+    i, lane = wp.tid()
     world = system_world[i]
     if active[world] == 0:
         return
+    for row in range(lane, LANES * block_count, team):
+        value = matrix[i, row, block_count + column / 8][column % 8]
+        for j in range(tail_count):
+            value -= matrix[i, row, block_count + j / 8][j % 8] * float(tail[world, j])
+        right[i, row] = value
+    barrier()
     for step in range(block_count):
         block = block_count - 1 - step
+        first = LANES * block
         x = vec8()
         for reverse in range(8):
             a = 7 - reverse
-            row = LANES * block + a
-            rest = vec8()
-            for l in range(block + 1, block_count):
-                rest += wp.cw_mul(matrix[i, row, l], solution_out[i, l])
-            value = matrix[i, row, block_count + column / 8][column % 8]
-            for j in range(tail_count):
-                value -= matrix[i, row, block_count + j / 8][j % 8] * float(tail[world, j])
-            d = diagonal[i, row]
+            value = right[i, first + a]
+            d = diagonal[i, first + a]
             for b in range(8):
-                value -= rest[b]
                 if b > a:
                     value -= d[b] * x[b]
             x[a] = value * d[a]
-        solution_out[i, block] = x
+        if lane == 0:
+            solution_out[i, block] = x
+        for row in range(lane, first, team):
+            right[i, row] = right[i, row] - sum8(wp.cw_mul(matrix[i, row, block], x))
+        barrier()
 
 
 class BlockCholesky:
@@ -165,7 +181,7 @@ class BlockCholesky:
         device: Warp device.
     """
 
-    def __init__(self, system_world: wp.array, size: int, column_count: int, device) -> None:
+    def __init__(self, system_world: wp.array, size: int, column_count: int, device: Any) -> None:
         """Allocate everything once."""
         self.system_world = system_world
         self.system_count = system_world.shape[0]
@@ -175,34 +191,33 @@ class BlockCholesky:
         self.device = device
         total = self.block_count + self.column_block_count
         self.matrix = wp.zeros((self.system_count, size, total), dtype=vec8, device=device)
+        self.team, self.width, self._unit = 1, LANES, self.matrix
+        if wp.get_device(device).is_cuda:
+            columns = LANES * total
+            self.team, self.width = min(-(-columns // TEAM) * TEAM, 8 * TEAM), 1
+            shape = (self.system_count, size, columns)
+            self._unit = wp.array(ptr=self.matrix.ptr, dtype=float, shape=shape, device=device, copy=False)
+        self.indefinite = wp.zeros(self.system_count, dtype=int, device=device)
         self.diagonal = wp.zeros((self.system_count, size), dtype=vec8, device=device)
+        self.right = wp.zeros((self.system_count, size), dtype=float, device=device)
         self.solution = wp.zeros((self.system_count, self.block_count), dtype=vec8, device=device)
 
     def factor(self, active: wp.array) -> None:
-        """Replace [A | B] by [U | U^-T B] in the active worlds; only the upper triangle of A is read."""
-        for block in range(self.block_count):
-            shape = (self.system_count, self.block_count - block + self.column_block_count)
-            selection = [self.system_world, active, block, self.matrix]
-            if block > 0:
-                wp.launch(_update_row_block, dim=shape, inputs=selection, device=self.device)
-            wp.launch(_factor_row_block, dim=shape, inputs=selection, outputs=[self.diagonal], device=self.device)
+        """Replace [A | B] by [U | U^-T B] in the active worlds; only the upper triangle of A is read.
+
+        Sets ``indefinite`` where a pivot had to be raised.
+        """
+        selection = [self.system_world, active, self.block_count, self.team, self.width]
+        self._launch(_factor, [*selection, self.matrix, self._unit], [self.diagonal, self.indefinite])
 
     def solve(self, active: wp.array, column: int, tail: wp.array, tail_count: int) -> wp.array:
         """Return x of U x = y - Y tail, shape (system_count, N / 8) of 8-vectors."""
-        wp.launch(
-            _back_substitute,
-            dim=self.system_count,
-            inputs=[
-                self.system_world,
-                active,
-                self.block_count,
-                column,
-                self.matrix,
-                self.diagonal,
-                tail,
-                tail_count,
-            ],
-            outputs=[self.solution],
-            device=self.device,
-        )
+        selection = [self.system_world, active, self.block_count, column, self.team]
+        system = [self.matrix, self.diagonal, tail, tail_count, self.right]
+        self._launch(_back_substitute, [*selection, *system], [self.solution])
         return self.solution
+
+    def _launch(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
+        """Launch one team per system."""
+        dim = (self.system_count, self.team)
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, block_dim=self.team, device=self.device)

@@ -1,239 +1,436 @@
 """Device side of the reduced step: state in and out, elastic energy, stress and Hessian, the gradient.
 
-One *instance* is one body in one world. The incremental potential of a world is, over its instances,
+The incremental potential of a world is, over its instances,
 
-    sum_i [ m/(2 dt^2) |q - q_n - dt v_n|^2 + m alpha/(2 dt) |q - q_n|^2
+    sum_i [ m c^2/(2 dt^2) |q - q_inertial|^2 + m alpha c/(2 dt) |q - q_rate|^2
             + sum_p V_p Psi(F_p) - f . q + contacts and pins ]
     + 1/2 (r - r_predicted)^T M_eff/dt^2 (r - r_predicted)
 
 with r = dt * joint velocity of the rigid dofs that take part (see ``coupling``). The basis is mass-orthonormal, so the
-mass matrix of a body is its mass times the identity. Unknowns of one instance are ordered component-major,
-row = c * stride + k, with the function count padded to ``stride``, a multiple of 8.
+mass matrix of a body is its mass times the identity. With velocity v = c (q - q_rate)/dt and acceleration
+c (v - v_rate)/dt, q_inertial = q_rate + dt/c v_rate:
+
+    implicit Euler  c = 1,    q_rate = q_n,                      v_rate = v_n
+    BDF2            c = 3/2,  q_rate = (4 q_n - q_(n-1))/3,      v_rate = (4 v_n - v_(n-1))/3
 
 Precision: basis data float32; q, energy and residual float64; the Newton direction float32.
 """
 
 import warp as wp
 
-from softmode.deformables.materials import MaterialParameters, energy, hessian, lame, stress
-from softmode.deformables.status import WORLD_NOT_FINITE
+from softmode.deformables.lanes import LANES, barrier, sum8d, vec8, vec8d
+from softmode.deformables.materials import (
+    MaterialModel,
+    MaterialParameters,
+    determinant_minus_one,
+    energy,
+    hessian,
+    lame,
+    stress,
+)
+from softmode.deformables.status import WORLD_COLLAPSED, WORLD_NOT_FINITE
+from softmode.deformables.tables import (
+    Basis,
+    Entries,
+    Instances,
+    Motion,
+    Points,
+    Progress,
+    Rigid,
+    blocks_of,
+    interpolate,
+)
 
 wp.set_module_options({"enable_backward": False})
+
+NEEDS_FEASIBLE_START = wp.constant(int(MaterialModel.__members__.get("NEO_HOOKEAN", -1)))
+"""The material that forbids inversion: a step starts where the last one ended."""
+COLLAPSED_RATIO = wp.constant(0.01)
+"""Points whose volume is below this fraction of their rest volume count as collapsed, and"""
+COLLAPSED_SHARE = wp.constant(0.1)
+"""a body of which more than this share has collapsed is flagged."""
+
+
+@wp.kernel
+def sum_external(
+    instances: Instances,
+    basis: Basis,
+    particle_f: wp.array[wp.vec3],  # (particle_count,) [N]
+    chunk_count: int,
+    # Out:
+    chunk_out: wp.array3d[vec8d],  # (instance_count, chunk_count, 3 block_count) [N]
+):
+    """Sum b_k f over one chunk of the surface samples."""
+    i, chunk, b = wp.tid()
+    stride = basis.row.shape[1]
+    x = vec8d()
+    y = vec8d()
+    z = vec8d()
+    count = instances.sample_count[i]
+    for s in range(chunk * count / chunk_count, (chunk + 1) * count / chunk_count):
+        f = wp.vec3d(particle_f[instances.particle_start[i] + s])
+        value = vec8d(basis.row[instances.row_start[i] + s, b])
+        x = x + f[0] * value
+        y = y + f[1] * value
+        z = z + f[2] * value
+    chunk_out[i, chunk, b] = x
+    chunk_out[i, chunk, stride + b] = y
+    chunk_out[i, chunk, 2 * stride + b] = z
 
 
 @wp.kernel
 def begin_step(
-    # Instances:
-    function_start: wp.array[int],
-    function_count: wp.array[int],
-    asset: wp.array[int],
-    world: wp.array[int],
-    mass: wp.array[wp.float64],  # (instance_count,) [kg]
-    row_start: wp.array[int],
-    sample_count: wp.array[int],
-    particle_start: wp.array[int],
-    # Assets:
-    mean_basis: wp.array2d[wp.float64],  # (asset_count, stride)
-    row_basis: wp.array2d[float],  # (row_count, stride)
+    instances: Instances,
+    basis: Basis,
     # Model and state in:
     gravity: wp.array[wp.vec3],  # (world_count,) [m/s^2]
     q_in: wp.array[wp.vec3d],  # (function_total,) [m]
     qd_in: wp.array[wp.vec3d],  # (function_total,) [m/s]
-    particle_f: wp.array[wp.vec3],  # (particle_count,) [N]
+    q_before: wp.array[wp.vec3d],  # q_(n-1)
+    qd_before: wp.array[wp.vec3d],  # v_(n-1)
+    dt_before: wp.array[wp.float64],  # (instance_count,) [s], 0 where there was no step before
+    q_driven: wp.array[wp.vec3d],  # (function_total,), where the driven functions are to be at the end of the step
+    external: wp.array3d[vec8d],  # (instance_count, chunk_count, 3 block_count) [N]
     dt: wp.float64,
+    bdf2: int,
     # Out:
-    q_start_out: wp.array2d[wp.vec3d],  # (instance_count, stride)
-    q_inertial_out: wp.array2d[wp.vec3d],
-    q_out: wp.array2d[wp.vec3d],
-    force_out: wp.array2d[wp.vec3d],
+    motion: Motion,
+    q_out: wp.array2d[vec8d],
 ):
-    """Read the state, predict q + dt v and gather gravity and external point forces as generalised forces."""
-    i, k = wp.tid()
-    if k >= function_count[i]:
+    """Read the state, predict where the body goes, and add gravity to the external forces."""
+    i, b = wp.tid()
+    n = instances.function_count[i]
+    if LANES * b >= n:
         return
-    q = q_in[function_start[i] + k]
-    qd = qd_in[function_start[i] + k]
-    force = mass[i] * mean_basis[asset[i], k] * wp.vec3d(gravity[wp.max(world[i], 0)])
-    if particle_f.shape[0] > 0:
-        for s in range(sample_count[i]):
-            force += wp.float64(row_basis[row_start[i] + s, k]) * wp.vec3d(particle_f[particle_start[i] + s])
-    q_start_out[i, k] = q
-    q_inertial_out[i, k] = q + dt * qd
-    q_out[i, k] = q + dt * qd
-    force_out[i, k] = force
+    stride = basis.row.shape[1]
+    first = instances.function_start[i] + LANES * b
+    driven = instances.driven_count[i] - LANES * b
+    again = wp.abs(dt_before[i] - dt) < wp.float64(1.0e-6) * dt
+    c = wp.float64(1.0)
+    if again and bdf2 != 0:
+        c = wp.float64(1.5)
+    # Newton starts from the motion that goes on; a material that forbids inversion wants a feasible start
+    ahead = wp.float64(1.0)
+    if instances.material_model[i] == NEEDS_FEASIBLE_START:
+        ahead = wp.float64(0.0)
+    third = wp.float64(1.0) / wp.float64(3.0)
+    for axis in range(3):
+        q = vec8d()
+        qd = vec8d()
+        q_rate = vec8d()
+        qd_rate = vec8d()
+        change = vec8d()
+        start = vec8d()
+        for lane in range(LANES):
+            if LANES * b + lane < n:
+                q[lane] = q_in[first + lane][axis]
+                qd[lane] = qd_in[first + lane][axis]
+                q_rate[lane] = q[lane]
+                qd_rate[lane] = qd[lane]
+                if c > wp.float64(1.0):
+                    q_rate[lane] += third * (q[lane] - q_before[first + lane][axis])
+                    qd_rate[lane] += third * (qd[lane] - qd_before[first + lane][axis])
+                start[lane] = q[lane] + ahead * dt * qd[lane]
+                if again:
+                    change[lane] = ahead * dt * (qd[lane] - qd_before[first + lane][axis])
+                if lane < driven:
+                    start[lane] = q_driven[first + lane][axis]
+                    change[lane] = wp.float64(0.0)
+        e = axis * stride + b
+        motion.q_start[i, e] = q
+        motion.qd_start[i, e] = qd
+        motion.q_rate[i, e] = q_rate
+        motion.q_inertial[i, e] = q_rate + dt / c * qd_rate
+        motion.change[i, e] = change
+        q_out[i, e] = start
+    motion.rate[i] = c
+    weight = instances.mass[i] * vec8d(basis.mean[instances.asset[i], b])
+    g = wp.vec3d(gravity[wp.max(instances.world[i], 0)])
+    fx = g[0] * weight
+    fy = g[1] * weight
+    fz = g[2] * weight
+    for chunk in range(external.shape[1]):
+        fx = fx + external[i, chunk, b]
+        fy = fy + external[i, chunk, stride + b]
+        fz = fz + external[i, chunk, 2 * stride + b]
+    motion.force[i, b] = fx
+    motion.force[i, stride + b] = fy
+    motion.force[i, 2 * stride + b] = fz
+
+
+@wp.kernel
+def begin_newton(
+    progress: Progress,
+    instances: Instances,
+    entries: Entries,
+):
+    """Start Newton's iteration in every world."""
+    w = wp.tid()
+    touching = int(0)
+    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
+        if entries.count[i] > instances.pin_count[i]:
+            touching = 1
+    progress.touching[w] = touching
+    progress.active[w] = 1
+    progress.renew[w] = 1
+    progress.project[w] = 0
+    progress.failures[w] = 0
+    progress.exact[w] = 0
+    progress.iteration[w] = 0
+    progress.any_active[0] = 1
+
+
+@wp.kernel
+def extrapolate(
+    instances: Instances,
+    motion: Motion,
+    entries: Entries,
+    # In and out:
+    q: wp.array2d[vec8d],
+):
+    """Let a body that touches nothing start Newton with the acceleration of the step before as well."""
+    i, e = wp.tid()
+    if entries.count[i] == instances.pin_count[i]:
+        q[i, e] = q[i, e] + motion.change[i, e]
 
 
 @wp.func
-def displacement_gradient(
-    grad_basis: wp.array2d[wp.vec3], q: wp.array2d[wp.vec3d], instance: int, point: int, function_count: int
-):
+def displacement_gradient(basis: Basis, q: wp.array2d[vec8d], i: int, point: int, function_count: int):
     """Return G = F - I = sum_k q_k (grad b_k)^T."""
+    stride = basis.row.shape[1]
     G = wp.mat33d()
-    for k in range(function_count):
-        G += wp.outer(q[instance, k], wp.vec3d(grad_basis[point, k]))
+    for b in range(blocks_of(function_count)):
+        gx = vec8d(basis.gradient[b, point, 0])
+        gy = vec8d(basis.gradient[b, point, 1])
+        gz = vec8d(basis.gradient[b, point, 2])
+        for axis in range(3):
+            x = q[i, axis * stride + b]
+            G[axis, 0] += sum8d(wp.cw_mul(x, gx))
+            G[axis, 1] += sum8d(wp.cw_mul(x, gy))
+            G[axis, 2] += sum8d(wp.cw_mul(x, gz))
     return G
 
 
 @wp.kernel
 def evaluate_points(
-    # Instances:
-    world: wp.array[int],
-    function_count: wp.array[int],
-    point_start: wp.array[int],
-    point_count: wp.array[int],
-    material_model: wp.array[int],
-    youngs_modulus: wp.array[float],  # [Pa]
-    poissons_ratio: wp.array[float],
-    viscosity: wp.array[float],  # [s]
-    # Assets:
-    grad_basis: wp.array2d[wp.vec3],  # (point_total, stride) [1/m]
-    point_weight: wp.array[wp.float64],  # (point_total,) [m^3]
-    stiffness_scale: wp.array[float],  # (point_total,)
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
     # State in:
     selected: wp.array[int],  # (world_count,)
-    q_start: wp.array2d[wp.vec3d],
-    q: wp.array2d[wp.vec3d],
+    q: wp.array2d[vec8d],
     dt: wp.float64,
     derivatives: int,
-    renew: wp.array[int],  # (world_count,), whether to evaluate the Hessian too
+    progress: Progress,
     # Out:
-    energy_out: wp.array2d[wp.float64],  # (instance_count, point_max) [J]
-    stress_out: wp.array2d[wp.mat33d],  # (instance_count, point_max), V P [N m]
-    hessian_out: wp.array3d[wp.mat33],  # (instance_count, 6, point_max), blocks of V d2Psi/dF2 [N m]
+    points: Points,
 ):
     """Evaluate V_p Psi(F_p) and, where asked, its derivatives at every cubature point."""
     i, p = wp.tid()
-    if selected[world[i]] == 0 or p >= point_count[i]:
+    if selected[instances.world[i]] == 0 or p >= instances.point_count[i]:
         return
-    row = point_start[i] + p
+    point = instances.point_start[i] + p
     parameters = MaterialParameters()
-    mu, lam = lame(youngs_modulus[i] * stiffness_scale[row], poissons_ratio[i])
-    parameters.model = material_model[i]
+    mu, lam = lame(instances.youngs_modulus[i] * basis.stiffness_scale[point], instances.poissons_ratio[i])
+    parameters.model = instances.material_model[i]
     parameters.mu = mu
     parameters.lam = lam
-    parameters.viscosity = wp.float64(viscosity[i])
-    weight = point_weight[row]
+    parameters.viscosity = wp.float64(instances.viscosity[i])
+    weight = basis.point_weight[point]
 
-    G = displacement_gradient(grad_basis, q, i, row, function_count[i])
+    G = displacement_gradient(basis, q, i, point, instances.function_count[i])
     G_start = G
-    if viscosity[i] > 0.0:
-        G_start = displacement_gradient(grad_basis, q_start, i, row, function_count[i])
-    energy_out[i, p] = weight * energy(parameters, G, G_start, dt)
+    if instances.viscosity[i] > 0.0:
+        G_start = displacement_gradient(basis, motion.q_start, i, point, instances.function_count[i])
+    points.energy[i, p] = weight * energy(parameters, G, G_start, dt)
     if derivatives != 0:
-        stress_out[i, p] = weight * stress(parameters, G, G_start, dt)
-    if derivatives != 0 and renew[world[i]] != 0:
-        C = float(weight) * hessian(parameters, G, dt)
+        points.stress[i, p] = weight * stress(parameters, G, G_start, dt)
+        points.volume_ratio[i, p] = float(wp.float64(1.0) + determinant_minus_one(G))
+    if derivatives != 0 and progress.renew[instances.world[i]] != 0:
+        C = float(weight) * hessian(parameters, G, G_start, dt, progress.project[instances.world[i]])
         for pair in range(6):
             r = 3 * pair
-            hessian_out[i, pair, p] = wp.mat33(
+            points.hessian[i, pair, p] = wp.mat33(
                 C[r, 0], C[r, 1], C[r, 2], C[r + 1, 0], C[r + 1, 1], C[r + 1, 2], C[r + 2, 0], C[r + 2, 1], C[r + 2, 2]
             )
 
 
 @wp.kernel
-def gather_gradient(
-    # Instances:
-    world: wp.array[int],
-    function_count: wp.array[int],
-    point_start: wp.array[int],
-    point_count: wp.array[int],
-    mass: wp.array[wp.float64],
-    mass_damping: wp.array[float],
-    # Assets:
-    grad_basis: wp.array2d[wp.vec3],
-    row_basis: wp.array2d[float],
-    # State in:
+def sum_forces(
+    instances: Instances,
+    basis: Basis,
+    points: Points,
+    entries: Entries,
     active: wp.array[int],
-    q_start: wp.array2d[wp.vec3d],
-    q_inertial: wp.array2d[wp.vec3d],
-    q: wp.array2d[wp.vec3d],
-    force: wp.array2d[wp.vec3d],
-    point_stress: wp.array2d[wp.mat33d],
-    entry_count: wp.array[int],
-    entry_row: wp.array2d[int],
-    entry_force: wp.array2d[wp.vec3d],
+    chunk_count: int,
+    # Out:
+    chunk_out: wp.array3d[vec8d],  # (instance_count, chunk_count, 3 block_count) [N]
+):
+    """Sum V P grad b_k over one chunk of the points, less b_k f over one chunk of the entries."""
+    i, chunk, b = wp.tid()
+    if active[instances.world[i]] == 0 or LANES * b >= instances.function_count[i]:
+        return
+    stride = basis.row.shape[1]
+    x = vec8d()
+    y = vec8d()
+    z = vec8d()
+    first = instances.point_start[i]
+    count = instances.point_count[i]
+    for p in range(chunk * count / chunk_count, (chunk + 1) * count / chunk_count):
+        P = points.stress[i, p]
+        gx = vec8d(basis.gradient_across[b, first + p, 0])
+        gy = vec8d(basis.gradient_across[b, first + p, 1])
+        gz = vec8d(basis.gradient_across[b, first + p, 2])
+        x = x + P[0, 0] * gx
+        x = x + P[0, 1] * gy
+        x = x + P[0, 2] * gz
+        y = y + P[1, 0] * gx
+        y = y + P[1, 1] * gy
+        y = y + P[1, 2] * gz
+        z = z + P[2, 0] * gx
+        z = z + P[2, 1] * gy
+        z = z + P[2, 2] * gz
+    count = entries.count[i]
+    for e in range(chunk * count / chunk_count, (chunk + 1) * count / chunk_count):
+        f = entries.force[i, e]
+        value = vec8d(basis.row[entries.row[i, e], b])
+        x = x - f[0] * value
+        y = y - f[1] * value
+        z = z - f[2] * value
+    chunk_out[i, chunk, b] = x
+    chunk_out[i, chunk, stride + b] = y
+    chunk_out[i, chunk, 2 * stride + b] = z
+
+
+@wp.kernel
+def sum_gradient(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    active: wp.array[int],
+    chunk: wp.array3d[vec8d],
+    q: wp.array2d[vec8d],
     dt: wp.float64,
     # Out:
-    gradient_out: wp.array2d[wp.vec3d],  # (instance_count, stride) [N]
+    gradient_out: wp.array2d[vec8d],  # [N]; zero for driven functions
+    reaction_out: wp.array2d[vec8d],  # [N]; what holds the driven functions, zero for the others
 ):
-    """Compute g_k = m/dt^2 (q_k - q_inertial) + m alpha/dt (q_k - q_n) + sum_p V P grad b_k - f_k - sum_e b_k f_e."""
-    i, k = wp.tid()
-    if active[world[i]] == 0 or k >= function_count[i]:
+    """Compute g = m c^2/dt^2 (q - q_inertial) + m alpha c/dt (q - q_rate) - f + sum_p V P grad b - sum_e b f_e."""
+    i, e = wp.tid()
+    stride = basis.row.shape[1]
+    b = e % stride
+    if active[instances.world[i]] == 0 or LANES * b >= instances.function_count[i]:
         return
-    damping = mass[i] * wp.float64(mass_damping[i]) / dt
-    g = mass[i] / (dt * dt) * (q[i, k] - q_inertial[i, k]) + damping * (q[i, k] - q_start[i, k]) - force[i, k]
-    first = point_start[i]
-    for p in range(point_count[i]):
-        g += point_stress[i, p] * wp.vec3d(grad_basis[first + p, k])
-    for e in range(entry_count[i]):
-        g -= wp.float64(row_basis[entry_row[i, e], k]) * entry_force[i, e]
-    gradient_out[i, k] = g
+    c = motion.rate[i]
+    mass = instances.mass[i]
+    damping = mass * wp.float64(instances.mass_damping[i]) * c / dt
+    g = mass * c * c / (dt * dt) * (q[i, e] - motion.q_inertial[i, e])
+    g = g + damping * (q[i, e] - motion.q_rate[i, e]) - motion.force[i, e]
+    for k in range(chunk.shape[1]):
+        g = g + chunk[i, k, e]
+    reaction = vec8d()
+    for lane in range(LANES):
+        if LANES * b + lane < instances.driven_count[i]:
+            reaction[lane] = g[lane]
+            g[lane] = wp.float64(0.0)
+    gradient_out[i, e] = g
+    reaction_out[i, e] = reaction
 
 
 @wp.kernel
 def end_step(
-    # Instances:
-    function_start: wp.array[int],
-    function_count: wp.array[int],
-    world: wp.array[int],
+    instances: Instances,
+    motion: Motion,
     # State in:
     status: wp.array[int],
-    q_start: wp.array2d[wp.vec3d],
-    q: wp.array2d[wp.vec3d],
+    q: wp.array2d[vec8d],
+    stride: int,
     dt: wp.float64,
     # Out:
     q_out: wp.array[wp.vec3d],
     qd_out: wp.array[wp.vec3d],
+    q_before_out: wp.array[wp.vec3d],
+    qd_before_out: wp.array[wp.vec3d],
+    dt_before_out: wp.array[wp.float64],
 ):
-    """Write the state: v = (q - q_n) / dt; a world that is not finite stays where it was, at rest."""
+    """Write the state: v = c (q - q_rate) / dt; a world that is not finite stays where it was, at rest."""
     i, k = wp.tid()
-    if k >= function_count[i]:
+    if k >= instances.function_count[i]:
         return
-    out = function_start[i] + k
-    if (status[world[i]] & WORLD_NOT_FINITE) != 0:
-        q_out[out] = q_start[i, k]
-        qd_out[out] = wp.vec3d()
-        return
-    q_out[out] = q[i, k]
-    qd_out[out] = (q[i, k] - q_start[i, k]) / dt
+    b = k / LANES
+    lane = k % LANES
+    failed = (status[instances.world[i]] & WORLD_NOT_FINITE) != 0
+    before = wp.vec3d()
+    qd_before = wp.vec3d()
+    now = wp.vec3d()
+    qd = wp.vec3d()
+    for axis in range(3):
+        e = axis * stride + b
+        before[axis] = motion.q_start[i, e][lane]
+        qd_before[axis] = motion.qd_start[i, e][lane]
+        now[axis] = q[i, e][lane]
+        qd[axis] = motion.rate[i] / dt * (now[axis] - motion.q_rate[i, e][lane])
+    if failed:
+        now = before
+        qd = wp.vec3d()
+    out = instances.function_start[i] + k
+    q_out[out] = now
+    qd_out[out] = qd
+    q_before_out[out] = before
+    qd_before_out[out] = qd_before
+    if k == 0:
+        dt_before_out[i] = wp.where(failed, wp.float64(0.0), dt)
 
 
 @wp.kernel
-def check_finite(
-    # Instances:
-    function_count: wp.array[int],
-    # Worlds:
-    instance_start: wp.array[int],
-    rigid_count: wp.array[int],
+def check_state(
+    instances: Instances,
+    points: Points,
+    rigid: Rigid,
+    team: int,
+    stride: int,
     # State in:
-    q: wp.array2d[wp.vec3d],
-    r: wp.array2d[wp.float64],
+    q: wp.array2d[vec8d],
     # In and out:
-    status: wp.array[int],
+    progress: Progress,
 ):
-    """Flag a world whose unknowns are not all finite."""
-    w = wp.tid()
+    """Flag a world whose unknowns are not all finite, or one of whose bodies has collapsed."""
+    w, lane = wp.tid()
     total = wp.float64(0.0)
-    for i in range(instance_start[w], instance_start[w + 1]):
-        for k in range(function_count[i]):
-            total += wp.length_sq(q[i, k])
-    for j in range(rigid_count[w]):
-        total += wp.abs(r[w, j])
-    if not wp.isfinite(total):
-        status[w] = status[w] | WORLD_NOT_FINITE
+    if lane == 0:
+        for j in range(rigid.count[w]):
+            total += wp.abs(rigid.r[w, j])
+    collapsed = float(0.0)
+    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
+        for e in range(lane, 3 * stride, team):
+            total += wp.dot(q[i, e], q[i, e])
+        share = 1.0 / (COLLAPSED_SHARE * float(instances.point_count[i]))
+        flat = float(0.0)
+        for p in range(lane, instances.point_count[i], team):
+            if points.volume_ratio[i, p] < COLLAPSED_RATIO:
+                flat += share
+        progress.partial[w, lane] = wp.float64(flat)
+        barrier()
+        whole = float(0.0)
+        for k in range(team):
+            whole += float(progress.partial[w, k])
+        collapsed = wp.max(collapsed, whole)
+        barrier()
+    progress.partial[w, lane] = total
+    barrier()
+    if lane == 0:
+        for k in range(1, team):
+            total += progress.partial[w, k]
+        if not wp.isfinite(total):
+            progress.status[w] = progress.status[w] | WORLD_NOT_FINITE
+        if collapsed > 1.0:
+            progress.status[w] = progress.status[w] | WORLD_COLLAPSED
 
 
 @wp.kernel
 def skin_samples(
-    # Instances:
-    function_start: wp.array[int],
-    function_count: wp.array[int],
-    row_start: wp.array[int],
-    sample_count: wp.array[int],
-    particle_start: wp.array[int],
-    # Assets:
-    row_point: wp.array[wp.vec3d],  # (row_count,) rest points [m]
-    row_basis: wp.array2d[float],
+    instances: Instances,
+    basis: Basis,
     # State in:
     q: wp.array[wp.vec3d],
     qd: wp.array[wp.vec3d],
@@ -243,43 +440,47 @@ def skin_samples(
 ):
     """Write position and velocity of the surface samples as Newton particles."""
     i, s = wp.tid()
-    if s >= sample_count[i]:
+    if s >= instances.sample_count[i]:
         return
-    row = row_start[i] + s
-    x = row_point[row]
+    row = instances.row_start[i] + s
+    x = basis.row_point[row]
     v = wp.vec3d()
-    for k in range(function_count[i]):
-        b = wp.float64(row_basis[row, k])
-        x += b * q[function_start[i] + k]
-        v += b * qd[function_start[i] + k]
-    particle_q_out[particle_start[i] + s] = wp.vec3(x)
-    particle_qd_out[particle_start[i] + s] = wp.vec3(v)
+    first = instances.function_start[i]
+    n = instances.function_count[i]
+    for b in range(blocks_of(n)):
+        values = basis.row[row, b]
+        for lane in range(wp.min(LANES, n - LANES * b)):
+            value = wp.float64(values[lane])
+            x += value * q[first + LANES * b + lane]
+            v += value * qd[first + LANES * b + lane]
+    particle_q_out[instances.particle_start[i] + s] = wp.vec3(x)
+    particle_qd_out[instances.particle_start[i] + s] = wp.vec3(v)
 
 
 @wp.kernel
 def reset_functions(
-    function_start: wp.array[int],
-    function_count: wp.array[int],
-    world: wp.array[int],
+    instances: Instances,
     world_mask: wp.array[wp.bool],
     q_in: wp.array[wp.vec3d],
     qd_in: wp.array[wp.vec3d],
     # Out:
     q_out: wp.array[wp.vec3d],
     qd_out: wp.array[wp.vec3d],
+    dt_before_out: wp.array[wp.float64],
 ):
-    """Copy the initial coordinates of the bodies in masked worlds."""
+    """Copy the initial coordinates of the bodies in masked worlds and forget the step before."""
     i, k = wp.tid()
-    if k >= function_count[i] or not world_mask[world[i]]:
+    if k >= instances.function_count[i] or not world_mask[instances.world[i]]:
         return
-    f = function_start[i] + k
+    f = instances.function_start[i] + k
     q_out[f] = q_in[f]
     qd_out[f] = qd_in[f]
+    dt_before_out[i] = wp.float64(0.0)
 
 
 @wp.kernel
 def reset_worlds(
-    instance_world: wp.array[int],
+    instances: Instances,
     body_world: wp.array[int],
     world_mask: wp.array[wp.bool],
     # Out:
@@ -291,7 +492,7 @@ def reset_worlds(
     i = wp.tid()
     if i < status_out.shape[0] and world_mask[i]:
         status_out[i] = 0
-    if i < instance_world.shape[0] and world_mask[instance_world[i]]:
+    if i < instances.world.shape[0] and world_mask[instances.world[i]]:
         instance_force_out[i] = wp.vec3d()
     if i < body_world.shape[0]:
         w = body_world[i]

@@ -6,6 +6,8 @@ import newton
 import numpy as np
 import warp as wp
 
+from softmode.deformables.tables import Rigid
+
 
 class RigidDofs:
     """Joint dofs that take part in the solve: per world r = dt * joint velocity and its quadratic model.
@@ -36,6 +38,10 @@ class RigidDofs:
         links, dofs = model.max_joints_per_articulation, model.max_dofs_per_articulation
         shape = (max(model.articulation_count, 1), max(6 * links, 6), max(dofs, 1))
         self.jacobian = wp.zeros(shape, dtype=float, device=device)
+        self.table = Rigid()
+        """The same arrays as the kernels take them."""
+        for name in Rigid.vars:
+            setattr(self.table, name, getattr(self, name))
 
 
 def _articulation_dofs(model: Any) -> tuple[np.ndarray, np.ndarray]:

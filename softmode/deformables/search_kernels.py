@@ -1,308 +1,320 @@
-"""Device side of Newton's iteration: convergence, trial steps, the sum of the potential, acceptance."""
+"""Device side of Newton's iteration: the sum of the potential, convergence, trial steps, acceptance."""
 
 import warp as wp
 
-from softmode.deformables.factor import LANES, vec8
+from softmode.deformables.lanes import barrier, vec8, vec8d
 from softmode.deformables.status import WORLD_ITERATION_LIMIT, WORLD_NO_DESCENT
+from softmode.deformables.tables import Entries, Instances, Motion, Points, Progress, Rigid
 
 wp.set_module_options({"enable_backward": False})
 
 
+INERTIA_SHARE = wp.constant(0.01)
+"""A Hessian serves further iterations while strains have changed it by less than this fraction of the inertia, which
+is all that resists the rotation of a stiff body: beyond, small steps would pass for convergence."""
+PROJECTED_DISTANCE = wp.constant(0.01)
+"""A projected Hessian is kept while steps are larger than this fraction of the size: far from the minimum Newton's own
+is likely to be indefinite again."""
+FAILURES = wp.constant(2)
+"""Indefinite Hessians after which a step keeps to the projected one."""
+PROJECTED_ITERATIONS = wp.constant(8)
+"""Iterations before which a small step with the projected Hessian does not count as convergence."""
+
+
+@wp.func
+def potential_share(
+    progress: Progress,
+    instances: Instances,
+    motion: Motion,
+    points: Points,
+    entries: Entries,
+    rigid: Rigid,
+    q: wp.array2d[vec8d],
+    r: wp.array2d[wp.float64],
+    dt: wp.float64,
+    w: int,
+    lane: int,
+    team: int,
+):
+    """Return one thread's share of the incremental potential of a world [J], in a fixed order."""
+    half = wp.float64(0.5)
+    total = wp.float64(0.0)
+    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
+        c = motion.rate[i]
+        inertial = half * instances.mass[i] * c * c / (dt * dt)
+        damping = half * instances.mass[i] * wp.float64(instances.mass_damping[i]) * c / dt
+        for e in range(lane, q.shape[1], team):
+            x = q[i, e]
+            away = x - motion.q_inertial[i, e]
+            moved = x - motion.q_rate[i, e]
+            step = x - motion.q_start[i, e]
+            total += inertial * wp.dot(away, away) + damping * wp.dot(moved, moved) - wp.dot(motion.force[i, e], step)
+        for p in range(lane, instances.point_count[i], team):
+            total += points.energy[i, p]
+        for e in range(lane, entries.count[i], team):
+            total += entries.energy[i, e]
+    for j in range(lane, rigid.count[w], team):
+        for l in range(rigid.count[w]):
+            total += (
+                half * (r[w, j] - rigid.predicted[w, j]) * rigid.inertia[w, j, l] * (r[w, l] - rigid.predicted[w, l])
+            )
+    return total
+
+
+@wp.func
+def sum_shares(progress: Progress, share: wp.float64, w: int, lane: int, team: int):
+    """Return the sum of the shares of a team, in its first thread."""
+    progress.partial[w, lane] = share
+    barrier()
+    total = share
+    if lane == 0:
+        for k in range(1, team):
+            total += progress.partial[w, k]
+    return total
+
+
 @wp.kernel
-def check_convergence(
-    # Instances:
-    function_count: wp.array[int],
-    mass: wp.array[wp.float64],
-    tolerance: wp.array[float],  # (instance_count,) [m]
-    # Worlds:
-    instance_start: wp.array[int],
+def judge_iterate(
+    instances: Instances,
+    motion: Motion,
+    points: Points,
+    entries: Entries,
+    rigid: Rigid,
+    team: int,
     iteration_max: int,
     force_tolerance: wp.float64,
-    dt: wp.float64,
     # State in:
-    gradient: wp.array2d[wp.vec3d],
-    force: wp.array2d[wp.vec3d],
-    pin_count: wp.array[int],
-    entry_count: wp.array[int],
-    entry_force: wp.array2d[wp.vec3d],
-    last: wp.array[int],
-    iteration: wp.array[int],
+    gradient: wp.array2d[vec8d],
+    q: wp.array2d[vec8d],
+    dt: wp.float64,
     # In and out:
-    active: wp.array[int],
-    status: wp.array[int],
+    progress: Progress,
 ):
-    """Stop a world whose last step was small and whose residual is small against the forces on each of its bodies.
+    """Sum the potential; stop a world whose last step was small and whose residual is small near its contacts.
 
     The second condition matters in contact: within a step's tolerance friction goes from one side of its cone to the
     other, and a residual is momentum that the other body receives and this one does not.
     """
-    w = wp.tid()
-    if active[w] == 0 or iteration[w] == 0:
+    w, lane = wp.tid()
+    if progress.active[w] == 0:
         return
-    done = last[w]
-    for i in range(instance_start[w], instance_start[w + 1]):
-        residual = wp.float64(0.0)
-        external = wp.float64(0.0)
-        for k in range(function_count[i]):
-            residual += wp.length_sq(gradient[i, k])
-            external += wp.length_sq(force[i, k])
-        scale = wp.sqrt(external)
-        for e in range(entry_count[i]):
-            scale += wp.length(entry_force[i, e])
-        floor = wp.float64(1.0e-3) * mass[i] * wp.float64(tolerance[i]) / (dt * dt)
-        if entry_count[i] > pin_count[i] and not (wp.sqrt(residual) <= force_tolerance * scale + floor):
-            done = 0
+    share = potential_share(progress, instances, motion, points, entries, rigid, q, rigid.r, dt, w, lane, team)
+    potential = sum_shares(progress, share, w, lane, team)
+    if lane != 0:
+        return
+    progress.potential[w] = potential
+    if progress.iteration[w] == 0:
+        return
+    done = progress.last[w]
+    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
+        if done == 1 and entries.count[i] > instances.pin_count[i]:
+            residual = wp.float64(0.0)
+            external = wp.float64(0.0)
+            for e in range(q.shape[1]):
+                residual += wp.dot(gradient[i, e], gradient[i, e])
+                external += wp.dot(motion.force[i, e], motion.force[i, e])
+            scale = wp.sqrt(external)
+            for e in range(entries.count[i]):
+                scale += wp.length(entries.force[i, e])
+            floor = wp.float64(1.0e-3) * instances.mass[i] * wp.float64(instances.tolerance[i]) / (dt * dt)
+            if not (wp.sqrt(residual) <= force_tolerance * scale + floor):
+                done = 0
     if done == 1:
-        active[w] = 0
-    elif iteration[w] >= iteration_max:
-        active[w] = 0
-        status[w] = status[w] | WORLD_ITERATION_LIMIT
-
-
-@wp.func
-def unknown(direction: wp.array2d[vec8], instance: int, blocks: int, function: int):
-    """Return the vec3 of one function out of a component-major solution."""
-    lane = function % LANES
-    block = function / LANES
-    return wp.vec3d(
-        wp.float64(direction[instance, block][lane]),
-        wp.float64(direction[instance, blocks + block][lane]),
-        wp.float64(direction[instance, 2 * blocks + block][lane]),
-    )
-
-
-@wp.kernel
-def trial_functions(
-    # Instances:
-    world: wp.array[int],
-    function_count: wp.array[int],
-    stride: int,
-    # State in:
-    searching: wp.array[int],
-    step_length: wp.array[wp.float64],
-    q: wp.array2d[wp.vec3d],
-    direction: wp.array2d[vec8],  # (instance_count, 3 stride / 8)
-    # Out:
-    q_out: wp.array2d[wp.vec3d],
-):
-    """Set q_trial = q + alpha dq."""
-    i, k = wp.tid()
-    w = world[i]
-    if searching[w] == 0 or k >= function_count[i]:
-        return
-    q_out[i, k] = q[i, k] + step_length[w] * unknown(direction, i, stride / LANES, k)
-
-
-@wp.kernel
-def trial_rigid(
-    rigid_count: wp.array[int],
-    searching: wp.array[int],
-    step_length: wp.array[wp.float64],
-    r: wp.array2d[wp.float64],
-    direction: wp.array2d[wp.float64],
-    # Out:
-    r_out: wp.array2d[wp.float64],
-):
-    """Set r_trial = r + alpha dr."""
-    w, j = wp.tid()
-    if searching[w] == 0 or j >= rigid_count[w]:
-        return
-    r_out[w, j] = r[w, j] + step_length[w] * direction[w, j]
-
-
-@wp.kernel
-def sum_potential(
-    # Instances:
-    function_count: wp.array[int],
-    point_count: wp.array[int],
-    mass: wp.array[wp.float64],
-    mass_damping: wp.array[float],
-    # Worlds:
-    instance_start: wp.array[int],
-    rigid_count: wp.array[int],
-    # State in:
-    selected: wp.array[int],
-    q_start: wp.array2d[wp.vec3d],
-    q_inertial: wp.array2d[wp.vec3d],
-    q: wp.array2d[wp.vec3d],
-    force: wp.array2d[wp.vec3d],
-    point_energy: wp.array2d[wp.float64],
-    entry_count: wp.array[int],
-    entry_energy: wp.array2d[wp.float64],
-    inertia: wp.array3d[wp.float64],
-    r_predicted: wp.array2d[wp.float64],
-    r: wp.array2d[wp.float64],
-    dt: wp.float64,
-    # Out:
-    potential_out: wp.array[wp.float64],  # (world_count,) [J]
-):
-    """Sum the incremental potential of a world, in a fixed order."""
-    w = wp.tid()
-    if selected[w] == 0:
-        return
-    half = wp.float64(0.5)
-    total = wp.float64(0.0)
-    for i in range(instance_start[w], instance_start[w + 1]):
-        inertial = half * mass[i] / (dt * dt)
-        damping = half * mass[i] * wp.float64(mass_damping[i]) / dt
-        for k in range(function_count[i]):
-            inertial_step = q[i, k] - q_inertial[i, k]
-            step = q[i, k] - q_start[i, k]
-            total += inertial * wp.length_sq(inertial_step) + damping * wp.length_sq(step) - wp.dot(force[i, k], step)
-        for p in range(point_count[i]):
-            total += point_energy[i, p]
-        for e in range(entry_count[i]):
-            total += entry_energy[i, e]
-    for j in range(rigid_count[w]):
-        for l in range(rigid_count[w]):
-            total += half * (r[w, j] - r_predicted[w, j]) * inertia[w, j, l] * (r[w, l] - r_predicted[w, l])
-    potential_out[w] = total
+        progress.active[w] = 0
+    elif progress.iteration[w] >= iteration_max:
+        progress.active[w] = 0
+        progress.status[w] = progress.status[w] | WORLD_ITERATION_LIMIT
 
 
 @wp.kernel
 def begin_search(
-    # Instances:
-    function_count: wp.array[int],
-    stride: int,
-    tolerance: wp.array[float],  # (instance_count,) [m], root mean square
-    # Worlds:
-    instance_start: wp.array[int],
-    rigid_count: wp.array[int],
+    instances: Instances,
+    entries: Entries,
+    rigid: Rigid,
     rigid_tolerance: float,  # [m or rad]
     stick_range: wp.float64,  # [m]
     # State in:
-    active: wp.array[int],
-    pin_count: wp.array[int],
-    entry_count: wp.array[int],
-    gradient: wp.array2d[wp.vec3d],
+    gradient: wp.array2d[vec8d],
     direction: wp.array2d[vec8],
-    rigid_gradient: wp.array2d[wp.float64],
-    rigid_direction: wp.array2d[wp.float64],
-    # Out:
-    slope_out: wp.array[wp.float64],
-    step_length_out: wp.array[wp.float64],
-    last_out: wp.array[int],  # (world_count,), 1 where every body moves less than its tolerance
-    searching_out: wp.array[int],
-    any_searching_out: wp.array[int],
+    indefinite: wp.array[int],  # (instance_count,)
+    # In and out:
+    progress: Progress,
 ):
     """Compute the slope g . d of each active world and start its line search at alpha = 1.
+
+    Where Newton's own Hessian turns out to be indefinite the world stays put and takes the projected one next.
 
     A step below the tolerance (in contact, far below the stick range too) is taken in full: there the change of the
     potential drowns in rounding.
     """
     w = wp.tid()
-    searching_out[w] = 0
-    if active[w] == 0:
+    progress.searching[w] = 0
+    if progress.active[w] == 0:
         return
     slope = wp.float64(0.0)
     last = int(1)
-    blocks = stride / LANES
-    for i in range(instance_start[w], instance_start[w + 1]):
+    unsound = int(0)
+    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
+        if progress.project[w] == 0 and indefinite[i] != 0:
+            unsound = 1
         moved = wp.float64(0.0)
-        for k in range(function_count[i]):
-            dq = unknown(direction, i, blocks, k)
-            slope += wp.dot(gradient[i, k], dq)
-            moved += wp.length_sq(dq)
-        limit = wp.float64(tolerance[i])
-        if entry_count[i] > pin_count[i]:
+        for e in range(gradient.shape[1]):
+            d = vec8d(direction[i, e])
+            slope += wp.dot(gradient[i, e], d)
+            moved += wp.dot(d, d)
+        limit = wp.float64(instances.tolerance[i])
+        if entries.count[i] > instances.pin_count[i]:
             limit = wp.min(limit, wp.float64(0.1) * stick_range)
         if not (wp.sqrt(moved) <= limit):
             last = 0
-    for j in range(rigid_count[w]):
-        slope += rigid_gradient[w, j] * rigid_direction[w, j]
-        if not (wp.abs(rigid_direction[w, j]) <= wp.float64(rigid_tolerance)):
+    for j in range(rigid.count[w]):
+        slope += rigid.gradient[w, j] * rigid.direction[w, j]
+        if not (wp.abs(rigid.direction[w, j]) <= wp.float64(rigid_tolerance)):
             last = 0
-    slope_out[w] = slope
-    step_length_out[w] = wp.float64(1.0)
-    last_out[w] = last
-    if last == 0:
-        searching_out[w] = 1
-        wp.atomic_max(any_searching_out, 0, 1)
+    progress.slope[w] = slope
+    progress.step_length[w] = wp.float64(1.0)
+    progress.last[w] = last
+    if unsound == 1:
+        progress.step_length[w] = wp.float64(0.0)
+        progress.last[w] = 0
+        progress.failures[w] = progress.failures[w] + 1
+    elif last == 1 and progress.project[w] != 0 and progress.iteration[w] < PROJECTED_ITERATIONS:
+        # too stiff a matrix takes small steps: that says nothing of the distance to the minimum
+        progress.last[w] = 0
+    elif last == 0:
+        progress.searching[w] = 1
+        wp.atomic_max(progress.any_searching, 0, 1)
+
+
+@wp.kernel
+def trial_functions(
+    instances: Instances,
+    progress: Progress,
+    q: wp.array2d[vec8d],
+    direction: wp.array2d[vec8],
+    # Out:
+    q_out: wp.array2d[vec8d],
+):
+    """Set q_trial = q + alpha dq."""
+    i, e = wp.tid()
+    w = instances.world[i]
+    if progress.searching[w] == 0:
+        return
+    q_out[i, e] = q[i, e] + progress.step_length[w] * vec8d(direction[i, e])
+
+
+@wp.kernel
+def trial_rigid(
+    progress: Progress,
+    # In and out:
+    rigid: Rigid,
+):
+    """Set r_trial = r + alpha dr."""
+    w, j = wp.tid()
+    if progress.searching[w] == 0 or j >= rigid.count[w]:
+        return
+    rigid.trial[w, j] = rigid.r[w, j] + progress.step_length[w] * rigid.direction[w, j]
 
 
 @wp.kernel
 def judge_trial(
-    # State in:
-    potential: wp.array[wp.float64],
-    potential_trial: wp.array[wp.float64],
-    slope: wp.array[wp.float64],
+    instances: Instances,
+    motion: Motion,
+    points: Points,
+    entries: Entries,
+    rigid: Rigid,
+    team: int,
     step_length_min: wp.float64,
+    # State in:
+    q: wp.array2d[vec8d],
+    dt: wp.float64,
     # In and out:
-    step_length: wp.array[wp.float64],
-    searching: wp.array[int],
-    # Out:
-    any_searching_out: wp.array[int],
+    progress: Progress,
 ):
     """Accept a trial that lowers the potential (Armijo, up to rounding) or halve the step; give up at the minimum."""
-    w = wp.tid()
-    if searching[w] == 0:
+    w, lane = wp.tid()
+    if progress.searching[w] == 0:
         return
-    rounding = wp.float64(1.0e-12) * wp.abs(potential[w])
-    alpha = step_length[w]
-    if potential_trial[w] <= potential[w] + wp.float64(1.0e-4) * alpha * slope[w] + rounding:
-        searching[w] = 0
+    share = potential_share(progress, instances, motion, points, entries, rigid, q, rigid.trial, dt, w, lane, team)
+    trial = sum_shares(progress, share, w, lane, team)
+    if lane != 0:
+        return
+    potential = progress.potential[w]
+    rounding = wp.float64(1.0e-12) * wp.abs(potential)
+    alpha = progress.step_length[w]
+    if trial <= potential + wp.float64(1.0e-4) * alpha * progress.slope[w] + rounding:
+        progress.searching[w] = 0
         return
     alpha *= wp.float64(0.5)
     if alpha < step_length_min:
         alpha = wp.float64(0.0)
-        searching[w] = 0
+        progress.searching[w] = 0
     else:
-        wp.atomic_max(any_searching_out, 0, 1)
-    step_length[w] = alpha
+        wp.atomic_max(progress.any_searching, 0, 1)
+    progress.step_length[w] = alpha
 
 
 @wp.kernel
 def finish_iteration(
-    # Instances:
-    function_count: wp.array[int],
-    stride: int,
-    # Worlds:
-    instance_start: wp.array[int],
-    rigid_count: wp.array[int],
+    instances: Instances,
+    rigid: Rigid,
+    team: int,
     renewal: int,
-    renewal_distance: wp.float64,  # in tolerances
-    tolerance: wp.array[float],  # (instance_count,) [m]
+    renewal_distance: float,  # in sizes
+    dt: float,
     # State in:
-    step_length: wp.array[wp.float64],
     direction: wp.array2d[vec8],
-    rigid_direction: wp.array2d[wp.float64],
-    last: wp.array[int],
     # In and out:
-    active: wp.array[int],
-    q: wp.array2d[wp.vec3d],
-    r: wp.array2d[wp.float64],
-    iteration: wp.array[int],
-    renew: wp.array[int],
-    exact: wp.array[int],
-    status: wp.array[int],
-    # Out:
-    any_active_out: wp.array[int],
+    q: wp.array2d[vec8d],
+    progress: Progress,
 ):
-    """Take the accepted step; say whether the stiffness is to be renewed and how friction is to be linearised."""
-    w = wp.tid()
-    if active[w] == 0:
+    """Take the accepted step; say whether the stiffness is to be renewed and how friction is to be linearised.
+
+    A world that touches nothing is done with a step below the tolerance; near contacts the residual decides.
+    """
+    w, lane = wp.tid()
+    if progress.active[w] == 0:
         return
-    iteration[w] = iteration[w] + 1
-    alpha = step_length[w]
-    stale = renew[w] == 0
-    renew[w] = 0
-    if iteration[w] % renewal == 0 or alpha == wp.float64(0.0):
-        renew[w] = 1
-    for i in range(instance_start[w], instance_start[w + 1]):
+    alpha = progress.step_length[w]
+    far = int(0)
+    away = int(0)
+    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
         moved = wp.float64(0.0)
-        for k in range(function_count[i]):
-            step = alpha * unknown(direction, i, stride / LANES, k)
-            moved += wp.length_sq(step)
-            q[i, k] = q[i, k] + step
-        if wp.sqrt(moved) > renewal_distance * wp.float64(tolerance[i]):
-            renew[w] = 1
-    for j in range(rigid_count[w]):
-        r[w, j] = r[w, j] + alpha * rigid_direction[w, j]
-    exact[w] = 0
-    if iteration[w] >= 1 and alpha == wp.float64(1.0):
-        exact[w] = 1
-    if alpha == wp.float64(0.0) and last[w] == 0 and not stale:
-        active[w] = 0
-        status[w] = status[w] | WORLD_NO_DESCENT
+        for e in range(q.shape[1]):
+            d = vec8d(direction[i, e])
+            moved += wp.dot(d, d)
+            if e % team == lane and alpha > wp.float64(0.0):
+                q[i, e] = q[i, e] + alpha * d
+        inertia = instances.inertia[i] / (dt * dt * instances.youngs_modulus[i])
+        limit = wp.min(renewal_distance, INERTIA_SHARE * inertia) * instances.size[i]
+        if alpha * wp.sqrt(moved) > wp.float64(limit):
+            far = 1
+        if alpha * wp.sqrt(moved) > wp.float64(PROJECTED_DISTANCE * instances.size[i]):
+            away = 1
+    for j in range(lane, rigid.count[w], team):
+        if alpha > wp.float64(0.0):
+            rigid.r[w, j] = rigid.r[w, j] + alpha * rigid.direction[w, j]
+    barrier()
+    if lane != 0:
+        return
+    progress.iteration[w] = progress.iteration[w] + 1
+    stale = progress.renew[w] == 0 or progress.project[w] == 0
+    progress.renew[w] = far
+    if progress.iteration[w] % renewal == 0 or alpha == wp.float64(0.0):
+        progress.renew[w] = 1
+    if progress.project[w] != 0:
+        progress.renew[w] = 1
+    if alpha < wp.float64(1.0):
+        progress.project[w] = 1
+    elif away == 0 and progress.failures[w] < FAILURES:
+        progress.project[w] = 0
+    progress.exact[w] = 0
+    if alpha == wp.float64(1.0):
+        progress.exact[w] = 1
+    if alpha == wp.float64(0.0) and progress.last[w] == 0 and not stale:
+        progress.active[w] = 0
+        progress.status[w] = progress.status[w] | WORLD_NO_DESCENT
+    elif progress.last[w] == 1 and progress.touching[w] == 0:
+        progress.active[w] = 0
     else:
-        wp.atomic_max(any_active_out, 0, 1)
+        wp.atomic_max(progress.any_active, 0, 1)

@@ -8,3 +8,5 @@ WORLD_CONTACT_OVERFLOW = 4
 """Status bit: an instance had more contacts than its capacity; near ones were dropped first, then touching ones."""
 WORLD_NOT_FINITE = 8
 """Status bit: the step produced a value that is not finite; the world kept its state at rest."""
+WORLD_COLLAPSED = 16
+"""Status bit: more than a tenth of a body is squeezed to less than a hundredth of its volume."""

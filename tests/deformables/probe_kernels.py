@@ -4,6 +4,7 @@ import warp as wp
 
 from softmode.deformables import contact, materials, shape_queries
 from softmode.deformables.materials import HessianBlocks, MaterialParameters
+from softmode.deformables.singular_value_kernels import positive_part, singular_values
 
 wp.set_module_options({"enable_backward": False})
 
@@ -13,17 +14,39 @@ def evaluate_materials(
     parameters: MaterialParameters,
     G: wp.array[wp.mat33d],
     G_start: wp.array[wp.mat33d],
+    direction: wp.array[wp.mat33d],
     dt: wp.float64,
+    project: int,
     # Out:
     energy_out: wp.array[wp.float64],
     stress_out: wp.array[wp.mat33d],
+    derivative_out: wp.array[wp.mat33d],
     hessian_out: wp.array[HessianBlocks],
 ):
-    """Evaluate energy, stress and Hessian of one material at every G = F - I."""
+    """Evaluate energy, stress, its derivative in a direction, and the Hessian at every G = F - I."""
     i = wp.tid()
     energy_out[i] = materials.energy(parameters, G[i], G_start[i], dt)
     stress_out[i] = materials.stress(parameters, G[i], G_start[i], dt)
-    hessian_out[i] = materials.hessian(parameters, G[i], dt)
+    derivative_out[i] = materials.stress_derivative(parameters, G[i], G_start[i], dt, direction[i])
+    hessian_out[i] = materials.hessian(parameters, G[i], G_start[i], dt, project)
+
+
+@wp.kernel
+def decompose(
+    F: wp.array[wp.mat33d],
+    # Out:
+    U_out: wp.array[wp.mat33d],
+    sigma_out: wp.array[wp.vec3d],
+    V_out: wp.array[wp.mat33d],
+    positive_out: wp.array[wp.mat33d],
+):
+    """Evaluate the singular values of every F, and the positive part of F + F^T."""
+    i = wp.tid()
+    U, sigma, V = singular_values(F[i])
+    U_out[i] = U
+    sigma_out[i] = sigma
+    V_out[i] = V
+    positive_out[i] = positive_part(F[i] + wp.transpose(F[i]))
 
 
 @wp.kernel

@@ -93,10 +93,10 @@ def test_mesh_contact_is_not_lost_when_deep():
     """A face 5 cm inside a mesh is in contact however small the detection distance (1.7 mm here)."""
     mesh = box_mesh((0.1, 0.1, 0.1))
     scene = on_shape(lambda world: world.add_shape_mesh(-1, mesh=mesh), height=0.05)
-    scene.reduced.begin(scene.state, scene.dt)
+    scene.reduced.begin(scene.state, scene.control, scene.dt)
     scene.reduced.detect(scene.state, scene.control, scene.dt, prescribed=True)
     bottom = cube().surface_points[:, 2] < -0.49 * EDGE
-    assert scene.reduced.entry_count.numpy()[0] >= bottom.sum()
+    assert scene.reduced.entries.count.numpy()[0] >= bottom.sum()
 
 
 # -- potentials --------------------------------------------------------------------------------------------------------
@@ -192,7 +192,7 @@ def test_stiffness_and_size_of_the_penalty():
     scene = on_shape(lambda w: w.add_ground_plane(), height=0.0, material=material)
     settle(scene, 400)
     kappa = float(scene.model.softmode.contact_stiffness.numpy()[0])
-    eps = float(scene.reduced.smoothing.numpy()[0])
+    eps = float(scene.reduced.instances.smoothing.numpy()[0])
     pressure = scene.mass() * GRAVITY / EDGE**2
     p = np.sqrt(2 * eps * pressure / kappa)
     p = p if p < eps else pressure / kappa + eps / 2
@@ -287,7 +287,7 @@ def contacts_after_one_step(populate_shape, position):
 
     scene = Scene(populate, [body], dt=0.001)
     scene.step()
-    return int(scene.reduced.entry_count.numpy()[0])
+    return int(scene.reduced.entries.count.numpy()[0])
 
 
 def test_mesh_away_from_its_own_origin_is_found():
@@ -318,7 +318,7 @@ def test_spinning_shape_is_found_in_time():
     twist[0, 5] = omega
     scene.state.body_qd.assign(twist)
     scene.step()
-    assert scene.reduced.entry_count.numpy()[0] > 0
+    assert scene.reduced.entries.count.numpy()[0] > 0
 
 
 def test_bounded_plane_ends_where_it_ends():
@@ -341,7 +341,7 @@ def test_shapes_of_other_worlds_are_not_touched():
     solver = SolverReduced(model, [body])
     first, second = model.state(), model.state()
     solver.step(first, second, None, None, 0.001)
-    counts = solver.entry_count.numpy()
+    counts = solver.entries.count.numpy()
     assert counts[0] > 0 and counts[1] == 0
 
 
@@ -351,7 +351,7 @@ def test_overflow_is_reported():
     scene = on_shape(lambda w: w.add_ground_plane(), height=-0.001, options=options)
     scene.step()
     assert scene.reduced.status.numpy()[0] & bits.WORLD_CONTACT_OVERFLOW
-    assert scene.reduced.entry_count.numpy()[0] == 8
+    assert scene.reduced.entries.count.numpy()[0] == 8
     assert scene.reduced.instance_force.numpy()[0, 2] > 0.0
 
 

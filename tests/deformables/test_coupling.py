@@ -6,6 +6,7 @@ import pytest
 
 from softmode.deformables import status as bits
 from softmode.deformables.coupling import SolverCoupledReduced
+from softmode.deformables.lanes import from_blocks, to_blocks
 from softmode.deformables.materials import Material
 from softmode.deformables.solver_reduced import SolverReducedOptions, add_pins, add_reduced_body
 from softmode.errors import ConfigError
@@ -56,16 +57,15 @@ class Potential:
             scene.step()
         scene.step()  # reads the contacts of a step that starts in contact
         self.n = scene.body().function_count
-        self.q = self.solver.q.numpy()[0, : self.n].copy()
+        self.q = from_blocks(self.solver.q.numpy()[0], self.n)
         self.r = self.solver.rigid.r.numpy()[0].copy()
 
     def put(self, u):
         """Write u into the solver and ask for a fresh elastic Hessian."""
         solver = self.solver
-        solver.renew.fill_(1)
-        q = np.zeros((1, solver.stride, 3))
-        q[0, : self.n] = u[: 3 * self.n].reshape(-1, 3)
-        solver.q.assign(q)
+        solver.progress.renew.fill_(1)
+        q = u[: 3 * self.n].reshape(1, -1, 3)
+        solver.q.assign(to_blocks(q, solver.layout.block_count))
         solver.rigid.r.assign(u[None, 3 * self.n :])
 
     @property
@@ -77,20 +77,23 @@ class Potential:
         """Return E(u) with the normal forces of friction as they were last renewed."""
         solver, dt = self.solver, self.scene.dt
         self.put(u)
-        solver.active.fill_(1)
-        solver._evaluate(solver.active, solver.q, solver.rigid.r, dt, derivatives=False)
-        solver._sum_potential(solver.active, solver.q, solver.rigid.r, dt, solver.potential)
-        return float(solver.potential.numpy()[0])
+        solver.progress.active.fill_(1)
+        solver._evaluate(solver.progress.active, solver.q, solver.rigid.r, dt, derivatives=False)
+        solver.progress.iteration.zero_()
+        solver._judge_iterate(dt)
+        return float(solver.progress.potential.numpy()[0])
 
     def gradient(self, u):
         """Return dE/du; renews the normal forces of friction."""
         solver, dt = self.solver, self.scene.dt
         self.put(u)
-        solver.active.fill_(1)
-        solver._evaluate(solver.active, solver.q, solver.rigid.r, dt, derivatives=True)
+        solver.progress.active.fill_(1)
+        solver._evaluate(solver.progress.active, solver.q, solver.rigid.r, dt, derivatives=True)
         solver._gather_gradient(dt)
         solver._assemble(dt)
-        return np.concatenate([solver.gradient.numpy()[0, : self.n].ravel(), solver.rigid.gradient.numpy()[0]])
+        return np.concatenate(
+            [from_blocks(solver.gradient.numpy()[0], self.n).ravel(), solver.rigid.gradient.numpy()[0]]
+        )
 
     def matrix(self):
         """Return the assembled d2E/du2, unknowns in the order of u."""
@@ -108,7 +111,7 @@ class Potential:
 def test_gradient_of_the_incremental_potential():
     """dE/du equals central differences of E, u = (q, r), with contact, friction, pins, viscosity and rigid dofs."""
     potential = Potential(impact(1.0, offset=(0.02, 0.01), pins=True)[0])
-    assert potential.solver.entry_count.numpy()[0] > 4 + 5
+    assert potential.solver.entries.count.numpy()[0] > 4 + 5
     rng = np.random.default_rng(0)
     u = potential.u + 1e-5 * rng.normal(size=potential.u.size)
     gradient = potential.gradient(u)
@@ -157,8 +160,8 @@ def test_jacobians_move_the_shape():
     gradient = potential.gradient(u)[3 * potential.n :]
     inertia = solver.rigid.inertia.numpy()[0]
     contact = gradient - inertia @ (potential.r - solver.rigid.predicted.numpy()[0])
-    count = solver.entry_count.numpy()[0]
-    force, arm = solver.entry_force.numpy()[0, :count], solver.entry_arm.numpy()[0, :count]
+    count = solver.entries.count.numpy()[0]
+    force, arm = solver.entries.force.numpy()[0, :count], solver.entries.arm.numpy()[0, :count]
     expected = np.concatenate([force.sum(axis=0), np.cross(arm, force).sum(axis=0)])
     # arms are float32 differences of world positions near 0.1 m
     np.testing.assert_allclose(contact, expected, atol=1e-5 * np.abs(force).sum() * EDGE + 1e-6 * np.abs(force).sum())

@@ -6,6 +6,7 @@ import pytest
 import warp as wp
 
 from softmode.deformables import status as bits
+from softmode.deformables.lanes import from_blocks, to_blocks
 from softmode.deformables.materials import Material, MaterialModel
 from softmode.deformables.solver_reduced import (
     SolverReduced,
@@ -57,13 +58,13 @@ def evaluate_at(scene, q):
     """Return elastic energy [J] and gradient of the incremental potential [N] of the first instance at q."""
     solver = scene.reduced
     scene.set(q=q, qd=np.zeros_like(q))
-    solver.begin(scene.state, scene.dt)
+    solver.begin(scene.state, scene.control, scene.dt)
     solver.detect(scene.state, scene.control, scene.dt, prescribed=True)
-    solver.active.fill_(1)
-    solver._evaluate(solver.active, solver.q, solver.rigid.r, scene.dt, derivatives=True)
+    solver.progress.active.fill_(1)
+    solver._evaluate(solver.progress.active, solver.q, solver.rigid.r, scene.dt, derivatives=True)
     solver._gather_gradient(scene.dt)
     solver._assemble(scene.dt)
-    return solver.point_energy.numpy()[0].sum(), solver.gradient.numpy()[0][: len(q)]
+    return solver.points.energy.numpy()[0].sum(), from_blocks(solver.gradient.numpy()[0], len(q))
 
 
 # -- identities --------------------------------------------------------------------------------------------------------
@@ -135,7 +136,7 @@ def test_step_equals_dense_reference(viscosity):
 def test_material_models_differ_in_the_solver():
     """Each instance is stepped with its own energy density."""
     ends = []
-    for model in MaterialModel:
+    for model in (MaterialModel.STABLE_NEO_HOOKEAN_LOG, MaterialModel.STABLE_NEO_HOOKEAN):
         scene = single(Material(model=model), options=FINE)
         scene.set(q=deformed(cube(), 0.05))
         scene.step()
@@ -191,7 +192,7 @@ def spin_left(omega, dt, time):
 def test_free_spin_loses_what_implicit_euler_loses(omega):
     """A stiff cube spun for 1 s at dt = 1/60 keeps 0.984, 0.740, 0.481, 0.180: the recurrence of `spin_left`."""
     dt = 1.0 / 60.0
-    scene = single(Material(youngs_modulus=1.0e7), spin=(0.0, 0.0, omega), dt=dt)
+    scene = single(Material(youngs_modulus=1.0e7), spin=(0.0, 0.0, omega), dt=dt, options=FINE)
     before = scene.momentum()[1][2]
     scene.step(60)
     kept = scene.momentum()[1][2] / before
@@ -243,12 +244,12 @@ def test_inner_forces_have_no_resultant():
     solver, n = scene.reduced, body.function_count
     start, q = deformed(body, 0.01), deformed(body, 0.02, seed=1)
     evaluate_at(scene, start)  # sets q_n
-    solver.q.assign(np.pad(q, ((0, solver.stride - n), (0, 0)))[None])
-    solver._evaluate(solver.active, solver.q, solver.rigid.r, scene.dt, derivatives=True)
+    solver.q.assign(to_blocks(q[None], solver.layout.block_count))
+    solver._evaluate(solver.progress.active, solver.q, solver.rigid.r, scene.dt, derivatives=True)
     solver._gather_gradient(scene.dt)
     solver._assemble(scene.dt)
     inertia = scene.mass() / scene.dt**2 * (q - start)
-    forces = solver.gradient.numpy()[0][:n] - inertia
+    forces = from_blocks(solver.gradient.numpy()[0], n) - inertia
     size = np.abs(forces).max()
     assert np.abs(body.mean_basis @ forces).max() <= 1e-6 * size  # gradients of a constant, float32
     y = q + body.linear_coordinates[:, :3]
@@ -260,11 +261,12 @@ def test_viscosity_leaves_a_free_spin_alone():
     """A rotating body does not deform, so 2 mu tau dE/dt = 0: with and without viscosity it spins alike."""
     ends = []
     for viscosity in (0.0, 0.05):
-        scene = single(Material(youngs_modulus=1.0e7, viscosity=viscosity), spin=(0.0, 0.0, 5.0), dt=0.01)
+        material = Material(youngs_modulus=1.0e7, viscosity=viscosity)
+        scene = single(material, spin=(0.0, 0.0, 5.0), dt=0.01, options=FINE)
         scene.step(30)
         ends.append(scene.momentum()[1][2])
     widening = 300.0 * 25.0 * EDGE**2 / 1.0e7
-    assert ends[1] == pytest.approx(ends[0], rel=2 * widening + 30 * 1e-2 * 1e-5 / (5.0 * 0.01))
+    assert ends[1] == pytest.approx(ends[0], rel=2 * widening + 30 * 1e-2 * FINE.tolerance / (5.0 * 0.01))
 
 
 def test_energy_never_rises():
@@ -372,23 +374,6 @@ def test_point_forces_act_in_full():
 
 
 # -- robustness --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("nu", [0.3, 0.45])
-def test_collapse_to_a_point_recovers(nu):
-    """Started at F = 0 plus 1e-3 of noise, the energy with the origin term opens again; the plain one stays shut."""
-    body = cube()
-    noise = 1e-3 * SIZE * np.random.default_rng(0).normal(size=(body.function_count, 3))
-    for model in MaterialModel:
-        scene = single(Material(model=model, poissons_ratio=nu, mass_damping=4.0), dt=0.01)
-        twin = reference.FreeBody(body=body, material=Material(model=model, poissons_ratio=nu), dt=0.01)
-        scene.set(q=body.affine(np.zeros((3, 3))) + noise)
-        scene.step(400)
-        J = np.linalg.det(twin.deformation_gradient(scene.q()))
-        if model == MaterialModel.STABLE_NEO_HOOKEAN_LOG:
-            np.testing.assert_allclose(J, 1.0, atol=1e-2)
-        else:
-            assert (np.abs(J) < 0.01).mean() > 0.9
 
 
 @pytest.mark.parametrize("start", ["flat", "mirrored"])
@@ -508,7 +493,7 @@ def test_bodies_with_different_function_counts():
         alone.set(q=q, qd=qd)
         alone.step(5)
         # Not bitwise: one line search and one stopping test serve all bodies of a world.
-        assert np.linalg.norm(both.q(i) - alone.q()) <= 5 * both.reduced.tolerance.numpy()[i]
+        assert np.linalg.norm(both.q(i) - alone.q()) <= 5 * both.reduced.instances.tolerance.numpy()[i]
 
 
 def test_masked_reset():

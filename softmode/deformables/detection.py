@@ -1,0 +1,338 @@
+"""Detection of contact between surface samples and the rigid shapes of the Newton model, once per step.
+
+Every sample is tested against the shapes near its body; gap, normal and lever arm are frozen for the step and become
+*entries*, the point constraints of the step (see ``contact`` for their energy): first the pins of the instance, then
+its contacts in sample order. Shapes without closed-form distance (heightfield, convex decomposition, ellipsoid) are
+refused.
+
+The queries are ours because Newton's public ``sdf_*`` functions come without their gradients, and because its soft
+contact records are appended by an atomic counter: fixed slots per sample keep the order, and so the bits, reproducible.
+"""
+
+import warp as wp
+
+from softmode.deformables.lanes import barrier
+from softmode.deformables.shape_queries import PLANE, query_shape
+from softmode.deformables.status import WORLD_CONTACT_OVERFLOW
+from softmode.deformables.tables import Basis, Entries, Instances, Motion, Rigid, interpolate, interpolate_change
+
+wp.set_module_options({"enable_backward": False})
+
+SLOTS = 2
+"""Contacts kept per surface sample: the deepest two."""
+
+
+@wp.struct
+class Shapes:
+    """The rigid shapes of the model and where their bodies are at the start of the step."""
+
+    kind: wp.array[int]
+    scale: wp.array[wp.vec3]
+    source: wp.array[wp.uint64]
+    margin: wp.array[float]
+    lower: wp.array[wp.vec3]  # bounds in the shape's frame [m]
+    upper: wp.array[wp.vec3]
+    body: wp.array[int]
+    transform: wp.array[wp.transform]
+    friction: wp.array[float]
+    body_q: wp.array[wp.transform]
+    body_qd: wp.array[wp.spatial_vector]
+    body_com: wp.array[wp.vec3]
+
+
+@wp.struct
+class Samples:
+    """Surface samples at the start of the step, shape (instance_count, sample_max), and what they found."""
+
+    position: wp.array2d[wp.vec3d]  # [m]
+    drift: wp.array2d[wp.vec3]  # dt v [m]
+    shape: wp.array3d[int]  # (..., SLOTS), -1 where empty
+    gap: wp.array3d[wp.float64]  # (..., SLOTS) [m]
+    normal: wp.array3d[wp.vec3]  # (..., SLOTS)
+    lower: wp.array[wp.vec3]  # (instance_count,) bounds, grown by margin and drift [m]
+    upper: wp.array[wp.vec3]
+    reach: wp.array3d[wp.vec3]  # (instance_count, team, 2), scratch of the bounds
+    tally: wp.array3d[int]  # (instance_count, team, 2), scratch of the entries
+
+
+@wp.kernel
+def place_samples(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    # Out:
+    samples: Samples,
+):
+    """Compute where the surface samples are at the start of the step and how far they would drift during it."""
+    i, s = wp.tid()
+    if s >= instances.sample_count[i]:
+        return
+    row = instances.row_start[i] + s
+    n = instances.function_count[i]
+    samples.position[i, s] = basis.row_point[row] + interpolate(basis.row, row, motion.q_start, i, n)
+    samples.drift[i, s] = wp.vec3(interpolate_change(basis.row, row, motion.q_inertial, motion.q_start, i, n))
+
+
+@wp.kernel
+def bound_samples(
+    instances: Instances,
+    team: int,
+    # In and out:
+    samples: Samples,
+):
+    """Bound the samples of an instance, grown by margin and drift."""
+    i, lane = wp.tid()
+    lower = wp.vec3(1.0e30)
+    upper = wp.vec3(-1.0e30)
+    reach = float(0.0)
+    for s in range(lane, instances.sample_count[i], team):
+        x = wp.vec3(samples.position[i, s])
+        lower = wp.min(lower, x)
+        upper = wp.max(upper, x)
+        reach = wp.max(reach, wp.length(samples.drift[i, s]))
+    grow = wp.vec3(2.0 * reach)
+    samples.reach[i, lane, 0] = lower - grow
+    samples.reach[i, lane, 1] = upper + grow
+    barrier()
+    if lane != 0:
+        return
+    lower = samples.reach[i, 0, 0]
+    upper = samples.reach[i, 0, 1]
+    for k in range(1, team):
+        lower = wp.min(lower, samples.reach[i, k, 0])
+        upper = wp.max(upper, samples.reach[i, k, 1])
+    samples.lower[i] = lower - wp.vec3(instances.margin[i])
+    samples.upper[i] = upper + wp.vec3(instances.margin[i])
+
+
+@wp.func
+def point_velocity(body_q: wp.transform, body_qd: wp.spatial_vector, com: wp.vec3, point: wp.vec3):
+    """Return the velocity [m/s] of a world point that moves with a body."""
+    arm = point - wp.transform_point(body_q, com)
+    return wp.spatial_top(body_qd) + wp.cross(wp.spatial_bottom(body_qd), arm)
+
+
+@wp.kernel
+def cull_shapes(
+    candidate: wp.array2d[int],  # (instance_count, candidate_max), -1 pads
+    shapes: Shapes,
+    samples: Samples,
+    dt: float,
+    # Out:
+    near_out: wp.array2d[int],  # (instance_count, candidate_max)
+):
+    """Mark the candidate shapes whose bounding sphere reaches the bounds of the instance."""
+    i, c = wp.tid()
+    shape = candidate[i, c]
+    near_out[i, c] = 0
+    if shape < 0:
+        return
+    if shapes.kind[shape] == PLANE:
+        near_out[i, c] = 1
+        return
+    pose = shapes.transform[shape]
+    lower = shapes.lower[shape]
+    upper = shapes.upper[shape]
+    radius = 0.5 * wp.length(upper - lower)
+    body = shapes.body[shape]
+    if body >= 0:
+        pose = shapes.body_q[body] * pose
+    centre = wp.transform_point(pose, 0.5 * (lower + upper))
+    reach = radius + shapes.margin[shape]
+    if body >= 0:
+        twist = shapes.body_qd[body]
+        speed = wp.length(point_velocity(shapes.body_q[body], twist, shapes.body_com[body], centre))
+        reach += 2.0 * dt * (speed + radius * wp.length(wp.spatial_bottom(twist)))
+    nearest = wp.min(wp.max(centre, samples.lower[i]), samples.upper[i])
+    if wp.length(centre - nearest) <= reach:
+        near_out[i, c] = 1
+
+
+@wp.kernel
+def find_contacts(
+    instances: Instances,
+    candidate: wp.array2d[int],
+    near: wp.array2d[int],
+    shapes: Shapes,
+    dt: float,
+    # In and out:
+    samples: Samples,
+):
+    """Keep the deepest contacts of each sample within margin plus twice the relative motion of the step."""
+    i, s = wp.tid()
+    if s >= instances.sample_count[i]:
+        return
+    samples.shape[i, s, 0] = -1
+    samples.shape[i, s, 1] = -1
+    samples.gap[i, s, 0] = wp.float64(1.0e30)
+    samples.gap[i, s, 1] = wp.float64(1.0e30)
+    x = samples.position[i, s]
+    for c in range(candidate.shape[1]):
+        if near[i, c] == 0:
+            continue
+        shape = candidate[i, c]
+        pose = shapes.transform[shape]
+        body = shapes.body[shape]
+        motion = samples.drift[i, s]
+        if body >= 0:
+            pose = shapes.body_q[body] * pose
+            moving = point_velocity(shapes.body_q[body], shapes.body_qd[body], shapes.body_com[body], wp.vec3(x))
+            motion -= dt * moving
+        reach = instances.margin[i] + 2.0 * wp.length(motion)
+        # the difference to the shape's origin in float64: far from the world's origin only the offset is large
+        origin = wp.transform_get_translation(pose)
+        local = wp.quat_rotate_inv(wp.transform_get_rotation(pose), wp.vec3(x - wp.vec3d(origin)))
+        # inside a mesh the surface may be as far away as the mesh is large
+        far = wp.max(reach + shapes.margin[shape], wp.length(shapes.upper[shape] - shapes.lower[shape]))
+        query = query_shape(shapes.kind[shape], shapes.scale[shape], shapes.source[shape], local, far)
+        gap = wp.float64(query.distance - shapes.margin[shape])
+        if gap < wp.float64(reach) and gap < samples.gap[i, s, 1]:
+            normal = wp.quat_rotate(wp.transform_get_rotation(pose), query.normal)
+            slot = int(1)
+            if gap < samples.gap[i, s, 0]:
+                samples.shape[i, s, 1] = samples.shape[i, s, 0]
+                samples.gap[i, s, 1] = samples.gap[i, s, 0]
+                samples.normal[i, s, 1] = samples.normal[i, s, 0]
+                slot = 0
+            samples.shape[i, s, slot] = shape
+            samples.gap[i, s, slot] = gap
+            samples.normal[i, s, slot] = normal
+
+
+@wp.kernel
+def gather_contacts(
+    instances: Instances,
+    basis: Basis,
+    shapes: Shapes,
+    samples: Samples,
+    entry_max: int,
+    prescribed: int,
+    team: int,
+    dt: float,
+    # Out:
+    entries: Entries,
+    status: wp.array[int],
+):
+    """Compact the slots of an instance behind its pins, in sample order: touching contacts first, then near ones.
+
+    Each thread of a team counts its own run of samples, then writes where the counts before it end.
+    """
+    i, lane = wp.tid()
+    count = instances.sample_count[i]
+    begin = lane * count / team
+    end = (lane + 1) * count / team
+    touching = int(0)
+    close = int(0)
+    for s in range(begin, end):
+        for slot in range(SLOTS):
+            if samples.shape[i, s, slot] >= 0:
+                if samples.gap[i, s, slot] <= wp.float64(0.0):
+                    touching += 1
+                else:
+                    close += 1
+    samples.tally[i, lane, 0] = touching
+    samples.tally[i, lane, 1] = close
+    barrier()
+    total = instances.pin_count[i]
+    at_touching = total
+    at_close = total
+    for k in range(team):
+        if k < lane:
+            at_touching += samples.tally[i, k, 0]
+            at_close += samples.tally[i, k, 1]
+        at_close += samples.tally[i, k, 0]
+        total += samples.tally[i, k, 0] + samples.tally[i, k, 1]
+    if lane == 0:
+        entries.count[i] = wp.min(total, entry_max)
+        if total > entry_max:
+            wp.atomic_or(status, instances.world[i], WORLD_CONTACT_OVERFLOW)
+    for s in range(begin, end):
+        for slot in range(SLOTS):
+            shape = samples.shape[i, s, slot]
+            if shape < 0:
+                continue
+            gap = samples.gap[i, s, slot]
+            e = at_close
+            if gap <= wp.float64(0.0):
+                e = at_touching
+                at_touching += 1
+            else:
+                at_close += 1
+            if e >= entry_max:
+                continue
+            # of unit length in float64: what is left of the gap in the slip must not count against the stick range
+            normal = wp.normalize(wp.vec3d(samples.normal[i, s, slot]))
+            # both bodies feel the force at the sample, not the shape at its own surface: a pair of forces on two
+            # points would make angular momentum out of friction times penetration
+            point = wp.vec3(samples.position[i, s])
+            drift = wp.vec3()
+            arm = wp.vec3()
+            body = shapes.body[shape]
+            if body >= 0:
+                arm = point - wp.transform_point(shapes.body_q[body], shapes.body_com[body])
+                if prescribed != 0:
+                    drift = dt * point_velocity(shapes.body_q[body], shapes.body_qd[body], shapes.body_com[body], point)
+            row = instances.row_start[i] + s
+            entries.row[i, e] = row
+            entries.shape[i, e] = shape
+            entries.arm[i, e] = arm
+            entries.normal[i, e] = normal
+            # d enters as offset + displacement, with the gap along the normal and the shape's own motion taken off
+            entries.offset[i, e] = gap * normal - wp.vec3d(drift)
+            entries.stiffness[i, e] = wp.float64(instances.contact_stiffness[i] * basis.row_area[row])
+            entries.friction[i, e] = wp.float64(wp.sqrt(instances.friction[i] * shapes.friction[shape]))
+
+
+@wp.kernel
+def gather_pins(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    first_row: int,
+    pin_stiffness: wp.array[float],  # (pin_total,) [N/m]
+    pin_target: wp.array[wp.vec3d],  # (pin_total,) [m]
+    # Out:
+    entries: Entries,
+):
+    """Write the pins of an instance as its first entries: offset = x_n - target."""
+    i, e = wp.tid()
+    if e >= instances.pin_count[i]:
+        return
+    pin = instances.pin_start[i] + e
+    row = first_row + pin
+    x = basis.row_point[row] + interpolate(basis.row, row, motion.q_start, i, instances.function_count[i])
+    entries.row[i, e] = row
+    entries.shape[i, e] = -1
+    entries.offset[i, e] = x - pin_target[pin]
+    entries.stiffness[i, e] = wp.float64(pin_stiffness[pin])
+
+
+@wp.kernel
+def entry_jacobians(
+    instances: Instances,
+    shapes: Shapes,
+    rigid: Rigid,
+    # In and out:
+    entries: Entries,
+):
+    """Compute the motion of the shape at each contact per unit joint motion: J_v - arm x J_w."""
+    i, e, j = wp.tid()
+    w = instances.world[i]
+    if e >= entries.count[i] or j >= rigid.count[w]:
+        return
+    value = wp.vec3()
+    shape = entries.shape[i, e]
+    body = int(-1)
+    if shape >= 0:
+        body = shapes.body[shape]
+    if body >= 0:
+        a = rigid.body_articulation[body]
+        if a >= 0:
+            local = rigid.dof_start[w] + j - rigid.articulation_dof_start[a]
+            if local >= 0 and local < rigid.articulation_dof_count[a]:
+                r = 6 * rigid.body_link[body]
+                J = rigid.jacobian
+                linear = wp.vec3(J[a, r, local], J[a, r + 1, local], J[a, r + 2, local])
+                angular = wp.vec3(J[a, r + 3, local], J[a, r + 4, local], J[a, r + 5, local])
+                value = linear + wp.cross(angular, entries.arm[i, e])
+    entries.jacobian[i, e, j] = value

@@ -1,0 +1,218 @@
+"""Where everything stands in the solver's arrays: bases one after another, instances ordered by world, pins, shapes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from softmode.deformables.authoring import MATERIAL_FIELDS, NAMESPACE, body_key
+from softmode.deformables.body import ReducedBody
+from softmode.deformables.lanes import LANES, pad, vec8, vec8d
+from softmode.deformables.shape_queries import SUPPORTED_SHAPES
+from softmode.deformables.tables import Basis, Instances
+from softmode.errors import ConfigError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """Sizes and tables of a model with reduced bodies."""
+
+    bodies: tuple[ReducedBody, ...]
+    """The distinct bodies."""
+    asset: np.ndarray
+    """Index into ``bodies`` per instance."""
+    instance_world: np.ndarray
+    """World per instance."""
+    instance_start: np.ndarray
+    """First instance of each world, and the end: shape (world_count + 1,)."""
+    block_count: int
+    """Blocks of eight functions per component, enough for the largest body."""
+    point_max: int
+    """Cubature points of the largest body."""
+    sample_max: int
+    """Surface samples of the largest body."""
+    pin_max: int
+    """Pins of the instance with the most."""
+    first_pin_row: int
+    """Row of the first pin in ``basis.row``."""
+    size: np.ndarray
+    """Diagonal of the bounding box per instance [m]."""
+    basis: Basis
+    """The bases."""
+    instances: Instances
+    """Offsets, counts and parameters; masses and tolerances are the solver's to fill."""
+
+    @property
+    def instance_count(self) -> int:
+        """Number of instances."""
+        return len(self.asset)
+
+    @property
+    def world_count(self) -> int:
+        """Number of worlds."""
+        return len(self.instance_start) - 1
+
+
+def lay_out(model: Any, bodies: Sequence[ReducedBody]) -> Layout:
+    """Build the tables of a model.
+
+    Raises:
+        ConfigError: If an instance uses a body that is not given, or instances or pins are out of order.
+    """
+    data = getattr(model, NAMESPACE)
+    keys = {body_key(body): a for a, body in enumerate(bodies)}
+    wanted = data.body_key.numpy()
+    missing = [int(k) for k in wanted if int(k) not in keys]
+    if missing:
+        raise ConfigError(
+            f"{len(missing)} instance(s) of the model use a body that is not in bodies",
+            hint="pass every ReducedBody given to add_reduced_body",
+        )
+    asset = np.array([keys[int(k)] for k in wanted])
+    world = data.instance_world.numpy()
+    if (world < 0).any() and model.world_count > 1:
+        raise ConfigError("a reduced body lies outside all worlds", hint="add it to the builder that is replicated")
+    world = np.maximum(world, 0)
+    if (np.diff(world) < 0).any():
+        raise ConfigError("instances are not ordered by world", hint="add bodies to one world before the next")
+    counts = np.bincount(world, minlength=max(model.world_count, 1))
+    stride = pad(max(body.function_count for body in bodies))
+
+    pin_rows, pin_points, pin_count = _pins(model, bodies, asset, stride)
+    device = model.device
+    basis = _basis(bodies, stride, pin_rows, pin_points, device)
+    instances = Instances()
+    ends = {
+        "point_start": [body.point_count for body in bodies],
+        "row_start": [body.surface_count for body in bodies],
+    }
+    per_instance = {name: np.concatenate([[0], np.cumsum(sizes)[:-1]])[asset] for name, sizes in ends.items()}
+    per_instance |= {
+        "world": world,
+        "asset": asset,
+        "function_count": np.array([body.function_count for body in bodies])[asset],
+        "driven_count": np.array([body.driven_count for body in bodies])[asset],
+        "point_count": np.array([body.point_count for body in bodies])[asset],
+        "sample_count": np.array([body.surface_count for body in bodies])[asset],
+        "pin_count": pin_count,
+        "pin_start": np.concatenate([[0], np.cumsum(pin_count)[:-1]]),
+    }
+    for name, values in per_instance.items():
+        setattr(instances, name, wp.array(values, dtype=int, device=device))
+    for name in ("function_start", "particle_start", "material_model", "contact_stiffness", *MATERIAL_FIELDS):
+        if name != "density":
+            setattr(instances, name, getattr(data, name))
+    return Layout(
+        bodies=tuple(bodies),
+        asset=asset,
+        instance_world=world,
+        instance_start=np.concatenate([[0], np.cumsum(counts)]),
+        block_count=stride // LANES,
+        point_max=max(body.point_count for body in bodies),
+        sample_max=max(body.surface_count for body in bodies),
+        pin_max=int(pin_count.max(initial=0)),
+        first_pin_row=sum(body.surface_count for body in bodies),
+        size=np.array([np.linalg.norm(np.ptp(body.bounds, axis=0)) for body in bodies])[asset],
+        basis=basis,
+        instances=instances,
+    )
+
+
+def _basis(
+    bodies: Sequence[ReducedBody], stride: int, pin_rows: np.ndarray, pin_points: np.ndarray, device: Any
+) -> Basis:
+    """Concatenate the bases of all bodies, padded to ``stride`` functions, in blocks of eight."""
+    gradient = np.concatenate([_padded(body.grad_basis, stride) for body in bodies])
+    gradient = gradient.reshape(len(gradient), -1, LANES, 3).transpose(1, 0, 3, 2)
+    row = np.concatenate([*(_padded(body.surface_basis, stride) for body in bodies), pin_rows])
+    mean = np.concatenate([_padded(body.mean_basis[None], stride) for body in bodies])
+
+    def joined(name: str) -> np.ndarray:
+        return np.concatenate([getattr(body, name) for body in bodies])
+
+    def table(values: np.ndarray, dtype: Any, kind: Any = None) -> wp.array:
+        return wp.array(np.ascontiguousarray(values, dtype=kind), dtype=dtype, device=device)
+
+    basis = Basis()
+    basis.gradient = basis.gradient_across = table(gradient, vec8, np.float32)
+    if wp.get_device(device).is_cuda:
+        basis.gradient_across = table(gradient.transpose(1, 2, 0, 3), vec8, np.float32).transpose((2, 0, 1))
+    basis.point_weight = table(joined("weights"), wp.float64)
+    basis.stiffness_scale = table(joined("stiffness_scale"), float, np.float32)
+    basis.mean = table(mean.reshape(len(bodies), -1, LANES), vec8d)
+    basis.row = table(row.reshape(len(row), -1, LANES), vec8, np.float32)
+    basis.row_point = table(np.concatenate([joined("surface_points"), pin_points]), wp.vec3d)
+    basis.row_area = table(np.append(joined("surface_areas"), np.zeros(len(pin_points))), float, np.float32)
+    return basis
+
+
+def _padded(values: np.ndarray, stride: int) -> np.ndarray:
+    """Pad the function axis (the second) of basis values with zeros."""
+    widths = [(0, 0)] * values.ndim
+    widths[1] = (0, stride - values.shape[1])
+    return np.pad(np.asarray(values, float), widths)
+
+
+def _pins(
+    model: Any, bodies: Sequence[ReducedBody], asset: np.ndarray, stride: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Evaluate the basis at the pins; return rows, rest points, and the number of pins per instance."""
+    data = getattr(model, NAMESPACE)
+    owner = data.pin_instance.numpy() if hasattr(data, "pin_instance") else np.zeros(0, int)
+    points = data.pin_point.numpy().reshape(-1, 3) if len(owner) else np.zeros((0, 3))
+    counts = np.bincount(owner, minlength=len(asset)) if len(owner) else np.zeros(len(asset), int)
+    if (np.diff(owner) < 0).any():
+        raise ConfigError("pins are not ordered by instance", hint="add the pins of one body before the next")
+    rows = np.zeros((len(owner), stride))
+    known: dict[tuple[int, bytes], np.ndarray] = {}
+    for i in range(len(asset)):
+        mine = slice(counts[:i].sum(), counts[: i + 1].sum())
+        key = (int(asset[i]), points[mine].tobytes())
+        if counts[i] and key not in known:
+            known[key] = _padded(bodies[asset[i]].evaluate(points[mine])[0], stride)
+        if counts[i]:
+            rows[mine] = known[key]
+    return rows, points, counts
+
+
+def candidate_shapes(model: Any, layout: Layout) -> np.ndarray:
+    """List, per instance, the shapes of its world that collide with particles; -1 pads.
+
+    Raises:
+        ConfigError: If a shape cannot be touched.
+    """
+    instance_count, world_count = layout.instance_count, layout.world_count
+    if model.shape_count == 0:
+        return np.full((instance_count, 1), -1)
+    flags, kinds, worlds = model.shape_flags.numpy(), model.shape_type.numpy(), model.shape_world.numpy()
+    solid = (flags & int(newton.ShapeFlags.COLLIDE_PARTICLES)) != 0
+    supported = [int(kind) for kind in SUPPORTED_SHAPES]
+    for shape in np.flatnonzero(solid & ~np.isin(kinds, supported)):
+        raise ConfigError(
+            f"shape {shape} ({model.shape_label[shape]!r}) is a {newton.GeoType(int(kinds[shape])).name.lower()}, "
+            "which a soft body cannot touch",
+            hint="use a plane, box, sphere, capsule, cylinder or mesh, or clear its COLLIDE_PARTICLES flag",
+        )
+    scale = model.shape_scale.numpy()
+    meshes = np.isin(kinds, [int(newton.GeoType.MESH), int(newton.GeoType.CONVEX_MESH)])
+    uneven = np.ptp(np.abs(scale), axis=1) > 1e-5 * np.abs(scale).max(axis=1)
+    for shape in np.flatnonzero(solid & meshes & uneven):
+        raise ConfigError(
+            f"shape {shape} ({model.shape_label[shape]!r}) is a mesh scaled by {scale[shape]}, whose distances "
+            "a soft body cannot query",
+            hint="scale the vertices of the mesh instead",
+        )
+    moving = solid & (model.shape_body.numpy() >= 0) & (worlds == -1)
+    if world_count > 1 and moving.any():
+        raise ConfigError(
+            f"shape {np.flatnonzero(moving)[0]} belongs to a body outside all worlds; every world would push it",
+            hint="add the body to the builder that is replicated",
+        )
+    lists = [np.flatnonzero(solid & ((worlds == -1) | (worlds == w))) for w in layout.instance_world]
+    out = np.full((instance_count, max(max(map(len, lists)), 1)), -1)
+    for i, shapes in enumerate(lists):
+        out[i, : len(shapes)] = shapes
+    return out

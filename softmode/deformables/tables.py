@@ -1,0 +1,179 @@
+"""What the kernels of a step read and write, in groups.
+
+One *instance* is one body in one world; replicas of a body share the rows of its basis. Functions are stored in blocks
+of eight (see ``lanes``): an array over the unknowns of an instance has the blocks of x first, then those of y and z,
+entry ``component * block_count + block``, which is also the order of the linear system. Padding is zero everywhere.
+"""
+
+import warp as wp
+
+from softmode.deformables.lanes import sum8d, vec8, vec8d
+
+
+@wp.struct
+class Basis:
+    """The bases of all bodies, one after another; *rows* are the points at which functions are evaluated."""
+
+    gradient: wp.array3d[vec8]  # (block_count, point_total, 3) [1/m], points side by side in memory
+    gradient_across: wp.array3d[vec8]  # the same; on CUDA with blocks side by side, for kernels with a thread per block
+    point_weight: wp.array[wp.float64]  # (point_total,) [m^3]
+    stiffness_scale: wp.array[float]  # (point_total,)
+    mean: wp.array2d[vec8d]  # (asset_count, block_count)
+    row: wp.array2d[vec8]  # (row_total, block_count): surface samples of all bodies, then pins
+    row_point: wp.array[wp.vec3d]  # (row_total,) [m]
+    row_area: wp.array[float]  # (row_total,) [m^2]
+
+
+@wp.struct
+class Instances:
+    """Where each instance finds its data, and its parameters."""
+
+    world: wp.array[int]
+    asset: wp.array[int]
+    function_start: wp.array[int]  # first function in the state's arrays
+    function_count: wp.array[int]
+    driven_count: wp.array[int]  # leading functions that are prescribed
+    point_start: wp.array[int]
+    point_count: wp.array[int]
+    row_start: wp.array[int]
+    sample_count: wp.array[int]
+    particle_start: wp.array[int]
+    pin_start: wp.array[int]
+    pin_count: wp.array[int]
+    mass: wp.array[wp.float64]  # [kg]
+    inertia: wp.array[float]  # density times the square of the size [kg/m]
+    size: wp.array[float]  # diagonal of the bounding box [m]
+    tolerance: wp.array[float]  # [m], root mean square
+    margin: wp.array[float]  # contact detection distance [m]
+    smoothing: wp.array[float]  # range of the C2 onset of contact [m]
+    material_model: wp.array[int]
+    youngs_modulus: wp.array[float]  # [Pa]
+    poissons_ratio: wp.array[float]
+    viscosity: wp.array[float]  # [s]
+    mass_damping: wp.array[float]  # [1/s]
+    friction: wp.array[float]
+    contact_stiffness: wp.array[float]  # [Pa/m]
+
+
+@wp.struct
+class Motion:
+    """The step's data per unknown, shape (instance_count, 3 block_count) where not said."""
+
+    q_start: wp.array2d[vec8d]  # q_n [m]
+    qd_start: wp.array2d[vec8d]  # v_n [m/s]
+    q_rate: wp.array2d[vec8d]  # v = c (q - q_rate) / dt at the end of the step [m]
+    q_inertial: wp.array2d[vec8d]  # where the body would go without forces [m]
+    change: wp.array2d[vec8d]  # dt (v_n - v_(n-1)), 0 where there was no step before [m]
+    force: wp.array2d[vec8d]  # gravity and external forces [N]
+    rate: wp.array[wp.float64]  # (instance_count,), c: 1 implicit Euler, 3/2 BDF2
+
+
+@wp.struct
+class Points:
+    """Results at the cubature points."""
+
+    energy: wp.array2d[wp.float64]  # (instance_count, point_max) [J]
+    stress: wp.array2d[wp.mat33d]  # (instance_count, point_max), V P [N m]
+    hessian: wp.array3d[wp.mat33]  # (instance_count, 6, point_max), blocks 00, 01, 02, 11, 12, 22 of V d2Psi/dF2 [N m]
+    volume_ratio: wp.array2d[float]  # (instance_count, point_max), J
+
+
+@wp.struct
+class Entries:
+    """Point constraints of an instance: first its pins, then its contacts in sample order."""
+
+    count: wp.array[int]  # (instance_count,)
+    row: wp.array2d[int]  # (instance_count, entry_max)
+    shape: wp.array2d[int]  # -1 for a pin
+    arm: wp.array2d[wp.vec3]  # from the centre of mass of the shape's body [m]
+    normal: wp.array2d[wp.vec3d]
+    offset: wp.array2d[wp.vec3d]  # pin: x_n - target; contact: gap n - drift of the shape [m]
+    stiffness: wp.array2d[wp.float64]  # [N/m]
+    friction: wp.array2d[wp.float64]
+    normal_force: wp.array2d[wp.float64]  # of the last iterates, for friction [N]
+    energy: wp.array2d[wp.float64]  # [J]
+    force: wp.array2d[wp.vec3d]  # on the soft body [N]
+    hessian: wp.array2d[wp.mat33]  # [N/m]
+    jacobian: wp.array3d[wp.vec3]  # (instance_count, entry_max, rigid_max), motion of the shape per rigid unknown
+    coupling: wp.array3d[wp.vec3]  # hessian times jacobian
+
+
+@wp.struct
+class Rigid:
+    """Joint dofs that are unknowns of the solve, r = dt * joint velocity; see ``rigid_dofs``."""
+
+    count: wp.array[int]  # (world_count,)
+    dof_start: wp.array[int]  # (world_count,), first joint dof of a world
+    inertia: wp.array3d[wp.float64]  # (world_count, rigid_max, rigid_max), M_eff / dt^2
+    predicted: wp.array2d[wp.float64]  # (world_count, rigid_max)
+    r: wp.array2d[wp.float64]
+    trial: wp.array2d[wp.float64]
+    gradient: wp.array2d[wp.float64]
+    direction: wp.array2d[wp.float64]
+    matrix: wp.array3d[wp.float64]  # (world_count, rigid_max, rigid_max)
+    body_articulation: wp.array[int]  # (body_count,), -1 for none
+    body_link: wp.array[int]  # (body_count,), row block in the articulation's Jacobian
+    articulation_dof_start: wp.array[int]
+    articulation_dof_count: wp.array[int]
+    jacobian: wp.array3d[float]  # (articulation_count, 6 link_max, dof_max), twists of centres of mass, world frame
+
+
+@wp.struct
+class Progress:
+    """Where Newton's iteration stands in each world, shape (world_count,) where not said."""
+
+    instance_start: wp.array[int]  # (world_count + 1,)
+    active: wp.array[int]
+    searching: wp.array[int]
+    last: wp.array[int]  # whether every body moves less than its tolerance in this iteration
+    touching: wp.array[int]  # whether a body of the world is near a shape
+    renew: wp.array[int]  # whether the elastic Hessian is to be evaluated
+    project: wp.array[int]  # whether it is projected to positive semidefinite; Newton's own converges faster
+    failures: wp.array[int]  # how often Newton's own was indefinite in this step
+    exact: wp.array[int]  # whether friction takes its own curvature
+    iteration: wp.array[int]
+    status: wp.array[int]
+    potential: wp.array[wp.float64]  # [J]
+    slope: wp.array[wp.float64]  # [J]
+    step_length: wp.array[wp.float64]
+    partial: wp.array2d[wp.float64]  # (world_count, team), scratch of sums
+    any_active: wp.array[int]  # (1,)
+    any_searching: wp.array[int]  # (1,)
+
+
+@wp.func
+def blocks_of(function_count: int):
+    """Return the number of blocks that hold so many functions."""
+    return (function_count + 7) / 8
+
+
+@wp.func
+def interpolate(row: wp.array2d[vec8], r: int, q: wp.array2d[vec8d], i: int, function_count: int):
+    """Return sum_k b_k q_k at a row."""
+    stride = row.shape[1]
+    x = vec8d()
+    y = vec8d()
+    z = vec8d()
+    for b in range(blocks_of(function_count)):
+        value = vec8d(row[r, b])
+        x = x + wp.cw_mul(value, q[i, b])
+        y = y + wp.cw_mul(value, q[i, stride + b])
+        z = z + wp.cw_mul(value, q[i, 2 * stride + b])
+    return wp.vec3d(sum8d(x), sum8d(y), sum8d(z))
+
+
+@wp.func
+def interpolate_change(
+    row: wp.array2d[vec8], r: int, q: wp.array2d[vec8d], q_from: wp.array2d[vec8d], i: int, function_count: int
+):
+    """Return sum_k b_k (q_k - q_from_k) at a row."""
+    stride = row.shape[1]
+    x = vec8d()
+    y = vec8d()
+    z = vec8d()
+    for b in range(blocks_of(function_count)):
+        value = vec8d(row[r, b])
+        x = x + wp.cw_mul(value, q[i, b] - q_from[i, b])
+        y = y + wp.cw_mul(value, q[i, stride + b] - q_from[i, stride + b])
+        z = z + wp.cw_mul(value, q[i, 2 * stride + b] - q_from[i, 2 * stride + b])
+    return wp.vec3d(sum8d(x), sum8d(y), sum8d(z))

@@ -1,0 +1,31 @@
+"""A cube that can only move affinely: its four functions admit exact closed forms of statics and vibration."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+
+from softmode.deformables.body import BuildOptions, ReducedBody, build_body
+from softmode.deformables.quadrature import quadrature_from_box
+
+
+@functools.cache
+def affine_cube(edge: float = 1.0) -> ReducedBody:
+    """Return a cube reduced to the functions 1, X, Y, Z: every deformation is homogeneous.
+
+    The kinetic energy of x = F X is rho V edge^2 / 24 |dF/dt|^2 up to the error of the quadrature.
+    """
+    quadrature = quadrature_from_box((edge,) * 3, point_count=1000, surface_count=96)
+    body = build_body(quadrature, BuildOptions(mode_count=2, kernel_count=64, cubature_count=8), name=f"affine {edge}")
+    names = ("mean_basis", "linear_coordinates")
+    changes = {name: np.ascontiguousarray(getattr(body, name)[:4]) for name in names}
+    names = ("grad_basis", "surface_basis", "transform")
+    changes |= {name: np.ascontiguousarray(getattr(body, name)[:, :4]) for name in names}
+    return dataclasses.replace(body, **changes, fingerprint=f"{body.fingerprint}, affine")
+
+
+def mean_gradient(body: ReducedBody, q: np.ndarray) -> np.ndarray:
+    """Return the deformation gradient F (3, 3) that an affine body has at coordinates q (4, 3)."""
+    return np.eye(3) + np.einsum("kc,kd->cd", q, body.grad_basis.astype(float).mean(axis=0))
