@@ -288,7 +288,9 @@ class FreeBody:
         if q_start is None:
             C = projected(C).reshape(-1, 3, 3, 3, 3)
         else:
-            rate = self.material.viscosity / self.dt * (green_strain(F) - green_strain(self.deformation_gradient(q_start)))
+            rate = (
+                self.material.viscosity / self.dt * (green_strain(F) - green_strain(self.deformation_gradient(q_start)))
+            )
             C = C + np.einsum("ik,pjl->pijkl", I3, hooke_stress(rate, *self.hooke_moduli))
         C = C + viscous_hessian(F, *self.hooke_moduli, self.material.viscosity, self.dt)
         grad = self.body.grad_basis.astype(float)

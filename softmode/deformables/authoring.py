@@ -194,3 +194,50 @@ def add_pins(
             for a, b, c in zip(X, k, T, strict=True)
         ]
     )
+
+
+def add_region_pins(
+    builder: newton.ModelBuilder, instance: int, body: ReducedBody, name: str, *, youngs_modulus: float
+) -> None:
+    """Hold a soft region of a body where the body frame puts it, by pins of the stiffness it was built for.
+
+    Args:
+        builder: Builder that holds the instance.
+        instance: Index from :func:`add_reduced_body`.
+        body: The body, built with the region.
+        name: Name of the region.
+        youngs_modulus: Young's modulus of the instance [Pa]; the region's stiffness is relative to it.
+
+    Raises:
+        ConfigError: If the region is unknown or exact; exact ones follow ``control.softmode.q_driven``.
+    """
+    if name not in body.region_names:
+        raise ConfigError(f"body {body.name!r} has no region {name!r}", hint=f"it has {list(body.region_names)}")
+    stiffness = float(body.region_stiffness[body.region_names.index(name)])
+    if stiffness == 0.0:
+        raise ConfigError(f"region {name!r} is held exactly and needs no pins", hint="move it with drive_regions")
+    rows = body.region_rows(name)
+    rows = rows[body.region_weights[rows] > 0.0]
+    pins = stiffness * youngs_modulus * body.region_weights[rows]
+    add_pins(builder, instance, body.region_points[rows], stiffness=pins)
+
+
+def drive_regions(
+    model: Any, control: Any, instance: int, body: ReducedBody, rotations: np.ndarray, translations: np.ndarray
+) -> None:
+    """Say where the exact regions of a body shall be at the end of the next step.
+
+    Writes ``control.softmode.q_driven`` on the host; in a captured loop copy into that array on the device instead.
+
+    Args:
+        model: Finalised model.
+        control: Its control.
+        instance: Index of the instance in the model.
+        body: Its body.
+        rotations: Matrix A of each region, x = A X + t with X in the body frame, shape (region_count, 3, 3).
+        translations: Vector t of each region [m], shape (region_count, 3).
+    """
+    q = body.driven_affine(rotations, translations)
+    start = int(getattr(model, NAMESPACE).function_start.numpy()[instance])
+    target = getattr(control, NAMESPACE).q_driven
+    target[start : start + len(q)].assign(q)

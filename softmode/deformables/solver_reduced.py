@@ -16,7 +16,9 @@ from softmode.deformables.authoring import (
     NAMESPACE,
     add_pins,
     add_reduced_body,
+    add_region_pins,
     contact_stiffness,
+    drive_regions,
     register_custom_attributes,
 )
 from softmode.deformables.body import ReducedBody
@@ -32,7 +34,9 @@ __all__ = [
     "SolverReducedOptions",
     "add_pins",
     "add_reduced_body",
+    "add_region_pins",
     "contact_stiffness",
+    "drive_regions",
     "register_custom_attributes",
 ]
 
@@ -300,7 +304,8 @@ class SolverReduced(SolverBase):
     def minimise(self, dt: float) -> None:
         """Minimise the incremental potential of every world by Newton with a line search."""
         self._launch(kernels.begin_newton, self.world_count, [self.progress, self.instances, self.entries])
-        self._launch(kernels.extrapolate, self.functions, [self.instances, self.motion, self.entries], [self.q])
+        tables = [self.instances, self.motion, self.entries]
+        self._launch(kernels.extrapolate, self.functions, [*tables, wp.float64(dt)], [self.q])
         wp.capture_while(self.progress.any_active, self._newton_iteration, dt=dt)
 
     def _newton_iteration(self, dt: float) -> None:

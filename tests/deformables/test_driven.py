@@ -1,0 +1,104 @@
+"""Regions of a body that are held or moved: exactly, as driven coordinates, or softly, by pins."""
+
+import functools
+
+import newton
+import numpy as np
+import pytest
+
+from softmode.deformables.body import BuildOptions, Region, build_body
+from softmode.deformables.lanes import from_blocks
+from softmode.deformables.materials import Material
+from softmode.deformables.quadrature import quadrature_from_box
+from softmode.deformables.solver_reduced import SolverReducedOptions, add_reduced_body, add_region_pins, drive_regions
+from softmode.errors import ConfigError
+from tests.scenes import GRAVITY, Scene, rotation
+
+LENGTH, EDGE = 0.4, 0.1
+DOWN = (0.0, 0.0, -GRAVITY)
+MATERIAL = Material(youngs_modulus=2.0e5, mass_damping=20.0)
+FINE = SolverReducedOptions(tolerance=1.0e-8)
+FLOAT32 = float(np.finfo(np.float32).eps)
+
+
+@functools.cache
+def held_bar(stiffness=None, ends=1):
+    """Return a bar whose first (and last) 5 cm are a region."""
+    half, width = 0.5 * LENGTH, 0.05
+    low, high = np.array([-np.inf] * 3), np.array([np.inf] * 3)
+    left = Region(name="left", box=np.array([low, [-half + width, np.inf, np.inf]]), stiffness=stiffness)
+    right = Region(name="right", box=np.array([[half - width, -np.inf, -np.inf], high]), stiffness=stiffness)
+    quadrature = quadrature_from_box((LENGTH, EDGE, EDGE), point_count=2000, surface_count=150)
+    options = BuildOptions(mode_count=2, kernel_count=200, cubature_count=200)
+    return build_body(quadrature, options, regions=(left, right)[:ends], name="held bar")
+
+
+def scene_of(body, **options):
+    """Return one bar under gravity."""
+    return Scene(
+        lambda world: add_reduced_body(world, body, material=MATERIAL), [body], gravity=DOWN, options=FINE, **options
+    )
+
+
+def region_positions(scene, name):
+    """Return where the points of a region are [m]."""
+    body = scene.body()
+    rows = body.region_rows(name)
+    return body.region_points[rows] + body.evaluate(body.region_points[rows])[0] @ scene.q(), body.region_points[rows]
+
+
+def test_exact_region_stays_put():
+    """Held exactly, x = X on the region while the rest sags; what holds it is the weight: sum_k c_k g_k = m g."""
+    body = held_bar()
+    scene = scene_of(body, dt=0.02)
+    scene.step(150)
+    x, X = region_positions(scene, "left")
+    np.testing.assert_allclose(x, X, atol=1e-9)
+    assert scene.q()[body.driven_count :].min() < -1e-3
+    assert np.linalg.norm(scene.qd()) < 1e-6
+    reaction = from_blocks(scene.reduced.reaction.numpy()[0], body.function_count)
+    assert not reaction[body.driven_count :].any()
+    force = body.drive_affine[0][:, 3] @ reaction[: body.driven_count]
+    np.testing.assert_allclose(force, [0.0, 0.0, scene.mass() * GRAVITY], atol=1e-5 * scene.mass() * GRAVITY)
+
+
+def test_driven_regions_follow_their_poses():
+    """Each exact region moves as x = A_i X + t_i, to rounding; the body between them twists without a status bit."""
+    body = held_bar(ends=2)
+    scene = scene_of(body, dt=0.01)
+    for k in range(1, 21):
+        turn = np.stack([np.eye(3), rotation((1, 0, 0), 0.05 * k)])
+        shift = np.array([[0.0, 0.0, 0.0], [0.002 * k, 0.0, 0.0]])
+        drive_regions(scene.model, scene.control, 0, body, turn, shift)
+        scene.step()
+        for i, name in enumerate(("left", "right")):
+            x, X = region_positions(scene, name)
+            np.testing.assert_allclose(x, X @ turn[i].T + shift[i], atol=8 * FLOAT32 * LENGTH)
+    assert not scene.reduced.status.numpy().any()
+    middle = body.evaluate(np.array([[0.0, 0.0, 0.5 * EDGE]]))[0] @ scene.q()
+    assert 0.2 < -middle[0, 1] / (0.5 * EDGE) < 0.8  # about half of the radian
+
+
+def test_soft_region_is_held_by_its_pins():
+    """Kappa sum_p V_p (x_p - X_p) = weight at rest: the region sinks by weight over its stiffness, at its own mean."""
+    body = held_bar(stiffness=1.0e3)
+
+    def populate(world):
+        add_region_pins(world, add_reduced_body(world, body, material=MATERIAL), body, "left", youngs_modulus=2.0e5)
+
+    scene = Scene(populate, [body], gravity=DOWN, options=FINE, dt=0.02)
+    scene.step(200)
+    rows = body.region_rows("left")
+    x, X = region_positions(scene, "left")
+    force = -1.0e3 * 2.0e5 * body.region_weights[rows] @ (x - X)
+    np.testing.assert_allclose(force, [0.0, 0.0, scene.mass() * GRAVITY], atol=1e-3 * scene.mass() * GRAVITY)
+
+
+def test_region_pins_refuse_what_needs_none():
+    """Unknown names and exact regions: an error that says what to do."""
+    builder = newton.ModelBuilder()
+    instance = add_reduced_body(builder, held_bar(), material=MATERIAL)
+    with pytest.raises(ConfigError, match="no region"):
+        add_region_pins(builder, instance, held_bar(), "tip", youngs_modulus=1.0e5)
+    with pytest.raises(ConfigError, match="exactly"):
+        add_region_pins(builder, instance, held_bar(), "left", youngs_modulus=1.0e5)
