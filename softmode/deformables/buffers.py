@@ -10,7 +10,7 @@ from softmode.deformables.lanes import vec8d
 from softmode.deformables.tables import Entries, Motion, Points, Progress
 
 
-def make_motion(functions: tuple[int, int], device: Any) -> Motion:
+def make_motion(functions: tuple[int, int], device: Any) -> Any:
     """Return the per-unknown data of a step for (instance_count, 3 block_count) blocks."""
     motion = Motion()
     for name in ("q_start", "qd_start", "q_rate", "q_inertial", "change", "force"):
@@ -19,7 +19,7 @@ def make_motion(functions: tuple[int, int], device: Any) -> Motion:
     return motion
 
 
-def make_points(instance_count: int, point_max: int, device: Any) -> Points:
+def make_points(instance_count: int, point_max: int, device: Any) -> Any:
     """Return the results at the cubature points."""
     points, shape = Points(), (instance_count, point_max)
     points.energy = wp.zeros(shape, dtype=wp.float64, device=device)
@@ -29,7 +29,7 @@ def make_points(instance_count: int, point_max: int, device: Any) -> Points:
     return points
 
 
-def make_samples(instance_count: int, sample_max: int, team: int, device: Any) -> Samples:
+def make_samples(instance_count: int, sample_max: int, team: int, device: Any) -> Any:
     """Return the surface samples of a step and the contacts they find."""
     samples, shape = Samples(), (instance_count, sample_max)
     samples.position = wp.zeros(shape, dtype=wp.vec3d, device=device)
@@ -43,7 +43,7 @@ def make_samples(instance_count: int, sample_max: int, team: int, device: Any) -
     return samples
 
 
-def make_entries(instance_count: int, entry_max: int, rigid_max: int, device: Any) -> Entries:
+def make_entries(instance_count: int, entry_max: int, rigid_max: int, device: Any) -> Any:
     """Return the point constraints of a step."""
     entries, shape = Entries(), (instance_count, entry_max)
     entries.count = wp.zeros(instance_count, dtype=int, device=device)
@@ -61,7 +61,7 @@ def make_entries(instance_count: int, entry_max: int, rigid_max: int, device: An
     return entries
 
 
-def make_progress(instance_start: np.ndarray, team: int, device: Any) -> Progress:
+def make_progress(instance_start: np.ndarray, team: int, device: Any) -> Any:
     """Return the state of Newton's iteration."""
     progress, world_count = Progress(), len(instance_start) - 1
     progress.instance_start = wp.array(instance_start, dtype=int, device=device)

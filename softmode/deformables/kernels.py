@@ -18,7 +18,7 @@ Precision: basis data float32; q, energy and residual float64; the Newton direct
 
 import warp as wp
 
-from softmode.deformables.lanes import LANES, barrier, sum8d, vec8, vec8d
+from softmode.deformables.lanes import LANES, barrier, sum8d, vec8d
 from softmode.deformables.materials import (
     MaterialModel,
     MaterialParameters,
@@ -38,7 +38,6 @@ from softmode.deformables.tables import (
     Progress,
     Rigid,
     blocks_of,
-    interpolate,
 )
 
 wp.set_module_options({"enable_backward": False})

@@ -40,10 +40,10 @@ class Layout:
     """Row of the first pin in ``basis.row``."""
     size: np.ndarray
     """Diagonal of the bounding box per instance [m]."""
-    basis: Basis
-    """The bases."""
-    instances: Instances
-    """Offsets, counts and parameters; masses and tolerances are the solver's to fill."""
+    basis: Any
+    """The bases, a :class:`softmode.deformables.tables.Basis`."""
+    instances: Any
+    """Offsets, counts and parameters, :class:`softmode.deformables.tables.Instances`; masses and tolerances are the solver's to fill."""
 
     @property
     def instance_count(self) -> int:
@@ -123,7 +123,7 @@ def lay_out(model: Any, bodies: Sequence[ReducedBody]) -> Layout:
 
 def _basis(
     bodies: Sequence[ReducedBody], stride: int, pin_rows: np.ndarray, pin_points: np.ndarray, device: Any
-) -> Basis:
+) -> Any:
     """Concatenate the bases of all bodies, padded to ``stride`` functions, in blocks of eight."""
     gradient = np.concatenate([_padded(body.grad_basis, stride) for body in bodies])
     gradient = gradient.reshape(len(gradient), -1, LANES, 3).transpose(1, 0, 3, 2)

@@ -51,8 +51,9 @@ class SolverReducedOptions:
     """How a step is solved."""
 
     integrator: Integrator = "euler"
-    """"euler": implicit Euler, first order, damps what a step cannot resolve (half of a 10 rad/s spin per second at 60
-    Hz). "bdf2": second order, keeps 97 % of it; needs equal steps, and takes an Euler step where there is none before."""
+    """"euler": implicit Euler, first order, damps what a step cannot resolve (half of a 10 rad/s spin in a second at
+    60 Hz). "bdf2": second order, keeps 97 % of it; needs equal steps, and takes an Euler step where there is none
+    before."""
     iteration_max: int = 20
     """Newton iterations at most."""
     stiffness_renewal: int = 5
@@ -172,7 +173,7 @@ class SolverReduced(SolverBase):
         """Return into how many parts sums over points are split where a kernel has so many threads."""
         return int(np.clip(CUDA_THREADS // threads, 1, 16)) if self.model.device.is_cuda else 1
 
-    def _shapes(self) -> detection.Shapes:
+    def _shapes(self) -> Any:
         """Gather what contact reads of the model's shapes."""
         model, shapes = self.model, detection.Shapes()
         if model.shape_count:
@@ -247,9 +248,7 @@ class SolverReduced(SolverBase):
         """Read the state and predict."""
         data, chunk = getattr(state, NAMESPACE), self.gradient_chunk
         dim = (self.instance_count, chunk.shape[1], self.layout.block_count)
-        self._launch(
-            kernels.sum_external, dim, [self.instances, self.basis, state.particle_f, chunk.shape[1]], [chunk]
-        )
+        self._launch(kernels.sum_external, dim, [self.instances, self.basis, state.particle_f, chunk.shape[1]], [chunk])
         self._launch(
             kernels.begin_step,
             (self.instance_count, self.layout.block_count),
@@ -413,10 +412,11 @@ class SolverReduced(SolverBase):
         """Start the line search of every active world."""
         self.progress.any_searching.zero_()
         limits = [self.rigid_tolerance, wp.float64(self.options.stick_velocity * dt)]
+        linear = [self.gradient, self.direction, self.system.indefinite]
         self._launch(
             search.begin_search,
             self.world_count,
-            [self.instances, self.entries, self.rigid.table, *limits, self.gradient, self.direction, self.system.indefinite],
+            [self.instances, self.entries, self.rigid.table, *limits, *linear],
             [self.progress],
         )
 
@@ -514,9 +514,7 @@ class SolverReduced(SolverBase):
         self, kernel: Any, dim: Any, inputs: list[Any], outputs: Sequence[Any] = (), block_dim: int = 256
     ) -> None:
         """Launch on the model's device."""
-        wp.launch(
-            kernel, dim=dim, inputs=inputs, outputs=list(outputs), block_dim=block_dim, device=self.model.device
-        )
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=list(outputs), block_dim=block_dim, device=self.model.device)
 
     def _launch_team(self, kernel: Any, count: int, inputs: list[Any], outputs: Sequence[Any] = ()) -> None:
         """Launch one team of threads per world or instance, each in a block of its own."""

@@ -206,7 +206,7 @@ class TableScene:
             dim=(worlds, self.soft.body.function_count),
             inputs=[
                 data.function_start,
-                self.solver.reduced.world,
+                self.solver.reduced.instances.world,
                 self._linear,
                 self._world_mask,
                 self._place_position,
