@@ -46,6 +46,18 @@ def block_task(task: int, block_count: int):
     return wp.where(diagonal == 0, 0, wp.where(diagonal == 1, 3, 5)), rows, rows + lanes
 
 
+@wp.func
+def free_part(value: vec8, driven: int):
+    """Return the lanes with those of the first ``driven`` functions set to zero."""
+    if driven <= 0:
+        return value
+    out = vec8()
+    for lane in range(LANES):
+        if lane >= driven:
+            out[lane] = value[lane]
+    return out
+
+
 @wp.kernel
 def assemble_stiffness(
     instances: Instances,
@@ -171,7 +183,6 @@ def assemble_matrix(
     instances: Instances,
     basis: Basis,
     motion: Motion,
-    entries: Entries,
     active: wp.array[int],
     stiffness: wp.array4d[vec8],
     pins: wp.array3d[vec8],
@@ -180,7 +191,7 @@ def assemble_matrix(
     # Out:
     matrix_out: wp.array3d[vec8],  # (instance_count, 3 stride, ...), upper triangle
 ):
-    """Add inertia, pins and contacts, sum_e b^T H b, to the stiffness; driven unknowns stay put."""
+    """Add inertia and pins to the stiffness; driven unknowns stay put."""
     i, row, member = wp.tid()
     if active[instances.world[i]] == 0:
         return
@@ -197,14 +208,7 @@ def assemble_matrix(
                 value = value + stiffness[i, chunk, row, column]
             if c == d and instances.pin_count[i] > 0:
                 value = value + pins[i, k, lanes]
-            for e in range(instances.pin_count[i], entries.count[i]):
-                r = entries.row[i, e]
-                b = basis.row[r, k / LANES][k % LANES]
-                value = value + (b * entries.hessian[i, e][c, d]) * basis.row[r, lanes]
-            if k < driven or LANES * lanes < driven:
-                for lane in range(LANES):
-                    if k < driven or LANES * lanes + lane < driven:
-                        value[lane] = 0.0
+            value = free_part(value, wp.where(k < driven, LANES, driven - LANES * lanes))
             if row / LANES == column:
                 # the padding behind the functions carries inertia alone
                 rate = motion.rate[i] / dt
@@ -216,6 +220,55 @@ def assemble_matrix(
 
 
 @wp.kernel
+def add_contacts(
+    instances: Instances,
+    basis: Basis,
+    entries: Entries,
+    active: wp.array[int],
+    # In and out:
+    matrix: wp.array3d[vec8],  # (instance_count, 3 stride, ...), upper triangle
+):
+    """Add the contacts, sum_e b^T H b, to 8x8 blocks; driven unknowns stay put."""
+    i, task = wp.tid()
+    if active[instances.world[i]] == 0 or entries.count[i] == instances.pin_count[i]:
+        return
+    block_count = basis.row.shape[1]
+    pair, rows, lanes = block_task(task, block_count)
+    c, d = block_pair(pair)
+    driven = instances.driven_count[i]
+    a0 = vec8()
+    a1 = vec8()
+    a2 = vec8()
+    a3 = vec8()
+    a4 = vec8()
+    a5 = vec8()
+    a6 = vec8()
+    a7 = vec8()
+    for e in range(instances.pin_count[i], entries.count[i]):
+        r = entries.row[i, e]
+        b = free_part(basis.row[r, rows], driven - LANES * rows)
+        v = entries.hessian[i, e][c, d] * free_part(basis.row[r, lanes], driven - LANES * lanes)
+        a0 = a0 + b[0] * v
+        a1 = a1 + b[1] * v
+        a2 = a2 + b[2] * v
+        a3 = a3 + b[3] * v
+        a4 = a4 + b[4] * v
+        a5 = a5 + b[5] * v
+        a6 = a6 + b[6] * v
+        a7 = a7 + b[7] * v
+    row = LANES * (c * block_count + rows)
+    column = d * block_count + lanes
+    matrix[i, row, column] = matrix[i, row, column] + a0
+    matrix[i, row + 1, column] = matrix[i, row + 1, column] + a1
+    matrix[i, row + 2, column] = matrix[i, row + 2, column] + a2
+    matrix[i, row + 3, column] = matrix[i, row + 3, column] + a3
+    matrix[i, row + 4, column] = matrix[i, row + 4, column] + a4
+    matrix[i, row + 5, column] = matrix[i, row + 5, column] + a5
+    matrix[i, row + 6, column] = matrix[i, row + 6, column] + a6
+    matrix[i, row + 7, column] = matrix[i, row + 7, column] + a7
+
+
+@wp.kernel
 def assemble_columns(
     instances: Instances,
     basis: Basis,
@@ -224,29 +277,24 @@ def assemble_columns(
     gradient: wp.array2d[vec8d],
     rigid_count: int,
     # Out:
-    matrix_out: wp.array3d[vec8],
+    matrix_out: wp.array3d[float],  # (instance_count, 3 stride, 3 stride + ...)
 ):
     """Fill the columns right of K: d2E/dq dr = -sum_e b_k H_e J_e, and -g in column rigid_count."""
-    i, rows, block = wp.tid()
+    i, rows, j = wp.tid()
     if active[instances.world[i]] == 0:
         return
     block_count = basis.row.shape[1]
     c = rows / block_count
-    g = gradient[i, rows]
+    b = rows % block_count
+    value = vec8()
+    if j == rigid_count:
+        value = vec8(-gradient[i, rows])
+    else:
+        for e in range(instances.pin_count[i], entries.count[i]):
+            value = value - entries.coupling[i, e, j][c] * basis.row[entries.row[i, e], b]
+        value = free_part(value, instances.driven_count[i] - LANES * b)
     for a in range(LANES):
-        k = LANES * (rows % block_count) + a
-        value = vec8()
-        for lane in range(LANES):
-            j = LANES * block + lane
-            if j == rigid_count:
-                value[lane] = -float(g[a])
-            if j < rigid_count and k >= instances.driven_count[i]:
-                total = float(0.0)
-                for e in range(instances.pin_count[i], entries.count[i]):
-                    b = basis.row[entries.row[i, e], rows % block_count]
-                    total -= b[a] * entries.coupling[i, e, j][c]
-                value[lane] = total
-        matrix_out[i, LANES * rows + a, 3 * block_count + block] = value
+        matrix_out[i, LANES * rows + a, 3 * LANES * block_count + j] = value[a]
 
 
 @wp.kernel

@@ -35,7 +35,7 @@ def _factor(
     # Out:
     diagonal_out: wp.array2d[
         vec8
-    ],  # (system_count, N): rows of the diagonal blocks of U, inverse pivots on the diagonal
+    ],  # (system_count, N): diagonal blocks of U with inverse pivots
     indefinite_out: wp.array[int],  # (system_count,), 1 where a pivot had to be raised
 ):
     """Factor row block by row block: subtract what is above (left-looking), then solve with the diagonal block."""
@@ -193,12 +193,13 @@ class BlockCholesky:
         self.device = device
         total = self.block_count + self.column_block_count
         self.matrix = wp.zeros((self.system_count, size, total), dtype=vec8, device=device)
+        shape = (self.system_count, size, LANES * total)
+        self.scalars = wp.array(ptr=self.matrix.ptr, dtype=float, shape=shape, device=device, copy=False)
+        """The same memory as ``matrix``, number by number."""
         self.team, self.width, self._unit = 1, LANES, self.matrix
         if wp.get_device(device).is_cuda:
-            columns = LANES * total
-            self.team, self.width = min(-(-columns // TEAM) * TEAM, 8 * TEAM), 1
-            shape = (self.system_count, size, columns)
-            self._unit = wp.array(ptr=self.matrix.ptr, dtype=float, shape=shape, device=device, copy=False)
+            self.team, self.width, self._unit = min(-(-LANES * total // TEAM) * TEAM, 8 * TEAM), 1, self.scalars
+        self._factor = wp.overload(_factor, {"unit": self._unit})
         self.indefinite = wp.zeros(self.system_count, dtype=int, device=device)
         self.diagonal = wp.zeros((self.system_count, size), dtype=vec8, device=device)
         self.right = wp.zeros((self.system_count, size), dtype=float, device=device)
@@ -210,7 +211,7 @@ class BlockCholesky:
         Sets ``indefinite`` where a pivot had to be raised.
         """
         selection = [self.system_world, active, self.block_count, self.team, self.width]
-        self._launch(_factor, [*selection, self.matrix, self._unit], [self.diagonal, self.indefinite])
+        self._launch(self._factor, [*selection, self.matrix, self._unit], [self.diagonal, self.indefinite])
 
     def solve(self, active: wp.array, column: int, tail: wp.array, tail_count: int) -> wp.array:
         """Return x of U x = y - Y tail, shape (system_count, N / 8) of 8-vectors."""

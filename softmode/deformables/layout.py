@@ -43,7 +43,8 @@ class Layout:
     basis: Any
     """The bases, a :class:`softmode.deformables.tables.Basis`."""
     instances: Any
-    """Offsets, counts and parameters, :class:`softmode.deformables.tables.Instances`; masses and tolerances are the solver's to fill."""
+    """Offsets, counts and parameters, :class:`softmode.deformables.tables.Instances`; masses and tolerances are the
+    solver's to fill."""
 
     @property
     def instance_count(self) -> int:

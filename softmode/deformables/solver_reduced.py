@@ -373,10 +373,11 @@ class SolverReduced(SolverBase):
         instances, basis, entries = self.instances, self.basis, self.entries
         active, blocks, rigid = self.progress.active, self.layout.block_count, self.rigid
         chunks = self.stiffness.shape[1]
+        tasks = 3 * blocks * blocks + 3 * (blocks * blocks + blocks) // 2  # 8x8 blocks of the upper triangle
         columns = 3 * blocks if self.model.device.is_cuda else 1  # threads that share a row of the matrix
         self._launch(
             assembly.assemble_stiffness,
-            (self.instance_count, chunks, 3 * blocks * blocks + 3 * (blocks * blocks + blocks) // 2),
+            (self.instance_count, chunks, tasks),
             [instances, basis, self.points, active, self.progress.renew, chunks],
             [self.stiffness],
             block_dim=128,  # more than 100 registers per thread: larger blocks leave half of a multiprocessor idle
@@ -384,14 +385,21 @@ class SolverReduced(SolverBase):
         self._launch(
             assembly.assemble_matrix,
             (self.instance_count, 3 * self.stride, columns),
-            [instances, basis, self.motion, entries, active, self.stiffness, self.pins, wp.float64(dt), columns],
+            [instances, basis, self.motion, active, self.stiffness, self.pins, wp.float64(dt), columns],
             [self.system.matrix],
         )
         self._launch(
-            assembly.assemble_columns,
-            (self.instance_count, 3 * blocks, self.system.column_block_count),
-            [instances, basis, entries, active, self.gradient, rigid.count_max],
+            assembly.add_contacts,
+            (self.instance_count, tasks),
+            [instances, basis, entries, active],
             [self.system.matrix],
+            block_dim=128,
+        )
+        self._launch(
+            assembly.assemble_columns,
+            (self.instance_count, 3 * blocks, rigid.count_max + 1),
+            [instances, basis, entries, active, self.gradient, rigid.count_max],
+            [self.system.scalars],
         )
         if rigid.count_max:
             dim = (self.world_count, rigid.count_max, rigid.count_max)
