@@ -128,7 +128,14 @@ def _build(
             stage,
         )
         count = len(points) if options.cubature_count is None else options.cubature_count
-        chosen = select_cubature(volumes, basis.gradient, count, stiffness_scale=stiffness, seed=options.seed)
+        chosen = select_cubature(
+            volumes,
+            basis.gradient,
+            count,
+            stiffness_scale=stiffness,
+            driven_count=basis.functions.driven_count,
+            seed=options.seed,
+        )
         stage("cubature")
         function_count = basis.gradient.shape[1]
         cores = [region.cores for region in regions]
@@ -184,6 +191,7 @@ def _build(
         "cubature_count": len(chosen.index),
         "cubature_force_error": chosen.force_error,
         "cubature_stiffness_error": chosen.stiffness_error,
+        "soft_mode_error": chosen.soft_mode_error,
         **{f"cubature_force_error_{size}": error for size, error in chosen.trade_off.items()},
     }
     return dataclasses.replace(

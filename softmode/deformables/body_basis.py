@@ -121,6 +121,7 @@ def make_body_basis(domain: Domain, options: BuildOptions, stage: Callable[[str]
         length=domain.length,
         kept=skin.translating,
         held=bool(domain.regions),
+        rank_tolerance=options.rank_tolerance,
         trace=trace,
     )
     driven = np.zeros((0, 0)) if trace is None else trace @ found.transform[:, : found.driven_count]

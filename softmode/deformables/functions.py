@@ -17,13 +17,14 @@ from softmode.errors import BasisError
 Array = NDArray[np.float64]
 
 RANK_TOLERANCE = 1e-5
-"""Directions of the scaled mass Gram matrix under this fraction of the largest are dropped. That is an amplitude of
-0.3 %, the error of the eigenmodes themselves: on a sphere, where x W_y = y W_x, 8 of 36 functions are such noise.
-Dropping them changes the compliance of a clamped sphere by 0.1 % and cuts the cubature's force error tenfold.
-Rougher functions above the bound matter: a bound of 1e-3 makes a clamped beam half again as stiff."""
+"""Default of `BuildOptions.rank_tolerance`. Directions of the scaled mass Gram matrix under this fraction of the
+largest are dropped. That is an amplitude of 0.3 %, the error of the eigenmodes themselves: on a sphere, where
+x W_y = y W_x, 8 of 36 functions are such noise. Dropping them changes the compliance of a clamped sphere by 0.1 % and
+cuts the cubature's force error tenfold. Rougher functions above the bound matter: a bound of 1e-3 makes a clamped beam
+half again as stiff."""
 HELD_RANK_TOLERANCE = 1e-7
-"""The same bound on a body with regions, where little is noise: a clamped beam under twice its weight has an error of
-4e-7 with the five functions between the bounds and 3e-6 without them (nMSE, 123 and 108 unknowns)."""
+"""The largest bound on a body with regions, where little is noise: a clamped beam under twice its weight has an error
+of 4e-7 with the five functions between the bounds and 3e-6 without them (nMSE, 123 and 108 unknowns)."""
 KEPT_TOLERANCE = 1e-10
 """The bound for static responses. What eigenmodes lack in a response is small but decides its energy: under the
 bound above, the response of a clamped beam lost its anticlastic part and the beam was 20 % too stiff."""
@@ -56,6 +57,7 @@ def orthonormalise(
     length: float,
     kept: NDArray[np.bool_] | None = None,
     held: bool = False,
+    rank_tolerance: float = RANK_TOLERANCE,
     trace: Array | None = None,
 ) -> Functions:
     """Build the orthonormal functions.
@@ -69,7 +71,8 @@ def orthonormalise(
         length: Unit of length of the raw functions [m].
         kept: Raw functions that come next and are dropped only when they repeat others to rounding, (R,); none when
             None.
-        held: Whether the body has regions, which decides the rank tolerance.
+        held: Whether the body has regions, which caps the rank tolerance at `HELD_RANK_TOLERANCE`.
+        rank_tolerance: Directions of the scaled mass Gram matrix under this fraction of the largest are dropped.
         trace: Raw functions at points that fill the exact regions, (T, R); None without such regions.
 
     Returns:
@@ -88,7 +91,8 @@ def orthonormalise(
     others = np.ones(total, dtype=bool)
     others[lead] = False
     both = _extend(both, gram, np.flatnonzero(others & kept), KEPT_TOLERANCE)
-    both = _extend(both, gram, np.flatnonzero(others & ~kept), HELD_RANK_TOLERANCE if held else RANK_TOLERANCE)
+    bound = min(rank_tolerance, HELD_RANK_TOLERANCE) if held else rank_tolerance
+    both = _extend(both, gram, np.flatnonzero(others & ~kept), bound)
     if both.shape[1] == len(lead):
         raise BasisError("the eigenmodes add nothing to affine motion", hint="Use more modes or kernels.")
     # One pass against the actual functions repairs what the squared condition number of the Gram matrix cost.

@@ -36,7 +36,7 @@ def quadrature_from_mesh(
         seed: Seed of the surface samples.
 
     Returns:
-        The quadrature; weights sum to the mesh volume.
+        The quadrature; weights sum to the mesh volume, less what overlapping parts count repeatedly (by the chords).
 
     Raises:
         AssetError: If the mesh is empty, not finite, not closed, not consistently oriented, or of zero or negative
@@ -58,11 +58,9 @@ def quadrature_from_mesh(
             hint="Flip the faces (inside out) or close and thicken the mesh.",
         )
     shape = grid_shape(upper - lower, volume, area, point_count)
-    cell, first = _integrate_columns(corner, normal[:, 2], lower, upper, shape)
+    cell, first, signed = _integrate_columns(corner, normal[:, 2], lower, upper, shape)
     points, weights, counted = assemble_cells(cell, first, lower, upper, shape)
-    overlapping = abs(counted / volume - 1.0) > 0.01
-    if overlapping:
-        volume = counted
+    volume *= counted / signed
     rng = np.random.default_rng(seed)
     candidate_count = CANDIDATES_PER_SAMPLE * surface_count
     pick = np.searchsorted(
@@ -74,7 +72,7 @@ def quadrature_from_mesh(
     surface = select_surface(
         np.einsum("nk,nki->ni", bary, corner[pick]), normal[pick] / twice_area[pick, None], area, surface_count, seed
     )
-    report = {"source": "mesh", "triangles": len(face), "overlapping": overlapping}
+    report = {"source": "mesh", "triangles": len(face), "overlapping": signed > 1.001 * counted}
     extent = np.stack([lower, upper])
     return finish_quadrature(points, weights, counted, volume, (upper - lower) / shape, surface, extent, report)
 
@@ -106,8 +104,8 @@ def _load_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, NDArray[np
 
 def _integrate_columns(
     corner: Array, normal_z: Array, lower: Array, upper: Array, shape: NDArray[np.int64]
-) -> tuple[Array, Array]:
-    """Return volume (cells,) and first moment (cells, 3) of a closed mesh in every grid cell."""
+) -> tuple[Array, Array, float]:
+    """Return volume (cells,) and first moment (cells, 3) per grid cell of a mesh, and the chords' signed volume."""
     fine = shape[:2] * SUBDIVISION
     width = (upper - lower)[:2] / fine
     # Columns stand at sub-cell centres. Triangle-column pairs from each triangle's bounding box, then three edge tests.
@@ -137,7 +135,9 @@ def _integrate_columns(
     key, height, column = key[order], height[order], column[order]
     # Going up, a downward facing triangle enters the object. Columns balance, so one running sum serves all.
     winding = np.cumsum(np.where(normal_z[triangle[order]] < 0.0, 1, -1))
-    open_ = np.flatnonzero((winding[:-1] > 0) & (key[:-1] == key[1:]))
+    same = key[:-1] == key[1:]
+    signed = float((winding[:-1] * np.diff(height))[same].sum() * width.prod())
+    open_ = np.flatnonzero((winding[:-1] > 0) & same)
     bottom, top, column = height[open_], height[open_ + 1], column[open_]
 
     # Cut each chord at the cell borders.
@@ -153,4 +153,4 @@ def _integrate_columns(
     fine_xy = column[chord]
     index = np.ravel_multi_index((fine_xy[:, 0] // SUBDIVISION, fine_xy[:, 1] // SUBDIVISION, k), tuple(shape))
     position = np.column_stack([lower[:2] + (fine_xy + 0.5) * width, 0.5 * (low + high)])
-    return sum_by(index, volume, position, int(shape.prod()))
+    return *sum_by(index, volume, position, int(shape.prod())), signed

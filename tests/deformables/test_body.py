@@ -21,6 +21,7 @@ from softmode.deformables.body import (
     cached_body,
     fingerprint_of,
 )
+from softmode.deformables.functions import RANK_TOLERANCE
 from softmode.deformables.quadrature import (
     Quadrature,
     quadrature_from_box,
@@ -182,11 +183,23 @@ def test_bad_fields_are_refused(quadrature: Quadrature, field: str, bad: float) 
 
 
 def test_bad_options_are_refused() -> None:
-    """Counts out of range raise ConfigError."""
+    """Counts and tolerances out of range raise ConfigError."""
     bad = ({"mode_count": 0}, {"kernel_count": 8}, {"cubature_count": 3}, {"handles": "cubic"})
-    for options in (*bad, {"poissons_ratio": 0.5}, {"response_derivatives": 19}):
+    rank = ({"rank_tolerance": 0.0}, {"rank_tolerance": 0.02}, {"rank_tolerance": np.nan})
+    for options in (*bad, *rank, {"poissons_ratio": 0.5}, {"response_derivatives": 19}):
         with pytest.raises(ConfigError, match=next(iter(options))):
             BuildOptions(**options)
+
+
+def test_rank_tolerance_decides_what_is_dropped() -> None:
+    """On a sphere x W_y = y W_x to the error of the eigenmodes: a tiny tolerance keeps what the default drops."""
+    quadrature = quadrature_from_sphere(0.03)
+    options = BuildOptions(cubature_count=48)
+    default, fine = (build_body(quadrature, dataclasses.replace(options, rank_tolerance=t)) for t in (1e-5, 1e-9))
+    assert default.function_count < fine.function_count <= 36
+    assert default.fingerprint != fine.fingerprint
+    assert fine.provenance["option_rank_tolerance"] == 1e-9
+    assert default.provenance["option_rank_tolerance"] == RANK_TOLERANCE == 1e-5
 
 
 def test_object_without_volume_is_refused(quadrature: Quadrature) -> None:
