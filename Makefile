@@ -21,7 +21,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 unexport VIRTUAL_ENV
 
 .DEFAULT_GOAL := help
-.PHONY: help lock demo test test-slow lint bench clean
+.PHONY: help lock demo test test-slow lint bench accuracy baselines clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -48,7 +48,7 @@ $(VENV)/.dev: $(VENV)/.created pyproject.toml constraints.txt
 	@touch $@ $(VENV)/.demo
 
 lock: $(VENV)/.created  ## pin the newest versions that pyproject.toml allows
-	$(UV) pip compile --quiet --universal --upgrade --python-version 3.11 --extra demo --extra dev --no-header \
+	$(UV) pip compile --quiet --universal --upgrade --python-version 3.11 --extra demo --extra dev --extra bench --no-header \
 	  --no-annotate --no-emit-index-url pyproject.toml -o constraints.txt
 
 demo: $(VENV)/.demo  ## play the scripted lift and write out/lift.mp4
@@ -65,8 +65,21 @@ lint: $(VENV)/.dev  ## ruff and pyright
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
-bench: $(VENV)/.demo  ## time the build and each stage of a step
-	$(BIN)/python benchmarks/step.py $(ARGS)
+bench: $(VENV)/.demo  ## time the build, a step and each stage of a grasp
+	$(BIN)/python benchmarks/build.py
+	$(BIN)/python benchmarks/step.py --stages $(ARGS)
+	$(BIN)/python benchmarks/grasp.py
+
+$(VENV)/.bench: $(VENV)/.dev
+	$(INSTALL) --editable '.[bench]' || $(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[bench]'
+	@touch $@
+
+accuracy: $(VENV)/.bench  ## the tables and the picture of docs/accuracy.md
+	$(BIN)/python -m benchmarks.accuracy $(ARGS)
+	$(BIN)/python -m benchmarks.accuracy_picture
+
+baselines: $(VENV)/.bench  ## the table and the picture of docs/baselines.md
+	$(BIN)/python -m benchmarks.baselines.run --picture docs/images/baselines.png $(ARGS)
 
 clean:  ## remove what the targets made, the virtual environment included
 	rm -rf $(VENV) .cache out build dist .pytest_cache .ruff_cache .hypothesis

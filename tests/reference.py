@@ -295,7 +295,9 @@ class FreeBody:
         C = C + viscous_hessian(F, *self.hooke_moduli, self.material.viscosity, self.dt)
         grad = self.body.grad_basis.astype(float)
         n = grad.shape[1]
-        K = np.einsum("p,pka,pcadb,plb->kcld", self.body.weights, grad, C, grad, optimize=True).reshape(3 * n, 3 * n)
+        C = (self.body.weights[:, None, None, None, None] * C).swapaxes(1, 2).reshape(-1, 3, 27)
+        left = (grad @ C).reshape(-1, n, 3, 3, 3)
+        K = np.tensordot(left, grad, axes=((0, 4), (0, 2))).swapaxes(2, 3).reshape(3 * n, 3 * n)
         K += np.kron(self.pin_stiffness * self.pin_basis.T @ self.pin_basis, I3)
         return K + self.mass * (1.0 / self.dt + self.material.mass_damping) / self.dt * np.eye(3 * n)
 

@@ -364,6 +364,7 @@ class AdjointReduced:
         self._launch(kernels.pack, (1, *self._blocks), [solver.instances, self._q[t + 2 : t + 3]], [end])
         for stored, values in self._entries(t):
             wp.copy(values, stored)
+        solver.adapt(dt)
         progress = solver.progress
         for flag in (progress.active, progress.renew, progress.exact):
             flag.fill_(1)

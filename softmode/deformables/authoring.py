@@ -167,8 +167,8 @@ def add_pins(
         instance: Index from :func:`add_reduced_body`.
         points: Rest points in the body frame [m], shape (pin_count, 3).
         stiffness: Spring stiffness [N/m], a number or one per pin; scale it with a volume or an area for a clamp.
-        targets: World positions [m], shape (pin_count, 3); default: the points themselves. Move them at run time
-            through ``control.softmode.pin_target``.
+        targets: World positions [m], shape (pin_count, 3); default: the points themselves, so give them for a body
+            that is not placed at the origin. Move them at run time through ``control.softmode.pin_target``.
 
     Raises:
         ConfigError: If there is no point, a shape does not fit, or a stiffness is negative.
@@ -197,9 +197,16 @@ def add_pins(
 
 
 def add_region_pins(
-    builder: newton.ModelBuilder, instance: int, body: ReducedBody, name: str, *, youngs_modulus: float
+    builder: newton.ModelBuilder,
+    instance: int,
+    body: ReducedBody,
+    name: str,
+    *,
+    youngs_modulus: float,
+    position: Sequence[float] = (0.0, 0.0, 0.0),
+    rotation: np.ndarray | None = None,
 ) -> None:
-    """Hold a soft region of a body where the body frame puts it, by pins of the stiffness it was built for.
+    """Hold a soft region of a body where its pose puts it, by pins of the stiffness it was built for.
 
     Args:
         builder: Builder that holds the instance.
@@ -207,6 +214,8 @@ def add_region_pins(
         body: The body, built with the region.
         name: Name of the region.
         youngs_modulus: Young's modulus of the instance [Pa]; the region's stiffness is relative to it.
+        position: Position of the body, as given to :func:`add_reduced_body` [m].
+        rotation: Its rotation, shape (3, 3); default identity.
 
     Raises:
         ConfigError: If the region is unknown or exact; exact ones follow ``control.softmode.q_driven``.
@@ -219,25 +228,28 @@ def add_region_pins(
     rows = body.region_rows(name)
     rows = rows[body.region_weights[rows] > 0.0]
     pins = stiffness * youngs_modulus * body.region_weights[rows]
-    add_pins(builder, instance, body.region_points[rows], stiffness=pins)
+    X = body.region_points[rows]
+    targets = X @ (np.eye(3) if rotation is None else np.asarray(rotation, float)).T + np.asarray(position, float)
+    add_pins(builder, instance, X, stiffness=pins, targets=targets)
 
 
 def drive_regions(
-    model: Any, control: Any, instance: int, body: ReducedBody, rotations: np.ndarray, translations: np.ndarray
+    model: Any, control: Any, instance: int, body: ReducedBody, matrices: np.ndarray, translations: np.ndarray
 ) -> None:
     """Say where the exact regions of a body shall be at the end of the next step.
 
     Writes ``control.softmode.q_driven`` on the host; in a captured loop copy into that array on the device instead.
+    A reset of the state leaves the control as it is: drive the regions back too.
 
     Args:
         model: Finalised model.
         control: Its control.
         instance: Index of the instance in the model.
         body: Its body.
-        rotations: Matrix A of each region, x = A X + t with X in the body frame, shape (region_count, 3, 3).
+        matrices: Matrix A of each region, x = A X + t with X in the body frame, shape (region_count, 3, 3).
         translations: Vector t of each region [m], shape (region_count, 3).
     """
-    q = body.driven_affine(rotations, translations)
+    q = body.driven_affine(matrices, translations)
     start = int(getattr(model, NAMESPACE).function_start.numpy()[instance])
     target = getattr(control, NAMESPACE).q_driven
     target[start : start + len(q)].assign(q)

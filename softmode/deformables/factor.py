@@ -33,9 +33,7 @@ def _factor(
     matrix: wp.array3d[vec8],  # (system_count, N, (N + M) / 8)
     unit: wp.array3d[Any],  # (system_count, N, (N + M) / width)
     # Out:
-    diagonal_out: wp.array2d[
-        vec8
-    ],  # (system_count, N): diagonal blocks of U with inverse pivots
+    diagonal_out: wp.array2d[vec8],  # (system_count, N): diagonal blocks of U with inverse pivots
     indefinite_out: wp.array[int],  # (system_count,), 1 where a pivot had to be raised
 ):
     """Factor row block by row block: subtract what is above (left-looking), then solve with the diagonal block."""

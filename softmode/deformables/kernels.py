@@ -42,6 +42,8 @@ from softmode.deformables.tables import (
 
 wp.set_module_options({"enable_backward": False})
 
+EXTRAPOLATION_INERTIA = wp.constant(wp.float64(0.01))
+"""Least rho L^2 / (E dt^2) of a body whose acceleration is carried on."""
 NEEDS_FEASIBLE_START = wp.constant(int(MaterialModel.__members__.get("NEO_HOOKEAN", -1)))
 """The material that forbids inversion: a step starts where the last one ended."""
 COLLAPSED_RATIO = wp.constant(0.01)
@@ -158,6 +160,23 @@ def begin_step(
 
 
 @wp.kernel
+def touch(
+    instances: Instances,
+    entries: Entries,
+    dt: wp.float64,
+    # In and out:
+    motion: Motion,
+):
+    """Let a body near a shape take an Euler step: BDF2 would carry its velocity across the jump of an impact."""
+    i, e = wp.tid()
+    if entries.count[i] == instances.pin_count[i]:
+        return
+    motion.rate[i] = wp.float64(1.0)
+    motion.q_rate[i, e] = motion.q_start[i, e]
+    motion.q_inertial[i, e] = motion.q_start[i, e] + dt * motion.qd_start[i, e]
+
+
+@wp.kernel
 def begin_newton(
     progress: Progress,
     instances: Instances,
@@ -191,7 +210,8 @@ def extrapolate(
     """Let a body that touches nothing start Newton with the acceleration of the step before as well.
 
     Only where velocities change by less than half in a step: a jerky motion would be thrown from one valley of the
-    potential into another, step by step.
+    potential into another, step by step. And not a body so stiff that a step's rotation meets little else than its
+    inertia: there a start up the elastic valley costs more iterations than it saves.
     """
     i, e = wp.tid()
     if entries.count[i] > instances.pin_count[i]:
@@ -201,7 +221,8 @@ def extrapolate(
     for k in range(q.shape[1]):
         change += wp.dot(motion.change[i, k], motion.change[i, k])
         moved += wp.dot(motion.qd_start[i, k], motion.qd_start[i, k])
-    if change < wp.float64(0.25) * dt * dt * moved:
+    inertia = wp.float64(instances.inertia[i]) / (dt * dt * wp.float64(instances.youngs_modulus[i]))
+    if inertia > EXTRAPOLATION_INERTIA and change < wp.float64(0.25) * dt * dt * moved:
         q[i, e] = q[i, e] + motion.change[i, e]
 
 
@@ -352,6 +373,7 @@ def sum_gradient(
 def end_step(
     instances: Instances,
     motion: Motion,
+    entries: Entries,
     # State in:
     status: wp.array[int],
     q: wp.array2d[vec8d],
@@ -364,7 +386,10 @@ def end_step(
     qd_before_out: wp.array[wp.vec3d],
     dt_before_out: wp.array[wp.float64],
 ):
-    """Write the state: v = c (q - q_rate) / dt; a world that is not finite stays where it was, at rest."""
+    """Write the state: v = c (q - q_rate) / dt; a world that is not finite stays where it was, at rest.
+
+    After a step near a shape there is no step before: the next one starts over with implicit Euler.
+    """
     i, k = wp.tid()
     if k >= instances.function_count[i]:
         return
@@ -390,7 +415,8 @@ def end_step(
     q_before_out[out] = before
     qd_before_out[out] = qd_before
     if k == 0:
-        dt_before_out[i] = wp.where(failed, wp.float64(0.0), dt)
+        fresh = failed or entries.count[i] > instances.pin_count[i]
+        dt_before_out[i] = wp.where(fresh, wp.float64(0.0), dt)
 
 
 @wp.kernel

@@ -164,6 +164,10 @@ def _pins(
     data = getattr(model, NAMESPACE)
     owner = data.pin_instance.numpy() if hasattr(data, "pin_instance") else np.zeros(0, int)
     points = data.pin_point.numpy().reshape(-1, 3) if len(owner) else np.zeros((0, 3))
+    if len(owner) and (owner.min() < 0 or owner.max() >= len(asset)):
+        raise ConfigError(
+            "a pin belongs to an instance that does not exist", hint="pass what add_reduced_body returned"
+        )
     counts = np.bincount(owner, minlength=len(asset)) if len(owner) else np.zeros(len(asset), int)
     if (np.diff(owner) < 0).any():
         raise ConfigError("pins are not ordered by instance", hint="add the pins of one body before the next")

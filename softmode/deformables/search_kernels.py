@@ -3,7 +3,7 @@
 import warp as wp
 
 from softmode.deformables.lanes import barrier, vec8, vec8d
-from softmode.deformables.status import WORLD_ITERATION_LIMIT, WORLD_NO_DESCENT
+from softmode.deformables.status import WORLD_ITERATION_LIMIT, WORLD_NO_DESCENT, WORLD_NOT_FINITE
 from softmode.deformables.tables import Entries, Instances, Motion, Points, Progress, Rigid
 
 wp.set_module_options({"enable_backward": False})
@@ -103,6 +103,10 @@ def judge_iterate(
     if lane != 0:
         return
     progress.potential[w] = potential
+    if wp.isnan(potential):
+        progress.active[w] = 0
+        progress.status[w] = progress.status[w] | WORLD_NOT_FINITE
+        return
     if progress.iteration[w] == 0:
         return
     done = progress.last[w]
@@ -300,14 +304,14 @@ def finish_iteration(
     progress.iteration[w] = progress.iteration[w] + 1
     stale = progress.renew[w] == 0 or progress.project[w] == 0
     progress.renew[w] = far
-    if progress.iteration[w] % renewal == 0 or alpha == wp.float64(0.0):
+    slow = progress.iteration[w] >= 2 * renewal
+    if slow or progress.iteration[w] % renewal == 0 or alpha == wp.float64(0.0):
         progress.renew[w] = 1
-    if progress.project[w] != 0:
-        progress.renew[w] = 1
-    if alpha < wp.float64(1.0):
+    if alpha == wp.float64(0.0) or slow:
         progress.project[w] = 1
-    elif away == 0 and progress.failures[w] < FAILURES:
+    elif progress.project[w] != 0 and away == 0 and progress.failures[w] < FAILURES:
         progress.project[w] = 0
+        progress.renew[w] = 1
     progress.exact[w] = 0
     if alpha == wp.float64(1.0):
         progress.exact[w] = 1

@@ -26,6 +26,7 @@ from softmode.deformables.buffers import make_entries, make_motion, make_points,
 from softmode.deformables.factor import BlockCholesky
 from softmode.deformables.lanes import LANES, team_size, vec8, vec8d
 from softmode.deformables.layout import candidate_shapes, lay_out
+from softmode.deformables.materials import MaterialModel
 from softmode.deformables.rigid_dofs import RigidDofs
 from softmode.errors import ConfigError
 
@@ -52,8 +53,9 @@ class SolverReducedOptions:
 
     integrator: Integrator = "euler"
     """"euler": implicit Euler, first order, damps what a step cannot resolve (half of a 10 rad/s spin in a second at
-    60 Hz). "bdf2": second order, keeps 97 % of it; needs equal steps, and takes an Euler step where there is none
-    before."""
+    60 Hz). "bdf2": keeps 97 % of it; second order for a body without viscosity (whose stress is differenced
+    backwards). It needs equal steps, and takes an Euler step where there is none before, as after a reset, and where
+    a body has contacts. Who writes q or qd must set ``state.softmode.dt_before`` of the instance to 0."""
     iteration_max: int = 20
     """Newton iterations at most."""
     stiffness_renewal: int = 5
@@ -82,6 +84,8 @@ class SolverReducedOptions:
         for name, low in (("iteration_max", 1), ("stiffness_renewal", 1), ("contact_max", 1)):
             if getattr(self, name) < low:
                 raise ConfigError(f"{name} must be at least {low}, got {getattr(self, name)}")
+        if not 0.0 <= self.renewal_distance < float("inf"):
+            raise ConfigError(f"renewal_distance must be a finite number >= 0, got {self.renewal_distance!r}")
         for name in (
             "tolerance",
             "force_tolerance",
@@ -154,6 +158,8 @@ class SolverReduced(SolverBase):
         self.progress = make_progress(layout.instance_start, self.team, device)
         self.q, self.q_trial = (wp.zeros(functions, dtype=vec8d, device=device) for _ in range(2))
         self.gradient, self.reaction = (wp.zeros(functions, dtype=vec8d, device=device) for _ in range(2))
+        # self.reaction: generalised forces [N] that held the driven functions at the last iterate but one; their error
+        # is Newton's tolerance times the stiffness, so tighten it where forces of 1 % matter
         self.gradient_chunk = wp.zeros(
             (functions[0], self._chunks(functions[0] * layout.block_count), functions[1]), dtype=vec8d, device=device
         )
@@ -208,18 +214,20 @@ class SolverReduced(SolverBase):
         return self.progress.iteration
 
     def refresh(self) -> None:
-        """Prepare what the model's parameters decide once: masses from densities, the matrix of the pins."""
+        """Read back what the model's parameters decide on the host: masses from densities."""
         volumes = np.array([body.volume for body in self.bodies])[self.layout.asset]
         density = self.parameters.density.numpy()
+        models = self.parameters.material_model.numpy()
+        if (self.instances.driven_count.numpy()[models == int(MaterialModel.NEO_HOOKEAN)] > 0).any():
+            raise ConfigError(
+                "a body with exact regions has the material NEO_HOOKEAN, which a driven region may invert in one step",
+                hint="use STABLE_NEO_HOOKEAN_LOG, or a soft region",
+            )
         self.instances.mass.assign(density * volumes)
         self.instances.inertia.assign(density * self.layout.size**2)
-        if self.layout.pin_max:
-            dim = (self.instance_count, self.layout.block_count, self.layout.block_count)
-            pins = [self.layout.first_pin_row, self.parameters.pin_stiffness]
-            self._launch(assembly.assemble_pins, dim, [self.instances, self.basis, *pins], [self.pins])
 
     def notify_model_changed(self, flags: int) -> None:
-        """Follow changes of the model; material arrays are read live, masses and the matrix of the pins are not."""
+        """Follow changes of the model; material and pin arrays are read live, masses are recomputed."""
         self.refresh()
 
     # -- the step -----------------------------------------------------------------------------------------------------
@@ -273,9 +281,13 @@ class SolverReduced(SolverBase):
         """Find the contacts of the step and write them behind the pins as entries."""
         instances, samples, team, layout = self.instances, self.samples, self.team, self.layout
         if layout.pin_max:
-            pins = [layout.first_pin_row, self.parameters.pin_stiffness, self._control(control).pin_target]
+            pins = [layout.first_pin_row, self.parameters.pin_stiffness]
+            targets = self._control(control).pin_target
             dim = (self.instance_count, layout.pin_max)
-            self._launch(detection.gather_pins, dim, [instances, self.basis, self.motion, *pins], [self.entries])
+            tables = [instances, self.basis, self.motion]
+            self._launch(detection.gather_pins, dim, [*tables, *pins, targets], [self.entries])
+            dim = (self.instance_count, layout.block_count, layout.block_count)
+            self._launch(assembly.assemble_pins, dim, [instances, self.basis, *pins], [self.pins])
         if self.model.shape_count == 0:
             wp.copy(self.entries.count, instances.pin_count)
             return
@@ -296,9 +308,15 @@ class SolverReduced(SolverBase):
             [instances, self.basis, shapes, samples, self.entry_max, int(prescribed), team, float(dt)],
             [self.entries, self.status],
         )
+        self.adapt(dt)
         if self.rigid.count_max:
             dim = (self.instance_count, self.entry_max, self.rigid.count_max)
             self._launch(detection.entry_jacobians, dim, [instances, shapes, self.rigid.table], [self.entries])
+
+    def adapt(self, dt: float) -> None:
+        """Let the bodies that have contacts take an Euler step, whatever the integrator."""
+        if self.options.integrator == "bdf2":
+            self._launch(kernels.touch, self.functions, [self.instances, self.entries, wp.float64(dt)], [self.motion])
 
     def minimise(self, dt: float) -> None:
         """Minimise the incremental potential of every world by Newton with a line search."""
@@ -469,7 +487,7 @@ class SolverReduced(SolverBase):
         self._launch(
             kernels.end_step,
             (self.instance_count, self.stride),
-            [self.instances, self.motion, self.status, self.q, self.layout.block_count, wp.float64(dt)],
+            [self.instances, self.motion, self.entries, self.status, self.q, self.layout.block_count, wp.float64(dt)],
             [out.q, out.qd, out.q_before, out.qd_before, out.dt_before],
         )
         self.body_wrench.zero_()

@@ -77,6 +77,28 @@ def test_bdf2_worlds_reset_on_their_own():
     np.testing.assert_array_equal(scene.q(1), first)
 
 
+def test_bdf2_does_not_bounce():
+    """A cube dropped on the ground: a body in contact takes Euler steps, so BDF2 rebounds no higher than Euler."""
+    heights = {}
+    for integrator in ("euler", "bdf2"):
+        options = SolverReducedOptions(integrator=integrator)
+        material = Material(youngs_modulus=1.0e6, viscosity=0.0)
+        scene = Scene(
+            lambda world, material=material: add_reduced_body(world, cube(), material=material, position=(0, 0, 0.25)),
+            [cube()],
+            gravity=(0.0, 0.0, -9.81),
+            ground=0.5,
+            options=options,
+            dt=1.0 / 60.0,
+        )
+        scene.step(20)
+        heights[integrator] = []
+        for _ in range(40):
+            scene.step()
+            heights[integrator].append(scene.centre()[2])
+    assert max(heights["bdf2"]) <= max(heights["euler"]) + 0.01
+
+
 def test_unknown_integrator():
     """Any other name is refused."""
     with pytest.raises(ConfigError, match="integrator"):

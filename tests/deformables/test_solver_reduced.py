@@ -391,34 +391,15 @@ def test_flat_and_mirrored_bodies_recover(start):
     np.testing.assert_allclose(np.swapaxes(F, 1, 2) @ F, np.broadcast_to(np.eye(3), F.shape), atol=1e-2)
 
 
-def test_stiffness_and_step_sizes():
-    """E in 1e3..1e9 Pa x dt in 1e-3..3e-2 s, nu 0 and 0.49: finite, at most 20 iterations, never at the limit.
-
-    Except the corner E = 1e9, dt = 3e-2: there stiffness exceeds inertia by 3e7, the inverse of float32's precision,
-    and the direction of the bar's free rotation is noise; it must stay finite and say that it stopped at the limit.
-    """
-    body = bar()
-    points = np.array([[-0.2, y, z] for y in (-0.05, 0.05) for z in (-0.05, 0.05)])
-    for nu in (0.0, 0.49):
-
-        def populate(world, nu=nu):
-            instance = add_reduced_body(world, body, material=Material(poissons_ratio=nu))
-            add_pins(world, instance, points, stiffness=2000.0)
-
-        moduli = [1.0e3, 1.0e5, 1.0e7, 1.0e9]
-        for dt in (1.0e-3, 1.0e-2, 3.0e-2):
-            scene = Scene(populate, [body], gravity=DOWN, dt=dt, world_count=len(moduli))
-            scene.set_parameter("youngs_modulus", moduli)
-            most, status = 0, 0
-            for _ in range(20):
-                scene.step()
-                most = max(most, int(scene.reduced.iteration.numpy().max()))
-                status |= int(np.bitwise_or.reduce(scene.reduced.status.numpy()))
-            assert np.isfinite(scene.state.softmode.q.numpy()).all()
-            assert most <= 20
-            assert not status & bits.WORLD_NOT_FINITE
-            soft = scene.reduced.status.numpy()[:-1] if dt == 3.0e-2 else scene.reduced.status.numpy()
-            assert not (soft & bits.WORLD_ITERATION_LIMIT).any()
+@pytest.mark.parametrize(("edge", "modulus", "dt", "omega"), [(0.03, 1e9, 1 / 60, 2.0), (0.01, 1e9, 1 / 60, 10.0)])
+def test_small_stiff_bodies_spin_down(edge, modulus, dt, omega):
+    """A cube far stiffer than a step resolves loses spin as implicit Euler does, never gains it, and raises no flag."""
+    body = cube(edge)
+    scene = single(Material(youngs_modulus=modulus), body=body, spin=(0.0, 0.0, omega), dt=dt)
+    before = scene.momentum()[1][2]
+    scene.step(15)
+    assert 0.6 < scene.momentum()[1][2] / before < 1.0
+    assert not scene.reduced.status.numpy().any()
 
 
 @pytest.mark.parametrize("omega", [1.0, 5.0])
