@@ -368,6 +368,7 @@ class AdjointReduced:
         progress = solver.progress
         for flag in (progress.active, progress.renew, progress.exact):
             flag.fill_(1)
+        progress.project.zero_()
         progress.iteration.zero_()
         solver._evaluate(progress.active, solver.q, solver.rigid.r, dt, derivatives=True)
         solver._gather_gradient(dt)

@@ -7,14 +7,11 @@ linear system: contact couples a body with rigid shapes only. Every sum runs in 
 import warp as wp
 
 from softmode.deformables.contact import friction_potential, normal_potential
-from softmode.deformables.kernels import displacement_gradient
-from softmode.deformables.krylov_kernels import free_part
-from softmode.deformables.lanes import LANES, vec8d
+from softmode.deformables.kernels import displacement_gradient, material_of
+from softmode.deformables.lanes import LANES, free_part, vec8d
 from softmode.deformables.materials import (
-    MaterialParameters,
     green_strain,
     hooke_stress,
-    lame,
     stress,
     stress_derivative,
 )
@@ -33,18 +30,6 @@ class Linearised:
     entry_slip: wp.array2d[wp.vec3d]  # pins: x - target [m]; contacts: friction force per coefficient, times -1 [N]
     entry_hessian: wp.array2d[wp.mat33d]  # -d force / d displacement [N/m]; not symmetric where a contact slips
     entry: wp.array2d[wp.vec3d]  # what is summed over the entries next [N]
-
-
-@wp.func
-def material_of(instances: Instances, basis: Basis, i: int, point: int):
-    """Return the material of an instance at a cubature point."""
-    parameters = MaterialParameters()
-    mu, lam = lame(instances.youngs_modulus[i] * basis.stiffness_scale[point], instances.poissons_ratio[i])
-    parameters.model = instances.material_model[i]
-    parameters.mu = mu
-    parameters.lam = lam
-    parameters.viscosity = wp.float64(instances.viscosity[i])
-    return parameters
 
 
 # -- layout ------------------------------------------------------------------------------------------------------------
@@ -271,7 +256,7 @@ def sum_product(
     if LANES * b < instances.function_count[i]:
         for k in range(chunk.shape[1]):
             total = total + chunk[i, k, e]
-    free = free_part(total, LANES * b, instances.driven_count[i])
+    free = free_part(total, instances.driven_count[i] - LANES * b)
     out[i, e] = free
     driven_out[i, e] = total - free
 
@@ -430,7 +415,7 @@ def propagate(
     if third > wp.float64(0.0):
         q_bar_2[i, e] = q_bar_2[i, e] - third * q_rate
         qd_bar_2[i, e] = qd_bar_2[i, e] - third * qd_rate
-    q_bar[i, e] = q_bar[i, e] - free_part(q_bar[i, e], LANES * b, instances.driven_count[i]) - driven[i, e]
+    q_bar[i, e] = q_bar[i, e] - free_part(q_bar[i, e], instances.driven_count[i] - LANES * b) - driven[i, e]
 
     travel = rate * (q[i, e] - motion.q_rate[i, e])
     mean = basis.mean[instances.asset[i], b]

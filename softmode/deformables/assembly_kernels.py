@@ -5,8 +5,8 @@ Unknowns of one instance are ordered component-major in blocks of eight, see ``t
 
 import warp as wp
 
-from softmode.deformables.lanes import LANES, barrier, vec8, vec8d
-from softmode.deformables.tables import Basis, Entries, Instances, Motion, Points, Progress, Rigid
+from softmode.deformables.lanes import LANES, barrier, free_part, vec8, vec8d
+from softmode.deformables.tables import Basis, Entries, Instances, Motion, Points, Progress, Rigid, has_contacts
 
 wp.set_module_options({"enable_backward": False})
 
@@ -44,18 +44,6 @@ def block_task(task: int, block_count: int):
         lanes -= block_count - rows
         rows += 1
     return wp.where(diagonal == 0, 0, wp.where(diagonal == 1, 3, 5)), rows, rows + lanes
-
-
-@wp.func
-def free_part(value: vec8, driven: int):
-    """Return the lanes with those of the first ``driven`` functions set to zero."""
-    if driven <= 0:
-        return value
-    out = vec8()
-    for lane in range(LANES):
-        if lane >= driven:
-            out[lane] = value[lane]
-    return out
 
 
 @wp.kernel
@@ -230,7 +218,7 @@ def add_contacts(
 ):
     """Add the contacts, sum_e b^T H b, to 8x8 blocks; driven unknowns stay put."""
     i, task = wp.tid()
-    if active[instances.world[i]] == 0 or entries.count[i] == instances.pin_count[i]:
+    if active[instances.world[i]] == 0 or not has_contacts(instances, entries, i):
         return
     block_count = basis.row.shape[1]
     pair, rows, lanes = block_task(task, block_count)

@@ -122,8 +122,39 @@ def _factor(
         indefinite_out[i] = indefinite
 
 
+@wp.func
+def back_substitute(
+    matrix: wp.array3d[vec8],
+    diagonal: wp.array2d[vec8],
+    right: wp.array2d[float],
+    solution: wp.array2d[vec8],
+    i: int,
+    lane: int,
+    team: int,
+):
+    """Solve U x = right of system i from the last row up; overwrites ``right`` and ends with a barrier."""
+    block_count = solution.shape[1]
+    for step in range(block_count):
+        block = block_count - 1 - step
+        first = LANES * block
+        x = vec8()
+        for reverse in range(8):
+            a = 7 - reverse
+            value = right[i, first + a]
+            d = diagonal[i, first + a]
+            for b in range(8):
+                if b > a:
+                    value -= d[b] * x[b]
+            x[a] = value * d[a]
+        if lane == 0:
+            solution[i, block] = x
+        for row in range(lane, first, team):
+            right[i, row] = right[i, row] - sum8(wp.cw_mul(matrix[i, row, block], x))
+        barrier()
+
+
 @wp.kernel
-def _back_substitute(
+def _solve(
     # Selection:
     system_world: wp.array[int],
     active: wp.array[int],
@@ -152,23 +183,7 @@ def _back_substitute(
             value -= matrix[i, row, block_count + j / 8][j % 8] * float(tail[world, j])
         right[i, row] = value
     barrier()
-    for step in range(block_count):
-        block = block_count - 1 - step
-        first = LANES * block
-        x = vec8()
-        for reverse in range(8):
-            a = 7 - reverse
-            value = right[i, first + a]
-            d = diagonal[i, first + a]
-            for b in range(8):
-                if b > a:
-                    value -= d[b] * x[b]
-            x[a] = value * d[a]
-        if lane == 0:
-            solution_out[i, block] = x
-        for row in range(lane, first, team):
-            right[i, row] = right[i, row] - sum8(wp.cw_mul(matrix[i, row, block], x))
-        barrier()
+    back_substitute(matrix, diagonal, right, solution_out, i, lane, team)
 
 
 class BlockCholesky:
@@ -215,7 +230,7 @@ class BlockCholesky:
         """Return x of U x = y - Y tail, shape (system_count, N / 8) of 8-vectors."""
         selection = [self.system_world, active, self.block_count, column, self.team]
         system = [self.matrix, self.diagonal, tail, tail_count, self.right]
-        self._launch(_back_substitute, [*selection, *system], [self.solution])
+        self._launch(_solve, [*selection, *system], [self.solution])
         return self.solution
 
     def _launch(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:

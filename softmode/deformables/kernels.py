@@ -18,7 +18,7 @@ Precision: basis data float32; q, energy and residual float64; the Newton direct
 
 import warp as wp
 
-from softmode.deformables.lanes import LANES, barrier, sum8d, vec8d
+from softmode.deformables.lanes import LANES, sum8d, team_sum, vec8d
 from softmode.deformables.materials import (
     MaterialModel,
     MaterialParameters,
@@ -38,13 +38,14 @@ from softmode.deformables.tables import (
     Progress,
     Rigid,
     blocks_of,
+    has_contacts,
 )
 
 wp.set_module_options({"enable_backward": False})
 
 EXTRAPOLATION_INERTIA = wp.constant(wp.float64(0.01))
 """Least rho L^2 / (E dt^2) of a body whose acceleration is carried on."""
-NEEDS_FEASIBLE_START = wp.constant(int(MaterialModel.__members__.get("NEO_HOOKEAN", -1)))
+NEEDS_FEASIBLE_START = wp.constant(int(MaterialModel.NEO_HOOKEAN))
 """The material that forbids inversion: a step starts where the last one ended."""
 COLLAPSED_RATIO = wp.constant(0.01)
 """Points whose volume is below this fraction of their rest volume count as collapsed, and"""
@@ -169,7 +170,7 @@ def touch(
 ):
     """Let a body near a shape take an Euler step: BDF2 would carry its velocity across the jump of an impact."""
     i, e = wp.tid()
-    if entries.count[i] == instances.pin_count[i]:
+    if not has_contacts(instances, entries, i):
         return
     motion.rate[i] = wp.float64(1.0)
     motion.q_rate[i, e] = motion.q_start[i, e]
@@ -186,7 +187,7 @@ def begin_newton(
     w = wp.tid()
     touching = int(0)
     for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
-        if entries.count[i] > instances.pin_count[i]:
+        if has_contacts(instances, entries, i):
             touching = 1
     progress.touching[w] = touching
     progress.active[w] = 1
@@ -214,7 +215,7 @@ def extrapolate(
     inertia: there a start up the elastic valley costs more iterations than it saves.
     """
     i, e = wp.tid()
-    if entries.count[i] > instances.pin_count[i]:
+    if has_contacts(instances, entries, i):
         return
     change = wp.float64(0.0)
     moved = wp.float64(0.0)
@@ -243,6 +244,18 @@ def displacement_gradient(basis: Basis, q: wp.array2d[vec8d], i: int, point: int
     return G
 
 
+@wp.func
+def material_of(instances: Instances, basis: Basis, i: int, point: int):
+    """Return the material of an instance at a cubature point."""
+    parameters = MaterialParameters()
+    mu, lam = lame(instances.youngs_modulus[i] * basis.stiffness_scale[point], instances.poissons_ratio[i])
+    parameters.model = instances.material_model[i]
+    parameters.mu = mu
+    parameters.lam = lam
+    parameters.viscosity = wp.float64(instances.viscosity[i])
+    return parameters
+
+
 @wp.kernel
 def evaluate_points(
     instances: Instances,
@@ -262,12 +275,7 @@ def evaluate_points(
     if selected[instances.world[i]] == 0 or p >= instances.point_count[i]:
         return
     point = instances.point_start[i] + p
-    parameters = MaterialParameters()
-    mu, lam = lame(instances.youngs_modulus[i] * basis.stiffness_scale[point], instances.poissons_ratio[i])
-    parameters.model = instances.material_model[i]
-    parameters.mu = mu
-    parameters.lam = lam
-    parameters.viscosity = wp.float64(instances.viscosity[i])
+    parameters = material_of(instances, basis, i, point)
     weight = basis.point_weight[point]
 
     G = displacement_gradient(basis, q, i, point, instances.function_count[i])
@@ -415,7 +423,7 @@ def end_step(
     q_before_out[out] = before
     qd_before_out[out] = qd_before
     if k == 0:
-        fresh = failed or entries.count[i] > instances.pin_count[i]
+        fresh = failed or has_contacts(instances, entries, i)
         dt_before_out[i] = wp.where(fresh, wp.float64(0.0), dt)
 
 
@@ -446,18 +454,9 @@ def check_state(
         for p in range(lane, instances.point_count[i], team):
             if points.volume_ratio[i, p] < COLLAPSED_RATIO:
                 flat += share
-        progress.partial[w, lane] = wp.float64(flat)
-        barrier()
-        whole = float(0.0)
-        for k in range(team):
-            whole += float(progress.partial[w, k])
-        collapsed = wp.max(collapsed, whole)
-        barrier()
-    progress.partial[w, lane] = total
-    barrier()
+        collapsed = wp.max(collapsed, float(team_sum(progress.partial, w, lane, team, wp.float64(flat))))
+    total = team_sum(progress.partial, w, lane, team, total)
     if lane == 0:
-        for k in range(1, team):
-            total += progress.partial[w, k]
         if not wp.isfinite(total):
             progress.status[w] = progress.status[w] | WORLD_NOT_FINITE
         if collapsed > 1.0:

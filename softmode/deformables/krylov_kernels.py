@@ -7,7 +7,8 @@ single systems give.
 
 import warp as wp
 
-from softmode.deformables.lanes import LANES, barrier, sum8, vec8, vec8d
+from softmode.deformables.factor import back_substitute
+from softmode.deformables.lanes import LANES, barrier, free_part, team_sum, vec8, vec8d
 from softmode.deformables.tables import Instances
 
 wp.set_module_options({"enable_backward": False})
@@ -39,28 +40,6 @@ class Krylov:
 
 
 @wp.func
-def free_part(block: vec8d, first: int, driven_count: int):
-    """Return a block with zeros at the driven functions; ``first`` is the function of its first lane."""
-    out = block
-    for lane in range(LANES):
-        if first + lane < driven_count:
-            out[lane] = wp.float64(0.0)
-    return out
-
-
-@wp.func
-def team_sum(partial: wp.array2d[wp.float64], i: int, lane: int, team: int, value: wp.float64):
-    """Return the sum of the threads' values, in order, to every thread."""
-    partial[i, lane] = value
-    barrier()
-    total = wp.float64(0.0)
-    for k in range(team):
-        total += partial[i, k]
-    barrier()
-    return total
-
-
-@wp.func
 def precondition(k: Krylov, i: int, lane: int, team: int, size: wp.float64, right: wp.array2d[vec8d]):
     """Solve U^T U search = right in float32; ``size`` is the length of ``right``."""
     blocks = k.work.shape[1]
@@ -89,23 +68,9 @@ def precondition(k: Krylov, i: int, lane: int, team: int, size: wp.float64, righ
                 rest = rest - y[a] * k.factored[i, first + a, l]
             k.work[i, l] = rest
         barrier()
-    for reverse_block in range(blocks):
-        block = blocks - 1 - reverse_block
-        first = LANES * block
-        x = vec8()
-        for reverse in range(8):
-            a = 7 - reverse
-            value = k.rows[i, first + a]
-            d = k.diagonal[i, first + a]
-            for b in range(8):
-                if b > a:
-                    value -= d[b] * x[b]
-            x[a] = value * d[a]
-        if lane == 0:
-            k.search[i, block] = size * vec8d(x)
-        for row in range(lane, first, team):
-            k.rows[i, row] = k.rows[i, row] - sum8(wp.cw_mul(k.factored[i, row, block], x))
-        barrier()
+    back_substitute(k.factored, k.diagonal, k.rows, k.work, i, lane, team)
+    for l in range(lane, blocks, team):
+        k.search[i, l] = size * vec8d(k.work[i, l])
 
 
 @wp.kernel
@@ -128,7 +93,7 @@ def begin_cycle(
         return
     rho = wp.float64(0.0)
     for e in range(lane, total, team):
-        r = free_part(right[i, e], LANES * (e % stride), instances.driven_count[i])
+        r = free_part(right[i, e], instances.driven_count[i] - LANES * (e % stride))
         if first_cycle != 0:
             solution[i, e] = vec8d()
         else:

@@ -58,6 +58,31 @@ def sum8d(v: vec8d):
     return ((v[0] + v[4]) + (v[2] + v[6])) + ((v[1] + v[5]) + (v[3] + v[7]))
 
 
+@wp.func
+def free_part(block: Any, driven: int):
+    """Return a block with zeros in its first ``driven`` lanes, which may be none or more than all."""
+    if driven <= 0:
+        return block
+    out = block
+    zero = type(block)()
+    for lane in range(LANES):
+        if lane < driven:
+            out[lane] = zero[lane]
+    return out
+
+
+@wp.func
+def team_sum(partial: wp.array2d[wp.float64], i: int, lane: int, team: int, value: wp.float64):
+    """Return the sum of the threads' values, in order, to every thread; every thread of the team must call it."""
+    partial[i, lane] = value
+    barrier()
+    total = wp.float64(0.0)
+    for k in range(team):
+        total += partial[i, k]
+    barrier()
+    return total
+
+
 def to_blocks(q: np.ndarray, block_count: int) -> np.ndarray:
     """Return coordinates (..., n, 3) in the layout of the kernels, (..., 3 block_count, 8), padded with zeros."""
     n = q.shape[-2]

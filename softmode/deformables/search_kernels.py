@@ -2,9 +2,9 @@
 
 import warp as wp
 
-from softmode.deformables.lanes import barrier, vec8, vec8d
+from softmode.deformables.lanes import barrier, team_sum, vec8, vec8d
 from softmode.deformables.status import WORLD_ITERATION_LIMIT, WORLD_NO_DESCENT, WORLD_NOT_FINITE
-from softmode.deformables.tables import Entries, Instances, Motion, Points, Progress, Rigid
+from softmode.deformables.tables import Entries, Instances, Motion, Points, Progress, Rigid, has_contacts
 
 wp.set_module_options({"enable_backward": False})
 
@@ -61,18 +61,6 @@ def potential_share(
     return total
 
 
-@wp.func
-def sum_shares(progress: Progress, share: wp.float64, w: int, lane: int, team: int):
-    """Return the sum of the shares of a team, in its first thread."""
-    progress.partial[w, lane] = share
-    barrier()
-    total = share
-    if lane == 0:
-        for k in range(1, team):
-            total += progress.partial[w, k]
-    return total
-
-
 @wp.kernel
 def judge_iterate(
     instances: Instances,
@@ -99,7 +87,7 @@ def judge_iterate(
     if progress.active[w] == 0:
         return
     share = potential_share(progress, instances, motion, points, entries, rigid, q, rigid.r, dt, w, lane, team)
-    potential = sum_shares(progress, share, w, lane, team)
+    potential = team_sum(progress.partial, w, lane, team, share)
     if lane != 0:
         return
     progress.potential[w] = potential
@@ -111,7 +99,7 @@ def judge_iterate(
         return
     done = progress.last[w]
     for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
-        if done == 1 and entries.count[i] > instances.pin_count[i]:
+        if done == 1 and has_contacts(instances, entries, i):
             residual = wp.float64(0.0)
             external = wp.float64(0.0)
             for e in range(q.shape[1]):
@@ -167,7 +155,7 @@ def begin_search(
             slope += wp.dot(gradient[i, e], d)
             moved += wp.dot(d, d)
         limit = wp.float64(instances.tolerance[i])
-        if entries.count[i] > instances.pin_count[i]:
+        if has_contacts(instances, entries, i):
             limit = wp.min(limit, wp.float64(0.1) * stick_range)
         if not (wp.sqrt(moved) <= limit):
             last = 0
@@ -240,7 +228,7 @@ def judge_trial(
     if progress.searching[w] == 0:
         return
     share = potential_share(progress, instances, motion, points, entries, rigid, q, rigid.trial, dt, w, lane, team)
-    trial = sum_shares(progress, share, w, lane, team)
+    trial = team_sum(progress.partial, w, lane, team, share)
     if lane != 0:
         return
     potential = progress.potential[w]

@@ -157,9 +157,10 @@ class SolverReduced(SolverBase):
         self.samples = make_samples(self.instance_count, layout.sample_max, self.team, device)
         self.progress = make_progress(layout.instance_start, self.team, device)
         self.q, self.q_trial = (wp.zeros(functions, dtype=vec8d, device=device) for _ in range(2))
-        self.gradient, self.reaction = (wp.zeros(functions, dtype=vec8d, device=device) for _ in range(2))
-        # self.reaction: generalised forces [N] that held the driven functions at the last iterate but one; their error
-        # is Newton's tolerance times the stiffness, so tighten it where forces of 1 % matter
+        self.gradient = wp.zeros(functions, dtype=vec8d, device=device)
+        self.reaction = wp.zeros(functions, dtype=vec8d, device=device)
+        """Generalised forces that held the driven functions at the last iterate but one [N], in blocks: their error is
+        Newton's tolerance times the stiffness, so tighten it where forces of 1 % matter."""
         self.gradient_chunk = wp.zeros(
             (functions[0], self._chunks(functions[0] * layout.block_count), functions[1]), dtype=vec8d, device=device
         )

@@ -142,6 +142,12 @@ class Progress:
 
 
 @wp.func
+def has_contacts(instances: Instances, entries: Entries, i: int):
+    """Return whether an instance is near a shape: its entries are more than its pins."""
+    return entries.count[i] > instances.pin_count[i]
+
+
+@wp.func
 def blocks_of(function_count: int):
     """Return the number of blocks that hold so many functions."""
     return (function_count + 7) / 8
