@@ -6,7 +6,17 @@ Unknowns of one instance are ordered component-major in blocks of eight, see ``t
 import warp as wp
 
 from softmode.deformables.lanes import LANES, barrier, free_part, vec8, vec8d
-from softmode.deformables.tables import Basis, Entries, Instances, Motion, Points, Progress, Rigid, has_contacts
+from softmode.deformables.tables import (
+    Basis,
+    Entries,
+    Instances,
+    Motion,
+    Points,
+    Progress,
+    Rigid,
+    first_coupled,
+    has_contacts,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -145,7 +155,7 @@ def assemble_pins(
     a6 = vec8()
     a7 = vec8()
     for e in range(instances.pin_start[i], instances.pin_start[i] + instances.pin_count[i]):
-        b = pin_stiffness[e] * basis.row[first_row + e, rows]
+        b = wp.max(pin_stiffness[e], 0.0) * basis.row[first_row + e, rows]
         v = basis.row[first_row + e, lanes]
         a0 = a0 + b[0] * v
         a1 = a1 + b[1] * v
@@ -278,7 +288,7 @@ def assemble_columns(
     if j == rigid_count:
         value = vec8(-gradient[i, rows])
     else:
-        for e in range(instances.pin_count[i], entries.count[i]):
+        for e in range(first_coupled(instances, i), entries.count[i]):
             value = value - entries.coupling[i, e, j][c] * basis.row[entries.row[i, e], b]
         value = free_part(value, instances.driven_count[i] - LANES * b)
     for a in range(LANES):
@@ -287,6 +297,7 @@ def assemble_columns(
 
 @wp.kernel
 def assemble_rigid(
+    instances: Instances,
     entries: Entries,
     progress: Progress,
     # In and out:
@@ -300,7 +311,7 @@ def assemble_rigid(
     end = progress.instance_start[w + 1]
     h = rigid.inertia[w, j, l]
     for i in range(first, end):
-        for e in range(entries.count[i]):
+        for e in range(first_coupled(instances, i), entries.count[i]):
             h += wp.float64(wp.dot(entries.jacobian[i, e, j], entries.coupling[i, e, l]))
     rigid.matrix[w, j, l] = h
     if l == 0:
@@ -308,7 +319,7 @@ def assemble_rigid(
         for k in range(rigid.count[w]):
             g += rigid.inertia[w, j, k] * (rigid.r[w, k] - rigid.predicted[w, k])
         for i in range(first, end):
-            for e in range(entries.count[i]):
+            for e in range(first_coupled(instances, i), entries.count[i]):
                 g += wp.dot(wp.vec3d(entries.jacobian[i, e, j]), entries.force[i, e])
         rigid.gradient[w, j] = g
 

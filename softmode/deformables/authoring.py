@@ -59,6 +59,7 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
     declare("dt_before", wp.float64, _INSTANCE, assignment=assignment.STATE)
     declare("q_driven", wp.vec3d, _FUNCTION, assignment=assignment.CONTROL)
     declare("pin_instance", wp.int32, _PIN, references=_INSTANCE)
+    declare("pin_body", wp.int32, _PIN, references="body")
     declare("pin_point", wp.vec3d, _PIN)
     declare("pin_stiffness", wp.float32, _PIN)
     declare("pin_target", wp.vec3d, _PIN, assignment=assignment.CONTROL)
@@ -66,9 +67,14 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
 
 def contact_stiffness(body: ReducedBody, material: Material) -> float:
     """Return the default contact stiffness per area [Pa/m]: twenty times the bulk's, and never under the floor."""
-    nu = material.poissons_ratio
-    wave = material.youngs_modulus * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
-    return max(20.0 * wave / float(np.linalg.norm(np.ptp(body.bounds, axis=0))), CONTACT_STIFFNESS_FLOOR)
+    return max(bulk_stiffness(body, material.youngs_modulus, material.poissons_ratio), CONTACT_STIFFNESS_FLOOR)
+
+
+def bulk_stiffness(body: ReducedBody, youngs_modulus: float, poissons_ratio: float) -> float:
+    """Return twenty times the stiffness per area [Pa/m] of the bulk: the P-wave modulus over the size."""
+    nu = poissons_ratio
+    wave = youngs_modulus * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
+    return 20.0 * wave / float(np.linalg.norm(np.ptp(body.bounds, axis=0)))
 
 
 def add_reduced_body(
@@ -159,16 +165,19 @@ def add_pins(
     *,
     stiffness: float | np.ndarray,
     targets: np.ndarray | None = None,
+    link: int = -1,
 ) -> None:
-    """Pin rest points of a body to targets in the world by springs (soft boundary conditions).
+    """Pin rest points of a body to targets in the world or on a rigid body by springs (soft boundary conditions).
 
     Args:
         builder: Builder that holds the instance.
         instance: Index from :func:`add_reduced_body`.
         points: Rest points in the body frame [m], shape (pin_count, 3).
         stiffness: Spring stiffness [N/m], a number or one per pin; scale it with a volume or an area for a clamp.
-        targets: World positions [m], shape (pin_count, 3); default: the points themselves, so give them for a body
-            that is not placed at the origin. Move them at run time through ``control.softmode.pin_target``.
+        targets: Positions in the frame of the link, or in the world [m], shape (pin_count, 3); default: the points
+            themselves, so give them for a body that is not placed at the origin. Move them at run time through
+            ``control.softmode.pin_target``.
+        link: Rigid body that holds the targets, -1 for the world.
 
     Raises:
         ConfigError: If there is no point, a shape does not fit, or a stiffness is negative.
@@ -181,12 +190,17 @@ def add_pins(
     k = np.broadcast_to(k, (len(X),))
     if X.ndim != 2 or X.shape[1:] != (3,) or T.shape != X.shape or len(X) == 0:
         raise ConfigError(f"points and targets must have shape (pin_count > 0, 3), got {X.shape} and {T.shape}")
+    if not -1 <= link < builder.body_count:
+        raise ConfigError(
+            f"link must be a rigid body of the builder or -1, got {link}; it has {builder.body_count} bodies"
+        )
     if not (np.isfinite(k).all() and (k >= 0).all() and np.isfinite(X).all() and np.isfinite(T).all()):
         raise ConfigError("stiffness must be finite and >= 0 [N/m], points and targets finite [m]")
     builder.add_custom_values_batch(
         [
             {
                 f"{NAMESPACE}:pin_instance": instance,
+                f"{NAMESPACE}:pin_body": link,
                 f"{NAMESPACE}:pin_point": wp.vec3d(*a),
                 f"{NAMESPACE}:pin_stiffness": float(b),
                 f"{NAMESPACE}:pin_target": wp.vec3d(*c),
@@ -194,43 +208,6 @@ def add_pins(
             for a, b, c in zip(X, k, T, strict=True)
         ]
     )
-
-
-def add_region_pins(
-    builder: newton.ModelBuilder,
-    instance: int,
-    body: ReducedBody,
-    name: str,
-    *,
-    youngs_modulus: float,
-    position: Sequence[float] = (0.0, 0.0, 0.0),
-    rotation: np.ndarray | None = None,
-) -> None:
-    """Hold a soft region of a body where its pose puts it, by pins of the stiffness it was built for.
-
-    Args:
-        builder: Builder that holds the instance.
-        instance: Index from :func:`add_reduced_body`.
-        body: The body, built with the region.
-        name: Name of the region.
-        youngs_modulus: Young's modulus of the instance [Pa]; the region's stiffness is relative to it.
-        position: Position of the body, as given to :func:`add_reduced_body` [m].
-        rotation: Its rotation, shape (3, 3); default identity.
-
-    Raises:
-        ConfigError: If the region is unknown or exact; exact ones follow ``control.softmode.q_driven``.
-    """
-    if name not in body.region_names:
-        raise ConfigError(f"body {body.name!r} has no region {name!r}", hint=f"it has {list(body.region_names)}")
-    stiffness = float(body.region_stiffness[body.region_names.index(name)])
-    if stiffness == 0.0:
-        raise ConfigError(f"region {name!r} is held exactly and needs no pins", hint="move it with drive_regions")
-    rows = body.region_rows(name)
-    rows = rows[body.region_weights[rows] > 0.0]
-    pins = stiffness * youngs_modulus * body.region_weights[rows]
-    X = body.region_points[rows]
-    targets = X @ (np.eye(3) if rotation is None else np.asarray(rotation, float)).T + np.asarray(position, float)
-    add_pins(builder, instance, X, stiffness=pins, targets=targets)
 
 
 def drive_regions(

@@ -48,7 +48,7 @@ def make_entries(instance_count: int, entry_max: int, rigid_max: int, device: An
     entries, shape = Entries(), (instance_count, entry_max)
     entries.count = wp.zeros(instance_count, dtype=int, device=device)
     for names, dtype in (
-        (("row", "shape"), int),
+        (("row", "shape", "body"), int),
         (("arm",), wp.vec3),
         (("normal", "offset", "force"), wp.vec3d),
         (("stiffness", "friction", "normal_force", "energy"), wp.float64),

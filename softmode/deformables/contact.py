@@ -12,7 +12,16 @@ Newton iterate.
 import warp as wp
 
 from softmode.deformables.lanes import vec8d
-from softmode.deformables.tables import Basis, Entries, Instances, Motion, Progress, Rigid, interpolate_change
+from softmode.deformables.tables import (
+    Basis,
+    Entries,
+    Instances,
+    Motion,
+    Progress,
+    Rigid,
+    first_coupled,
+    interpolate_change,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -109,19 +118,19 @@ def sum_reactions(
     instances: Instances,
     progress: Progress,
     entries: Entries,
-    shape_body: wp.array[int],
     # Out:
     body_wrench_out: wp.array[wp.spatial_vector],  # (body_count,) on the rigid bodies, about their COM [N, N m]
     instance_force_out: wp.array[wp.vec3d],  # (instance_count,) total contact force on the body [N]
 ):
-    """Sum contact forces per rigid body (equal and opposite) and per instance, in entry order."""
+    """Sum the forces of contacts and links per rigid body (equal and opposite), of contacts per instance, in order."""
     w = wp.tid()
     for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
         total = wp.vec3d()
-        for e in range(instances.pin_count[i], entries.count[i]):
+        for e in range(first_coupled(instances, i), entries.count[i]):
             f = entries.force[i, e]
-            total += f
-            body = shape_body[entries.shape[i, e]]
+            if e >= instances.pin_count[i]:
+                total += f
+            body = entries.body[i, e]
             if body >= 0:
                 reaction = -wp.vec3(f)
                 body_wrench_out[body] = body_wrench_out[body] + wp.spatial_vector(

@@ -114,14 +114,20 @@ def point_velocity(body_q: wp.transform, body_qd: wp.spatial_vector, com: wp.vec
 
 @wp.kernel
 def cull_shapes(
+    instances: Instances,
     candidate: wp.array2d[int],  # (instance_count, candidate_max), -1 pads
     shapes: Shapes,
     samples: Samples,
+    pin_body: wp.array[int],  # (pin_total,)
+    pin_stiffness: wp.array[float],  # (pin_total,) [N/m]
     dt: float,
     # Out:
     near_out: wp.array2d[int],  # (instance_count, candidate_max)
 ):
-    """Mark the candidate shapes whose bounding sphere reaches the bounds of the instance."""
+    """Mark the candidate shapes whose bounding sphere reaches the bounds of the instance.
+
+    A body does not touch the shapes of a rigid body that it is fixed to, until it is released.
+    """
     i, c = wp.tid()
     shape = candidate[i, c]
     near_out[i, c] = 0
@@ -137,6 +143,10 @@ def cull_shapes(
     body = shapes.body[shape]
     if body >= 0:
         pose = shapes.body_q[body] * pose
+        if instances.link_pin_count[i] > 0:
+            for pin in range(instances.pin_start[i], instances.pin_start[i] + instances.pin_count[i]):
+                if pin_body[pin] == body and pin_stiffness[pin] > 0.0:
+                    return
     centre = wp.transform_point(pose, 0.5 * (lower + upper))
     reach = radius + shapes.margin[shape]
     if body >= 0:
@@ -275,6 +285,7 @@ def gather_contacts(
             row = instances.row_start[i] + s
             entries.row[i, e] = row
             entries.shape[i, e] = shape
+            entries.body[i, e] = body
             entries.arm[i, e] = arm
             entries.normal[i, e] = normal
             # d enters as offset + displacement, with the gap along the normal and the shape's own motion taken off
@@ -288,9 +299,13 @@ def gather_pins(
     instances: Instances,
     basis: Basis,
     motion: Motion,
+    shapes: Shapes,
     first_row: int,
-    pin_stiffness: wp.array[float],  # (pin_total,) [N/m]
-    pin_target: wp.array[wp.vec3d],  # (pin_total,) [m]
+    pin_body: wp.array[int],  # (pin_total,), rigid body that holds the target, -1 for the world
+    pin_stiffness: wp.array[float],  # (pin_total,) [N/m], negative while released
+    pin_target: wp.array[wp.vec3d],  # (pin_total,), in the frame of that body [m]
+    prescribed: int,
+    dt: float,
     # Out:
     entries: Entries,
 ):
@@ -302,29 +317,37 @@ def gather_pins(
     row = first_row + pin
     x = basis.row_point[row] + interpolate(basis.row, row, motion.q_start, i, instances.function_count[i])
     entries.row[i, e] = row
+    body = pin_body[pin]
+    target = pin_target[pin]
+    if body >= 0:
+        pose = shapes.body_q[body]
+        arm = wp.quat_rotate(wp.transform_get_rotation(pose), wp.vec3(target) - shapes.body_com[body])
+        target = wp.vec3d(wp.transform_point(pose, wp.vec3(target)))
+        if prescribed != 0:
+            target += wp.vec3d(
+                dt * (wp.spatial_top(shapes.body_qd[body]) + wp.cross(wp.spatial_bottom(shapes.body_qd[body]), arm))
+            )
+        entries.arm[i, e] = arm
     entries.shape[i, e] = -1
-    entries.offset[i, e] = x - pin_target[pin]
-    entries.stiffness[i, e] = wp.float64(pin_stiffness[pin])
+    entries.body[i, e] = body
+    entries.offset[i, e] = x - target
+    entries.stiffness[i, e] = wp.float64(wp.max(pin_stiffness[pin], 0.0))
 
 
 @wp.kernel
 def entry_jacobians(
     instances: Instances,
-    shapes: Shapes,
     rigid: Rigid,
     # In and out:
     entries: Entries,
 ):
-    """Compute the motion of the shape at each contact per unit joint motion: J_v - arm x J_w."""
+    """Compute the motion of the rigid body at each contact or pin per unit joint motion: J_v - arm x J_w."""
     i, e, j = wp.tid()
     w = instances.world[i]
     if e >= entries.count[i] or j >= rigid.count[w]:
         return
     value = wp.vec3()
-    shape = entries.shape[i, e]
-    body = int(-1)
-    if shape >= 0:
-        body = shapes.body[shape]
+    body = entries.body[i, e]
     if body >= 0:
         a = rigid.body_articulation[body]
         if a >= 0:

@@ -39,6 +39,7 @@ from softmode.deformables.tables import (
     Rigid,
     blocks_of,
     has_contacts,
+    pushes,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -187,7 +188,7 @@ def begin_newton(
     w = wp.tid()
     touching = int(0)
     for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
-        if has_contacts(instances, entries, i):
+        if pushes(instances, entries, i):
             touching = 1
     progress.touching[w] = touching
     progress.active[w] = 1

@@ -100,6 +100,7 @@ def lay_out(model: Any, bodies: Sequence[ReducedBody]) -> Layout:
         "sample_count": np.array([body.surface_count for body in bodies])[asset],
         "pin_count": pin_count,
         "pin_start": np.concatenate([[0], np.cumsum(pin_count)[:-1]]),
+        "link_pin_count": _link_pins(model, pin_count),
     }
     for name, values in per_instance.items():
         setattr(instances, name, wp.array(values, dtype=int, device=device))
@@ -181,6 +182,15 @@ def _pins(
         if counts[i]:
             rows[mine] = known[key]
     return rows, points, counts
+
+
+def _link_pins(model: Any, pin_count: np.ndarray) -> np.ndarray:
+    """Return how many pins of each instance follow a rigid body."""
+    data = getattr(model, NAMESPACE)
+    if not pin_count.any():
+        return np.zeros(len(pin_count), int)
+    followers = data.pin_instance.numpy()[data.pin_body.numpy() >= 0]
+    return np.bincount(followers, minlength=len(pin_count))
 
 
 def candidate_shapes(model: Any, layout: Layout) -> np.ndarray:

@@ -4,7 +4,7 @@ import warp as wp
 
 from softmode.deformables.lanes import barrier, team_sum, vec8, vec8d
 from softmode.deformables.status import WORLD_ITERATION_LIMIT, WORLD_NO_DESCENT, WORLD_NOT_FINITE
-from softmode.deformables.tables import Entries, Instances, Motion, Points, Progress, Rigid, has_contacts
+from softmode.deformables.tables import Entries, Instances, Motion, Points, Progress, Rigid, has_contacts, pushes
 
 wp.set_module_options({"enable_backward": False})
 
@@ -99,7 +99,7 @@ def judge_iterate(
         return
     done = progress.last[w]
     for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
-        if done == 1 and has_contacts(instances, entries, i):
+        if done == 1 and pushes(instances, entries, i):
             residual = wp.float64(0.0)
             external = wp.float64(0.0)
             for e in range(q.shape[1]):

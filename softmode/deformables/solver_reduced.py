@@ -10,13 +10,13 @@ import warp as wp
 from newton.solvers import SolverBase
 
 from softmode.deformables import assembly_kernels as assembly
-from softmode.deformables import contact, detection, kernels
+from softmode.deformables import attachment_kernels, contact, detection, kernels
 from softmode.deformables import search_kernels as search
+from softmode.deformables.attachments import Attachment
 from softmode.deformables.authoring import (
     NAMESPACE,
     add_pins,
     add_reduced_body,
-    add_region_pins,
     contact_stiffness,
     drive_regions,
     register_custom_attributes,
@@ -35,7 +35,6 @@ __all__ = [
     "SolverReducedOptions",
     "add_pins",
     "add_reduced_body",
-    "add_region_pins",
     "contact_stiffness",
     "drive_regions",
     "register_custom_attributes",
@@ -187,7 +186,8 @@ class SolverReduced(SolverBase):
             shapes.kind, shapes.scale, shapes.source = model.shape_type, model.shape_scale, model.shape_source_ptr
             shapes.margin, shapes.friction = model.shape_margin, model.shape_material_mu
             shapes.lower, shapes.upper = model.shape_collision_aabb_lower, model.shape_collision_aabb_upper
-            shapes.body, shapes.transform, shapes.body_com = model.shape_body, model.shape_transform, model.body_com
+            shapes.body, shapes.transform = model.shape_body, model.shape_transform
+        shapes.body_com = model.body_com
         return shapes
 
     def attach_rigid(self, rigid: RigidDofs) -> None:
@@ -280,25 +280,29 @@ class SolverReduced(SolverBase):
 
     def detect(self, state: newton.State, control: newton.Control | None, dt: float, *, prescribed: bool) -> None:
         """Find the contacts of the step and write them behind the pins as entries."""
-        instances, samples, team, layout = self.instances, self.samples, self.team, self.layout
-        if layout.pin_max:
-            pins = [layout.first_pin_row, self.parameters.pin_stiffness]
-            targets = self._control(control).pin_target
-            dim = (self.instance_count, layout.pin_max)
-            tables = [instances, self.basis, self.motion]
-            self._launch(detection.gather_pins, dim, [*tables, *pins, targets], [self.entries])
-            dim = (self.instance_count, layout.block_count, layout.block_count)
-            self._launch(assembly.assemble_pins, dim, [instances, self.basis, *pins], [self.pins])
-        if self.model.shape_count == 0:
-            wp.copy(self.entries.count, instances.pin_count)
-            return
-        shapes = self.shapes
-        shapes.body_q, shapes.body_qd = state.body_q, state.body_qd
-        every = (self.instance_count, layout.sample_max)
+        self.shapes.body_q, self.shapes.body_qd = state.body_q, state.body_qd
+        if self.layout.pin_max:
+            self._gather_pins(control, dt, prescribed=prescribed)
+        if self.model.shape_count:
+            self._find_contacts(dt, prescribed=prescribed)
+        else:
+            wp.copy(self.entries.count, self.instances.pin_count)
+        self.adapt(dt)
+        if self.rigid.count_max:
+            dim = (self.instance_count, self.entry_max, self.rigid.count_max)
+            self._launch(detection.entry_jacobians, dim, [self.instances, self.rigid.table], [self.entries])
+
+    def _find_contacts(self, dt: float, *, prescribed: bool) -> None:
+        """Find the contacts of the surface samples with the rigid shapes."""
+        instances, samples, shapes, team = self.instances, self.samples, self.shapes, self.team
+        every = (self.instance_count, self.layout.sample_max)
         self._launch(detection.place_samples, every, [instances, self.basis, self.motion], [samples])
         self._launch_team(detection.bound_samples, self.instance_count, [instances, team], [samples])
         self._launch(
-            detection.cull_shapes, self.candidate.shape, [self.candidate, shapes, samples, float(dt)], [self.near]
+            detection.cull_shapes,
+            self.candidate.shape,
+            [instances, self.candidate, shapes, samples, *self._link_pins(), float(dt)],
+            [self.near],
         )
         self._launch(
             detection.find_contacts, every, [instances, self.candidate, self.near, shapes, float(dt)], [samples]
@@ -309,10 +313,23 @@ class SolverReduced(SolverBase):
             [instances, self.basis, shapes, samples, self.entry_max, int(prescribed), team, float(dt)],
             [self.entries, self.status],
         )
-        self.adapt(dt)
-        if self.rigid.count_max:
-            dim = (self.instance_count, self.entry_max, self.rigid.count_max)
-            self._launch(detection.entry_jacobians, dim, [instances, shapes, self.rigid.table], [self.entries])
+
+    def _gather_pins(self, control: newton.Control | None, dt: float, *, prescribed: bool) -> None:
+        """Write the pins as the first entries of the step and assemble their stiffness."""
+        layout, tables, row = self.layout, [self.instances, self.basis], self.layout.first_pin_row
+        targets = [self._control(control).pin_target, int(prescribed), float(dt)]
+        self._launch(
+            detection.gather_pins,
+            (self.instance_count, layout.pin_max),
+            [*tables, self.motion, self.shapes, row, *self._link_pins(), *targets],
+            [self.entries],
+        )
+        dim = (self.instance_count, layout.block_count, layout.block_count)
+        self._launch(assembly.assemble_pins, dim, [*tables, row, self.parameters.pin_stiffness], [self.pins])
+
+    def _link_pins(self) -> list[Any]:
+        """Return which rigid bodies the pins follow and how stiffly, empty where there are no pins."""
+        return [getattr(self.parameters, name, None) for name in ("pin_body", "pin_stiffness")]
 
     def adapt(self, dt: float) -> None:
         """Let the bodies that have contacts take an Euler step, whatever the integrator."""
@@ -422,7 +439,7 @@ class SolverReduced(SolverBase):
         )
         if rigid.count_max:
             dim = (self.world_count, rigid.count_max, rigid.count_max)
-            self._launch(assembly.assemble_rigid, dim, [entries, self.progress], [rigid.table])
+            self._launch(assembly.assemble_rigid, dim, [instances, entries, self.progress], [rigid.table])
 
     def _solve(self) -> None:
         """Factor every body, condense onto the rigid dofs, solve those, substitute back."""
@@ -495,7 +512,7 @@ class SolverReduced(SolverBase):
         self._launch(
             contact.sum_reactions,
             self.world_count,
-            [self.instances, self.progress, self.entries, self.model.shape_body],
+            [self.instances, self.progress, self.entries],
             [self.body_wrench, self.instance_force],
         )
         self.update_particles(state)
@@ -517,7 +534,7 @@ class SolverReduced(SolverBase):
             flags: Accepted for the contract; reduced coordinates are always reset.
         """
         if world_mask is None:
-            world_mask = wp.full(self.world_count + 1, True, dtype=bool, device=self.model.device)
+            world_mask = self._every_world()
         initial, out = self.parameters, getattr(state, NAMESPACE)
         self._launch(
             kernels.reset_functions,
@@ -531,7 +548,38 @@ class SolverReduced(SolverBase):
             [self.instances, self.model.body_world, world_mask],
             [self.status, self.instance_force, self.body_wrench],
         )
+        if self.layout.pin_max:
+            dim = (self.instance_count, self.layout.pin_max)
+            pins = [self.parameters.pin_stiffness]
+            self._launch(attachment_kernels.hold_all_pins, dim, [self.instances, world_mask], pins)
         self.update_particles(state)
+
+    def release(self, attachment: Attachment, world_mask: wp.array | None = None) -> None:
+        """Let go of an attachment in the masked worlds; may be captured, then give a mask.
+
+        Args:
+            attachment: What :func:`softmode.deformables.attachments.attach` returned.
+            world_mask: Boolean mask of shape (world_count + 1,) as for :meth:`reset`; None for all worlds.
+        """
+        self._hold(attachment, world_mask, -1.0)
+
+    def hold(self, attachment: Attachment, world_mask: wp.array | None = None) -> None:
+        """Take a released attachment up again; arguments as for :meth:`release`."""
+        self._hold(attachment, world_mask, 1.0)
+
+    def _hold(self, attachment: Attachment, world_mask: wp.array | None, sign: float) -> None:
+        mask = self._every_world() if world_mask is None else world_mask
+        where = [attachment.instance, attachment.first, sign]
+        self._launch(
+            attachment_kernels.hold_pins,
+            (self.world_count, attachment.count),
+            [self.instances, self.progress.instance_start, mask, *where],
+            [self.parameters.pin_stiffness],
+        )
+
+    def _every_world(self) -> wp.array:
+        """Return a mask of all worlds."""
+        return wp.full(self.world_count + 1, True, dtype=bool, device=self.model.device)
 
     def _control(self, control: newton.Control | None) -> Any:
         """Return the control attributes, the model's where there is no control."""

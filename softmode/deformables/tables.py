@@ -40,6 +40,7 @@ class Instances:
     particle_start: wp.array[int]
     pin_start: wp.array[int]
     pin_count: wp.array[int]
+    link_pin_count: wp.array[int]  # pins that follow a rigid body
     mass: wp.array[wp.float64]  # [kg]
     inertia: wp.array[float]  # density times the square of the size [kg/m]
     size: wp.array[float]  # diagonal of the bounding box [m]
@@ -85,9 +86,10 @@ class Entries:
     count: wp.array[int]  # (instance_count,)
     row: wp.array2d[int]  # (instance_count, entry_max)
     shape: wp.array2d[int]  # -1 for a pin
-    arm: wp.array2d[wp.vec3]  # from the centre of mass of the shape's body [m]
+    body: wp.array2d[int]  # rigid body on the other side: of the shape, or that a pin follows; -1 for none
+    arm: wp.array2d[wp.vec3]  # from the centre of mass of that body [m]
     normal: wp.array2d[wp.vec3d]
-    offset: wp.array2d[wp.vec3d]  # pin: x_n - target; contact: gap n - drift of the shape [m]
+    offset: wp.array2d[wp.vec3d]  # pin: x_n - target; contact: gap n; both less the drift of a prescribed body [m]
     stiffness: wp.array2d[wp.float64]  # [N/m]
     friction: wp.array2d[wp.float64]
     normal_force: wp.array2d[wp.float64]  # of the last iterates, for friction [N]
@@ -145,6 +147,18 @@ class Progress:
 def has_contacts(instances: Instances, entries: Entries, i: int):
     """Return whether an instance is near a shape: its entries are more than its pins."""
     return entries.count[i] > instances.pin_count[i]
+
+
+@wp.func
+def pushes(instances: Instances, entries: Entries, i: int):
+    """Return whether an instance may push another body: it is near a shape or fixed to a rigid body."""
+    return instances.link_pin_count[i] > 0 or has_contacts(instances, entries, i)
+
+
+@wp.func
+def first_coupled(instances: Instances, i: int):
+    """Return the first entry of an instance that may push a rigid body: a pin only where some pin follows a body."""
+    return wp.where(instances.link_pin_count[i] > 0, 0, instances.pin_count[i])
 
 
 @wp.func

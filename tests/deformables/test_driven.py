@@ -6,11 +6,12 @@ import newton
 import numpy as np
 import pytest
 
+from softmode.deformables.attachments import attach
 from softmode.deformables.body import BuildOptions, Region, build_body
 from softmode.deformables.lanes import from_blocks
 from softmode.deformables.materials import Material
 from softmode.deformables.quadrature import quadrature_from_box
-from softmode.deformables.solver_reduced import SolverReducedOptions, add_reduced_body, add_region_pins, drive_regions
+from softmode.deformables.solver_reduced import SolverReducedOptions, add_reduced_body, drive_regions
 from softmode.errors import ConfigError
 from tests.scenes import GRAVITY, Scene, rotation
 
@@ -84,7 +85,7 @@ def test_soft_region_is_held_by_its_pins():
     body = held_bar(stiffness=1.0e3)
 
     def populate(world):
-        add_region_pins(world, add_reduced_body(world, body, material=MATERIAL), body, "left", youngs_modulus=2.0e5)
+        attach(world, add_reduced_body(world, body, material=MATERIAL), body, region="left")
 
     scene = Scene(populate, [body], gravity=DOWN, options=FINE, dt=0.02)
     scene.step(200)
@@ -99,6 +100,6 @@ def test_region_pins_refuse_what_needs_none():
     builder = newton.ModelBuilder()
     instance = add_reduced_body(builder, held_bar(), material=MATERIAL)
     with pytest.raises(ConfigError, match="no region"):
-        add_region_pins(builder, instance, held_bar(), "tip", youngs_modulus=1.0e5)
+        attach(builder, instance, held_bar(), region="tip")
     with pytest.raises(ConfigError, match="exactly"):
-        add_region_pins(builder, instance, held_bar(), "left", youngs_modulus=1.0e5)
+        attach(builder, instance, held_bar(), region="left")

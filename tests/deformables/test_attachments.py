@@ -1,0 +1,184 @@
+"""Attachments: held by a link or the world, two-way, released and held again, and the errors."""
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+
+from softmode.deformables.attachments import attach
+from softmode.deformables.materials import Material
+from softmode.deformables.solver_reduced import SolverReducedOptions, add_reduced_body
+from softmode.errors import ConfigError
+from tests.scenes import GRAVITY, Scene, add_free_box, cube, rotation
+
+DOWN = (0.0, 0.0, -GRAVITY)
+EDGE = 0.1
+HALF = 0.5 * EDGE
+TOP = ((-1.0, -1.0, 0.9 * HALF), (1.0, 1.0, 1.0))
+
+
+def joined(*, mass=0.5, gap=0.02, spin=(0.0, 0.0, 0.0), **kw):
+    """Return a soft cube that hangs under a free box by its top, and the attachment."""
+    body, kept = cube(), []
+
+    def populate(world):
+        link = add_free_box(world, (0.05, 0.05, 0.02), mass, (0.0, 0.0, HALF + gap + 0.02))
+        instance = add_reduced_body(world, body, material=Material(youngs_modulus=1.0e5), angular_velocity=spin)
+        kept.append(attach(world, instance, body, link=link, box=TOP))
+
+    return Scene(populate, [body], coupled=True, **kw), kept[0]
+
+
+def test_momentum_of_a_joined_pair():
+    """A soft cube glued to a free box, the cube spinning at first: p kept to 1e-6 of m omega edge / 2, L to 2e-4.
+
+    The levers of a step are those of its start: what that and implicit Euler take of the angular momentum is of first
+    order in dt, within these 50 ms far below the spin that the box takes up.
+    """
+    scene, _ = joined(spin=(0.5, 0.3, 1.0), dt=0.002)
+    L0 = scene.momentum()[1] + scene.rigid_momentum()[1]
+    scale = scene.mass() * 0.5 * EDGE
+    for _ in range(50):
+        scene.step()
+        assert np.linalg.norm(scene.momentum()[0] + scene.rigid_momentum()[0]) <= 1e-6 * scale
+    L = scene.momentum()[1] + scene.rigid_momentum()[1]
+    assert np.linalg.norm(scene.rigid_momentum()[1]) > 0.1 * np.linalg.norm(L0)
+    assert np.linalg.norm(L - L0) <= 2e-4 * np.linalg.norm(L0)
+
+
+def test_free_fall_of_a_joined_pair():
+    """Everything falls with g, and nothing pulls: the joint carries no force in free fall."""
+    scene, _ = joined(gravity=DOWN)
+    scene.step(50)
+    v = scene.momentum()[0] / scene.mass()
+    np.testing.assert_allclose(v, [0.0, 0.0, -GRAVITY * 50 * scene.dt], atol=1e-5)
+    assert np.abs(scene.solver.body_wrench.numpy()).max() <= 1e-4 * scene.mass() * GRAVITY
+
+
+@pytest.mark.parametrize("released", ["held", "released", "held again"])
+def test_hanging_from_the_world(released):
+    """A cube glued to the world by its top hangs still; let go it falls as sqrt says; a reset or hold takes it up."""
+    body, kept = cube(), []
+
+    def populate(world):
+        instance = add_reduced_body(world, body, rotation=rotation((0, 0, 1), 0.3), position=(0.2, 0.0, 1.0))
+        kept.append(attach(world, instance, body, box=TOP))
+
+    scene = Scene(populate, [body], gravity=DOWN)
+    start = scene.centre()
+    if released != "held":
+        scene.reduced.release(kept[0])
+    if released == "held again":
+        scene.reduced.hold(kept[0])
+    scene.step(100)
+    drop = start[2] - scene.centre()[2]
+    t = 100 * scene.dt
+    if released == "released":
+        assert drop == pytest.approx(0.5 * GRAVITY * t * (t + scene.dt), rel=1e-5)
+        scene.reduced.reset(scene.state)
+        scene.step(100)
+        drop = start[2] - scene.centre()[2]
+    # the glue of k = 20 M / size per area stretches by weight / (k A), the body by less than weight / (E edge)
+    assert 0.0 < drop <= 2.0 * scene.mass() * GRAVITY / (Material().youngs_modulus * EDGE)
+
+
+def test_release_of_one_world_in_a_recorded_graph():
+    """A mask chooses the worlds, inside a captured graph too; the others hang on, bit for bit."""
+    body, kept = cube(), []
+
+    def populate(world):
+        instance = add_reduced_body(world, body)
+        kept.append(attach(world, instance, body, box=TOP))
+
+    def run(world_count, masked):
+        scene = Scene(populate, [body], gravity=DOWN, world_count=world_count)
+        mask = wp.array([w == masked for w in range(world_count + 1)], dtype=bool, device="cpu")
+        with wp.ScopedCapture(device="cpu") as capture:
+            scene.reduced.release(kept[-1], mask)
+        replay = scene.capture()
+        wp.capture_launch(capture.graph)
+        for _ in range(10):
+            replay()
+        return scene
+
+    batch, alone = run(3, 1), run(1, -1)
+    np.testing.assert_array_equal(batch.q(0), alone.q())
+    np.testing.assert_array_equal(batch.q(2), alone.q())
+    assert batch.centre(1)[2] < -0.01
+
+
+@pytest.mark.parametrize("coupled", [True, False])
+def test_weight_on_a_moving_link(coupled):
+    """Hung on a rigid body: at rest its wrench is the weight of the cube, the lever about its centre of mass included.
+
+    The link is held by a stiff drive (coupled) or prescribed (not coupled).
+    """
+    body, kept = cube(), []
+    x = 0.1
+
+    def populate(world):
+        pose = wp.transform(wp.vec3(x, 0.0, 0.08), wp.quat_identity())
+        link = world.add_link(xform=pose, mass=1.0, inertia=wp.mat33(np.eye(3) * 1.0e-3))
+        joint = world.add_joint_prismatic(
+            parent=-1, child=link, axis=(0, 0, 1), parent_xform=pose,
+            target_ke=1.0e4, target_kd=2.0e2,
+        )  # fmt: skip
+        world.add_articulation([joint])
+        instance = add_reduced_body(world, body, material=Material(youngs_modulus=2.0e5, mass_damping=10.0))
+        kept.append(attach(world, instance, body, link=link, box=TOP))
+
+    options = SolverReducedOptions(tolerance=1e-7)
+    scene = Scene(populate, [body], coupled=coupled, gravity=DOWN, options=options)
+    scene.step(300)
+    wrench = scene.reduced.body_wrench.numpy()[0]
+    weight = scene.mass() * GRAVITY
+    np.testing.assert_allclose(wrench[:3], [0.0, 0.0, -weight], atol=2e-3 * weight)
+    # the centre of the cube is x beside the centre of mass of the link: moment (-x) e_x cross (-weight) e_z
+    np.testing.assert_allclose(wrench[3:], [0.0, -x * weight, 0.0], atol=5e-3 * x * weight)
+    if coupled:
+        sunk = scene.state.joint_q.numpy()[0]
+        assert sunk == pytest.approx(-(1.0 * GRAVITY + weight) / 1.0e4, rel=1e-2)
+
+
+def test_prescribed_link_carries_the_body_along():
+    """A link that moves as told drags the body: after a while they have one velocity."""
+    body = cube()
+
+    def populate(world):
+        link = add_free_box(world, (0.05, 0.05, 0.02), 1.0, (0.0, 0.0, 0.09))
+        attach(world, add_reduced_body(world, body, material=Material(mass_damping=5.0)), body, link=link, box=TOP)
+
+    scene = Scene(populate, [body])
+    for k in range(200):
+        for state in (scene.state, scene.next_state):
+            state.body_q.assign(np.array([[0.3 * k * scene.dt, 0.0, 0.09, 0.0, 0.0, 0.0, 1.0]], np.float32))
+            state.body_qd.assign(np.array([[0.3, 0.0, 0.0, 0.0, 0.0, 0.0]], np.float32))
+        scene.step()
+    np.testing.assert_allclose(scene.momentum()[0] / scene.mass(), [0.3, 0.0, 0.0], atol=3e-3)
+    assert scene.reduced.instance_force.numpy()[0] == pytest.approx(np.zeros(3))
+
+
+def test_held_body_does_not_touch_its_link():
+    """The shapes of the link a body is fixed to are not in contact with it, until it is released."""
+    scene, attachment = joined(gap=-0.01)
+    scene.step()
+    assert scene.reduced.entries.count.numpy()[0] == attachment.count
+    scene.reduced.release(attachment)
+    scene.step()
+    assert scene.reduced.entries.count.numpy()[0] > attachment.count
+
+
+def test_errors():
+    """No point inside, a link that does not exist, not exactly one place: typed errors with a remedy."""
+    builder = newton.ModelBuilder()
+    body = cube()
+    instance = add_reduced_body(builder, body)
+    with pytest.raises(ConfigError, match="no point") as error:
+        attach(builder, instance, body, box=((1.0,) * 3, (2.0,) * 3))
+    assert "spans" in str(error.value)
+    with pytest.raises(ConfigError, match="link"):
+        attach(builder, instance, body, link=3, box=TOP)
+    with pytest.raises(ConfigError, match="exactly one"):
+        attach(builder, instance, body)
+    with pytest.raises(ConfigError, match="stiffness"):
+        attach(builder, instance, body, box=TOP, stiffness=-1.0)
