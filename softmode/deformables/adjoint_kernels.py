@@ -110,8 +110,8 @@ def place_points(
         return
     point = instances.point_start[i] + p
     n = instances.function_count[i]
-    step.place[i, p] = displacement_gradient(basis, q, i, point, n)
-    step.place_start[i, p] = displacement_gradient(basis, motion.q_start, i, point, n)
+    step.place[i, p] = displacement_gradient(basis.gradient, q, i, point, n)
+    step.place_start[i, p] = displacement_gradient(basis.gradient, motion.q_start, i, point, n)
 
 
 @wp.kernel
@@ -207,7 +207,7 @@ def apply_points(
     if active[instances.world[i]] == 0 or p >= instances.point_count[i]:
         return
     point = instances.point_start[i] + p
-    dF = displacement_gradient(basis, direction, i, point, instances.function_count[i])
+    dF = displacement_gradient(basis.gradient, direction, i, point, instances.function_count[i])
     material = material_of(instances, basis, i, point)
     step.point[i, p] = basis.point_weight[point] * stress_derivative(
         material, step.place[i, p], step.place_start[i, p], dt, dF
@@ -299,7 +299,7 @@ def accumulate_points(
     G = step.place[i, p]
     G_start = step.place_start[i, p]
     material = material_of(instances, basis, i, point)
-    L = displacement_gradient(basis, costate, i, point, instances.function_count[i])
+    L = displacement_gradient(basis.gradient, costate, i, point, instances.function_count[i])
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     two = wp.float64(2.0)

@@ -187,7 +187,7 @@ def assemble_matrix(
     dt: wp.float64,
     team: int,
     # Out:
-    matrix_out: wp.array3d[vec8],  # (instance_count, 3 stride, ...), upper triangle
+    matrix_out: wp.array3d[vec8],  # (system_count, N, ...), upper triangle
 ):
     """Add inertia and pins to the stiffness; driven unknowns stay put."""
     i, row, member = wp.tid()
@@ -197,6 +197,7 @@ def assemble_matrix(
     c = row / (LANES * block_count)
     k = row % (LANES * block_count)
     driven = instances.driven_count[i]
+    first = instances.system_block[i]
     for column in range(member, 3 * block_count, team):
         d = column / block_count
         lanes = column % block_count
@@ -214,7 +215,7 @@ def assemble_matrix(
                 for lane in range(LANES):
                     if lane == row % LANES:
                         value[lane] = value[lane] + inertia
-            matrix_out[i, row, column] = value
+            matrix_out[instances.system[i], LANES * first + row, first + column] = value
 
 
 @wp.kernel
@@ -224,7 +225,7 @@ def add_contacts(
     entries: Entries,
     active: wp.array[int],
     # In and out:
-    matrix: wp.array3d[vec8],  # (instance_count, 3 stride, ...), upper triangle
+    matrix: wp.array3d[vec8],  # (system_count, N, ...), upper triangle
 ):
     """Add the contacts, sum_e b^T H b, to 8x8 blocks; driven unknowns stay put."""
     i, task = wp.tid()
@@ -254,8 +255,10 @@ def add_contacts(
         a5 = a5 + b[5] * v
         a6 = a6 + b[6] * v
         a7 = a7 + b[7] * v
-    row = LANES * (c * block_count + rows)
-    column = d * block_count + lanes
+    first = instances.system_block[i]
+    row = LANES * (first + c * block_count + rows)
+    column = first + d * block_count + lanes
+    i = instances.system[i]
     matrix[i, row, column] = matrix[i, row, column] + a0
     matrix[i, row + 1, column] = matrix[i, row + 1, column] + a1
     matrix[i, row + 2, column] = matrix[i, row + 2, column] + a2
@@ -274,8 +277,9 @@ def assemble_columns(
     active: wp.array[int],
     gradient: wp.array2d[vec8d],
     rigid_count: int,
+    size: int,  # N
     # Out:
-    matrix_out: wp.array3d[float],  # (instance_count, 3 stride, 3 stride + ...)
+    matrix_out: wp.array3d[float],  # (system_count, N, N + ...)
 ):
     """Fill the columns right of K: d2E/dq dr = -sum_e b_k H_e J_e, and -g in column rigid_count."""
     i, rows, j = wp.tid()
@@ -292,7 +296,8 @@ def assemble_columns(
             value = value - entries.coupling[i, e, j][c] * basis.row[entries.row[i, e], b]
         value = free_part(value, instances.driven_count[i] - LANES * b)
     for a in range(LANES):
-        matrix_out[i, LANES * rows + a, 3 * LANES * block_count + j] = value[a]
+        row = LANES * (instances.system_block[i] + rows) + a
+        matrix_out[instances.system[i], row, size + j] = value[a]
 
 
 @wp.kernel
@@ -327,6 +332,7 @@ def assemble_rigid(
 @wp.kernel
 def condense(
     progress: Progress,
+    system_start: wp.array[int],  # (world_count + 1,)
     rigid_max: int,
     factored: wp.array3d[vec8],  # [U | Y | y], Y = U^-T C, y = U^-T (-g)
     # In and out:
@@ -345,7 +351,7 @@ def condense(
         column = rigid_max
     else:
         value = rigid.matrix[w, j, l]
-    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
+    for i in range(system_start[w], system_start[w + 1]):
         for row in range(row_count):
             y = factored[i, row, first + j / LANES][j % LANES]
             value -= wp.float64(y) * wp.float64(factored[i, row, first + column / LANES][column % LANES])
@@ -396,3 +402,94 @@ def solve_rigid(
         for s in range(a + 1, n):
             value -= matrix[w, s, a] * solution[w, s]
         solution[w, a] = value / matrix[w, a, a]
+
+
+@wp.kernel
+def relate_pairs(
+    instances: Instances,
+    progress: Progress,
+    entries: Entries,
+    # Out:
+    pattern: wp.array3d[int],  # (world_count, part_count, part_count)
+):
+    """Say which bodies of a world touch each other."""
+    w, part = wp.tid()
+    for other in range(pattern.shape[2]):
+        pattern[w, part, other] = 0
+    i = progress.instance_start[w] + part
+    if i >= progress.instance_start[w + 1]:
+        return
+    for e in range(entries.count[i] - entries.pair_count[i], entries.count[i]):
+        j = entries.partner[i, e]
+        if j > i:
+            pattern[w, part, j - progress.instance_start[w]] = 1
+
+
+@wp.kernel
+def assemble_pairs(
+    instances: Instances,
+    basis: Basis,
+    entries: Entries,
+    progress: Progress,
+    pattern: wp.array3d[int],
+    # In and out:
+    matrix: wp.array3d[vec8],  # (world_count, N, ...), upper triangle
+):
+    """Fill the 8x8 blocks between two bodies of a world, -sum_e b_i^T H b_j; zero where only the elimination fills."""
+    w, both, task = wp.tid()
+    part_count = pattern.shape[1]
+    part = both / part_count
+    other = both % part_count
+    if progress.active[w] == 0 or other <= part or pattern[w, part, other] == 0:
+        return
+    i = progress.instance_start[w] + part
+    j = progress.instance_start[w] + other
+    block_count = basis.row.shape[1]
+    pair = task / (block_count * block_count)
+    c = pair / 3
+    d = pair % 3
+    rows = (task / block_count) % block_count
+    lanes = task % block_count
+    a0 = vec8()
+    a1 = vec8()
+    a2 = vec8()
+    a3 = vec8()
+    a4 = vec8()
+    a5 = vec8()
+    a6 = vec8()
+    a7 = vec8()
+    for e in range(entries.count[i] - entries.pair_count[i], entries.count[i]):
+        if entries.partner[i, e] == j:
+            b = free_part(basis.row[entries.row[i, e], rows], instances.driven_count[i] - LANES * rows)
+            v = free_part(basis.row[entries.partner_row[i, e], lanes], instances.driven_count[j] - LANES * lanes)
+            v = entries.hessian[i, e][c, d] * v
+            a0 = a0 - b[0] * v
+            a1 = a1 - b[1] * v
+            a2 = a2 - b[2] * v
+            a3 = a3 - b[3] * v
+            a4 = a4 - b[4] * v
+            a5 = a5 - b[5] * v
+            a6 = a6 - b[6] * v
+            a7 = a7 - b[7] * v
+    row = LANES * (instances.system_block[i] + c * block_count + rows)
+    column = instances.system_block[j] + d * block_count + lanes
+    matrix[w, row, column] = a0
+    matrix[w, row + 1, column] = a1
+    matrix[w, row + 2, column] = a2
+    matrix[w, row + 3, column] = a3
+    matrix[w, row + 4, column] = a4
+    matrix[w, row + 5, column] = a5
+    matrix[w, row + 6, column] = a6
+    matrix[w, row + 7, column] = a7
+
+
+@wp.kernel
+def read_direction(
+    instances: Instances,
+    solution: wp.array2d[vec8],  # (system_count, N / 8)
+    # Out:
+    direction_out: wp.array2d[vec8],  # (instance_count, 3 block_count)
+):
+    """Take each body's part out of the solution of its system."""
+    i, e = wp.tid()
+    direction_out[i, e] = solution[instances.system[i], instances.system_block[i] + e]

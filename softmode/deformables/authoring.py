@@ -20,6 +20,9 @@ _PIN = f"{NAMESPACE}:pin"
 MATERIAL_FIELDS = ("youngs_modulus", "poissons_ratio", "density", "viscosity", "mass_damping", "friction")
 """Numbers of a :class:`Material` that a model stores per instance."""
 
+CONTACT_FIELDS = ("contact_stiffness", "contact_radius", "self_contact")
+"""What a model stores per instance of its surface."""
+
 CONTACT_STIFFNESS_FLOOR = 5.0e7
 """Least contact stiffness per area [Pa/m]: 25 kPa, a firm grasp, sinks 0.5 mm deep."""
 
@@ -51,6 +54,8 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
     for name in MATERIAL_FIELDS:
         declare(name, wp.float32, _INSTANCE)
     declare("contact_stiffness", wp.float32, _INSTANCE)
+    declare("contact_radius", wp.float32, _INSTANCE)
+    declare("self_contact", wp.int32, _INSTANCE)
     declare("q", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
     declare("qd", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
     # the step before, for BDF2 and for Newton's start; dt_before = 0 says that there is none
@@ -87,6 +92,8 @@ def add_reduced_body(
     velocity: Sequence[float] = (0.0, 0.0, 0.0),
     angular_velocity: Sequence[float] = (0.0, 0.0, 0.0),
     contact_stiffness_per_area: float | None = None,
+    contact_radius: float = 0.0,
+    self_contact: bool = False,
     particle_radius: float | None = None,
 ) -> int:
     """Add a body to a world; its surface samples become Newton particles.
@@ -100,13 +107,15 @@ def add_reduced_body(
         velocity: Initial velocity of the centre of mass [m/s].
         angular_velocity: Initial angular velocity [rad/s].
         contact_stiffness_per_area: Penalty stiffness of contact [Pa/m]; default :func:`contact_stiffness`.
+        contact_radius: How far the surface that touches stands out from the body's [m].
+        self_contact: Whether the body may touch itself.
         particle_radius: Radius of the particles for viewers and picking [m]; default half their spacing.
 
     Returns:
         Index of the instance in this builder.
 
     Raises:
-        ConfigError: If the pose or a stiffness is not finite or the rotation is no rotation.
+        ConfigError: If the pose, a stiffness or a radius is not finite or the rotation is no rotation.
     """
     register_custom_attributes(builder)
     material = material or Material()
@@ -120,6 +129,8 @@ def add_reduced_body(
     stiffness = contact_stiffness(body, material) if contact_stiffness_per_area is None else contact_stiffness_per_area
     if not 0.0 < stiffness < np.inf:
         raise ConfigError(f"contact_stiffness_per_area must be a finite number > 0 [Pa/m], got {stiffness!r}")
+    if not 0.0 <= contact_radius < np.inf:
+        raise ConfigError(f"contact_radius must be a finite number >= 0 [m], got {contact_radius!r}")
 
     omega = np.asarray(angular_velocity, float)
     spin = np.array([[0, -omega[2], omega[1]], [omega[2], 0, -omega[0]], [-omega[1], omega[0], 0]])
@@ -151,6 +162,8 @@ def add_reduced_body(
         "particle_start": particle_start,
         "material_model": int(material.model),
         "contact_stiffness": float(stiffness),
+        "contact_radius": float(contact_radius),
+        "self_contact": int(self_contact),
     }
     for name in MATERIAL_FIELDS:
         values[name] = getattr(material, name)

@@ -46,9 +46,9 @@ def make_samples(instance_count: int, sample_max: int, team: int, device: Any) -
 def make_entries(instance_count: int, entry_max: int, rigid_max: int, device: Any) -> Any:
     """Return the point constraints of a step."""
     entries, shape = Entries(), (instance_count, entry_max)
-    entries.count = wp.zeros(instance_count, dtype=int, device=device)
+    entries.count, entries.pair_count = (wp.zeros(instance_count, dtype=int, device=device) for _ in range(2))
     for names, dtype in (
-        (("row", "shape", "body"), int),
+        (("row", "shape", "body", "partner", "partner_row"), int),
         (("arm",), wp.vec3),
         (("normal", "offset", "force"), wp.vec3d),
         (("stiffness", "friction", "normal_force", "energy"), wp.float64),

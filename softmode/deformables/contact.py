@@ -72,14 +72,28 @@ def evaluate_entries(
     # In and out:
     entries: Entries,
 ):
-    """Evaluate pins and contacts at displacement d = sum_k b_k (q_k - q_nk) - J r."""
+    """Evaluate pins and contacts at displacement d = sum_k b_k (q_k - q_nk) - J r, less that of a soft partner.
+
+    A contact of two soft bodies is an entry of each, which has one half of its energy and all of its force.
+    """
     i, e = wp.tid()
     w = instances.world[i]
     if selected[w] == 0 or e >= entries.count[i]:
         return
     d = interpolate_change(basis.row, entries.row[i, e], q, motion.q_start, i, instances.function_count[i])
-    for j in range(rigid.count[w]):
-        d -= r[w, j] * wp.vec3d(entries.jacobian[i, e, j])
+    smoothing = instances.smoothing[i]
+    share = wp.float64(1.0)
+    if e >= entries.count[i] - entries.pair_count[i]:
+        j = entries.partner[i, e]
+        if j >= 0:
+            d -= interpolate_change(
+                basis.row, entries.partner_row[i, e], q, motion.q_start, j, instances.function_count[j]
+            )
+            smoothing = wp.min(smoothing, instances.smoothing[j])
+            share = wp.float64(0.5)
+    else:
+        for j in range(rigid.count[w]):
+            d -= r[w, j] * wp.vec3d(entries.jacobian[i, e, j])
     stiffness = entries.stiffness[i, e]
     identity = wp.identity(n=3, dtype=wp.float64)
     H = stiffness * identity
@@ -90,7 +104,7 @@ def evaluate_entries(
     else:
         n = entries.normal[i, e]
         total = entries.offset[i, e] + d
-        psi, slope, curvature = normal_potential(-wp.dot(n, total), wp.float64(instances.smoothing[i]))
+        psi, slope, curvature = normal_potential(-wp.dot(n, total), wp.float64(smoothing))
         if derivatives != 0 and progress.iteration[w] <= LAG_ITERATIONS:
             entries.normal_force[i, e] = stiffness * slope
         normal_force = entries.normal_force[i, e]
@@ -99,7 +113,7 @@ def evaluate_entries(
         y = wp.length(t)
         f0, f1_over_y, f1_slope = friction_potential(y, stick_range)
         limit = entries.friction[i, e] * normal_force
-        entries.energy[i, e] = stiffness * psi + limit * f0
+        entries.energy[i, e] = share * (stiffness * psi + limit * f0)
         entries.force[i, e] = stiffness * slope * n - limit * f1_over_y * t
         # f0 is concave in y^2, so the quadratic of curvature f1 / y lies above it and its steps cannot overshoot, from
         # however far away; the potential's own curvature f1' along the slip converges faster once the state is close

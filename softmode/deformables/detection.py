@@ -90,9 +90,8 @@ def bound_samples(
         lower = wp.min(lower, x)
         upper = wp.max(upper, x)
         reach = wp.max(reach, wp.length(samples.drift[i, s]))
-    grow = wp.vec3(2.0 * reach)
-    samples.reach[i, lane, 0] = lower - grow
-    samples.reach[i, lane, 1] = upper + grow
+    samples.reach[i, lane, 0] = lower - wp.vec3(2.0 * reach)
+    samples.reach[i, lane, 1] = upper + wp.vec3(2.0 * reach)
     barrier()
     if lane != 0:
         return
@@ -101,8 +100,9 @@ def bound_samples(
     for k in range(1, team):
         lower = wp.min(lower, samples.reach[i, k, 0])
         upper = wp.max(upper, samples.reach[i, k, 1])
-    samples.lower[i] = lower - wp.vec3(instances.margin[i])
-    samples.upper[i] = upper + wp.vec3(instances.margin[i])
+    grow = wp.vec3(instances.margin[i] + instances.contact_radius[i])
+    samples.lower[i] = lower - grow
+    samples.upper[i] = upper + grow
 
 
 @wp.func
@@ -193,9 +193,10 @@ def find_contacts(
         origin = wp.transform_get_translation(pose)
         local = wp.quat_rotate_inv(wp.transform_get_rotation(pose), wp.vec3(x - wp.vec3d(origin)))
         # inside a mesh the surface may be as far away as the mesh is large
-        far = wp.max(reach + shapes.margin[shape], wp.length(shapes.upper[shape] - shapes.lower[shape]))
+        thick = shapes.margin[shape] + instances.contact_radius[i]
+        far = wp.max(reach + thick, wp.length(shapes.upper[shape] - shapes.lower[shape]))
         query = query_shape(shapes.kind[shape], shapes.scale[shape], shapes.source[shape], local, far)
-        gap = wp.float64(query.distance - shapes.margin[shape])
+        gap = wp.float64(query.distance - thick)
         if gap < wp.float64(reach) and gap < samples.gap[i, s, 1]:
             normal = wp.quat_rotate(wp.transform_get_rotation(pose), query.normal)
             slot = int(1)

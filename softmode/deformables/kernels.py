@@ -18,7 +18,7 @@ Precision: basis data float32; q, energy and residual float64; the Newton direct
 
 import warp as wp
 
-from softmode.deformables.lanes import LANES, sum8d, team_sum, vec8d
+from softmode.deformables.lanes import LANES, sum8d, team_sum, vec8, vec8d
 from softmode.deformables.materials import (
     MaterialModel,
     MaterialParameters,
@@ -229,14 +229,14 @@ def extrapolate(
 
 
 @wp.func
-def displacement_gradient(basis: Basis, q: wp.array2d[vec8d], i: int, point: int, function_count: int):
-    """Return G = F - I = sum_k q_k (grad b_k)^T."""
-    stride = basis.row.shape[1]
+def displacement_gradient(gradient: wp.array3d[vec8], q: wp.array2d[vec8d], i: int, point: int, function_count: int):
+    """Return G = F - I = sum_k q_k (grad b_k)^T, with gradients of shape (block_count, point_count, 3)."""
+    stride = q.shape[1] / 3
     G = wp.mat33d()
     for b in range(blocks_of(function_count)):
-        gx = vec8d(basis.gradient[b, point, 0])
-        gy = vec8d(basis.gradient[b, point, 1])
-        gz = vec8d(basis.gradient[b, point, 2])
+        gx = vec8d(gradient[b, point, 0])
+        gy = vec8d(gradient[b, point, 1])
+        gz = vec8d(gradient[b, point, 2])
         for axis in range(3):
             x = q[i, axis * stride + b]
             G[axis, 0] += sum8d(wp.cw_mul(x, gx))
@@ -279,10 +279,10 @@ def evaluate_points(
     parameters = material_of(instances, basis, i, point)
     weight = basis.point_weight[point]
 
-    G = displacement_gradient(basis, q, i, point, instances.function_count[i])
+    G = displacement_gradient(basis.gradient, q, i, point, instances.function_count[i])
     G_start = G
     if instances.viscosity[i] > 0.0:
-        G_start = displacement_gradient(basis, motion.q_start, i, point, instances.function_count[i])
+        G_start = displacement_gradient(basis.gradient, motion.q_start, i, point, instances.function_count[i])
     points.energy[i, p] = weight * energy(parameters, G, G_start, dt)
     if derivatives != 0:
         points.stress[i, p] = weight * stress(parameters, G, G_start, dt)

@@ -32,6 +32,7 @@ class Gmres:
         k.rotation, k.tail = self._zeros((count, length), wp.vec2d), self._zeros((count, length + 1), wp.float64)
         k.search, k.product = (self._zeros(solver.functions, vec8d) for _ in range(2))
         k.factored, k.diagonal = solver.system.matrix, solver.system.diagonal
+        k.pattern = solver.system.pattern
         k.work, k.rows = self._zeros(solver.functions, vec8), self._zeros((count, 3 * solver.stride), float)
         k.partial = self._zeros((count, solver.team), wp.float64)
         self._krylov = k

@@ -34,6 +34,7 @@ class Krylov:
     product: wp.array2d[vec8d]  # H^T of the search direction, or of the solution
     factored: wp.array3d[vec8]  # (instance_count, N, ...), rows of U: M = U^T U is the solver's matrix
     diagonal: wp.array2d[vec8]  # (instance_count, N), diagonal blocks of U, inverse pivots on the diagonal
+    pattern: wp.array3d[int]  # (instance_count, 1, 1), see ``factor``
     work: wp.array2d[vec8]  # (instance_count, N / 8)
     rows: wp.array2d[float]  # (instance_count, N)
     partial: wp.array2d[wp.float64]  # (instance_count, team)
@@ -68,7 +69,7 @@ def precondition(k: Krylov, i: int, lane: int, team: int, size: wp.float64, righ
                 rest = rest - y[a] * k.factored[i, first + a, l]
             k.work[i, l] = rest
         barrier()
-    back_substitute(k.factored, k.diagonal, k.rows, k.work, i, lane, team)
+    back_substitute(k.factored, k.diagonal, k.pattern, k.rows, k.work, i, lane, team)
     for l in range(lane, blocks, team):
         k.search[i, l] = size * vec8d(k.work[i, l])
 

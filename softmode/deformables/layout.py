@@ -8,8 +8,9 @@ import newton
 import numpy as np
 import warp as wp
 
-from softmode.deformables.authoring import MATERIAL_FIELDS, NAMESPACE, body_key
+from softmode.deformables.authoring import CONTACT_FIELDS, MATERIAL_FIELDS, NAMESPACE, body_key
 from softmode.deformables.body import ReducedBody
+from softmode.deformables.factor import BlockCholesky
 from softmode.deformables.lanes import LANES, pad, vec8, vec8d
 from softmode.deformables.shape_queries import SUPPORTED_SHAPES
 from softmode.deformables.tables import Basis, Instances
@@ -104,7 +105,7 @@ def lay_out(model: Any, bodies: Sequence[ReducedBody]) -> Layout:
     }
     for name, values in per_instance.items():
         setattr(instances, name, wp.array(values, dtype=int, device=device))
-    for name in ("function_start", "particle_start", "material_model", "contact_stiffness", *MATERIAL_FIELDS):
+    for name in ("function_start", "particle_start", "material_model", *CONTACT_FIELDS, *MATERIAL_FIELDS):
         if name != "density":
             setattr(instances, name, getattr(data, name))
     return Layout(
@@ -121,6 +122,32 @@ def lay_out(model: Any, bodies: Sequence[ReducedBody]) -> Layout:
         basis=basis,
         instances=instances,
     )
+
+
+def join_systems(layout: Layout, part_count: int, column_count: int, device: Any) -> tuple[wp.array, BlockCholesky]:
+    """Allocate a linear system per instance or, of ``part_count`` parts, per world; say where instances find theirs.
+
+    Returns:
+        First system of each world, shape (world_count + 1,), and the systems.
+    """
+    size, world, instances = 3 * LANES * layout.block_count, layout.instance_world, layout.instances
+    start, system, part = layout.instance_start, np.arange(layout.instance_count), np.zeros_like(world)
+    if part_count > 1:
+        start, system, part = np.arange(layout.world_count + 1), world, system - start[world]
+    instances.system = wp.array(system, dtype=int, device=device)
+    instances.system_block = wp.array(3 * layout.block_count * part, dtype=int, device=device)
+    system_world = wp.array(np.repeat(np.arange(layout.world_count), np.diff(start)), dtype=int, device=device)
+    systems = BlockCholesky(system_world, part_count * size, column_count, device, part_count)
+    # a world of fewer bodies keeps the identity in the place of the others
+    used = np.zeros((systems.system_count, part_count), bool)
+    used[system, part] = True
+    if not used.all():
+        matrix = np.zeros(systems.scalars.shape, np.float32)
+        for w, a in np.argwhere(~used):
+            rows = np.arange(a * size, (a + 1) * size)
+            matrix[w, rows, rows] = 1.0
+        systems.scalars.assign(matrix)
+    return wp.array(start, dtype=int, device=device), systems
 
 
 def _basis(

@@ -128,7 +128,7 @@ def begin_search(
     # State in:
     gradient: wp.array2d[vec8d],
     direction: wp.array2d[vec8],
-    indefinite: wp.array[int],  # (instance_count,)
+    indefinite: wp.array[int],  # (system_count,)
     # In and out:
     progress: Progress,
 ):
@@ -147,7 +147,7 @@ def begin_search(
     last = int(1)
     unsound = int(0)
     for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
-        if progress.project[w] == 0 and indefinite[i] != 0:
+        if progress.project[w] == 0 and indefinite[instances.system[i]] != 0:
             unsound = 1
         moved = wp.float64(0.0)
         for e in range(gradient.shape[1]):

@@ -23,10 +23,10 @@ from softmode.deformables.authoring import (
 )
 from softmode.deformables.body import ReducedBody
 from softmode.deformables.buffers import make_entries, make_motion, make_points, make_progress, make_samples
-from softmode.deformables.factor import BlockCholesky
 from softmode.deformables.lanes import LANES, team_size, vec8, vec8d
-from softmode.deformables.layout import candidate_shapes, lay_out
+from softmode.deformables.layout import candidate_shapes, join_systems, lay_out
 from softmode.deformables.materials import MaterialModel
+from softmode.deformables.pairs import SoftPairs
 from softmode.deformables.rigid_dofs import RigidDofs
 from softmode.errors import ConfigError
 
@@ -71,6 +71,8 @@ class SolverReducedOptions:
     """Contacts per instance at most; more raise the overflow flag and drop those that do not touch yet."""
     contact_margin: float = 0.01
     """Detection distance as a fraction of the body size, on top of twice the motion of the step."""
+    soft_contact: bool = True
+    """Whether soft bodies touch each other, and themselves where ``self_contact`` says so."""
     contact_smoothing: float = 1.0e-3
     """Range of the C2 onset of the contact penalty as a fraction of the body size."""
     stick_velocity: float = 1.0e-4
@@ -154,6 +156,9 @@ class SolverReduced(SolverBase):
         self.motion = make_motion(functions, device)
         self.points = make_points(self.instance_count, layout.point_max, device)
         self.samples = make_samples(self.instance_count, layout.sample_max, self.team, device)
+        crowded = bool((np.diff(layout.instance_start) > 1).any()) or bool(self.parameters.self_contact.numpy().any())
+        self.pairs = SoftPairs(model, layout, options.contact_max // 2) if options.soft_contact and crowded else None
+        """Contact between soft bodies, None where there is never any."""
         self.progress = make_progress(layout.instance_start, self.team, device)
         self.q, self.q_trial = (wp.zeros(functions, dtype=vec8d, device=device) for _ in range(2))
         self.gradient = wp.zeros(functions, dtype=vec8d, device=device)
@@ -196,8 +201,16 @@ class SolverReduced(SolverBase):
         device = self.model.device
         self.entry_max = self.options.contact_max + self.layout.pin_max
         self.entries = make_entries(self.instance_count, self.entry_max, rigid.count_max, device)
-        self.system = BlockCholesky(self.instances.world, 3 * self.stride, rigid.count_max + 1, device)
+        columns = rigid.count_max + 1
+        self.system_start, self.system = join_systems(self.layout, self.part_count, columns, device)
         self.direction = self.system.solution
+        if self.part_count > 1:
+            self.direction = wp.zeros(self.functions, dtype=vec8, device=device)
+
+    @property
+    def part_count(self) -> int:
+        """Bodies that share a linear system: all of a world where soft bodies may touch each other, else one."""
+        return 1 if self.pairs is None else int(np.diff(self.layout.instance_start).max())
 
     @property
     def bodies(self) -> tuple[ReducedBody, ...]:
@@ -283,21 +296,34 @@ class SolverReduced(SolverBase):
         self.shapes.body_q, self.shapes.body_qd = state.body_q, state.body_qd
         if self.layout.pin_max:
             self._gather_pins(control, dt, prescribed=prescribed)
+        if self.model.shape_count or self.pairs is not None:
+            self._place_samples()
         if self.model.shape_count:
             self._find_contacts(dt, prescribed=prescribed)
         else:
             wp.copy(self.entries.count, self.instances.pin_count)
+        if self.pairs is not None:
+            self.pairs.detect(self.motion, self.samples, self.progress, self.entries, self.entry_max)
+        if self.part_count > 1:
+            dim = (self.world_count, self.part_count)
+            tables = [self.instances, self.progress, self.entries]
+            self._launch(assembly.relate_pairs, dim, tables, [self.system.pattern])
+            self.system.fill()
         self.adapt(dt)
         if self.rigid.count_max:
             dim = (self.instance_count, self.entry_max, self.rigid.count_max)
             self._launch(detection.entry_jacobians, dim, [self.instances, self.rigid.table], [self.entries])
 
+    def _place_samples(self) -> None:
+        """Compute where the surface samples are and what bounds them."""
+        every = (self.instance_count, self.layout.sample_max)
+        self._launch(detection.place_samples, every, [self.instances, self.basis, self.motion], [self.samples])
+        self._launch_team(detection.bound_samples, self.instance_count, [self.instances, self.team], [self.samples])
+
     def _find_contacts(self, dt: float, *, prescribed: bool) -> None:
         """Find the contacts of the surface samples with the rigid shapes."""
         instances, samples, shapes, team = self.instances, self.samples, self.shapes, self.team
         every = (self.instance_count, self.layout.sample_max)
-        self._launch(detection.place_samples, every, [instances, self.basis, self.motion], [samples])
-        self._launch_team(detection.bound_samples, self.instance_count, [instances, team], [samples])
         self._launch(
             detection.cull_shapes,
             self.candidate.shape,
@@ -434,9 +460,17 @@ class SolverReduced(SolverBase):
         self._launch(
             assembly.assemble_columns,
             (self.instance_count, 3 * blocks, rigid.count_max + 1),
-            [instances, basis, entries, active, self.gradient, rigid.count_max],
+            [instances, basis, entries, active, self.gradient, rigid.count_max, self.system.size],
             [self.system.scalars],
         )
+        if self.part_count > 1:
+            self._launch(
+                assembly.assemble_pairs,
+                (self.world_count, self.part_count**2, 9 * blocks * blocks),
+                [instances, basis, entries, self.progress, self.system.pattern],
+                [self.system.matrix],
+                block_dim=128,
+            )
         if rigid.count_max:
             dim = (self.world_count, rigid.count_max, rigid.count_max)
             self._launch(assembly.assemble_rigid, dim, [instances, entries, self.progress], [rigid.table])
@@ -447,10 +481,13 @@ class SolverReduced(SolverBase):
         system.factor(active)
         if rigid.count_max:
             dim = (self.world_count, rigid.count_max, rigid.count_max + 1)
-            self._launch(assembly.condense, dim, [self.progress, rigid.count_max, system.matrix], [rigid.table])
+            tables = [self.progress, self.system_start, rigid.count_max, system.matrix]
+            self._launch(assembly.condense, dim, tables, [rigid.table])
             dense = [rigid.matrix, rigid.count, rigid.direction]
             self._launch_team(assembly.solve_rigid, self.world_count, [active, self.team, *dense])
-        self.direction = system.solve(active, rigid.count_max, rigid.direction, rigid.count_max)
+        solution = system.solve(active, rigid.count_max, rigid.direction, rigid.count_max)
+        if self.part_count > 1:
+            self._launch(assembly.read_direction, self.functions, [self.instances, solution], [self.direction])
 
     def _begin_search(self, dt: float) -> None:
         """Start the line search of every active world."""

@@ -19,9 +19,11 @@ class Basis:
     point_weight: wp.array[wp.float64]  # (point_total,) [m^3]
     stiffness_scale: wp.array[float]  # (point_total,)
     mean: wp.array2d[vec8d]  # (asset_count, block_count)
-    row: wp.array2d[vec8]  # (row_total, block_count): surface samples of all bodies, then pins
+    row: wp.array2d[vec8]  # (row_total, block_count): surface samples of all bodies, then pins, then dynamic rows
     row_point: wp.array[wp.vec3d]  # (row_total,) [m]
     row_area: wp.array[float]  # (row_total,) [m^2]
+    row_normal: wp.array[wp.vec3]  # (sample_total,), outward at rest; only where soft bodies may touch each other
+    row_gradient: wp.array3d[vec8]  # (block_count, sample_total, 3) [1/m], likewise
 
 
 @wp.struct
@@ -38,6 +40,8 @@ class Instances:
     row_start: wp.array[int]
     sample_count: wp.array[int]
     particle_start: wp.array[int]
+    system: wp.array[int]  # linear system that holds its unknowns, and
+    system_block: wp.array[int]  # their first block there
     pin_start: wp.array[int]
     pin_count: wp.array[int]
     link_pin_count: wp.array[int]  # pins that follow a rigid body
@@ -54,6 +58,8 @@ class Instances:
     mass_damping: wp.array[float]  # [1/s]
     friction: wp.array[float]
     contact_stiffness: wp.array[float]  # [Pa/m]
+    contact_radius: wp.array[float]  # how far the surface stands out [m]
+    self_contact: wp.array[int]  # whether the body may touch itself
 
 
 @wp.struct
@@ -81,12 +87,15 @@ class Points:
 
 @wp.struct
 class Entries:
-    """Point constraints of an instance: first its pins, then its contacts in sample order."""
+    """Point constraints of an instance: pins, contacts with shapes in sample order, contacts with soft bodies."""
 
     count: wp.array[int]  # (instance_count,)
+    pair_count: wp.array[int]  # (instance_count,), the last of them: contacts with soft bodies
     row: wp.array2d[int]  # (instance_count, entry_max)
     shape: wp.array2d[int]  # -1 for a pin
     body: wp.array2d[int]  # rigid body on the other side: of the shape, or that a pin follows; -1 for none
+    partner: wp.array2d[int]  # the other instance, of a contact between two soft bodies; -1 within one
+    partner_row: wp.array2d[int]  # and the row of its touched point
     arm: wp.array2d[wp.vec3]  # from the centre of mass of that body [m]
     normal: wp.array2d[wp.vec3d]
     offset: wp.array2d[wp.vec3d]  # pin: x_n - target; contact: gap n; both less the drift of a prescribed body [m]

@@ -1,0 +1,91 @@
+"""Contact of soft bodies with each other and with themselves: buffers and launches, see ``pair_kernels``."""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from softmode.deformables import pair_kernels as kernels
+from softmode.deformables.lanes import LANES, vec8
+from softmode.deformables.layout import Layout
+
+CELLS = (32, 128)
+"""Cells of the grid along an edge, before it repeats, at least and at most: in all about as many as samples."""
+
+
+class SoftPairs:
+    """Finds which soft bodies touch and writes their entries; does nothing in worlds where none are near.
+
+    Args:
+        model: Finalised model.
+        layout: Its layout; rows of surface gradients and dynamic rows are added to the basis.
+        pair_max: Pairs per instance at most.
+    """
+
+    def __init__(self, model: Any, layout: Layout, pair_max: int) -> None:
+        """Allocate everything once."""
+        self.model, self.layout = model, layout
+        self.device, count, sample_max = model.device, layout.instance_count, layout.sample_max
+        spacing = np.array([np.sqrt(body.surface_areas.mean()) for body in layout.bodies])
+        pairs: Any = kernels.Pairs()
+        pairs.first_row = layout.basis.row.shape[0]
+        pairs.spacing_max = float(spacing.max())
+        pairs.spacing = wp.array(spacing[layout.asset], dtype=float, device=self.device)
+        pairs.point = self._zeros((count * sample_max,), wp.vec3)
+        pairs.surface_normal = self._zeros((count, sample_max), wp.vec3)
+        pairs.radius_max = float(layout.instances.contact_radius.numpy().max())
+        shape = (count, sample_max, kernels.SLOTS)
+        pairs.other, pairs.normal = (self._zeros(shape, t) for t in (int, wp.vec3d))
+        pairs.gap, pairs.nearest = (self._zeros(shape, wp.float64) for _ in range(2))
+        pairs.near, pairs.count = (self._zeros((count,), int) for _ in range(2))
+        pairs.sample, pairs.entry, pairs.mirror = (self._zeros((count, pair_max), int) for _ in range(3))
+        self.table = pairs
+        self._extend_basis(count * pair_max)
+
+        # samples are grouped by world; what pads the bodies is in a group of its own
+        used = np.arange(sample_max)[None, :] < layout.instances.sample_count.numpy()[:, None]
+        group = np.where(used, layout.instance_world[:, None], layout.world_count)
+        self.group = wp.array(group.ravel(), dtype=int, device=self.device)
+        cells = 2 ** round(np.log2(np.clip(np.cbrt(count * sample_max), *CELLS)))
+        self.grid = wp.HashGrid(cells, cells, cells, device=self.device)
+        self.grid.reserve(count * sample_max)
+        self.cell = 2.0 * pairs.spacing_max
+        self.grid.build(pairs.point, self.cell, groups=self.group)
+        pairs.grid = self.grid.id
+
+    def _zeros(self, shape: tuple[int, ...], dtype: Any) -> Any:
+        return wp.zeros(shape, dtype=dtype, device=self.device)
+
+    def _extend_basis(self, dynamic_count: int) -> None:
+        """Add normals and gradients at the samples, and room for the dynamic rows."""
+        basis, bodies = self.layout.basis, self.layout.bodies
+        blocks = basis.row.shape[1]
+        gradients = np.zeros((sum(body.surface_count for body in bodies), blocks * LANES, 3), np.float32)
+        start = 0
+        for body in bodies:
+            rows = slice(start, start + body.surface_count)
+            gradients[rows, : body.function_count] = body.evaluate(body.surface_points)[1]
+            start += body.surface_count
+        gradients = gradients.reshape(start, blocks, LANES, 3).transpose(1, 0, 3, 2)
+        basis.row_gradient = wp.array(np.ascontiguousarray(gradients), dtype=vec8, device=self.device)
+        normals = np.concatenate([body.surface_normals for body in bodies]).astype(np.float32)
+        basis.row_normal = wp.array(normals, dtype=wp.vec3, device=self.device)
+        rows = self._zeros((basis.row.shape[0] + dynamic_count, blocks), vec8)
+        wp.copy(rows, basis.row, count=basis.row.size)
+        basis.row = rows
+
+    def detect(self, motion: Any, samples: Any, progress: Any, entries: Any, entry_max: int) -> None:
+        """Find the pairs of this step, ``samples`` being placed and bounded, and append them to the entries."""
+        layout, pairs = self.layout, self.table
+        instances, basis = layout.instances, layout.basis
+        every = samples.position.shape
+        self._launch(kernels.mark_near, layout.instance_count, [instances, progress, samples], [pairs])
+        self._launch(kernels.place_surface, every, [instances, basis, motion, samples], [pairs])
+        self.grid.build(pairs.point, self.cell, groups=self.group)
+        self._launch(kernels.find_pairs, every, [instances, basis, progress], [samples, pairs])
+        self._launch(kernels.compact_pairs, layout.instance_count, [instances], [pairs, progress.status])
+        self._launch(kernels.accept_pairs, layout.world_count, [progress, entry_max], [pairs, entries, progress.status])
+        self._launch(kernels.write_pairs, pairs.sample.shape, [instances, basis, samples, pairs], [entries])
+
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
