@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -138,6 +139,25 @@ class RobotDescription:
             values[self.joint_names.index(name)] = closed + opening * (wide - closed)
         return values
 
+    def tool_pose(self, joint_q: Sequence[float] | None = None) -> tuple[float, ...]:
+        """Return the pose of the tool in the base frame.
+
+        Args:
+            joint_q: Joint coordinates [m or rad], shape (joint_count,); the home pose if omitted.
+
+        Returns:
+            Position [m] and quaternion (xyzw), seven numbers.
+        """
+        mujoco: Any = importlib.import_module("mujoco")
+        model = mujoco.MjModel.from_xml_string(self.mjcf)
+        data = mujoco.MjData(model)
+        data.qpos[:] = model.qpos0 + np.asarray(self.home if joint_q is None else joint_q, float)
+        mujoco.mj_kinematics(model, data)
+        link = model.body(self.end_effector).id
+        mount: Any = wp.transformd(data.xpos[link], np.roll(data.xquat[link], -1))
+        pose: Any = mount * wp.transformd(*self.tool)
+        return tuple(float(value) for value in pose)
+
     def add_to(
         self, builder: newton.ModelBuilder, *, xform: Sequence[float] | None = None, label: str | None = None
     ) -> RobotIndices:
@@ -170,6 +190,8 @@ class RobotDescription:
                 parse_visuals=self.visuals,
                 parse_mujoco_options=False,
                 enable_self_collisions=False,
+                # As loop joints they would stand among the joints of the tree; SolverMuJoCo enforces them either way.
+                convert_mjc_equality_constraints=False,
             )
         except (ValueError, OSError, RuntimeError, KeyError) as error:
             raise AssetError(f"robot {self.name!r} ({self.path}): {error}", hint="mend the file") from error

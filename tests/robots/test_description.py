@@ -89,6 +89,8 @@ def test_masses_and_kinematics_are_the_compiler_s(kind, tmp_path):
         data.qpos[:] = joint_q
         mujoco.mj_forward(model, data)
         stand.put(joint_q)
+        tool = wp.transform(*base) * wp.transform(*robot.tool_pose(joint_q))
+        np.testing.assert_allclose(stand.tool, np.array(tool)[:3], atol=2e-6)
         for pose, body, b in zip(stand.state.body_q.numpy(), stand.indices.link_bodies, range(1, 99), strict=False):
             assert body == b - 1
             expected = wp.transform(*base) * wp.transform(data.xpos[b], np.roll(data.xquat[b], -1))
@@ -220,6 +222,35 @@ def test_two_robots_in_one_builder(tmp_path):
     model = world.finalize(device="cpu")
     with pytest.raises(ConfigError, match="joint_target_q"):
         robots.ArmController(model, second)
+
+
+FOUR_BAR = """<mujoco><worldbody><body name="base"><geom size="0.02"/>
+  <body name="crank"><joint name="crank" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 0.1" size="0.01"/>
+    <body name="coupler" pos="0 0 0.1"><joint name="coupler" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.01"/><site name="tool" pos="0.1 0 0"/></body></body>
+  <body name="rocker" pos="0.2 0 0"><joint name="rocker" axis="0 1 0"/>
+    <geom type="capsule" fromto="0 0 0 0 0 0.1" size="0.01"/></body></body></worldbody>
+  <equality><connect body1="coupler" body2="rocker" anchor="0.2 0 0"/></equality>
+  <actuator><position joint="crank" kp="20" kv="2"/></actuator></mujoco>"""
+
+
+def test_closed_loop_stays_closed(tmp_path):
+    """A parallelogram driven at its crank: the passive joints follow, rocker = crank = -coupler within 0.01 rad."""
+    robot = robots.load(write_mjcf(tmp_path, FOUR_BAR))
+    assert robot.passive_joints == ("coupler", "rocker")
+    stand = Stand(robot)
+    stand.control.joint_target_q.assign(np.array([0.5, 0.0, 0.0], np.float32))
+    stand.step(500)
+    crank, coupler, rocker = stand.state.joint_q.numpy()
+    assert crank == pytest.approx(0.5, abs=0.01)
+    assert (coupler, rocker) == pytest.approx((-crank, crank), abs=0.01)
+
+
+@needs_aloha
+def test_the_page_runs():
+    """The first snippet of docs/robots.md."""
+    page = (Path(__file__).resolve().parents[2] / "docs" / "robots.md").read_text()
+    exec(page.split("```python")[1].split("```")[0], {})
 
 
 # -- what a caller may get wrong ---------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import newton
 import numpy as np
 import pytest
 import warp as wp
@@ -30,12 +29,8 @@ def test_loaded_arm_lifts_a_soft_cube():
     def populate(world):
         indices = robot.add_to(world)
         world.joint_q[:] = world.joint_target_q[:] = wide.tolist()
-        model = world.finalize(device="cpu")
-        state = model.state()
-        newton.eval_fk(model, model.joint_q, model.joint_qd, state)
-        tool = wp.transform(*state.body_q.numpy()[indices.hand_body]) * wp.transform(*robot.tool)
         # The tips are 4 mm behind the tool point and close 3.5 mm below it.
-        x, y, z = wp.transform_point(tool, wp.vec3(-0.008, 0.0, -0.0035))
+        x, y, z = wp.transform_point(wp.transform(*robot.tool_pose(wide)), wp.vec3(-0.008, 0.0, -0.0035))
         material = Material(youngs_modulus=5.0e5, density=300.0, friction=0.8)
         add_reduced_body(world, body, material=material, position=(x, y, z))
         pose = wp.transform((x, y, z - 0.5 * EDGE - 0.01), wp.quat_identity())
