@@ -158,6 +158,8 @@ class CompiledRobot:
                 torque_limit[leader] = total
                 continue
             lever = sum(c * ratio[j] for j, c in arms.items())
+            if lever == 0.0:
+                continue
             zero = sum(c * (shift[j] + self.reference[j]) for j, c in arms.items())
             ends = [-math.inf, math.inf]
             if model.actuator_ctrllimited[a]:
@@ -167,12 +169,14 @@ class CompiledRobot:
             for j in group:
                 share = 1.0 / (len(group) * ratio[j] ** 2)
                 low, high = sorted((shift[j] + ratio[j] * ends[0], shift[j] + ratio[j] * ends[1]))
+                # Several servos on one coordinate act together.
+                before = drives[j] or JointDrive(stiffness=0.0, damping=0.0, effort_limit=0.0)
                 drives[j] = JointDrive(
-                    stiffness=float(stiffness * lever**2 * share),
-                    damping=float(max(0.0, damping) * lever**2 * share),
-                    effort_limit=float(total / (len(group) * abs(ratio[j]))),
-                    lower=float(max(low, self.lower[j])),
-                    upper=float(min(high, self.upper[j])),
+                    stiffness=float(before.stiffness + stiffness * lever**2 * share),
+                    damping=float(before.damping + max(0.0, damping) * lever**2 * share),
+                    effort_limit=float(before.effort_limit + total / (len(group) * abs(ratio[j]))),
+                    lower=float(max(low, self.lower[j], before.lower)),
+                    upper=float(min(high, self.upper[j], before.upper)),
                 )
         for j, drive in enumerate(drives):
             if drive is None and owner[j] in torque_limit:

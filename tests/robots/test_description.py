@@ -139,6 +139,18 @@ def test_drives_of_an_mjcf(tmp_path):
     np.testing.assert_allclose(stand.model.joint_target_q.numpy(), robot.home, rtol=1e-6)
 
 
+def test_tied_joints_with_a_servo_each(tmp_path):
+    """q_left = -2 q_right, 100 N/m on each: on q_right k = 100 (4 + 1); the shares are k / 2 and k / (2 * 4)."""
+    tendon = MJCF[MJCF.index("    <general tendon") : MJCF.index("  </actuator>")]
+    servos = '<position joint="{}" kp="100" kv="10" forcerange="-6 6"/>'
+    text = MJCF.replace(tendon, servos.format("left") + servos.format("right"))
+    text = text.replace('range="0 0.04"', 'range="-0.1 0.1"').replace('polycoef="0 1', 'polycoef="0 -2')
+    robot = robots.load(write_mjcf(tmp_path, text), home=(0.0, 0.0, 0.0, 0.0))
+    left, right = robot.drives[2:]
+    assert (left.stiffness, left.damping, left.effort_limit) == pytest.approx((62.5, 6.25, 4.5))
+    assert (right.stiffness, right.damping, right.effort_limit) == pytest.approx((250.0, 25.0, 9.0))
+
+
 def test_drives_of_a_urdf(tmp_path):
     """Critically damped at 8 Hz: k = m w^2, d + damping = 2 m w; the mimic joint shares the range; limits arrive."""
     robot = description("urdf", tmp_path)
