@@ -1,4 +1,4 @@
-"""The command line: ``softmode play`` and ``softmode list-envs``."""
+"""The command line: ``softmode play``, ``softmode list-envs`` and ``softmode robots``."""
 
 from __future__ import annotations
 
@@ -68,6 +68,29 @@ class ListEnvs:
         return 0
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Robots:
+    """List the robots that load by name, or fetch some into the cache so that they load without a network."""
+
+    action: Literal["list", "fetch"]
+    """list prints the names, fetch downloads models."""
+    names: tuple[str, ...]
+    """What to fetch, for example so101 ur5e."""
+
+    def run(self) -> int:
+        """Print the names or fetch the models."""
+        from softmode.robots import available, fetch
+
+        if self.action == "list":
+            print("\n".join(available()))
+            return 0
+        if not self.names:
+            raise ConfigError("robots fetch names no robot", hint="name some, like: softmode robots fetch so101 ur5e")
+        for name, folder in zip(self.names, fetch(self.names), strict=True):
+            print(f"{name}  {folder}")
+        return 0
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; errors that softmode expects print one line and return 2, an interruption returns 130."""
     try:
@@ -78,7 +101,9 @@ def main(arguments: list[str] | None = None) -> int:
                 "the command line needs tyro", hint="install it with: pip install 'softmode[demo]'"
             ) from error
         command = tyro.cli(
-            Annotated[Play, tyro.conf.subcommand("play")] | Annotated[ListEnvs, tyro.conf.subcommand("list-envs")],  # type: ignore[arg-type]
+            Annotated[Play, tyro.conf.subcommand("play")]
+            | Annotated[ListEnvs, tyro.conf.subcommand("list-envs")]
+            | Annotated[Robots, tyro.conf.subcommand("robots")],  # type: ignore[arg-type]
             prog="softmode",
             args=arguments,
             config=(tyro.conf.PositionalRequiredArgs,),

@@ -1,6 +1,26 @@
-"""Robots: frozen descriptions, the functions that add them to a Newton builder, and their controllers."""
+"""Robots: frozen descriptions, the functions that add them to a Newton builder, and their controllers.
+
+The primitive arm (:class:`ArmDescription`) needs no file; :func:`load` reads others by name or path.
+"""
 
 from softmode.robots.arm import ArmDescription, ArmIndices, GripperDescription, add_arm
+from softmode.robots.assets import available, fetch
 from softmode.robots.control import ArmController, ArmControlOptions
+from softmode.robots.description import JointDrive, RobotDescription, RobotGripper, RobotIndices
+from softmode.robots.loading import load
 
-__all__ = ["ArmControlOptions", "ArmController", "ArmDescription", "ArmIndices", "GripperDescription", "add_arm"]
+__all__ = [
+    "ArmControlOptions",
+    "ArmController",
+    "ArmDescription",
+    "ArmIndices",
+    "GripperDescription",
+    "JointDrive",
+    "RobotDescription",
+    "RobotGripper",
+    "RobotIndices",
+    "add_arm",
+    "available",
+    "fetch",
+    "load",
+]

@@ -147,6 +147,12 @@ class ArmDescription:
         finger = 0.5 * self.home_opening
         return np.append(self.joint_q_over(self.home_position), (finger, finger))
 
+    def add_to(
+        self, builder: newton.ModelBuilder, *, xform: Sequence[float] | None = None, label: str = "arm"
+    ) -> ArmIndices:
+        """Add the arm to a builder, see :func:`add_arm`; robots read from files have the same method."""
+        return add_arm(builder, self, xform=xform, label=label)
+
     def joint_q_over(self, position: Sequence[float], yaw: float = 0.0) -> np.ndarray:
         """Return the arm's joint angles that hold the tool at a point, pointing down, in closed form.
 

@@ -109,6 +109,11 @@ class ArmController:
 
     def __init__(self, model: newton.Model, arm: ArmIndices, options: ArmControlOptions | None = None) -> None:
         """Allocate the command of every world and set it to the model's initial coordinates."""
+        if not isinstance(arm, ArmIndices):
+            raise ConfigError(
+                f"arm is a {type(arm).__name__}; the controller knows the kinematics of the built-in arm only",
+                hint="write control.joint_target_q for a loaded robot, see RobotDescription.with_opening",
+            )
         self.options = options if options is not None else ArmControlOptions()
         self.arm = arm
         self.world_count = max(model.world_count, 1)

@@ -1,0 +1,288 @@
+"""A compiled robot and what is read from it: home pose, tool, gripper, and position drives for its joints.
+
+Position servos are turned into joint drives, because the joint solve with soft bodies knows the damping of drives but
+not that of actuators or constraints:
+
+- an affine actuator on a joint, tau = clamp(g u - k q - d qd), becomes a drive of stiffness k and damping d;
+- joints tied by a linear equality q_i = a_i + s_i q_0 (the fingers of most grippers) each get a share of the drive that
+  acts on q_0, directly or through a tendon: k_i = k / (n s_i^2), d_i and the effort limit alike. Moving together they
+  answer as the tied pair did; the tie itself is dropped, so a finger that is pushed alone yields by its own drive.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from softmode.errors import AssetError, ConfigError
+from softmode.robots.assets import RobotAsset
+from softmode.robots.description import JointDrive, RobotGripper
+
+_TOOL_NAMES = (
+    "pinch",
+    "pinch_site",
+    "grasp_site",
+    "gripperframe",
+    "link_tcp",
+    "tcp",
+    "tool",
+    "tool0",
+    "end_effector",
+    "ee",
+    "gripper",
+    "attachment_site",
+    "hand",
+    "Fixed_Jaw",
+)
+"""Names of sites, then of bodies, that are taken for the tool when none is given; the first one present."""
+_DRIVE_FREQUENCY = 8.0
+"""Natural frequency of the drives of a file that has no actuators [Hz]."""
+
+
+@dataclass
+class CompiledRobot:
+    """A compiled robot and what is read from it; joint coordinates are Newton's, zero in the reference pose."""
+
+    model: Any
+    asset: RobotAsset
+    at_home: dict[str, float]
+
+    def __post_init__(self) -> None:
+        """Check that every link has at most one hinge or slide."""
+        self.mujoco: Any = importlib.import_module("mujoco")
+        model = self.model
+        self.joint_names = tuple(model.joint(j).name for j in range(model.njnt))
+        scalar = (int(self.mujoco.mjtJoint.mjJNT_HINGE), int(self.mujoco.mjtJoint.mjJNT_SLIDE))
+        for j, name in enumerate(self.joint_names):
+            if int(model.jnt_type[j]) not in scalar:
+                kind = self.mujoco.mjtJoint(int(model.jnt_type[j])).name.removeprefix("mjJNT_").lower()
+                raise AssetError(
+                    f"robot file {self.asset.path}: joint {name!r} is a {kind} joint",
+                    hint="use a robot on a fixed base whose joints are hinges and slides",
+                )
+        for b in range(model.nbody):
+            if model.body_jntnum[b] > 1:
+                raise AssetError(
+                    f"robot file {self.asset.path}: link {self.link(b)!r} has {model.body_jntnum[b]} joints",
+                    hint="put each joint into a link of its own",
+                )
+        if not model.njnt:
+            raise AssetError(f"robot file {self.asset.path} holds no joint", hint="give it a hinge or a slide")
+        limited = model.jnt_limited.astype(bool)
+        reference = model.qpos0[: model.njnt]
+        self.reference = reference
+        self.lower = np.where(limited, model.jnt_range[:, 0] - reference, -math.inf)
+        self.upper = np.where(limited, model.jnt_range[:, 1] - reference, math.inf)
+        self.dropped: set[str] = set()
+
+    def link(self, body: int) -> str:
+        """Return the name of a link."""
+        return self.model.body(int(body)).name
+
+    def behind(self, link: int) -> list[int]:
+        """Return a link and all links behind it."""
+        found = {link}
+        for b in range(link + 1, self.model.nbody):
+            if int(self.model.body_parentid[b]) in found:
+                found.add(b)
+        return sorted(found)
+
+    def home(self, given: Sequence[float] | None) -> np.ndarray:
+        """Return the home pose within the joint limits."""
+        if given is None:
+            values = np.array([self.at_home.get(name, 0.0) for name in self.joint_names]) - self.reference
+            return np.clip(values, self.lower, self.upper)
+        values = np.asarray(given, float)
+        if values.shape != (len(self.joint_names),) or not np.all(np.isfinite(values)):
+            raise ConfigError(
+                f"home has shape {values.shape} or holds a value that is not finite",
+                hint=f"give one number for each of {', '.join(self.joint_names)}",
+            )
+        return values
+
+    def data(self, joint_q: np.ndarray) -> Any:
+        """Return the kinematics at a pose."""
+        data = self.mujoco.MjData(self.model)
+        data.qpos[:] = joint_q + self.reference
+        self.mujoco.mj_forward(self.model, data)
+        return data
+
+    def tool(self, name: str | None, offset: np.ndarray) -> tuple[int, Any]:
+        """Return the link that carries the tool, and the tool's pose in it."""
+        model = self.model
+        sites = {model.site(s).name: s for s in range(model.nsite)}
+        bodies = {self.link(b): b for b in range(1, model.nbody)}
+        if name is None:
+            name = next((n for group in (sites, bodies) for n in _TOOL_NAMES if n in group), None)
+        if name is None or (name not in sites and name not in bodies):
+            leaves = [n for n, b in bodies.items() if b not in model.body_parentid]
+            what = "names no end effector" if name is None else f"has no site or body {name!r} for end_effector"
+            known = ", ".join(repr(n) for n in [*filter(None, sites), *leaves][:12])
+            raise ConfigError(
+                f"robot {self.asset.name!r} {what}", hint=f"pass end_effector= a site or body, like {known}"
+            )
+        if name in sites:
+            s = sites[name]
+            link, position, (w, x, y, z) = int(model.site_bodyid[s]), model.site_pos[s], model.site_quat[s]
+        else:
+            link, position, (w, x, y, z) = bodies[name], np.zeros(3), (1.0, 0.0, 0.0, 0.0)
+        turned = np.zeros(3)
+        self.mujoco.mju_rotVecQuat(turned, offset, np.array([w, x, y, z]))
+        return link, tuple(float(value) for value in (*(position + turned), x, y, z, w))
+
+    # -- drives -------------------------------------------------------------------------------------------------------
+
+    def drives(self) -> tuple[JointDrive | None, ...]:
+        """Turn actuators into joint drives."""
+        model = self.model
+        owner, ratio, shift = self._ties()
+        count = model.njnt
+        drives: list[JointDrive | None] = [None] * count
+        torque_limit: dict[int, float] = {} if model.nu else dict.fromkeys(range(count), math.inf)
+        for a in range(model.nu):
+            arms = self._transmission(a)
+            if not arms or len({owner[j] for j in arms}) != 1:
+                continue
+            leader = owner[next(iter(arms))]
+            limit = float(np.min(np.abs(model.actuator_forcerange[a]))) if model.actuator_forcelimited[a] else math.inf
+            # The force on the leader's coordinate, each joint's part bounded by its own limit.
+            total = sum(min(limit * abs(c), self._joint_limit(j)) * abs(ratio[j]) for j, c in arms.items() if c)
+            stiffness, damping = -model.actuator_biasprm[a, 1], -model.actuator_biasprm[a, 2]
+            affine = int(model.actuator_biastype[a]) == int(self.mujoco.mjtBias.mjBIAS_AFFINE)
+            if not affine or stiffness <= 0.0:
+                torque_limit[leader] = total
+                continue
+            lever = sum(c * ratio[j] for j, c in arms.items())
+            if lever == 0.0:
+                continue
+            zero = sum(c * (shift[j] + self.reference[j]) for j, c in arms.items())
+            ends = [-math.inf, math.inf]
+            if model.actuator_ctrllimited[a]:
+                wanted = model.actuator_gainprm[a, 0] * model.actuator_ctrlrange[a] + model.actuator_biasprm[a, 0]
+                ends = sorted(((wanted / stiffness - zero) / lever).tolist())
+            group = [j for j in range(count) if owner[j] == leader]
+            for j in group:
+                share = 1.0 / (len(group) * ratio[j] ** 2)
+                low, high = sorted((shift[j] + ratio[j] * ends[0], shift[j] + ratio[j] * ends[1]))
+                # Several servos on one coordinate act together.
+                before = drives[j] or JointDrive(stiffness=0.0, damping=0.0, effort_limit=0.0)
+                drives[j] = JointDrive(
+                    stiffness=float(before.stiffness + stiffness * lever**2 * share),
+                    damping=float(before.damping + max(0.0, damping) * lever**2 * share),
+                    effort_limit=float(before.effort_limit + total / (len(group) * abs(ratio[j]))),
+                    lower=float(max(low, self.lower[j], before.lower)),
+                    upper=float(min(high, self.upper[j], before.upper)),
+                )
+        for j, drive in enumerate(drives):
+            if drive is None and owner[j] in torque_limit:
+                drives[j] = self._default_drive(j, min(torque_limit[owner[j]], self._joint_limit(j)))
+        # A tie between driven joints is what their drives replace; one between passive joints stays.
+        for e in range(model.neq):
+            if self._tie(e) is not None and drives[int(model.eq_obj1id[e])] is not None:
+                self.dropped.add(model.equality(e).name)
+        return tuple(drives)
+
+    def _tie(self, e: int) -> tuple[int, int, float, float] | None:
+        """Return (joint, leader, offset, ratio) of a linear equality between two joints, or None."""
+        model = self.model
+        linear = int(model.eq_type[e]) == int(self.mujoco.mjtEq.mjEQ_JOINT) and model.eq_obj2id[e] >= 0
+        if not linear or np.any(model.eq_data[e, 2:5]) or model.eq_data[e, 1] == 0.0 or not model.eq_active0[e]:
+            return None
+        offset, ratio = model.eq_data[e, :2]
+        return int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), float(offset), float(ratio)
+
+    def _ties(self) -> tuple[list[int], list[float], list[float]]:
+        """Return per joint its leader, and ratio and offset of q_joint = offset + ratio q_leader."""
+        count = self.model.njnt
+        owner, ratio, shift = list(range(count)), [1.0] * count, [0.0] * count
+        for e in range(self.model.neq):
+            tie = self._tie(e)
+            if tie is None or owner[tie[0]] == owner[tie[1]]:
+                continue
+            joint, leader, offset, slope = tie
+            # q_joint = offset + slope q_leader, in terms of the leader's own leader; then all that followed the joint.
+            top, slope, offset = owner[leader], slope * ratio[leader], offset + slope * shift[leader]
+            old, old_ratio, old_shift = owner[joint], ratio[joint], shift[joint]
+            a, b = slope / old_ratio, (offset - old_shift) / old_ratio
+            for j in range(count):
+                if owner[j] == old:
+                    owner[j], shift[j], ratio[j] = top, shift[j] + ratio[j] * b, ratio[j] * a
+        return owner, ratio, shift
+
+    def _transmission(self, a: int) -> dict[int, float]:
+        """Return d(actuator length)/d(joint coordinate) of an actuator on a joint or a fixed tendon."""
+        model, kind = self.model, self.mujoco.mjtTrn
+        target, gear = int(model.actuator_trnid[a, 0]), float(model.actuator_gear[a, 0])
+        transmission = int(model.actuator_trntype[a])
+        if transmission in (int(kind.mjTRN_JOINT), int(kind.mjTRN_JOINTINPARENT)):
+            return {target: gear}
+        if transmission == int(kind.mjTRN_TENDON):
+            wraps = range(model.tendon_adr[target], model.tendon_adr[target] + model.tendon_num[target])
+            if all(int(model.wrap_type[w]) == int(self.mujoco.mjtWrap.mjWRAP_JOINT) for w in wraps):
+                return {int(model.wrap_objid[w]): gear * float(model.wrap_prm[w]) for w in wraps}
+        return {}
+
+    def _joint_limit(self, j: int) -> float:
+        """Return the largest actuator force on a joint."""
+        limited = self.model.jnt_actfrclimited[j]
+        return float(np.min(np.abs(self.model.jnt_actfrcrange[j]))) if limited else math.inf
+
+    def _default_drive(self, j: int, limit: float) -> JointDrive:
+        """Return a critically damped drive for a joint without servo."""
+        model = self.model
+        mass = np.zeros((model.nv, model.nv))
+        data = self.data(self.home(None))
+        self.mujoco.mj_fullM(model, data, mass)
+        omega = 2.0 * math.pi * _DRIVE_FREQUENCY
+        return JointDrive(
+            stiffness=float(mass[j, j] * omega**2),
+            damping=float(max(2.0 * mass[j, j] * omega - model.dof_damping[j], 0.0)),
+            effort_limit=limit,
+            lower=float(self.lower[j]),
+            upper=float(self.upper[j]),
+        )
+
+    # -- gripper ------------------------------------------------------------------------------------------------------
+
+    def gripper(
+        self,
+        given: Mapping[str, tuple[float, float]] | None,
+        drives: tuple[JointDrive | None, ...],
+        start: np.ndarray,
+        link: int,
+        tool: Any,
+        hand: list[int],
+    ) -> RobotGripper | None:
+        """Return the gripper as given, or as found behind the end effector."""
+        if given is None:
+            fingers = [j for j, b in enumerate(self.model.jnt_bodyid) if b in hand and b != link]
+            given = {}
+            for j in fingers:
+                drive = drives[j]
+                if drive is None or not (math.isfinite(drive.lower) and math.isfinite(drive.upper)):
+                    continue
+                ends = sorted((drive.lower, drive.upper), key=lambda q: self._distance(j, q, start, link, tool))
+                given[self.joint_names[j]] = (ends[0], ends[1])
+        unknown = [name for name in given if name not in self.joint_names]
+        if unknown:
+            raise ConfigError(
+                f"gripper names the joint {unknown[0]!r}, which robot {self.asset.name!r} does not have",
+                hint=f"its joints are {', '.join(self.joint_names)}",
+            )
+        if not given:
+            return None
+        closed, wide = ([float(pair[k]) for pair in given.values()] for k in (0, 1))
+        return RobotGripper(joints=tuple(given), closed=tuple(closed), open=tuple(wide))
+
+    def _distance(self, j: int, q: float, start: np.ndarray, link: int, tool: Any) -> float:
+        """Return the distance of a finger's centre of mass from the tool point with its joint at a coordinate [m]."""
+        joint_q = start.copy()
+        joint_q[j] = q
+        data = self.data(joint_q)
+        point = data.xpos[link] + data.xmat[link].reshape(3, 3) @ np.array(tool[:3])
+        return float(np.linalg.norm(data.xipos[self.model.jnt_bodyid[j]] - point))

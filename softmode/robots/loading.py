@@ -1,0 +1,219 @@
+"""From a name or a file to a :class:`RobotDescription`: MuJoCo reads and compiles it, Newton imports the result.
+
+MuJoCo's own compiler resolves includes, defaults and classes, so what the description says (drives, limits, home pose)
+is what MuJoCo would simulate; see :mod:`softmode.robots.compiled` for how actuators become drives.
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from softmode.errors import AssetError, ConfigError
+from softmode.robots.assets import RobotAsset, find
+from softmode.robots.compiled import CompiledRobot
+from softmode.robots.description import RobotDescription
+from softmode.robots.references import check_references, read_xml, resolve_inside
+
+
+def load(
+    source: str | Path,
+    *,
+    end_effector: str | None = None,
+    tool_offset: Sequence[float] | None = None,
+    gripper: Mapping[str, tuple[float, float]] | None = None,
+    home: Sequence[float] | None = None,
+    root: str | None = None,
+    asset_root: str | Path | None = None,
+    download: bool = True,
+) -> RobotDescription:
+    """Load a robot by name, or from an MJCF or URDF file.
+
+    A URDF, and an MJCF file without any actuator, gets critically damped drives of 8 Hz on every joint, scaled by the
+    joint's inertia in the home pose and limited by its effort limit. A torque motor becomes such a drive as well.
+
+    Args:
+        source: A name of :func:`available`, or the path of a file (a `Path`, or a string that ends in .xml, .mjcf or
+            .urdf).
+        end_effector: Site or body that carries the tool; found by its usual names if omitted.
+        tool_offset: Tool point in the frame of that site or body [m], shape (3,).
+        gripper: Coordinates (closed, open) of each gripper joint [m or rad]. If omitted, the driven joints behind the
+            end effector with limits, open where the finger's centre of mass is farther from the tool point.
+        home: Joint coordinates of the home pose [m or rad]; by default the key frame "home", else the first one, else
+            zero, brought into the joint limits.
+        root: Body whose subtree is the robot, moved to the origin; needed if the file holds several robots.
+        asset_root: Folder outside which the file may refer to nothing; its own folder if omitted.
+        download: Whether a model that is not in the cache may be downloaded.
+
+    Returns:
+        The description.
+
+    Raises:
+        AssetError: If the model cannot be fetched, or the file is missing, broken, refers outside the asset root, or
+            holds what is not supported: a free or ball joint, several joints in one link.
+        ConfigError: If a name is unknown, or the end effector is neither named nor found.
+        MissingExtraError: If the name needs the extra ``[robots]`` and it is not installed.
+    """
+    asset = _locate(source, asset_root, download)
+    end_effector = asset.end_effector if end_effector is None else end_effector
+    offset = asset.tool_offset if tool_offset is None else tuple(float(value) for value in tool_offset)
+    if len(offset) != 3 or not all(math.isfinite(value) for value in offset):
+        raise ConfigError(f"tool_offset = {offset} is not a point", hint="give three coordinates in metres")
+    spec = _read(asset)
+    full = _compile(spec, asset)
+    keys = {full.key(k).name: full.key_qpos[k] for k in range(full.nkey)}
+    key = keys.get("home", next(iter(keys.values()), full.qpos0))
+    at_home = {full.joint(j).name: float(key[full.jnt_qposadr[j]]) for j in range(full.njnt)}
+    _keep_robot(spec, asset.root if root is None else root, asset)
+    robot = CompiledRobot(_compile(spec, asset), asset, at_home)
+    drives = robot.drives()
+    start = robot.home(home)
+    link, tool = robot.tool(end_effector, np.array(offset))
+    hand = robot.behind(link)
+    jaws = robot.gripper(gripper, drives, start, link, tool, hand)
+    for equality in list(spec.equalities):
+        if equality.name in robot.dropped:
+            spec.delete(equality)
+    for actuator in list(spec.actuators):
+        spec.delete(actuator)
+    _compile(spec, asset)
+    return RobotDescription(
+        name=asset.name,
+        path=asset.path,
+        mjcf=spec.to_xml(),
+        link_names=tuple(robot.link(b) for b in range(1, robot.model.nbody)),
+        joint_names=robot.joint_names,
+        joint_links=tuple(robot.link(b) for b in robot.model.jnt_bodyid),
+        joint_lower=tuple(robot.lower.tolist()),
+        joint_upper=tuple(robot.upper.tolist()),
+        drives=drives,
+        home=tuple(start.tolist()),
+        end_effector=robot.link(link),
+        tool=tool,
+        hand_links=tuple(robot.link(b) for b in hand),
+        gripper=jaws,
+    )
+
+
+def _locate(source: str | Path, asset_root: str | Path | None, download: bool) -> RobotAsset:
+    """Return the file that ``source`` means."""
+    if not isinstance(source, (str, Path)):
+        raise ConfigError(f"source is a {type(source).__name__}", hint="give a robot's name or the path of a file")
+    if isinstance(source, str) and not source.lower().endswith((".xml", ".mjcf", ".urdf")) and "/" not in source:
+        return find(source, download=download)
+    path = Path(source)
+    folder = path.parent if asset_root is None else Path(asset_root)
+    if path.exists() and not path.resolve().is_relative_to(folder.resolve()):
+        raise AssetError(f"robot file {path} lies outside asset_root = {folder}", hint="name a folder that holds it")
+    return RobotAsset(name=path.stem, path=path, asset_root=folder)
+
+
+def _read(asset: RobotAsset) -> Any:
+    """Return the editable MuJoCo specification of a file whose references have been checked."""
+    mujoco: Any = importlib.import_module("mujoco")
+    tree = read_xml(asset.path)
+    try:
+        if tree.tag == "robot":
+            spec = mujoco.MjSpec.from_string(_prepare_urdf(tree, asset))
+        elif tree.tag == "mujoco":
+            check_references(asset.path, asset.asset_root)
+            spec = mujoco.MjSpec.from_file(str(asset.path))
+        else:
+            raise AssetError(
+                f"robot file {asset.path} starts with <{tree.tag}>", hint="MJCF starts with <mujoco>, URDF with <robot>"
+            )
+    except (ValueError, RuntimeError) as error:
+        if isinstance(error, AssetError):
+            raise
+        raise AssetError(f"robot file {asset.path}: {_one_line(error)}", hint="mend the file at that line") from error
+    return spec
+
+
+def _prepare_urdf(tree: ElementTree.Element, asset: RobotAsset) -> str:
+    """Resolve the meshes of a URDF, and ask MuJoCo to keep its links and its shapes as they are."""
+    tree = copy.deepcopy(tree)
+    for old in tree.findall("mujoco"):
+        tree.remove(old)
+    extension = ElementTree.SubElement(tree, "mujoco")
+    ElementTree.SubElement(
+        extension,
+        "compiler",
+        {"strippath": "false", "fusestatic": "false", "discardvisual": "false", "balanceinertia": "true"},
+    )
+    for link in tree.iter("link"):
+        for visual in link.findall("visual"):
+            mesh = visual.find("geometry/mesh")
+            # MuJoCo reads no Collada; what only is there to be seen is left out.
+            if mesh is not None and not mesh.get("filename", "").lower().endswith((".stl", ".obj", ".msh")):
+                link.remove(visual)
+        for mesh in link.iter("mesh"):
+            value = mesh.get("filename", "")
+            bases = [asset.path.parent]
+            if value.startswith("package://"):
+                package, _, value = value.removeprefix("package://").partition("/")
+                bases = [asset.asset_root / package, asset.asset_root]
+            file = resolve_inside(value, bases, asset.asset_root, asset.path, "<mesh>")
+            mesh.set("filename", str(file))
+    for texture in tree.iter("texture"):
+        texture.attrib.pop("filename", None)
+    return ElementTree.tostring(tree, encoding="unicode")
+
+
+def _compile(spec: Any, asset: RobotAsset) -> Any:
+    """Compile a specification; errors of the compiler name the file."""
+    try:
+        return spec.compile()
+    except (ValueError, RuntimeError) as error:
+        raise AssetError(f"robot file {asset.path}: {_one_line(error)}", hint="mend the file") from error
+
+
+def _one_line(error: Exception) -> str:
+    return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
+
+
+def _keep_robot(spec: Any, root: str | None, asset: RobotAsset) -> None:
+    """Delete all but the robot, name what has no name, make asset paths absolute."""
+    tops = list(spec.worldbody.bodies)
+    chosen = [body for body in tops if body.name == root] if root is not None else tops
+    if len(chosen) != 1:
+        names = ", ".join(repr(body.name) for body in tops)
+        what = f"has no body {root!r} at the top" if root is not None else f"holds {len(tops)} bodies at the top"
+        raise ConfigError(
+            f"robot file {asset.path} {what}", hint=f"pass root= one of {names}" if tops else "give it a <body>"
+        )
+    for group in (spec.keys, spec.cameras, spec.lights, spec.sensors, spec.worldbody.geoms, spec.worldbody.sites):
+        for element in list(group):
+            spec.delete(element)
+    for body in tops:
+        if body is not chosen[0]:
+            spec.delete(body)
+    if root is not None:
+        chosen[0].pos, chosen[0].quat = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+    for kind, group in (("link", spec.bodies), ("joint", spec.joints), ("equality", spec.equalities)):
+        for k, element in enumerate(group):
+            element.name = element.name or f"{kind}{k}"
+    used = {geom.meshname for geom in spec.geoms} | {geom.hfieldname for geom in spec.geoms}
+    for group in (spec.meshes, spec.hfields):
+        for element in list(group):
+            if element.name not in used:
+                spec.delete(element)
+    for texture in list(spec.textures):
+        spec.delete(texture)
+    for material in spec.materials:
+        material.textures = [""] * len(material.textures)
+    # What compiled once is found again; only the folder that a path counts from is made explicit.
+    base = asset.path.parent.resolve() / spec.meshdir
+    for element in (*spec.meshes, *spec.hfields):
+        if element.file:
+            file = (base / element.file).resolve()
+            if not file.is_relative_to(asset.asset_root.resolve()):
+                raise AssetError(f"robot file {asset.path} refers to {file}", hint="keep assets inside the asset root")
+            element.file = str(file)
+    spec.meshdir = spec.texturedir = ""

@@ -1,0 +1,137 @@
+"""Checks on a robot file before any importer reads it: it is XML, and it refers to nothing outside its folder.
+
+A robot file names others: meshes, textures, included files. An importer follows ``..``, absolute paths and symbolic
+links wherever they lead, so every reference is resolved here first and refused if it leaves the asset root.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+from xml.etree import ElementTree
+
+from softmode.errors import AssetError
+
+_SIZE_LIMIT = 64 * 2**20
+"""Largest XML file that is read [bytes]."""
+_FILE_ATTRIBUTES = ("file", "filename", "fileright", "fileleft", "fileup", "filedown", "filefront", "fileback")
+_TEXTURE_TAGS = ("texture",)
+_NESTED_TAGS = ("include", "model")
+"""Elements whose file is itself a model."""
+
+
+def read_xml(path: Path) -> ElementTree.Element:
+    """Parse an XML file.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Its root element.
+
+    Raises:
+        AssetError: If the file is missing, too large or no well-formed XML, or declares a document type.
+    """
+    if not path.is_file():
+        what = "is a folder" if path.is_dir() else "does not exist"
+        raise AssetError(f"robot file {path} {what}", hint="give the path of an MJCF (.xml) or URDF (.urdf) file")
+    if path.stat().st_size > _SIZE_LIMIT:
+        raise AssetError(
+            f"robot file {path} has {path.stat().st_size} bytes", hint=f"at most {_SIZE_LIMIT} bytes are read"
+        )
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise AssetError(f"robot file {path} cannot be read: {error.strerror}", hint="check its permissions") from error
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
+        raise AssetError(f"robot file {path} declares a document type", hint="remove its <!DOCTYPE>; none is needed")
+    try:
+        return ElementTree.fromstring(data)
+    except (ElementTree.ParseError, ValueError) as error:
+        line = error.position[0] if isinstance(error, ElementTree.ParseError) else 1
+        raise AssetError(f"robot file {path}, line {line}: {error}", hint="mend the XML at that line") from error
+
+
+def check_references(path: Path, root: Path) -> None:
+    """Check that an MJCF file and all that it includes exist and lie in a folder, and so do their assets.
+
+    Args:
+        path: The file.
+        root: The asset root. Symbolic links are followed before the comparison.
+
+    Raises:
+        AssetError: If a reference leaves the folder or leads nowhere, or a file is broken.
+    """
+    trees: list[tuple[Path, ElementTree.Element]] = []
+    _collect(path, path.parent, root, trees, ())
+    compilers = [element for _, tree in trees for element in tree.iter("compiler")]
+
+    def folders(*names: str) -> list[str]:
+        found = [value for name in names for c in compilers if (value := c.get(name)) is not None]
+        return found or [""]
+
+    meshes, textures = folders("meshdir", "assetdir"), folders("texturedir", "assetdir", "meshdir")
+    strip = any(compiler.get("strippath", "false").lower() == "true" for compiler in compilers)
+    for file, tree in trees:
+        for element in tree.iter():
+            if element.tag in _NESTED_TAGS:
+                continue
+            for attribute in _FILE_ATTRIBUTES:
+                value = element.get(attribute)
+                if not value:
+                    continue
+                if strip:
+                    value = PurePosixPath(value.replace("\\", "/")).name
+                places = textures if element.tag in _TEXTURE_TAGS else meshes
+                joined = [str(PurePosixPath(folder) / value) for folder in dict.fromkeys([*places, ""])]
+                _resolve(joined, [path.parent, file.parent], root, file, f"<{element.tag}>")
+
+
+def resolve_inside(value: str, bases: list[Path], root: Path, file: Path, tag: str) -> Path:
+    """Return the file that a reference means, the first that exists from one of the base folders.
+
+    Raises:
+        AssetError: If the reference is absolute or a URL, leaves ``root``, or leads nowhere.
+    """
+    return _resolve([value], bases, root, file, tag)
+
+
+def _resolve(values: list[str], bases: list[Path], root: Path, file: Path, tag: str) -> Path:
+    asked = values[-1]
+    if any("://" in value for value in values) or asked.startswith("file:"):
+        raise AssetError(
+            f"{file}: {tag} refers to {asked!r}", hint="refer to files by relative paths; nothing is fetched"
+        )
+    if any(PurePosixPath(value).is_absolute() or "\\" in value or ":" in value for value in values):
+        raise AssetError(f"{file}: {tag} refers to {asked!r}", hint="use a relative path with forward slashes")
+    inside = root.resolve()
+    candidates = [(base / value).resolve() for value in values for base in dict.fromkeys(bases)]
+    # What an importer would open is the first that exists, whichever rule it follows: none of them may be outside.
+    existing = [candidate for candidate in candidates if candidate.exists()]
+    outside = [candidate for candidate in existing or candidates if not candidate.is_relative_to(inside)]
+    if outside:
+        raise AssetError(
+            f"{file}: {tag} refers to {asked!r}, which lies outside the asset root {root}",
+            hint="copy the file into the folder, or pass asset_root= the folder that holds the whole robot",
+        )
+    if not existing:
+        raise AssetError(f"{file}: {tag} refers to {asked!r}, which does not exist", hint="put the file in its place")
+    return existing[0]
+
+
+def _collect(
+    file: Path, main: Path, root: Path, trees: list[tuple[Path, ElementTree.Element]], above: tuple[Path, ...]
+) -> None:
+    """Append a file and what it includes, with their elements."""
+    real = file.resolve()
+    if real in above:
+        raise AssetError(f"{file} includes itself", hint="break the circle of <include> elements")
+    tree = read_xml(file)
+    trees.append((file, tree))
+    if len(trees) > 1000:
+        raise AssetError(f"{file} includes more than 1000 files", hint="flatten the model")
+    for tag in _NESTED_TAGS:
+        for element in tree.iter(tag):
+            value = element.get("file")
+            if value:
+                nested = resolve_inside(value, [main, file.parent], root, file, f"<{tag}>")
+                _collect(nested, main, root, trees, (*above, real))

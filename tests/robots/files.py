@@ -1,0 +1,112 @@
+"""Small robot files that the tests write."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import trimesh
+
+# A two-link arm whose drives are written in three ways: a position servo through a class, a general affine actuator,
+# and a gripper whose tied fingers hang on a tendon with a scaled control, as the Panda's do.
+MJCF = """<mujoco model="small">
+  <compiler angle="radian" meshdir="meshes"/>
+  <default>
+    <default class="arm">
+      <joint type="hinge" axis="0 1 0" armature="0.05" damping="0.4" range="-2 2"/>
+      <position kp="300" kv="12" ctrlrange="-1.5 1.5" forcerange="-40 40"/>
+    </default>
+    <default class="visual"><geom contype="0" conaffinity="0" group="2" density="0"/></default>
+  </default>
+  <asset><mesh name="wedge" file="wedge.stl"/></asset>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 0.1"/>
+    <body name="base" pos="0 0 0.1">
+      <geom type="cylinder" size="0.05 0.1" mass="1"/>
+      <body name="upper" pos="0 0 0.1">
+        <joint name="shoulder" class="arm"/>
+        <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="0.8"/>
+        <body name="fore" pos="0.3 0 0" euler="0 0 0.3">
+          <joint name="elbow" class="arm" pos="0.01 0 0" frictionloss="0.1"/>
+          <geom type="box" size="0.1 0.02 0.02" pos="0.1 0 0" mass="0.4"/>
+          <geom class="visual" type="sphere" size="0.03"/>
+          <site name="pinch" pos="0.25 0 0" euler="0 0.2 0"/>
+          <body name="jaw_left" pos="0.2 0 0">
+            <joint name="left" type="slide" axis="0 1 0" range="0 0.04" armature="0.1" damping="3"/>
+            <geom type="mesh" mesh="wedge" mass="0.05"/>
+          </body>
+          <body name="jaw_right" pos="0.2 0 0">
+            <joint name="right" type="slide" axis="0 -1 0" range="0 0.04" armature="0.1" damping="3"/>
+            <geom type="box" size="0.03 0.005 0.01" pos="0.03 -0.01 0" mass="0.05"/>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <tendon><fixed name="split"><joint joint="left" coef="0.5"/><joint joint="right" coef="0.5"/></fixed></tendon>
+  <equality><joint joint1="left" joint2="right" polycoef="0 1 0 0 0"/></equality>
+  <actuator>
+    <position class="arm" joint="shoulder"/>
+    <general joint="elbow" biastype="affine" gainprm="200" biasprm="0 -200 -8" ctrlrange="-2 2"/>
+    <general tendon="split" biastype="affine" gainprm="0.5" biasprm="0 -800 -60" ctrlrange="0 64" forcerange="-24 24"/>
+  </actuator>
+  <keyframe><key name="rest" qpos="0 0 0 0"/><key name="home" qpos="-0.4 0.9 0.02 0.02"/></keyframe>
+</mujoco>
+"""
+
+URDF = """<robot name="lifter">
+  <link name="base"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
+  <link name="arm">
+    <inertial><origin xyz="0.15 0 0"/><mass value="1.2"/>
+      <inertia ixx="0.001" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>
+    <visual><geometry><mesh filename="package://lifter/meshes/arm.dae"/></geometry></visual>
+    <collision><origin xyz="0.15 0 0" rpy="0 1.5707963 0"/>
+      <geometry><cylinder radius="0.02" length="0.3"/></geometry></collision>
+  </link>
+  <link name="jaw_a">
+    <inertial><mass value="0.1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><mesh filename="package://lifter/meshes/wedge.stl"/></geometry></collision>
+  </link>
+  <link name="jaw_b">
+    <inertial><mass value="0.1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><box size="0.04 0.01 0.02"/></geometry></collision>
+  </link>
+  <link name="tool0"/>
+  <joint name="lift" type="revolute"><parent link="base"/><child link="arm"/><origin xyz="0 0 0.1"/><axis xyz="0 1 0"/>
+    <limit lower="-1.2" upper="0.3" effort="60" velocity="2"/><dynamics damping="0.5" friction="0.1"/></joint>
+  <joint name="tool_mount" type="fixed"><parent link="arm"/><child link="tool0"/><origin xyz="0.32 0 0"/></joint>
+  <joint name="jaw_a" type="prismatic"><parent link="tool0"/><child link="jaw_a"/><origin xyz="0 0.01 0"/>
+    <axis xyz="0 1 0"/><limit lower="0" upper="0.03" effort="20" velocity="1"/></joint>
+  <joint name="jaw_b" type="prismatic"><parent link="tool0"/><child link="jaw_b"/><origin xyz="0 -0.01 0"/>
+    <axis xyz="0 -1 0"/><limit lower="0" upper="0.03" effort="20" velocity="1"/>
+    <mimic joint="jaw_a" multiplier="1" offset="0"/></joint>
+</robot>
+"""
+
+
+def write_mjcf(folder: Path, text: str = MJCF) -> Path:
+    """Write an MJCF robot with the mesh it names; return its path."""
+    (folder / "meshes").mkdir(parents=True, exist_ok=True)
+    write_wedge(folder / "meshes" / "wedge.stl")
+    path = folder / "small.xml"
+    path.write_text(text)
+    return path
+
+
+def write_urdf(folder: Path, text: str = URDF) -> Path:
+    """Write a URDF in the customary layout, urdf/ beside meshes/; return its path."""
+    for name in ("meshes", "urdf"):
+        (folder / "lifter" / name).mkdir(parents=True, exist_ok=True)
+    write_wedge(folder / "lifter" / "meshes" / "wedge.stl")
+    path = folder / "lifter" / "urdf" / "lifter.urdf"
+    path.write_text(text)
+    return path
+
+
+def write_wedge(path: Path) -> None:
+    """Write an L-shaped finger without its end face: neither convex nor closed."""
+    parts = [trimesh.creation.box((0.06, 0.01, 0.02)), trimesh.creation.box((0.01, 0.02, 0.02))]
+    parts[1].apply_translation((0.025, 0.005, 0.0))
+    mesh: Any = trimesh.util.concatenate(parts)
+    mesh.update_faces([k > 1 for k in range(len(mesh.faces))])
+    mesh.export(path)
