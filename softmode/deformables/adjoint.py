@@ -122,7 +122,8 @@ class AdjointReduced:
         options: Tolerances.
 
     Raises:
-        ConfigError: If rigid joints are unknowns of the solver.
+        ConfigError: If rigid joints are unknowns of the solver, soft bodies may touch each other, or a pin follows a
+            rigid body.
     """
 
     def __init__(self, solver: SolverReduced, step_max: int, *, options: AdjointOptions | None = None) -> None:
@@ -132,6 +133,13 @@ class AdjointReduced:
                 "the step solves for joint dofs, whose solver has no derivative",
                 hint="use SolverReduced with prescribed rigid bodies",
             )
+        if solver.pairs is not None:
+            raise ConfigError(
+                "contact between soft bodies has no derivative",
+                hint="use SolverReducedOptions(soft_contact=False), or one body per world",
+            )
+        if solver.instances.link_pin_count.numpy().any():
+            raise ConfigError("pins that follow a rigid body have no derivative", hint="pin to the world (link=-1)")
         self.solver, self.options, self.step_max = solver, options or AdjointOptions(), step_max
         self.device, layout = solver.model.device, solver.layout
         self.instances, self.total = layout.instance_count, int(solver.parameters.q.shape[0])

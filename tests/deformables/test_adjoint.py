@@ -458,3 +458,16 @@ def test_torch_rollout():
         first.sum().backward()
     with pytest.raises(ConfigError, match="mass"):
         rollout(case.adjoint, STEPS, DT, mass=inputs["qd"])
+
+
+def test_contact_of_soft_bodies_is_refused():
+    """Two bodies of one world may touch, which has no derivative: the message names the option."""
+    body = cube()
+
+    def populate(world):
+        add_reduced_body(world, body)
+        add_reduced_body(world, body, position=(0.0, 0.0, 1.0))
+
+    with pytest.raises(ConfigError, match="soft_contact"):
+        AdjointReduced(Scene(populate, [body]).reduced, 1)
+    AdjointReduced(Scene(populate, [body], options=SolverReducedOptions(soft_contact=False)).reduced, 1)
