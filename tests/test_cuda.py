@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from softmode.deformables.attachments import attach
 from softmode.deformables.materials import Material
 from softmode.deformables.solver_reduced import SolverReduced, add_reduced_body, register_custom_attributes
 from tests.scenes import cube
@@ -16,16 +17,23 @@ pytestmark = pytest.mark.gpu
 DT = 0.004
 
 
-def drop(device: str, world_count: int = 1, *, captured: bool = True, steps: int = 100) -> np.ndarray:
-    """Drop a spinning cube from 3 cm onto the ground; return the particles of every world."""
+KINDS = ("cube", "pile", "hung")
+
+
+def drop(device: str, kind: str, world_count: int = 1, *, captured: bool = True, steps: int = 100) -> np.ndarray:
+    """Drop a spinning cube from 3 cm onto the ground; return the particles of every world.
+
+    "pile": a second soft cube falls onto it; "hung": a second one hangs beside it by its top.
+    """
     world = newton.ModelBuilder()
-    add_reduced_body(
-        world,
-        cube(),
-        material=Material(youngs_modulus=1.0e5),
-        position=(0.0, 0.0, 0.08),
-        angular_velocity=(1.0, 0.5, 0.0),
-    )
+    material = Material(youngs_modulus=1.0e5)
+    spin = (1.0, 0.5, 0.0)
+    add_reduced_body(world, cube(), material=material, position=(0.0, 0.0, 0.08), angular_velocity=spin)
+    if kind == "pile":
+        add_reduced_body(world, cube(), material=material, position=(0.02, 0.01, 0.19))
+    elif kind == "hung":
+        instance = add_reduced_body(world, cube(), material=material, position=(0.15, 0.0, 0.08))
+        attach(world, instance, cube(), box=((-1.0, -1.0, 0.045), (1.0, 1.0, 1.0)))
     builder = newton.ModelBuilder()
     register_custom_attributes(builder)
     builder.replicate(world, world_count)
@@ -51,19 +59,26 @@ def drop(device: str, world_count: int = 1, *, captured: bool = True, steps: int
     return first.particle_q.numpy().reshape(world_count, -1, 3)
 
 
-def test_cuda_agrees_with_cpu():
-    """100 steps with an impact: the directions differ in rounding only, both stop at the same potential's minimum."""
-    np.testing.assert_allclose(drop("cuda:0"), drop("cpu"), atol=1e-4 * 0.1)
+@pytest.mark.parametrize("kind", KINDS)
+def test_cuda_agrees_with_cpu(kind):
+    """100 steps with an impact: the directions differ in rounding only, both stop at the same potential's minimum.
+
+    Bodies that roll over each other spread what the stopping tolerance leaves, ten times as much.
+    """
+    atol = (1e-3 if kind == "pile" else 1e-4) * 0.1
+    np.testing.assert_allclose(drop("cuda:0", kind), drop("cpu", kind), atol=atol)
 
 
-def test_cuda_graph_equals_eager():
+@pytest.mark.parametrize("kind", KINDS)
+def test_cuda_graph_equals_eager(kind):
     """A replayed graph takes the same branches and adds in the same order as eager launches."""
-    np.testing.assert_array_equal(drop("cuda:0"), drop("cuda:0", captured=False))
+    np.testing.assert_array_equal(drop("cuda:0", kind), drop("cuda:0", kind, captured=False))
 
 
-def test_cuda_worlds_are_alike():
+@pytest.mark.parametrize("kind", KINDS)
+def test_cuda_worlds_are_alike(kind):
     """256 replicas that start alike stay alike to the bit: no world sees another, no sum has a free order."""
-    worlds = drop("cuda:0", 256)
+    worlds = drop("cuda:0", kind, 256)
     np.testing.assert_array_equal(worlds, np.broadcast_to(worlds[:1], worlds.shape))
 
 
