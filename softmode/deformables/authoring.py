@@ -10,6 +10,7 @@ import warp as wp
 
 from softmode.deformables.body import ReducedBody
 from softmode.deformables.materials import Material
+from softmode.deformables.tables import mat23d
 from softmode.errors import ConfigError
 
 NAMESPACE = "softmode"
@@ -22,9 +23,6 @@ MATERIAL_FIELDS = ("youngs_modulus", "poissons_ratio", "density", "viscosity", "
 
 CONTACT_FIELDS = ("contact_stiffness", "contact_radius", "self_contact")
 """What a model stores per instance of its surface."""
-
-CONTACT_STIFFNESS_FLOOR = 5.0e7
-"""Least contact stiffness per area [Pa/m]: 25 kPa, a firm grasp, sinks 0.5 mm deep."""
 
 
 def body_key(body: ReducedBody) -> int:
@@ -53,7 +51,7 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
     declare("material_model", wp.int32, _INSTANCE)
     for name in MATERIAL_FIELDS:
         declare(name, wp.float32, _INSTANCE)
-    declare("contact_stiffness", wp.float32, _INSTANCE)
+    declare("contact_stiffness", wp.float32, _INSTANCE)  # 0: follows the body, see ``contact``
     declare("contact_radius", wp.float32, _INSTANCE)
     declare("self_contact", wp.int32, _INSTANCE)
     declare("q", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
@@ -62,17 +60,16 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
     declare("q_before", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
     declare("qd_before", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
     declare("dt_before", wp.float64, _INSTANCE, assignment=assignment.STATE)
+    # friction's memory: the shapes that a surface sample sticks to, and where (see ``stick``)
+    particle = newton.Model.AttributeFrequency.PARTICLE
+    declare("stick_shape", wp.vec2i, particle, default=wp.vec2i(-1, -1), assignment=assignment.STATE)
+    declare("stick_point", mat23d, particle, assignment=assignment.STATE)
     declare("q_driven", wp.vec3d, _FUNCTION, assignment=assignment.CONTROL)
     declare("pin_instance", wp.int32, _PIN, references=_INSTANCE)
     declare("pin_body", wp.int32, _PIN, references="body")
     declare("pin_point", wp.vec3d, _PIN)
     declare("pin_stiffness", wp.float32, _PIN)
     declare("pin_target", wp.vec3d, _PIN, assignment=assignment.CONTROL)
-
-
-def contact_stiffness(body: ReducedBody, material: Material) -> float:
-    """Return the default contact stiffness per area [Pa/m]: twenty times the bulk's, and never under the floor."""
-    return max(bulk_stiffness(body, material.youngs_modulus, material.poissons_ratio), CONTACT_STIFFNESS_FLOOR)
 
 
 def bulk_stiffness(body: ReducedBody, youngs_modulus: float, poissons_ratio: float) -> float:
@@ -106,7 +103,8 @@ def add_reduced_body(
         rotation: Rotation matrix of the rest pose, shape (3, 3); default identity.
         velocity: Initial velocity of the centre of mass [m/s].
         angular_velocity: Initial angular velocity [rad/s].
-        contact_stiffness_per_area: Penalty stiffness of contact [Pa/m]; default :func:`contact_stiffness`.
+        contact_stiffness_per_area: Penalty stiffness of contact [Pa/m]; None or 0 lets it follow the material and the
+            step, see :func:`softmode.deformables.contact.stiffness_per_area`.
         contact_radius: How far the surface that touches stands out from the body's [m].
         self_contact: Whether the body may touch itself.
         particle_radius: Radius of the particles for viewers and picking [m]; default half their spacing.
@@ -126,9 +124,9 @@ def add_reduced_body(
     for name, value in (("position", position), ("velocity", velocity), ("angular_velocity", angular_velocity)):
         if np.shape(value) != (3,) or not np.isfinite(value).all():
             raise ConfigError(f"{name} must be three finite numbers, got {value!r}")
-    stiffness = contact_stiffness(body, material) if contact_stiffness_per_area is None else contact_stiffness_per_area
-    if not 0.0 < stiffness < np.inf:
-        raise ConfigError(f"contact_stiffness_per_area must be a finite number > 0 [Pa/m], got {stiffness!r}")
+    stiffness = contact_stiffness_per_area or 0.0
+    if not 0.0 <= stiffness < np.inf:
+        raise ConfigError(f"contact_stiffness_per_area must be a finite number >= 0 [Pa/m], got {stiffness!r}")
     if not 0.0 <= contact_radius < np.inf:
         raise ConfigError(f"contact_radius must be a finite number >= 0 [m], got {contact_radius!r}")
 

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from softmode.deformables.detection import SLOTS, Samples
+from softmode.deformables.detection import Samples
 from softmode.deformables.lanes import vec8d
-from softmode.deformables.tables import Entries, Motion, Points, Progress
+from softmode.deformables.tables import SLOTS, Entries, Motion, Points, Progress
 
 
 def make_motion(functions: tuple[int, int], device: Any) -> Any:
@@ -37,6 +37,7 @@ def make_samples(instance_count: int, sample_max: int, team: int, device: Any) -
     samples.shape = wp.zeros((*shape, SLOTS), dtype=int, device=device)
     samples.gap = wp.zeros((*shape, SLOTS), dtype=wp.float64, device=device)
     samples.normal = wp.zeros((*shape, SLOTS), dtype=wp.vec3, device=device)
+    samples.entry = wp.full((*shape, SLOTS), -1, dtype=int, device=device)
     samples.lower, samples.upper = (wp.zeros(instance_count, dtype=wp.vec3, device=device) for _ in range(2))
     samples.reach = wp.zeros((instance_count, team, 2), dtype=wp.vec3, device=device)
     samples.tally = wp.zeros((instance_count, team, 2), dtype=int, device=device)
@@ -50,8 +51,8 @@ def make_entries(instance_count: int, entry_max: int, rigid_max: int, device: An
     for names, dtype in (
         (("row", "shape", "body", "partner", "partner_row"), int),
         (("arm",), wp.vec3),
-        (("normal", "offset", "force"), wp.vec3d),
-        (("stiffness", "friction", "normal_force", "energy"), wp.float64),
+        (("normal", "offset", "force", "anchor", "slip"), wp.vec3d),
+        (("stiffness", "friction", "stick", "normal_force", "energy"), wp.float64),
         (("hessian",), wp.mat33),
     ):
         for name in names:

@@ -25,6 +25,10 @@ from softmode.deformables.tables import (
 
 wp.set_module_options({"enable_backward": False})
 
+BULK_FACTOR = wp.constant(20.0)
+INERTIA_FACTOR = wp.constant(100.0)
+STIFFNESS_FLOOR = wp.constant(5.0e7)
+
 LAG_ITERATIONS = wp.constant(8)
 """Newton iterations during which the normal force of friction follows the contact; then it is frozen, and what is left
 is the minimisation of one potential."""
@@ -54,6 +58,45 @@ def friction_potential(y: wp.float64, eps: wp.float64):
             two / eps - two * y / (eps * eps),
         )
     return y, one / y, wp.float64(0.0)
+
+
+@wp.func
+def stick_potential(y: wp.float64, limit: wp.float64, stiffness: wp.float64):
+    """Return energy [J], force over slip and curvature along the slip [N/m] of elastic-plastic friction at slip y [m].
+
+    A spring up to the force ``limit`` [N], constant force beyond.
+    """
+    zero = wp.float64(0.0)
+    half = wp.float64(0.5)
+    if stiffness * y <= limit:
+        return half * stiffness * y * y, stiffness, stiffness
+    return limit * (y - half * limit / stiffness), limit / y, zero
+
+
+@wp.func
+def stiffness_per_area(instances: Instances, i: int, partner_mass: float, partner_area: float, dt: float):
+    """Return the contact stiffness per area [Pa/m] of a body against a partner, from the parameters as they are now.
+
+    What ``contact_stiffness`` gives, or, where that is 0, the largest of BULK_FACTOR times the wave modulus over the
+    size, INERTIA_FACTOR times the effective mass per area over dt^2, and STIFFNESS_FLOOR.
+
+    Args:
+        instances: The bodies.
+        i: The body.
+        partner_mass: Mass of what it touches [kg]; 0 where that does not yield.
+        partner_area: Its surface area [m^2].
+        dt: Step [s].
+    """
+    if instances.contact_stiffness[i] > 0.0:
+        return instances.contact_stiffness[i]
+    E = instances.youngs_modulus[i]
+    nu = instances.poissons_ratio[i]
+    wave = E * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
+    mass = float(instances.mass[i])
+    if partner_mass > 0.0:
+        mass *= partner_mass / (mass + partner_mass)
+    inertia = mass / (wp.min(instances.area[i], partner_area) * dt * dt)
+    return wp.max(wp.max(BULK_FACTOR * wave / instances.size[i], INERTIA_FACTOR * inertia), STIFFNESS_FLOOR)
 
 
 @wp.kernel
@@ -111,16 +154,23 @@ def evaluate_entries(
         # offset = gap n - drift of the shape: the tangential part is the slip of the step
         t = total - wp.dot(n, total) * n
         y = wp.length(t)
-        f0, f1_over_y, f1_slope = friction_potential(y, stick_range)
         limit = entries.friction[i, e] * normal_force
-        entries.energy[i, e] = share * (stiffness * psi + limit * f0)
-        entries.force[i, e] = stiffness * slope * n - limit * f1_over_y * t
-        # f0 is concave in y^2, so the quadratic of curvature f1 / y lies above it and its steps cannot overshoot, from
-        # however far away; the potential's own curvature f1' along the slip converges faster once the state is close
+        stick = entries.stick[i, e]
+        f0, secant, tangent = friction_potential(y, stick_range)
+        f0 = limit * f0
+        secant = limit * secant
+        tangent = limit * tangent
+        if stick > wp.float64(0.0):
+            f0, secant, tangent = stick_potential(y, limit, stick)
+        entries.slip[i, e] = t
+        entries.energy[i, e] = share * (stiffness * psi + f0)
+        entries.force[i, e] = stiffness * slope * n - secant * t
+        # f0 is concave in y^2, so the quadratic of the secant's curvature lies above it and its steps cannot overshoot,
+        # from however far away; the potential's own curvature along the slip converges faster once the state is close
         N = wp.outer(n, n)
-        H = stiffness * curvature * N + limit * f1_over_y * (identity - N)
+        H = stiffness * curvature * N + secant * (identity - N)
         if progress.exact[w] != 0 and y > wp.float64(1.0e-9) * stick_range:
-            H += limit * (f1_slope - f1_over_y) / (y * y) * wp.outer(t, t)
+            H += (tangent - secant) / (y * y) * wp.outer(t, t)
     if derivatives != 0:
         entries.hessian[i, e] = wp.mat33(H)
         for j in range(rigid.count[w]):

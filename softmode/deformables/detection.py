@@ -11,15 +11,23 @@ contact records are appended by an atomic counter: fixed slots per sample keep t
 
 import warp as wp
 
+from softmode.deformables.contact import stiffness_per_area
 from softmode.deformables.lanes import barrier
 from softmode.deformables.shape_queries import PLANE, query_shape
 from softmode.deformables.status import WORLD_CONTACT_OVERFLOW
-from softmode.deformables.tables import Basis, Entries, Instances, Motion, Rigid, interpolate, interpolate_change
+from softmode.deformables.tables import (
+    SLOTS,
+    Basis,
+    Entries,
+    Instances,
+    Motion,
+    Rigid,
+    interpolate,
+    interpolate_change,
+    mat23d,
+)
 
 wp.set_module_options({"enable_backward": False})
-
-SLOTS = 2
-"""Contacts kept per surface sample: the deepest two."""
 
 
 @wp.struct
@@ -38,6 +46,7 @@ class Shapes:
     body_q: wp.array[wp.transform]
     body_qd: wp.array[wp.spatial_vector]
     body_com: wp.array[wp.vec3]
+    body_mass: wp.array[float]  # [kg]
 
 
 @wp.struct
@@ -49,6 +58,7 @@ class Samples:
     shape: wp.array3d[int]  # (..., SLOTS), -1 where empty
     gap: wp.array3d[wp.float64]  # (..., SLOTS) [m]
     normal: wp.array3d[wp.vec3]  # (..., SLOTS)
+    entry: wp.array3d[int]  # (..., SLOTS), the entry it became, -1 for none
     lower: wp.array[wp.vec3]  # (instance_count,) bounds, grown by margin and drift [m]
     upper: wp.array[wp.vec3]
     reach: wp.array3d[wp.vec3]  # (instance_count, team, 2), scratch of the bounds
@@ -210,6 +220,53 @@ def find_contacts(
             samples.normal[i, s, slot] = normal
 
 
+@wp.func
+def shape_area(shapes: Shapes, shape: int):
+    """Return the surface area of a shape's bounds [m^2]."""
+    if shapes.kind[shape] == PLANE:
+        return float(1.0e30)
+    edge = shapes.upper[shape] - shapes.lower[shape]
+    return 2.0 * (edge[0] * edge[1] + edge[1] * edge[2] + edge[2] * edge[0])
+
+
+@wp.func
+def shape_frame(shapes: Shapes, shape: int):
+    """Return origin and rotation of a shape at the start of the step, in float64."""
+    pose = shapes.transform[shape]
+    body = shapes.body[shape]
+    if body >= 0:
+        pose = shapes.body_q[body] * pose
+    return wp.vec3d(wp.transform_get_translation(pose)), wp.normalize(wp.quatd(wp.transform_get_rotation(pose)))
+
+
+@wp.func
+def remembered_slip(
+    shapes: Shapes,
+    shape: int,
+    x: wp.vec3d,
+    normal: wp.vec3d,
+    stick_shape: wp.array[wp.vec2i],
+    stick_point: wp.array[mat23d],
+    particle: int,
+    prescribed: int,
+):
+    """Return the tangential displacement [m] that a sample carries over from the step before, and its anchor.
+
+    Zero where the sample has not been in contact with this shape.
+    """
+    origin, rotation = shape_frame(shapes, shape)
+    anchor = wp.quat_rotate_inv(rotation, x - origin)
+    slip = wp.vec3d()
+    for k in range(SLOTS):
+        if stick_shape[particle][k] == shape:
+            point = wp.vec3d(stick_point[particle][k, 0], stick_point[particle][k, 1], stick_point[particle][k, 2])
+            slip = wp.quat_rotate(rotation, point)
+            if prescribed == 0:
+                slip = x - origin - slip
+                anchor = point
+    return slip - wp.dot(slip, normal) * normal, anchor
+
+
 @wp.kernel
 def gather_contacts(
     instances: Instances,
@@ -218,8 +275,12 @@ def gather_contacts(
     samples: Samples,
     entry_max: int,
     prescribed: int,
+    stick_ratio: wp.float64,
     team: int,
     dt: float,
+    # State in:
+    stick_shape: wp.array[wp.vec2i],  # (particle_count,), see ``stick``
+    stick_point: wp.array[mat23d],
     # Out:
     entries: Entries,
     status: wp.array[int],
@@ -260,6 +321,7 @@ def gather_contacts(
     for s in range(begin, end):
         for slot in range(SLOTS):
             shape = samples.shape[i, s, slot]
+            samples.entry[i, s, slot] = -1
             if shape < 0:
                 continue
             gap = samples.gap[i, s, slot]
@@ -271,6 +333,7 @@ def gather_contacts(
                 at_close += 1
             if e >= entry_max:
                 continue
+            samples.entry[i, s, slot] = e
             # of unit length in float64: what is left of the gap in the slip must not count against the stick range
             normal = wp.normalize(wp.vec3d(samples.normal[i, s, slot]))
             # both bodies feel the force at the sample, not the shape at its own surface: a pair of forces on two
@@ -289,9 +352,26 @@ def gather_contacts(
             entries.body[i, e] = body
             entries.arm[i, e] = arm
             entries.normal[i, e] = normal
+            partner_mass = float(0.0)
+            if body >= 0 and prescribed == 0:
+                partner_mass = shapes.body_mass[body]
+            kappa = stiffness_per_area(instances, i, partner_mass, shape_area(shapes, shape), dt)
+            stiffness = wp.float64(kappa * basis.row_area[row])
+            slip, anchor = remembered_slip(
+                shapes,
+                shape,
+                samples.position[i, s],
+                normal,
+                stick_shape,
+                stick_point,
+                instances.particle_start[i] + s,
+                prescribed,
+            )
             # d enters as offset + displacement, with the gap along the normal and the shape's own motion taken off
-            entries.offset[i, e] = gap * normal - wp.vec3d(drift)
-            entries.stiffness[i, e] = wp.float64(instances.contact_stiffness[i] * basis.row_area[row])
+            entries.offset[i, e] = gap * normal + slip - wp.vec3d(drift)
+            entries.anchor[i, e] = anchor
+            entries.stick[i, e] = stick_ratio * stiffness
+            entries.stiffness[i, e] = stiffness
             entries.friction[i, e] = wp.float64(wp.sqrt(instances.friction[i] * shapes.friction[shape]))
 
 

@@ -108,6 +108,8 @@ def lay_out(model: Any, bodies: Sequence[ReducedBody]) -> Layout:
     for name in ("function_start", "particle_start", "material_model", *CONTACT_FIELDS, *MATERIAL_FIELDS):
         if name != "density":
             setattr(instances, name, getattr(data, name))
+    area = np.array([body.surface_areas.sum() for body in bodies])[asset]
+    instances.area = wp.array(area, dtype=float, device=device)
     return Layout(
         bodies=tuple(bodies),
         asset=asset,

@@ -19,6 +19,7 @@ difference.
 
 import warp as wp
 
+from softmode.deformables.contact import stiffness_per_area
 from softmode.deformables.detection import Samples
 from softmode.deformables.kernels import displacement_gradient
 from softmode.deformables.status import WORLD_CONTACT_OVERFLOW
@@ -329,6 +330,7 @@ def write_pairs(
     basis: Basis,
     samples: Samples,
     pairs: Pairs,
+    dt: float,
     # Out:
     entries: Entries,
 ):
@@ -367,8 +369,8 @@ def write_pairs(
                 for b in range(basis.row.shape[1]):
                     basis.row[row, b] = basis.row[row, b] + weight * basis.row[instances.row_start[j] + t, b]
 
-    ki = instances.contact_stiffness[i]
-    kj = instances.contact_stiffness[j]
+    ki = stiffness_per_area(instances, i, float(instances.mass[j]), instances.area[j], dt)
+    kj = stiffness_per_area(instances, j, float(instances.mass[i]), instances.area[i], dt)
     # two layers in series; each of the two surfaces brings its samples, so that each counts one half
     stiffness = wp.float64(0.5 * ki * kj / (ki + kj) * basis.row_area[own])
     friction = wp.float64(wp.sqrt(instances.friction[i] * instances.friction[j]))
@@ -390,4 +392,5 @@ def write_pairs(
             entries.normal[a, e] = direction * pairs.normal[i, s, slot]
             entries.offset[a, e] = direction * offset
             entries.stiffness[a, e] = stiffness
+            entries.stick[a, e] = wp.float64(0.0)
             entries.friction[a, e] = friction

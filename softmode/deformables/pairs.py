@@ -74,7 +74,7 @@ class SoftPairs:
         wp.copy(rows, basis.row, count=basis.row.size)
         basis.row = rows
 
-    def detect(self, motion: Any, samples: Any, progress: Any, entries: Any, entry_max: int) -> None:
+    def detect(self, motion: Any, samples: Any, progress: Any, entries: Any, entry_max: int, dt: float) -> None:
         """Find the pairs of this step, ``samples`` being placed and bounded, and append them to the entries."""
         layout, pairs = self.layout, self.table
         instances, basis = layout.instances, layout.basis
@@ -85,7 +85,7 @@ class SoftPairs:
         self._launch(kernels.find_pairs, every, [instances, basis, progress], [samples, pairs])
         self._launch(kernels.compact_pairs, layout.instance_count, [instances], [pairs, progress.status])
         self._launch(kernels.accept_pairs, layout.world_count, [progress, entry_max], [pairs, entries, progress.status])
-        self._launch(kernels.write_pairs, pairs.sample.shape, [instances, basis, samples, pairs], [entries])
+        self._launch(kernels.write_pairs, pairs.sample.shape, [instances, basis, samples, pairs, dt], [entries])
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

@@ -108,7 +108,7 @@ def judge_iterate(
             scale = wp.sqrt(external)
             for e in range(entries.count[i]):
                 scale += wp.length(entries.force[i, e])
-            floor = wp.float64(1.0e-3) * instances.mass[i] * wp.float64(instances.tolerance[i]) / (dt * dt)
+            floor = wp.float64(1.0e-5) * instances.mass[i] * wp.float64(instances.tolerance[i]) / (dt * dt)
             if not (wp.sqrt(residual) <= force_tolerance * scale + floor):
                 done = 0
     if done == 1:

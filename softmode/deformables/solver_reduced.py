@@ -17,7 +17,6 @@ from softmode.deformables.authoring import (
     NAMESPACE,
     add_pins,
     add_reduced_body,
-    contact_stiffness,
     drive_regions,
     register_custom_attributes,
 )
@@ -35,7 +34,6 @@ __all__ = [
     "SolverReducedOptions",
     "add_pins",
     "add_reduced_body",
-    "contact_stiffness",
     "drive_regions",
     "register_custom_attributes",
 ]
@@ -75,8 +73,11 @@ class SolverReducedOptions:
     """Whether soft bodies touch each other, and themselves where ``self_contact`` says so."""
     contact_smoothing: float = 1.0e-3
     """Range of the C2 onset of the contact penalty as a fraction of the body size."""
+    stick_ratio: float = 1.0
+    """Tangential over normal stiffness of a contact that sticks to a shape; friction remembers where, so that nothing
+    creeps. 0 forgets: friction is Coulomb's smoothed over ``stick_velocity``, and what it holds creeps at up to it."""
     stick_velocity: float = 1.0e-4
-    """Slip velocity [m/s] below which friction counts as sticking."""
+    """Slip velocity [m/s] below which friction without memory counts as sticking."""
 
     def __post_init__(self) -> None:
         """Check every range."""
@@ -85,8 +86,9 @@ class SolverReducedOptions:
         for name, low in (("iteration_max", 1), ("stiffness_renewal", 1), ("contact_max", 1)):
             if getattr(self, name) < low:
                 raise ConfigError(f"{name} must be at least {low}, got {getattr(self, name)}")
-        if not 0.0 <= self.renewal_distance < float("inf"):
-            raise ConfigError(f"renewal_distance must be a finite number >= 0, got {self.renewal_distance!r}")
+        for name in ("renewal_distance", "stick_ratio"):
+            if not 0.0 <= getattr(self, name) < float("inf"):
+                raise ConfigError(f"{name} must be a finite number >= 0, got {getattr(self, name)!r}")
         for name in (
             "tolerance",
             "force_tolerance",
@@ -192,7 +194,7 @@ class SolverReduced(SolverBase):
             shapes.margin, shapes.friction = model.shape_margin, model.shape_material_mu
             shapes.lower, shapes.upper = model.shape_collision_aabb_lower, model.shape_collision_aabb_upper
             shapes.body, shapes.transform = model.shape_body, model.shape_transform
-        shapes.body_com = model.body_com
+        shapes.body_com, shapes.body_mass = model.body_com, model.body_mass
         return shapes
 
     def attach_rigid(self, rigid: RigidDofs) -> None:
@@ -303,7 +305,7 @@ class SolverReduced(SolverBase):
         else:
             wp.copy(self.entries.count, self.instances.pin_count)
         if self.pairs is not None:
-            self.pairs.detect(self.motion, self.samples, self.progress, self.entries, self.entry_max)
+            self.pairs.detect(self.motion, self.samples, self.progress, self.entries, self.entry_max, float(dt))
         if self.part_count > 1:
             dim = (self.world_count, self.part_count)
             tables = [self.instances, self.progress, self.entries]
@@ -336,7 +338,19 @@ class SolverReduced(SolverBase):
         self._launch_team(
             detection.gather_contacts,
             self.instance_count,
-            [instances, self.basis, shapes, samples, self.entry_max, int(prescribed), team, float(dt)],
+            [
+                instances,
+                self.basis,
+                shapes,
+                samples,
+                self.entry_max,
+                int(prescribed),
+                wp.float64(self.options.stick_ratio),
+                team,
+                float(dt),
+                getattr(state, NAMESPACE).stick_shape,
+                getattr(state, NAMESPACE).stick_point,
+            ],
             [self.entries, self.status],
         )
 
@@ -545,6 +559,13 @@ class SolverReduced(SolverBase):
             [self.instances, self.motion, self.entries, self.status, self.q, self.layout.block_count, wp.float64(dt)],
             [out.q, out.qd, out.q_before, out.qd_before, out.dt_before],
         )
+        if self.model.shape_count:
+            self._launch(
+                detection.remember_slip,
+                (self.instance_count, self.layout.sample_max),
+                [self.instances, self.shapes, self.samples, self.entries, int(self.rigid.count_max == 0)],
+                [out.stick_shape, out.stick_point],
+            )
         self.body_wrench.zero_()
         self._launch(
             contact.sum_reactions,
@@ -579,6 +600,8 @@ class SolverReduced(SolverBase):
             [self.instances, world_mask, initial.q, initial.qd],
             [out.q, out.qd, out.dt_before],
         )
+        dim = (self.instance_count, self.layout.sample_max)
+        self._launch(detection.forget_slip, dim, [self.instances, world_mask], [out.stick_shape])
         self._launch(
             kernels.reset_worlds,
             max(self.world_count, self.instance_count, self.model.body_count),

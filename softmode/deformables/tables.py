@@ -5,9 +5,15 @@ of eight (see ``lanes``): an array over the unknowns of an instance has the bloc
 entry ``component * block_count + block``, which is also the order of the linear system. Padding is zero everywhere.
 """
 
+from typing import Any
+
 import warp as wp
 
 from softmode.deformables.lanes import sum8d, vec8, vec8d
+
+SLOTS = 2
+"""Contacts kept per surface sample: the deepest two."""
+mat23d: Any = wp.types.matrix(shape=(SLOTS, 3), dtype=wp.float64)
 
 
 @wp.struct
@@ -57,7 +63,8 @@ class Instances:
     viscosity: wp.array[float]  # [s]
     mass_damping: wp.array[float]  # [1/s]
     friction: wp.array[float]
-    contact_stiffness: wp.array[float]  # [Pa/m]
+    area: wp.array[float]  # of the surface samples [m^2]
+    contact_stiffness: wp.array[float]  # [Pa/m], 0 where it follows the body; see ``contact.stiffness_per_area``
     contact_radius: wp.array[float]  # how far the surface stands out [m]
     self_contact: wp.array[int]  # whether the body may touch itself
 
@@ -98,9 +105,12 @@ class Entries:
     partner_row: wp.array2d[int]  # and the row of its touched point
     arm: wp.array2d[wp.vec3]  # from the centre of mass of that body [m]
     normal: wp.array2d[wp.vec3d]
-    offset: wp.array2d[wp.vec3d]  # pin: x_n - target; contact: gap n; both less the drift of a prescribed body [m]
+    offset: wp.array2d[wp.vec3d]  # pin: x_n - target; contact: gap n + memory; less the drift of a prescribed body [m]
     stiffness: wp.array2d[wp.float64]  # [N/m]
     friction: wp.array2d[wp.float64]
+    stick: wp.array2d[wp.float64]  # tangential stiffness of a contact with memory [N/m]; 0: smoothed Coulomb friction
+    anchor: wp.array2d[wp.vec3d]  # where the sample stuck at the start of the step, in the shape's frame [m]
+    slip: wp.array2d[wp.vec3d]  # tangential displacement, that of the memory included [m]
     normal_force: wp.array2d[wp.float64]  # of the last iterates, for friction [N]
     energy: wp.array2d[wp.float64]  # [J]
     force: wp.array2d[wp.vec3d]  # on the soft body [N]

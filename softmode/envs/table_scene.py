@@ -15,7 +15,6 @@ from softmode.deformables.skinning import SkinSplats
 from softmode.deformables.solver_reduced import (
     SolverReducedOptions,
     add_reduced_body,
-    contact_stiffness,
     register_custom_attributes,
 )
 from softmode.envs import table_kernels as kernels
@@ -221,15 +220,12 @@ class TableScene:
         self._observe()
 
     def _set_stiffness(self, mask: np.ndarray, youngs_modulus: np.ndarray) -> None:
-        """Change E and the contact stiffness that goes with it in the masked worlds."""
-        data = self.model.softmode
-        modulus, contact = data.youngs_modulus.numpy(), data.contact_stiffness.numpy()
+        """Change E in the masked worlds."""
+        array = self.model.softmode.youngs_modulus
+        modulus = array.numpy()
         for w in np.flatnonzero(mask):
-            material = replace(self.config.material, youngs_modulus=float(youngs_modulus[w]))
-            modulus[w] = material.youngs_modulus
-            contact[w] = contact_stiffness(self.soft.body, material)
-        data.youngs_modulus.assign(modulus)
-        data.contact_stiffness.assign(contact)
+            modulus[w] = replace(self.config.material, youngs_modulus=float(youngs_modulus[w])).youngs_modulus
+        array.assign(modulus)
 
     def step(self, actions: np.ndarray) -> None:
         """Advance one control step.
