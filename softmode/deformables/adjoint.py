@@ -113,7 +113,8 @@ class AdjointReduced:
     (exactly); contact at the normals of the start of each step, the normal force of friction included. Not
     differentiated: the turning of contact normals with the point of contact, contacts appearing or vanishing at the end
     of their detection range (where they carry no force), the motion of rigid shapes, what BDF2 remembers from before
-    the record. Parameters must not change between recording and ``backward``.
+    the record, and how the automatic contact stiffness follows E, nu and density: give ``contact_stiffness_per_area``
+    where that matters. Friction must be without memory. Parameters must not change between recording and ``backward``.
 
     Args:
         solver: The solver; rigid dofs must not take part in its solve.
@@ -122,8 +123,8 @@ class AdjointReduced:
         options: Tolerances.
 
     Raises:
-        ConfigError: If rigid joints are unknowns of the solver, soft bodies may touch each other, or a pin follows a
-            rigid body.
+        ConfigError: If rigid joints are unknowns of the solver, soft bodies may touch each other, a pin follows a rigid
+            body, or friction has memory.
     """
 
     def __init__(self, solver: SolverReduced, step_max: int, *, options: AdjointOptions | None = None) -> None:
@@ -140,6 +141,11 @@ class AdjointReduced:
             )
         if solver.instances.link_pin_count.numpy().any():
             raise ConfigError("pins that follow a rigid body have no derivative", hint="pin to the world (link=-1)")
+        if solver.model.shape_count and solver.options.stick_ratio > 0.0:
+            raise ConfigError(
+                "friction remembers where contacts stick, and that memory has no derivative",
+                hint="use SolverReducedOptions(stick_ratio=0.0), friction smoothed over stick_velocity",
+            )
         self.solver, self.options, self.step_max = solver, options or AdjointOptions(), step_max
         self.device, layout = solver.model.device, solver.layout
         self.instances, self.total = layout.instance_count, int(solver.parameters.q.shape[0])

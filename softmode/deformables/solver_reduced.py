@@ -10,7 +10,7 @@ import warp as wp
 from newton.solvers import SolverBase
 
 from softmode.deformables import assembly_kernels as assembly
-from softmode.deformables import attachment_kernels, contact, detection, kernels
+from softmode.deformables import attachment_kernels, contact, detection, kernels, stick
 from softmode.deformables import search_kernels as search
 from softmode.deformables.attachments import Attachment
 from softmode.deformables.authoring import (
@@ -301,7 +301,7 @@ class SolverReduced(SolverBase):
         if self.model.shape_count or self.pairs is not None:
             self._place_samples()
         if self.model.shape_count:
-            self._find_contacts(dt, prescribed=prescribed)
+            self._find_contacts(state, dt, prescribed=prescribed)
         else:
             wp.copy(self.entries.count, self.instances.pin_count)
         if self.pairs is not None:
@@ -322,10 +322,10 @@ class SolverReduced(SolverBase):
         self._launch(detection.place_samples, every, [self.instances, self.basis, self.motion], [self.samples])
         self._launch_team(detection.bound_samples, self.instance_count, [self.instances, self.team], [self.samples])
 
-    def _find_contacts(self, dt: float, *, prescribed: bool) -> None:
+    def _find_contacts(self, state: newton.State, dt: float, *, prescribed: bool) -> None:
         """Find the contacts of the surface samples with the rigid shapes."""
         instances, samples, shapes, team = self.instances, self.samples, self.shapes, self.team
-        every = (self.instance_count, self.layout.sample_max)
+        memory, every = getattr(state, NAMESPACE), (self.instance_count, self.layout.sample_max)
         self._launch(
             detection.cull_shapes,
             self.candidate.shape,
@@ -348,8 +348,8 @@ class SolverReduced(SolverBase):
                 wp.float64(self.options.stick_ratio),
                 team,
                 float(dt),
-                getattr(state, NAMESPACE).stick_shape,
-                getattr(state, NAMESPACE).stick_point,
+                memory.stick_shape,
+                memory.stick_point,
             ],
             [self.entries, self.status],
         )
@@ -561,7 +561,7 @@ class SolverReduced(SolverBase):
         )
         if self.model.shape_count:
             self._launch(
-                detection.remember_slip,
+                stick.remember_slip,
                 (self.instance_count, self.layout.sample_max),
                 [self.instances, self.shapes, self.samples, self.entries, int(self.rigid.count_max == 0)],
                 [out.stick_shape, out.stick_point],
@@ -601,7 +601,7 @@ class SolverReduced(SolverBase):
             [out.q, out.qd, out.dt_before],
         )
         dim = (self.instance_count, self.layout.sample_max)
-        self._launch(detection.forget_slip, dim, [self.instances, world_mask], [out.stick_shape])
+        self._launch(stick.forget_slip, dim, [self.instances, world_mask], [out.stick_shape])
         self._launch(
             kernels.reset_worlds,
             max(self.world_count, self.instance_count, self.model.body_count),

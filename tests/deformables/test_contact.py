@@ -186,12 +186,20 @@ def test_rest_far_from_the_origin(offset):
     np.testing.assert_allclose(forces[-25:, 2].mean(), scene.mass() * GRAVITY, rtol=1e-3)
 
 
+def stiffness_per_area(scene, instance=0):
+    """Return the contact stiffness per area [Pa/m] of the contacts of the last step, the largest."""
+    entries, basis = scene.reduced.entries, scene.reduced.basis
+    count = int(entries.count.numpy()[instance])
+    area = basis.row_area.numpy()[entries.row.numpy()[instance, :count]]
+    return float((entries.stiffness.numpy()[instance, :count] / area).max())
+
+
 def test_stiffness_and_size_of_the_penalty():
     """At rest under uniform pressure w = m g / A the samples sink p with kappa (p - eps / 2) = w, or p^2 / (2 eps)."""
     material = Material(youngs_modulus=1.0e7, mass_damping=5.0)
     scene = on_shape(lambda w: w.add_ground_plane(), height=0.0, material=material)
     settle(scene, 400)
-    kappa = float(scene.model.softmode.contact_stiffness.numpy()[0])
+    kappa = stiffness_per_area(scene)
     eps = float(scene.reduced.instances.smoothing.numpy()[0])
     pressure = scene.mass() * GRAVITY / EDGE**2
     p = np.sqrt(2 * eps * pressure / kappa)
@@ -236,11 +244,9 @@ def slide(angle, friction, *, tilted_box, time=1.0):
 
 @pytest.mark.parametrize("tilted_box", [False, True], ids=["tilted gravity", "tilted box"])
 def test_friction_holds_below_the_cone(tilted_box):
-    """tan(angle) = 0.9 mu: the cube stays but for the creep of smoothed friction, at most the stick velocity."""
-    time = 1.0
-    moved, acceleration, scene = slide(np.arctan(0.45), 0.5, tilted_box=tilted_box, time=time)
-    settling = 1.0e-4  # sinking in and shearing under its weight, rho g L^2 / mu
-    assert abs(moved) <= scene.reduced.options.stick_velocity * time + settling
+    """tan(angle) = 0.9 mu: the cube stays, but for shearing under its weight, rho g L^2 / mu = 6e-5 m."""
+    moved, acceleration, _ = slide(np.arctan(0.45), 0.5, tilted_box=tilted_box)
+    assert abs(moved) <= 1.0e-4
     assert abs(acceleration) <= 1e-3 * GRAVITY
 
 

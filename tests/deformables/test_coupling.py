@@ -172,9 +172,9 @@ def test_jacobians_move_the_shape():
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.5], ids=["smooth", "rough"])
-@pytest.mark.parametrize("ratio", [0.01, 0.1, 1.0, 100.0])
+@pytest.mark.parametrize("ratio", [0.001, 0.01, 1.0, 100.0])
 def test_central_impact(ratio, friction):
-    """Free bodies without gravity: p is kept to 1e-4 and energy never exceeds the first, at any mass ratio."""
+    """Free bodies without gravity: p is kept to 1e-5 and energy never exceeds the first, at any mass ratio."""
     scene, twin = impact(ratio, friction=friction)
     p0, _, e0 = totals(scene, twin)
     touched = 0.0
@@ -182,7 +182,7 @@ def test_central_impact(ratio, friction):
         scene.step()
         p, _, e = totals(scene, twin)
         touched = max(touched, np.abs(scene.reduced.instance_force.numpy()).max())
-        assert np.abs(p - p0).max() <= 1e-4 * np.abs(p0).max()
+        assert np.abs(p - p0).max() <= 1e-5 * np.abs(p0).max()
         assert e <= (1.0 + 1e-6) * e0
     assert touched > 0.0
 
@@ -328,9 +328,8 @@ def test_squeeze_equals_drive(youngs_modulus, dt):
     weight = scene.mass() * GRAVITY
     assert abs(hold[:, 0].mean() - hold[:, 1].mean()) <= 1e-2 * hold[:, 0].mean()
     assert -hold[:, 2].mean() == pytest.approx(weight, rel=1e-2)
-    # It rises with the palm, but for the creep of smoothed friction.
-    creep = scene.reduced.options.stick_velocity * 2.0 * count * dt
-    assert hold[-1, 5] - height == pytest.approx(hold[-1, 6], abs=creep + 1e-3)
+    # It rises with the palm.
+    assert hold[-1, 5] - height == pytest.approx(hold[-1, 6], abs=1e-3)
     assert not status & (bits.WORLD_NOT_FINITE | bits.WORLD_CONTACT_OVERFLOW)
 
 
