@@ -186,6 +186,27 @@ def friction_potential(y: np.ndarray, eps: float) -> np.ndarray:
     return np.where(y < eps, y * y / eps - y**3 / (3 * eps**2) + eps / 3, y)
 
 
+def stick_potential(y: np.ndarray, limit: float, stiffness: float) -> np.ndarray:
+    """Return the energy [J] of a spring that slips at the force ``limit``: k y^2 / 2, then limit (y - limit / (2 k))."""
+    return np.where(stiffness * y <= limit, 0.5 * stiffness * y * y, limit * (y - 0.5 * limit / stiffness))
+
+
+def contact_stiffness(
+    body: ReducedBody, material: Material, dt: float, partner_mass: float = np.inf, partner_area: float = np.inf
+) -> float:
+    """Return the automatic contact stiffness per area [Pa/m].
+
+    The largest of 20 M / L (P-wave modulus over size), 100 m_eff / (A dt^2) with 1/m_eff = 1/m + 1/m_partner and A the
+    smaller surface, and 5e7.
+    """
+    E, nu = material.youngs_modulus, material.poissons_ratio
+    wave = E * (1 - nu) / ((1 + nu) * (1 - 2 * nu))
+    size = float(np.linalg.norm(np.ptp(body.bounds, axis=0)))
+    mass = 1.0 / (1.0 / (material.density * body.volume) + 1.0 / partner_mass)
+    area = min(float(body.surface_areas.sum()), partner_area)
+    return max(20.0 * wave / size, 100.0 * mass / (area * dt**2), 5.0e7)
+
+
 def distance_plane(x: np.ndarray) -> np.ndarray:
     """Return the signed distance to z = 0."""
     return x[..., 2]

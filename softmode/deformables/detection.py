@@ -221,6 +221,20 @@ def find_contacts(
 
 
 @wp.func
+def turn(rotation: wp.vec3, arm: wp.vec3):
+    """Return how far the end of an arm moves in a finite rotation, given as a vector [rad].
+
+    The linear omega dt x arm would move out by (omega dt)^2 / 2 of the arm in every step, and friction with it.
+    """
+    half = 0.5 * wp.length(rotation)
+    sinc = 1.0 - half * half / 6.0
+    if half > 1.0e-2:
+        sinc = wp.sin(half) / half
+    linear = wp.cross(rotation, arm)
+    return sinc * wp.cos(half) * linear + 0.5 * sinc * sinc * wp.cross(rotation, linear)
+
+
+@wp.func
 def shape_area(shapes: Shapes, shape: int):
     """Return the surface area of a shape's bounds [m^2]."""
     if shapes.kind[shape] == PLANE:
@@ -345,7 +359,8 @@ def gather_contacts(
             if body >= 0:
                 arm = point - wp.transform_point(shapes.body_q[body], shapes.body_com[body])
                 if prescribed != 0:
-                    drift = dt * point_velocity(shapes.body_q[body], shapes.body_qd[body], shapes.body_com[body], point)
+                    twist = shapes.body_qd[body]
+                    drift = dt * wp.spatial_top(twist) + turn(dt * wp.spatial_bottom(twist), arm)
             row = instances.row_start[i] + s
             entries.row[i, e] = row
             entries.shape[i, e] = shape

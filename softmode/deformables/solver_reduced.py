@@ -151,6 +151,8 @@ class SolverReduced(SolverBase):
         self.candidate = wp.array(candidate_shapes(model, layout), dtype=int, device=device)
         self.near = wp.zeros_like(self.candidate)
         self.shapes = self._shapes()
+        self.prescribed = True
+        """Whether the rigid bodies of the step move as prescribed."""
 
         self.team = team_size(device)
         functions = (self.instance_count, 3 * layout.block_count)
@@ -296,6 +298,7 @@ class SolverReduced(SolverBase):
     def detect(self, state: newton.State, control: newton.Control | None, dt: float, *, prescribed: bool) -> None:
         """Find the contacts of the step and write them behind the pins as entries."""
         self.shapes.body_q, self.shapes.body_qd = state.body_q, state.body_qd
+        self.prescribed = prescribed
         if self.layout.pin_max:
             self._gather_pins(control, dt, prescribed=prescribed)
         if self.model.shape_count or self.pairs is not None:
@@ -563,7 +566,7 @@ class SolverReduced(SolverBase):
             self._launch(
                 stick.remember_slip,
                 (self.instance_count, self.layout.sample_max),
-                [self.instances, self.shapes, self.samples, self.entries, int(self.rigid.count_max == 0)],
+                [self.instances, self.shapes, self.samples, self.entries, int(self.prescribed)],
                 [out.stick_shape, out.stick_point],
             )
         self.body_wrench.zero_()

@@ -81,3 +81,17 @@ def evaluate_potentials(
     normal_out[i] = wp.vec3d(value, slope, curvature)
     f0, f1_over_y, f1_slope = contact.friction_potential(x[i], eps)
     friction_out[i] = wp.vec3d(f0, f1_over_y, f1_slope)
+
+
+@wp.kernel
+def evaluate_stick(
+    x: wp.array[wp.float64],
+    limit: wp.float64,
+    stiffness: wp.float64,
+    # Out:
+    out: wp.array[wp.vec3d],
+):
+    """Evaluate friction with memory: energy, force over slip, curvature along the slip."""
+    i = wp.tid()
+    energy, secant, tangent = contact.stick_potential(x[i], limit, stiffness)
+    out[i] = wp.vec3d(energy, secant, tangent)
