@@ -187,7 +187,7 @@ def friction_potential(y: np.ndarray, eps: float) -> np.ndarray:
 
 
 def stick_potential(y: np.ndarray, limit: float, stiffness: float) -> np.ndarray:
-    """Return the energy [J] of a spring that slips at the force ``limit``: k y^2 / 2, then limit (y - limit / (2 k))."""
+    """Return the energy [J] of a spring that slips at the force limit: k y^2 / 2, then limit (y - limit / (2 k))."""
     return np.where(stiffness * y <= limit, 0.5 * stiffness * y * y, limit * (y - 0.5 * limit / stiffness))
 
 
@@ -196,15 +196,15 @@ def contact_stiffness(
 ) -> float:
     """Return the automatic contact stiffness per area [Pa/m].
 
-    The largest of 20 M / L (P-wave modulus over size), 100 m_eff / (A dt^2) with 1/m_eff = 1/m + 1/m_partner and A the
-    smaller surface, and 5e7.
+    The largest of 40 M / L (P-wave modulus over size), 100 m_eff / (A dt^2) with 1/m_eff = 1/m + 1/m_partner and A the
+    smaller surface, and 1e8.
     """
     E, nu = material.youngs_modulus, material.poissons_ratio
     wave = E * (1 - nu) / ((1 + nu) * (1 - 2 * nu))
     size = float(np.linalg.norm(np.ptp(body.bounds, axis=0)))
     mass = 1.0 / (1.0 / (material.density * body.volume) + 1.0 / partner_mass)
     area = min(float(body.surface_areas.sum()), partner_area)
-    return max(20.0 * wave / size, 100.0 * mass / (area * dt**2), 5.0e7)
+    return max(40.0 * wave / size, 100.0 * mass / (area * dt**2), 1.0e8)
 
 
 def distance_plane(x: np.ndarray) -> np.ndarray:

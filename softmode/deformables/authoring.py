@@ -39,7 +39,7 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
     for name in ("instance", "function", "pin"):
         builder.add_custom_frequency(newton.ModelBuilder.CustomFrequency(name=name, namespace=NAMESPACE))
 
-    def declare(name: str, dtype: Any, frequency: str, **options: Any) -> None:
+    def declare(name: str, dtype: Any, frequency: Any, **options: Any) -> None:
         builder.add_custom_attribute(
             attribute(name=name, dtype=dtype, frequency=frequency, namespace=NAMESPACE, **options)
         )
@@ -60,7 +60,7 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
     declare("q_before", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
     declare("qd_before", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
     declare("dt_before", wp.float64, _INSTANCE, assignment=assignment.STATE)
-    # friction's memory: the shapes that a surface sample sticks to, and where (see ``stick``)
+    # friction's memory: the shapes that a surface sample sticks to, and where (see ``stick_kernels``)
     particle = newton.Model.AttributeFrequency.PARTICLE
     declare("stick_shape", wp.vec2i, particle, default=wp.vec2i(-1, -1), assignment=assignment.STATE)
     declare("stick_point", mat23d, particle, assignment=assignment.STATE)

@@ -2,11 +2,16 @@
 
 With the displacement d of the sample relative to the shape during the step, a contact adds
 
-    E(d) = A [ kappa psi_n(g0 + n . d) ] + mu f_n psi_t(|d_t|),
+    E(d) = A kappa psi_n(-g0 - n . d) + psi_t(|s + d_t|; mu f_n, k_t),
 
-psi_n the C2 penalty p^3/(6 eps) for p < eps, p^2/2 - eps p/2 + eps^2/6 beyond (p the penetration), psi_t the smoothed
-Coulomb potential of Li et al. 2020 (IPC, doi:10.1145/3386569.3392425, eq. 13) with the normal force f_n of the last
-Newton iterate.
+psi_n the C2 penalty p^3/(6 eps) for p < eps, p^2/2 - eps p/2 + eps^2/6 beyond (p the penetration); s the slip that the
+contact remembers (see ``stick_kernels``); psi_t the incremental potential of elastic-plastic friction, a spring k_t up to the
+force mu f_n and that force beyond (Cundall and Strack 1979, doi:10.1680/geot.1979.29.1.47), with the normal force f_n
+of the last Newton iterate. k_t does not depend on f_n: the energy of the spring cannot grow but by work, whatever the
+normal force does, so friction takes energy in every closed cycle.
+
+Contacts without memory (k_t = 0) have the smoothed Coulomb potential of Li et al. 2020 instead (IPC,
+doi:10.1145/3386569.3392425, eq. 13), mu f_n f0(|d_t|), which creeps.
 """
 
 import warp as wp
@@ -25,9 +30,14 @@ from softmode.deformables.tables import (
 
 wp.set_module_options({"enable_backward": False})
 
-BULK_FACTOR = wp.constant(20.0)
+BULK_FACTOR = wp.constant(40.0)
+"""Contact stiffness per area over P-wave modulus per size: under a pressure that squeezes a body by 10 %, contact sinks
+by 0.25 % of its size. 20 sinks 1.4 to 1.6 times as deep in a grasp and saves 3 % of the iterations."""
 INERTIA_FACTOR = wp.constant(100.0)
-STIFFNESS_FLOOR = wp.constant(5.0e7)
+"""Contact stiffness over effective mass / dt^2, per area: what hits flat is stopped within a step, v dt / 100 deep. 0
+sinks 1.5 to 3 mm at 5 m/s instead of 0.2 to 0.9; 1000 sinks 0.2 mm for a third more iterations."""
+STIFFNESS_FLOOR = wp.constant(1.0e8)
+"""Least contact stiffness per area [Pa/m]: under 25 kPa, a firm grasp, contact sinks by 0.25 mm."""
 
 LAG_ITERATIONS = wp.constant(8)
 """Newton iterations during which the normal force of friction follows the contact; then it is frozen, and what is left
@@ -151,7 +161,7 @@ def evaluate_entries(
         if derivatives != 0 and progress.iteration[w] <= LAG_ITERATIONS:
             entries.normal_force[i, e] = stiffness * slope
         normal_force = entries.normal_force[i, e]
-        # offset = gap n - drift of the shape: the tangential part is the slip of the step
+        # offset = gap n + memory - drift of the shape: the tangential part is the slip
         t = total - wp.dot(n, total) * n
         y = wp.length(t)
         limit = entries.friction[i, e] * normal_force

@@ -293,7 +293,7 @@ def gather_contacts(
     team: int,
     dt: float,
     # State in:
-    stick_shape: wp.array[wp.vec2i],  # (particle_count,), see ``stick``
+    stick_shape: wp.array[wp.vec2i],  # (particle_count,), see ``stick_kernels``
     stick_point: wp.array[mat23d],
     # Out:
     entries: Entries,

@@ -10,7 +10,7 @@ import warp as wp
 from newton.solvers import SolverBase
 
 from softmode.deformables import assembly_kernels as assembly
-from softmode.deformables import attachment_kernels, contact, detection, kernels, stick
+from softmode.deformables import attachment_kernels, contact, detection, kernels, stick_kernels
 from softmode.deformables import search_kernels as search
 from softmode.deformables.attachments import Attachment
 from softmode.deformables.authoring import (
@@ -564,7 +564,7 @@ class SolverReduced(SolverBase):
         )
         if self.model.shape_count:
             self._launch(
-                stick.remember_slip,
+                stick_kernels.remember_slip,
                 (self.instance_count, self.layout.sample_max),
                 [self.instances, self.shapes, self.samples, self.entries, int(self.prescribed)],
                 [out.stick_shape, out.stick_point],
@@ -604,7 +604,7 @@ class SolverReduced(SolverBase):
             [out.q, out.qd, out.dt_before],
         )
         dim = (self.instance_count, self.layout.sample_max)
-        self._launch(stick.forget_slip, dim, [self.instances, world_mask], [out.stick_shape])
+        self._launch(stick_kernels.forget_slip, dim, [self.instances, world_mask], [out.stick_shape])
         self._launch(
             kernels.reset_worlds,
             max(self.world_count, self.instance_count, self.model.body_count),

@@ -12,6 +12,7 @@ from softmode.deformables.solver_reduced import SolverReduced, SolverReducedOpti
 from softmode.errors import ConfigError
 from tests import reference
 from tests.deformables.probe_kernels import evaluate_potentials, query_points
+from tests.deformables.test_coupling import impact, totals
 from tests.scenes import GRAVITY, Scene, cube, rotation
 
 FLOAT32 = float(np.finfo(np.float32).eps)
@@ -208,6 +209,73 @@ def test_stiffness_and_size_of_the_penalty():
     depth = -scene.state.particle_q.numpy()[bottom, 2].astype(float)
     # E = 10 MPa is stiff but not rigid, and the areas of the samples sum to the face's only on average.
     assert np.average(depth, weights=scene.body().surface_areas[bottom]) == pytest.approx(p, rel=0.1)
+
+
+@pytest.mark.parametrize("dt", [0.004, 0.0005], ids=["bulk", "inertia"])
+def test_automatic_stiffness_follows_the_parameters(dt):
+    """Largest of 40 M / L, 100 m / (A dt^2) and 1e8 per world, from what the model holds when a graph is replayed."""
+    scene = on_shape(lambda w: w.add_ground_plane(), height=-1e-4, world_count=2, dt=dt)
+    replay = scene.capture()
+    body, first = cube(), Material()
+    second = Material(youngs_modulus=3.0e7, poissons_ratio=0.45, density=200.0)
+    for material in (first, second):
+        for name in ("youngs_modulus", "poissons_ratio", "density"):
+            scene.set_parameter(name, [getattr(first, name), getattr(material, name)])
+        scene.solver.reset(scene.state)
+        replay()
+        for world, expected in enumerate((first, material)):
+            assert stiffness_per_area(scene, world) == pytest.approx(
+                reference.contact_stiffness(body, expected, dt), rel=1e-5
+            )
+    assert reference.contact_stiffness(body, first, dt) != reference.contact_stiffness(body, second, dt)
+    scene.set_parameter("contact_stiffness", [2.0e6, 0.0])
+    scene.solver.reset(scene.state)
+    replay()
+    assert stiffness_per_area(scene, 0) == pytest.approx(2.0e6, rel=1e-5)
+    assert stiffness_per_area(scene, 1) == pytest.approx(reference.contact_stiffness(body, second, dt), rel=1e-5)
+
+
+@pytest.mark.parametrize("ratio", [0.1, 10.0])
+def test_automatic_stiffness_takes_the_effective_mass(ratio):
+    """Against a free box of 0.1 and 10 times the mass: 1/m_eff = 1/m + 1/m_box, over the smaller of both surfaces."""
+    dt = 0.0005
+    scene, _ = impact(ratio, dt=dt)
+    scene.step()
+    body, material = scene.body(), Material()
+    box = ratio * material.density * body.volume
+    expected = reference.contact_stiffness(body, material, dt, box, 6.0 * EDGE**2)
+    assert expected < 0.95 * reference.contact_stiffness(body, material, dt)
+    assert stiffness_per_area(scene) == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("youngs_modulus, density", [(1.0e4, 100.0), (1.0e5, 1000.0), (1.0e6, 8000.0)])
+def test_fast_impact_stays_shallow(youngs_modulus, density):
+    """Thrown at the ground with 5 m/s, 20 mm per step: no sample sinks deeper than 1 % of the edge."""
+    material = Material(youngs_modulus=youngs_modulus, density=density)
+    scene = on_shape(lambda w: w.add_ground_plane(), height=0.001, material=material)
+    qd = scene.body().affine(np.eye(3), (0.0, 0.0, -5.0))
+    scene.set(qd=qd)
+    depth = []
+    for _ in range(20):
+        scene.step()
+        depth.append(-scene.state.particle_q.numpy()[:, 2].min())
+    assert 0.0 < max(depth) <= 0.01 * EDGE
+    assert not scene.reduced.status.numpy()[0] & (bits.WORLD_NOT_FINITE | bits.WORLD_COLLAPSED)
+
+
+@pytest.mark.parametrize("ratio", [0.001, 1000.0])
+def test_fast_impact_of_light_and_heavy_boxes(ratio):
+    """A free box of 0.001 and 1000 times the mass hits a soft cube with 5 m/s: at most 1 % of the edge deep."""
+    scene, twin = impact(ratio, speed=5.0, dt=0.001)
+    momentum, _, energy = totals(scene, twin)
+    depth = []
+    for _ in range(60):
+        scene.step()
+        depth.append(-float(scene.reduced.samples.gap.numpy()[0, :, 0].min()))
+        p, _, e = totals(scene, twin)
+        assert np.abs(p - momentum).max() <= 1e-5 * np.abs(momentum).max()
+        assert e <= (1.0 + 1e-6) * energy
+    assert 0.0 < max(depth) <= 0.01 * EDGE
 
 
 # -- friction ----------------------------------------------------------------------------------------------------------

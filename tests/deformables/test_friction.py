@@ -24,7 +24,7 @@ ShapeConfig = newton.ModelBuilder.ShapeConfig
 
 
 def test_stick_potential():
-    """The energy of a spring k up to the limit, linear beyond; slope = secant * y; force continuous, never above limit."""
+    """A spring up to the limit, linear beyond; slope = secant * y; a continuous force, never above the limit."""
     limit, stiffness, step = 0.3, 2.0e3, 1.0e-9
     y = np.linspace(step, 4.0 * limit / stiffness, 400)
 
