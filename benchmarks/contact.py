@@ -26,6 +26,9 @@ from tests.scenes import GRAVITY, Scene, cube
 
 FRICTION = {"remembers": SolverReducedOptions(), "smoothed": SolverReducedOptions(stick_ratio=0.0)}
 
+LIFT_STEPS = 120
+"""Control steps of the scripted policy: reach, grasp, lift, hold."""
+
 
 def main() -> None:
     """Print the tables."""
@@ -144,10 +147,11 @@ def print_lift(youngs_modulus: float) -> None:
         scene._control_step()
 
     scene.solver.step, scene.step = watched, eager
-    done, info = False, {}
-    while not done:
+    info: dict[str, Any] = {}
+    for _ in range(LIFT_STEPS):
         observation, _, terminated, truncated, info = env.step(policy(observation))
-        done = terminated or truncated
+        if terminated or truncated:
+            break
     size = 1e3 * float(soft.layout.size[0])
     print(
         f"LiftSoft E {youngs_modulus:.0e}: {len(depth)} steps, at most {max(depth):.2f} mm deep, mean "

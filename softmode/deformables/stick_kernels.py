@@ -45,6 +45,8 @@ def remember_slip(
         origin, rotation = shape_frame(shapes, shape)
         total = entries.slip[i, e]
         stretch = entries.stick[i, e] * wp.length(total)
+        if not wp.isfinite(stretch + limit):
+            continue
         elastic = total
         if stretch > limit:
             elastic = limit / stretch * total

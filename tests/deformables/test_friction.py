@@ -77,7 +77,7 @@ def test_sticks_below_the_cone(share):
     assert np.abs(x).max() <= CREEP
     # once settled it does not creep at all: what is left is the rounding of the sum
     settled = x[time > 1.0]
-    assert np.ptp(settled) <= 1.0e-3 * CREEP
+    assert np.ptp(settled) <= 1.0e-2 * CREEP
 
 
 @pytest.mark.parametrize("share", [1.05, 1.5])
@@ -146,8 +146,10 @@ def test_force_stays_in_the_cone():
         f, n = entries.force.numpy()[0, :count], entries.normal.numpy()[0, :count]
         normal = (f * n).sum(axis=1)
         tangential = np.linalg.norm(f - normal[:, None] * n, axis=1)
-        # the normal force of friction is that of the last iterates but those after the eighth
-        assert (tangential <= MU * normal * (1 + 1e-9) + 1e-6 * scene.mass() * GRAVITY).all()
+        lagged = entries.normal_force.numpy()[0, :count]
+        assert (tangential <= MU * lagged * (1 + 1e-9)).all()
+        # it follows the contact for eight iterations, in most steps to the end
+        np.testing.assert_allclose(lagged, normal, atol=1e-4 * scene.mass() * GRAVITY)
         assert (f @ along <= 1e-9).all()
         seen += int((normal > 0).sum())
     assert seen > 100
