@@ -98,7 +98,7 @@ def print_drop(name: str, youngs_modulus: float, density: float, dt: float, *, i
     given = None if inertia else reference.contact_stiffness(body, material, np.inf)
 
     def populate(world: Any) -> None:
-        place = {"position": (0.0, 0.0, 0.051), "velocity": (0.0, 0.0, -5.0)}
+        place: Any = {"position": (0.0, 0.0, 0.051), "velocity": (0.0, 0.0, -5.0)}
         add_reduced_body(world, body, material=material, contact_stiffness_per_area=given, **place)
 
     scene = Scene(populate, [body], gravity=(0.0, 0.0, -GRAVITY), ground=0.5, dt=dt)
@@ -132,7 +132,8 @@ def print_lift(youngs_modulus: float) -> None:
     """Print the depth of every substep of a scripted LiftSoft episode."""
     env = LiftSoftEnv(obs_type="state")
     observation, _ = env.reset(seed=1, options={"youngs_modulus": youngs_modulus})
-    policy, scene = ScriptedLift(env), env.scene
+    policy = ScriptedLift(env)
+    scene: Any = env.scene
     soft, depth, iterations = scene.solver.reduced, [], []
     step = scene.solver.step
 
