@@ -240,6 +240,60 @@ def distance_cylinder(x: np.ndarray, radius: float, half_height: float) -> np.nd
     )
 
 
+def distance_cone(x: np.ndarray, radius: float, half_height: float) -> np.ndarray:
+    """Return the signed distance to a cone along Z, apex up, from its profile in the half plane (rho, z)."""
+    p = np.stack([np.hypot(x[..., 0], x[..., 1]), x[..., 2]], axis=-1)
+    rim, apex, foot = np.array([radius, -half_height]), np.array([0.0, half_height]), np.array([0.0, -half_height])
+    away = [_distance_to_segment(p, rim, apex), _distance_to_segment(p, foot, rim)]
+    inside = (p[..., 1] > -half_height) & (p[..., 0] / radius < (half_height - p[..., 1]) / (2.0 * half_height))
+    return np.where(inside, -1.0, 1.0) * np.minimum(*away)
+
+
+def _distance_to_segment(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    t = np.clip((p - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
+    return np.linalg.norm(p - a - t[..., None] * (b - a), axis=-1)
+
+
+def distance_ellipsoid(x: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Return the signed distance to an ellipsoid: bisection for s in x_i = y_i (1 + s / e_i^2), y on the surface."""
+    z = np.maximum(np.abs(x), 1e-14)
+    low, high = np.full(x.shape[:-1], -(axes.min() ** 2)), (axes * np.linalg.norm(x, axis=-1)[..., None]).max(axis=-1)
+    for _ in range(200):
+        middle = 0.5 * (low + high)
+        outside = ((axes * z / (middle[..., None] + axes**2)) ** 2).sum(axis=-1) > 1.0
+        low, high = np.where(outside, middle, low), np.where(outside, high, middle)
+    y = axes**2 * z / (high[..., None] + axes**2)
+    return np.sign(high) * np.linalg.norm(z - y, axis=-1)
+
+
+def distance_mesh(x: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return the signed distance of points (N, 3) to closed, outward oriented triangles (M, 3, 3).
+
+    The nearest of all triangles; inside where the winding number (sum of solid angles, van Oosterom and Strackee 1983)
+    exceeds one half.
+    """
+    out = np.empty(len(x))
+    a, b, c = (triangles[:, k] for k in range(3))
+    sides = ((a, b), (b, c), (c, a))
+    normal = np.cross(b - a, c - a)
+    for i, point in enumerate(x):
+        edges = [_distance_to_segments(point, p, q) for p, q in sides]
+        above = ((point - a) * normal).sum(axis=-1) / np.linalg.norm(normal, axis=-1)
+        over = np.all([(np.cross(q - p, point - p) * normal).sum(axis=-1) > 0 for p, q in sides], axis=0)
+        nearest = np.min([*edges, np.where(over, np.abs(above), np.inf)])
+        u, v, w = a - point, b - point, c - point
+        lu, lv, lw = (np.linalg.norm(k, axis=-1) for k in (u, v, w))
+        bottom = lu * lv * lw + (u * v).sum(-1) * lw + (v * w).sum(-1) * lu + (w * u).sum(-1) * lv
+        angle = 2.0 * np.arctan2((u * np.cross(v, w)).sum(axis=-1), bottom).sum()
+        out[i] = -nearest if angle > 2.0 * np.pi else nearest
+    return out
+
+
+def _distance_to_segments(point: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    t = np.clip(((point - a) * (b - a)).sum(axis=-1) / ((b - a) ** 2).sum(axis=-1), 0.0, 1.0)
+    return np.linalg.norm(point - a - t[:, None] * (b - a), axis=-1)
+
+
 @dataclass(frozen=True, kw_only=True)
 class FreeBody:
     """A body without contact and the incremental potential of one implicit Euler step, dense.

@@ -2,8 +2,7 @@
 
 Every sample is tested against the shapes near its body; gap, normal and lever arm are frozen for the step and become
 *entries*, the point constraints of the step (see ``contact`` for their energy): first the pins of the instance, then
-its contacts in sample order. Shapes without closed-form distance (heightfield, convex decomposition, ellipsoid) are
-refused.
+its contacts in sample order.
 
 The queries are ours because Newton's public ``sdf_*`` functions come without their gradients, and because its soft
 contact records are appended by an atomic counter: fixed slots per sample keep the order, and so the bits, reproducible.
@@ -13,7 +12,14 @@ import warp as wp
 
 from softmode.deformables.contact import stiffness_per_area
 from softmode.deformables.lanes import barrier
-from softmode.deformables.shape_queries import PLANE, query_shape
+from softmode.deformables.shape_queries import (
+    HEIGHTFIELD,
+    PLANE,
+    Heightfields,
+    SurfaceQuery,
+    query_heightfield,
+    query_shape,
+)
 from softmode.deformables.status import WORLD_CONTACT_OVERFLOW
 from softmode.deformables.tables import (
     SLOTS,
@@ -30,6 +36,10 @@ from softmode.deformables.tables import (
 wp.set_module_options({"enable_backward": False})
 
 
+OPPOSED = wp.constant(0.3)
+"""Cosine beyond which a direction counts as against a normal."""
+
+
 @wp.struct
 class Shapes:
     """The rigid shapes of the model and where their bodies are at the start of the step."""
@@ -37,6 +47,7 @@ class Shapes:
     kind: wp.array[int]
     scale: wp.array[wp.vec3]
     source: wp.array[wp.uint64]
+    fields: Heightfields
     margin: wp.array[float]
     lower: wp.array[wp.vec3]  # bounds in the shape's frame [m]
     upper: wp.array[wp.vec3]
@@ -143,7 +154,7 @@ def cull_shapes(
     near_out[i, c] = 0
     if shape < 0:
         return
-    if shapes.kind[shape] == PLANE:
+    if shapes.kind[shape] == PLANE or shapes.kind[shape] == HEIGHTFIELD:  # solid below without end
         near_out[i, c] = 1
         return
     pose = shapes.transform[shape]
@@ -168,9 +179,71 @@ def cull_shapes(
         near_out[i, c] = 1
 
 
+@wp.func
+def march(
+    shapes: Shapes,
+    shape: int,
+    x: wp.vec3,
+    nearest: SurfaceQuery,
+    along: wp.vec3,
+    end: float,
+    back: int,
+    thick: float,
+    reach: float,
+):
+    """Return gap and normal of the half-space that stands for a shape along a way from ``x``, in the shape's frame.
+
+    The way is marched by distances to the shape grown by ``thick``. To the body's inside (``back``), for a sample past
+    the middle of a thin plate or through it: where the way leaves the shape, else what is ``nearest`` to x. The way of
+    a fast sample: where it first meets the shape, or else passes nearest.
+    """
+    kind = shapes.kind[shape]
+    scale = shapes.scale[shape]
+    source = shapes.source[shape]
+    query = nearest
+    out = query
+    at = float(0.0)
+    out_at = float(0.0)
+    inside = query.distance <= 0.0
+    depth = 0.5 * end
+    least = 1.0e-3 * end
+    for _ in range(64):
+        if at >= end:
+            break
+        at = wp.min(at + wp.max(wp.abs(query.distance), least), end)
+        y = x + at * along
+        query = query_shape(kind, scale, source, y, reach)
+        if kind == HEIGHTFIELD:
+            query = query_heightfield(y, shapes.fields, shapes.fields.index[shape], reach)
+        query.distance -= thick
+        if back == 1:
+            if inside and query.distance > 0.0:
+                if wp.dot(query.normal, along) > OPPOSED:
+                    out = query
+                    out_at = at
+                break
+            if not inside and at > depth:
+                break
+            inside = query.distance <= 0.0
+        else:
+            if query.distance < out.distance:
+                out = query
+                out_at = at
+            if query.distance <= least:
+                inside = bool(True)
+                break
+    slope = wp.dot(out.normal, along)
+    out.distance -= out_at * slope
+    if back == 0 and not inside:
+        out.distance = wp.max(out.distance, -end * slope)  # a way that misses the shape misses its half-space
+    return out
+
+
 @wp.kernel
 def find_contacts(
     instances: Instances,
+    basis: Basis,
+    motion: Motion,
     candidate: wp.array2d[int],
     near: wp.array2d[int],
     shapes: Shapes,
@@ -187,28 +260,56 @@ def find_contacts(
     samples.gap[i, s, 0] = wp.float64(1.0e30)
     samples.gap[i, s, 1] = wp.float64(1.0e30)
     x = samples.position[i, s]
+    row = instances.row_start[i] + s
     for c in range(candidate.shape[1]):
         if near[i, c] == 0:
             continue
         shape = candidate[i, c]
         pose = shapes.transform[shape]
         body = shapes.body[shape]
-        motion = samples.drift[i, s]
+        drift = samples.drift[i, s]
         if body >= 0:
             pose = shapes.body_q[body] * pose
             moving = point_velocity(shapes.body_q[body], shapes.body_qd[body], shapes.body_com[body], wp.vec3(x))
-            motion -= dt * moving
-        reach = instances.margin[i] + 2.0 * wp.length(motion)
+            drift -= dt * moving
+        reach = instances.margin[i] + 2.0 * wp.length(drift)
         # the difference to the shape's origin in float64: far from the world's origin only the offset is large
-        origin = wp.transform_get_translation(pose)
-        local = wp.quat_rotate_inv(wp.transform_get_rotation(pose), wp.vec3(x - wp.vec3d(origin)))
-        # inside a mesh the surface may be as far away as the mesh is large
+        turn = wp.transform_get_rotation(pose)
+        local = wp.quat_rotate_inv(turn, wp.vec3(x - wp.vec3d(wp.transform_get_translation(pose))))
         thick = shapes.margin[shape] + instances.contact_radius[i]
-        far = wp.max(reach + thick, wp.length(shapes.upper[shape] - shapes.lower[shape]))
-        query = query_shape(shapes.kind[shape], shapes.scale[shape], shapes.source[shape], local, far)
-        gap = wp.float64(query.distance - thick)
+        far = reach + thick
+        kind = shapes.kind[shape]
+        if kind != HEIGHTFIELD:  # inside a mesh the surface may be as far away as the mesh is large
+            far = wp.max(far, wp.length(shapes.upper[shape] - shapes.lower[shape]))
+        # struct arguments are copied: one of many arrays costs more than the distance to a box
+        query = query_shape(kind, shapes.scale[shape], shapes.source[shape], local, far)
+        if kind == HEIGHTFIELD:
+            query = query_heightfield(local, shapes.fields, shapes.fields.index[shape], far)
+        query.distance -= thick
+        # In general the half-space at the nearest point stands for the shape during the step, but
+        along = wp.vec3()
+        end = float(0.0)
+        back = int(0)
+        depth = float(wp.length(basis.inner_point[row]))
+        travel = wp.length(drift)
+        if query.distance < 2.0 * depth:
+            bent = interpolate(basis.inner_row, row, motion.q_start, i, instances.function_count[i])
+            inner = wp.quat_rotate_inv(turn, wp.vec3(basis.inner_point[row] + bent))
+            depth = wp.length(inner)
+            if query.distance < depth and wp.dot(query.normal, inner) < -OPPOSED * depth:
+                # the nearest surface faces away from the body's inside: the sample must go back to it
+                along = inner / depth
+                end = 2.0 * depth
+                back = 1
+        if end == 0.0 and query.distance > 0.0 and travel > instances.margin[i] and travel > query.distance:
+            # a half-space at the start would also stop fast samples that fly past a small shape
+            along = wp.quat_rotate_inv(turn, drift) / travel
+            end = travel
+        if end > 0.0:
+            query = march(shapes, shape, local, query, along, end, back, thick, far)
+        gap = wp.float64(query.distance)
         if gap < wp.float64(reach) and gap < samples.gap[i, s, 1]:
-            normal = wp.quat_rotate(wp.transform_get_rotation(pose), query.normal)
+            normal = wp.quat_rotate(turn, query.normal)
             slot = int(1)
             if gap < samples.gap[i, s, 0]:
                 samples.shape[i, s, 1] = samples.shape[i, s, 0]

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import newton
 import numpy as np
 import warp as wp
 
@@ -12,7 +11,8 @@ from softmode.deformables.authoring import CONTACT_FIELDS, MATERIAL_FIELDS, NAME
 from softmode.deformables.body import ReducedBody
 from softmode.deformables.factor import BlockCholesky
 from softmode.deformables.lanes import LANES, pad, vec8, vec8d
-from softmode.deformables.shape_queries import SUPPORTED_SHAPES
+from softmode.deformables.shape_tables import solid_shapes
+from softmode.deformables.surface_samples import inner_offsets
 from softmode.deformables.tables import Basis, Instances
 from softmode.errors import ConfigError
 
@@ -120,7 +120,7 @@ def lay_out(model: Any, bodies: Sequence[ReducedBody]) -> Layout:
         sample_max=max(body.surface_count for body in bodies),
         pin_max=int(pin_count.max(initial=0)),
         first_pin_row=sum(body.surface_count for body in bodies),
-        size=np.array([np.linalg.norm(np.ptp(body.bounds, axis=0)) for body in bodies])[asset],
+        size=np.array([_size(body) for body in bodies])[asset],
         basis=basis,
         instances=instances,
     )
@@ -176,8 +176,21 @@ def _basis(
     basis.mean = table(mean.reshape(len(bodies), -1, LANES), vec8d)
     basis.row = table(row.reshape(len(row), -1, LANES), vec8, np.float32)
     basis.row_point = table(np.concatenate([joined("surface_points"), pin_points]), wp.vec3d)
+    inner = [inner_offsets(body.surface_points, body.surface_normals, _size(body)) for body in bodies]
+    inner_row = [
+        body.evaluate(body.surface_points + offset)[0] - body.surface_basis
+        for body, offset in zip(bodies, inner, strict=True)
+    ]
+    inner_row = np.concatenate([_padded(values, stride) for values in inner_row])
+    basis.inner_row = table(inner_row.reshape(len(inner_row), -1, LANES), vec8, np.float32)
+    basis.inner_point = table(np.concatenate(inner), wp.vec3d)
     basis.row_area = table(np.append(joined("surface_areas"), np.zeros(len(pin_points))), float, np.float32)
     return basis
+
+
+def _size(body: ReducedBody) -> float:
+    """Return the diagonal of a body's bounds [m]."""
+    return float(np.linalg.norm(np.ptp(body.bounds, axis=0)))
 
 
 def _padded(values: np.ndarray, stride: int) -> np.ndarray:
@@ -231,24 +244,8 @@ def candidate_shapes(model: Any, layout: Layout) -> np.ndarray:
     instance_count, world_count = layout.instance_count, layout.world_count
     if model.shape_count == 0:
         return np.full((instance_count, 1), -1)
-    flags, kinds, worlds = model.shape_flags.numpy(), model.shape_type.numpy(), model.shape_world.numpy()
-    solid = (flags & int(newton.ShapeFlags.COLLIDE_PARTICLES)) != 0
-    supported = [int(kind) for kind in SUPPORTED_SHAPES]
-    for shape in np.flatnonzero(solid & ~np.isin(kinds, supported)):
-        raise ConfigError(
-            f"shape {shape} ({model.shape_label[shape]!r}) is a {newton.GeoType(int(kinds[shape])).name.lower()}, "
-            "which a soft body cannot touch",
-            hint="use a plane, box, sphere, capsule, cylinder or mesh, or clear its COLLIDE_PARTICLES flag",
-        )
-    scale = model.shape_scale.numpy()
-    meshes = np.isin(kinds, [int(newton.GeoType.MESH), int(newton.GeoType.CONVEX_MESH)])
-    uneven = np.ptp(np.abs(scale), axis=1) > 1e-5 * np.abs(scale).max(axis=1)
-    for shape in np.flatnonzero(solid & meshes & uneven):
-        raise ConfigError(
-            f"shape {shape} ({model.shape_label[shape]!r}) is a mesh scaled by {scale[shape]}, whose distances "
-            "a soft body cannot query",
-            hint="scale the vertices of the mesh instead",
-        )
+    worlds = model.shape_world.numpy()
+    solid = solid_shapes(model)
     moving = solid & (model.shape_body.numpy() >= 0) & (worlds == -1)
     if world_count > 1 and moving.any():
         raise ConfigError(

@@ -27,6 +27,7 @@ from softmode.deformables.layout import candidate_shapes, join_systems, lay_out
 from softmode.deformables.materials import MaterialModel
 from softmode.deformables.pairs import SoftPairs
 from softmode.deformables.rigid_dofs import RigidDofs
+from softmode.deformables.shape_tables import heightfields, mesh_sources, solid_shapes
 from softmode.errors import ConfigError
 
 __all__ = [
@@ -115,7 +116,7 @@ class SolverReduced(SolverBase):
         options: How the step is solved.
 
     Raises:
-        ConfigError: If a body of the model is not among ``bodies``, or a shape type cannot be touched.
+        ConfigError: If a body of the model is not among ``bodies``, or a shape cannot be touched.
     """
 
     @classmethod
@@ -192,10 +193,12 @@ class SolverReduced(SolverBase):
         """Gather what contact reads of the model's shapes."""
         model, shapes = self.model, detection.Shapes()
         if model.shape_count:
-            shapes.kind, shapes.scale, shapes.source = model.shape_type, model.shape_scale, model.shape_source_ptr
+            shapes.kind, shapes.scale = model.shape_type, model.shape_scale
+            shapes.source, self._hulls = mesh_sources(model, solid_shapes(model))
             shapes.margin, shapes.friction = model.shape_margin, model.shape_material_mu
             shapes.lower, shapes.upper = model.shape_collision_aabb_lower, model.shape_collision_aabb_upper
             shapes.body, shapes.transform = model.shape_body, model.shape_transform
+            shapes.fields = heightfields(model)
         shapes.body_com, shapes.body_mass = model.body_com, model.body_mass
         return shapes
 
@@ -336,7 +339,10 @@ class SolverReduced(SolverBase):
             [self.near],
         )
         self._launch(
-            detection.find_contacts, every, [instances, self.candidate, self.near, shapes, float(dt)], [samples]
+            detection.find_contacts,
+            every,
+            [instances, self.basis, self.motion, self.candidate, self.near, shapes, float(dt)],
+            [samples],
         )
         self._launch_team(
             detection.gather_contacts,

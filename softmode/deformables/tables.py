@@ -30,6 +30,8 @@ class Basis:
     row_area: wp.array[float]  # (row_total,) [m^2]
     row_normal: wp.array[wp.vec3]  # (sample_total,), outward at rest; only where soft bodies may touch each other
     row_gradient: wp.array3d[vec8]  # (block_count, sample_total, 3) [1/m], likewise
+    inner_row: wp.array2d[vec8]  # (sample_total, block_count), difference to a point inside the body
+    inner_point: wp.array[wp.vec3d]  # (sample_total,) [m]
 
 
 @wp.struct

@@ -88,8 +88,9 @@ class LiftSoftEnv(gym.Env, gym.utils.EzPickle):
     The reward is the sum of ``info["reward_terms"]``: ``reach`` (0..1, tool to object), ``grasp`` (0 or 0.5, both
     fingers touch), ``lift`` (0..2, share of the goal height while grasped), ``hold`` (0 or 2, at the goal). ``info``
     also holds ``is_success`` (the object is held at the goal, and has been for ``hold_steps`` steps), ``object_height``
-    (rise of its centre of mass [m]), ``finger_force`` [N], ``youngs_modulus`` [Pa] and ``solver_status`` (the solver's
-    flags). An episode terminates only by failure, named by ``failure``: "dropped" (off the table) or "diverged".
+    (rise of its centre of mass [m]), ``finger_force`` [N], ``youngs_modulus`` [Pa], ``solver_status`` (the solver's
+    flags) and ``solver_reasons`` (their names, such as "contact_overflow"). An episode terminates only by failure,
+    named by ``failure``: "dropped" (off the table) or "diverged".
 
     ``reset`` takes ``options``: ``position`` (x, y) [m], ``yaw`` [rad], ``youngs_modulus`` [Pa]; what is not given is
     drawn at random from the configured ranges.
@@ -312,6 +313,7 @@ class LiftSoftEnv(gym.Env, gym.utils.EzPickle):
             "finger_force": self._finger_force(),
             "youngs_modulus": self._youngs_modulus,
             "solver_status": int(self.scene.status[0]),
+            "solver_reasons": self.scene.status_reasons[0],
         }
 
     def _agent_pos(self) -> NDArray[Any]:

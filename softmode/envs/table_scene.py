@@ -17,6 +17,7 @@ from softmode.deformables.solver_reduced import (
     add_reduced_body,
     register_custom_attributes,
 )
+from softmode.deformables.status import status_reasons
 from softmode.envs import table_kernels as kernels
 from softmode.envs.objects import ObjectConfig, SoftObject, load_object
 from softmode.errors import ConfigError
@@ -304,3 +305,8 @@ class TableScene:
     def status(self) -> np.ndarray:
         """Status bits of the last control step per world, see :mod:`softmode.deformables.status`."""
         return self.solver.reduced.status.numpy()
+
+    @property
+    def status_reasons(self) -> tuple[tuple[str, ...], ...]:
+        """Names of those bits per world."""
+        return tuple(status_reasons(int(bits)) for bits in self.status)

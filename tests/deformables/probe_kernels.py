@@ -54,6 +54,7 @@ def query_points(
     shape_type: int,
     scale: wp.vec3,
     mesh: wp.uint64,
+    fields: shape_queries.Heightfields,
     x: wp.array[wp.vec3],
     reach: float,
     # Out:
@@ -63,6 +64,8 @@ def query_points(
     """Evaluate the distance of every point to one shape."""
     i = wp.tid()
     query = shape_queries.query_shape(shape_type, scale, mesh, x[i], reach)
+    if shape_type == shape_queries.HEIGHTFIELD:
+        query = shape_queries.query_heightfield(x[i], fields, fields.index[0], reach)
     distance_out[i] = query.distance
     normal_out[i] = query.normal
 

@@ -14,6 +14,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env, data_equivalence
 
 import softmode
+from softmode.deformables.status import status_reasons
 from softmode.envs.lift_soft import LiftSoftConfig, LiftSoftEnv
 from softmode.errors import ConfigError, MaterialError
 
@@ -295,6 +296,21 @@ def test_episode_is_truncated_by_its_limit(make_env: MakeEnv) -> None:
     ends = [env.step(idle)[2:4] for _ in range(150)]
     assert ends[-1] == (False, True)
     assert not any(terminated or truncated for terminated, truncated in ends[:-1])
+
+
+def test_info_names_what_the_solver_reports(lift: LiftSoftEnv) -> None:
+    """``solver_reasons`` are the names of the bits of ``solver_status``, of the last control step only."""
+    lift.reset(seed=0)
+    idle = np.array([0.0, 0.0, 0.0, 0.0, 1.0], np.float32)
+    clean = lift.step(idle)[-1]
+    assert clean["solver_status"] == 0 and clean["solver_reasons"] == ()
+    data = lift.scene.state.softmode
+    data.qd.assign(np.full((*data.qd.shape, 3), np.nan))
+    broken = lift.step(idle)[-1]
+    assert "not_finite" in broken["solver_reasons"] and broken["failure"] == "diverged"
+    assert broken["solver_reasons"] == status_reasons(broken["solver_status"])
+    lift.reset(seed=0)
+    assert lift.step(idle)[-1]["solver_reasons"] == ()
 
 
 def test_an_object_off_the_table_ends_the_episode(lift: LiftSoftEnv) -> None:
