@@ -82,7 +82,7 @@ def test_centre_of_pressure_of_an_eccentric_load():
     scene = Scene(populate, [body], coupled=True, gravity=DOWN, ground=0.8)
     sensor = ContactSensor(scene.solver, [0, -1])
     replay = scene.capture()
-    for _ in range(200):
+    for _ in range(120):
         replay()
     sensor.update()
     position, force, torque = (
