@@ -92,7 +92,9 @@ class ContactSensor:
 class SurfacePressure:
     """Pressure on the surface samples of a soft body, and its contact with everything.
 
-    sum_s area_s (pressure_s normal_s + traction_s) = total_force, less what other soft bodies press between samples.
+    sum_s area_s (pressure_s normal_s + traction_s) = total_force. Where two soft bodies touch, each sample of either
+    finds the surface of the other: what it presses there between samples counts for the nearest that faces it. Contact
+    of the body with itself puts no force on it and is not sensed.
 
     Args:
         solver: As for :class:`ContactSensor`.
@@ -126,6 +128,11 @@ class SurfacePressure:
         self.area = layout.bodies[assets[0]].surface_areas.copy()
         shape, vector = (worlds, len(self.area)), wp.vec3d
         self._normal_force, self._friction = (wp.zeros(shape, dtype=vector, device=device) for _ in range(2))
+        pairs = reduced.pairs
+        self._surface_normal = (
+            pairs.table.surface_normal if pairs is not None else wp.zeros((1, 1), dtype=wp.vec3, device=device)
+        )
+        self._sample = wp.zeros((worlds, reduced.entry_max), dtype=int, device=device)
         self.pressure = wp.zeros(shape, dtype=float, device=device)
         self.traction, self.normal = (wp.zeros(shape, dtype=wp.vec3, device=device) for _ in range(2))
         self._patch = patch = kernels.Patch()
@@ -138,13 +145,20 @@ class SurfacePressure:
     def update(self) -> None:
         """Read the contacts of the last step."""
         reduced, device = self._solver, self._solver.model.device
-        self._normal_force.zero_()
-        self._friction.zero_()
-        sums = [self._normal_force, self._friction]
+        step, sums = [*_step(reduced), self.soft], [self._normal_force, self._friction]
+        for array in sums:
+            array.zero_()
+        wp.launch(
+            kernels.find_samples,
+            dim=self._sample.shape,
+            inputs=[*step, reduced.samples.position, self._surface_normal],
+            outputs=[self._sample],
+            device=device,
+        )
         wp.launch(
             kernels.gather_pressure,
             dim=reduced.world_count,
-            inputs=[*_step(reduced), self.soft, *sums],
+            inputs=[*step, self._sample, *sums],
             outputs=[self._patch],
             device=device,
         )

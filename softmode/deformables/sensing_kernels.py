@@ -34,9 +34,22 @@ class Patch:
 
 @wp.func
 def point_of(instances: Instances, basis: Basis, motion: Motion, entries: Entries, i: int, e: int):
-    """Return where the soft side of an entry was at the start of the step [m]: both bodies feel the force there."""
+    """Return where an entry was at the start of the step [m]: both bodies feel the force there.
+
+    Where a sample of another soft body touches this one, the row is a mean of rows and its place that of the sample.
+    """
     row = entries.row[i, e]
-    return basis.row_point[row] + interpolate(basis.row, row, motion.q_start, i, instances.function_count[i])
+    k = i
+    if row >= basis.row_point.shape[0]:
+        row = entries.partner_row[i, e]
+        k = entries.partner[i, e]
+    return basis.row_point[row] + interpolate(basis.row, row, motion.q_start, k, instances.function_count[k])
+
+
+@wp.func
+def is_internal(entries: Entries, i: int, e: int):
+    """Return whether an entry is a contact of a body with itself, which puts no force on it."""
+    return e >= entries.count[i] - entries.pair_count[i] and entries.partner[i, e] < 0
 
 
 @wp.func
@@ -166,6 +179,38 @@ def read_attachments(
 
 
 @wp.kernel
+def find_samples(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    entries: Entries,
+    instance_start: wp.array[int],
+    soft: int,
+    position: wp.array2d[wp.vec3d],  # (instance_count, sample_max), samples at the start of the step [m]
+    surface_normal: wp.array2d[wp.vec3],  # and their normals, outward
+    # Out:
+    sample_out: wp.array2d[int],  # (world_count, entry_max)
+):
+    """Find the sample of each contact: its own, or the nearest that faces the sample of another soft body."""
+    w, e = wp.tid()
+    i = instance_start[w] + soft
+    if e < instances.pin_count[i] or e >= entries.count[i] or is_internal(entries, i, e):
+        return
+    found = entries.row[i, e] - instances.row_start[i]
+    if entries.row[i, e] >= basis.row_point.shape[0]:
+        x = point_of(instances, basis, motion, entries, i, e)
+        nearest = wp.float64(1.0e30)
+        for s in range(instances.sample_count[i]):
+            distance = wp.length_sq(position[i, s] - x)
+            if wp.dot(surface_normal[i, s], wp.vec3(entries.normal[i, e])) > -0.5:
+                distance += wp.float64(1.0e10)  # only where none faces it
+            if distance < nearest:
+                nearest = distance
+                found = s
+    sample_out[w, e] = found
+
+
+@wp.kernel
 def gather_pressure(
     instances: Instances,
     basis: Basis,
@@ -173,6 +218,7 @@ def gather_pressure(
     entries: Entries,
     instance_start: wp.array[int],
     soft: int,
+    sample: wp.array2d[int],  # (world_count, entry_max)
     # In and out, zero before:
     normal_force: wp.array2d[wp.vec3d],  # (world_count, sample_count) [N]
     friction: wp.array2d[wp.vec3d],  # (world_count, sample_count) [N]
@@ -197,7 +243,7 @@ def gather_pressure(
     area = wp.float64(0.0)
     for e in range(instances.pin_count[i], entries.count[i]):
         f = entries.force[i, e]
-        if not wp.isfinite(wp.length_sq(f)):
+        if is_internal(entries, i, e) or not wp.isfinite(wp.length_sq(f)):
             continue
         n = entries.normal[i, e]
         pressing = normal_part(entries, i, e)
@@ -209,14 +255,12 @@ def gather_pressure(
             weight += pressing
             position += pressing * x
             normal += pressing * n
-        # the other side of a contact between soft bodies lies between samples: part of the total only
-        s = entries.row[i, e] - instances.row_start[i]
-        if s >= 0 and s < instances.sample_count[i]:
-            before = wp.length_sq(normal_force[w, s])
-            normal_force[w, s] = normal_force[w, s] + pressing * n
-            friction[w, s] = friction[w, s] + (f - pressing * n)
-            if before == wp.float64(0.0) and pressing > wp.float64(0.0):
-                area += wp.float64(basis.row_area[entries.row[i, e]])
+        s = sample[w, e]
+        before = wp.length_sq(normal_force[w, s])
+        normal_force[w, s] = normal_force[w, s] + pressing * n
+        friction[w, s] = friction[w, s] + (f - pressing * n)
+        if before == wp.float64(0.0) and pressing > wp.float64(0.0):
+            area += wp.float64(basis.row_area[instances.row_start[i] + s])
     patch_out.force[w] = wp.vec3(total)
     patch_out.friction[w] = wp.vec3(tangential)
     patch_out.torque[w] = wp.vec3(torque)

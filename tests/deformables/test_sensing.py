@@ -161,6 +161,42 @@ def test_torque_turns_the_body():
     assert worst <= 2.0 * omega * scene.dt * np.linalg.norm(scene.momentum()[1])
 
 
+def test_soft_on_soft():
+    """A cube on a cube on the ground: each feels the other's m g, and the pressures make it up.
+
+    The solver puts a reaction on a mean of samples, the sensor at the sample that touches: levers to a share of their
+    spacing.
+    """
+    body = cube()
+    lever = 0.02 * np.sqrt(body.surface_areas.mean())
+
+    def populate(world):
+        for k in range(2):
+            material = Material(youngs_modulus=5.0e5, mass_damping=5.0)
+            add_reduced_body(world, body, material=material, position=(0.0, 0.0, (0.5 + k) * EDGE + (1 + k) * 1e-4))
+
+    scene = Scene(populate, [body], gravity=DOWN, ground=0.8)
+    sensors = [SurfacePressure(scene.solver, k) for k in range(2)]
+    scene.step(200)
+    weight = scene.mass() * GRAVITY
+    for sensor in sensors:
+        sensor.update()
+        total = sensor.total_force.numpy()[0]
+        np.testing.assert_allclose(total, [0.0, 0.0, weight], atol=2e-3 * weight)
+        np.testing.assert_allclose(integral(sensor), total, atol=64 * FLOAT32 * weight)
+        np.testing.assert_allclose(sensor.total_torque.numpy()[0], 0.0, atol=lever * weight)
+    for sensor, side in zip(sensors, (1.0, -1.0), strict=True):
+        touched = side * body.surface_points[:, 2] > 0.499 * EDGE
+        p, n = sensor.pressure.numpy()[0], sensor.normal.numpy()[0]
+        force = (sensor.area * p * n[:, 2])[touched].sum()
+        assert force == pytest.approx(-side * weight, rel=1e-2)
+        assert sensor.area[touched & (p > 0.0)].sum() == pytest.approx(EDGE**2, rel=0.1)
+    ground = ContactSensor(scene.solver, [-1])
+    ground.update()
+    force = ground.force_matrix.numpy()[0, 0, :, 2]
+    np.testing.assert_allclose(force, [-2.0 * weight, 0.0], atol=4e-3 * weight)
+
+
 # -- attachments -------------------------------------------------------------------------------------------------------
 
 
