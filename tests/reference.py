@@ -405,3 +405,32 @@ def with_float32(material: Material) -> Material:
     """Return the material with its numbers rounded to float32, as a Newton model stores them."""
     names = ("youngs_modulus", "poissons_ratio", "density", "viscosity", "mass_damping", "friction")
     return replace(material, **{name: float(np.float32(getattr(material, name))) for name in names})
+
+
+def contact_readings(entries, body, body_q, body_com):
+    """Return force, friction, torque about the COM, centre of pressure and mean normal of a body at some contacts.
+
+    Args:
+        entries: Dict of arrays ``body`` (count,), ``point``, ``normal`` and ``force`` on the soft side (count, 3).
+        body: Rigid body whose contacts are taken; torques about the origin where it is negative.
+        body_q: Pose of the body at the start of the step, position and quaternion.
+        body_com: Its centre of mass in its frame.
+    """
+    mine = entries["body"] == body
+    x, n, f = (entries[name][mine] for name in ("point", "normal", "force"))
+    centre = np.zeros(3)
+    if body >= 0:
+        w, v = body_q[6], body_q[3:6]
+        centre = body_q[:3] + body_com + 2.0 * np.cross(v, np.cross(v, body_com) + w * body_com)
+    pressing = np.einsum("ij,ij->i", n, f)
+    weight = np.maximum(pressing, 0.0)
+    if not weight.sum():
+        return (np.zeros(3),) * 5
+    mean = weight @ n
+    return (
+        -f.sum(axis=0),
+        -(f - pressing[:, None] * n).sum(axis=0),
+        -np.cross(x - centre, f).sum(axis=0),
+        weight @ x / weight.sum(),
+        mean / np.linalg.norm(mean),
+    )

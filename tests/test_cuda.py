@@ -9,6 +9,7 @@ import warp as wp
 
 from softmode.deformables.attachments import attach
 from softmode.deformables.materials import Material
+from softmode.deformables.sensing import ContactSensor, SurfacePressure
 from softmode.deformables.solver_reduced import SolverReduced, add_reduced_body, register_custom_attributes
 from tests.scenes import cube
 
@@ -80,6 +81,43 @@ def test_cuda_worlds_are_alike(kind):
     """256 replicas that start alike stay alike to the bit: no world sees another, no sum has a free order."""
     worlds = drop("cuda:0", kind, 256)
     np.testing.assert_array_equal(worlds, np.broadcast_to(worlds[:1], worlds.shape))
+
+
+def weigh(device: str) -> tuple[np.ndarray, np.ndarray]:
+    """Let cubes settle on the ground in three worlds; return what the ground and the surfaces feel, captured."""
+    world = newton.ModelBuilder()
+    material = Material(youngs_modulus=5.0e5, mass_damping=5.0)
+    add_reduced_body(world, cube(), material=material, position=(0.0, 0.0, 0.0501))
+    builder = newton.ModelBuilder()
+    register_custom_attributes(builder)
+    builder.replicate(world, 3)
+    builder.add_ground_plane()
+    model = builder.finalize(device=device)
+    solver = SolverReduced(model, [cube()])
+    ground, surface = ContactSensor(solver, [-1]), SurfacePressure(solver)
+    first, second = model.state(), model.state()
+
+    def two_steps() -> None:
+        solver.step(first, second, None, None, DT)
+        solver.step(second, first, None, None, DT)
+        ground.update()
+        surface.update()
+
+    two_steps()
+    with wp.ScopedCapture(device=device) as capture:
+        two_steps()
+    for _ in range(100):
+        wp.capture_launch(capture.graph)
+    return ground.total_force.numpy()[:, 0], surface.pressure.numpy()
+
+
+def test_cuda_senses():
+    """Sensors on CUDA: equal in all worlds to the bit, and as on the CPU to the tolerance of the step."""
+    force, pressure = weigh("cuda:0")
+    np.testing.assert_array_equal(pressure, np.broadcast_to(pressure[:1], pressure.shape))
+    expected_force, expected_pressure = weigh("cpu")
+    np.testing.assert_allclose(force, expected_force, atol=1e-3 * np.abs(expected_force).max())
+    np.testing.assert_allclose(pressure, expected_pressure, atol=1e-2 * expected_pressure.max())
 
 
 def test_cuda_lifts():

@@ -524,13 +524,15 @@ def reset_worlds(
     status_out: wp.array[int],
     instance_force_out: wp.array[wp.vec3d],
     body_wrench_out: wp.array[wp.spatial_vector],
+    entry_count_out: wp.array[int],
 ):
-    """Clear what the masked worlds report: status, contact force on bodies, contact wrench on rigid bodies."""
+    """Clear what the masked worlds report: status, entries, contact force on bodies, wrench on rigid bodies."""
     i = wp.tid()
     if i < status_out.shape[0] and world_mask[i]:
         status_out[i] = 0
     if i < instances.world.shape[0] and world_mask[instances.world[i]]:
         instance_force_out[i] = wp.vec3d()
+        entry_count_out[i] = 0
     if i < body_world.shape[0]:
         w = body_world[i]
         if w < 0:

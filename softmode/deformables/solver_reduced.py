@@ -615,7 +615,7 @@ class SolverReduced(SolverBase):
             kernels.reset_worlds,
             max(self.world_count, self.instance_count, self.model.body_count),
             [self.instances, self.model.body_world, world_mask],
-            [self.status, self.instance_force, self.body_wrench],
+            [self.status, self.instance_force, self.body_wrench, self.entries.count],
         )
         if self.layout.pin_max:
             dim = (self.instance_count, self.layout.pin_max)

@@ -8,6 +8,7 @@ from softmode.robots.assets import available, fetch
 from softmode.robots.control import ArmController, ArmControlOptions
 from softmode.robots.description import JointDrive, RobotDescription, RobotGripper, RobotIndices
 from softmode.robots.loading import load
+from softmode.robots.soft_fingertips import SoftFingertips, add_soft_fingertips
 
 __all__ = [
     "ArmControlOptions",
@@ -19,7 +20,9 @@ __all__ = [
     "RobotDescription",
     "RobotGripper",
     "RobotIndices",
+    "SoftFingertips",
     "add_arm",
+    "add_soft_fingertips",
     "available",
     "fetch",
     "load",
