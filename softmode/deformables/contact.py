@@ -202,8 +202,9 @@ def sum_reactions(
         total = wp.vec3d()
         for e in range(first_coupled(instances, i), entries.count[i]):
             f = entries.force[i, e]
-            if e >= instances.pin_count[i]:
-                total += f
+            paired = e >= entries.count[i] - entries.pair_count[i]
+            if e >= instances.pin_count[i] and not (paired and entries.partner[i, e] < 0):
+                total += f  # a contact of the body with itself is none of the world's business
             body = entries.body[i, e]
             if body >= 0:
                 reaction = -wp.vec3(f)
