@@ -276,6 +276,7 @@ def assemble_columns(
     entries: Entries,
     active: wp.array[int],
     gradient: wp.array2d[vec8d],
+    rigid: Rigid,
     rigid_count: int,
     size: int,  # N
     # Out:
@@ -291,7 +292,7 @@ def assemble_columns(
     value = vec8()
     if j == rigid_count:
         value = vec8(-gradient[i, rows])
-    else:
+    elif j < rigid.count[instances.world[i]]:
         for e in range(first_coupled(instances, i), entries.count[i]):
             value = value - entries.coupling[i, e, j][c] * basis.row[entries.row[i, e], b]
         value = free_part(value, instances.driven_count[i] - LANES * b)
@@ -308,7 +309,7 @@ def assemble_rigid(
     # In and out:
     rigid: Rigid,
 ):
-    """Compute gradient and Hessian of the rigid dofs: M_eff/dt^2 (r - r_predicted) + sum_e J_e^T f_e."""
+    """Compute gradient and Hessian of the rigid dofs: M_eff/dt^2 (r - r_predicted) + sum_e J_e^T f_e, and the rows."""
     w, j, l = wp.tid()
     if progress.active[w] == 0 or j >= rigid.count[w] or l >= rigid.count[w]:
         return
@@ -318,6 +319,8 @@ def assemble_rigid(
     for i in range(first, end):
         for e in range(first_coupled(instances, i), entries.count[i]):
             h += wp.float64(wp.dot(entries.jacobian[i, e, j], entries.coupling[i, e, l]))
+    for k in range(rigid.row_count[w]):
+        h += wp.float64(rigid.row_jacobian[w, k, j]) * rigid.row_coupling[w, k, l]
     rigid.matrix[w, j, l] = h
     if l == 0:
         g = wp.float64(0.0)
@@ -326,6 +329,8 @@ def assemble_rigid(
         for i in range(first, end):
             for e in range(first_coupled(instances, i), entries.count[i]):
                 g += wp.dot(wp.vec3d(entries.jacobian[i, e, j]), entries.force[i, e])
+        for k in range(rigid.row_count[w]):
+            g += wp.float64(rigid.row_jacobian[w, k, j]) * rigid.row_force[w, k]
         rigid.gradient[w, j] = g
 
 

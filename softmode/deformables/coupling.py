@@ -4,15 +4,24 @@ Lagged or staggered exchange of contact forces chatters or gains energy once con
 joint solve has no lag and nothing to tune. With M_eff = M + dt (D + K_d), the inertia that SolverMuJoCo's implicit
 integrator shows to an external force (joint damping D and drive damping K_d are implicit there, drive stiffness not):
 
-1. SolverMuJoCo steps without soft contact: joint velocities v*;
+1. SolverMuJoCo steps without soft contact: joint velocities v*, and the constraint rows that it found;
 2. mass matrix and body Jacobians at the start of the step;
 3. one Newton solve over [q of all bodies in the world ; r = dt * joint velocity] with
-   1/(2 dt^2) (r - dt v*)^T M_eff (r - dt v*) and the contact energies of both;
+   1/(2 dt^2) (r - dt v*)^T M_eff (r - dt v*), MuJoCo's constraint rows (rigid contacts, joint limits, equalities,
+   friction loss; see ``constraint_kernels``) and the contact energies of both;
 4. the reaction wrenches join ``state.body_f``;
 5. SolverMuJoCo steps again, from the same start.
+
+Where no soft body is near a rigid one that moves, the joint dofs stay out of the solve; where none pushes one, the
+prediction is the step: on the CPU the second MuJoCo step is taken only if some world needs it, and a world that does
+not need it is left as the prediction has it.
+
+What step 3 neglects of MuJoCo's answer to the forces: the implicit integrator damps after the constraints are solved,
+(M + dt C)^-1 M (M + J^T D J)^-1 instead of (M + dt C + J^T D J)^-1, which differ by the cross term dt J^T D J M^-1 C on
+dofs that are both damped and constrained; and contacts that MuJoCo will only detect in the next step.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import newton
@@ -20,6 +29,7 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverBase, SolverMuJoCo
 
+from softmode.deformables import constraint_kernels as constraints
 from softmode.deformables import coupling_kernels as kernels
 from softmode.deformables.authoring import register_custom_attributes
 from softmode.deformables.body import ReducedBody
@@ -31,8 +41,9 @@ from softmode.errors import ConfigError
 class SolverCoupledReduced(SolverBase):
     """Soft bodies and articulated rigid bodies in one step: :class:`SolverReduced` with ``SolverMuJoCo``.
 
-    MuJoCo keeps its own contacts between rigid shapes. A step costs two MuJoCo steps and one soft solve, reads nothing
-    back and may be captured with ``wp.ScopedCapture`` on CPU and CUDA.
+    MuJoCo keeps its own contacts between rigid shapes, and the solve sees them. A step costs two MuJoCo steps and one
+    soft solve, one MuJoCo step less where nothing touches (see the module), reads nothing back and may be captured with
+    ``wp.ScopedCapture`` on CPU and CUDA.
 
     Args:
         model: Finalised model with reduced bodies and at least one joint.
@@ -62,9 +73,14 @@ class SolverCoupledReduced(SolverBase):
             raise ConfigError("model has no joint dofs to couple with", hint="use SolverReduced")
         self.reduced = SolverReduced(model, bodies, options=options)
         self.rigid = rigid or SolverMuJoCo(model)
+        if self.rigid.use_mujoco_cpu:
+            raise ConfigError(
+                "the rigid solver runs MuJoCo in C, which shows its constraints to no kernel",
+                hint="build it with use_mujoco_cpu=False",
+            )
         self.reduced.attach_rigid(self._rigid_dofs())
         self.predicted_state = model.state()
-        device = model.device
+        device, worlds = model.device, self.reduced.world_count
         articulations, dofs = model.articulation_count, model.max_dofs_per_articulation
         self.mass_matrix = wp.zeros((articulations, dofs, dofs), dtype=float, device=device)
         self.joint_S = wp.zeros(model.joint_dof_count, dtype=vector, device=device)
@@ -78,6 +94,10 @@ class SolverCoupledReduced(SolverBase):
                 "some joints belong to no articulation", hint="call add_articulation for every joint tree"
             )
         self.dof_articulation = wp.array(owner, dtype=int, device=device)
+        self.any_coupled = wp.zeros(1, dtype=int, device=device)
+        self.pushed, self.any_pushed = (wp.zeros(n, dtype=int, device=device) for n in (worlds, 1))
+        self._lay_out_joints()
+        self._bind()
 
     def _rigid_dofs(self) -> RigidDofs:
         """Take every joint dof of each world into the solve."""
@@ -89,7 +109,51 @@ class SolverCoupledReduced(SolverBase):
                     "joints outside all worlds cannot be coupled", hint="add them to the replicated builder"
                 )
             starts = np.array([0, model.joint_dof_count])
-        return RigidDofs(model, worlds, np.diff(starts[: worlds + 1]), starts[:worlds])
+        rows = self.rigid.mjw_data.efc.type.shape[1]
+        return RigidDofs(model, worlds, np.diff(starts[: worlds + 1]), starts[:worlds], row_max=rows)
+
+    def _lay_out_joints(self) -> None:
+        """Find the world of every joint coordinate, the body of every dof, and the free and ball joints of a world."""
+        model, device = self.model, self.model.device
+        count, worlds = model.joint_count, self.reduced.world_count
+        world = np.maximum(model.joint_world.numpy()[:count], 0)
+        self.dof_world, self.coordinate_world, self.dof_body = (
+            wp.array(np.repeat(owner, np.diff(np.append(start.numpy()[:count], total))), dtype=int, device=device)
+            for owner, start, total in (
+                (world, model.joint_qd_start, model.joint_dof_count),
+                (world, model.joint_q_start, model.joint_coord_count),
+                (model.joint_child.numpy()[:count], model.joint_qd_start, model.joint_dof_count),
+            )
+        )
+        kind = model.joint_type.numpy()[:count]
+        chosen = [
+            np.flatnonzero((world == w) & np.isin(kind, (newton.JointType.FREE, newton.JointType.BALL)))
+            for w in range(worlds)
+        ]
+        joint = np.full((worlds, max(len(c) for c in chosen)), -1)
+        for w, c in enumerate(chosen):
+            joint[w, : len(c)] = c
+        self.turned = constraints.TurnedJoints()
+        self.turned.joint = wp.array(joint, dtype=int, device=device)
+        self.turned.free = wp.array(kind == newton.JointType.FREE, dtype=int, device=device)
+
+    def _bind(self) -> None:
+        """Point to the arrays of the model and of MuJoCo that the kernels read."""
+        model, turned, data, mujoco = self.model, self.turned, self.rigid.mjw_data, constraints.MujocoRows()
+        turned.qd_start, turned.q_start, turned.child = model.joint_qd_start, model.joint_q_start, model.joint_child
+        turned.parent_frame, turned.child_frame, turned.body_com = model.joint_X_p, model.joint_X_c, model.body_com
+        mujoco.count, mujoco.qacc, mujoco.dof = data.nefc, data.qacc, self.rigid.mjc_dof_to_newton_dof
+        for name in ("type", "id", "J", "J_rownnz", "J_rowadr", "J_colind", "D", "aref", "frictionloss"):
+            setattr(mujoco, name, getattr(data.efc, name))
+        mujoco.contact_friction, mujoco.contact_dim = data.contact.friction, data.contact.dim
+        mujoco.contact_address = data.contact.efc_address
+        mujoco.impratio_invsqrt = self.rigid.mjw_model.opt.impratio_invsqrt
+        self.mujoco = mujoco
+        # what MuJoCo's step leaves behind for the next: activations go on from the start in both steps, the corrector
+        # starts its iteration from the prediction, and a world that keeps the prediction keeps its acceleration too
+        self.activation = wp.zeros_like(data.act)
+        self.warmstart = wp.zeros_like(data.qacc_warmstart)
+        self.data_world = wp.array(np.arange(data.nworld), dtype=int, device=model.device)
 
     @property
     def body_wrench(self) -> wp.array:
@@ -108,20 +172,77 @@ class SolverCoupledReduced(SolverBase):
     ) -> None:
         """Advance soft and rigid bodies by ``dt`` [s]."""
         self.validate_observables(observables, contacts)
-        self.rigid.step(state_in, self.predicted_state, control, contacts, dt)
-        self._linearise(state_in, dt)
+        data = self.rigid.mjw_data
+        wp.copy(self.activation, data.act)
+        self.rigid.step(state_in, self.predicted_state, control, contacts, dt, observables=observables)
+        wp.copy(self.warmstart, data.qacc_warmstart)
 
         self.reduced.begin(state_in, control, dt)
         self.reduced.detect(state_in, control, dt, prescribed=False)
+        self._find_coupled()
+        self._branch(self.any_coupled, self._linearise, state=state_in, dt=dt)
         self.reduced.minimise(dt)
         self.reduced.finish(state_out, dt)
 
-        body_f: Any = state_in.body_f
-        wp.copy(self.body_f, body_f)
-        count = self.model.body_count
-        wp.launch(kernels.add_wrench, dim=count, inputs=[self.body_wrench, state_in.body_f], device=self.model.device)
+        self._find_pushed()
+        arguments = {"control": control, "contacts": contacts, "dt": dt, "observables": observables}
+        self._branch(self.any_pushed, self._correct, state_in=state_in, state_out=state_out, **arguments)
+        self._keep_prediction(state_out)
+
+    def _branch(self, condition: wp.array, body: Callable[..., None], **arguments: Any) -> None:
+        """Do what is needed only if ``condition`` holds; on CUDA always.
+
+        The branch of a CUDA graph must not allocate, and MuJoCo's step does; with many worlds one needs it anyway.
+        """
+        if self.model.device.is_cuda:
+            body(**arguments)
+        else:
+            wp.capture_if(condition, body, **arguments)
+
+    def _find_coupled(self) -> None:
+        """Let the joint dofs take part where a soft body is near a rigid one."""
+        reduced, dofs = self.reduced, self.reduced.rigid
+        self.any_coupled.zero_()
+        tables = [reduced.instances, reduced.progress, reduced.entries, dofs.dof_count]
+        self._launch(kernels.find_coupled, reduced.world_count, tables, [dofs.table, self.any_coupled])
+
+    def _find_pushed(self) -> None:
+        """Mark the worlds in which a soft body pushes a rigid one."""
+        self.pushed.zero_()
+        self.any_pushed.zero_()
+        inputs = [self.model.body_world, self.body_wrench]
+        self._launch(kernels.find_pushed, self.model.body_count, inputs, [self.pushed, self.any_pushed])
+
+    def _correct(self, state_in: Any, state_out: Any, control: Any, contacts: Any, dt: float, observables: Any) -> None:
+        """Let MuJoCo take the step with the soft bodies' wrenches."""
+        wp.copy(self.rigid.mjw_data.act, self.activation)
+        wp.copy(self.body_f, state_in.body_f)
+        self._launch(kernels.add_wrench, self.model.body_count, [self.body_wrench, state_in.body_f])
         self.rigid.step(state_in, state_out, control, contacts, dt, observables=observables)
-        wp.copy(body_f, self.body_f)
+        wp.copy(state_in.body_f, self.body_f)
+
+    def _keep_prediction(self, state: Any) -> None:
+        """Take the prediction in the worlds where no soft body pushes a rigid one."""
+        before, model, data = self.predicted_state, self.model, self.rigid.mjw_data
+        arrays = [
+            (self.coordinate_world, before.joint_q, state.joint_q),
+            (self.dof_world, before.joint_qd, state.joint_qd),
+            (self.data_world, self.warmstart, data.qacc_warmstart),
+        ]
+        for name in ("body_q", "body_qd", "body_qdd", "body_parent_f"):
+            arrays.append((model.body_world, getattr(before, name, None), getattr(state, name, None)))
+        if hasattr(state, "mujoco") and getattr(state.mujoco, "qfrc_actuator", None) is not None:
+            arrays.append((self.dof_world, before.mujoco.qfrc_actuator, state.mujoco.qfrc_actuator))
+        for world, source, target in arrays:
+            if source is None or target is None:
+                continue
+            rows, width = len(world), source.size * wp.types.type_size_in_bytes(source.dtype) // 4 // len(world)
+            flat = [wp.array(ptr=x.ptr, shape=rows * width, dtype=float, device=x.device) for x in (source, target)]
+            self._launch(kernels.keep_prediction, (rows, width), [self.pushed, world, width, flat[0]], [flat[1]])
+
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: Sequence[Any] = ()) -> None:
+        """Launch on the model's device."""
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=list(outputs), device=self.model.device)
 
     def _linearise(self, state: newton.State, dt: float) -> None:
         """Evaluate Jacobians and the effective inertia at the start of the step."""
@@ -130,17 +251,12 @@ class SolverCoupledReduced(SolverBase):
         newton.eval_mass_matrix(
             model, state, self.mass_matrix, J=dofs.jacobian, body_I_s=self.body_I, joint_S_s=self.joint_S
         )
-        wp.launch(
-            kernels.drive_damping,
-            dim=model.joint_dof_count,
-            inputs=[model.joint_target_mode, model.joint_target_kd, model.joint_damping],
-            outputs=[self.damping],
-            device=model.device,
-        )
-        wp.launch(
+        drives = [model.joint_target_mode, model.joint_target_kd, model.joint_damping]
+        self._launch(kernels.drive_damping, model.joint_dof_count, drives, [self.damping])
+        self._launch(
             kernels.effective_inertia,
-            dim=(self.reduced.world_count, dofs.count_max),
-            inputs=[
+            (self.reduced.world_count, dofs.count_max),
+            [
                 dofs.count,
                 dofs.dof_start,
                 self.dof_articulation,
@@ -149,16 +265,21 @@ class SolverCoupledReduced(SolverBase):
                 self.mass_matrix,
                 state.joint_qd,
                 self.predicted_state.joint_qd,
+                self.dof_body,
+                model.body_flags,
                 wp.float64(dt),
             ],
-            outputs=[dofs.inertia, dofs.predicted, dofs.r],
-            device=model.device,
+            [dofs.inertia, dofs.predicted, dofs.r],
         )
+        rows = [self.mujoco, self.turned, state.joint_q]
+        self._launch(constraints.gather_rows, (self.reduced.world_count, dofs.row_max), rows, [dofs.table])
+        self.reduced.differentiate_entries()
 
     def notify_model_changed(self, flags: int) -> None:
         """Pass the change on to both solvers."""
         self.reduced.notify_model_changed(flags)
         self.rigid.notify_model_changed(flags)
+        self._bind()
 
     def reset(self, state: newton.State, world_mask: wp.array | None = None, flags: Any = None) -> None:
         """Reset soft and rigid bodies of the chosen worlds to the model's initial state."""

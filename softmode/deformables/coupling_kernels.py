@@ -1,7 +1,9 @@
-"""Device side of the coupling: effective inertia of the joints, reactions onto the bodies."""
+"""Device side of the coupling: which worlds are coupled, effective inertia of the joints, reactions onto the bodies."""
 
 import newton
 import warp as wp
+
+from softmode.deformables.tables import Entries, Instances, Progress, Rigid, first_coupled
 
 wp.set_module_options({"enable_backward": False})
 
@@ -13,6 +15,69 @@ _DAMPED_MODES = tuple(
         newton.JointTargetMode.POSITION_VELOCITY,
     )
 )
+
+
+IMMOVABLE = wp.constant(wp.float64(1.0e9))
+"""Inertia [kg or kg m^2] of a dof that MuJoCo moves as prescribed."""
+
+
+@wp.kernel
+def find_coupled(
+    instances: Instances,
+    progress: Progress,
+    entries: Entries,
+    dof_count: wp.array[int],
+    # Out:
+    rigid: Rigid,
+    any_out: wp.array[int],  # (1,)
+):
+    """Let the joint dofs take part in the worlds in which a soft body is near a rigid one that moves."""
+    w = wp.tid()
+    coupled = int(0)
+    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
+        for e in range(first_coupled(instances, i), entries.count[i]):
+            body = entries.body[i, e]
+            if body >= 0:
+                if rigid.body_articulation[body] >= 0:
+                    coupled = 1
+    rigid.count[w] = coupled * dof_count[w]
+    if coupled == 0:
+        rigid.row_count[w] = 0
+        for j in range(rigid.direction.shape[1]):
+            rigid.direction[w, j] = wp.float64(0.0)
+    else:
+        wp.atomic_max(any_out, 0, 1)
+
+
+@wp.kernel
+def find_pushed(
+    body_world: wp.array[int],
+    wrench: wp.array[wp.spatial_vector],
+    # Out, set before to 0:
+    pushed_out: wp.array[int],  # (world_count,)
+    any_out: wp.array[int],  # (1,)
+):
+    """Mark the worlds in which a soft body pushes a rigid one."""
+    b = wp.tid()
+    f = wrench[b]
+    if wp.dot(f, f) != 0.0:
+        wp.atomic_max(pushed_out, wp.max(body_world[b], 0), 1)
+        wp.atomic_max(any_out, 0, 1)
+
+
+@wp.kernel
+def keep_prediction(
+    pushed: wp.array[int],  # (world_count,)
+    world: wp.array[int],  # of each element
+    width: int,
+    predicted: wp.array[float],
+    # In and out:
+    corrected: wp.array[float],
+):
+    """Put the prediction back in the worlds that no soft body pushes, ``width`` numbers per element."""
+    e, c = wp.tid()
+    if pushed[wp.max(world[e], 0)] == 0:
+        corrected[width * e + c] = predicted[width * e + c]
 
 
 @wp.kernel
@@ -27,6 +92,8 @@ def effective_inertia(
     mass_matrix: wp.array3d[float],  # (articulation_count, dof_max, dof_max)
     joint_qd_start: wp.array[float],
     joint_qd_predicted: wp.array[float],
+    dof_body: wp.array[int],  # (joint_dof_count,), the body that a dof moves
+    body_flags: wp.array[int],
     dt: wp.float64,
     # Out:
     inertia_out: wp.array3d[wp.float64],  # (world_count, rigid_max, rigid_max), M_eff / dt^2
@@ -47,6 +114,8 @@ def effective_inertia(
             value = wp.float64(mass_matrix[a, dof - first, other - first])
         if l == j:
             value += dt * wp.float64(damping[dof])
+            if body_flags[dof_body[dof]] & wp.static(int(newton.BodyFlags.KINEMATIC)) != 0:
+                value += IMMOVABLE
         inertia_out[w, j, l] = value / (dt * dt)
     predicted_out[w, j] = dt * wp.float64(joint_qd_predicted[dof])
     # Newton starts from the motion that goes on, as it does for q: in a grasp the contact-free prediction would press

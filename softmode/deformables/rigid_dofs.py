@@ -15,12 +15,16 @@ class RigidDofs:
     Empty (``count_max`` 0) while rigid bodies move as prescribed; ``coupling`` fills one in.
     """
 
-    def __init__(self, model: newton.Model, world_count: int, counts: np.ndarray, dof_start: np.ndarray) -> None:
-        """Allocate for ``counts`` dofs per world, the first of them at ``dof_start``."""
+    def __init__(
+        self, model: newton.Model, world_count: int, counts: np.ndarray, dof_start: np.ndarray, *, row_max: int = 0
+    ) -> None:
+        """Allocate for ``counts`` dofs per world, the first at ``dof_start``, and ``row_max`` constraint rows."""
         device = model.device
-        self.count_max = int(counts.max(initial=0))
+        self.count_max, self.row_max = int(counts.max(initial=0)), row_max
         size = max(self.count_max, 1)
         self.count = wp.array(counts, dtype=int, device=device)
+        self.dof_count = wp.array(counts, dtype=int, device=device)
+        """Joint dofs of a world, shape (world_count,); ``count`` is 0 while they take no part."""
         self.dof_start = wp.array(dof_start, dtype=int, device=device)
         self.inertia = wp.zeros((world_count, size, size), dtype=wp.float64, device=device)
         self.predicted = wp.zeros((world_count, size), dtype=wp.float64, device=device)
@@ -38,6 +42,14 @@ class RigidDofs:
         links, dofs = model.max_joints_per_articulation, model.max_dofs_per_articulation
         shape = (max(model.articulation_count, 1), max(6 * links, 6), max(dofs, 1))
         self.jacobian = wp.zeros(shape, dtype=float, device=device)
+        self.row_count = wp.zeros(world_count, dtype=int, device=device)
+        rows = (world_count, max(row_max, 1))
+        for name in ("row_kind", "row_size"):
+            setattr(self, name, wp.zeros(rows, dtype=int, device=device))
+        for name in ("row_start", "row_stiffness", "row_limit", "row_change", "row_energy", "row_force"):
+            setattr(self, name, wp.zeros(rows, dtype=wp.float64, device=device))
+        self.row_jacobian = wp.zeros((*rows, size), dtype=float, device=device)
+        self.row_coupling = wp.zeros((*rows, size), dtype=wp.float64, device=device)
         self.table = Rigid()
         """The same arrays as the kernels take them."""
         for name in Rigid.vars:

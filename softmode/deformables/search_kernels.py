@@ -58,6 +58,8 @@ def potential_share(
             total += (
                 half * (r[w, j] - rigid.predicted[w, j]) * rigid.inertia[w, j, l] * (r[w, l] - rigid.predicted[w, l])
             )
+    for k in range(lane, rigid.row_count[w], team):
+        total += rigid.row_energy[w, k]
     return total
 
 
@@ -123,7 +125,7 @@ def begin_search(
     instances: Instances,
     entries: Entries,
     rigid: Rigid,
-    rigid_tolerance: float,  # [m or rad]
+    rigid_tolerance: wp.array[float],  # (world_count,) [m or rad]
     stick_range: wp.float64,  # [m]
     # State in:
     gradient: wp.array2d[vec8d],
@@ -161,7 +163,7 @@ def begin_search(
             last = 0
     for j in range(rigid.count[w]):
         slope += rigid.gradient[w, j] * rigid.direction[w, j]
-        if not (wp.abs(rigid.direction[w, j]) <= wp.float64(rigid_tolerance)):
+        if not (wp.abs(rigid.direction[w, j]) <= wp.float64(rigid_tolerance[w])):
             last = 0
     progress.slope[w] = slope
     progress.step_length[w] = wp.float64(1.0)

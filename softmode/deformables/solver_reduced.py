@@ -11,6 +11,7 @@ from newton.solvers import SolverBase
 
 from softmode.deformables import assembly_kernels as assembly
 from softmode.deformables import attachment_kernels, contact, detection, kernels, stick_kernels
+from softmode.deformables import constraint_kernels as constraints
 from softmode.deformables import search_kernels as search
 from softmode.deformables.attachments import Attachment
 from softmode.deformables.authoring import (
@@ -148,7 +149,9 @@ class SolverReduced(SolverBase):
             setattr(self.instances, name, wp.array(fraction * layout.size, dtype=float, device=device))
         self.instances.mass = wp.zeros(self.instance_count, dtype=wp.float64, device=device)
         self.instances.inertia = wp.zeros(self.instance_count, dtype=float, device=device)
-        self.rigid_tolerance = float(options.tolerance * layout.size.min())
+        smallest = np.full(self.world_count, np.inf)
+        np.minimum.at(smallest, self.instances.world.numpy(), options.tolerance * layout.size)
+        self.rigid_tolerance = wp.array(smallest, dtype=float, device=device)
         self.candidate = wp.array(candidate_shapes(model, layout), dtype=int, device=device)
         self.near = wp.zeros_like(self.candidate)
         self.shapes = self._shapes()
@@ -318,9 +321,11 @@ class SolverReduced(SolverBase):
             self._launch(assembly.relate_pairs, dim, tables, [self.system.pattern])
             self.system.fill()
         self.adapt(dt)
-        if self.rigid.count_max:
-            dim = (self.instance_count, self.entry_max, self.rigid.count_max)
-            self._launch(detection.entry_jacobians, dim, [self.instances, self.rigid.table], [self.entries])
+
+    def differentiate_entries(self) -> None:
+        """Compute how the entries move with the joint dofs, from the Jacobians of the articulations."""
+        dim = (self.instance_count, self.entry_max, self.rigid.count_max)
+        self._launch(detection.entry_jacobians, dim, [self.instances, self.rigid.table], [self.entries])
 
     def _place_samples(self) -> None:
         """Compute where the surface samples are and what bounds them."""
@@ -420,6 +425,10 @@ class SolverReduced(SolverBase):
             [*tables, stick_range, selected, q, r, int(derivatives)],
             [self.entries],
         )
+        if self.rigid.row_max:
+            rows = [selected, r, wp.float64(dt), int(derivatives)]
+            dim = (self.world_count, self.rigid.row_max)
+            self._launch(constraints.evaluate_rows, dim, rows, [self.rigid.table])
 
     def _gather_gradient(self, dt: float) -> None:
         """Gather the gradient of the potential with respect to q."""
@@ -483,7 +492,7 @@ class SolverReduced(SolverBase):
         self._launch(
             assembly.assemble_columns,
             (self.instance_count, 3 * blocks, rigid.count_max + 1),
-            [instances, basis, entries, active, self.gradient, rigid.count_max, self.system.size],
+            [instances, basis, entries, active, self.gradient, rigid.table, rigid.count_max, self.system.size],
             [self.system.scalars],
         )
         if self.part_count > 1:

@@ -125,7 +125,7 @@ class Entries:
 class Rigid:
     """Joint dofs that are unknowns of the solve, r = dt * joint velocity; see ``rigid_dofs``."""
 
-    count: wp.array[int]  # (world_count,)
+    count: wp.array[int]  # (world_count,), 0 in a step in which no soft body of the world is near a rigid one
     dof_start: wp.array[int]  # (world_count,), first joint dof of a world
     inertia: wp.array3d[wp.float64]  # (world_count, rigid_max, rigid_max), M_eff / dt^2
     predicted: wp.array2d[wp.float64]  # (world_count, rigid_max)
@@ -139,6 +139,18 @@ class Rigid:
     articulation_dof_start: wp.array[int]
     articulation_dof_count: wp.array[int]
     jacobian: wp.array3d[float]  # (articulation_count, 6 link_max, dof_max), twists of centres of mass, world frame
+    # MuJoCo's constraint rows, (world_count, row_max), see ``constraint_kernels``:
+    row_count: wp.array[int]  # (world_count,)
+    row_kind: wp.array2d[int]
+    row_size: wp.array2d[int]  # rows of an elliptic cone, at its first
+    row_start: wp.array2d[wp.float64]  # x = J a - a_ref in the prediction
+    row_stiffness: wp.array2d[wp.float64]  # D
+    row_limit: wp.array2d[wp.float64]  # friction loss; in a cone mu, then the friction coefficients
+    row_jacobian: wp.array3d[float]  # (world_count, row_max, rigid_max)
+    row_change: wp.array2d[wp.float64]  # x - x of the prediction, in cones
+    row_energy: wp.array2d[wp.float64]  # [J]
+    row_force: wp.array2d[wp.float64]
+    row_coupling: wp.array3d[wp.float64]  # second derivative times Jacobian / dt^2
 
 
 @wp.struct
