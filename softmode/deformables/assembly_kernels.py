@@ -294,6 +294,8 @@ def assemble_columns(
         value = vec8(-gradient[i, rows])
     elif j < rigid.count[instances.world[i]]:
         for e in range(first_coupled(instances, i), entries.count[i]):
+            if j < entries.dof_begin[i, e] or j >= entries.dof_end[i, e]:
+                continue
             value = value - entries.coupling[i, e, j][c] * basis.row[entries.row[i, e], b]
         value = free_part(value, instances.driven_count[i] - LANES * b)
     for a in range(LANES):
@@ -311,24 +313,27 @@ def assemble_rigid(
 ):
     """Compute gradient and Hessian of the rigid dofs: M_eff/dt^2 (r - r_predicted) + sum_e J_e^T f_e, and the rows."""
     w, j, l = wp.tid()
-    if progress.active[w] == 0 or j >= rigid.count[w] or l >= rigid.count[w]:
+    if progress.active[w] == 0 or j >= rigid.count[w] or l > j:
         return
     first = progress.instance_start[w]
     end = progress.instance_start[w + 1]
     h = rigid.inertia[w, j, l]
     for i in range(first, end):
         for e in range(first_coupled(instances, i), entries.count[i]):
-            h += wp.float64(wp.dot(entries.jacobian[i, e, j], entries.coupling[i, e, l]))
+            if l >= entries.dof_begin[i, e] and j < entries.dof_end[i, e]:
+                h += wp.float64(wp.dot(entries.jacobian[i, e, j], entries.coupling[i, e, l]))
     for k in range(rigid.row_count[w]):
         h += wp.float64(rigid.row_jacobian[w, k, j]) * rigid.row_coupling[w, k, l]
     rigid.matrix[w, j, l] = h
+    rigid.matrix[w, l, j] = h
     if l == 0:
         g = wp.float64(0.0)
         for k in range(rigid.count[w]):
             g += rigid.inertia[w, j, k] * (rigid.r[w, k] - rigid.predicted[w, k])
         for i in range(first, end):
             for e in range(first_coupled(instances, i), entries.count[i]):
-                g += wp.dot(wp.vec3d(entries.jacobian[i, e, j]), entries.force[i, e])
+                if j >= entries.dof_begin[i, e] and j < entries.dof_end[i, e]:
+                    g += wp.dot(wp.vec3d(entries.jacobian[i, e, j]), entries.force[i, e])
         for k in range(rigid.row_count[w]):
             g += wp.float64(rigid.row_jacobian[w, k, j]) * rigid.row_force[w, k]
         rigid.gradient[w, j] = g
@@ -345,8 +350,8 @@ def condense(
 ):
     """Subtract the bodies: S = R - sum_i Y_i^T Y_i and s = -g_r - sum_i Y_i^T y_i."""
     w, j, l = wp.tid()
-    # column l = rigid_count is the right-hand side
-    if progress.active[w] == 0 or j >= rigid.count[w] or l > rigid.count[w]:
+    # column l = rigid_count is the right-hand side; of the matrix only the lower triangle is read
+    if progress.active[w] == 0 or j >= rigid.count[w] or l > rigid.count[w] or (l > j and l < rigid.count[w]):
         return
     row_count = factored.shape[1]
     first = row_count / LANES

@@ -49,7 +49,7 @@ def make_entries(instance_count: int, entry_max: int, rigid_max: int, device: An
     entries, shape = Entries(), (instance_count, entry_max)
     entries.count, entries.pair_count = (wp.zeros(instance_count, dtype=int, device=device) for _ in range(2))
     for names, dtype in (
-        (("row", "shape", "body", "partner", "partner_row"), int),
+        (("row", "shape", "body", "dof_begin", "dof_end", "partner", "partner_row"), int),
         (("arm",), wp.vec3),
         (("normal", "offset", "force", "anchor", "slip"), wp.vec3d),
         (("stiffness", "friction", "stick", "normal_force", "energy"), wp.float64),

@@ -144,9 +144,8 @@ def evaluate_entries(
             )
             smoothing = wp.min(smoothing, instances.smoothing[j])
             share = wp.float64(0.5)
-    else:
-        for j in range(rigid.count[w]):
-            d -= r[w, j] * wp.vec3d(entries.jacobian[i, e, j])
+    for k in range(entries.dof_begin[i, e], entries.dof_end[i, e]):
+        d -= r[w, k] * wp.vec3d(entries.jacobian[i, e, k])
     stiffness = entries.stiffness[i, e]
     identity = wp.identity(n=3, dtype=wp.float64)
     H = stiffness * identity
@@ -183,8 +182,8 @@ def evaluate_entries(
             H += (tangent - secant) / (y * y) * wp.outer(t, t)
     if derivatives != 0:
         entries.hessian[i, e] = wp.mat33(H)
-        for j in range(rigid.count[w]):
-            entries.coupling[i, e, j] = wp.mat33(H) * entries.jacobian[i, e, j]
+        for k in range(entries.dof_begin[i, e], entries.dof_end[i, e]):
+            entries.coupling[i, e, k] = wp.mat33(H) * entries.jacobian[i, e, k]
 
 
 @wp.kernel

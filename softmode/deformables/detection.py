@@ -464,6 +464,8 @@ def gather_contacts(
                     drift = dt * wp.spatial_top(twist) + turn(dt * wp.spatial_bottom(twist), arm)
             row = instances.row_start[i] + s
             entries.row[i, e] = row
+            entries.dof_begin[i, e] = 0
+            entries.dof_end[i, e] = 0
             entries.shape[i, e] = shape
             entries.body[i, e] = body
             entries.arm[i, e] = arm
@@ -525,6 +527,8 @@ def gather_pins(
                 dt * (wp.spatial_top(shapes.body_qd[body]) + wp.cross(wp.spatial_bottom(shapes.body_qd[body]), arm))
             )
         entries.arm[i, e] = arm
+    entries.dof_begin[i, e] = 0
+    entries.dof_end[i, e] = 0
     entries.shape[i, e] = -1
     entries.body[i, e] = body
     entries.offset[i, e] = x - target
@@ -539,20 +543,22 @@ def entry_jacobians(
     entries: Entries,
 ):
     """Compute the motion of the rigid body at each contact or pin per unit joint motion: J_v - arm x J_w."""
-    i, e, j = wp.tid()
+    i, e = wp.tid()
     w = instances.world[i]
-    if e >= entries.count[i] or j >= rigid.count[w]:
+    if e >= entries.count[i] or rigid.count[w] == 0:
         return
-    value = wp.vec3()
     body = entries.body[i, e]
-    if body >= 0:
-        a = rigid.body_articulation[body]
-        if a >= 0:
-            local = rigid.dof_start[w] + j - rigid.articulation_dof_start[a]
-            if local >= 0 and local < rigid.articulation_dof_count[a]:
-                r = 6 * rigid.body_link[body]
-                J = rigid.jacobian
-                linear = wp.vec3(J[a, r, local], J[a, r + 1, local], J[a, r + 2, local])
-                angular = wp.vec3(J[a, r + 3, local], J[a, r + 4, local], J[a, r + 5, local])
-                value = linear + wp.cross(angular, entries.arm[i, e])
-    entries.jacobian[i, e, j] = value
+    if body < 0:
+        return
+    a = rigid.body_articulation[body]
+    if a < 0:
+        return
+    begin = rigid.articulation_dof_start[a] - rigid.dof_start[w]
+    entries.dof_begin[i, e] = begin
+    entries.dof_end[i, e] = begin + rigid.articulation_dof_count[a]
+    r = 6 * rigid.body_link[body]
+    J = rigid.jacobian
+    for local in range(rigid.articulation_dof_count[a]):
+        linear = wp.vec3(J[a, r, local], J[a, r + 1, local], J[a, r + 2, local])
+        angular = wp.vec3(J[a, r + 3, local], J[a, r + 4, local], J[a, r + 5, local])
+        entries.jacobian[i, e, begin + local] = linear + wp.cross(angular, entries.arm[i, e])

@@ -386,6 +386,8 @@ def write_pairs(
         if e >= 0:
             entries.shape[a, e] = -1
             entries.body[a, e] = -1
+            entries.dof_begin[a, e] = 0
+            entries.dof_end[a, e] = 0
             entries.row[a, e] = wp.where(side == 1 or j == i, row, own)
             entries.partner[a, e] = wp.where(j == i, -1, wp.where(side == 1, i, j))
             entries.partner_row[a, e] = wp.where(side == 1, own, row)

@@ -324,7 +324,7 @@ class SolverReduced(SolverBase):
 
     def differentiate_entries(self) -> None:
         """Compute how the entries move with the joint dofs, from the Jacobians of the articulations."""
-        dim = (self.instance_count, self.entry_max, self.rigid.count_max)
+        dim = (self.instance_count, self.entry_max)
         self._launch(detection.entry_jacobians, dim, [self.instances, self.rigid.table], [self.entries])
 
     def _place_samples(self) -> None:

@@ -117,7 +117,9 @@ class Entries:
     energy: wp.array2d[wp.float64]  # [J]
     force: wp.array2d[wp.vec3d]  # on the soft body [N]
     hessian: wp.array2d[wp.mat33]  # [N/m]
-    jacobian: wp.array3d[wp.vec3]  # (instance_count, entry_max, rigid_max), motion of the shape per rigid unknown
+    dof_begin: wp.array2d[int]  # the rigid unknowns that move the shape; an empty range where none does
+    dof_end: wp.array2d[int]
+    jacobian: wp.array3d[wp.vec3]  # (instance_count, entry_max, rigid_max), motion of the shape per such unknown
     coupling: wp.array3d[wp.vec3]  # hessian times jacobian
 
 
