@@ -87,13 +87,6 @@ class SolverCoupledReduced(SolverBase):
         self.body_I = wp.zeros(model.body_count, dtype=wp.spatial_matrix, device=device)
         self.body_f = wp.zeros(model.body_count, dtype=vector, device=device)
         self.damping = wp.zeros(model.joint_dof_count, dtype=float, device=device)
-        counts: Any = self.reduced.rigid.articulation_dof_count.numpy()
-        owner = np.repeat(np.arange(articulations), counts)
-        if len(owner) != model.joint_dof_count:
-            raise ConfigError(
-                "some joints belong to no articulation", hint="call add_articulation for every joint tree"
-            )
-        self.dof_articulation = wp.array(owner, dtype=int, device=device)
         self.any_coupled = wp.zeros(1, dtype=int, device=device)
         self.pushed, self.any_pushed = (wp.zeros(n, dtype=int, device=device) for n in (worlds, 1))
         self._lay_out_joints()
@@ -133,6 +126,15 @@ class SolverCoupledReduced(SolverBase):
         joint = np.full((worlds, max(len(c) for c in chosen)), -1)
         for w, c in enumerate(chosen):
             joint[w, : len(c)] = c
+        # a joint that closes a loop has no dofs in MuJoCo, where it is an equality
+        closes = np.tile(self.rigid.mj_qd_start.numpy() < 0, worlds)[:count]
+        articulation = model.joint_articulation.numpy()[:count]
+        dofs = np.diff(np.append(model.joint_qd_start.numpy()[:count], model.joint_dof_count))
+        if ((articulation < 0) & ~closes & (dofs > 0)).any():
+            raise ConfigError(
+                "some joints belong to no articulation", hint="call add_articulation for every joint tree"
+            )
+        self.dof_articulation = wp.array(np.repeat(articulation, dofs), dtype=int, device=device)
         self.turned = constraints.TurnedJoints()
         self.turned.joint = wp.array(joint, dtype=int, device=device)
         self.turned.free = wp.array(kind == newton.JointType.FREE, dtype=int, device=device)

@@ -86,7 +86,7 @@ def effective_inertia(
     count: wp.array[int],
     dof_start: wp.array[int],
     # Joint dofs:
-    dof_articulation: wp.array[int],  # (joint_dof_count,)
+    dof_articulation: wp.array[int],  # (joint_dof_count,), -1 for a joint that closes a loop
     articulation_dof_start: wp.array[int],
     damping: wp.array[float],  # (joint_dof_count,), D + K_d
     mass_matrix: wp.array3d[float],  # (articulation_count, dof_max, dof_max)
@@ -106,15 +106,17 @@ def effective_inertia(
         return
     dof = dof_start[w] + j
     a = dof_articulation[dof]
-    first = articulation_dof_start[a]
+    first = int(0)
+    if a >= 0:
+        first = articulation_dof_start[a]
     for l in range(count[w]):
         other = dof_start[w] + l
         value = wp.float64(0.0)
-        if dof_articulation[other] == a:
+        if a >= 0 and dof_articulation[other] == a:
             value = wp.float64(mass_matrix[a, dof - first, other - first])
         if l == j:
             value += dt * wp.float64(damping[dof])
-            if body_flags[dof_body[dof]] & wp.static(int(newton.BodyFlags.KINEMATIC)) != 0:
+            if a < 0 or body_flags[dof_body[dof]] & wp.static(int(newton.BodyFlags.KINEMATIC)) != 0:
                 value += IMMOVABLE
         inertia_out[w, j, l] = value / (dt * dt)
     predicted_out[w, j] = dt * wp.float64(joint_qd_predicted[dof])
