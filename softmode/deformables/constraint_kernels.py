@@ -264,8 +264,10 @@ def evaluate_cone(rigid: Rigid, w: int, head: int, r: wp.array2d[wp.float64], dt
                 else:
                     x = rigid.row_start[w, k] + rigid.row_change[w, k]
                     along = scale * x / tangent
-                    value = Dm * scale * (
-                        -mu * along * (z0 - mu * p) + (mu * mu - mu * normal / tangent) * (scale * J - along * p)
+                    value = (
+                        Dm
+                        * scale
+                        * (-mu * along * (z0 - mu * p) + (mu * mu - mu * normal / tangent) * (scale * J - along * p))
                     )
             rigid.row_coupling[w, k, j] = value / (dt * dt)
 

@@ -110,13 +110,11 @@ class SolverCoupledReduced(SolverBase):
         model, device = self.model, self.model.device
         count, worlds = model.joint_count, self.reduced.world_count
         world = np.maximum(model.joint_world.numpy()[:count], 0)
+        dofs: Any = np.diff(np.append(model.joint_qd_start.numpy()[:count], model.joint_dof_count))
+        coordinates: Any = np.diff(np.append(model.joint_q_start.numpy()[:count], model.joint_coord_count))
         self.dof_world, self.coordinate_world, self.dof_body = (
-            wp.array(np.repeat(owner, np.diff(np.append(start.numpy()[:count], total))), dtype=int, device=device)
-            for owner, start, total in (
-                (world, model.joint_qd_start, model.joint_dof_count),
-                (world, model.joint_q_start, model.joint_coord_count),
-                (model.joint_child.numpy()[:count], model.joint_qd_start, model.joint_dof_count),
-            )
+            wp.array(np.repeat(owner, size), dtype=int, device=device)
+            for owner, size in ((world, dofs), (world, coordinates), (model.joint_child.numpy()[:count], dofs))
         )
         kind = model.joint_type.numpy()[:count]
         chosen = [
@@ -129,7 +127,6 @@ class SolverCoupledReduced(SolverBase):
         # a joint that closes a loop has no dofs in MuJoCo, where it is an equality
         closes = np.tile(self.rigid.mj_qd_start.numpy() < 0, worlds)[:count]
         articulation = model.joint_articulation.numpy()[:count]
-        dofs = np.diff(np.append(model.joint_qd_start.numpy()[:count], model.joint_dof_count))
         if ((articulation < 0) & ~closes & (dofs > 0)).any():
             raise ConfigError(
                 "some joints belong to no articulation", hint="call add_articulation for every joint tree"
@@ -233,8 +230,8 @@ class SolverCoupledReduced(SolverBase):
         ]
         for name in ("body_q", "body_qd", "body_qdd", "body_parent_f"):
             arrays.append((model.body_world, getattr(before, name, None), getattr(state, name, None)))
-        if hasattr(state, "mujoco") and getattr(state.mujoco, "qfrc_actuator", None) is not None:
-            arrays.append((self.dof_world, before.mujoco.qfrc_actuator, state.mujoco.qfrc_actuator))
+        forces = [getattr(getattr(x, "mujoco", None), "qfrc_actuator", None) for x in (before, state)]
+        arrays.append((self.dof_world, *forces))
         for world, source, target in arrays:
             if source is None or target is None:
                 continue

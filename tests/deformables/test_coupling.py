@@ -171,25 +171,26 @@ def test_jacobians_move_the_shape():
 # -- momentum and energy -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("friction", [0.0, 0.5], ids=["smooth", "rough"])
-@pytest.mark.parametrize("ratio", [0.001, 0.01, 1.0, 100.0])
-def test_central_impact(ratio, friction):
-    """Free bodies without gravity: p is kept to 1e-5 and energy never exceeds the first, at any mass ratio."""
-    scene, twin = impact(ratio, friction=friction)
-    p0, _, e0 = totals(scene, twin)
+@pytest.mark.parametrize("dt", [0.001, 0.004, 0.01])
+@pytest.mark.parametrize("ratio", [1e-3, 1e-2, 1.0, 1e2, 1e3])
+def test_central_impact(ratio, dt):
+    """Free bodies without gravity: p is kept to 1e-5 in every step and energy never grows, rigid : soft 1e-3 to 1e3."""
+    scene, twin = impact(ratio, friction=0.0 if dt == 0.001 else 0.5, dt=dt)
+    p0, _, last = totals(scene, twin)
     touched = 0.0
-    for _ in range(80):
+    for _ in range(max(round(0.05 / dt), 8)):
         scene.step()
         p, _, e = totals(scene, twin)
         touched = max(touched, np.abs(scene.reduced.instance_force.numpy()).max())
         assert np.abs(p - p0).max() <= 1e-5 * np.abs(p0).max()
-        assert e <= (1.0 + 1e-6) * e0
+        assert e <= (1.0 + 1e-6) * last
+        last = e
     assert touched > 0.0
 
 
-@pytest.mark.parametrize("ratio", [0.01, 1.0, 100.0])
+@pytest.mark.parametrize("ratio", [1e-3, 1.0, 1e3])
 def test_eccentric_impact(ratio):
-    """Off centre: p to 1e-4, and angular momentum about the origin to 1e-4 plus what implicit Euler loses of the spin.
+    """Off centre: p to 1e-5, and angular momentum about the origin to 1e-4 plus what implicit Euler loses of the spin.
 
     L_(n+1) - L_n = -dt^2 sum_k v_k cross f_k(q_(n+1)) in a step, of first order in dt, as in the decay of a free spin:
     bounded by omega dt of the angular momentum passed on. The levers of a step are those of its start, the shape moves
@@ -202,7 +203,7 @@ def test_eccentric_impact(ratio):
         scene.step()
         p, L, e = totals(scene, twin)
         soft.append(np.linalg.norm(scene.momentum()[1]))
-        assert np.abs(p - p0).max() <= 1e-4 * np.abs(p0).max()
+        assert np.abs(p - p0).max() <= 1e-5 * np.abs(p0).max()
         assert e <= (1.0 + 1e-6) * e0
     omega = max(soft) / (scene.mass() * EDGE**2 / 6.0)
     assert max(soft) > 0.05 * np.linalg.norm(L0) or ratio != 1.0
@@ -263,29 +264,6 @@ def test_box_on_cube_on_ground(mass):
     assert ground == pytest.approx((mass + scene.mass()) * GRAVITY, rel=1e-3)
 
 
-def test_cube_on_rigid_box_on_ground():
-    """A soft cube on a rigid box that stands on the ground is carried with its own weight, within 1 %.
-
-    MuJoCo's contact of box and ground is not part of the joint solve: during the solve the box yields to the cube by
-    dt^2 f / m, which must stay small against the sinking-in; with a box of the cube's own mass it is.
-    """
-    body = cube()
-
-    def populate(world):
-        add_free_box(world, (0.05, 0.05, 0.02), 0.3, (0.0, 0.0, 0.02))
-        add_reduced_body(world, body, material=Material(youngs_modulus=5.0e5), position=(0.0, 0.0, 0.0901))
-
-    scene = Scene(populate, [body], coupled=True, gravity=DOWN, ground=0.8)
-    replay = scene.capture()
-    force = []
-    for _ in range(250):
-        replay()
-        force.append(scene.reduced.instance_force.numpy()[0, 2])
-    weight = scene.mass() * GRAVITY
-    assert np.mean(force[-50:]) == pytest.approx(weight, rel=1e-2)
-    assert np.std(force[-50:]) <= 1e-2 * weight
-
-
 def grasp(youngs_modulus, dt, *, time=1.6, options=None, world_count=1):
     """Return a gripper that closes on a soft cube in 0.4 s, lifts it from 0.6 s to 1.2 s, and what holds it there."""
     body = cube(0.06)
@@ -309,9 +287,11 @@ def grasp(youngs_modulus, dt, *, time=1.6, options=None, world_count=1):
     return scene, close, round(time / dt / 2)
 
 
-@pytest.mark.parametrize(("youngs_modulus", "dt"), [(5.0e5, 0.004), (5.0e6, 0.004), (5.0e5, 0.001)])
+@pytest.mark.parametrize(
+    ("youngs_modulus", "dt"), [(5.0e4, 0.01), (5.0e5, 0.004), (5.0e6, 0.004), (5.0e6, 0.01), (5.0e5, 0.001)]
+)
 def test_squeeze_equals_drive(youngs_modulus, dt):
-    """Both fingers press with k (target - q) within 1 %, std < 1 %; friction carries the weight; the cube is lifted."""
+    """Both fingers press with k (target - q) within 0.5 %, std too; friction carries the weight; the cube is lifted."""
     scene, close, count = grasp(youngs_modulus, dt)
     height, rows, status = scene.centre()[2], [], 0
     for k in range(count):
@@ -322,8 +302,8 @@ def test_squeeze_equals_drive(youngs_modulus, dt):
     hold = np.array(rows[-round(0.1 / dt) :])
     for side in (0, 1):
         drive = GRIPPER["stiffness"] * (GRIPPER["squeeze"] - hold[:, 3 + side])
-        np.testing.assert_allclose(hold[:, side].mean(), drive.mean(), rtol=1e-2)
-        assert hold[:, side].std() <= 1e-2 * drive.mean()
+        np.testing.assert_allclose(hold[:, side].mean(), drive.mean(), rtol=5e-3)
+        assert hold[:, side].std() <= 5e-3 * drive.mean()
     # At rest the cube is in equilibrium: no net force along the fingers' axis, its weight across it.
     weight = scene.mass() * GRAVITY
     assert abs(hold[:, 0].mean() - hold[:, 1].mean()) <= 1e-2 * hold[:, 0].mean()

@@ -97,9 +97,7 @@ def test_solve_foresees_what_mujoco_does(rigid, height, cone, jacobian):
     builder.add_ground_plane(cfg=newton.ModelBuilder.ShapeConfig(mu=0.3))
     model = builder.finalize(device="cpu")
     model.set_gravity(DOWN)
-    mujoco = SolverMuJoCo(
-        model, njmax=64, nconmax=32, cone=cone, jacobian=jacobian, tolerance=1e-10, iterations=100
-    )
+    mujoco = SolverMuJoCo(model, njmax=64, nconmax=32, cone=cone, jacobian=jacobian, tolerance=1e-10, iterations=100)
     solver = SolverCoupledReduced(model, [body], rigid=mujoco)
     state, following, dt = model.state(), model.state(), 0.004
     newton.eval_fk(model, model.joint_q, model.joint_qd, state)
@@ -172,7 +170,7 @@ def test_cube_on_light_box_on_ground(mass, dt):
 
 
 def rest(populate, bodies, time=3.0):
-    """Return a scene after ``time`` and how far its rigid body and the depth of contact moved in the last half second."""
+    """Return a scene after ``time``, the path of its rigid body, its drift in the last half second, and the depth."""
     scene = Scene(populate, bodies, coupled=True, gravity=DOWN, ground=0.8)
     replay = scene.capture()
     path, depth = [], 0.0
@@ -265,12 +263,16 @@ def workshop(world_count=1):
         wall = wp.transform(wp.vec3(0.075, 0.0, 0.03), wp.quat_identity())
         world.add_shape_box(tray, xform=wall, hx=0.005, hy=0.08, hz=0.025, cfg=config)
         inertia = wp.mat33(np.eye(3) * 1e-4)
-        flap = world.add_link(xform=wp.transform(wp.vec3(-0.3, 0.0, 0.1), wp.quat_identity()), mass=0.1, inertia=inertia)
+        flap = world.add_link(
+            xform=wp.transform(wp.vec3(-0.3, 0.0, 0.1), wp.quat_identity()), mass=0.1, inertia=inertia
+        )
         world.add_shape_box(flap, hx=0.05, hy=0.05, hz=0.005, cfg=config)
         anchor = wp.transform(wp.vec3(-0.3, 0.0, 0.1), wp.quat_identity())
         joint = world.add_joint_revolute(parent=-1, child=flap, axis=(0, 1, 0), parent_xform=anchor)
         world.add_articulation([joint])
-        world.add_shape_box(-1, hx=0.02, hy=0.02, hz=0.02, xform=wp.transform(wp.vec3(0.0, 0.3, 0.02), wp.quat_identity()))
+        world.add_shape_box(
+            -1, hx=0.02, hy=0.02, hz=0.02, xform=wp.transform(wp.vec3(0.0, 0.3, 0.02), wp.quat_identity())
+        )
         for x, z in ((0.0, 0.0301), (0.32, 0.0402), (-0.28, 0.1352)):
             add_reduced_body(world, body, material=Material(friction=0.8), position=(x, 0.0, z))
 
