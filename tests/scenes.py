@@ -55,7 +55,7 @@ class Scene:
         options: Solver options.
         dt: Step [s].
         finish: Called with the model before the solver is built, to change what the builder cannot.
-        rigid_contact_max: Contacts between rigid shapes at most, per world.
+        mujoco: Arguments of SolverMuJoCo besides the model, or in place of these defaults.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class Scene:
         options: SolverReducedOptions | None = None,
         dt: float = 0.004,
         finish: Callable[[newton.Model], Any] | None = None,
-        rigid_contact_max: int = 32,
+        mujoco: dict[str, Any] | None = None,
     ) -> None:
         """Build model, solver and states."""
         world = newton.ModelBuilder()
@@ -91,7 +91,7 @@ class Scene:
             finish(self.model)
         self.solver: Any
         if coupled:
-            rigid = SolverMuJoCo(self.model, njmax=2 * rigid_contact_max, nconmax=rigid_contact_max)
+            rigid = SolverMuJoCo(self.model, **{"njmax": 64, "nconmax": 32} | (mujoco or {}))
             self.solver = SolverCoupledReduced(self.model, bodies, rigid=rigid, options=options)
             self.reduced: SolverReduced = self.solver.reduced
         else:

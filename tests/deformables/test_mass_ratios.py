@@ -6,10 +6,10 @@ import pytest
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
-from softmode.deformables.coupling import SolverCoupledReduced
 from softmode.deformables.materials import Material
-from softmode.deformables.solver_reduced import add_reduced_body, register_custom_attributes
+from softmode.deformables.solver_reduced import add_reduced_body
 from softmode.errors import ConfigError
+from tests.deformables.test_coupling import Potential
 from tests.scenes import GRAVITY, GRIPPER, Scene, add_free_box, add_gripper, cube
 
 EDGE = 0.1
@@ -68,6 +68,20 @@ def slide_at_limit(world):
     return body, 0.02
 
 
+def standing(rigid, height, **mujoco):
+    """Return a soft cube that falls half a millimetre onto a rigid body, off its centre."""
+
+    def populate(world):
+        link, half = rigid(world)
+        config = newton.ModelBuilder.ShapeConfig(density=0.0, mu=0.5)
+        world.add_shape_box(link, hx=0.05, hy=0.05, hz=half, cfg=config)
+        material = Material(youngs_modulus=5.0e5, friction=0.4)
+        add_reduced_body(world, cube(), material=material, position=(0.02, 0.01, height + half + 0.0505))
+
+    mujoco = {"tolerance": 1e-10, "iterations": 100} | mujoco
+    return Scene(populate, [cube()], coupled=True, gravity=DOWN, ground=0.3, mujoco=mujoco)
+
+
 @pytest.mark.parametrize(
     ("rigid", "height", "cone", "jacobian"),
     [
@@ -83,36 +97,62 @@ def test_solve_foresees_what_mujoco_does(rigid, height, cone, jacobian):
     Contacts that slide, stick and open, limits and friction loss; to 1e-3 of what the soft body changes (MuJoCo's
     iteration is float32).
     """
-    body = cube()
-    world, builder = newton.ModelBuilder(), newton.ModelBuilder()
-    for target in (world, builder):
-        register_custom_attributes(target)
-        SolverMuJoCo.register_custom_attributes(target)
-    link, half = rigid(world)
-    config = newton.ModelBuilder.ShapeConfig(density=0.0, mu=0.5)
-    world.add_shape_box(link, hx=0.05, hy=0.05, hz=half, cfg=config)
-    material = Material(youngs_modulus=5.0e5, friction=0.4)
-    add_reduced_body(world, body, material=material, position=(0.02, 0.01, height + half + 0.0505))
-    builder.replicate(world, 1)
-    builder.add_ground_plane(cfg=newton.ModelBuilder.ShapeConfig(mu=0.3))
-    model = builder.finalize(device="cpu")
-    model.set_gravity(DOWN)
-    mujoco = SolverMuJoCo(model, njmax=64, nconmax=32, cone=cone, jacobian=jacobian, tolerance=1e-10, iterations=100)
-    solver = SolverCoupledReduced(model, [body], rigid=mujoco)
-    state, following, dt = model.state(), model.state(), 0.004
-    newton.eval_fk(model, model.joint_q, model.joint_qd, state)
+    scene = standing(rigid, height, cone=cone, jacobian=jacobian)
+    solver = scene.solver
     error, change, rows = 0.0, 0.0, 0
     for _ in range(30):
-        solver.step(state, following, None, None, dt)
+        scene.step()
         if solver.any_pushed.numpy()[0]:
-            velocity = following.joint_qd.numpy()
-            error = max(error, np.abs(solver.reduced.rigid.r.numpy()[0] / dt - velocity).max())
+            velocity = scene.state.joint_qd.numpy()
+            error = max(error, np.abs(solver.reduced.rigid.r.numpy()[0] / scene.dt - velocity).max())
             change = max(change, np.abs(velocity - solver.predicted_state.joint_qd.numpy()).max())
             rows = max(rows, int(solver.reduced.rigid.row_count.numpy()[0]))
-        state, following = following, state
     assert rows > 0
     assert change > 0.01
     assert error <= 1e-3 * change
+
+
+@pytest.mark.parametrize(
+    ("rigid", "height", "cone"),
+    [(turned_box, 0.02, "pyramidal"), (turned_box, 0.02, "elliptic"), (slide_at_limit, 0.1, "pyramidal")],
+)
+def test_derivatives_of_the_rows(rigid, height, cone):
+    """The gradient over r is a central difference of the potential; the rows' matrix one of their gradient, and PSD."""
+    potential = Potential(standing(rigid, height, cone=cone))
+    assert potential.solver.rigid.row_count.numpy()[0] > 0
+    n, m, dt = 3 * potential.n, len(potential.r), potential.scene.dt
+    rng = np.random.default_rng(0)
+    u = potential.u.copy()
+    u[n:] += 1e-3 * dt * rng.normal(size=m)  # away from the prediction: contacts open, slip and stick
+    step = 1e-7 * dt
+    for d in np.eye(m):
+        d = np.concatenate([np.zeros(n), d])
+        # the normal force of friction lags: the potential takes that of the last gradient
+        gradient = potential.gradient(u)
+        slope = (potential.value(u + step * d) - potential.value(u - step * d)) / (2 * step)
+        noise = 16 * np.finfo(float).eps * max(abs(potential.value(u)), 1e-3) / step
+        assert slope == pytest.approx(gradient @ d, rel=1e-4, abs=noise + 1e-4 * np.linalg.norm(gradient[n:]))
+    potential.gradient(u)
+    rigid = potential.solver.rigid
+    count = rigid.row_count.numpy()[0]
+    rows = rigid.row_jacobian.numpy()[0, :count].T @ rigid.row_coupling.numpy()[0, :count]
+    np.testing.assert_allclose(rows, rows.T, atol=1e-6 * np.abs(rows).max())
+    assert np.linalg.eigvalsh(rows).min() >= -1e-6 * np.abs(rows).max()
+    difference = np.array([row_gradient(potential, u, step, j) for j in range(m)])
+    np.testing.assert_allclose(rows, difference, atol=1e-4 * np.abs(rows).max())
+
+
+def row_gradient(potential, u, step, j):
+    """Return the central difference over r_j of the rows' share of the gradient."""
+    rigid, n = potential.solver.rigid, 3 * potential.n
+    shares = []
+    for sign in (1.0, -1.0):
+        moved = u.copy()
+        moved[n + j] += sign * step
+        potential.value(moved)
+        count = rigid.row_count.numpy()[0]
+        shares.append(rigid.row_force.numpy()[0, :count] @ rigid.row_jacobian.numpy()[0, :count].astype(float))
+    return (shares[0] - shares[1])[: len(potential.r)] / (2 * step)
 
 
 def test_ground_does_not_pull():
@@ -277,7 +317,13 @@ def workshop(world_count=1):
             add_reduced_body(world, body, material=Material(friction=0.8), position=(x, 0.0, z))
 
     scene = Scene(
-        populate, [body], coupled=True, gravity=DOWN, ground=0.8, world_count=world_count, rigid_contact_max=64
+        populate,
+        [body],
+        coupled=True,
+        gravity=DOWN,
+        ground=0.8,
+        world_count=world_count,
+        mujoco={"njmax": 128, "nconmax": 64},
     )
     target = scene.control.joint_target_q.numpy().reshape(world_count, -1)
     target[:, 1:3] = GRIPPER["squeeze"]
