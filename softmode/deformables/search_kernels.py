@@ -163,7 +163,9 @@ def begin_search(
             last = 0
     for j in range(rigid.count[w]):
         slope += rigid.gradient[w, j] * rigid.direction[w, j]
-        if not (wp.abs(rigid.direction[w, j]) <= wp.float64(rigid_tolerance[w])):
+        # dofs that take part are in contact: a light body moves where the soft one stays
+        limit = wp.min(wp.float64(rigid_tolerance[w]), wp.float64(0.01) * stick_range)
+        if not (wp.abs(rigid.direction[w, j]) <= limit):
             last = 0
     progress.slope[w] = slope
     progress.step_length[w] = wp.float64(1.0)
