@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from softmode.deformables.tables import Instances
+from softmode.deformables.tables import Instances, in_mask
 
 wp.set_module_options({"enable_backward": False})
 
@@ -11,6 +11,7 @@ wp.set_module_options({"enable_backward": False})
 def hold_pins(
     instances: Instances,
     instance_start: wp.array[int],  # (world_count + 1,)
+    instance_world: wp.array[int],
     world_mask: wp.array[wp.bool],
     local: int,
     first: int,
@@ -21,7 +22,9 @@ def hold_pins(
     """Hold (sign 1) or release (sign -1) pins of one body in the masked worlds."""
     w, p = wp.tid()
     i = instance_start[w] + local
-    if world_mask[w] and i < instance_start[w + 1]:
+    if i >= instance_start[w + 1]:
+        return
+    if in_mask(instance_world[i], world_mask):
         pin = instances.pin_start[i] + first + p
         pin_stiffness[pin] = sign * wp.abs(pin_stiffness[pin])
 
@@ -29,12 +32,13 @@ def hold_pins(
 @wp.kernel
 def hold_all_pins(
     instances: Instances,
+    instance_world: wp.array[int],
     world_mask: wp.array[wp.bool],
     # In and out:
     pin_stiffness: wp.array[float],
 ):
     """Hold every pin of the masked worlds."""
     i, p = wp.tid()
-    if world_mask[instances.world[i]] and p < instances.pin_count[i]:
+    if p < instances.pin_count[i] and in_mask(instance_world[i], world_mask):
         pin = instances.pin_start[i] + p
         pin_stiffness[pin] = wp.abs(pin_stiffness[pin])

@@ -21,7 +21,7 @@ What step 3 neglects of MuJoCo's answer to the forces: the implicit integrator d
 dofs that are both damped and constrained; and contacts that MuJoCo will only detect in the next step.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import newton
@@ -33,6 +33,7 @@ from softmode.deformables import constraint_kernels as constraints
 from softmode.deformables import coupling_kernels as kernels
 from softmode.deformables.authoring import register_custom_attributes
 from softmode.deformables.body import ReducedBody
+from softmode.deformables.observables import REDUCED_KINDS, RIGID_KINDS, CoupledObservables, ReducedObservableKind
 from softmode.deformables.rigid_dofs import RigidDofs
 from softmode.deformables.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.errors import ConfigError
@@ -51,6 +52,10 @@ class SolverCoupledReduced(SolverBase):
         options: How the soft step is solved.
         rigid: The MuJoCo solver; default ``SolverMuJoCo(model)``.
     """
+
+    ObservableKind = ReducedObservableKind
+    Observables = CoupledObservables
+    SUPPORTED_OBSERVABLES = REDUCED_KINDS | RIGID_KINDS
 
     @classmethod
     def register_custom_attributes(cls, builder: newton.ModelBuilder) -> None:
@@ -159,6 +164,16 @@ class SolverCoupledReduced(SolverBase):
         """Soft contact wrench on every rigid body about its centre of mass [N, N m], shape (body_count,)."""
         return self.reduced.body_wrench
 
+    def observables(
+        self, kinds: Iterable[str], *, contacts: newton.Contacts | None = None, requires_grad: bool | None = None
+    ) -> CoupledObservables:
+        """Allocate arrays for what a step shall report; see ``SolverBase.observables``."""
+        container: Any = super().observables(kinds, contacts=contacts, requires_grad=requires_grad)
+        container.rigid = self.rigid.observables(container.kinds & RIGID_KINDS, requires_grad=requires_grad)
+        for kind in container.rigid.kinds:
+            setattr(container, kind, getattr(container.rigid, kind))
+        return container
+
     def step(
         self,
         state_in: newton.State,
@@ -171,9 +186,10 @@ class SolverCoupledReduced(SolverBase):
     ) -> None:
         """Advance soft and rigid bodies by ``dt`` [s]."""
         self.validate_observables(observables, contacts)
+        of_rigid = None if observables is None else observables.rigid
         data = self.rigid.mjw_data
         wp.copy(self.activation, data.act)
-        self.rigid.step(state_in, self.predicted_state, control, contacts, dt, observables=observables)
+        self.rigid.step(state_in, self.predicted_state, control, contacts, dt, observables=of_rigid)
         wp.copy(self.warmstart, data.qacc_warmstart)
 
         self.reduced.begin(state_in, control, dt)
@@ -184,9 +200,10 @@ class SolverCoupledReduced(SolverBase):
         self.reduced.finish(state_out, dt)
 
         self._find_pushed()
-        arguments = {"control": control, "contacts": contacts, "dt": dt, "observables": observables}
+        arguments = {"control": control, "contacts": contacts, "dt": dt, "observables": of_rigid}
         self._branch(self.any_pushed, self._correct, state_in=state_in, state_out=state_out, **arguments)
         self._keep_prediction(state_out)
+        self.reduced.report(observables)
 
     def _branch(self, condition: wp.array, body: Callable[..., None], **arguments: Any) -> None:
         """Do what is needed only if ``condition`` holds; on CUDA always.

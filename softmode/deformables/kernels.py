@@ -39,6 +39,7 @@ from softmode.deformables.tables import (
     Rigid,
     blocks_of,
     has_contacts,
+    in_mask,
     pushes,
 )
 
@@ -495,9 +496,27 @@ def skin_samples(
 
 
 @wp.kernel
+def set_masses(
+    volume: wp.array[wp.float64],  # (instance_count,) [m^3]
+    size: wp.array[float],
+    density: wp.array[float],
+    # Out:
+    mass_out: wp.array[wp.float64],
+    inertia_out: wp.array[float],
+):
+    """Compute the masses of the bodies from their densities."""
+    i = wp.tid()
+    mass_out[i] = wp.float64(density[i]) * volume[i]
+    inertia_out[i] = density[i] * size[i] * size[i]
+
+
+@wp.kernel
 def reset_functions(
     instances: Instances,
+    instance_world: wp.array[int],
     world_mask: wp.array[wp.bool],
+    positions: int,
+    velocities: int,
     q_in: wp.array[wp.vec3d],
     qd_in: wp.array[wp.vec3d],
     # Out:
@@ -507,17 +526,20 @@ def reset_functions(
 ):
     """Copy the initial coordinates of the bodies in masked worlds and forget the step before."""
     i, k = wp.tid()
-    if k >= instances.function_count[i] or not world_mask[instances.world[i]]:
+    if k >= instances.function_count[i] or not in_mask(instance_world[i], world_mask):
         return
     f = instances.function_start[i] + k
-    q_out[f] = q_in[f]
-    qd_out[f] = qd_in[f]
+    if positions != 0:
+        q_out[f] = q_in[f]
+    if velocities != 0:
+        qd_out[f] = qd_in[f]
     dt_before_out[i] = wp.float64(0.0)
 
 
 @wp.kernel
 def reset_worlds(
     instances: Instances,
+    instance_world: wp.array[int],
     body_world: wp.array[int],
     world_mask: wp.array[wp.bool],
     # Out:
@@ -528,14 +550,9 @@ def reset_worlds(
 ):
     """Clear what the masked worlds report: status, entries, contact force on bodies, wrench on rigid bodies."""
     i = wp.tid()
-    if i < status_out.shape[0] and world_mask[i]:
-        status_out[i] = 0
-    if i < instances.world.shape[0] and world_mask[instances.world[i]]:
+    if i < instance_world.shape[0] and in_mask(instance_world[i], world_mask):
+        status_out[instances.world[i]] = 0
         instance_force_out[i] = wp.vec3d()
         entry_count_out[i] = 0
-    if i < body_world.shape[0]:
-        w = body_world[i]
-        if w < 0:
-            w = world_mask.shape[0] - 1
-        if world_mask[w]:
-            body_wrench_out[i] = wp.spatial_vector()
+    if i < body_world.shape[0] and in_mask(body_world[i], world_mask):
+        body_wrench_out[i] = wp.spatial_vector()

@@ -26,6 +26,7 @@ from softmode.deformables.buffers import make_entries, make_motion, make_points,
 from softmode.deformables.lanes import LANES, team_size, vec8, vec8d
 from softmode.deformables.layout import candidate_shapes, join_systems, lay_out
 from softmode.deformables.materials import MaterialModel
+from softmode.deformables.observables import REDUCED_KINDS, ReducedObservableKind, ReducedObservables
 from softmode.deformables.pairs import SoftPairs
 from softmode.deformables.rigid_dofs import RigidDofs
 from softmode.deformables.shape_tables import heightfields, mesh_sources, solid_shapes
@@ -120,6 +121,10 @@ class SolverReduced(SolverBase):
         ConfigError: If a body of the model is not among ``bodies``, or a shape cannot be touched.
     """
 
+    ObservableKind = ReducedObservableKind
+    Observables = ReducedObservables
+    SUPPORTED_OBSERVABLES = REDUCED_KINDS
+
     @classmethod
     def register_custom_attributes(cls, builder: newton.ModelBuilder) -> None:
         """Declare the attributes of reduced bodies on a builder."""
@@ -147,6 +152,8 @@ class SolverReduced(SolverBase):
             ("smoothing", options.contact_smoothing),
         ):
             setattr(self.instances, name, wp.array(fraction * layout.size, dtype=float, device=device))
+        volumes = np.array([body.volume for body in self.bodies])[layout.asset]
+        self.volume = wp.array(volumes, dtype=wp.float64, device=device)
         self.instances.mass = wp.zeros(self.instance_count, dtype=wp.float64, device=device)
         self.instances.inertia = wp.zeros(self.instance_count, dtype=float, device=device)
         smallest = np.full(self.world_count, np.inf)
@@ -186,6 +193,8 @@ class SolverReduced(SolverBase):
         """Contact wrench on every rigid body about its centre of mass [N, N m]."""
         none = np.zeros(self.world_count, int)
         self.attach_rigid(RigidDofs(model, self.world_count, none, none))
+        self.every_world = wp.full(self.world_count + 1, True, dtype=bool, device=device)
+        self._check_materials()
         self.refresh()
 
     def _chunks(self, threads: int) -> int:
@@ -238,21 +247,29 @@ class SolverReduced(SolverBase):
         return self.progress.iteration
 
     def refresh(self) -> None:
-        """Read back what the model's parameters decide on the host: masses from densities."""
-        volumes = np.array([body.volume for body in self.bodies])[self.layout.asset]
-        density = self.parameters.density.numpy()
+        """Compute what follows from the model's parameters: masses from densities."""
+        instances = self.instances
+        inputs = [self.volume, instances.size, self.parameters.density]
+        self._launch(kernels.set_masses, self.instance_count, inputs, [instances.mass, instances.inertia])
+
+    def _check_materials(self) -> None:
+        """Refuse materials that the bodies cannot have."""
         models = self.parameters.material_model.numpy()
         if (self.instances.driven_count.numpy()[models == int(MaterialModel.NEO_HOOKEAN)] > 0).any():
             raise ConfigError(
                 "a body with exact regions has the material NEO_HOOKEAN, which a driven region may invert in one step",
                 hint="use STABLE_NEO_HOOKEAN_LOG, or a soft region",
             )
-        self.instances.mass.assign(density * volumes)
-        self.instances.inertia.assign(density * self.layout.size**2)
 
     def notify_model_changed(self, flags: int) -> None:
-        """Follow changes of the model; material and pin arrays are read live, masses are recomputed."""
+        """Follow changes of the model: call it, with any flags, after a change of density or material model.
+
+        Everything else (Young's modulus, Poisson's ratio, viscosity, damping, friction, contact stiffness, pins,
+        gravity, shapes' poses and friction) is read in every step. May be captured, and then checks nothing.
+        """
         self.refresh()
+        if not self.model.device.is_capturing:
+            self._check_materials()
 
     # -- the step -----------------------------------------------------------------------------------------------------
 
@@ -275,6 +292,7 @@ class SolverReduced(SolverBase):
         self.detect(state_in, control, dt, prescribed=True)
         self.minimise(dt)
         self.finish(state_out, dt)
+        self.report(observables)
 
     def begin(self, state: newton.State, control: newton.Control | None, dt: float) -> None:
         """Read the state and predict."""
@@ -593,6 +611,15 @@ class SolverReduced(SolverBase):
         )
         self.update_particles(state)
 
+    def report(self, observables: Any) -> None:
+        """Write the contact forces of the step into the arrays that ``observables`` asks for."""
+        if observables is None:
+            return
+        if observables.is_requested(ReducedObservableKind.BODY_SOFT_CONTACT_F):
+            wp.copy(observables.body_soft_contact_f, self.body_wrench, count=self.model.body_count)
+        if observables.is_requested(ReducedObservableKind.INSTANCE_CONTACT_F):
+            wp.copy(observables.instance_contact_f, self.instance_force)
+
     def update_particles(self, state: newton.State) -> None:
         """Move the surface particles of ``state`` to where its reduced coordinates put them."""
         out = getattr(state, NAMESPACE)
@@ -607,29 +634,39 @@ class SolverReduced(SolverBase):
             state: State to reset in place.
             world_mask: Boolean mask of shape (world_count + 1,), the last entry for entities outside worlds; or None
                 for all.
-            flags: Accepted for the contract; reduced coordinates are always reset.
+            flags: ``newton.StateFlags``; coordinates are reset with PARTICLE_Q, velocities with PARTICLE_QD. None
+                resets all.
+
+        Raises:
+            ConfigError: If the mask has another shape.
         """
-        if world_mask is None:
-            world_mask = self._every_world()
+        mask = self.every_world if world_mask is None else world_mask
+        if mask.shape != self.every_world.shape:
+            raise ConfigError(
+                f"world_mask must have shape (world_count + 1,) = {self.every_world.shape}, got {mask.shape}",
+                hint="give the entities outside all worlds the last entry",
+            )
+        flags = int(newton.StateFlags.ALL if flags is None else flags)
         initial, out = self.parameters, getattr(state, NAMESPACE)
+        chosen = [flags & int(newton.StateFlags.PARTICLE_Q), flags & int(newton.StateFlags.PARTICLE_QD)]
         self._launch(
             kernels.reset_functions,
             (self.instance_count, self.stride),
-            [self.instances, world_mask, initial.q, initial.qd],
+            [self.instances, initial.instance_world, mask, *chosen, initial.q, initial.qd],
             [out.q, out.qd, out.dt_before],
         )
         dim = (self.instance_count, self.layout.sample_max)
-        self._launch(stick_kernels.forget_slip, dim, [self.instances, world_mask], [out.stick_shape])
+        self._launch(stick_kernels.forget_slip, dim, [self.instances, initial.instance_world, mask], [out.stick_shape])
         self._launch(
             kernels.reset_worlds,
-            max(self.world_count, self.instance_count, self.model.body_count),
-            [self.instances, self.model.body_world, world_mask],
+            max(self.instance_count, self.model.body_count),
+            [self.instances, initial.instance_world, self.model.body_world, mask],
             [self.status, self.instance_force, self.body_wrench, self.entries.count],
         )
         if self.layout.pin_max:
             dim = (self.instance_count, self.layout.pin_max)
             pins = [self.parameters.pin_stiffness]
-            self._launch(attachment_kernels.hold_all_pins, dim, [self.instances, world_mask], pins)
+            self._launch(attachment_kernels.hold_all_pins, dim, [self.instances, initial.instance_world, mask], pins)
         self.update_particles(state)
 
     def release(self, attachment: Attachment, world_mask: wp.array | None = None) -> None:
@@ -646,18 +683,14 @@ class SolverReduced(SolverBase):
         self._hold(attachment, world_mask, 1.0)
 
     def _hold(self, attachment: Attachment, world_mask: wp.array | None, sign: float) -> None:
-        mask = self._every_world() if world_mask is None else world_mask
+        mask = self.every_world if world_mask is None else world_mask
         where = [attachment.instance, attachment.first, sign]
         self._launch(
             attachment_kernels.hold_pins,
             (self.world_count, attachment.count),
-            [self.instances, self.progress.instance_start, mask, *where],
+            [self.instances, self.progress.instance_start, self.parameters.instance_world, mask, *where],
             [self.parameters.pin_stiffness],
         )
-
-    def _every_world(self) -> wp.array:
-        """Return a mask of all worlds."""
-        return wp.full(self.world_count + 1, True, dtype=bool, device=self.model.device)
 
     def _control(self, control: newton.Control | None) -> Any:
         """Return the control attributes, the model's where there is no control."""

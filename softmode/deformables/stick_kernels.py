@@ -7,7 +7,7 @@ memory of a sample is, per slot, the shape it sticks to and a point in that shap
 import warp as wp
 
 from softmode.deformables.detection import Samples, Shapes, shape_frame
-from softmode.deformables.tables import SLOTS, Entries, Instances, mat23d
+from softmode.deformables.tables import SLOTS, Entries, Instances, mat23d, in_mask
 
 wp.set_module_options({"enable_backward": False})
 
@@ -69,11 +69,12 @@ def remember_slip(
 @wp.kernel
 def forget_slip(
     instances: Instances,
+    instance_world: wp.array[int],
     world_mask: wp.array[wp.bool],
     # State out:
     stick_shape_out: wp.array[wp.vec2i],
 ):
     """Let the samples in masked worlds stick to nothing."""
     i, s = wp.tid()
-    if s < instances.sample_count[i] and world_mask[instances.world[i]]:
+    if s < instances.sample_count[i] and in_mask(instance_world[i], world_mask):
         stick_shape_out[instances.particle_start[i] + s] = wp.vec2i(-1, -1)

@@ -197,6 +197,14 @@ def first_coupled(instances: Instances, i: int):
 
 
 @wp.func
+def in_mask(world: int, world_mask: wp.array[wp.bool]):
+    """Return whether a mask of shape (world_count + 1,) selects a world; the last entry is that of world -1."""
+    if world < 0:
+        return world_mask[world_mask.shape[0] - 1]
+    return world_mask[world]
+
+
+@wp.func
 def blocks_of(function_count: int):
     """Return the number of blocks that hold so many functions."""
     return (function_count + 7) / 8
