@@ -178,22 +178,45 @@ def test_effective_mass_of_a_sample():
     assert (out.numpy() < mass).all()
 
 
-def test_out_of_place_entry():
-    """An entry that is not in place would lose its coordinates: the message says what to pass."""
-    builder = newton.ModelBuilder()
+def couple(**entry):
+    """Return the model of a box that rests on a cube on the ground, and a coupler of three passes around both."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
     register_custom_attributes(builder)
-    add_free_box(builder, BOX, 1.0, (0.0, 0.0, 0.2))
-    add_reduced_body(builder, cube())
+    SolverMuJoCo.register_custom_attributes(builder)
+    add_free_box(builder, BOX, 1.0, (0.0, 0.0, EDGE + BOX[2]))
+    add_reduced_body(builder, cube(), material=Material(youngs_modulus=5.0e5), position=(0.0, 0.0, 0.5 * EDGE))
+    builder.add_ground_plane()
     model = builder.finalize(device="cpu")
     Entry, Proxy = SolverCoupledProxy.Entry, SolverCoupledProxy.Proxy
-    coupled = SolverCoupledProxy(
-        model,
-        [
-            Entry("rigid", lambda view: SolverMuJoCo(view), bodies=[0], joints=[0]),
-            Entry("soft", lambda view: SolverReducedProxy(view, [cube()]), particles=range(model.particle_count)),
-        ],
-        SolverCoupledProxy.Config(proxies=[Proxy("rigid", "soft", bodies=[0])]),
+    soft = Entry(
+        "soft", lambda view: SolverReducedProxy(view, [cube()]), particles=range(model.particle_count), **entry
     )
+    rigid = Entry("rigid", lambda view: SolverMuJoCo(view, njmax=64, nconmax=32), bodies=[0], joints=[0])
+    config = SolverCoupledProxy.Config(proxies=[Proxy("rigid", "soft", bodies=[0])], iterations=3)
+    return model, SolverCoupledProxy(model, [rigid, soft], config)
+
+
+def test_substeps_of_the_entry():
+    """Two soft steps per step of the coupler: it receives their mean wrench, the box's weight at rest."""
+    model, coupled = couple(in_place=True, substeps=2)
+    states, control = [model.state(), model.state()], model.control()
+    del control.softmode
+    for state in states:
+        newton.eval_fk(model, model.joint_q, model.joint_qd, state)
+    with wp.ScopedCapture(device="cpu") as capture:
+        for a, b in ((0, 1), (1, 0)):
+            coupled.step(states[a], states[b], control, None, 0.008)
+    soft, height = coupled.solver("soft"), []
+    for _ in range(100):
+        wp.capture_launch(capture.graph)
+        height.append(states[0].body_q.numpy()[0, 2])
+    assert soft.impulse.numpy()[0, 2] / 0.008 == pytest.approx(GRAVITY, rel=5e-3)
+    assert np.ptp(height[-20:]) < 1e-5  # what the box received is its weight: it stays
+
+
+def test_out_of_place_entry():
+    """An entry that is not in place would lose its coordinates: the message says what to pass."""
+    model, coupled = couple()
     state, out = model.state(), model.state()
     with pytest.raises(ConfigError, match="in_place"):
         coupled.step(state, out, None, None, 0.004)
