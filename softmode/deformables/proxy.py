@@ -26,11 +26,8 @@ from softmode.deformables.rigid_dofs import RigidDofs
 from softmode.deformables.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.errors import ConfigError
 
-STATE_FIELDS = ("q", "qd", "q_before", "qd_before", "dt_before")
-"""Attributes of ``state.softmode`` that a pass of a coupler must start from again."""
-
-LIVE_FIELDS = ("material_model", *MATERIAL_FIELDS, "contact_stiffness", "pin_stiffness")
-"""Attributes of ``model.softmode`` that may change at run time."""
+LIVE_FIELDS = ("material_model", *MATERIAL_FIELDS, "contact_stiffness")
+"""Attributes of ``model.softmode`` that may change at run time and that a view copies."""
 
 
 class SolverReducedProxy(SolverReduced, CouplingInterface):
@@ -42,9 +39,9 @@ class SolverReducedProxy(SolverReduced, CouplingInterface):
     ``coupled.entry_state("soft")``. For the same reason ``in_place`` is needed, and what is written into the parent
     state's ``softmode`` is not read; particles, poses and velocities are exchanged.
 
-    Targets of pins and driven regions are read from ``coupled.solver("soft").parameters`` (``pin_target``,
-    ``q_driven``), not from the control. Newton copies the controls of custom frequencies in a way that cannot be
-    captured on CPU: give the coupler a control without them, ``del control.softmode``.
+    Pins and driven regions are read from ``coupled.solver("soft").parameters`` (``pin_stiffness``, ``pin_target``,
+    ``q_driven``), not from the model or the control. Newton copies the controls of custom frequencies in a way that
+    cannot be captured on CPU: give the coupler a control without them, ``del control.softmode``.
 
     Proxy joints are not simulated: a proxy is a free body with the effective inertia that the source reports.
 
@@ -132,8 +129,8 @@ class SolverReducedProxy(SolverReduced, CouplingInterface):
         """Prepare to start passes again from the state at the start of the step."""
         self.coupled = True
         if enabled:
-            sources = {name: getattr(self.parameters, name) for name in STATE_FIELDS}
-            self.start = {name: wp.zeros_like(source) for name, source in sources.items()}
+            state = vars(getattr(self.model.state(), NAMESPACE))
+            self.start = {name: value for name, value in state.items() if isinstance(value, wp.array)}
 
     def coupling_notify_input_state_update(
         self, state: Any, flags: int, *, iteration_restart: bool = False, dt: float = 0.0
