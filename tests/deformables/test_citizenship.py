@@ -4,12 +4,14 @@ The checks of notifications, masks and observables follow Newton's own of a cust
 newton/tests/test_custom_solver.py.
 """
 
+from typing import Any
+
 import newton
 import numpy as np
 import pytest
 import warp as wp
 from newton.solvers import SolverBase, SolverMuJoCo
-from newton.solvers.experimental.coupled import ModelView
+from newton.solvers.experimental.coupled import ModelView  # pyright: ignore[reportMissingImports]
 
 from softmode.deformables.coupling import SolverCoupledReduced
 from softmode.deformables.materials import Material
@@ -36,10 +38,9 @@ def world_builder(material=None):
     return builder
 
 
-def finish(builder, *, ground=True):
-    """Return the model of a builder, with gravity."""
-    if ground:
-        builder.add_ground_plane(height=-0.06)
+def finish(builder) -> Any:
+    """Return the model of a builder, with ground and gravity."""
+    builder.add_ground_plane(height=-0.06)
     model = builder.finalize(device="cpu")
     model.set_gravity((0.0, 0.0, -GRAVITY))
     return model
@@ -65,9 +66,10 @@ class Run:
 
     def __init__(self, kind, model):
         """Build the solver and the states."""
-        self.model, self.solver = model, solver_of(kind, model)
-        self.states = [model.state(), model.state()]
-        self.control = model.control()
+        self.model: Any = model
+        self.solver: Any = solver_of(kind, model)
+        self.states: list[Any] = [model.state(), model.state()]
+        self.control: Any = model.control()
         for state in self.states:
             newton.eval_fk(model, model.joint_q, model.joint_qd, state)
 
@@ -167,7 +169,8 @@ def test_view_of_a_model():
     views = [Run(SolverReduced, model)]
     view = ModelView(model, "view")
     solver = SolverReduced(view, [cube()])
-    state, out = model.state(), model.state()
+    state: Any = model.state()
+    out: Any = model.state()
     for each in (state, out):
         newton.eval_fk(model, model.joint_q, model.joint_qd, each)
     for flag in newton.ModelFlags:

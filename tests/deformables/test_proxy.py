@@ -1,11 +1,13 @@
 """SolverReduced as an entry of Newton's SolverCoupledProxy: contact force, squeeze, energy, worlds, restarts."""
 
+from typing import Any
+
 import newton
 import numpy as np
 import pytest
 import warp as wp
 from newton.solvers import SolverMuJoCo
-from newton.solvers.experimental.coupled import SolverCoupledProxy
+from newton.solvers.experimental.coupled import SolverCoupledProxy  # pyright: ignore[reportMissingImports]
 
 from benchmarks.coupling import HELD, gripper_world, impact, squeeze
 from benchmarks.coupling_schemes import Coupled, Cube, World
@@ -126,7 +128,7 @@ def test_parameters_reach_the_entry():
 def test_without_rigid_bodies():
     """With no rigid body the entry is the plain solver, bit for bit."""
 
-    def populate():
+    def populate() -> Any:
         builder = newton.ModelBuilder()
         instance = add_reduced_body(builder, cube(), position=(0.0, 0.0, 0.06))
         corners = 0.5 * EDGE * np.array([[x, y, 1.0] for x in (-1, 1) for y in (-1, 1)])
@@ -164,7 +166,7 @@ def test_effective_mass_of_a_sample():
     """3 / tr(J M^-1 J^T) of a surface sample: the inertia that one force on it meets, against the dense formula."""
     builder = newton.ModelBuilder()
     add_reduced_body(builder, cube())
-    model = builder.finalize(device="cpu")
+    model: Any = builder.finalize(device="cpu")
     solver = SolverReducedProxy(model, [cube()])
     index = np.array([0, 7, 149])
     kinds = np.full(3, int(SolverReducedProxy.EndpointKind.PARTICLE))
@@ -178,7 +180,7 @@ def test_effective_mass_of_a_sample():
     assert (out.numpy() < mass).all()
 
 
-def couple(**entry):
+def couple(**entry) -> tuple[Any, Any]:
     """Return the model of a box that rests on a cube on the ground, and a coupler of three passes around both."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
     register_custom_attributes(builder)
