@@ -211,7 +211,17 @@ def _free_bodies(model: Any, world_count: int) -> RigidDofs:
     counts = 6 * np.bincount(world, minlength=world_count)
     dofs = RigidDofs(model, world_count, counts, np.concatenate([[0], np.cumsum(counts)[:-1]]))
     if count:
-        each = np.arange(count)
-        dofs.set_tree(each, np.zeros(count, int), 6 * each, np.full(count, 6), (count, 6, 6))
-        dofs.jacobian.assign(np.tile(np.eye(6, dtype=np.float32), (count, 1, 1)))
+        # each body is a tree of its own, with one link that its six dofs move as they are
+        first = 6 * np.arange(count)
+        each = {
+            "body_articulation": np.arange(count),
+            "body_link": np.zeros(count, int),
+            "articulation_dof_start": first,
+            "articulation_dof_count": np.full(count, 6),
+        }
+        arrays = {name: wp.array(values, dtype=int, device=model.device) for name, values in each.items()}
+        arrays["jacobian"] = wp.array(np.tile(np.eye(6), (count, 1, 1)), dtype=float, device=model.device)
+        for name, array in arrays.items():
+            setattr(dofs, name, array)
+            setattr(dofs.table, name, array)
     return dofs
