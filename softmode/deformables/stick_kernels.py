@@ -7,7 +7,7 @@ memory of a sample is, per slot, the shape it sticks to and a point in that shap
 import warp as wp
 
 from softmode.deformables.detection import Samples, Shapes, shape_frame
-from softmode.deformables.tables import SLOTS, Entries, Instances, mat23d, in_mask
+from softmode.deformables.tables import SLOTS, Entries, Instances, in_mask, mat23d
 
 wp.set_module_options({"enable_backward": False})
 
