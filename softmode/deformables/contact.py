@@ -142,7 +142,9 @@ def sum_reactions(
         total = wp.vec3d()
         for e in range(first_coupled(instances, i), entries.count[i]):
             f = entries.force[i, e]
-            if e >= instances.pin_count[i]:
+            # what a body does to itself is no force on it
+            within = e >= entries.count[i] - entries.pair_count[i] and entries.partner[i, e] < 0
+            if e >= instances.pin_count[i] and not within:
                 total += f
             body = entries.body[i, e]
             if body >= 0:
