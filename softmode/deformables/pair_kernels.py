@@ -4,13 +4,14 @@ The surface of a body is what its samples x_k with deformed normals n_k say: nea
 least-squares surface (Kolluri 2008, doi:10.1145/1361192.1361195, eq. 1)
 
     gap(x) = sum_k theta_k n_k . (x - x_k) / sum_k theta_k,
-    theta_k = exp(-(|x - x_k|^2 - d_min^2) / h^2) max(-n . n_k, 0)^2,
+    theta_k = exp(-(|x - x_k|^2 - d_min^2) / h^2) max(-n . n_k - c, 0)^2,
 
-h three quarters of the spacing of the samples, n the normal of the sample at x: exact for a plane, without the bumps
-that a ball around every sample would have, and blind to what lies around a sharp edge. Samples of each body are tested
-against the surfaces of the others. What is touched of the other body is the material at x itself,
+h three quarters of the spacing of the samples, n the normal of the sample at x, c = 0.3: exact for a plane, without the
+bumps that a ball around every sample would have, and blind to what lies around a sharp edge. Samples of each body are tested
+against the surfaces of the others. What is touched of the other body is the material at x, less the gap n that has to
+close before,
 
-    sum_k theta_k b(x_k) / sum_k theta_k + grad b(X_t) . F_t^-1 (x - sum_k theta_k x_k / sum_k theta_k),
+    sum_k theta_k b(X_k) / sum_k theta_k + grad b(X_t) . F_t^-1 (x - max(gap, 0) n - sum_k theta_k x_k / sum_k theta_k),
 
 t the nearest sample: exact where the body moves affinely. Force and reaction then act on one point, and neither the
 normal force nor friction turns the two bodies together.
@@ -34,15 +35,17 @@ wp.set_module_options({"enable_backward": False})
 SLOTS = 2
 """Other bodies that one sample may touch: the nearest two."""
 FACING = wp.constant(0.3)
-"""Cosine between normals above which two samples look the same way and cannot touch: the far side of a thin body."""
-ASIDE = wp.constant(wp.float64(1.0e-4))
-"""Weight of a sample that looks across, against one that looks at the point: behind a sharp edge it says nothing."""
+"""c: one sample looks at another where the cosine between their normals is below -c. Above c they look the same way and
+cannot touch: the far side of a thin body."""
 WIDTH = wp.constant(0.75)
 """h in spacings."""
 CUTOFF = wp.constant(9.0)
 """Exponent of theta beyond which a sample says nothing: three h."""
 LATERAL = wp.constant(wp.float64(1.2))
 """How far beside the samples, in spacings, a point may lie and still be above the surface."""
+FLAT = wp.constant(wp.float64(0.95))
+"""How much of a surface must look one way, |sum theta n| / sum theta, to be touched by a sample that does not look at
+it, as on a blade."""
 ACROSS = wp.constant(wp.float64(0.5))
 """Cosine between a sample's normal and the surface's below which the sample belongs to a face around an edge."""
 NEIGHBOURHOOD = wp.constant(wp.float64(2.0))
@@ -170,17 +173,27 @@ def may_touch(instances: Instances, basis: Basis, pairs: Pairs, i: int, s: int, 
 
 
 @wp.func
-def weigh(samples: Samples, pairs: Pairs, i: int, s: int, j: int, t: int, nearest: wp.float64):
+def looks_at(pairs: Pairs, i: int, s: int, j: int, t: int):
+    """Return whether sample s of instance i looks at sample t of instance j."""
+    return wp.dot(pairs.surface_normal[i, s], pairs.surface_normal[j, t]) < -FACING
+
+
+@wp.func
+def weigh(samples: Samples, pairs: Pairs, i: int, s: int, j: int, t: int, nearest: int):
     """Return theta of sample t of instance j for sample s of instance i, 0 where it is negligible.
 
-    ``nearest`` is the squared distance to the nearest sample [m^2].
+    Where s does not look at the nearest sample it looks at none, and all count alike.
     """
     h = wp.float64(WIDTH * pairs.spacing[j])
-    exponent = (wp.length_sq(samples.position[i, s] - samples.position[j, t]) - nearest) / (h * h)
+    x = samples.position[i, s]
+    least = wp.length_sq(x - samples.position[j, nearest])
+    exponent = (wp.length_sq(x - samples.position[j, t]) - least) / (h * h)
     if exponent > wp.float64(CUTOFF):
         return wp.float64(0.0)
-    facing = wp.float64(wp.max(-wp.dot(pairs.surface_normal[i, s], pairs.surface_normal[j, t]), 0.0))
-    return wp.exp(-exponent) * (facing * facing + ASIDE)
+    ramp = float(1.0)
+    if looks_at(pairs, i, s, j, nearest):
+        ramp = wp.max(-wp.dot(pairs.surface_normal[i, s], pairs.surface_normal[j, t]) - FACING, 0.0)
+    return wp.exp(-exponent) * wp.float64(ramp * ramp)
 
 
 @wp.func
@@ -212,18 +225,17 @@ def beside(instances: Instances, samples: Samples, pairs: Pairs, i: int, s: int,
 
 @wp.func
 def fit_patch(instances: Instances, basis: Basis, samples: Samples, pairs: Pairs, i: int, s: int, j: int, t: int):
-    """Fit the surface of instance j near sample s of instance i; t is its nearest sample."""
+    """Fit the surface of instance j near sample s of instance i; t is its nearest sample, as ``find_pairs`` says."""
     patch = Patch()
     x = samples.position[i, s]
     count = samples.position.shape[1]
-    nearest = wp.length_sq(x - samples.position[j, t])
     offset = wp.vec3d()
     query = wp.hash_grid_query(pairs.grid, wp.vec3(x), pairs.radius[i, s], instances.world[i])
     k = int(0)
     while wp.hash_grid_query_next(query, k):
         if k / count == j and may_touch(instances, basis, pairs, i, s, j, k % count):
             away = x - samples.position[j, k % count]
-            theta = weigh(samples, pairs, i, s, j, k % count, nearest)
+            theta = weigh(samples, pairs, i, s, j, k % count, t)
             n = wp.vec3d(pairs.surface_normal[j, k % count])
             patch.total += theta
             patch.gap += theta * wp.dot(n, away)
@@ -234,12 +246,15 @@ def fit_patch(instances: Instances, basis: Basis, samples: Samples, pairs: Pairs
         return patch
     inverse = wp.float64(1.0) / patch.total
     patch.gap = inverse * patch.gap
+    flat = inverse * wp.length(patch.normal)
     patch.normal = wp.normalize(patch.normal)
     patch.drift = float(inverse) * patch.drift
     offset = inverse * offset
     lateral = offset - wp.dot(offset, patch.normal) * patch.normal
     thick = wp.max(pairs.thickness[instances.row_start[i] + s], pairs.thickness[instances.row_start[j] + t])
     if wp.length(lateral) > LATERAL * wp.float64(pairs.spacing[j]) or patch.gap < wp.float64(-DEPTH * thick):
+        patch.total = wp.float64(0.0)
+    elif flat < FLAT and not looks_at(pairs, i, s, j, t):
         patch.total = wp.float64(0.0)
     elif beside(instances, samples, pairs, i, s, j, x - offset, patch.normal):
         patch.total = wp.float64(0.0)
@@ -288,7 +303,7 @@ def find_pairs(
     pairs.radius[i, s] = radius
     if radius == 0.0:
         return
-    # the nearest samples of the nearest two bodies
+    # the nearest samples of the nearest two bodies, those that it looks at before others
     count = samples.position.shape[1]
     first = int(-1)
     second = int(-1)
@@ -299,6 +314,8 @@ def find_pairs(
     while wp.hash_grid_query_next(query, k):
         if may_touch(instances, basis, pairs, i, s, k / count, k % count):
             distance = wp.length_sq(x - samples.position[k / count, k % count])
+            if not looks_at(pairs, i, s, k / count, k % count):
+                distance += wp.float64(radius * radius)
             if distance < first_distance:
                 if first < 0 or first / count != k / count:
                     second = first
@@ -315,7 +332,9 @@ def find_pairs(
         j = nearest / count
         patch = fit_patch(instances, basis, samples, pairs, i, s, j, nearest % count)
         gap = patch.gap - wp.float64(instances.contact_radius[i] + instances.contact_radius[j])
-        reach = instances.margin[i] + 2.0 * wp.length(samples.drift[i, s] - patch.drift)
+        reach = instances.margin[i]
+        if looks_at(pairs, i, s, j, nearest % count):
+            reach += 2.0 * wp.length(samples.drift[i, s] - patch.drift)
         if patch.total > wp.float64(0.0) and gap < wp.float64(reach):
             pairs.other[i, s, slot] = j
             pairs.gap[i, s, slot] = gap
@@ -442,7 +461,6 @@ def write_pairs(
 
     # the mean of the samples of the other body,
     nearest = pairs.nearest[i, s, slot]
-    distance = wp.length_sq(x - samples.position[j, nearest])
     total = wp.float64(0.0)
     offset = wp.vec3d()
     for b in range(basis.row.shape[1]):
@@ -452,7 +470,7 @@ def write_pairs(
     while wp.hash_grid_query_next(query, point):
         t = point % count
         if point / count == j and may_touch(instances, basis, pairs, i, s, j, t):
-            theta = weigh(samples, pairs, i, s, j, t, distance)
+            theta = weigh(samples, pairs, i, s, j, t, nearest)
             if theta > wp.float64(0.0):
                 total += theta
                 offset += theta * (x - samples.position[j, t])
@@ -460,10 +478,11 @@ def write_pairs(
                     basis.row[row, b] = basis.row[row, b] + float(theta) * basis.row[instances.row_start[j] + t, b]
     inverse = wp.float64(1.0) / total
     # carried on to x; of the same body, the difference to it
+    offset = inverse * offset - wp.max(pairs.gap[i, s, slot], wp.float64(0.0)) * pairs.normal[i, s, slot]
     at = instances.row_start[j] + nearest
     G = displacement_gradient(basis.row_gradient, motion.q_start, j, at, instances.function_count[j])
     F = wp.identity(n=3, dtype=wp.float64) + G
-    X = wp.vec3(inverse * (clamped_inverse(F) * offset))
+    X = wp.vec3(clamped_inverse(F) * offset)
     for b in range(basis.row.shape[1]):
         value = float(inverse) * basis.row[row, b]
         value = value + X[0] * basis.row_gradient[b, at, 0]
