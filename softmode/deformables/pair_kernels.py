@@ -54,7 +54,9 @@ DEPTH = wp.constant(0.3)
 """How deep a point may lie below a surface, as a fraction of the thicker of the two bodies there: beyond, it is seen
 from the far side, through both."""
 SELF_DISTANCE = wp.constant(wp.float64(4.0))
-"""Distance at rest, in spacings, below which samples of one body are neighbours and do not touch."""
+"""Distance at rest, in spacings, below which samples of one body are neighbours and do not touch, unless"""
+SELF_OPENING = wp.constant(wp.float64(1.0))
+"""they see each other across an opening at least so wide."""
 VOLUME_RATIO_MIN = wp.constant(wp.float64(1.0e-2))
 """det F below which F^-1 is kept from growing."""
 
@@ -168,8 +170,12 @@ def may_touch(instances: Instances, basis: Basis, pairs: Pairs, i: int, s: int, 
         return pairs.near[j] != 0 and facing < FACING
     if instances.self_contact[i] == 0 or facing >= 0.0:
         return False
-    apart = basis.row_point[instances.row_start[i] + s] - basis.row_point[instances.row_start[i] + t]
-    return wp.length(apart) > SELF_DISTANCE * wp.float64(pairs.spacing[i])
+    own = instances.row_start[i] + s
+    row = instances.row_start[i] + t
+    away = basis.row_point[row] - basis.row_point[own]
+    spacing = wp.float64(pairs.spacing[i])
+    opening = wp.min(wp.dot(wp.vec3d(basis.row_normal[own]), away), -wp.dot(wp.vec3d(basis.row_normal[row]), away))
+    return wp.length(away) > SELF_DISTANCE * spacing or opening > SELF_OPENING * spacing
 
 
 @wp.func
@@ -187,8 +193,10 @@ def weigh(samples: Samples, pairs: Pairs, i: int, s: int, j: int, t: int, neares
     h = wp.float64(WIDTH * pairs.spacing[j])
     x = samples.position[i, s]
     least = wp.length_sq(x - samples.position[j, nearest])
-    exponent = (wp.length_sq(x - samples.position[j, t]) - least) / (h * h)
-    if exponent > wp.float64(CUTOFF):
+    distance = wp.length_sq(x - samples.position[j, t])
+    exponent = (distance - least) / (h * h)
+    # the grid also returns what lies in the same cells but farther away
+    if exponent > wp.float64(CUTOFF) or distance > wp.float64(pairs.radius[i, s] * pairs.radius[i, s]):
         return wp.float64(0.0)
     ramp = float(1.0)
     if looks_at(pairs, i, s, j, nearest):
@@ -314,6 +322,8 @@ def find_pairs(
     while wp.hash_grid_query_next(query, k):
         if may_touch(instances, basis, pairs, i, s, k / count, k % count):
             distance = wp.length_sq(x - samples.position[k / count, k % count])
+            if distance > wp.float64(radius * radius):
+                continue
             if not looks_at(pairs, i, s, k / count, k % count):
                 distance += wp.float64(radius * radius)
             if distance < first_distance:

@@ -4,9 +4,11 @@ import functools
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.spatial import ConvexHull
 
 from softmode.deformables import status as bits
+from softmode.deformables.attachments import attach
 from softmode.deformables.body import BuildOptions, build_body
 from softmode.deformables.lanes import from_blocks, to_blocks
 from softmode.deformables.materials import Material
@@ -114,8 +116,8 @@ def test_surfaces_equal_the_twin(seed):
                 continue
             j, gap, normal, nearest = touching[i, s]
             assert (j, nearest) == (1 - i, patch[3])
-            assert gap == pytest.approx(patch[0], abs=16 * FLOAT32 * size)
-            np.testing.assert_allclose(normal, patch[1], atol=64 * FLOAT32)
+            assert gap == pytest.approx(patch[0], abs=FLOAT32 * size)
+            np.testing.assert_allclose(normal, patch[1], atol=16 * FLOAT32)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -510,3 +512,333 @@ def test_soft_rigid_soft_stands(time):
     np.testing.assert_allclose(force[:, 2], weight, rtol=2e-3)
     assert box[2] == pytest.approx(0.5 * GRAVITY, rel=2e-3)
     assert np.abs(last - first).max() <= scene.reduced.options.stick_velocity * time + 1e-4
+
+
+@pytest.mark.parametrize("tangent", [0.2, 0.6], ids=["below the cone", "above the cone"])
+def test_friction_between_soft_bodies(tangent):
+    """A cube on a slab that is glued to the world, mu = 0.4: it sticks, or slides with g (sin - mu cos) within 2 %."""
+    mu, dt = 0.4, 0.004
+    angle = np.arctan(tangent)
+    material = Material(youngs_modulus=5.0e5, friction=mu)
+    slab = build_slab()
+
+    def populate(world):
+        i = add_reduced_body(world, slab, material=material)
+        attach(world, i, slab, box=((-1.0, -1.0, -1.0), (1.0, 1.0, -0.0099)))
+        add_reduced_body(world, cube(0.06), material=material, position=(-0.05, 0.0, 0.04 + RIGID_GAP))
+
+    gravity = GRAVITY * np.array([np.sin(angle), 0.0, -np.cos(angle)])
+    scene = Scene(populate, [slab, cube(0.06)], gravity=gravity, dt=dt)
+    scene.step(50)
+    x, v = scene.centre(1)[0], scene.momentum(1)[0][0] / scene.mass(1)
+    scene.step(25)
+    moved, gained = scene.centre(1)[0] - x, scene.momentum(1)[0][0] / scene.mass(1) - v
+    expected = GRAVITY * (np.sin(angle) - mu * np.cos(angle))
+    print(tangent, moved, gained / (25 * dt), expected)
+    if tangent < mu:
+        assert abs(moved) <= scene.reduced.options.stick_velocity * 25 * dt
+    else:
+        assert gained / (25 * dt) == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize(("speed", "dt"), [(0.0, 0.004), (2.0, 0.004), (5.0, 0.004), (5.0, 0.01)])
+def test_thin_sheet_holds_a_ball(speed, dt):
+    """A ball thrown on a sheet of 4 mm, held at two sides, never comes through, and rests with its weight on it."""
+    body = sheet()
+
+    def populate(world):
+        i = add_reduced_body(world, body, material=Material(youngs_modulus=1.0e6))
+        attach(world, i, body, points=body.surface_points[np.abs(body.surface_points[:, 0]) > 0.05])
+        add_reduced_body(world, ball(), position=(0.0, 0.0, 0.033), velocity=(0.0, 0.0, -speed))
+
+    options = SolverReducedOptions(contact_max=512)
+    scene = Scene(populate, [body, ball()], gravity=DOWN, dt=dt, options=options)
+    for _ in range(round(0.4 / dt)):
+        scene.step()
+        middle = surface(scene, 0).points[np.abs(surface(scene, 0).body.surface_points[:, :2]).max(axis=1) < 0.015]
+        assert scene.centre(1)[2] > middle[:, 2].min() + 0.02
+    if speed == 0.0:
+        weight = scene.mass(1) * GRAVITY
+        assert scene.reduced.instance_force.numpy()[1, 2] == pytest.approx(weight, rel=0.05)
+    assert not scene.reduced.status.numpy().any()
+
+
+def test_far_side_does_not_push():
+    """A ball just above a sheet, which it does not touch, feels nothing, nor do two sheets that lie on each other."""
+    for second, height in ((ball(), 0.0321), (sheet(), 0.0041)):
+        scene = two(sheet(), second, (0.0, 0.0, height))
+        scene.step(5)
+        np.testing.assert_array_equal(scene.reduced.instance_force.numpy(), 0.0)
+        for i, _, j, gap, normal, _ in found(scene):
+            assert gap > 0.0
+            assert normal[2] * (i - j) > 0.0
+
+
+def test_contact_radius():
+    """Bodies at rest stand off by the sum of their radii, from the ground by their own."""
+    radii = (0.002, 0.003)
+
+    def populate(world):
+        z = 0.05
+        for radius in radii:
+            z += radius
+            add_reduced_body(
+                world,
+                cube(),
+                material=Material(youngs_modulus=1.0e6),
+                position=(0.0, 0.0, z),
+                contact_radius=radius,
+            )
+            z += EDGE + radius
+
+    scene = Scene(populate, [cube()], gravity=DOWN, ground=0.8)
+    replay = scene.capture()
+    for _ in range(150):
+        replay()
+    points = [surface(scene, i).points[:, 2] for i in range(2)]
+    # the load presses each contact in by its stiffness and smoothing
+    sink = 2.0 * scene.mass() * GRAVITY / (5.0e7 * EDGE**2) + float(scene.reduced.instances.smoothing.numpy()[0])
+    print(points[0].min(), points[1].min() - points[0].max(), sink)
+    assert points[0].min() == pytest.approx(radii[0], abs=sink)
+    assert points[1].min() - points[0].max() == pytest.approx(sum(radii), abs=2 * sink)
+
+
+# -- self contact ------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def build_slab():
+    """Return a slab of 24 x 12 x 2 cm."""
+    quadrature = quadrature_from_box((0.24, 0.12, 0.02), point_count=2000, surface_count=500)
+    options = BuildOptions(mode_count=3, kernel_count=150, cubature_count=120)
+    return build_body(quadrature, options, name="slab")
+
+
+@functools.cache
+def ring(opening=0.01):
+    """Return a ring of square section about Z, cut open at +X by twice ``opening`` [m]; 0 leaves it closed."""
+
+    def distance(x):
+        d = np.maximum(np.abs(np.hypot(x[:, 0], x[:, 1]) - 0.05) - 0.012, np.abs(x[:, 2]) - 0.015)
+        cut = np.maximum(np.abs(x[:, 1]) - opening, -x[:, 0])
+        return np.maximum(d, -cut) if opening > 0.0 else d
+
+    bounds = np.array([[-0.07, -0.07, -0.02], [0.07, 0.07, 0.02]])
+    quadrature = quadrature_from_implicit(distance, bounds, point_count=2000, surface_count=400)
+    options = BuildOptions(mode_count=6, kernel_count=250, cubature_count=200)
+    return build_body(quadrature, options, name=f"ring {opening}")
+
+
+@pytest.mark.parametrize("body", [cube, ball, sheet, ring, functools.partial(ring, 0.0), build_slab])
+def test_at_rest_nothing_touches_itself(body):
+    """A body at rest has no contact with itself, nor one that turns, and it stays at rest."""
+    shape = body()
+
+    def populate(world):
+        add_reduced_body(world, shape, self_contact=True, rotation=rotation((1, 2, 3), 0.5))
+
+    scene = Scene(populate, [shape])
+    assert not [row for row in found(scene) if row[3] <= 0.0]
+    scene.step(3)
+    assert np.abs(scene.reduced.entries.force.numpy()).max() == 0.0
+    assert np.abs(scene.qd()).max() < 1e-6
+
+
+@pytest.mark.parametrize("height", [0.7, 0.45])
+def test_squeezed_body_does_not_touch_its_far_side(height):
+    """A cube pressed flat has no contact of its top with its bottom."""
+    scene = Scene(lambda world: add_reduced_body(world, cube(0.06), self_contact=True), [cube(0.06)])
+    scene.set(q=scene.body().affine(np.diag([1.0, 1.0, height])))
+    assert not found(scene)
+
+
+def tips(scene):
+    """Return the mean width of the opening of the ring [m]: between the samples of its two end faces."""
+    X, x = scene.body().surface_points, surface(scene, 0).points
+    end = (X[:, 0] > 0.03) & (np.abs(np.abs(X[:, 1]) - 0.01) < 0.002)
+    return x[end & (X[:, 1] > 0.0), 1].mean() - x[end & (X[:, 1] < 0.0), 1].mean()
+
+
+@pytest.mark.parametrize("self_contact", [True, False])
+def test_ring_squeezed_shut(self_contact):
+    """Springs that pull the tips of an open ring past each other: they stop where they meet, else they pass."""
+    body = ring()
+
+    def populate(world):
+        i = add_reduced_body(world, body, material=Material(youngs_modulus=1.0e4), self_contact=self_contact)
+        X = np.array([[0.048, side * 0.014, z] for side in (-1, 1) for z in (-0.01, 0.01)])
+        back = np.array([[-0.05, 0.0, -0.01], [-0.05, 0.0, 0.01]])
+        targets = np.concatenate([X - np.sign(X[:, 1:2]) * np.array([0.0, 0.018, 0.0]), back])
+        add_pins(world, i, np.concatenate([X, back]), stiffness=2000.0, targets=targets)
+
+    scene = Scene(populate, [body])
+    assert tips(scene) > 0.015
+    scene.step(100)
+    force = scene.reduced.instance_force.numpy()[0]
+    print(self_contact, "opening", tips(scene), "force", force, scene.reduced.status.numpy())
+    if self_contact:
+        assert -2e-3 < tips(scene) < 1e-3
+        assert scene.reduced.entries.pair_count.numpy()[0] > 0
+    else:
+        assert tips(scene) < -4e-3
+    np.testing.assert_array_equal(force, 0.0)  # what a body does to itself is no force on it
+    assert not scene.reduced.status.numpy().any()
+
+
+def shut_ring(dt):
+    """Let the tips of a ring fly at each other; return errors of p and L, relative to m v and m v R, the largest force
+    [N] and the narrowest opening [m]. Asserts that energy does not grow."""
+    body, material = ring(), Material(youngs_modulus=4.0e4)
+
+    def populate(world):
+        add_reduced_body(world, body, material=material, self_contact=True)
+
+    scene = Scene(populate, [body], dt=dt)
+    twin = reference.FreeBody(body=body, material=reference.with_float32(material), dt=dt)
+    X = body.surface_points
+    v = np.zeros_like(X)
+    v[:, 1] = -np.sign(X[:, 1]) * 8.0 * np.clip((X[:, 0] + 0.05) / 0.1, 0.0, 1.0)
+    scene.set(qd=np.linalg.lstsq(body.surface_basis.astype(float), v, rcond=None)[0])
+    p0, L0 = scene.momentum()
+    e0, scale = scene.kinetic_energy(), scene.mass() * np.abs(v).max()
+    out = []
+    for _ in range(round(0.03 / dt)):
+        scene.step()
+        p, L = scene.momentum()
+        assert scene.kinetic_energy() + twin.elastic_energy(scene.q()) <= (1.0 + 1e-4) * e0
+        count = scene.reduced.entries.count.numpy()[0]
+        force = np.abs(scene.reduced.entries.force.numpy()[0, :count]).max(initial=0.0)
+        out.append([np.abs(p - p0).max() / scale, np.abs(L - L0).max() / (0.05 * scale), force, -tips(scene)])
+    return np.max(out, axis=0) * (1, 1, 1, -1)
+
+
+def test_momentum_of_a_ring_that_shuts():
+    """Contact with itself is no force on the body: p is kept to 1e-8, L to first order in dt as without contact."""
+    errors = [shut_ring(dt) for dt in (0.001, 0.0005)]
+    print(errors)
+    for p, L, force, narrow in errors:
+        assert force > 0.1
+        assert narrow > -2e-3
+        assert p <= 1e-8
+        assert L <= 2.5e-3
+    assert errors[0][1] / errors[1][1] > 1.5
+
+
+# -- worlds, graphs, faults --------------------------------------------------------------------------------------------
+
+
+def crowd(world_count=1, **kw):
+    """Return worlds of three bodies, of which one may touch itself, that fly at each other."""
+
+    def populate(world):
+        material = Material(youngs_modulus=5.0e4)
+        add_reduced_body(world, cube(), material=material, position=(0.0, 0.0, 0.051))
+        add_reduced_body(world, ball(), position=(0.01, 0.0, 0.132), velocity=(0.0, 0.0, -1.0), contact_radius=1e-3)
+        add_reduced_body(
+            world, ring(), material=material, position=(-0.131, 0.0, 0.05), velocity=(1.0, 0, 0), self_contact=True
+        )
+
+    kw = {"gravity": DOWN, "ground": 0.5} | kw
+    return Scene(populate, [cube(), ball(), ring()], world_count=world_count, **kw)
+
+
+def fling(scene, world, seed):
+    """Give the bodies of a world velocities of their own."""
+    rng = np.random.default_rng(seed)
+    for i in range(3 * world, 3 * world + 3):
+        qd = scene.qd(i)
+        qd[0] += 0.2 * rng.normal(size=3)
+        qd[4:7] += 0.02 * rng.normal(size=(3, 3))
+        scene.set(qd=qd, instance=i)
+
+
+def test_world_of_eight_equals_single_world():
+    """World i of 8, each in a state of its own, equals the single world bit for bit."""
+    batch = crowd(8)
+    for w in range(8):
+        fling(batch, w, w)
+    batch.step(15)
+    assert (batch.reduced.entries.pair_count.numpy().reshape(8, 3).max(axis=1) > 0).all()
+    assert len({batch.q(3 * w).tobytes() for w in range(8)}) == 8
+    for w in range(0, 8, 3):
+        alone = crowd()
+        fling(alone, 0, w)
+        alone.step(15)
+        for i in range(3):
+            np.testing.assert_array_equal(batch.q(3 * w + i), alone.q(i))
+            np.testing.assert_array_equal(batch.qd(3 * w + i), alone.qd(i))
+
+
+def test_captured_graph_equals_eager():
+    """A recorded graph gives the bits of kernel-by-kernel launches."""
+    scene, fresh = crowd(2), crowd(2)
+    replay = scene.capture()
+    for _ in range(10):
+        replay()
+    fresh.step(20)
+    assert (fresh.reduced.entries.pair_count.numpy() > 0).any()
+    np.testing.assert_array_equal(scene.state.softmode.q.numpy(), fresh.state.softmode.q.numpy())
+
+
+def test_masked_reset():
+    """A reset world repeats its first run bit for bit, the other one goes on as if nothing had been."""
+    scene, other = crowd(2), crowd(2)
+    scene.step(10)
+    other.step(10)
+    first = [scene.q(i) for i in range(3)]
+    mask = wp.array([True, False, False], dtype=bool, device="cpu")
+    scene.reduced.reset(scene.state, mask)
+    scene.step(10)
+    other.step(10)
+    for i in range(3):
+        np.testing.assert_array_equal(scene.q(i), first[i])
+        np.testing.assert_array_equal(scene.q(3 + i), other.q(3 + i))
+
+
+def test_not_a_number_stays_in_its_world():
+    """NaN in one body is flagged in its world; the other worlds go on bit for bit, whichever body is struck."""
+    for struck in (3, 5):
+        clean, dirty = crowd(3), crowd(3)
+        for scene in (clean, dirty):
+            scene.step(3)
+        qd = dirty.qd(struck)
+        qd[2, 1] = np.nan
+        dirty.set(qd=qd, instance=struck)
+        for k in range(3):
+            clean.step()
+            dirty.step()
+            if k == 0:
+                assert dirty.reduced.status.numpy()[1] & bits.WORLD_NOT_FINITE
+            for i in (0, 1, 2, 6, 7, 8):
+                np.testing.assert_array_equal(dirty.q(i), clean.q(i))
+        q = dirty.q(struck)
+        q[0] = np.nan
+        dirty.set(q=q, instance=struck)
+        clean.step()
+        dirty.step()
+        for i in (0, 1, 2, 6, 7, 8):
+            np.testing.assert_array_equal(dirty.q(i), clean.q(i))
+
+
+@pytest.mark.parametrize("contact_max", [8, 40])
+def test_capacity(contact_max):
+    """Contacts beyond the capacity are flagged; each that is kept has its reaction, and those that touch go first."""
+    scene = two(cube(), cube(), (0.0, 0.0, 0.9995 * EDGE), options=SolverReducedOptions(contact_max=contact_max))
+    scene.step()
+    force = scene.reduced.instance_force.numpy()
+    assert scene.reduced.status.numpy()[0] & bits.WORLD_CONTACT_OVERFLOW
+    assert np.abs(force).max() > 0.1
+    np.testing.assert_array_equal(force[0], -force[1])
+    assert scene.reduced.entries.count.numpy().max() <= contact_max
+    np.testing.assert_allclose(scene.momentum(0)[0] + scene.momentum(1)[0], 0.0, atol=1e-8)
+
+
+def test_soft_contact_may_be_left_out():
+    """With soft_contact=False bodies fly through each other, each with a system of its own."""
+    scene = two(
+        cube(), cube(), (0.0, 0.0, 0.11), velocity=(0, 0, -1.0), options=SolverReducedOptions(soft_contact=False)
+    )
+    assert scene.reduced.pairs is None
+    assert scene.reduced.part_count == 1
+    scene.step(30)
+    np.testing.assert_allclose(scene.momentum(1)[0], [0.0, 0.0, -scene.mass()], atol=1e-5)
