@@ -109,7 +109,9 @@ def evaluate_entries(
             held = slope
             if progress.iteration[w] == 0:
                 # in an impact the first guess lies far too deep: friction of such a force would be too stiff to solve
-                most = wp.float64(smoothing) - wp.float64(2.0) * wp.min(wp.dot(n, entries.offset[i, e]), wp.float64(0.0))
+                most = wp.float64(smoothing) - wp.float64(2.0) * wp.min(
+                    wp.dot(n, entries.offset[i, e]), wp.float64(0.0)
+                )
                 held = wp.min(slope, most)
             entries.normal_force[i, e] = stiffness * held
         normal_force = entries.normal_force[i, e]

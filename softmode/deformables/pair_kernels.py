@@ -7,9 +7,9 @@ least-squares surface (Kolluri 2008, doi:10.1145/1361192.1361195, eq. 1)
     theta_k = exp(-(|x - x_k|^2 - d_min^2) / h^2) max(-n . n_k - c, 0)^2,
 
 h three quarters of the spacing of the samples, n the normal of the sample at x, c = 0.3: exact for a plane, without the
-bumps that a ball around every sample would have, and blind to what lies around a sharp edge. Samples of each body are tested
-against the surfaces of the others. What is touched of the other body is the material at x, less the gap n that has to
-close before,
+bumps that a ball around every sample would have, and blind to what lies around a sharp edge. Samples of each body are
+tested against the surfaces of the others. What is touched of the other body is the material at x, less the gap n that
+has to close before,
 
     sum_k theta_k b(X_k) / sum_k theta_k + grad b(X_t) . F_t^-1 (x - max(gap, 0) n - sum_k theta_k x_k / sum_k theta_k),
 
@@ -419,7 +419,7 @@ def accept_pairs(
     entries: Entries,
     status: wp.array[int],
 ):
-    """Give each pair its two entries, or none: a force without its reaction must not be. Those that touch come first."""
+    """Give each pair its two entries, or none: a force without its reaction must not be. What touches comes first."""
     w = wp.tid()
     first = progress.instance_start[w]
     end = progress.instance_start[w + 1]

@@ -33,7 +33,9 @@ class SoftPairs:
         pairs.spacing = wp.array(spacing[layout.asset], dtype=float, device=self.device)
         pairs.point = self._zeros((count * sample_max,), wp.vec3)
         pairs.surface_normal = self._zeros((count, sample_max), wp.vec3)
-        pairs.thickness = wp.array(np.concatenate([thickness(b) for b in layout.bodies]), dtype=float, device=self.device)
+        pairs.thickness = wp.array(
+            np.concatenate([thickness(b) for b in layout.bodies]), dtype=float, device=self.device
+        )
         pairs.radius = self._zeros((count, sample_max), float)
         self.team = team_size(self.device)
         pairs.tally = self._zeros((count, self.team, 2), int)

@@ -2,6 +2,7 @@
 
 import functools
 
+import newton
 import numpy as np
 import pytest
 import warp as wp
@@ -14,7 +15,13 @@ from softmode.deformables.lanes import from_blocks, to_blocks
 from softmode.deformables.materials import Material
 from softmode.deformables.pairs import thickness
 from softmode.deformables.quadrature import quadrature_from_box, quadrature_from_implicit, quadrature_from_sphere
-from softmode.deformables.solver_reduced import SolverReducedOptions, add_pins, add_reduced_body
+from softmode.deformables.solver_reduced import (
+    SolverReduced,
+    SolverReducedOptions,
+    add_pins,
+    add_reduced_body,
+    register_custom_attributes,
+)
 from tests import reference
 from tests.scenes import GRAVITY, RIGID_GAP, Scene, add_free_box, cube, rotation
 
@@ -690,7 +697,8 @@ def test_ring_squeezed_shut(self_contact):
 
 def shut_ring(dt):
     """Let the tips of a ring fly at each other; return errors of p and L, relative to m v and m v R, the largest force
-    [N] and the narrowest opening [m]. Asserts that energy does not grow."""
+    [N] and the narrowest opening [m]. Asserts that energy does not grow.
+    """
     body, material = ring(), Material(youngs_modulus=4.0e4)
 
     def populate(world):
@@ -845,3 +853,50 @@ def test_soft_contact_may_be_left_out():
     assert scene.reduced.part_count == 1
     scene.step(30)
     np.testing.assert_allclose(scene.momentum(1)[0], [0.0, 0.0, -scene.mass()], atol=1e-5)
+
+
+class Mixed(Scene):
+    """Worlds that differ: each is filled by a function of its own."""
+
+    def __init__(self, worlds, **kw):
+        """Build model, solver and states."""
+        builder = newton.ModelBuilder()
+        register_custom_attributes(builder)
+        for populate in worlds:
+            world = newton.ModelBuilder()
+            populate(world)
+            builder.add_world(world)
+        builder.add_ground_plane()
+        self.bodies, self.dt = [cube(), ball(), cube(0.06)], 0.004
+        self.model = builder.finalize(device="cpu")
+        self.model.set_gravity(DOWN)
+        self.solver = self.reduced = SolverReduced(self.model, self.bodies, **kw)
+        self.control = self.model.control()
+        self.restart()
+
+
+def test_worlds_of_different_numbers_of_bodies():
+    """Worlds of one, three and two bodies, of different sizes, equal the same worlds alone bit for bit."""
+
+    def pile_of(*bodies):
+        def populate(world):
+            height = 0.0
+            for k, body in enumerate(bodies):
+                low, high = body.bounds[:, 2]
+                position = (0.003 * k, 0.0, height + 1e-3 - low)
+                add_reduced_body(world, body, position=position, velocity=(0.0, 0.0, -0.3))
+                height += 1e-3 + high - low
+
+        return populate
+
+    piles = [pile_of(cube()), pile_of(cube(), cube(0.06), ball()), pile_of(cube(0.06), cube())]
+    batch = Mixed(piles)
+    batch.step(30)
+    assert not batch.reduced.status.numpy().any()
+    starts = batch.reduced.layout.instance_start
+    for w, populate in enumerate(piles):
+        alone = Mixed([populate])
+        alone.step(30)
+        for i in range(starts[w + 1] - starts[w]):
+            np.testing.assert_array_equal(batch.q(starts[w] + i), alone.q(i))
+    assert (batch.reduced.entries.pair_count.numpy()[1:] > 0).all()
