@@ -145,8 +145,9 @@ def filled(relations):
 @pytest.mark.parametrize("part", [8, 24])
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_parts(part, share):
-    """A x = b where most parts have nothing to do with each other; what the pattern leaves out is neither read nor
-    written, and its fill is that of the Cholesky factor.
+    """A x = b where most parts have nothing to do with each other: the pattern fills in as the Cholesky factor does.
+
+    What it leaves out is neither read nor written.
     """
     rng = np.random.default_rng(part)
     count, part_count, columns = 3, 6, 3

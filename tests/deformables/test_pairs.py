@@ -696,8 +696,10 @@ def test_ring_squeezed_shut(self_contact):
 
 
 def shut_ring(dt):
-    """Let the tips of a ring fly at each other; return errors of p and L, relative to m v and m v R, the largest force
-    [N] and the narrowest opening [m]. Asserts that energy does not grow.
+    """Let the tips of a ring fly at each other, and assert that energy does not grow.
+
+    Returns:
+        Errors of p and L relative to m v and m v R, the largest force [N] and the narrowest opening [m].
     """
     body, material = ring(), Material(youngs_modulus=4.0e4)
 
