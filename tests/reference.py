@@ -295,6 +295,82 @@ def _distance_to_segments(point: np.ndarray, a: np.ndarray, b: np.ndarray) -> np
 
 
 @dataclass(frozen=True, kw_only=True)
+class Surface:
+    """The deformed surface of a soft body as other bodies' samples see it, through its own samples."""
+
+    body: ReducedBody
+    q: np.ndarray
+    """Coordinates (n, 3) [m]."""
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """Samples (S, 3) [m]."""
+        return self.body.surface_points + self.body.surface_basis.astype(float) @ self.q
+
+    @cached_property
+    def deformation_gradient(self) -> np.ndarray:
+        """F at the samples, (S, 3, 3)."""
+        gradients = self.body.evaluate(self.body.surface_points)[1]
+        return I3 + np.einsum("kc,skd->scd", self.q, gradients)
+
+    @cached_property
+    def normals(self) -> np.ndarray:
+        """Outward unit normals, cof(F) N, (S, 3)."""
+        n = np.einsum("scd,sd->sc", cofactor(self.deformation_gradient), self.body.surface_normals)
+        return n / np.linalg.norm(n, axis=1, keepdims=True)
+
+    @property
+    def spacing(self) -> float:
+        """Spacing of the samples [m]."""
+        return float(np.sqrt(self.body.surface_areas.mean()))
+
+    def patch(self, x: np.ndarray, n: np.ndarray, radius: float) -> tuple[float, np.ndarray, np.ndarray, int] | None:
+        """Return gap [m], normal, weights (S,) and nearest sample of the surface about a sample x with normal n.
+
+        gap = sum w_k n_k . (x - x_k), w_k ~ exp(-|x - x_k|^2 / h^2) max(-n . n_k - 0.3, 0)^2, h = 3/4 spacing. None
+        where there is no surface: no sample within ``radius`` looks at x, or x lies beside all of them.
+        """
+        distance = np.linalg.norm(x - self.points, axis=1)
+        facing = -(self.normals @ n)
+        looking = (distance <= radius) & (facing > 0.3)
+        blade = not looking.any()
+        if blade:
+            looking = (distance <= radius) & (facing > -0.3)
+        if not looking.any():
+            return None
+        nearest = int(np.argmin(np.where(looking, distance, np.inf)))
+        exponent = (distance**2 - distance[nearest] ** 2) / (0.75 * self.spacing) ** 2
+        w = np.where(looking & (exponent <= 9.0), np.exp(-exponent), 0.0)
+        w *= 1.0 if blade else np.maximum(facing - 0.3, 0.0) ** 2
+        w /= w.sum()
+        gap = float(w @ np.einsum("sc,sc->s", self.normals, x - self.points))
+        mean = w @ self.normals
+        normal = mean / np.linalg.norm(mean)
+        offset = x - w @ self.points
+        beside = np.linalg.norm(offset - (offset @ normal) * normal) > 1.2 * self.spacing
+        if beside or (blade and np.linalg.norm(mean) < 0.95) or self._beyond_edge(x, x - offset, normal, distance):
+            return None
+        return gap, normal, w, nearest
+
+    def _beyond_edge(self, x: np.ndarray, centre: np.ndarray, normal: np.ndarray, distance: np.ndarray) -> bool:
+        """Return whether a face across the normal lies between x, in front of it, and the surface, behind it."""
+
+        def height(y: np.ndarray) -> np.ndarray:
+            return np.einsum("sc,sc->s", self.normals, y - self.points)
+
+        across = (np.abs(self.normals @ normal) < 0.5) & (distance < 2.0 * self.spacing)
+        below = (self.points - centre) @ normal < 0.0
+        return bool((across & below & (height(x) > 0.0) & (height(centre) < 0.0)).any())
+
+    def touched_row(self, x: np.ndarray, patch: tuple[float, np.ndarray, np.ndarray, int]) -> np.ndarray:
+        """Return the functions (n,) of the material at x - max(gap, 0) normal, carried there from the samples."""
+        gap, normal, w, nearest = patch
+        away = x - max(gap, 0.0) * normal - w @ self.points
+        gradient = self.body.evaluate(self.body.surface_points[[nearest]])[1][0]
+        return w @ self.body.surface_basis + gradient @ np.linalg.solve(self.deformation_gradient[nearest], away)
+
+
+@dataclass(frozen=True, kw_only=True)
 class FreeBody:
     """A body without contact and the incremental potential of one implicit Euler step, dense.
 

@@ -38,8 +38,9 @@ def make_samples(instance_count: int, sample_max: int, team: int, device: Any) -
     samples.gap = wp.zeros((*shape, SLOTS), dtype=wp.float64, device=device)
     samples.normal = wp.zeros((*shape, SLOTS), dtype=wp.vec3, device=device)
     samples.entry = wp.full((*shape, SLOTS), -1, dtype=int, device=device)
-    samples.lower, samples.upper = (wp.zeros(instance_count, dtype=wp.vec3, device=device) for _ in range(2))
-    samples.reach = wp.zeros((instance_count, team, 2), dtype=wp.vec3, device=device)
+    for name in ("lower", "upper", "drift_lower", "drift_upper"):
+        setattr(samples, name, wp.zeros(instance_count, dtype=wp.vec3, device=device))
+    samples.reach = wp.zeros((instance_count, team, 4), dtype=wp.vec3, device=device)
     samples.tally = wp.zeros((instance_count, team, 2), dtype=int, device=device)
     return samples
 

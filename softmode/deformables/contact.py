@@ -158,7 +158,14 @@ def evaluate_entries(
         total = entries.offset[i, e] + d
         psi, slope, curvature = normal_potential(-wp.dot(n, total), wp.float64(smoothing))
         if derivatives != 0 and progress.iteration[w] <= LAG_ITERATIONS:
-            entries.normal_force[i, e] = stiffness * slope
+            held = slope
+            if progress.iteration[w] == 0:
+                # in an impact the first guess lies far too deep: friction of such a force would be too stiff to solve
+                most = wp.float64(smoothing) - wp.float64(2.0) * wp.min(
+                    wp.dot(n, entries.offset[i, e]), wp.float64(0.0)
+                )
+                held = wp.min(slope, most)
+            entries.normal_force[i, e] = stiffness * held
         normal_force = entries.normal_force[i, e]
         # offset = gap n + memory - drift of the shape: the tangential part is the slip
         t = total - wp.dot(n, total) * n

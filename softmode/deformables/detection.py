@@ -72,7 +72,9 @@ class Samples:
     entry: wp.array3d[int]  # (..., SLOTS), the entry it became, -1 for none
     lower: wp.array[wp.vec3]  # (instance_count,) bounds, grown by margin and drift [m]
     upper: wp.array[wp.vec3]
-    reach: wp.array3d[wp.vec3]  # (instance_count, team, 2), scratch of the bounds
+    drift_lower: wp.array[wp.vec3]  # (instance_count,) bounds of the drift [m]
+    drift_upper: wp.array[wp.vec3]
+    reach: wp.array3d[wp.vec3]  # (instance_count, team, 4), scratch of the bounds
     tally: wp.array3d[int]  # (instance_count, team, 2), scratch of the entries
 
 
@@ -105,14 +107,21 @@ def bound_samples(
     i, lane = wp.tid()
     lower = wp.vec3(1.0e30)
     upper = wp.vec3(-1.0e30)
+    drift_lower = wp.vec3(1.0e30)
+    drift_upper = wp.vec3(-1.0e30)
     reach = float(0.0)
     for s in range(lane, instances.sample_count[i], team):
         x = wp.vec3(samples.position[i, s])
+        drift = samples.drift[i, s]
         lower = wp.min(lower, x)
         upper = wp.max(upper, x)
-        reach = wp.max(reach, wp.length(samples.drift[i, s]))
+        drift_lower = wp.min(drift_lower, drift)
+        drift_upper = wp.max(drift_upper, drift)
+        reach = wp.max(reach, wp.length(drift))
     samples.reach[i, lane, 0] = lower - wp.vec3(2.0 * reach)
     samples.reach[i, lane, 1] = upper + wp.vec3(2.0 * reach)
+    samples.reach[i, lane, 2] = drift_lower
+    samples.reach[i, lane, 3] = drift_upper
     barrier()
     if lane != 0:
         return
@@ -121,6 +130,10 @@ def bound_samples(
     for k in range(1, team):
         lower = wp.min(lower, samples.reach[i, k, 0])
         upper = wp.max(upper, samples.reach[i, k, 1])
+        drift_lower = wp.min(drift_lower, samples.reach[i, k, 2])
+        drift_upper = wp.max(drift_upper, samples.reach[i, k, 3])
+    samples.drift_lower[i] = drift_lower
+    samples.drift_upper[i] = drift_upper
     grow = wp.vec3(instances.margin[i] + instances.contact_radius[i])
     samples.lower[i] = lower - grow
     samples.upper[i] = upper + grow

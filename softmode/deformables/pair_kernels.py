@@ -4,17 +4,22 @@ The surface of a body is what its samples x_k with deformed normals n_k say: nea
 least-squares surface (Kolluri 2008, doi:10.1145/1361192.1361195, eq. 1)
 
     gap(x) = sum_k theta_k n_k . (x - x_k) / sum_k theta_k,
-    theta_k = exp(-(|x - x_k|^2 - d_min^2) / h^2) max(-n . n_k, 0)^2,
+    theta_k = exp(-(|x - x_k|^2 - d_min^2) / h^2) max(-n . n_k - c, 0)^2,
 
-h three quarters of the spacing of the samples, n the normal of the sample at x: exact for a plane, without the bumps
-that a ball around every sample would have, and blind to what lies around a sharp edge. Samples of each body are tested
-against the surfaces of the others. The point of the other body that is touched moves with sum_k w_k x_k, the weights
-theta_k corrected to first order so that they reproduce the point itself: force and reaction act on one line.
+h three quarters of the spacing of the samples, n the normal of the sample at x, c = 0.3: exact for a plane, without the
+bumps that a ball around every sample would have, and blind to what lies around a sharp edge. Samples of each body are
+tested against the surfaces of the others. What is touched of the other body is the material at x, less the gap n that
+has to close before,
+
+    sum_k theta_k b(X_k) / sum_k theta_k + grad b(X_t) . F_t^-1 (x - max(gap, 0) n - sum_k theta_k x_k / sum_k theta_k),
+
+t the nearest sample: exact where the body moves affinely. Force and reaction then act on one point, and neither the
+normal force nor friction turns the two bodies together.
 
 A pair of a sample and a surface becomes an entry of each of the two bodies (``contact``), with normal and offset of
 opposite sign and one half of the energy, so that both feel the same force. Their rows are the sample's row, and a
-*dynamic row*, sum_k w_k b(x_k), written behind the static ones. A pair within one body is one entry whose row is the
-difference.
+*dynamic row*, the touched material above, written behind the static ones. A pair within one body is one entry whose row
+is the difference.
 """
 
 import warp as wp
@@ -22,6 +27,7 @@ import warp as wp
 from softmode.deformables.contact import stiffness_per_area
 from softmode.deformables.detection import Samples
 from softmode.deformables.kernels import displacement_gradient
+from softmode.deformables.lanes import barrier, vec8
 from softmode.deformables.status import WORLD_CONTACT_OVERFLOW
 from softmode.deformables.tables import Basis, Entries, Instances, Motion, Progress
 
@@ -30,17 +36,30 @@ wp.set_module_options({"enable_backward": False})
 SLOTS = 2
 """Other bodies that one sample may touch: the nearest two."""
 FACING = wp.constant(0.3)
-"""Cosine between normals above which two samples look the same way and cannot touch: the far side of a thin body."""
-ASIDE = wp.constant(wp.float64(1.0e-4))
-"""Weight of a sample that looks across, against one that looks at the point: behind a sharp edge it says nothing."""
+"""c: one sample looks at another where the cosine between their normals is below -c. Above c they look the same way and
+cannot touch: the far side of a thin body."""
 WIDTH = wp.constant(0.75)
 """h in spacings."""
 CUTOFF = wp.constant(9.0)
 """Exponent of theta beyond which a sample says nothing: three h."""
 LATERAL = wp.constant(wp.float64(1.2))
 """How far beside the samples, in spacings, a point may lie and still be above the surface."""
+FLAT = wp.constant(wp.float64(0.95))
+"""How much of a surface must look one way, |sum theta n| / sum theta, to be touched by a sample that does not look at
+it, as on a blade."""
+ACROSS = wp.constant(wp.float64(0.5))
+"""Cosine between a sample's normal and the surface's below which the sample belongs to a face around an edge."""
+NEIGHBOURHOOD = wp.constant(wp.float64(2.0))
+"""Distance in spacings within which such faces are looked for."""
+DEPTH = wp.constant(0.3)
+"""How deep a point may lie below a surface, as a fraction of the thicker of the two bodies there: beyond, it is seen
+from the far side, through both."""
 SELF_DISTANCE = wp.constant(wp.float64(4.0))
-"""Distance at rest, in spacings, below which samples of one body are neighbours and do not touch."""
+"""Distance at rest, in spacings, below which samples of one body are neighbours and do not touch, unless"""
+SELF_OPENING = wp.constant(wp.float64(1.0))
+"""they see each other across an opening at least so wide."""
+VOLUME_RATIO_MIN = wp.constant(wp.float64(1.0e-2))
+"""det F below which F^-1 is kept from growing."""
 
 
 @wp.struct
@@ -48,17 +67,18 @@ class Pairs:
     """Surfaces at the start of the step and the pairs that touch, shape (instance_count, sample_max) where not said."""
 
     grid: wp.uint64
-    spacing_max: float  # [m]
-    radius_max: float  # largest contact radius [m]
     first_row: int  # first dynamic row
     point: wp.array[wp.vec3]  # (instance_count * sample_max,) [m], for the grid
     surface_normal: wp.array2d[wp.vec3]  # outward, of unit length
+    thickness: wp.array[float]  # (sample_total,), of the body at rest below each static row [m]
     spacing: wp.array[float]  # (instance_count,) of the samples [m]
     near: wp.array[int]  # (instance_count,), whether its bounds meet those of another body
+    radius: wp.array2d[float]  # how far from the sample others are looked for [m], 0 where none are near
     other: wp.array3d[int]  # (..., SLOTS), instance, -1 where empty
     gap: wp.array3d[wp.float64]  # (..., SLOTS) [m]
     normal: wp.array3d[wp.vec3d]  # (..., SLOTS), outward from the other body
-    nearest: wp.array3d[wp.float64]  # (..., SLOTS), squared distance to its nearest sample [m^2]
+    nearest: wp.array3d[int]  # (..., SLOTS), its nearest sample
+    tally: wp.array3d[int]  # (instance_count, team, 2), scratch of the list
     count: wp.array[int]  # (instance_count,)
     sample: wp.array2d[int]  # (instance_count, pair_max): sample * SLOTS + slot
     entry: wp.array2d[int]  # (instance_count, pair_max), -1 where dropped
@@ -69,13 +89,25 @@ class Pairs:
 class Patch:
     """The surface of a body near a point."""
 
-    total: wp.float64  # sum theta
-    nearest: wp.float64  # squared distance of the nearest sample [m^2]
+    total: wp.float64  # sum theta, 0 where there is no surface
     gap: wp.float64  # [m]
     normal: wp.vec3d
-    centre: wp.vec3d  # sum theta x_k / sum theta [m]
-    slope: wp.vec3d  # w_k = theta_k / total (1 + slope . (x_k - centre)) [1/m]
     drift: wp.vec3  # mean motion of the step [m]
+
+
+@wp.func
+def cofactor(F: wp.mat33d):
+    """Return cof F = det(F) F^-T, whose columns are the cross products of those of F."""
+    a = wp.vec3d(F[0, 0], F[1, 0], F[2, 0])
+    b = wp.vec3d(F[0, 1], F[1, 1], F[2, 1])
+    c = wp.vec3d(F[0, 2], F[1, 2], F[2, 2])
+    return wp.matrix_from_cols(wp.cross(b, c), wp.cross(c, a), wp.cross(a, b))
+
+
+@wp.func
+def clamped_inverse(F: wp.mat33d):
+    """Return F^-1, with det F raised where the body is crushed."""
+    return wp.transpose(cofactor(F)) / wp.max(wp.determinant(F), VOLUME_RATIO_MIN)
 
 
 @wp.func
@@ -127,13 +159,8 @@ def place_surface(
     row = instances.row_start[i] + s
     G = displacement_gradient(basis.row_gradient, motion.q_start, i, row, instances.function_count[i])
     F = wp.identity(n=3, dtype=wp.float64) + G
-    a = wp.vec3d(F[0, 0], F[1, 0], F[2, 0])
-    b = wp.vec3d(F[0, 1], F[1, 1], F[2, 1])
-    c = wp.vec3d(F[0, 2], F[1, 2], F[2, 2])
-    N = wp.vec3d(basis.row_normal[row])
-    pairs.surface_normal[i, s] = wp.vec3(
-        wp.normalize(N[0] * wp.cross(b, c) + N[1] * wp.cross(c, a) + N[2] * wp.cross(a, b))
-    )
+    normal = wp.normalize(cofactor(F) * wp.vec3d(basis.row_normal[row]))
+    pairs.surface_normal[i, s] = wp.vec3(normal)
 
 
 @wp.func
@@ -144,77 +171,123 @@ def may_touch(instances: Instances, basis: Basis, pairs: Pairs, i: int, s: int, 
         return pairs.near[j] != 0 and facing < FACING
     if instances.self_contact[i] == 0 or facing >= 0.0:
         return False
-    apart = basis.row_point[instances.row_start[i] + s] - basis.row_point[instances.row_start[i] + t]
-    return wp.length(apart) > SELF_DISTANCE * wp.float64(pairs.spacing[i])
+    own = instances.row_start[i] + s
+    row = instances.row_start[i] + t
+    away = basis.row_point[row] - basis.row_point[own]
+    spacing = wp.float64(pairs.spacing[i])
+    opening = wp.min(wp.dot(wp.vec3d(basis.row_normal[own]), away), -wp.dot(wp.vec3d(basis.row_normal[row]), away))
+    return wp.length(away) > SELF_DISTANCE * spacing or opening > SELF_OPENING * spacing
 
 
 @wp.func
-def search_radius(instances: Instances, samples: Samples, pairs: Pairs, i: int, s: int):
-    """Return how far from a sample others are looked for [m]."""
-    reach = instances.margin[i] + 2.0 * wp.length(samples.drift[i, s])
-    return reach + instances.contact_radius[i] + pairs.radius_max + wp.sqrt(CUTOFF) * WIDTH * pairs.spacing_max
+def looks_at(pairs: Pairs, i: int, s: int, j: int, t: int):
+    """Return whether sample s of instance i looks at sample t of instance j."""
+    return wp.dot(pairs.surface_normal[i, s], pairs.surface_normal[j, t]) < -FACING
 
 
 @wp.func
-def weigh(samples: Samples, pairs: Pairs, i: int, s: int, j: int, t: int, nearest: wp.float64):
-    """Return theta of sample t of instance j for sample s of instance i, 0 where it is negligible."""
+def weigh(samples: Samples, pairs: Pairs, i: int, s: int, j: int, t: int, nearest: int):
+    """Return theta of sample t of instance j for sample s of instance i, 0 where it is negligible.
+
+    Where s does not look at the nearest sample it looks at none, and all count alike.
+    """
     h = wp.float64(WIDTH * pairs.spacing[j])
-    exponent = (wp.length_sq(samples.position[i, s] - samples.position[j, t]) - nearest) / (h * h)
-    if exponent > wp.float64(CUTOFF):
+    x = samples.position[i, s]
+    least = wp.length_sq(x - samples.position[j, nearest])
+    distance = wp.length_sq(x - samples.position[j, t])
+    exponent = (distance - least) / (h * h)
+    # the grid also returns what lies in the same cells but farther away
+    if exponent > wp.float64(CUTOFF) or distance > wp.float64(pairs.radius[i, s] * pairs.radius[i, s]):
         return wp.float64(0.0)
-    facing = wp.float64(wp.max(-wp.dot(pairs.surface_normal[i, s], pairs.surface_normal[j, t]), 0.0))
-    return wp.exp(-exponent) * (facing * facing + ASIDE)
+    ramp = float(1.0)
+    if looks_at(pairs, i, s, j, nearest):
+        ramp = wp.max(-wp.dot(pairs.surface_normal[i, s], pairs.surface_normal[j, t]) - FACING, 0.0)
+    return wp.exp(-exponent) * wp.float64(ramp * ramp)
 
 
 @wp.func
-def fit_patch(
-    instances: Instances,
-    basis: Basis,
-    samples: Samples,
-    pairs: Pairs,
-    i: int,
-    s: int,
-    j: int,
-    nearest: wp.float64,
-):
-    """Fit the surface of instance j near sample s of instance i; ``nearest`` is the squared distance to it."""
-    patch = Patch()
-    patch.nearest = nearest
+def beside(instances: Instances, samples: Samples, pairs: Pairs, i: int, s: int, j: int, centre: wp.vec3d, n: wp.vec3d):
+    """Return whether sample s lies beyond a convex edge of the surface with normal n about ``centre``.
+
+    So it does where it is in front of a face around the edge, and the surface is behind that face.
+    """
     x = samples.position[i, s]
-    h = wp.float64(pairs.spacing[j])
     count = samples.position.shape[1]
-    outer = wp.mat33d()
-    radius = search_radius(instances, samples, pairs, i, s)
-    query = wp.hash_grid_query(pairs.grid, wp.vec3(x), radius, instances.world[i])
+    reach = NEIGHBOURHOOD * wp.float64(pairs.spacing[j])
+    query = wp.hash_grid_query(pairs.grid, wp.vec3(x), float(reach), instances.world[i])
+    k = int(0)
+    found = bool(False)
+    while wp.hash_grid_query_next(query, k):
+        if k / count == j:
+            face = wp.vec3d(pairs.surface_normal[j, k % count])
+            at = samples.position[j, k % count]
+            if (
+                wp.abs(wp.dot(face, n)) < ACROSS
+                and wp.length_sq(x - at) < reach * reach
+                and wp.dot(face, x - at) > wp.float64(0.0)
+                and wp.dot(face, centre - at) < wp.float64(0.0)
+                and wp.dot(n, at - centre) < wp.float64(0.0)
+            ):
+                found = True
+    return found
+
+
+@wp.func
+def fit_patch(instances: Instances, basis: Basis, samples: Samples, pairs: Pairs, i: int, s: int, j: int, t: int):
+    """Fit the surface of instance j near sample s of instance i; t is its nearest sample, as ``find_pairs`` says."""
+    patch = Patch()
+    x = samples.position[i, s]
+    count = samples.position.shape[1]
+    offset = wp.vec3d()
+    query = wp.hash_grid_query(pairs.grid, wp.vec3(x), pairs.radius[i, s], instances.world[i])
     k = int(0)
     while wp.hash_grid_query_next(query, k):
-        t = k % count
-        if k / count == j and may_touch(instances, basis, pairs, i, s, j, t):
-            away = x - samples.position[j, t]
-            theta = weigh(samples, pairs, i, s, j, t, nearest)
-            n = wp.vec3d(pairs.surface_normal[j, t])
+        if k / count == j and may_touch(instances, basis, pairs, i, s, j, k % count):
+            away = x - samples.position[j, k % count]
+            theta = weigh(samples, pairs, i, s, j, k % count, t)
+            n = wp.vec3d(pairs.surface_normal[j, k % count])
             patch.total += theta
             patch.gap += theta * wp.dot(n, away)
             patch.normal += theta * n
-            patch.centre += theta * away
-            patch.drift += float(theta) * samples.drift[j, t]
-            outer += theta * wp.outer(away, away)
+            patch.drift += float(theta) * samples.drift[j, k % count]
+            offset += theta * away
     if patch.total <= wp.float64(0.0):
         return patch
     inverse = wp.float64(1.0) / patch.total
     patch.gap = inverse * patch.gap
+    flat = inverse * wp.length(patch.normal)
     patch.normal = wp.normalize(patch.normal)
     patch.drift = float(inverse) * patch.drift
-    offset = inverse * patch.centre  # x - centre
-    patch.centre = x - offset
+    offset = inverse * offset
     lateral = offset - wp.dot(offset, patch.normal) * patch.normal
-    S = inverse * outer - wp.outer(offset, offset)
-    S += h * h * (wp.outer(patch.normal, patch.normal) + wp.float64(1.0e-3) * wp.identity(n=3, dtype=wp.float64))
-    slope = wp.inverse(S) * lateral
-    patch.slope = slope / wp.max(wp.float64(1.0), wp.length(slope) * h)
-    if wp.length(lateral) > LATERAL * h:
+    thick = wp.max(pairs.thickness[instances.row_start[i] + s], pairs.thickness[instances.row_start[j] + t])
+    if wp.length(lateral) > LATERAL * wp.float64(pairs.spacing[j]) or patch.gap < wp.float64(-DEPTH * thick):
+        patch.total = wp.float64(0.0)
+    elif flat < FLAT and not looks_at(pairs, i, s, j, t):
+        patch.total = wp.float64(0.0)
+    elif beside(instances, samples, pairs, i, s, j, x - offset, patch.normal):
         patch.total = wp.float64(0.0)
     return patch
+
+
+@wp.func
+def search_radius(instances: Instances, progress: Progress, samples: Samples, pairs: Pairs, i: int, s: int):
+    """Return how far from a sample others are to be looked for [m], 0 where no body is near.
+
+    Margin, contact radii and twice the motion relative to the other body, whichever of the two moves.
+    """
+    x = wp.vec3(samples.position[i, s])
+    drift = samples.drift[i, s]
+    radius = float(0.0)
+    for j in range(progress.instance_start[instances.world[i]], progress.instance_start[instances.world[i] + 1]):
+        if pairs.near[j] != 0 and (j != i or instances.self_contact[i] != 0):
+            motion = wp.max(wp.abs(drift - samples.drift_lower[j]), wp.abs(drift - samples.drift_upper[j]))
+            reach = instances.margin[i] + 2.0 * wp.length(motion) + instances.contact_radius[i]
+            grow = wp.vec3(reach)
+            if wp.min(x - samples.lower[j] + grow) >= 0.0 and wp.min(samples.upper[j] + grow - x) >= 0.0:
+                reach += instances.contact_radius[j] + wp.sqrt(CUTOFF) * WIDTH * pairs.spacing[j]
+                radius = wp.max(radius, reach)
+    return radius
 
 
 @wp.kernel
@@ -222,8 +295,8 @@ def find_pairs(
     instances: Instances,
     basis: Basis,
     progress: Progress,
-    # In and out:
     samples: Samples,
+    # In and out:
     pairs: Pairs,
 ):
     """Find the surfaces within reach of each sample: margin plus twice the relative motion of the step."""
@@ -232,64 +305,110 @@ def find_pairs(
         return
     for slot in range(SLOTS):
         pairs.other[i, s, slot] = -1
-    x = wp.vec3(samples.position[i, s])
-    w = instances.world[i]
-    inside = instances.self_contact[i]
-    for j in range(progress.instance_start[w], progress.instance_start[w + 1]):
-        grow = wp.vec3(instances.margin[i] + 2.0 * wp.length(samples.drift[i, s]))
-        if j != i and wp.min(x - samples.lower[j] + grow) >= 0.0 and wp.min(samples.upper[j] + grow - x) >= 0.0:
-            inside = 1
-    if inside == 0:
+    x = samples.position[i, s]
+    if not wp.isfinite(wp.length_sq(x)):
         return
+    radius = search_radius(instances, progress, samples, pairs, i, s)
+    pairs.radius[i, s] = radius
+    if radius == 0.0:
+        return
+    # the nearest samples of the nearest two bodies, those that it looks at before others
     count = samples.position.shape[1]
-    taken = int(-1)
+    first = int(-1)
+    second = int(-1)
+    first_distance = wp.float64(1.0e30)
+    second_distance = wp.float64(1.0e30)
+    query = wp.hash_grid_query(pairs.grid, wp.vec3(x), radius, instances.world[i])
+    k = int(0)
+    while wp.hash_grid_query_next(query, k):
+        if may_touch(instances, basis, pairs, i, s, k / count, k % count):
+            distance = wp.length_sq(x - samples.position[k / count, k % count])
+            if distance > wp.float64(radius * radius):
+                continue
+            if not looks_at(pairs, i, s, k / count, k % count):
+                distance += wp.float64(radius * radius)
+            if distance < first_distance:
+                if first < 0 or first / count != k / count:
+                    second = first
+                    second_distance = first_distance
+                first = k
+                first_distance = distance
+            elif distance < second_distance and first / count != k / count:
+                second = k
+                second_distance = distance
     for slot in range(SLOTS):
-        best = int(-1)
-        nearest = wp.float64(1.0e30)
-        radius = search_radius(instances, samples, pairs, i, s)
-        query = wp.hash_grid_query(pairs.grid, x, radius, w)
-        k = int(0)
-        while wp.hash_grid_query_next(query, k):
-            j = k / count
-            if j != taken and may_touch(instances, basis, pairs, i, s, j, k % count):
-                distance = wp.length_sq(samples.position[i, s] - samples.position[j, k % count])
-                if distance < nearest:
-                    nearest = distance
-                    best = j
-        if best < 0:
+        nearest = wp.where(slot == 0, first, second)
+        if nearest < 0:
             return
-        taken = best
-        patch = fit_patch(instances, basis, samples, pairs, i, s, best, nearest)
-        gap = patch.gap - wp.float64(instances.contact_radius[i] + instances.contact_radius[best])
-        reach = instances.margin[i] + 2.0 * wp.length(samples.drift[i, s] - patch.drift)
+        j = nearest / count
+        patch = fit_patch(instances, basis, samples, pairs, i, s, j, nearest % count)
+        gap = patch.gap - wp.float64(instances.contact_radius[i] + instances.contact_radius[j])
+        reach = instances.margin[i]
+        if looks_at(pairs, i, s, j, nearest % count):
+            reach += 2.0 * wp.length(samples.drift[i, s] - patch.drift)
         if patch.total > wp.float64(0.0) and gap < wp.float64(reach):
-            pairs.other[i, s, slot] = best
+            pairs.other[i, s, slot] = j
             pairs.gap[i, s, slot] = gap
             pairs.normal[i, s, slot] = patch.normal
-            pairs.nearest[i, s, slot] = nearest
+            pairs.nearest[i, s, slot] = nearest % count
 
 
 @wp.kernel
 def compact_pairs(
     instances: Instances,
+    team: int,
     # In and out:
     pairs: Pairs,
     status: wp.array[int],
 ):
-    """List the pairs of each instance in sample order, those that touch first."""
-    i = wp.tid()
+    """List the pairs of each instance in sample order, those that touch first.
+
+    Each thread of a team counts its own run of samples, then writes where the counts before it end.
+    """
+    i, lane = wp.tid()
+    if pairs.near[i] == 0:
+        if lane == 0:
+            pairs.count[i] = 0
+        return
+    begin = lane * instances.sample_count[i] / team
+    end = (lane + 1) * instances.sample_count[i] / team
+    touching = int(0)
+    close = int(0)
+    for s in range(begin, end):
+        for slot in range(SLOTS):
+            if pairs.other[i, s, slot] >= 0:
+                if pairs.gap[i, s, slot] <= wp.float64(0.0):
+                    touching += 1
+                else:
+                    close += 1
+    pairs.tally[i, lane, 0] = touching
+    pairs.tally[i, lane, 1] = close
+    barrier()
     total = int(0)
-    if pairs.near[i] != 0:
-        for turn in range(2):
-            for s in range(instances.sample_count[i]):
-                for slot in range(SLOTS):
-                    if pairs.other[i, s, slot] >= 0 and (pairs.gap[i, s, slot] > wp.float64(0.0)) == (turn == 1):
-                        if total < pairs.sample.shape[1]:
-                            pairs.sample[i, total] = s * SLOTS + slot
-                        total += 1
+    at_touching = int(0)
+    at_close = int(0)
+    for k in range(team):
+        if k < lane:
+            at_touching += pairs.tally[i, k, 0]
+            at_close += pairs.tally[i, k, 1]
+        at_close += pairs.tally[i, k, 0]
+        total += pairs.tally[i, k, 0] + pairs.tally[i, k, 1]
+    if lane == 0:
+        pairs.count[i] = wp.min(total, pairs.sample.shape[1])
         if total > pairs.sample.shape[1]:
             wp.atomic_or(status, instances.world[i], WORLD_CONTACT_OVERFLOW)
-    pairs.count[i] = wp.min(total, pairs.sample.shape[1])
+    for s in range(begin, end):
+        for slot in range(SLOTS):
+            if pairs.other[i, s, slot] < 0:
+                continue
+            at = at_close
+            if pairs.gap[i, s, slot] <= wp.float64(0.0):
+                at = at_touching
+                at_touching += 1
+            else:
+                at_close += 1
+            if at < pairs.sample.shape[1]:
+                pairs.sample[i, at] = s * SLOTS + slot
 
 
 @wp.kernel
@@ -301,33 +420,39 @@ def accept_pairs(
     entries: Entries,
     status: wp.array[int],
 ):
-    """Give each pair its two entries, or none: a force without its reaction must not be."""
+    """Give each pair its two entries, or none: a force without its reaction must not be. What touches comes first."""
     w = wp.tid()
     first = progress.instance_start[w]
     end = progress.instance_start[w + 1]
     for i in range(first, end):
         entries.pair_count[i] = 0
-    for i in range(first, end):
-        for k in range(pairs.count[i]):
-            j = pairs.other[i, pairs.sample[i, k] / SLOTS, pairs.sample[i, k] % SLOTS]
-            pairs.entry[i, k] = -1
-            pairs.mirror[i, k] = -1
-            if entries.count[i] >= entry_max or entries.count[j] >= entry_max:
-                status[w] = status[w] | WORLD_CONTACT_OVERFLOW
-                continue
-            pairs.entry[i, k] = entries.count[i]
-            entries.count[i] = entries.count[i] + 1
-            entries.pair_count[i] = entries.pair_count[i] + 1
-            if j != i:
-                pairs.mirror[i, k] = entries.count[j]
-                entries.count[j] = entries.count[j] + 1
-                entries.pair_count[j] = entries.pair_count[j] + 1
+    for turn in range(2):
+        for i in range(first, end):
+            for k in range(pairs.count[i]):
+                s = pairs.sample[i, k] / SLOTS
+                slot = pairs.sample[i, k] % SLOTS
+                if (pairs.gap[i, s, slot] > wp.float64(0.0)) != (turn == 1):
+                    continue
+                j = pairs.other[i, s, slot]
+                pairs.entry[i, k] = -1
+                pairs.mirror[i, k] = -1
+                if entries.count[i] >= entry_max or entries.count[j] >= entry_max:
+                    status[w] = status[w] | WORLD_CONTACT_OVERFLOW
+                    continue
+                pairs.entry[i, k] = entries.count[i]
+                entries.count[i] = entries.count[i] + 1
+                entries.pair_count[i] = entries.pair_count[i] + 1
+                if j != i:
+                    pairs.mirror[i, k] = entries.count[j]
+                    entries.count[j] = entries.count[j] + 1
+                    entries.pair_count[j] = entries.pair_count[j] + 1
 
 
 @wp.kernel
 def write_pairs(
     instances: Instances,
     basis: Basis,
+    motion: Motion,
     samples: Samples,
     pairs: Pairs,
     dt: float,
@@ -343,31 +468,41 @@ def write_pairs(
     j = pairs.other[i, s, slot]
     count = samples.position.shape[1]
     x = samples.position[i, s]
-    radius = search_radius(instances, samples, pairs, i, s)
-    nearest = pairs.nearest[i, s, slot]
-    patch = fit_patch(instances, basis, samples, pairs, i, s, j, nearest)
-
-    # the touched point of the other body; of the same body, the difference to it
     own = instances.row_start[i] + s
     row = pairs.first_row + i * pairs.sample.shape[1] + k
-    sign = float(1.0)
+
+    # the mean of the samples of the other body,
+    nearest = pairs.nearest[i, s, slot]
+    total = wp.float64(0.0)
+    offset = wp.vec3d()
     for b in range(basis.row.shape[1]):
-        if j == i:
-            sign = -1.0
-            basis.row[row, b] = basis.row[own, b]
-        else:
-            basis.row[row, b] = type(basis.row[own, b])()
-    query = wp.hash_grid_query(pairs.grid, wp.vec3(x), radius, instances.world[i])
+        basis.row[row, b] = vec8()
+    query = wp.hash_grid_query(pairs.grid, wp.vec3(x), pairs.radius[i, s], instances.world[i])
     point = int(0)
     while wp.hash_grid_query_next(query, point):
         t = point % count
         if point / count == j and may_touch(instances, basis, pairs, i, s, j, t):
-            theta = weigh(samples, pairs, i, s, j, t, nearest) / patch.total
-            along = wp.dot(patch.slope, samples.position[j, t] - patch.centre)
-            weight = sign * float(theta * (wp.float64(1.0) + along))
-            if weight != 0.0:
+            theta = weigh(samples, pairs, i, s, j, t, nearest)
+            if theta > wp.float64(0.0):
+                total += theta
+                offset += theta * (x - samples.position[j, t])
                 for b in range(basis.row.shape[1]):
-                    basis.row[row, b] = basis.row[row, b] + weight * basis.row[instances.row_start[j] + t, b]
+                    basis.row[row, b] = basis.row[row, b] + float(theta) * basis.row[instances.row_start[j] + t, b]
+    inverse = wp.float64(1.0) / total
+    # carried on to x; of the same body, the difference to it
+    offset = inverse * offset - wp.max(pairs.gap[i, s, slot], wp.float64(0.0)) * pairs.normal[i, s, slot]
+    at = instances.row_start[j] + nearest
+    G = displacement_gradient(basis.row_gradient, motion.q_start, j, at, instances.function_count[j])
+    F = wp.identity(n=3, dtype=wp.float64) + G
+    X = wp.vec3(clamped_inverse(F) * offset)
+    for b in range(basis.row.shape[1]):
+        value = float(inverse) * basis.row[row, b]
+        value = value + X[0] * basis.row_gradient[b, at, 0]
+        value = value + X[1] * basis.row_gradient[b, at, 1]
+        value = value + X[2] * basis.row_gradient[b, at, 2]
+        if j == i:
+            value = basis.row[own, b] - value
+        basis.row[row, b] = value
 
     ki = stiffness_per_area(instances, i, float(instances.mass[j]), instances.area[j], dt)
     kj = stiffness_per_area(instances, j, float(instances.mass[i]), instances.area[i], dt)

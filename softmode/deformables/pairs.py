@@ -6,7 +6,8 @@ import numpy as np
 import warp as wp
 
 from softmode.deformables import pair_kernels as kernels
-from softmode.deformables.lanes import LANES, vec8
+from softmode.deformables.body import ReducedBody
+from softmode.deformables.lanes import LANES, team_size, vec8
 from softmode.deformables.layout import Layout
 
 CELLS = (32, 128)
@@ -29,14 +30,18 @@ class SoftPairs:
         spacing = np.array([np.sqrt(body.surface_areas.mean()) for body in layout.bodies])
         pairs: Any = kernels.Pairs()
         pairs.first_row = layout.basis.row.shape[0]
-        pairs.spacing_max = float(spacing.max())
         pairs.spacing = wp.array(spacing[layout.asset], dtype=float, device=self.device)
         pairs.point = self._zeros((count * sample_max,), wp.vec3)
         pairs.surface_normal = self._zeros((count, sample_max), wp.vec3)
-        pairs.radius_max = float(layout.instances.contact_radius.numpy().max())
+        pairs.thickness = wp.array(
+            np.concatenate([thickness(b) for b in layout.bodies]), dtype=float, device=self.device
+        )
+        pairs.radius = self._zeros((count, sample_max), float)
+        self.team = team_size(self.device)
+        pairs.tally = self._zeros((count, self.team, 2), int)
         shape = (count, sample_max, kernels.SLOTS)
-        pairs.other, pairs.normal = (self._zeros(shape, t) for t in (int, wp.vec3d))
-        pairs.gap, pairs.nearest = (self._zeros(shape, wp.float64) for _ in range(2))
+        pairs.other, pairs.nearest = (self._zeros(shape, int) for _ in range(2))
+        pairs.gap, pairs.normal = self._zeros(shape, wp.float64), self._zeros(shape, wp.vec3d)
         pairs.near, pairs.count = (self._zeros((count,), int) for _ in range(2))
         pairs.sample, pairs.entry, pairs.mirror = (self._zeros((count, pair_max), int) for _ in range(3))
         self.table = pairs
@@ -49,7 +54,7 @@ class SoftPairs:
         cells = 2 ** round(np.log2(np.clip(np.cbrt(count * sample_max), *CELLS)))
         self.grid = wp.HashGrid(cells, cells, cells, device=self.device)
         self.grid.reserve(count * sample_max)
-        self.cell = 2.0 * pairs.spacing_max
+        self.cell = 2.0 * float(spacing.max())
         self.grid.build(pairs.point, self.cell, groups=self.group)
         pairs.grid = self.grid.id
 
@@ -82,10 +87,29 @@ class SoftPairs:
         self._launch(kernels.mark_near, layout.instance_count, [instances, progress, samples], [pairs])
         self._launch(kernels.place_surface, every, [instances, basis, motion, samples], [pairs])
         self.grid.build(pairs.point, self.cell, groups=self.group)
-        self._launch(kernels.find_pairs, every, [instances, basis, progress], [samples, pairs])
-        self._launch(kernels.compact_pairs, layout.instance_count, [instances], [pairs, progress.status])
+        self._launch(kernels.find_pairs, every, [instances, basis, progress, samples], [pairs])
+        dim = (layout.instance_count, self.team)
+        self._launch(kernels.compact_pairs, dim, [instances, self.team], [pairs, progress.status], self.team)
         self._launch(kernels.accept_pairs, layout.world_count, [progress, entry_max], [pairs, entries, progress.status])
-        self._launch(kernels.write_pairs, pairs.sample.shape, [instances, basis, samples, pairs, dt], [entries])
+        tables = [instances, basis, motion, samples, pairs, dt]
+        self._launch(kernels.write_pairs, pairs.sample.shape, tables, [entries])
 
-    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any], block_dim: int = 256) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, block_dim=block_dim, device=self.device)
+
+
+def thickness(body: ReducedBody) -> np.ndarray:
+    """Return how thick the body is at rest below each surface sample, shape (surface_count,) [m].
+
+    The distance along the inner normal to the first samples that look the other way; the body's size where there are
+    none.
+    """
+    x, normals = body.surface_points, body.surface_normals
+    beside = (1.5**2) * body.surface_areas.mean()
+    out = np.full(len(x), float(np.linalg.norm(np.ptp(body.bounds, axis=0))))
+    for s, n in enumerate(normals):
+        away = x[s] - x
+        depth = away @ n
+        opposite = (depth > 0.0) & (normals @ n < 0.0) & ((away**2).sum(axis=1) - depth**2 < beside)
+        out[s] = depth[opposite].min(initial=out[s])
+    return out

@@ -109,3 +109,84 @@ def test_singular_matrix_stays_finite():
     system = build(A, np.ones((1, 16, 1)))
     system.factor(flags([1]))
     assert np.isfinite(system.solve(flags([1]), 0, no_tail(1), 0).numpy()).all()
+
+
+# -- systems made of parts ---------------------------------------------------------------------------------------------
+
+
+def related_parts(rng, count, part_count, share):
+    """Return random symmetric relations (count, part_count, part_count) of which about a ``share`` is there."""
+    upper = np.triu(rng.random((count, part_count, part_count)) < share, 1)
+    return upper | np.swapaxes(upper, 1, 2) | np.eye(part_count, dtype=bool)
+
+
+def in_parts(rng, relations, part):
+    """Return positive definite matrices whose blocks of unrelated parts are zero, of condition about 10."""
+    count, part_count = relations.shape[:2]
+    size = part_count * part
+    A = rng.normal(size=(count, size, size))
+    A = (A + np.swapaxes(A, 1, 2)) * np.kron(relations, np.ones((part, part)))
+    low = np.linalg.eigvalsh(A)[:, 0]
+    spread = np.linalg.eigvalsh(A)[:, -1] - low
+    return A + (0.1 * spread - low)[:, None, None] * np.eye(size)
+
+
+def filled(relations):
+    """Return the upper relations after the elimination: the pattern of the Cholesky factor."""
+    upper = np.triu(relations, 1)
+    for pattern in upper:
+        for k in range(len(pattern)):
+            later = np.flatnonzero(pattern[k])
+            for a, i in enumerate(later):
+                pattern[i, later[a + 1 :]] = True
+    return upper
+
+
+@pytest.mark.parametrize("part", [8, 24])
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_parts(part, share):
+    """A x = b where most parts have nothing to do with each other: the pattern fills in as the Cholesky factor does.
+
+    What it leaves out is neither read nor written.
+    """
+    rng = np.random.default_rng(part)
+    count, part_count, columns = 3, 6, 3
+    relations = related_parts(rng, count, part_count, share)
+    A, B = in_parts(rng, relations, part), rng.normal(size=(count, part_count * part, columns))
+    left_out = np.kron(~filled(relations) & ~np.eye(part_count, dtype=bool), np.ones((part, part), bool))
+    poisoned = np.where(left_out, np.nan, A)
+    world = wp.array(np.arange(count), dtype=int, device="cpu")
+    system = BlockCholesky(world, part_count * part, columns, "cpu", part_count)
+    rows = np.concatenate([poisoned, np.pad(B, ((0, 0), (0, 0), (0, pad(columns) - columns)))], axis=2)
+    system.matrix.assign(rows.astype(np.float32).reshape(count, part_count * part, -1, LANES))
+    system.pattern.assign(np.triu(relations, 1).astype(np.int32))
+    system.fill()
+    np.testing.assert_array_equal(np.triu(system.pattern.numpy(), 1) != 0, filled(relations))
+    system.factor(flags([1] * count))
+    assert not system.indefinite.numpy().any()
+    expected = np.linalg.solve(A, B)
+    U = np.swapaxes(np.linalg.cholesky(A), 1, 2)
+    Y = system.matrix.numpy().reshape(count, part_count * part, -1)[:, :, part_count * part :][:, :, :columns]
+    np.testing.assert_allclose(Y, np.linalg.solve(np.swapaxes(U, 1, 2), B), atol=100 * FLOAT32 * np.abs(B).max())
+    for column in range(columns):
+        x = system.solve(flags([1] * count), column, no_tail(count), 0).numpy().reshape(count, -1)
+        error = np.linalg.norm(x - expected[:, :, column])
+        assert error <= 100 * FLOAT32 * np.linalg.norm(expected[:, :, column])
+
+
+def test_parts_with_known_unknowns():
+    """The Schur correction reaches every part, whatever the pattern."""
+    rng = np.random.default_rng(0)
+    relations = related_parts(rng, 1, 4, 0.4)
+    A, C = in_parts(rng, relations, 16), rng.normal(size=(1, 64, 5))
+    b, t = rng.normal(size=(1, 64, 1)), rng.normal(size=(1, 5))
+    world = wp.array([0], dtype=int, device="cpu")
+    system = BlockCholesky(world, 64, 6, "cpu", 4)
+    rows = np.concatenate([A, C, b, np.zeros((1, 64, 2))], axis=2)
+    system.matrix.assign(rows.astype(np.float32).reshape(1, 64, -1, LANES))
+    system.pattern.assign(np.triu(relations, 1).astype(np.int32))
+    system.fill()
+    system.factor(flags([1]))
+    x = system.solve(flags([1]), 5, wp.array(t, dtype=wp.float64, device="cpu"), 5).numpy().reshape(64)
+    expected = np.linalg.solve(A[0], b[0, :, 0] - C[0] @ t[0])
+    assert np.linalg.norm(x - expected) <= 100 * FLOAT32 * np.linalg.norm(expected)
