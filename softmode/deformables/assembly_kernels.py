@@ -420,19 +420,33 @@ def relate_pairs(
     progress: Progress,
     entries: Entries,
     # Out:
-    pattern: wp.array3d[int],  # (world_count, part_count, part_count)
+    relation: wp.array3d[int],  # (world_count, part_count, part_count)
 ):
     """Say which bodies of a world touch each other."""
     w, part = wp.tid()
-    for other in range(pattern.shape[2]):
-        pattern[w, part, other] = 0
+    for other in range(relation.shape[2]):
+        relation[w, part, other] = 0
     i = progress.instance_start[w] + part
     if i >= progress.instance_start[w + 1]:
         return
+    relation[w, part, part] = 1
     for e in range(entries.count[i] - entries.pair_count[i], entries.count[i]):
         j = entries.partner[i, e]
-        if j > i:
-            pattern[w, part, j - progress.instance_start[w]] = 1
+        if j >= 0:
+            relation[w, part, j - progress.instance_start[w]] = 1
+
+
+@wp.kernel
+def place_parts(
+    instances: Instances,
+    progress: Progress,
+    place: wp.array2d[int],  # (world_count, part_count)
+    part_blocks: int,
+):
+    """Say where each body stands in the system of its world: writes ``instances.system_block``."""
+    i = wp.tid()
+    w = instances.world[i]
+    instances.system_block[i] = part_blocks * place[w, i - progress.instance_start[w]]
 
 
 @wp.kernel
@@ -441,19 +455,21 @@ def assemble_pairs(
     basis: Basis,
     entries: Entries,
     progress: Progress,
-    pattern: wp.array3d[int],
+    relation: wp.array3d[int],  # (world_count, part_count, part_count), its fill included
     # In and out:
     matrix: wp.array3d[vec8],  # (world_count, N, ...), upper triangle
 ):
     """Fill the 8x8 blocks between two bodies of a world, -sum_e b_i^T H b_j; zero where only the elimination fills."""
     w, both, task = wp.tid()
-    part_count = pattern.shape[1]
+    part_count = relation.shape[1]
     part = both / part_count
     other = both % part_count
-    if progress.active[w] == 0 or other <= part or pattern[w, part, other] == 0:
+    if progress.active[w] == 0 or other == part or relation[w, part, other] == 0:
         return
     i = progress.instance_start[w] + part
     j = progress.instance_start[w] + other
+    if instances.system_block[i] > instances.system_block[j]:
+        return
     block_count = basis.row.shape[1]
     pair = task / (block_count * block_count)
     c = pair / 3

@@ -336,8 +336,10 @@ class SolverReduced(SolverBase):
         if self.part_count > 1:
             dim = (self.world_count, self.part_count)
             tables = [self.instances, self.progress, self.entries]
-            self._launch(assembly.relate_pairs, dim, tables, [self.system.pattern])
-            self.system.fill()
+            self._launch(assembly.relate_pairs, dim, tables, [self.system.relation])
+            self.system.order_parts()
+            place = [self.instances, self.progress, self.system.place, 3 * self.layout.block_count]
+            self._launch(assembly.place_parts, self.instance_count, place)
         self.adapt(dt)
 
     def differentiate_entries(self) -> None:
@@ -517,7 +519,7 @@ class SolverReduced(SolverBase):
             self._launch(
                 assembly.assemble_pairs,
                 (self.world_count, self.part_count**2, 9 * blocks * blocks),
-                [instances, basis, entries, self.progress, self.system.pattern],
+                [instances, basis, entries, self.progress, self.system.relation],
                 [self.system.matrix],
                 block_dim=128,
             )

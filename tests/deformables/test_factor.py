@@ -131,15 +131,26 @@ def in_parts(rng, relations, part):
     return A + (0.1 * spread - low)[:, None, None] * np.eye(size)
 
 
-def filled(relations):
-    """Return the upper relations after the elimination: the pattern of the Cholesky factor."""
-    upper = np.triu(relations, 1)
-    for pattern in upper:
-        for k in range(len(pattern)):
-            later = np.flatnonzero(pattern[k])
-            for a, i in enumerate(later):
-                pattern[i, later[a + 1 :]] = True
-    return upper
+def eliminated(relations):
+    """Return where least-degree elimination places each part (count, n), and the relations of the factor, by place."""
+    place, pattern = np.zeros(relations.shape[:2], int), np.zeros(relations.shape, bool)
+    for relation, places, out in zip(relations.copy(), place, pattern, strict=True):
+        left = list(range(len(relation)))
+        for step in range(len(relation)):
+            best = min(left, key=lambda part: relation[part, left].sum())
+            left.remove(best)
+            near = [part for part in left if relation[best, part]]
+            relation[np.ix_(near, near)] = True
+            places[best] = step
+        order = np.argsort(places)
+        out[:] = np.triu(relation[np.ix_(order, order)], 1)
+    return place, pattern
+
+
+def placed(values, place, part, axes):
+    """Return matrices with the rows (and columns) of part p moved to place[p]."""
+    rows = [np.concatenate([np.arange(part) + part * p for p in np.argsort(one)]) for one in place]
+    return np.stack([a[np.ix_(r, r)] if axes == 2 else a[r] for a, r in zip(values, rows, strict=True)])
 
 
 @pytest.mark.parametrize("part", [8, 24])
@@ -152,16 +163,19 @@ def test_parts(part, share):
     rng = np.random.default_rng(part)
     count, part_count, columns = 3, 6, 3
     relations = related_parts(rng, count, part_count, share)
+    place, pattern = eliminated(relations)
     A, B = in_parts(rng, relations, part), rng.normal(size=(count, part_count * part, columns))
-    left_out = np.kron(~filled(relations) & ~np.eye(part_count, dtype=bool), np.ones((part, part), bool))
+    A, B = placed(A, place, part, 2), placed(B, place, part, 1)
+    left_out = np.kron(~pattern & ~np.eye(part_count, dtype=bool), np.ones((part, part), bool))
     poisoned = np.where(left_out, np.nan, A)
     world = wp.array(np.arange(count), dtype=int, device="cpu")
     system = BlockCholesky(world, part_count * part, columns, "cpu", part_count)
     rows = np.concatenate([poisoned, np.pad(B, ((0, 0), (0, 0), (0, pad(columns) - columns)))], axis=2)
     system.matrix.assign(rows.astype(np.float32).reshape(count, part_count * part, -1, LANES))
-    system.pattern.assign(np.triu(relations, 1).astype(np.int32))
-    system.fill()
-    np.testing.assert_array_equal(np.triu(system.pattern.numpy(), 1) != 0, filled(relations))
+    system.relation.assign(relations.astype(np.int32))
+    system.order_parts()
+    np.testing.assert_array_equal(system.place.numpy(), place)
+    np.testing.assert_array_equal(np.triu(system.pattern.numpy(), 1) != 0, pattern)
     system.factor(flags([1] * count))
     assert not system.indefinite.numpy().any()
     expected = np.linalg.solve(A, B)
@@ -178,15 +192,28 @@ def test_parts_with_known_unknowns():
     """The Schur correction reaches every part, whatever the pattern."""
     rng = np.random.default_rng(0)
     relations = related_parts(rng, 1, 4, 0.4)
-    A, C = in_parts(rng, relations, 16), rng.normal(size=(1, 64, 5))
+    place, _ = eliminated(relations)
+    A, C = placed(in_parts(rng, relations, 16), place, 16, 2), rng.normal(size=(1, 64, 5))
     b, t = rng.normal(size=(1, 64, 1)), rng.normal(size=(1, 5))
     world = wp.array([0], dtype=int, device="cpu")
     system = BlockCholesky(world, 64, 6, "cpu", 4)
     rows = np.concatenate([A, C, b, np.zeros((1, 64, 2))], axis=2)
     system.matrix.assign(rows.astype(np.float32).reshape(1, 64, -1, LANES))
-    system.pattern.assign(np.triu(relations, 1).astype(np.int32))
-    system.fill()
+    system.relation.assign(relations.astype(np.int32))
+    system.order_parts()
     system.factor(flags([1]))
     x = system.solve(flags([1]), 5, wp.array(t, dtype=wp.float64, device="cpu"), 5).numpy().reshape(64)
     expected = np.linalg.solve(A[0], b[0, :, 0] - C[0] @ t[0])
     assert np.linalg.norm(x - expected) <= 100 * FLOAT32 * np.linalg.norm(expected)
+
+
+def test_order_of_parts():
+    """A star is eliminated without fill, its centre last but one; parts that do not exist keep their places."""
+    relations = np.zeros((1, 6, 6), bool)
+    relations[0, 0, 1:4] = relations[0, 1:4, 0] = True
+    relations[0, range(4), range(4)] = True
+    system = BlockCholesky(wp.array([0], dtype=int, device="cpu"), 48, 1, "cpu", 6)
+    system.relation.assign(relations.astype(np.int32))
+    system.order_parts()
+    np.testing.assert_array_equal(system.place.numpy()[0], [2, 0, 1, 3, 4, 5])
+    assert np.triu(system.pattern.numpy()[0], 1).sum() == 3
