@@ -64,6 +64,9 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
     particle = newton.Model.AttributeFrequency.PARTICLE
     declare("stick_shape", wp.vec2i, particle, default=wp.vec2i(-1, -1), assignment=assignment.STATE)
     declare("stick_point", mat23d, particle, assignment=assignment.STATE)
+    # and the soft bodies of its world that it sticks to, counted within the world, with its slip at rest
+    declare("stick_partner", wp.vec2i, particle, default=wp.vec2i(-1, -1), assignment=assignment.STATE)
+    declare("stick_slip", mat23d, particle, assignment=assignment.STATE)
     declare("q_driven", wp.vec3d, _FUNCTION, assignment=assignment.CONTROL)
     declare("pin_instance", wp.int32, _PIN, references=_INSTANCE)
     declare("pin_body", wp.int32, _PIN, references="body")

@@ -29,7 +29,7 @@ from softmode.deformables.detection import Samples
 from softmode.deformables.kernels import displacement_gradient
 from softmode.deformables.lanes import barrier, vec8
 from softmode.deformables.status import WORLD_CONTACT_OVERFLOW
-from softmode.deformables.tables import Basis, Entries, Instances, Motion, Progress
+from softmode.deformables.tables import Basis, Entries, Instances, Motion, Progress, mat23d
 
 wp.set_module_options({"enable_backward": False})
 
@@ -79,6 +79,7 @@ class Pairs:
     normal: wp.array3d[wp.vec3d]  # (..., SLOTS), outward from the other body
     nearest: wp.array3d[int]  # (..., SLOTS), its nearest sample
     tally: wp.array3d[int]  # (instance_count, team, 2), scratch of the list
+    held: wp.array3d[int]  # (..., SLOTS), the entry it became, -1 for none
     count: wp.array[int]  # (instance_count,)
     sample: wp.array2d[int]  # (instance_count, pair_max): sample * SLOTS + slot
     entry: wp.array2d[int]  # (instance_count, pair_max), -1 where dropped
@@ -305,6 +306,7 @@ def find_pairs(
         return
     for slot in range(SLOTS):
         pairs.other[i, s, slot] = -1
+        pairs.held[i, s, slot] = -1
     x = samples.position[i, s]
     if not wp.isfinite(wp.length_sq(x)):
         return
@@ -454,8 +456,13 @@ def write_pairs(
     basis: Basis,
     motion: Motion,
     samples: Samples,
-    pairs: Pairs,
+    progress: Progress,
+    stick_ratio: wp.float64,
+    stick_partner: wp.array[wp.vec2i],  # (particle_count,), see ``stick_kernels``
+    stick_slip: wp.array[mat23d],  # (particle_count,) [m]
     dt: float,
+    # In and out:
+    pairs: Pairs,
     # Out:
     entries: Entries,
 ):
@@ -509,7 +516,18 @@ def write_pairs(
     # two layers in series; each of the two surfaces brings its samples, so that each counts one half
     stiffness = wp.float64(0.5 * ki * kj / (ki + kj) * basis.row_area[own])
     friction = wp.float64(wp.sqrt(instances.friction[i] * instances.friction[j]))
-    offset = pairs.gap[i, s, slot] * pairs.normal[i, s, slot]
+    n = pairs.normal[i, s, slot]
+    offset = pairs.gap[i, s, slot] * n
+    particle = instances.particle_start[i] + s
+    for k_before in range(SLOTS):
+        if stick_partner[particle][k_before] == j - progress.instance_start[instances.world[i]]:
+            slip = wp.vec3d()
+            for axis in range(3):
+                slip[axis] = stick_slip[particle][k_before, axis]
+            G = displacement_gradient(basis.row_gradient, motion.q_start, i, own, instances.function_count[i])
+            slip += G * slip
+            offset += slip - wp.dot(n, slip) * n
+    pairs.held[i, s, slot] = pairs.entry[i, k]
     for side in range(2):
         a = i
         e = pairs.entry[i, k]
@@ -526,8 +544,52 @@ def write_pairs(
             entries.row[a, e] = wp.where(side == 1 or j == i, row, own)
             entries.partner[a, e] = wp.where(j == i, -1, wp.where(side == 1, i, j))
             entries.partner_row[a, e] = wp.where(side == 1, own, row)
-            entries.normal[a, e] = direction * pairs.normal[i, s, slot]
+            entries.normal[a, e] = direction * n
             entries.offset[a, e] = direction * offset
             entries.stiffness[a, e] = stiffness
-            entries.stick[a, e] = wp.float64(0.0)
+            entries.stick[a, e] = stick_ratio * stiffness
             entries.friction[a, e] = friction
+
+
+@wp.kernel
+def remember_pairs(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    progress: Progress,
+    pairs: Pairs,
+    entries: Entries,
+    # State out:
+    stick_partner_out: wp.array[wp.vec2i],
+    stick_slip_out: wp.array[mat23d],
+):
+    """Write which soft bodies a sample sticks to at the end of the step, and its elastic slip carried back to rest.
+
+    Carried on by the body's own gradient in the next step, it turns with the body.
+    """
+    i, s = wp.tid()
+    if s >= instances.sample_count[i]:
+        return
+    partner = wp.vec2i(-1, -1)
+    slips = mat23d()
+    for slot in range(SLOTS):
+        e = int(-1)
+        if pairs.near[i] != 0:
+            e = pairs.held[i, s, slot]
+        if e < 0:
+            continue
+        limit = entries.friction[i, e] * entries.normal_force[i, e]
+        total = entries.slip[i, e]
+        stretch = entries.stick[i, e] * wp.length(total)
+        if not (limit > wp.float64(0.0) and stretch > wp.float64(0.0) and wp.isfinite(stretch + limit)):
+            continue
+        row = instances.row_start[i] + s
+        G = displacement_gradient(basis.row_gradient, motion.q_start, i, row, instances.function_count[i])
+        F = wp.identity(n=3, dtype=wp.float64) + G
+        elastic = clamped_inverse(F) * (wp.min(wp.float64(1.0), limit / stretch) * total)
+        partner[slot] = pairs.other[i, s, slot] - progress.instance_start[instances.world[i]]
+        for axis in range(3):
+            slips[slot, axis] = elastic[axis]
+    particle = instances.particle_start[i] + s
+    stick_partner_out[particle] = partner
+    stick_slip_out[particle] = slips

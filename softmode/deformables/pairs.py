@@ -21,11 +21,12 @@ class SoftPairs:
         model: Finalised model.
         layout: Its layout; rows of surface gradients and dynamic rows are added to the basis.
         pair_max: Pairs per instance at most.
+        stick_ratio: Tangential over normal stiffness of a contact that sticks; 0 for friction without memory.
     """
 
-    def __init__(self, model: Any, layout: Layout, pair_max: int) -> None:
+    def __init__(self, model: Any, layout: Layout, pair_max: int, stick_ratio: float) -> None:
         """Allocate everything once."""
-        self.model, self.layout = model, layout
+        self.model, self.layout, self.stick_ratio = model, layout, stick_ratio
         self.device, count, sample_max = model.device, layout.instance_count, layout.sample_max
         spacing = np.array([np.sqrt(body.surface_areas.mean()) for body in layout.bodies])
         pairs: Any = kernels.Pairs()
@@ -40,7 +41,7 @@ class SoftPairs:
         self.team = team_size(self.device)
         pairs.tally = self._zeros((count, self.team, 2), int)
         shape = (count, sample_max, kernels.SLOTS)
-        pairs.other, pairs.nearest = (self._zeros(shape, int) for _ in range(2))
+        pairs.other, pairs.nearest, pairs.held = (self._zeros(shape, int) for _ in range(3))
         pairs.gap, pairs.normal = self._zeros(shape, wp.float64), self._zeros(shape, wp.vec3d)
         pairs.near, pairs.count = (self._zeros((count,), int) for _ in range(2))
         pairs.sample, pairs.entry, pairs.mirror = (self._zeros((count, pair_max), int) for _ in range(3))
@@ -79,8 +80,13 @@ class SoftPairs:
         wp.copy(rows, basis.row, count=basis.row.size)
         basis.row = rows
 
-    def detect(self, motion: Any, samples: Any, progress: Any, entries: Any, entry_max: int, dt: float) -> None:
-        """Find the pairs of this step, ``samples`` being placed and bounded, and append them to the entries."""
+    def detect(
+        self, motion: Any, samples: Any, progress: Any, memory: Any, entries: Any, *, entry_max: int, dt: float
+    ) -> None:
+        """Find the pairs of this step, ``samples`` being placed and bounded, and append them to the entries.
+
+        ``memory`` are the attributes of the state, with what sticks.
+        """
         layout, pairs = self.layout, self.table
         instances, basis = layout.instances, layout.basis
         every = samples.position.shape
@@ -91,8 +97,16 @@ class SoftPairs:
         dim = (layout.instance_count, self.team)
         self._launch(kernels.compact_pairs, dim, [instances, self.team], [pairs, progress.status], self.team)
         self._launch(kernels.accept_pairs, layout.world_count, [progress, entry_max], [pairs, entries, progress.status])
-        tables = [instances, basis, motion, samples, pairs, dt]
-        self._launch(kernels.write_pairs, pairs.sample.shape, tables, [entries])
+        stick = [wp.float64(self.stick_ratio), memory.stick_partner, memory.stick_slip, dt]
+        tables = [instances, basis, motion, samples, progress, *stick]
+        self._launch(kernels.write_pairs, pairs.sample.shape, tables, [pairs, entries])
+
+    def remember(self, motion: Any, progress: Any, entries: Any, memory: Any) -> None:
+        """Write what sticks at the end of the step into the attributes of the state."""
+        layout = self.layout
+        tables = [layout.instances, layout.basis, motion, progress, self.table, entries]
+        out = [memory.stick_partner, memory.stick_slip]
+        self._launch(kernels.remember_pairs, self.table.surface_normal.shape, tables, out)
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any], block_dim: int = 256) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, block_dim=block_dim, device=self.device)

@@ -172,7 +172,9 @@ class SolverReduced(SolverBase):
         self.points = make_points(self.instance_count, layout.point_max, device)
         self.samples = make_samples(self.instance_count, layout.sample_max, self.team, device)
         crowded = bool((np.diff(layout.instance_start) > 1).any()) or bool(self.parameters.self_contact.numpy().any())
-        self.pairs = SoftPairs(model, layout, options.contact_max // 2) if options.soft_contact and crowded else None
+        self.pairs = None
+        if options.soft_contact and crowded:
+            self.pairs = SoftPairs(model, layout, options.contact_max // 2, options.stick_ratio)
         """Contact between soft bodies, None where there is never any."""
         self.progress = make_progress(layout.instance_start, self.team, device)
         self.q, self.q_trial = (wp.zeros(functions, dtype=vec8d, device=device) for _ in range(2))
@@ -332,7 +334,9 @@ class SolverReduced(SolverBase):
         else:
             wp.copy(self.entries.count, self.instances.pin_count)
         if self.pairs is not None:
-            self.pairs.detect(self.motion, self.samples, self.progress, self.entries, self.entry_max, float(dt))
+            memory = getattr(state, NAMESPACE)
+            tables = [self.samples, self.progress, memory, self.entries]
+            self.pairs.detect(self.motion, *tables, entry_max=self.entry_max, dt=float(dt))
         if self.part_count > 1:
             dim = (self.world_count, self.part_count)
             tables = [self.instances, self.progress, self.entries]
@@ -604,6 +608,8 @@ class SolverReduced(SolverBase):
                 [self.instances, self.shapes, self.samples, self.entries, int(self.prescribed)],
                 [out.stick_shape, out.stick_point],
             )
+        if self.pairs is not None:
+            self.pairs.remember(self.motion, self.progress, self.entries, out)
         self.body_wrench.zero_()
         self._launch(
             contact.sum_reactions,
@@ -658,7 +664,8 @@ class SolverReduced(SolverBase):
             [out.q, out.qd, out.dt_before],
         )
         dim = (self.instance_count, self.layout.sample_max)
-        self._launch(stick_kernels.forget_slip, dim, [self.instances, initial.instance_world, mask], [out.stick_shape])
+        memory = [out.stick_shape, out.stick_partner]
+        self._launch(stick_kernels.forget_slip, dim, [self.instances, initial.instance_world, mask], memory)
         self._launch(
             kernels.reset_worlds,
             max(self.instance_count, self.model.body_count),

@@ -73,8 +73,10 @@ def forget_slip(
     world_mask: wp.array[wp.bool],
     # State out:
     stick_shape_out: wp.array[wp.vec2i],
+    stick_partner_out: wp.array[wp.vec2i],
 ):
     """Let the samples in masked worlds stick to nothing."""
     i, s = wp.tid()
     if s < instances.sample_count[i] and in_mask(instance_world[i], world_mask):
         stick_shape_out[instances.particle_start[i] + s] = wp.vec2i(-1, -1)
+        stick_partner_out[instances.particle_start[i] + s] = wp.vec2i(-1, -1)
