@@ -340,6 +340,8 @@ class Surface:
             return None
         nearest = int(np.argmin(np.where(looking, distance, np.inf)))
         exponent = (distance**2 - distance[nearest] ** 2) / (0.75 * self.spacing) ** 2
+        around = self._around(nearest)
+        looking = around & (facing > (-0.3 if blade else 0.3))
         w = np.where(looking & (exponent <= 9.0), np.exp(-exponent), 0.0)
         w *= 1.0 if blade else np.maximum(facing - 0.3, 0.0) ** 2
         w /= w.sum()
@@ -348,17 +350,26 @@ class Surface:
         normal = mean / np.linalg.norm(mean)
         offset = x - w @ self.points
         beside = np.linalg.norm(offset - (offset @ normal) * normal) > 1.2 * self.spacing
-        if beside or (blade and np.linalg.norm(mean) < 0.95) or self._beyond_edge(x, x - offset, normal, distance):
+        if (
+            beside
+            or (blade and np.linalg.norm(mean) < 0.95)
+            or self._beyond_edge(x, x - offset, normal, around & (distance < 2.0 * self.spacing))
+        ):
             return None
         return gap, normal, w, nearest
 
-    def _beyond_edge(self, x: np.ndarray, centre: np.ndarray, normal: np.ndarray, distance: np.ndarray) -> bool:
+    def _around(self, sample: int) -> np.ndarray:
+        """Return which samples are among the 32 nearest to one at rest, (S,)."""
+        distance = np.linalg.norm(self.body.surface_points - self.body.surface_points[sample], axis=1)
+        return distance <= np.sort(distance)[min(32, len(distance)) - 1]
+
+    def _beyond_edge(self, x: np.ndarray, centre: np.ndarray, normal: np.ndarray, close: np.ndarray) -> bool:
         """Return whether a face across the normal lies between x, in front of it, and the surface, behind it."""
 
         def height(y: np.ndarray) -> np.ndarray:
             return np.einsum("sc,sc->s", self.normals, y - self.points)
 
-        across = (np.abs(self.normals @ normal) < 0.5) & (distance < 2.0 * self.spacing)
+        across = (np.abs(self.normals @ normal) < 0.5) & close
         below = (self.points - centre) @ normal < 0.0
         return bool((across & below & (height(x) > 0.0) & (height(centre) < 0.0)).any())
 

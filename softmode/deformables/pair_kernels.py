@@ -33,6 +33,10 @@ from softmode.deformables.tables import Basis, Entries, Instances, Motion, Progr
 
 wp.set_module_options({"enable_backward": False})
 
+NEIGHBOURS = 32
+"""Samples that make up the surface about a sample: those within three spacings of it."""
+BLADE_DISTANCE = wp.constant(wp.float64(1.0e10))
+"""Squared distance by which samples that are not looked at come after those that are [m^2]."""
 SLOTS = 2
 """Other bodies that one sample may touch: the nearest two."""
 FACING = wp.constant(0.3)
@@ -66,14 +70,12 @@ VOLUME_RATIO_MIN = wp.constant(wp.float64(1.0e-2))
 class Pairs:
     """Surfaces at the start of the step and the pairs that touch, shape (instance_count, sample_max) where not said."""
 
-    grid: wp.uint64
     first_row: int  # first dynamic row
-    point: wp.array[wp.vec3]  # (instance_count * sample_max,) [m], for the grid
+    neighbour: wp.array2d[int]  # (sample_total, NEIGHBOURS), nearest samples at rest, the sample itself first; -1 pads
     surface_normal: wp.array2d[wp.vec3]  # outward, of unit length
     thickness: wp.array[float]  # (sample_total,), of the body at rest below each static row [m]
     spacing: wp.array[float]  # (instance_count,) of the samples [m]
     near: wp.array[int]  # (instance_count,), whether its bounds meet those of another body
-    radius: wp.array2d[float]  # how far from the sample others are looked for [m], 0 where none are near
     other: wp.array3d[int]  # (..., SLOTS), instance, -1 where empty
     gap: wp.array3d[wp.float64]  # (..., SLOTS) [m]
     normal: wp.array3d[wp.vec3d]  # (..., SLOTS), outward from the other body
@@ -147,15 +149,9 @@ def place_surface(
     # Out:
     pairs: Pairs,
 ):
-    """Write the points of the grid, and where a body is near another its normals, cof(F) N."""
+    """Write the normals cof(F) N of the bodies that are near another."""
     i, s = wp.tid()
-    if s >= instances.sample_count[i]:
-        return
-    x = wp.vec3(samples.position[i, s])
-    if not wp.isfinite(wp.length_sq(x)):
-        x = wp.vec3()
-    pairs.point[i * samples.position.shape[1] + s] = x
-    if pairs.near[i] == 0:
+    if s >= instances.sample_count[i] or pairs.near[i] == 0:
         return
     row = instances.row_start[i] + s
     G = displacement_gradient(basis.row_gradient, motion.q_start, i, row, instances.function_count[i])
@@ -197,8 +193,7 @@ def weigh(samples: Samples, pairs: Pairs, i: int, s: int, j: int, t: int, neares
     least = wp.length_sq(x - samples.position[j, nearest])
     distance = wp.length_sq(x - samples.position[j, t])
     exponent = (distance - least) / (h * h)
-    # the grid also returns what lies in the same cells but farther away
-    if exponent > wp.float64(CUTOFF) or distance > wp.float64(pairs.radius[i, s] * pairs.radius[i, s]):
+    if exponent > wp.float64(CUTOFF):
         return wp.float64(0.0)
     ramp = float(1.0)
     if looks_at(pairs, i, s, j, nearest):
@@ -207,29 +202,27 @@ def weigh(samples: Samples, pairs: Pairs, i: int, s: int, j: int, t: int, neares
 
 
 @wp.func
-def beside(instances: Instances, samples: Samples, pairs: Pairs, i: int, s: int, j: int, centre: wp.vec3d, n: wp.vec3d):
-    """Return whether sample s lies beyond a convex edge of the surface with normal n about ``centre``.
+def beside(samples: Samples, pairs: Pairs, x: wp.vec3d, j: int, row: int, centre: wp.vec3d, n: wp.vec3d):
+    """Return whether x lies beyond a convex edge of the surface with normal n about ``centre``; ``row`` is nearest.
 
     So it does where it is in front of a face around the edge, and the surface is behind that face.
     """
-    x = samples.position[i, s]
-    count = samples.position.shape[1]
     reach = NEIGHBOURHOOD * wp.float64(pairs.spacing[j])
-    query = wp.hash_grid_query(pairs.grid, wp.vec3(x), float(reach), instances.world[i])
-    k = int(0)
     found = bool(False)
-    while wp.hash_grid_query_next(query, k):
-        if k / count == j:
-            face = wp.vec3d(pairs.surface_normal[j, k % count])
-            at = samples.position[j, k % count]
-            if (
-                wp.abs(wp.dot(face, n)) < ACROSS
-                and wp.length_sq(x - at) < reach * reach
-                and wp.dot(face, x - at) > wp.float64(0.0)
-                and wp.dot(face, centre - at) < wp.float64(0.0)
-                and wp.dot(n, at - centre) < wp.float64(0.0)
-            ):
-                found = True
+    for k in range(NEIGHBOURS):
+        t = pairs.neighbour[row, k]
+        if t < 0:
+            break
+        face = wp.vec3d(pairs.surface_normal[j, t])
+        at = samples.position[j, t]
+        if (
+            wp.abs(wp.dot(face, n)) < ACROSS
+            and wp.length_sq(x - at) < reach * reach
+            and wp.dot(face, x - at) > wp.float64(0.0)
+            and wp.dot(face, centre - at) < wp.float64(0.0)
+            and wp.dot(n, at - centre) < wp.float64(0.0)
+        ):
+            found = True
     return found
 
 
@@ -238,19 +231,20 @@ def fit_patch(instances: Instances, basis: Basis, samples: Samples, pairs: Pairs
     """Fit the surface of instance j near sample s of instance i; t is its nearest sample, as ``find_pairs`` says."""
     patch = Patch()
     x = samples.position[i, s]
-    count = samples.position.shape[1]
     offset = wp.vec3d()
-    query = wp.hash_grid_query(pairs.grid, wp.vec3(x), pairs.radius[i, s], instances.world[i])
-    k = int(0)
-    while wp.hash_grid_query_next(query, k):
-        if k / count == j and may_touch(instances, basis, pairs, i, s, j, k % count):
-            away = x - samples.position[j, k % count]
-            theta = weigh(samples, pairs, i, s, j, k % count, t)
-            n = wp.vec3d(pairs.surface_normal[j, k % count])
+    row = instances.row_start[j] + t
+    for k in range(NEIGHBOURS):
+        u = pairs.neighbour[row, k]
+        if u < 0:
+            break
+        if may_touch(instances, basis, pairs, i, s, j, u):
+            away = x - samples.position[j, u]
+            theta = weigh(samples, pairs, i, s, j, u, t)
+            n = wp.vec3d(pairs.surface_normal[j, u])
             patch.total += theta
             patch.gap += theta * wp.dot(n, away)
             patch.normal += theta * n
-            patch.drift += float(theta) * samples.drift[j, k % count]
+            patch.drift += float(theta) * samples.drift[j, u]
             offset += theta * away
     if patch.total <= wp.float64(0.0):
         return patch
@@ -261,34 +255,32 @@ def fit_patch(instances: Instances, basis: Basis, samples: Samples, pairs: Pairs
     patch.drift = float(inverse) * patch.drift
     offset = inverse * offset
     lateral = offset - wp.dot(offset, patch.normal) * patch.normal
-    thick = wp.max(pairs.thickness[instances.row_start[i] + s], pairs.thickness[instances.row_start[j] + t])
+    thick = wp.max(pairs.thickness[instances.row_start[i] + s], pairs.thickness[row])
     if wp.length(lateral) > LATERAL * wp.float64(pairs.spacing[j]) or patch.gap < wp.float64(-DEPTH * thick):
         patch.total = wp.float64(0.0)
     elif flat < FLAT and not looks_at(pairs, i, s, j, t):
         patch.total = wp.float64(0.0)
-    elif beside(instances, samples, pairs, i, s, j, x - offset, patch.normal):
+    elif beside(samples, pairs, x, j, row, x - offset, patch.normal):
         patch.total = wp.float64(0.0)
     return patch
 
 
 @wp.func
-def search_radius(instances: Instances, progress: Progress, samples: Samples, pairs: Pairs, i: int, s: int):
-    """Return how far from a sample others are to be looked for [m], 0 where no body is near.
+def search_radius(instances: Instances, samples: Samples, pairs: Pairs, i: int, s: int, j: int):
+    """Return how far from sample s of instance i samples of instance j are looked for [m], 0 where it is not near.
 
     Margin, contact radii and twice the motion relative to the other body, whichever of the two moves.
     """
+    if pairs.near[j] == 0 or (j == i and instances.self_contact[i] == 0):
+        return float(0.0)
     x = wp.vec3(samples.position[i, s])
     drift = samples.drift[i, s]
-    radius = float(0.0)
-    for j in range(progress.instance_start[instances.world[i]], progress.instance_start[instances.world[i] + 1]):
-        if pairs.near[j] != 0 and (j != i or instances.self_contact[i] != 0):
-            motion = wp.max(wp.abs(drift - samples.drift_lower[j]), wp.abs(drift - samples.drift_upper[j]))
-            reach = instances.margin[i] + 2.0 * wp.length(motion) + instances.contact_radius[i]
-            grow = wp.vec3(reach)
-            if wp.min(x - samples.lower[j] + grow) >= 0.0 and wp.min(samples.upper[j] + grow - x) >= 0.0:
-                reach += instances.contact_radius[j] + wp.sqrt(CUTOFF) * WIDTH * pairs.spacing[j]
-                radius = wp.max(radius, reach)
-    return radius
+    motion = wp.max(wp.abs(drift - samples.drift_lower[j]), wp.abs(drift - samples.drift_upper[j]))
+    reach = instances.margin[i] + 2.0 * wp.length(motion) + instances.contact_radius[i]
+    grow = wp.vec3(reach)
+    if wp.min(x - samples.lower[j] + grow) < 0.0 or wp.min(samples.upper[j] + grow - x) < 0.0:
+        return float(0.0)
+    return reach + instances.contact_radius[j] + wp.sqrt(CUTOFF) * WIDTH * pairs.spacing[j]
 
 
 @wp.kernel
@@ -310,49 +302,52 @@ def find_pairs(
     x = samples.position[i, s]
     if not wp.isfinite(wp.length_sq(x)):
         return
-    radius = search_radius(instances, progress, samples, pairs, i, s)
-    pairs.radius[i, s] = radius
-    if radius == 0.0:
-        return
     # the nearest samples of the nearest two bodies, those that it looks at before others
-    count = samples.position.shape[1]
-    first = int(-1)
-    second = int(-1)
-    first_distance = wp.float64(1.0e30)
-    second_distance = wp.float64(1.0e30)
-    query = wp.hash_grid_query(pairs.grid, wp.vec3(x), radius, instances.world[i])
-    k = int(0)
-    while wp.hash_grid_query_next(query, k):
-        if may_touch(instances, basis, pairs, i, s, k / count, k % count):
-            distance = wp.length_sq(x - samples.position[k / count, k % count])
-            if distance > wp.float64(radius * radius):
-                continue
-            if not looks_at(pairs, i, s, k / count, k % count):
-                distance += wp.float64(radius * radius)
-            if distance < first_distance:
-                if first < 0 or first / count != k / count:
-                    second = first
-                    second_distance = first_distance
-                first = k
-                first_distance = distance
-            elif distance < second_distance and first / count != k / count:
-                second = k
-                second_distance = distance
+    body = wp.vec2i(-1, -1)
+    sample = wp.vec2i(-1, -1)
+    first = wp.float64(1.0e30)
+    second = wp.float64(1.0e30)
+    w = instances.world[i]
+    for j in range(progress.instance_start[w], progress.instance_start[w + 1]):
+        radius = wp.float64(search_radius(instances, samples, pairs, i, s, j))
+        if radius > wp.float64(0.0):
+            best = wp.float64(1.0e30)
+            nearest = int(-1)
+            for t in range(instances.sample_count[j]):
+                distance = wp.length_sq(x - samples.position[j, t])
+                if distance > radius * radius or not may_touch(instances, basis, pairs, i, s, j, t):
+                    continue
+                if not looks_at(pairs, i, s, j, t):
+                    distance += BLADE_DISTANCE
+                if distance < best:
+                    best = distance
+                    nearest = t
+            if best < first:
+                second = first
+                body[1] = body[0]
+                sample[1] = sample[0]
+                first = best
+                body[0] = j
+                sample[0] = nearest
+            elif best < second:
+                second = best
+                body[1] = j
+                sample[1] = nearest
     for slot in range(SLOTS):
-        nearest = wp.where(slot == 0, first, second)
-        if nearest < 0:
+        j = body[slot]
+        nearest = sample[slot]
+        if j < 0:
             return
-        j = nearest / count
-        patch = fit_patch(instances, basis, samples, pairs, i, s, j, nearest % count)
+        patch = fit_patch(instances, basis, samples, pairs, i, s, j, nearest)
         gap = patch.gap - wp.float64(instances.contact_radius[i] + instances.contact_radius[j])
         reach = instances.margin[i]
-        if looks_at(pairs, i, s, j, nearest % count):
+        if looks_at(pairs, i, s, j, nearest):
             reach += 2.0 * wp.length(samples.drift[i, s] - patch.drift)
         if patch.total > wp.float64(0.0) and gap < wp.float64(reach):
             pairs.other[i, s, slot] = j
             pairs.gap[i, s, slot] = gap
             pairs.normal[i, s, slot] = patch.normal
-            pairs.nearest[i, s, slot] = nearest % count
+            pairs.nearest[i, s, slot] = nearest
 
 
 @wp.kernel
@@ -473,7 +468,6 @@ def write_pairs(
     s = pairs.sample[i, k] / SLOTS
     slot = pairs.sample[i, k] % SLOTS
     j = pairs.other[i, s, slot]
-    count = samples.position.shape[1]
     x = samples.position[i, s]
     own = instances.row_start[i] + s
     row = pairs.first_row + i * pairs.sample.shape[1] + k
@@ -484,11 +478,12 @@ def write_pairs(
     offset = wp.vec3d()
     for b in range(basis.row.shape[1]):
         basis.row[row, b] = vec8()
-    query = wp.hash_grid_query(pairs.grid, wp.vec3(x), pairs.radius[i, s], instances.world[i])
-    point = int(0)
-    while wp.hash_grid_query_next(query, point):
-        t = point % count
-        if point / count == j and may_touch(instances, basis, pairs, i, s, j, t):
+    at = instances.row_start[j] + nearest
+    for neighbour in range(NEIGHBOURS):
+        t = pairs.neighbour[at, neighbour]
+        if t < 0:
+            break
+        if may_touch(instances, basis, pairs, i, s, j, t):
             theta = weigh(samples, pairs, i, s, j, t, nearest)
             if theta > wp.float64(0.0):
                 total += theta
@@ -498,7 +493,6 @@ def write_pairs(
     inverse = wp.float64(1.0) / total
     # carried on to x; of the same body, the difference to it
     offset = inverse * offset - wp.max(pairs.gap[i, s, slot], wp.float64(0.0)) * pairs.normal[i, s, slot]
-    at = instances.row_start[j] + nearest
     G = displacement_gradient(basis.row_gradient, motion.q_start, j, at, instances.function_count[j])
     F = wp.identity(n=3, dtype=wp.float64) + G
     X = wp.vec3(clamped_inverse(F) * offset)
@@ -519,11 +513,11 @@ def write_pairs(
     n = pairs.normal[i, s, slot]
     offset = pairs.gap[i, s, slot] * n
     particle = instances.particle_start[i] + s
-    for k_before in range(SLOTS):
-        if stick_partner[particle][k_before] == j - progress.instance_start[instances.world[i]]:
+    for before in range(SLOTS):
+        if stick_partner[particle][before] == j - progress.instance_start[instances.world[i]]:
             slip = wp.vec3d()
             for axis in range(3):
-                slip[axis] = stick_slip[particle][k_before, axis]
+                slip[axis] = stick_slip[particle][before, axis]
             G = displacement_gradient(basis.row_gradient, motion.q_start, i, own, instances.function_count[i])
             slip += G * slip
             offset += slip - wp.dot(n, slip) * n

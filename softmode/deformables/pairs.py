@@ -4,14 +4,12 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from scipy.spatial import KDTree
 
 from softmode.deformables import pair_kernels as kernels
 from softmode.deformables.body import ReducedBody
 from softmode.deformables.lanes import LANES, team_size, vec8
 from softmode.deformables.layout import Layout
-
-CELLS = (32, 128)
-"""Cells of the grid along an edge, before it repeats, at least and at most: in all about as many as samples."""
 
 
 class SoftPairs:
@@ -32,12 +30,12 @@ class SoftPairs:
         pairs: Any = kernels.Pairs()
         pairs.first_row = layout.basis.row.shape[0]
         pairs.spacing = wp.array(spacing[layout.asset], dtype=float, device=self.device)
-        pairs.point = self._zeros((count * sample_max,), wp.vec3)
+        table = np.concatenate([neighbours(body) for body in layout.bodies])
+        pairs.neighbour = wp.array(table, dtype=int, device=self.device)
         pairs.surface_normal = self._zeros((count, sample_max), wp.vec3)
         pairs.thickness = wp.array(
             np.concatenate([thickness(b) for b in layout.bodies]), dtype=float, device=self.device
         )
-        pairs.radius = self._zeros((count, sample_max), float)
         self.team = team_size(self.device)
         pairs.tally = self._zeros((count, self.team, 2), int)
         shape = (count, sample_max, kernels.SLOTS)
@@ -47,17 +45,6 @@ class SoftPairs:
         pairs.sample, pairs.entry, pairs.mirror = (self._zeros((count, pair_max), int) for _ in range(3))
         self.table = pairs
         self._extend_basis(count * pair_max)
-
-        # samples are grouped by world; what pads the bodies is in a group of its own
-        used = np.arange(sample_max)[None, :] < layout.instances.sample_count.numpy()[:, None]
-        group = np.where(used, layout.instance_world[:, None], layout.world_count)
-        self.group = wp.array(group.ravel(), dtype=int, device=self.device)
-        cells = 2 ** round(np.log2(np.clip(np.cbrt(count * sample_max), *CELLS)))
-        self.grid = wp.HashGrid(cells, cells, cells, device=self.device)
-        self.grid.reserve(count * sample_max)
-        self.cell = 2.0 * float(spacing.max())
-        self.grid.build(pairs.point, self.cell, groups=self.group)
-        pairs.grid = self.grid.id
 
     def _zeros(self, shape: tuple[int, ...], dtype: Any) -> Any:
         return wp.zeros(shape, dtype=dtype, device=self.device)
@@ -92,7 +79,6 @@ class SoftPairs:
         every = samples.position.shape
         self._launch(kernels.mark_near, layout.instance_count, [instances, progress, samples], [pairs])
         self._launch(kernels.place_surface, every, [instances, basis, motion, samples], [pairs])
-        self.grid.build(pairs.point, self.cell, groups=self.group)
         self._launch(kernels.find_pairs, every, [instances, basis, progress, samples], [pairs])
         dim = (layout.instance_count, self.team)
         self._launch(kernels.compact_pairs, dim, [instances, self.team], [pairs, progress.status], self.team)
@@ -126,4 +112,12 @@ def thickness(body: ReducedBody) -> np.ndarray:
         depth = away @ n
         opposite = (depth > 0.0) & (normals @ n < 0.0) & ((away**2).sum(axis=1) - depth**2 < beside)
         out[s] = depth[opposite].min(initial=out[s])
+    return out
+
+
+def neighbours(body: ReducedBody) -> np.ndarray:
+    """Return the nearest surface samples of each at rest, itself first, shape (surface_count, NEIGHBOURS); -1 pads."""
+    count = min(kernels.NEIGHBOURS, body.surface_count)
+    out = np.full((body.surface_count, kernels.NEIGHBOURS), -1)
+    out[:, :count] = KDTree(body.surface_points).query(body.surface_points, count)[1]
     return out
