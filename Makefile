@@ -21,7 +21,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 unexport VIRTUAL_ENV
 
 .DEFAULT_GOAL := help
-.PHONY: help lock demo test test-slow lint bench accuracy baselines clean
+.PHONY: help lock demo test test-slow lint bench accuracy baselines clean coupling
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -80,6 +80,10 @@ accuracy: $(VENV)/.bench  ## the tables and the picture of docs/accuracy.md
 
 baselines: $(VENV)/.bench  ## the table and the picture of docs/baselines.md
 	$(BIN)/python -m benchmarks.baselines.run --picture docs/images/baselines.png $(ARGS)
+
+coupling: $(VENV)/.dev  ## the tables of docs/coupling.md and docs/contact.md
+	$(BIN)/python -m benchmarks.coupling $(ARGS)
+	$(BIN)/python -m benchmarks.contact
 
 clean:  ## remove what the targets made, the virtual environment included
 	rm -rf $(VENV) .cache out build dist .pytest_cache .ruff_cache .hypothesis
