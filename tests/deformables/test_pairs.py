@@ -381,7 +381,6 @@ def test_impact(ratio, offset, friction):
     """Between soft bodies p is kept to 1e-5, energy never grows by more than 1e-4, at any mass ratio."""
     scene, twins = impact(ratio=ratio, offset=offset, friction=friction)
     p, _, e, force = worst(scene, twins)
-    print(ratio, offset, friction, "dp", p, "e", e, "F", force, "status", scene.reduced.status.numpy())
     assert force > 0.0
     assert p <= 1e-5
     assert e <= 1e-4
@@ -393,7 +392,6 @@ def test_impact_of_stiffnesses(E):
     """The same where one body is a hundred times as stiff as the other, and where both are stiff."""
     scene, twins = impact(E=E, offset=(0.03, 0.02))
     p, _, e, force = worst(scene, twins)
-    print(E, "dp", p, "e", e, "F", force, "status", scene.reduced.status.numpy())
     assert force > 0.0
     assert p <= 1e-5
     assert e <= 1e-4
@@ -403,7 +401,6 @@ def test_impact_of_stiffnesses(E):
 def test_angular_momentum_errs_by_the_time_step_alone(friction):
     """L is kept to first order in dt (implicit Euler loses spin): half the step, half the error; 0.2 % at 1 ms."""
     errors = [worst(*impact(offset=(0.03, 0.02), friction=friction, dt=dt))[1] for dt in (0.002, 0.001, 0.0005)]
-    print(errors)
     assert errors[1] < 2e-3
     assert errors[0] / errors[1] > 1.6
     assert errors[1] / errors[2] > 1.6
@@ -430,7 +427,6 @@ def test_fast_impacts_do_not_tunnel(speed, dt, offset):
     for _ in range(round((0.05 + EDGE) / speed / dt) + 3):
         scene.step()
         depth = max(depth, overlap(scene))
-    print(speed, dt, offset, "depth", depth, scene.reduced.status.numpy())
     assert depth < 0.01 * EDGE
     assert np.abs(scene.momentum(0)[0][2]) > 0.3 * scene.mass() * speed
     assert not scene.reduced.status.numpy().any()
@@ -474,7 +470,7 @@ def test_stack_carries_its_weight():
 
 @pytest.mark.slow
 def test_stack_does_not_drift():
-    """After a second, nothing moves by more than the creep of smoothed friction, stick_velocity t, in ten."""
+    """After a second, nothing moves by more than 0.1 mm in ten."""
     scene = stack()
     replay = scene.capture()
     for _ in range(125):
@@ -483,8 +479,7 @@ def test_stack_does_not_drift():
     for _ in range(1250):
         replay()
     moved = np.array([scene.centre(i) for i in range(3)]) - first
-    print("moved", moved)
-    assert np.abs(moved).max() <= scene.reduced.options.stick_velocity * 10.0
+    assert np.abs(moved).max() <= 1e-4
     assert not scene.reduced.status.numpy().any()
 
 
@@ -515,10 +510,9 @@ def test_soft_rigid_soft_stands(time):
     last = np.array([scene.centre(0), scene.state.body_q.numpy()[0, :3], scene.centre(1)])
     force, box = scene.reduced.instance_force.numpy(), scene.solver.body_wrench.numpy()[0]
     weight = scene.mass() * GRAVITY
-    print("moved", last - first, force / weight, box[2] / GRAVITY)
     np.testing.assert_allclose(force[:, 2], weight, rtol=2e-3)
     assert box[2] == pytest.approx(0.5 * GRAVITY, rel=2e-3)
-    assert np.abs(last - first).max() <= scene.reduced.options.stick_velocity * time + 1e-4
+    assert np.abs(last - first).max() <= 1e-4
 
 
 @pytest.mark.parametrize("tangent", [0.2, 0.6], ids=["below the cone", "above the cone"])
@@ -541,9 +535,10 @@ def test_friction_between_soft_bodies(tangent):
     scene.step(25)
     moved, gained = scene.centre(1)[0] - x, scene.momentum(1)[0][0] / scene.mass(1) - v
     expected = GRAVITY * (np.sin(angle) - mu * np.cos(angle))
-    print(tangent, moved, gained / (25 * dt), expected)
     if tangent < mu:
-        assert abs(moved) <= scene.reduced.options.stick_velocity * 25 * dt
+        assert abs(moved) <= 1e-6
+        weight = scene.mass(1) * gravity
+        np.testing.assert_allclose(-scene.reduced.instance_force.numpy()[1], weight, atol=1e-4 * np.abs(weight).max())
     else:
         assert gained / (25 * dt) == pytest.approx(expected, rel=0.02)
 
@@ -606,7 +601,6 @@ def test_contact_radius():
     points = [surface(scene, i).points[:, 2] for i in range(2)]
     # the load presses each contact in by its stiffness and smoothing
     sink = 2.0 * scene.mass() * GRAVITY / (5.0e7 * EDGE**2) + float(scene.reduced.instances.smoothing.numpy()[0])
-    print(points[0].min(), points[1].min() - points[0].max(), sink)
     assert points[0].min() == pytest.approx(radii[0], abs=sink)
     assert points[1].min() - points[0].max() == pytest.approx(sum(radii), abs=2 * sink)
 
@@ -686,7 +680,6 @@ def test_ring_squeezed_shut(self_contact):
         scene.control.softmode.pin_target.assign(X + min(k / 50, 1.0) * pull)
         scene.step()
     force = scene.reduced.instance_force.numpy()[0]
-    print(self_contact, "opening", tips(scene), "force", force, scene.reduced.status.numpy())
     if self_contact:
         assert -2e-3 < tips(scene) < 1e-3
         assert scene.reduced.entries.pair_count.numpy()[0] > 0
@@ -729,7 +722,6 @@ def shut_ring(dt):
 def test_momentum_of_a_ring_that_shuts():
     """Contact with itself is no force on the body: p is kept to 1e-8, L to first order in dt as without contact."""
     errors = [shut_ring(dt) for dt in (0.001, 0.0005)]
-    print(errors)
     for p, L, force, narrow in errors:
         assert force > 0.1
         assert narrow > -2e-3
