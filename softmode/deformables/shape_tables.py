@@ -17,7 +17,7 @@ def solid_shapes(model: Any) -> np.ndarray:
     """Return which shapes collide with particles, shape (shape_count,).
 
     Raises:
-        ConfigError: If one of them has a form whose distance cannot be queried.
+        ConfigError: If one of them has a form whose distance cannot be queried, or a friction that is not >= 0.
     """
     flags, kinds, scale = model.shape_flags.numpy(), model.shape_type.numpy(), model.shape_scale.numpy()
     solid = (flags & int(newton.ShapeFlags.COLLIDE_PARTICLES)) != 0
@@ -26,6 +26,12 @@ def solid_shapes(model: Any) -> np.ndarray:
             f"{_name(model, shape)} is a {GeoType(int(kinds[shape])).name.lower()}, which a soft body cannot touch",
             hint="put a mesh or primitives (newton.ModelBuilder.approximate_meshes makes convex parts) in its place, "
             "or clear its COLLIDE_PARTICLES flag (ShapeConfig.has_particle_collision)",
+        )
+    friction = model.shape_material_mu.numpy()
+    for shape in np.flatnonzero(solid & ~((friction >= 0.0) & np.isfinite(friction))):
+        raise ConfigError(
+            f"{_name(model, shape)} has friction {friction[shape]:g}, expected a finite number >= 0",
+            hint="give ShapeConfig(mu=...) a Coulomb coefficient; 0 is without friction",
         )
     barrels = (kinds == int(GeoType.CYLINDER)) & (scale[:, 2] > 0.0)
     for shape in np.flatnonzero(solid & barrels):

@@ -1,5 +1,7 @@
 """Distances and normals of rigid shapes against float64 twins; which shapes are refused; status names."""
 
+import dataclasses
+
 import newton
 import numpy as np
 import pytest
@@ -268,7 +270,16 @@ def opened():
     return newton.Mesh(np.asarray(box.vertices), np.asarray(box.faces[:-1]).ravel())
 
 
+def rough(config, friction):
+    """Return a shape configuration with a friction."""
+    return dataclasses.replace(config or newton.ModelBuilder.ShapeConfig(), mu=friction)
+
+
 REFUSED = {
+    "negative friction": (
+        lambda w, cfg=None, **kw: w.add_shape_sphere(-1, radius=0.1, cfg=rough(cfg, -0.1), **kw),
+        "friction -0.1.*mu",
+    ),
     "open mesh": (lambda w, **kw: w.add_shape_mesh(-1, mesh=opened(), **kw), "not closed.*hull"),
     "barrel": (
         lambda w, **kw: w.add_shape_cylinder(-1, radius=0.1, half_height=0.1, barrel_radius=0.5, **kw),
