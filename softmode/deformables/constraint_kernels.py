@@ -184,10 +184,37 @@ def cone_zone(normal: wp.float64, tangent: wp.float64, mu: wp.float64):
 
 
 @wp.func
+def cone_row(
+    zone: int,
+    first: int,  # whether it is the cone's first row, on which the costs of the middle zone are booked
+    x: wp.float64,
+    normal: wp.float64,
+    tangent: wp.float64,
+    mu: wp.float64,
+    scale: wp.float64,
+    D: wp.float64,
+    Dm: wp.float64,
+):
+    """Return slope and cost of one row of an elliptic cone."""
+    slope = wp.float64(0.0)
+    cost = wp.float64(0.0)
+    if zone == 1:
+        slope = D * x
+        cost = wp.float64(0.5) * D * x * x
+    elif zone == 2:
+        gap = normal - mu * tangent
+        if first != 0:
+            slope = Dm * gap * mu
+            cost = wp.float64(0.5) * Dm * gap * gap
+        else:
+            slope = -Dm * gap * mu * scale * scale * x / tangent
+    return slope, cost
+
+
+@wp.func
 def evaluate_cone(rigid: Rigid, w: int, head: int, r: wp.array2d[wp.float64], dt: wp.float64, derivatives: int):
     """Evaluate an elliptic cone: 1/2 D_m (N - mu T)^2 between the cone and its polar, N = mu x_0, T = |friction x|."""
     zero = wp.float64(0.0)
-    half = wp.float64(0.5)
     size = rigid.row_size[w, head]
     mu = rigid.row_limit[w, head]
     D0 = rigid.row_stiffness[w, head]
@@ -214,31 +241,9 @@ def evaluate_cone(rigid: Rigid, w: int, head: int, r: wp.array2d[wp.float64], dt
         x = x_start + rigid.row_change[w, k]
         D = rigid.row_stiffness[w, k]
         scale = rigid.row_limit[w, k]
-        # costs of the middle zone are booked on the first row
-        slope_start = zero
-        cost_start = zero
-        if zone_start == 1:
-            slope_start = D * x_start
-            cost_start = half * D * x_start * x_start
-        elif zone_start == 2:
-            gap = normal_start - mu * tangent_start
-            if k == head:
-                slope_start = Dm * gap * mu
-                cost_start = half * Dm * gap * gap
-            else:
-                slope_start = -Dm * gap * mu * scale * scale * x_start / tangent_start
-        slope = zero
-        cost = zero
-        if zone == 1:
-            slope = D * x
-            cost = half * D * x * x
-        elif zone == 2:
-            gap = normal - mu * tangent
-            if k == head:
-                slope = Dm * gap * mu
-                cost = half * Dm * gap * gap
-            else:
-                slope = -Dm * gap * mu * scale * scale * x / tangent
+        first = wp.where(k == head, 1, 0)
+        slope_start, cost_start = cone_row(zone_start, first, x_start, normal_start, tangent_start, mu, scale, D, Dm)
+        slope, cost = cone_row(zone, first, x, normal, tangent, mu, scale, D, Dm)
         rigid.row_energy[w, k] = dt * dt * (cost - cost_start - slope_start * rigid.row_change[w, k])
         rigid.row_force[w, k] = slope - slope_start
     if derivatives == 0:

@@ -395,6 +395,45 @@ def remembered_slip(
     return slip - wp.dot(slip, normal) * normal, anchor
 
 
+@wp.func
+def rank_contacts(
+    found: wp.array3d[int],  # (instance_count, sample_max, SLOTS), -1 where empty
+    gap: wp.array3d[wp.float64],  # likewise [m]
+    tally: wp.array3d[int],  # (instance_count, team, 2), scratch
+    i: int,
+    begin: int,
+    end: int,
+    lane: int,
+    team: int,
+):
+    """Return where a thread writes what touches and what is close of its samples, and how many there are in all.
+
+    What touches stands before what is close, each in sample order. Every thread of the team must call it.
+    """
+    touching = int(0)
+    close = int(0)
+    for s in range(begin, end):
+        for slot in range(SLOTS):
+            if found[i, s, slot] >= 0:
+                if gap[i, s, slot] <= wp.float64(0.0):
+                    touching += 1
+                else:
+                    close += 1
+    tally[i, lane, 0] = touching
+    tally[i, lane, 1] = close
+    barrier()
+    at_touching = int(0)
+    at_close = int(0)
+    total = int(0)
+    for k in range(team):
+        if k < lane:
+            at_touching += tally[i, k, 0]
+            at_close += tally[i, k, 1]
+        at_close += tally[i, k, 0]
+        total += tally[i, k, 0] + tally[i, k, 1]
+    return at_touching, at_close, total
+
+
 @wp.kernel
 def gather_contacts(
     instances: Instances,
@@ -421,27 +460,10 @@ def gather_contacts(
     count = instances.sample_count[i]
     begin = lane * count / team
     end = (lane + 1) * count / team
-    touching = int(0)
-    close = int(0)
-    for s in range(begin, end):
-        for slot in range(SLOTS):
-            if samples.shape[i, s, slot] >= 0:
-                if samples.gap[i, s, slot] <= wp.float64(0.0):
-                    touching += 1
-                else:
-                    close += 1
-    samples.tally[i, lane, 0] = touching
-    samples.tally[i, lane, 1] = close
-    barrier()
-    total = instances.pin_count[i]
-    at_touching = total
-    at_close = total
-    for k in range(team):
-        if k < lane:
-            at_touching += samples.tally[i, k, 0]
-            at_close += samples.tally[i, k, 1]
-        at_close += samples.tally[i, k, 0]
-        total += samples.tally[i, k, 0] + samples.tally[i, k, 1]
+    at_touching, at_close, total = rank_contacts(samples.shape, samples.gap, samples.tally, i, begin, end, lane, team)
+    at_touching += instances.pin_count[i]
+    at_close += instances.pin_count[i]
+    total += instances.pin_count[i]
     if lane == 0:
         entries.count[i] = wp.min(total, entry_max)
         if total > entry_max:

@@ -25,9 +25,9 @@ is the difference.
 import warp as wp
 
 from softmode.deformables.contact import stiffness_per_area
-from softmode.deformables.detection import Samples
+from softmode.deformables.detection import Samples, rank_contacts
 from softmode.deformables.kernels import displacement_gradient
-from softmode.deformables.lanes import barrier, vec8
+from softmode.deformables.lanes import vec8
 from softmode.deformables.status import WORLD_CONTACT_OVERFLOW
 from softmode.deformables.tables import Basis, Entries, Instances, Motion, Progress, mat23d
 
@@ -369,27 +369,7 @@ def compact_pairs(
         return
     begin = lane * instances.sample_count[i] / team
     end = (lane + 1) * instances.sample_count[i] / team
-    touching = int(0)
-    close = int(0)
-    for s in range(begin, end):
-        for slot in range(SLOTS):
-            if pairs.other[i, s, slot] >= 0:
-                if pairs.gap[i, s, slot] <= wp.float64(0.0):
-                    touching += 1
-                else:
-                    close += 1
-    pairs.tally[i, lane, 0] = touching
-    pairs.tally[i, lane, 1] = close
-    barrier()
-    total = int(0)
-    at_touching = int(0)
-    at_close = int(0)
-    for k in range(team):
-        if k < lane:
-            at_touching += pairs.tally[i, k, 0]
-            at_close += pairs.tally[i, k, 1]
-        at_close += pairs.tally[i, k, 0]
-        total += pairs.tally[i, k, 0] + pairs.tally[i, k, 1]
+    at_touching, at_close, total = rank_contacts(pairs.other, pairs.gap, pairs.tally, i, begin, end, lane, team)
     if lane == 0:
         pairs.count[i] = wp.min(total, pairs.sample.shape[1])
         if total > pairs.sample.shape[1]:
