@@ -20,6 +20,9 @@ from softmode.deformables.tables import (
 
 wp.set_module_options({"enable_backward": False})
 
+CONDENSED_ROUNDING = wp.constant(wp.float64(1.0e-6))
+"""Rounding of a condensed diagonal entry as a fraction of the entry before: the bodies are factored in float32."""
+
 
 @wp.func
 def block_pair(pair: int):
@@ -367,51 +370,93 @@ def condense(
             value -= wp.float64(y) * wp.float64(factored[i, row, first + column / LANES][column % LANES])
     if l == rigid.count[w]:
         rigid.direction[w, j] = value
-    else:
-        rigid.matrix[w, j, l] = value
+        return
+    if l == j:
+        rigid.pivot_min[w, j] = wp.max(rigid.pivot_floor[w, j], CONDENSED_ROUNDING * rigid.matrix[w, j, j])
+    rigid.matrix[w, j, l] = value
+
+
+@wp.func
+def factor_rigid(
+    matrix: wp.array3d[wp.float64], pivot_min: wp.array2d[wp.float64], w: int, n: int, lane: int, team: int
+):
+    """Replace the matrix of a world by its lower Cholesky factor; a team shares the rows below the pivot.
+
+    A pivot is raised to ``pivot_min`` where it is below, and as far as the column under it needs to stay within what
+    the diagonal allows, so that an indefinite matrix has no huge factors, after the modified Cholesky factorisation of
+    Gill and Murray 1974 (doi:10.1007/BF01585529). Ends with a barrier.
+    """
+    for a in range(n):
+        pivot = matrix[w, a, a]
+        for s in range(a):
+            pivot -= matrix[w, a, s] * matrix[w, a, s]
+        for b in range(a + 1 + lane, n, team):
+            value = matrix[w, b, a]
+            for s in range(a):
+                value -= matrix[w, b, s] * matrix[w, a, s]
+            matrix[w, b, a] = value
+        barrier()
+        pivot = wp.max(pivot, pivot_min[w, a])
+        for b in range(a + 1, n):
+            pivot = wp.max(pivot, matrix[w, b, a] * matrix[w, b, a] / wp.max(matrix[w, b, b], pivot_min[w, b]))
+        pivot = wp.sqrt(pivot)
+        barrier()
+        if lane == 0:
+            matrix[w, a, a] = pivot
+        for b in range(a + 1 + lane, n, team):
+            matrix[w, b, a] = matrix[w, b, a] / pivot
+        barrier()
+
+
+@wp.kernel
+def bound_pivots(
+    team: int,
+    # In and out:
+    rigid: Rigid,
+):
+    """Compute the pivots of M_eff / dt^2, the least that those of the condensed matrix can be.
+
+    The condensed matrix is the inertia plus something positive semidefinite, so its pivots, the reciprocals of the last
+    diagonal entries of the leading blocks' inverses, are not smaller.
+    """
+    w, lane = wp.tid()
+    n = rigid.count[w]
+    for a in range(lane, n, team):
+        rigid.pivot_floor[w, a] = wp.float64(1.0e-12) * rigid.inertia[w, a, a]
+        for b in range(a + 1):
+            rigid.matrix[w, a, b] = rigid.inertia[w, a, b]
+    barrier()
+    factor_rigid(rigid.matrix, rigid.pivot_floor, w, n, lane, team)
+    for a in range(lane, n, team):
+        rigid.pivot_floor[w, a] = rigid.matrix[w, a, a] * rigid.matrix[w, a, a]
 
 
 @wp.kernel
 def solve_rigid(
     active: wp.array[int],
     team: int,
-    # In and out: matrix and right-hand side, overwritten by the lower Cholesky factor and the solution
-    matrix: wp.array3d[wp.float64],
-    count: wp.array[int],
-    solution: wp.array2d[wp.float64],
+    # In and out: ``matrix`` and ``direction`` are overwritten by the factor and the solution
+    rigid: Rigid,
 ):
-    """Solve S x = s by Cholesky, column by column; a team shares the rows below the pivot."""
+    """Solve S x = s by Cholesky. Pivots that rounding put below those of the inertia are raised to them."""
     w, lane = wp.tid()
     if active[w] == 0:
         return
-    n = count[w]
-    for a in range(n):
-        pivot = matrix[w, a, a]
-        full = pivot
-        for s in range(a):
-            pivot -= matrix[w, a, s] * matrix[w, a, s]
-        pivot = wp.sqrt(wp.max(pivot, wp.float64(1.0e-12) * wp.abs(full)))
-        barrier()
-        if lane == 0:
-            matrix[w, a, a] = pivot
-            value = solution[w, a]
-            for s in range(a):
-                value -= matrix[w, a, s] * solution[w, s]
-            solution[w, a] = value / pivot
-        for b in range(a + 1 + lane, n, team):
-            value = matrix[w, b, a]
-            for s in range(a):
-                value -= matrix[w, b, s] * matrix[w, a, s]
-            matrix[w, b, a] = value / pivot
-        barrier()
+    n = rigid.count[w]
+    factor_rigid(rigid.matrix, rigid.pivot_min, w, n, lane, team)
     if lane != 0:
         return
+    for a in range(n):
+        value = rigid.direction[w, a]
+        for s in range(a):
+            value -= rigid.matrix[w, a, s] * rigid.direction[w, s]
+        rigid.direction[w, a] = value / rigid.matrix[w, a, a]
     for reverse in range(n):
         a = n - 1 - reverse
-        value = solution[w, a]
+        value = rigid.direction[w, a]
         for s in range(a + 1, n):
-            value -= matrix[w, s, a] * solution[w, s]
-        solution[w, a] = value / matrix[w, a, a]
+            value -= rigid.matrix[w, s, a] * rigid.direction[w, s]
+        rigid.direction[w, a] = value / rigid.matrix[w, a, a]
 
 
 @wp.kernel

@@ -289,6 +289,7 @@ class SolverCoupledReduced(SolverBase):
         )
         rows = [self.mujoco, self.turned, state.joint_q]
         self._launch(constraints.gather_rows, (self.reduced.world_count, dofs.row_max), rows, [dofs.table])
+        self.reduced.bound_pivots()
         self.reduced.differentiate_entries()
 
     def notify_model_changed(self, flags: int) -> None:

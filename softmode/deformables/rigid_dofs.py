@@ -33,6 +33,8 @@ class RigidDofs:
         self.gradient = wp.zeros_like(self.predicted)
         self.direction = wp.zeros_like(self.predicted)
         self.matrix = wp.zeros_like(self.inertia)
+        self.pivot_floor = wp.zeros_like(self.predicted)
+        self.pivot_min = wp.zeros_like(self.predicted)
         articulation, link = _link_table(model)
         start, count = _articulation_dofs(model)
         self.body_articulation = wp.array(articulation, dtype=int, device=device)

@@ -19,6 +19,12 @@ FAILURES = wp.constant(2)
 """Indefinite Hessians after which a step keeps to the projected one."""
 PROJECTED_ITERATIONS = wp.constant(8)
 """Iterations before which a small step with the projected Hessian does not count as convergence."""
+SUFFICIENT_DECREASE = wp.constant(wp.float64(0.25))
+"""Least decrease of the potential over that of its tangent. A quadratic has 0.5; with little less than that asked for,
+friction between sticking and slipping is crossed back and forth for many iterations."""
+EXTENDED_DECREASE = wp.constant(wp.float64(0.54))
+"""Decrease beyond which twice the full step is tried. In the onset of contact the potential is cubic (0.58): there
+Newton's steps halve the penetration, and double ones end it."""
 
 
 @wp.func
@@ -227,7 +233,10 @@ def judge_trial(
     # In and out:
     progress: Progress,
 ):
-    """Accept a trial that lowers the potential (Armijo, up to rounding) or halve the step; give up at the minimum."""
+    """Accept a trial that lowers the potential enough (Armijo, up to rounding) or halve the step; give up if short.
+
+    Where a full step has lowered it by more than a quadratic would have, take the better of that and twice the step.
+    """
     w, lane = wp.tid()
     if progress.searching[w] == 0:
         return
@@ -238,7 +247,17 @@ def judge_trial(
     potential = progress.potential[w]
     rounding = wp.float64(1.0e-12) * wp.abs(potential)
     alpha = progress.step_length[w]
-    if trial <= potential + wp.float64(1.0e-4) * alpha * progress.slope[w] + rounding:
+    if alpha > wp.float64(1.0):
+        progress.searching[w] = 0
+        if not (trial < progress.reached[w]):
+            progress.step_length[w] = wp.float64(1.0)
+        return
+    if alpha == wp.float64(1.0) and trial < potential + EXTENDED_DECREASE * progress.slope[w] - rounding:
+        progress.reached[w] = trial
+        progress.step_length[w] = wp.float64(2.0)
+        wp.atomic_max(progress.any_searching, 0, 1)
+        return
+    if trial <= potential + SUFFICIENT_DECREASE * alpha * progress.slope[w] + rounding:
         progress.searching[w] = 0
         return
     alpha *= wp.float64(0.5)
@@ -299,13 +318,13 @@ def finish_iteration(
     slow = progress.iteration[w] >= 2 * renewal
     if slow or progress.iteration[w] % renewal == 0 or alpha == wp.float64(0.0):
         progress.renew[w] = 1
-    if alpha == wp.float64(0.0) or slow:
+    if alpha == wp.float64(0.0) or (slow and away == 1):
         progress.project[w] = 1
     elif progress.project[w] != 0 and away == 0 and progress.failures[w] < FAILURES:
         progress.project[w] = 0
         progress.renew[w] = 1
     progress.exact[w] = 0
-    if alpha == wp.float64(1.0):
+    if alpha >= wp.float64(1.0):
         progress.exact[w] = 1
     if alpha == wp.float64(0.0) and progress.last[w] == 0 and not stale:
         progress.active[w] = 0

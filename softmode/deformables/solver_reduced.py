@@ -56,7 +56,7 @@ class SolverReducedOptions:
     60 Hz). "bdf2": keeps 97 % of it; second order for a body without viscosity (whose stress is differenced
     backwards). It needs equal steps, and takes an Euler step where there is none before, as after a reset, and where
     a body has contacts. Who writes q or qd must set ``state.softmode.dt_before`` of the instance to 0."""
-    iteration_max: int = 20
+    iteration_max: int = 40
     """Newton iterations at most."""
     stiffness_renewal: int = 5
     """The elastic Hessian is assembled every so many iterations at least (contact always is), and"""
@@ -66,7 +66,7 @@ class SolverReducedOptions:
     """Newton stops when every body moved less than this fraction of its size (rms) in an iteration, and"""
     force_tolerance: float = 1.0e-5
     """when the residual force on every body near a contact is below this fraction of the forces on it."""
-    step_length_min: float = 2.0**-10
+    step_length_min: float = 2.0**-16
     """Shortest step the line search tries."""
     contact_max: int = 256
     """Contacts per instance at most; more raise the overflow flag and drop those that do not touch yet."""
@@ -351,6 +351,10 @@ class SolverReduced(SolverBase):
         dim = (self.instance_count, self.entry_max)
         self._launch(detection.entry_jacobians, dim, [self.instances, self.rigid.table], [self.entries])
 
+    def bound_pivots(self) -> None:
+        """Compute the pivots of the inertia, below which those of the condensed rigid system cannot be."""
+        self._launch_team(assembly.bound_pivots, self.world_count, [self.team], [self.rigid.table])
+
     def _place_samples(self) -> None:
         """Compute where the surface samples are and what bounds them."""
         every = (self.instance_count, self.layout.sample_max)
@@ -539,8 +543,7 @@ class SolverReduced(SolverBase):
             dim = (self.world_count, rigid.count_max, rigid.count_max + 1)
             tables = [self.progress, self.system_start, rigid.count_max, system.matrix]
             self._launch(assembly.condense, dim, tables, [rigid.table])
-            dense = [rigid.matrix, rigid.count, rigid.direction]
-            self._launch_team(assembly.solve_rigid, self.world_count, [active, self.team, *dense])
+            self._launch_team(assembly.solve_rigid, self.world_count, [active, self.team], [rigid.table])
         solution = system.solve(active, rigid.count_max, rigid.direction, rigid.count_max)
         if self.part_count > 1:
             self._launch(assembly.read_direction, self.functions, [self.instances, solution], [self.direction])

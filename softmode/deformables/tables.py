@@ -136,6 +136,8 @@ class Rigid:
     gradient: wp.array2d[wp.float64]
     direction: wp.array2d[wp.float64]
     matrix: wp.array3d[wp.float64]  # (world_count, rigid_max, rigid_max)
+    pivot_floor: wp.array2d[wp.float64]  # (world_count, rigid_max), Cholesky pivots of the inertia
+    pivot_min: wp.array2d[wp.float64]  # (world_count, rigid_max), least pivots of the condensed matrix
     body_articulation: wp.array[int]  # (body_count,), -1 for none
     body_link: wp.array[int]  # (body_count,), row block in the articulation's Jacobian
     articulation_dof_start: wp.array[int]
@@ -173,6 +175,7 @@ class Progress:
     potential: wp.array[wp.float64]  # [J]
     slope: wp.array[wp.float64]  # [J]
     step_length: wp.array[wp.float64]
+    reached: wp.array[wp.float64]  # potential after a full step, while a longer one is tried [J]
     partial: wp.array2d[wp.float64]  # (world_count, team), scratch of sums
     any_active: wp.array[int]  # (1,)
     any_searching: wp.array[int]  # (1,)
