@@ -176,9 +176,13 @@ def viscous_hessian(F: np.ndarray, mu: float, lam: float, viscosity: float, dt: 
 
 
 def normal_potential(penetration: np.ndarray, eps: float) -> np.ndarray:
-    """Return p^3 / (6 eps) up to p = eps and p^2/2 - eps p/2 + eps^2/6 beyond, 0 for p < 0."""
-    p = np.maximum(penetration, 0.0)
-    return np.where(p < eps, p**3 / (6 * eps), p * p / 2 - eps * p / 2 + eps * eps / 6)
+    """Return the contact potential per unit stiffness: a C2 penalty and one nine times as stiff from 2 eps on."""
+
+    def penalty(p, eps):
+        p = np.maximum(p, 0.0)
+        return np.where(p < eps, p**3 / (6 * eps), p * p / 2 - eps * p / 2 + eps * eps / 6)
+
+    return penalty(penetration, eps) + 9.0 * penalty(penetration - 2.0 * eps, 2.0 * eps)
 
 
 def friction_potential(y: np.ndarray, eps: float) -> np.ndarray:

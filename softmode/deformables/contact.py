@@ -38,6 +38,11 @@ INERTIA_FACTOR = wp.constant(100.0)
 sinks 1.5 to 3 mm at 5 m/s instead of 0.2 to 0.9; 1000 sinks 0.2 mm for a third more iterations."""
 STIFFNESS_FLOOR = wp.constant(1.0e8)
 """Least contact stiffness per area [Pa/m]: under 25 kPa, a firm grasp, contact sinks by 0.25 mm."""
+HARDENING = wp.constant(wp.float64(9.0))
+"""Stiffness that contact gains where it is deep, over that where it is not: what an arm presses with its full force
+sinks in 1.4 to 2.4 mm instead of 7 to 8. Ten times the stiffness throughout costs light bodies momentum."""
+HARDENING_DEPTH = wp.constant(wp.float64(2.0))
+"""Penetration beyond which it does, in ranges of the onset."""
 
 LAG_ITERATIONS = wp.constant(8)
 """Newton iterations during which the normal force of friction follows the contact; then it is frozen, and what is left
@@ -45,7 +50,7 @@ is the minimisation of one potential."""
 
 
 @wp.func
-def normal_potential(penetration: wp.float64, eps: wp.float64):
+def penalty(penetration: wp.float64, eps: wp.float64):
     """Return the C2 penalty of a penetration [m] per unit stiffness, and its first two derivatives."""
     p = wp.max(penetration, wp.float64(0.0))
     half = wp.float64(0.5)
@@ -53,6 +58,18 @@ def normal_potential(penetration: wp.float64, eps: wp.float64):
     if p < eps:
         return p * p * p / (six * eps), half * p * p / eps, p / eps
     return half * p * p - half * eps * p + eps * eps / six, p - half * eps, wp.float64(1.0)
+
+
+@wp.func
+def normal_potential(penetration: wp.float64, eps: wp.float64):
+    """Return the contact potential of a penetration [m] per unit stiffness, and its first two derivatives.
+
+    The C2 penalty, and a stiffer one that sets in twice as deep and as slowly.
+    """
+    psi, slope, curvature = penalty(penetration, eps)
+    deep = HARDENING_DEPTH * eps
+    psi_deep, slope_deep, curvature_deep = penalty(penetration - deep, deep)
+    return psi + HARDENING * psi_deep, slope + HARDENING * slope_deep, curvature + HARDENING * curvature_deep
 
 
 @wp.func

@@ -43,9 +43,9 @@ def test_mesh_contact_is_not_lost_when_deep():
 
 
 def test_potentials():
-    """psi_n equals p^3/(6 eps), p^2/2 - eps p/2 + eps^2/6, C2 at eps; psi_t is eq. (13) of IPC; both slopes too."""
+    """psi_n equals p^3/(6 eps), p^2/2 - eps p/2 + eps^2/6 and the same stiffer from 2 eps, C2; psi_t IPC's eq. (13)."""
     eps, step = 1.0e-3, 1.0e-9
-    x = np.concatenate([np.linspace(-eps, 4 * eps, 501), [0.0, eps, 0.5 * eps]])
+    x = np.concatenate([np.linspace(-eps, 8 * eps, 501), [0.0, eps, 0.5 * eps]])
 
     def evaluate(values):
         with wp.ScopedDevice("cpu"):
@@ -56,11 +56,11 @@ def test_potentials():
         return normal.numpy(), friction.numpy()
 
     normal, friction = evaluate(x)
-    np.testing.assert_allclose(normal[:, 0], reference.normal_potential(x, eps), atol=1e-15)
+    np.testing.assert_allclose(normal[:, 0], reference.normal_potential(x, eps), rtol=1e-12, atol=1e-15)
     plus, minus = evaluate(x + step), evaluate(x - step)
     # Curvature jumps in its own slope only (C2), so differences err by step times 1/eps.
     np.testing.assert_allclose((plus[0] - minus[0])[:, 0] / (2 * step), normal[:, 1], atol=1e-9)
-    np.testing.assert_allclose((plus[0] - minus[0])[:, 1] / (2 * step), normal[:, 2], atol=2 * step / eps)
+    np.testing.assert_allclose((plus[0] - minus[0])[:, 1] / (2 * step), normal[:, 2], atol=5 * step / eps)
     slip = x > 2 * step
     np.testing.assert_allclose(friction[slip, 0], reference.friction_potential(x[slip], eps), atol=1e-15)
     slope = (plus[1] - minus[1])[slip, 0] / (2 * step)
