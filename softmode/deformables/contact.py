@@ -91,10 +91,12 @@ def friction_potential(y: wp.float64, eps: wp.float64):
 def stick_potential(y: wp.float64, limit: wp.float64, stiffness: wp.float64):
     """Return energy [J], force over slip and curvature along the slip [N/m] of elastic-plastic friction at slip y [m].
 
-    A spring up to the force ``limit`` [N], constant force beyond.
+    A spring up to the force ``limit`` [N], constant force beyond; nothing where the limit is 0.
     """
     zero = wp.float64(0.0)
     half = wp.float64(0.5)
+    if limit <= zero:
+        return zero, zero, zero
     if stiffness * y <= limit:
         return half * stiffness * y * y, stiffness, stiffness
     return limit * (y - half * limit / stiffness), limit / y, zero

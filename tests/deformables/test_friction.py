@@ -28,7 +28,7 @@ def test_stick_potential():
     limit, stiffness, step = 0.3, 2.0e3, 1.0e-9
     y = np.linspace(step, 4.0 * limit / stiffness, 400)
 
-    def evaluate(values):
+    def evaluate(values, limit=limit):
         with wp.ScopedDevice("cpu"):
             out = wp.zeros(len(values), dtype=wp.vec3d)
             inputs = [wp.array(values, dtype=wp.float64), wp.float64(limit), wp.float64(stiffness)]
@@ -41,6 +41,22 @@ def test_stick_potential():
     np.testing.assert_allclose(value[:, 1] * y, slope, atol=1e-5 * limit)
     assert (value[:, 1] * y).max() == pytest.approx(limit)
     np.testing.assert_array_equal(value[:, 2], np.where(y * stiffness <= limit, stiffness, 0.0))
+    np.testing.assert_array_equal(evaluate(np.array([0.0, step]), limit=0.0), 0.0)
+
+
+def test_what_does_not_press_does_not_hold():
+    """A body at rest in reach of the ground, but above it, falls along it at its first step: v = g dt to rounding.
+
+    Nothing of friction may be in the matrix of that step either, or Newton needs more than the two iterations.
+    """
+    position = (0.0, 0.0, 0.5 * EDGE + 5.0e-4)
+    scene = Scene(
+        lambda world: add_reduced_body(world, cube(), position=position), [cube()], gravity=(GRAVITY, 0, 0), ground=MU
+    )
+    scene.step()
+    assert scene.reduced.entries.count.numpy()[0] > 0
+    np.testing.assert_allclose(scene.momentum()[0] / scene.mass(), [GRAVITY * scene.dt, 0.0, 0.0], rtol=1e-6)
+    assert scene.reduced.iteration.numpy()[0] <= 2
 
 
 # -- inclines ----------------------------------------------------------------------------------------------------------
