@@ -558,9 +558,8 @@ def gather_pins(
         arm = wp.quat_rotate(wp.transform_get_rotation(pose), wp.vec3(target) - shapes.body_com[body])
         target = wp.vec3d(wp.transform_point(pose, wp.vec3(target)))
         if prescribed != 0:
-            target += wp.vec3d(
-                dt * (wp.spatial_top(shapes.body_qd[body]) + wp.cross(wp.spatial_bottom(shapes.body_qd[body]), arm))
-            )
+            twist = shapes.body_qd[body]
+            target += wp.vec3d(dt * wp.spatial_top(twist) + turn(dt * wp.spatial_bottom(twist), arm))
         entries.arm[i, e] = arm
     entries.dof_begin[i, e] = 0
     entries.dof_end[i, e] = 0

@@ -158,6 +158,27 @@ def test_prescribed_link_carries_the_body_along():
     assert scene.reduced.instance_force.numpy()[0] == pytest.approx(np.zeros(3))
 
 
+def test_pins_of_a_prescribed_link_stay_on_their_circle():
+    """Where a link turns by omega dt in a step, its pins end on the circle they began on: t = x + R(omega dt) a."""
+    body, turn = cube(), 0.2
+
+    def populate(world):
+        link = add_free_box(world, (0.05, 0.05, 0.02), 1.0, (0.0, 0.0, HALF + 0.04))
+        attach(world, add_reduced_body(world, body), body, link=link, box=TOP)
+
+    scene = Scene(populate, [body], dt=0.01)
+    solver, state, link = scene.reduced, scene.state, np.array([0.0, 0.0, HALF + 0.04])
+    state.body_qd.assign(np.array([[0.0, 0.0, 0.0, 0.0, turn / scene.dt, 0.0]], np.float32))
+    solver.begin(state, scene.control, scene.dt)
+    solver.detect(state, scene.control, scene.dt, prescribed=True)
+    count = solver.instances.pin_count.numpy()[0]
+    points = solver.basis.row_point.numpy()[-count:]
+    target = points - solver.entries.offset.numpy()[0, :count]  # the body is where it was put: x_n = X
+    circle = link + (points - link) @ rotation((0, 1, 0), turn).T
+    np.testing.assert_allclose(target, circle, atol=1e-6)
+    assert np.linalg.norm(circle - points, axis=1).min() > 1e-3
+
+
 def test_held_body_does_not_touch_its_link():
     """The shapes of the link a body is fixed to are not in contact with it, until it is released."""
     scene, attachment = joined(gap=-0.01)
