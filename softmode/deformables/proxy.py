@@ -97,6 +97,7 @@ class SolverReducedProxy(SolverReduced, CouplingInterface):
             self._launch(kernels.predict_bodies, count, inputs, [self.rigid.table])
         self.begin(state_in, control, dt)
         self.detect(state_in, control, dt, prescribed=False)
+        self.bound_pivots()
         self.differentiate_entries()
         self.minimise(dt)
         self.finish(state_out, dt)

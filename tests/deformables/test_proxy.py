@@ -50,6 +50,16 @@ def test_box_on_cube_on_ground(mass):
     assert np.mean(net[-25:]) + np.mean(on_box[-25:]) == pytest.approx(weight + cube_weight, rel=5e-3)
 
 
+def test_pivots_of_the_inertia():
+    """The free bodies' part of the linear system is bounded below by the Cholesky pivots of their inertia / dt^2."""
+    run = box_on_cube()
+    run.replay()
+    rigid = run.solver.solver("soft").rigid
+    pivots = np.diag(np.linalg.cholesky(rigid.inertia.numpy()[0])) ** 2
+    np.testing.assert_allclose(rigid.pivot_floor.numpy()[0], pivots, rtol=1e-12)
+    assert pivots.min() > 0.0
+
+
 def test_squeeze_equals_drive():
     """A PD gripper's fingers press with k (target - q) within 1 %, deviation under 1 %, E 5e5, 4 ms, three passes."""
     ratio, deviation = squeeze("proxy x3", 5.0e5, 0.004)
