@@ -29,7 +29,7 @@ from softmode.deformables.detection import Samples, rank_contacts
 from softmode.deformables.kernels import displacement_gradient
 from softmode.deformables.lanes import vec8
 from softmode.deformables.status import WORLD_CONTACT_OVERFLOW
-from softmode.deformables.tables import Basis, Entries, Instances, Motion, Progress, mat23d
+from softmode.deformables.tables import SLOTS, Basis, Entries, Instances, Motion, Progress, mat23d
 
 wp.set_module_options({"enable_backward": False})
 
@@ -37,8 +37,6 @@ NEIGHBOURS = 32
 """Samples that make up the surface about a sample: those within three spacings of it."""
 BLADE_DISTANCE = wp.constant(wp.float64(1.0e10))
 """Squared distance by which samples that are not looked at come after those that are [m^2]."""
-SLOTS = 2
-"""Other bodies that one sample may touch: the nearest two."""
 FACING = wp.constant(0.3)
 """c: one sample looks at another where the cosine between their normals is below -c. Above c they look the same way and
 cannot touch: the far side of a thin body."""

@@ -10,6 +10,7 @@ from softmode.deformables import pair_kernels as kernels
 from softmode.deformables.body import ReducedBody
 from softmode.deformables.lanes import LANES, team_size, vec8
 from softmode.deformables.layout import Layout
+from softmode.deformables.tables import SLOTS
 
 
 class SoftPairs:
@@ -38,7 +39,7 @@ class SoftPairs:
         )
         self.team = team_size(self.device)
         pairs.tally = self._zeros((count, self.team, 2), int)
-        shape = (count, sample_max, kernels.SLOTS)
+        shape = (count, sample_max, SLOTS)
         pairs.other, pairs.nearest, pairs.held = (self._zeros(shape, int) for _ in range(3))
         pairs.gap, pairs.normal = self._zeros(shape, wp.float64), self._zeros(shape, wp.vec3d)
         pairs.near, pairs.count = (self._zeros((count,), int) for _ in range(2))

@@ -12,7 +12,7 @@ import warp as wp
 from softmode.deformables.lanes import sum8d, vec8, vec8d
 
 SLOTS = 2
-"""Contacts kept per surface sample: the deepest two."""
+"""What a surface sample may touch at a time: the deepest two shapes, and the nearest two other soft bodies."""
 mat23d: Any = wp.types.matrix(shape=(SLOTS, 3), dtype=wp.float64)
 
 
