@@ -1,7 +1,7 @@
 """A compiled robot and what is read from it: home pose, tool, gripper, and position drives for its joints.
 
 Position servos are turned into joint drives, because the joint solve with soft bodies knows the damping of drives but
-not that of actuators or constraints:
+not that of actuators:
 
 - an affine actuator on a joint, tau = clamp(g u - k q - d qd), becomes a drive of stiffness k and damping d;
 - joints tied by a linear equality q_i = a_i + s_i q_0 (the fingers of most grippers) each get a share of the drive that
