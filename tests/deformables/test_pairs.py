@@ -23,6 +23,7 @@ from softmode.deformables.solver_reduced import (
     register_custom_attributes,
 )
 from tests import reference
+from tests.deformables.test_driven import held_bar
 from tests.scenes import GRAVITY, RIGID_GAP, Scene, add_free_box, cube, rotation
 
 EDGE = 0.1
@@ -338,6 +339,30 @@ def test_matrix_of_a_world(rigid):
         d = d / np.linalg.norm(d)
         difference = (potential.gradient(u + step * d) - potential.gradient(u - step * d)) / (2 * step)
         np.testing.assert_allclose(matrix @ d, difference, atol=1e-4 * size)
+
+
+def test_derivatives_with_a_driven_body():
+    """A cube on a bar of other functions, some driven: E, gradient and matrix agree; driven unknowns stay put."""
+    body = held_bar()
+
+    def populate(world):
+        add_reduced_body(world, body)
+        add_reduced_body(world, cube(0.06), position=(-0.15, 0.0, 0.08 + RIGID_GAP), velocity=(0.1, 0.0, -0.5))
+
+    potential = Potential(Scene(populate, [body, cube(0.06)], dt=0.001))
+    free = np.arange(potential.u.size) >= 3 * body.driven_count
+    rng = np.random.default_rng(0)
+    u = potential.u + 1e-6 * free * rng.normal(size=free.size)
+    gradient, matrix = potential.gradient(u), potential.matrix()
+    assert not gradient[~free].any()
+    assert not matrix[~free][:, free].any()
+    cube_part = slice(potential.starts[1], None)
+    assert np.abs(matrix[free, cube_part][: -matrix[cube_part].shape[0]]).max() > 0.0  # between the two
+    step = 1.0e-9
+    for d in free * rng.normal(size=(5, free.size)):
+        d = d / np.linalg.norm(d)
+        difference = (potential.value(u + step * d) - potential.value(u - step * d)) / (2 * step)
+        assert difference == pytest.approx(gradient @ d, rel=1e-5, abs=1e-6 * np.linalg.norm(gradient))
 
 
 # -- momentum and energy -----------------------------------------------------------------------------------------------
