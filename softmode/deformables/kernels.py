@@ -170,9 +170,13 @@ def touch(
     # In and out:
     motion: Motion,
 ):
-    """Let a body near a shape take an Euler step: BDF2 would carry its velocity across the jump of an impact."""
+    """Let a body near a shape, or fixed to a rigid body, take an Euler step.
+
+    BDF2 would carry its velocity across the jump of an impact; and the rigid body takes Euler steps, in which the same
+    force changes its momentum by another amount.
+    """
     i, e = wp.tid()
-    if not has_contacts(instances, entries, i):
+    if not pushes(instances, entries, i):
         return
     motion.rate[i] = wp.float64(1.0)
     motion.q_rate[i, e] = motion.q_start[i, e]

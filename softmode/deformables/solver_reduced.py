@@ -55,7 +55,8 @@ class SolverReducedOptions:
     """"euler": implicit Euler, first order, damps what a step cannot resolve (half of a 10 rad/s spin in a second at
     60 Hz). "bdf2": keeps 97 % of it; second order for a body without viscosity (whose stress is differenced
     backwards). It needs equal steps, and takes an Euler step where there is none before, as after a reset, and where
-    a body has contacts. Who writes q or qd must set ``state.softmode.dt_before`` of the instance to 0."""
+    a body has contacts or is attached to a rigid body. Who writes q or qd must set ``state.softmode.dt_before`` of the
+    instance to 0."""
     iteration_max: int = 40
     """Newton iterations at most."""
     stiffness_renewal: int = 5
@@ -414,7 +415,7 @@ class SolverReduced(SolverBase):
         return [getattr(self.parameters, name, None) for name in ("pin_body", "pin_stiffness")]
 
     def adapt(self, dt: float) -> None:
-        """Let the bodies that have contacts take an Euler step, whatever the integrator."""
+        """Let bodies in contact or attached to a rigid body take an Euler step, whatever the integrator."""
         if self.options.integrator == "bdf2":
             self._launch(kernels.touch, self.functions, [self.instances, self.entries, wp.float64(dt)], [self.motion])
 
