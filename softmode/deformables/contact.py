@@ -4,11 +4,12 @@ With the displacement d of the sample relative to the shape during the step, a c
 
     E(d) = A kappa psi_n(-g0 - n . d) + psi_t(|s + d_t|; mu f_n, k_t),
 
-psi_n the C2 penalty p^3/(6 eps) for p < eps, p^2/2 - eps p/2 + eps^2/6 beyond (p the penetration); s the slip that the
-contact remembers (see ``stick_kernels``); psi_t the incremental potential of elastic-plastic friction, a spring k_t up
-to the force mu f_n and that force beyond (Cundall and Strack 1979, doi:10.1680/geot.1979.29.1.47), with the normal
-force f_n of the last Newton iterate. k_t does not depend on f_n: the energy of the spring cannot grow but by work,
-whatever the normal force does, so friction takes energy in every closed cycle.
+psi_n the C2 penalty p^3/(6 eps) for p < eps, p^2/2 - eps p/2 + eps^2/6 beyond (p the penetration), and a stiffer one
+where p is large (see ``normal_potential``); s the slip that the contact remembers (see ``stick_kernels``); psi_t the
+incremental potential of elastic-plastic friction, a spring k_t up to the force mu f_n and that force beyond (Cundall
+and Strack 1979, doi:10.1680/geot.1979.29.1.47), with the normal force f_n of the last Newton iterate. k_t does not
+depend on f_n: the energy of the spring cannot grow but by work, whatever the normal force does, so friction takes
+energy in every closed cycle.
 
 Contacts without memory (k_t = 0) have the smoothed Coulomb potential of Li et al. 2020 instead (IPC,
 doi:10.1145/3386569.3392425, eq. 13), mu f_n f0(|d_t|), which creeps.
