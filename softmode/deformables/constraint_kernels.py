@@ -215,7 +215,7 @@ def cone_row(
 def evaluate_cone(rigid: Rigid, w: int, head: int, r: wp.array2d[wp.float64], dt: wp.float64, derivatives: int):
     """Evaluate an elliptic cone: 1/2 D_m (N - mu T)^2 between the cone and its polar, N = mu x_0, T = |friction x|."""
     zero = wp.float64(0.0)
-    size = rigid.row_size[w, head]
+    size = wp.min(rigid.row_size[w, head], rigid.row_count[w] - head)
     mu = rigid.row_limit[w, head]
     D0 = rigid.row_stiffness[w, head]
     Dm = D0 / (mu * mu * (wp.float64(1.0) + mu * mu))

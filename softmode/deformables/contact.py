@@ -181,9 +181,10 @@ def evaluate_entries(
             held = slope
             if progress.iteration[w] == 0:
                 # in an impact the first guess lies far too deep: friction of such a force would be too stiff to solve
-                most = wp.float64(smoothing) - wp.float64(2.0) * wp.min(
+                deep = wp.float64(smoothing) - wp.float64(2.0) * wp.min(
                     wp.dot(n, entries.offset[i, e]), wp.float64(0.0)
                 )
+                _psi, most, _curvature = normal_potential(deep, wp.float64(smoothing))
                 held = wp.min(slope, most)
             entries.normal_force[i, e] = stiffness * held
         normal_force = entries.normal_force[i, e]

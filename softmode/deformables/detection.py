@@ -555,8 +555,10 @@ def gather_pins(
     target = pin_target[pin]
     if body >= 0:
         pose = shapes.body_q[body]
-        arm = wp.quat_rotate(wp.transform_get_rotation(pose), wp.vec3(target) - shapes.body_com[body])
-        target = wp.vec3d(wp.transform_point(pose, wp.vec3(target)))
+        rotation = wp.transform_get_rotation(pose)
+        arm = wp.quat_rotate(rotation, wp.vec3(target) - shapes.body_com[body])
+        # only the offset is large far from the world's origin
+        target = wp.vec3d(wp.transform_get_translation(pose)) + wp.vec3d(wp.quat_rotate(rotation, wp.vec3(target)))
         if prescribed != 0:
             twist = shapes.body_qd[body]
             target += wp.vec3d(dt * wp.spatial_top(twist) + turn(dt * wp.spatial_bottom(twist), arm))
