@@ -64,7 +64,8 @@ def attach(
         The attachment.
 
     Raises:
-        ConfigError: If not one of region, box and points is given, no point lies in it, the region is exact or unknown,
+        ConfigError: If not one of region, box and points is given, no point lies in it, a point lies
+            outside the body, the region is exact or unknown,
             or the link or the instance of the body does not exist.
     """
     if sum(where is not None for where in (region, box, points)) != 1:
@@ -90,6 +91,12 @@ def attach(
     elif points is not None:
         X = np.asarray(points, float).reshape(-1, 3)
         pins = np.full(len(X), per_area * body.surface_areas.sum() / max(len(X), 1))
+        outside = X[~np.isfinite(X).all(axis=1)] if not np.isfinite(X).all() else X[~body.covers(X)]
+        if len(outside):
+            raise ConfigError(
+                f"{len(outside)} of {len(X)} points lie outside body {body.name!r}, the first at {outside[0]} [m]",
+                hint=f"give points of its rest frame; it spans {body.bounds[0]} to {body.bounds[1]}",
+            )
     else:
         assert box is not None
         lower, upper = np.asarray(box[0], float), np.asarray(box[1], float)

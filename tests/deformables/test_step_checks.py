@@ -75,7 +75,7 @@ def test_masks_that_are_refused(mask):
 
 
 def test_attachments_of_other_bodies_are_refused():
-    """An index that no soft body has, and a body that the index does not belong to."""
+    """An index that no soft body has, a body that the index does not belong to, and points outside the body."""
     world, everything = newton.ModelBuilder(), ((-1.0,) * 3, (1.0,) * 3)
     with pytest.raises(ConfigError, match=r"it has 0.*add_reduced_body"):
         attach(world, 0, cube(), box=everything)
@@ -84,6 +84,9 @@ def test_attachments_of_other_bodies_are_refused():
         attach(world, 5, cube(), box=everything)
     with pytest.raises(ConfigError, match=r"is not of body 'cube 0.05'"):
         attach(world, instance, cube(0.05), box=everything)
+    for far in (5.0, np.nan):
+        with pytest.raises(ConfigError, match=r"1 of 2 points lie outside body 'cube 0.1'.*rest frame"):
+            attach(world, instance, cube(), points=np.array([[0.0, 0.0, 0.0], [far, 0.0, 0.0]]))
 
 
 def test_the_joint_solve_reports_and_releases():
