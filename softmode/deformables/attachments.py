@@ -13,7 +13,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from softmode.deformables.authoring import NAMESPACE, add_pins, bulk_stiffness
+from softmode.deformables.authoring import NAMESPACE, add_pins, body_key, bulk_stiffness
 from softmode.deformables.body import ReducedBody
 from softmode.errors import ConfigError
 
@@ -64,13 +64,24 @@ def attach(
         The attachment.
 
     Raises:
-        ConfigError: If not one of region, box and points is given, no point lies in it, the region is exact or unknown,
-            or the link does not exist.
+        ConfigError: If not one of region, box and points is given, no point lies in it, a point lies
+            outside the body, the region is exact or unknown,
+            or the link or the instance of the body does not exist.
     """
     if sum(where is not None for where in (region, box, points)) != 1:
         raise ConfigError("attach needs exactly one of region, box and points")
     if not -1 <= link < builder.body_count:
         raise ConfigError(f"link must be a rigid body of the builder or -1, got {link}; it has {builder.body_count}")
+    keys = list(_column(builder, "body_key")) if f"{NAMESPACE}:body_key" in builder.custom_attributes else []
+    if not 0 <= instance < len(keys):
+        raise ConfigError(
+            f"instance must be the index of a soft body of the builder, got {instance}; it has {len(keys)}",
+            hint="pass what add_reduced_body returned",
+        )
+    if keys[instance] != body_key(body):
+        raise ConfigError(
+            f"instance {instance} is not of body {body.name!r}", hint="pass the body that add_reduced_body was given"
+        )
     modulus, ratio = (float(list(_column(builder, name))[instance]) for name in ("youngs_modulus", "poissons_ratio"))
     per_area = bulk_stiffness(body, modulus, ratio) if stiffness is None else stiffness
     if not 0.0 < per_area < np.inf:
@@ -80,6 +91,12 @@ def attach(
     elif points is not None:
         X = np.asarray(points, float).reshape(-1, 3)
         pins = np.full(len(X), per_area * body.surface_areas.sum() / max(len(X), 1))
+        outside = X[~np.isfinite(X).all(axis=1)] if not np.isfinite(X).all() else X[~body.covers(X)]
+        if len(outside):
+            raise ConfigError(
+                f"{len(outside)} of {len(X)} points lie outside body {body.name!r}, the first at {outside[0]} [m]",
+                hint=f"give points of its rest frame; it spans {body.bounds[0]} to {body.bounds[1]}",
+            )
     else:
         assert box is not None
         lower, upper = np.asarray(box[0], float), np.asarray(box[1], float)

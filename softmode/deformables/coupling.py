@@ -31,11 +31,13 @@ from newton.solvers import SolverBase, SolverMuJoCo
 
 from softmode.deformables import constraint_kernels as constraints
 from softmode.deformables import coupling_kernels as kernels
+from softmode.deformables.attachments import Attachment
 from softmode.deformables.authoring import register_custom_attributes
 from softmode.deformables.body import ReducedBody
 from softmode.deformables.observables import REDUCED_KINDS, RIGID_KINDS, CoupledObservables, ReducedObservableKind
 from softmode.deformables.rigid_dofs import RigidDofs
 from softmode.deformables.solver_reduced import SolverReduced, SolverReducedOptions
+from softmode.deformables.step_checks import check_step
 from softmode.errors import ConfigError
 
 
@@ -50,7 +52,12 @@ class SolverCoupledReduced(SolverBase):
         model: Finalised model with reduced bodies and at least one joint.
         bodies: The reduced bodies used in the model.
         options: How the soft step is solved.
-        rigid: The MuJoCo solver; default ``SolverMuJoCo(model)``.
+        rigid: The MuJoCo solver; default ``SolverMuJoCo(model)``, whose room for contacts is MuJoCo's guess from the
+            initial state: if it prints "nefc overflow", pass ``SolverMuJoCo(model, njmax=..., nconmax=...)``.
+
+    Attributes:
+        reduced: The :class:`SolverReduced` inside.
+        rigid: The ``SolverMuJoCo`` inside.
     """
 
     ObservableKind = ReducedObservableKind
@@ -164,6 +171,24 @@ class SolverCoupledReduced(SolverBase):
         """Soft contact wrench on every rigid body about its centre of mass [N, N m], shape (body_count,)."""
         return self.reduced.body_wrench
 
+    @property
+    def status(self) -> wp.array:
+        """Status bits per world, as :attr:`SolverReduced.status`; MuJoCo's own overflows are not among them."""
+        return self.reduced.status
+
+    @property
+    def iteration(self) -> wp.array:
+        """Newton iterations of the last step per world."""
+        return self.reduced.iteration
+
+    def release(self, attachment: Attachment, world_mask: wp.array | None = None) -> None:
+        """Let go of an attachment in the masked worlds; see :meth:`SolverReduced.release`."""
+        self.reduced.release(attachment, world_mask)
+
+    def hold(self, attachment: Attachment, world_mask: wp.array | None = None) -> None:
+        """Take a released attachment up again; see :meth:`SolverReduced.hold`."""
+        self.reduced.hold(attachment, world_mask)
+
     def observables(
         self, kinds: Iterable[str], *, contacts: newton.Contacts | None = None, requires_grad: bool | None = None
     ) -> CoupledObservables:
@@ -184,8 +209,15 @@ class SolverCoupledReduced(SolverBase):
         *,
         observables: Any = None,
     ) -> None:
-        """Advance soft and rigid bodies by ``dt`` [s]."""
+        """Advance soft and rigid bodies by ``dt`` [s].
+
+        Without ``control`` drives, driven regions and pins aim where the model has them.
+
+        Raises:
+            ConfigError: If ``dt`` is not finite and positive, or a state or the control belongs to another model.
+        """
         self.validate_observables(observables, contacts)
+        check_step(self.model, state_in, state_out, control, dt)
         of_rigid = None if observables is None else observables.rigid
         data = self.rigid.mjw_data
         wp.copy(self.activation, data.act)
@@ -299,9 +331,9 @@ class SolverCoupledReduced(SolverBase):
         self._bind()
 
     def reset(self, state: newton.State, world_mask: wp.array | None = None, flags: Any = None) -> None:
-        """Reset soft and rigid bodies of the chosen worlds to the model's initial state."""
+        """Reset soft and rigid bodies of the chosen worlds to the model's initial state; see `SolverReduced.reset`."""
+        self.reduced.reset(state, world_mask, flags)
         self.rigid.reset(state, world_mask, flags)
         coordinates: Any = state.joint_q
         velocities: Any = state.joint_qd
         newton.eval_fk(self.model, coordinates, velocities, state)
-        self.reduced.reset(state, world_mask, flags)

@@ -24,6 +24,7 @@ from softmode.deformables.authoring import MATERIAL_FIELDS, NAMESPACE
 from softmode.deformables.body import ReducedBody
 from softmode.deformables.rigid_dofs import RigidDofs
 from softmode.deformables.solver_reduced import SolverReduced, SolverReducedOptions
+from softmode.deformables.step_checks import check_step
 from softmode.errors import ConfigError
 
 LIVE_FIELDS = ("material_model", *MATERIAL_FIELDS, "contact_stiffness")
@@ -82,9 +83,11 @@ class SolverReducedProxy(SolverReduced, CouplingInterface):
         """Advance soft bodies and free rigid bodies by ``dt`` [s]; only contact and ``state_in.body_f`` act on these.
 
         Raises:
-            ConfigError: If a coupler steps the entry out of place.
+            ConfigError: If a coupler steps the entry out of place, ``dt`` is not finite and positive, or a state
+                belongs to another model.
         """
         self.validate_observables(observables, contacts)
+        check_step(self.model, state_in, state_out, None, dt)
         if self.coupled and state_in is not state_out:
             raise ConfigError(
                 "a coupler loses the soft coordinates between two states of an entry", hint="pass Entry(in_place=True)"

@@ -83,8 +83,11 @@ def _load_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, NDArray[np
 
     vertex = np.asarray(vertices, dtype=np.float64)
     face = np.asarray(faces)
-    if vertex.ndim != 2 or vertex.shape[1] != 3 or not np.isfinite(vertex).all():
-        raise AssetError(f"vertices: expected finite positions of shape (V, 3), got shape {vertex.shape}")
+    if vertex.ndim != 2 or vertex.shape[1] != 3:
+        raise AssetError(f"vertices: expected positions of shape (V, 3), got shape {vertex.shape}")
+    if not np.isfinite(vertex).all():
+        lost = int((~np.isfinite(vertex).all(axis=1)).sum())
+        raise AssetError(f"vertices: expected finite positions, {lost} of {len(vertex)} are NaN or infinite")
     if face.ndim != 2 or face.shape[1] != 3 or len(face) < 4 or not np.issubdtype(face.dtype, np.integer):
         raise AssetError(f"faces: expected at least 4 integer triangles of shape (T, 3), got {face.shape} {face.dtype}")
     if face.min() < 0 or face.max() >= len(vertex):

@@ -30,6 +30,7 @@ from softmode.deformables.observables import REDUCED_KINDS, ReducedObservableKin
 from softmode.deformables.pairs import SoftPairs
 from softmode.deformables.rigid_dofs import RigidDofs
 from softmode.deformables.shape_tables import heightfields, mesh_sources, solid_shapes
+from softmode.deformables.step_checks import check_step
 from softmode.errors import ConfigError
 
 __all__ = [
@@ -288,9 +289,14 @@ class SolverReduced(SolverBase):
     ) -> None:
         """Advance every soft body by ``dt`` [s]; rigid bodies move as prescribed by ``state_in``.
 
-        ``contacts`` is not read: contacts between soft bodies and shapes are found by the solver itself.
+        ``contacts`` is not read: contacts between soft bodies and shapes are found by the solver itself. Without
+        ``control`` driven regions and pins stay where the model has them.
+
+        Raises:
+            ConfigError: If ``dt`` is not finite and positive, or a state or the control belongs to another model.
         """
         self.validate_observables(observables, contacts)
+        check_step(self.model, state_in, state_out, control, dt)
         self.begin(state_in, control, dt)
         self.detect(state_in, control, dt, prescribed=True)
         self.minimise(dt)
@@ -650,14 +656,9 @@ class SolverReduced(SolverBase):
                 resets all.
 
         Raises:
-            ConfigError: If the mask has another shape.
+            ConfigError: If the mask has another shape or type.
         """
-        mask = self.every_world if world_mask is None else world_mask
-        if mask.shape != self.every_world.shape:
-            raise ConfigError(
-                f"world_mask must have shape (world_count + 1,) = {self.every_world.shape}, got {mask.shape}",
-                hint="give the entities outside all worlds the last entry",
-            )
+        mask = self._mask(world_mask)
         flags = int(newton.StateFlags.ALL if flags is None else flags)
         initial, out = self.parameters, getattr(state, NAMESPACE)
         chosen = [flags & int(newton.StateFlags.PARTICLE_Q), flags & int(newton.StateFlags.PARTICLE_QD)]
@@ -688,6 +689,9 @@ class SolverReduced(SolverBase):
         Args:
             attachment: What :func:`softmode.deformables.attachments.attach` returned.
             world_mask: Boolean mask of shape (world_count + 1,) as for :meth:`reset`; None for all worlds.
+
+        Raises:
+            ConfigError: If the mask has another shape or type.
         """
         self._hold(attachment, world_mask, -1.0)
 
@@ -696,7 +700,7 @@ class SolverReduced(SolverBase):
         self._hold(attachment, world_mask, 1.0)
 
     def _hold(self, attachment: Attachment, world_mask: wp.array | None, sign: float) -> None:
-        mask = self.every_world if world_mask is None else world_mask
+        mask = self._mask(world_mask)
         where = [attachment.instance, attachment.first, sign]
         self._launch(
             attachment_kernels.hold_pins,
@@ -704,6 +708,20 @@ class SolverReduced(SolverBase):
             [self.instances, self.progress.instance_start, self.parameters.instance_world, mask, *where],
             [self.parameters.pin_stiffness],
         )
+
+    def _mask(self, world_mask: wp.array | None) -> wp.array:
+        """Return the mask, all worlds if there is none; refuse what a kernel would misread."""
+        if world_mask is None:
+            return self.every_world
+        mask: Any = world_mask
+        shape, dtype = self.every_world.shape, self.every_world.dtype
+        if not isinstance(mask, wp.array) or mask.dtype != dtype or mask.shape != shape:
+            given = f"{mask.dtype.__name__} {mask.shape}" if isinstance(mask, wp.array) else type(mask).__name__
+            raise ConfigError(
+                f"world_mask must be a wp.array of wp.bool, shape (world_count + 1,) = {shape}, got {given}",
+                hint="give the entities outside all worlds the last entry",
+            )
+        return mask
 
     def _control(self, control: newton.Control | None) -> Any:
         """Return the control attributes, the model's where there is no control."""

@@ -148,20 +148,24 @@ class RobotDescription:
         Returns:
             Position [m] and quaternion (xyzw), seven numbers.
         """
+        mount: Any = self._link_poses(joint_q)[self.end_effector]
+        pose: Any = mount * wp.transformd(*self.tool)
+        return tuple(float(value) for value in pose)
+
+    def _link_poses(self, joint_q: Sequence[float] | None = None) -> dict[str, wp.transformd]:
+        """Return the pose of every link in the base frame; the home pose's if no coordinates are given."""
         mujoco: Any = importlib.import_module("mujoco")
         model = mujoco.MjModel.from_xml_string(self.mjcf)
         data = mujoco.MjData(model)
         data.qpos[:] = model.qpos0 + np.asarray(self.home if joint_q is None else joint_q, float)
         mujoco.mj_kinematics(model, data)
-        link = model.body(self.end_effector).id
-        mount: Any = wp.transformd(data.xpos[link], np.roll(data.xquat[link], -1))
-        pose: Any = mount * wp.transformd(*self.tool)
-        return tuple(float(value) for value in pose)
+        ids = {name: model.body(name).id for name in self.link_names}
+        return {name: wp.transformd(data.xpos[k], np.roll(data.xquat[k], -1)) for name, k in ids.items()}
 
     def add_to(
         self, builder: newton.ModelBuilder, *, xform: Sequence[float] | None = None, label: str | None = None
     ) -> RobotIndices:
-        """Add the robot, standing in its home pose, to a Newton builder.
+        """Add the robot, standing in its home pose, to a Newton builder: ``joint_q`` and ``body_q`` say so.
 
         The base is static and the robot one articulation. Inertia, limits, armature, damping and dry friction of the
         joints are those of the file; its position servos become joint drives, to be commanded through
@@ -198,6 +202,9 @@ class RobotDescription:
         bodies = self._take_over(builder, first_body, first_joint, dof_start, label or self.name)
         shapes = tuple(range(first_shape, builder.shape_count))
         self._set_drives(builder, coord_start, dof_start)
+        base: Any = wp.transformd(*(xform if xform is not None else (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)))
+        for name, pose in self._link_poses().items():
+            builder.body_q[bodies[name]] = wp.transform(*(base * pose))
         if self.gravity_compensation:
             weightless: Any = builder.custom_attributes["mujoco:gravcomp"].values
             weightless.update({body: 1.0 for body in bodies.values()})

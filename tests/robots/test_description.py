@@ -73,6 +73,17 @@ class Stand:
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_builder_holds_the_home_pose(kind, tmp_path):
+    """Where the builder has the links, for what is attached to them there, is where the home pose puts them."""
+    xform = (0.1, -0.2, 0.3, 0.0, 0.0, np.sin(0.35), np.cos(0.35))
+    stand = Stand(description(kind, tmp_path), xform=xform, solve=False)
+    links = list(stand.indices.link_bodies)
+    given, found = np.array(stand.world.body_q)[links], stand.state.body_q.numpy()[links]
+    np.testing.assert_allclose(given[:, :3], found[:, :3], atol=1.0e-6)
+    np.testing.assert_allclose(np.abs((given[:, 3:] * found[:, 3:]).sum(axis=1)), 1.0, atol=1.0e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_masses_and_kinematics_are_the_compiler_s(kind, tmp_path):
     """Mass, centre of mass, inertia and the pose of every link equal MuJoCo's at random joint angles (float32)."""
     robot = description(kind, tmp_path)
