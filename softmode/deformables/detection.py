@@ -22,6 +22,7 @@ from softmode.deformables.shape_queries import (
 )
 from softmode.deformables.status import WORLD_CONTACT_OVERFLOW
 from softmode.deformables.tables import (
+    OVERLAP,
     SLOTS,
     Basis,
     Entries,
@@ -474,7 +475,7 @@ def gather_contacts(
             samples.entry[i, s, slot] = -1
             if shape < 0:
                 continue
-            gap = samples.gap[i, s, slot]
+            gap = wp.max(samples.gap[i, s, slot], -wp.float64(OVERLAP * instances.size[i]))
             e = at_close
             if gap <= wp.float64(0.0):
                 e = at_touching

@@ -29,7 +29,7 @@ from softmode.deformables.detection import Samples, rank_contacts
 from softmode.deformables.kernels import displacement_gradient
 from softmode.deformables.lanes import vec8
 from softmode.deformables.status import WORLD_CONTACT_OVERFLOW
-from softmode.deformables.tables import SLOTS, Basis, Entries, Instances, Motion, Progress, mat23d
+from softmode.deformables.tables import OVERLAP, SLOTS, Basis, Entries, Instances, Motion, Progress, mat23d
 
 wp.set_module_options({"enable_backward": False})
 
@@ -489,7 +489,8 @@ def write_pairs(
     stiffness = wp.float64(0.5 * ki * kj / (ki + kj) * basis.row_area[own])
     friction = wp.float64(wp.sqrt(instances.friction[i] * instances.friction[j]))
     n = pairs.normal[i, s, slot]
-    offset = pairs.gap[i, s, slot] * n
+    deepest = -wp.float64(OVERLAP * wp.min(instances.size[i], instances.size[j]))
+    offset = wp.max(pairs.gap[i, s, slot], deepest) * n
     particle = instances.particle_start[i] + s
     for before in range(SLOTS):
         if stick_partner[particle][before] == j - progress.instance_start[instances.world[i]]:

@@ -11,6 +11,9 @@ import warp as wp
 
 from softmode.deformables.lanes import sum8d, vec8, vec8d
 
+OVERLAP = wp.constant(0.05)
+"""Deepest gap that a step starts from, as a fraction of the body's size: what overlaps more, as when it was placed
+wrongly, is pushed out by that much a step instead of being thrown out."""
 SLOTS = 2
 """What a surface sample may touch at a time: the deepest two shapes, and the nearest two other soft bodies."""
 mat23d: Any = wp.types.matrix(shape=(SLOTS, 3), dtype=wp.float64)

@@ -46,6 +46,7 @@ def add_soft_fingertips(
     radius: float = 0.010,
     half_height: float = 0.012,
     material: Material | None = None,
+    mode_count: int = 12,
 ) -> SoftFingertips:
     """Glue a soft capsule to each finger: half of it stands out of the finger's face.
 
@@ -59,6 +60,7 @@ def add_soft_fingertips(
         radius: Radius of the capsule [m].
         half_height: Half the distance between the centres of its caps [m].
         material: Its material; default a soft rubber of 0.3 MPa.
+        mode_count: Skinning eigenmodes of a fingertip: more conform better and cost more, see ``docs/sensing.md``.
 
     Returns:
         The body, and where its instances and attachments stand.
@@ -70,7 +72,9 @@ def add_soft_fingertips(
     mounts = fingertip_mounts(mounts) if isinstance(mounts, ArmIndices) else tuple(mounts)
     material = material or Material(youngs_modulus=3.0e5, poissons_ratio=0.45, density=1100.0, friction=1.0)
     quadrature = quadrature_from_capsule(radius, half_height, point_count=2000, surface_count=400)
-    body = build_body(quadrature, BuildOptions(mode_count=12, kernel_count=300, cubature_count=256), name="fingertip")
+    body = build_body(
+        quadrature, BuildOptions(mode_count=mode_count, kernel_count=300, cubature_count=256), name="fingertip"
+    )
     back = ((-np.inf, -np.inf, -np.inf), (np.inf, 0.0, np.inf))
     poses = _link_poses(builder)
     instances, attachments = [], []

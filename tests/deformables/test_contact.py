@@ -9,6 +9,7 @@ import warp as wp
 from softmode.deformables import status as bits
 from softmode.deformables.materials import Material
 from softmode.deformables.solver_reduced import SolverReduced, SolverReducedOptions, add_reduced_body
+from softmode.deformables.tables import OVERLAP
 from tests import reference
 from tests.deformables.probe_kernels import evaluate_potentials
 from tests.deformables.test_coupling import impact, totals
@@ -393,3 +394,15 @@ def test_worlds_in_contact_are_independent():
         alone.step(20)
         np.testing.assert_array_equal(batch.q(i), alone.q())
         np.testing.assert_array_equal(batch.reduced.instance_force.numpy()[i], alone.reduced.instance_force.numpy()[0])
+
+
+def test_overlap_at_the_start_is_pushed_out_slowly():
+    """A cube placed half in the ground leaves it by at most OVERLAP of its size in a step, and a tenth as it unbends."""
+    scene = on_shape(lambda w: w.add_ground_plane(), height=-0.5 * EDGE)
+    size = float(scene.reduced.instances.size.numpy()[0])
+    fastest = 0.0
+    for _ in range(60):
+        scene.step()
+        fastest = max(fastest, float(np.abs(scene.momentum()[0][2]) / scene.mass()))
+    assert 0.0 < fastest <= 1.1 * OVERLAP * size / scene.dt
+    assert scene.state.particle_q.numpy()[:, 2].min() > -0.01 * size
