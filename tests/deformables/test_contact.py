@@ -397,7 +397,7 @@ def test_worlds_in_contact_are_independent():
 
 
 def test_overlap_at_the_start_is_pushed_out_slowly():
-    """A cube placed half in the ground leaves it by at most OVERLAP of its size in a step, and a tenth as it unbends."""
+    """A cube placed half in the ground leaves by at most OVERLAP of its size in a step, plus a tenth as it unbends."""
     scene = on_shape(lambda w: w.add_ground_plane(), height=-0.5 * EDGE)
     size = float(scene.reduced.instances.size.numpy()[0])
     fastest = 0.0
