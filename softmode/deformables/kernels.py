@@ -551,6 +551,7 @@ def reset_worlds(
     instance_force_out: wp.array[wp.vec3d],
     body_wrench_out: wp.array[wp.spatial_vector],
     entry_count_out: wp.array[int],
+    pair_count_out: wp.array[int],
 ):
     """Clear what the masked worlds report: status, entries, contact force on bodies, wrench on rigid bodies."""
     i = wp.tid()
@@ -558,5 +559,6 @@ def reset_worlds(
         status_out[instances.world[i]] = 0
         instance_force_out[i] = wp.vec3d()
         entry_count_out[i] = 0
+        pair_count_out[i] = 0
     if i < body_world.shape[0] and in_mask(body_world[i], world_mask):
         body_wrench_out[i] = wp.spatial_vector()

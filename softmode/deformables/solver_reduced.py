@@ -675,7 +675,7 @@ class SolverReduced(SolverBase):
             kernels.reset_worlds,
             max(self.instance_count, self.model.body_count),
             [self.instances, initial.instance_world, self.model.body_world, mask],
-            [self.status, self.instance_force, self.body_wrench, self.entries.count],
+            [self.status, self.instance_force, self.body_wrench, self.entries.count, self.entries.pair_count],
         )
         if self.layout.pin_max:
             dim = (self.instance_count, self.layout.pin_max)
