@@ -72,7 +72,7 @@ def attach(
         raise ConfigError("attach needs exactly one of region, box and points")
     if not -1 <= link < builder.body_count:
         raise ConfigError(f"link must be a rigid body of the builder or -1, got {link}; it has {builder.body_count}")
-    keys = list(_column(builder, "body_key")) if f"{NAMESPACE}:body_key" in builder.custom_attributes else []
+    keys = _column(builder, "body_key") if f"{NAMESPACE}:body_key" in builder.custom_attributes else []
     if not 0 <= instance < len(keys):
         raise ConfigError(
             f"instance must be the index of a soft body of the builder, got {instance}; it has {len(keys)}",
@@ -82,12 +82,12 @@ def attach(
         raise ConfigError(
             f"instance {instance} is not of body {body.name!r}", hint="pass the body that add_reduced_body was given"
         )
-    modulus, ratio = (float(list(_column(builder, name))[instance]) for name in ("youngs_modulus", "poissons_ratio"))
+    modulus, ratio = (float(_column(builder, name)[instance]) for name in ("youngs_modulus", "poissons_ratio"))
     per_area = bulk_stiffness(body, modulus, ratio) if stiffness is None else stiffness
     if not 0.0 < per_area < np.inf:
         raise ConfigError(f"stiffness must be a finite number > 0 [Pa/m], got {stiffness!r}")
     if region is not None:
-        X, pins = region_pins(body, region, modulus)
+        X, pins = _region_pins(body, region, modulus)
     elif points is not None:
         X = np.asarray(points, float).reshape(-1, 3)
         pins = np.full(len(X), per_area * body.surface_areas.sum() / max(len(X), 1))
@@ -107,7 +107,7 @@ def attach(
             f"the attachment of body {body.name!r} holds no point",
             hint=f"its surface spans {body.surface_points.min(axis=0)} to {body.surface_points.max(axis=0)} [m]",
         )
-    first = list(_column(builder, "pin_instance")).count(instance)
+    first = _column(builder, "pin_instance").count(instance)
     pose: Any = wp.transform_identity()
     if link >= 0:
         pose = builder.body_q[link] if link_pose is None else link_pose
@@ -117,7 +117,7 @@ def attach(
     return Attachment(instance=instance, first=first, count=len(X))
 
 
-def region_pins(body: ReducedBody, name: str, youngs_modulus: float) -> tuple[np.ndarray, np.ndarray]:
+def _region_pins(body: ReducedBody, name: str, youngs_modulus: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the rest points [m] of a soft region, shape (count, 3), and the stiffness [N/m] it was built for.
 
     Raises:
@@ -133,13 +133,13 @@ def region_pins(body: ReducedBody, name: str, youngs_modulus: float) -> tuple[np
     return body.region_points[rows], stiffness * youngs_modulus * body.region_weights[rows]
 
 
-def _column(builder: newton.ModelBuilder, name: str) -> Any:
+def _column(builder: newton.ModelBuilder, name: str) -> list[Any]:
     """Return the values of an attribute that a builder holds so far."""
     values: Any = builder.custom_attributes[f"{NAMESPACE}:{name}"].values
-    return values.values() if isinstance(values, dict) else values or []
+    return list(values.values() if isinstance(values, dict) else values or [])
 
 
 def _coordinates(builder: newton.ModelBuilder, instance: int, body: ReducedBody) -> np.ndarray:
     """Return the initial coordinates of an instance [m], shape (function_count, 3)."""
-    start = list(_column(builder, "function_start"))[instance]
-    return np.array([[float(x) for x in q] for q in list(_column(builder, "q"))[start : start + body.function_count]])
+    start = _column(builder, "function_start")[instance]
+    return np.array([[float(x) for x in q] for q in _column(builder, "q")[start : start + body.function_count]])

@@ -104,6 +104,15 @@ def stick_potential(y: wp.float64, limit: wp.float64, stiffness: wp.float64):
 
 
 @wp.func
+def slip_potential(y: wp.float64, limit: wp.float64, stick: wp.float64, stick_range: wp.float64):
+    """Return energy [J], force over slip and curvature along the slip [N/m] of friction, with memory or smoothed."""
+    if stick > wp.float64(0.0):
+        return stick_potential(y, limit, stick)
+    f0, secant, tangent = friction_potential(y, stick_range)
+    return limit * f0, limit * secant, limit * tangent
+
+
+@wp.func
 def stiffness_per_area(instances: Instances, i: int, partner_mass: float, partner_area: float, dt: float):
     """Return the contact stiffness per area [Pa/m] of a body against a partner, from the parameters as they are now.
 
@@ -193,12 +202,7 @@ def evaluate_entries(
         y = wp.length(t)
         limit = entries.friction[i, e] * normal_force
         stick = entries.stick[i, e]
-        f0, secant, tangent = friction_potential(y, stick_range)
-        f0 = limit * f0
-        secant = limit * secant
-        tangent = limit * tangent
-        if stick > wp.float64(0.0):
-            f0, secant, tangent = stick_potential(y, limit, stick)
+        f0, secant, tangent = slip_potential(y, limit, stick, stick_range)
         entries.slip[i, e] = t
         entries.energy[i, e] = share * (stiffness * psi + f0)
         entries.force[i, e] = stiffness * slope * n - secant * t

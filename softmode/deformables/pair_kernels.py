@@ -97,6 +97,14 @@ class Patch:
 
 
 @wp.func
+def gradient_at(instances: Instances, basis: Basis, motion: Motion, i: int, s: int):
+    """Return the deformation gradient F of an instance at a surface sample, at the start of the step."""
+    row = instances.row_start[i] + s
+    G = displacement_gradient(basis.row_gradient, motion.q_start, i, row, instances.function_count[i])
+    return wp.identity(n=3, dtype=wp.float64) + G
+
+
+@wp.func
 def cofactor(F: wp.mat33d):
     """Return cof F = det(F) F^-T, whose columns are the cross products of those of F."""
     a = wp.vec3d(F[0, 0], F[1, 0], F[2, 0])
@@ -151,10 +159,8 @@ def place_surface(
     i, s = wp.tid()
     if s >= instances.sample_count[i] or pairs.near[i] == 0:
         return
-    row = instances.row_start[i] + s
-    G = displacement_gradient(basis.row_gradient, motion.q_start, i, row, instances.function_count[i])
-    F = wp.identity(n=3, dtype=wp.float64) + G
-    normal = wp.normalize(cofactor(F) * wp.vec3d(basis.row_normal[row]))
+    F = gradient_at(instances, basis, motion, i, s)
+    normal = wp.normalize(cofactor(F) * wp.vec3d(basis.row_normal[instances.row_start[i] + s]))
     pairs.surface_normal[i, s] = wp.vec3(normal)
 
 
@@ -471,9 +477,7 @@ def write_pairs(
     inverse = wp.float64(1.0) / total
     # carried on to x; of the same body, the difference to it
     offset = inverse * offset - wp.max(pairs.gap[i, s, slot], wp.float64(0.0)) * pairs.normal[i, s, slot]
-    G = displacement_gradient(basis.row_gradient, motion.q_start, j, at, instances.function_count[j])
-    F = wp.identity(n=3, dtype=wp.float64) + G
-    X = wp.vec3(clamped_inverse(F) * offset)
+    X = wp.vec3(clamped_inverse(gradient_at(instances, basis, motion, j, nearest)) * offset)
     for b in range(basis.row.shape[1]):
         value = float(inverse) * basis.row[row, b]
         value = value + X[0] * basis.row_gradient[b, at, 0]
@@ -497,8 +501,7 @@ def write_pairs(
             slip = wp.vec3d()
             for axis in range(3):
                 slip[axis] = stick_slip[particle][before, axis]
-            G = displacement_gradient(basis.row_gradient, motion.q_start, i, own, instances.function_count[i])
-            slip += G * slip
+            slip = gradient_at(instances, basis, motion, i, s) * slip
             offset += slip - wp.dot(n, slip) * n
     pairs.held[i, s, slot] = pairs.entry[i, k]
     for side in range(2):
@@ -556,9 +559,7 @@ def remember_pairs(
         stretch = entries.stick[i, e] * wp.length(total)
         if not (limit > wp.float64(0.0) and stretch > wp.float64(0.0) and wp.isfinite(stretch + limit)):
             continue
-        row = instances.row_start[i] + s
-        G = displacement_gradient(basis.row_gradient, motion.q_start, i, row, instances.function_count[i])
-        F = wp.identity(n=3, dtype=wp.float64) + G
+        F = gradient_at(instances, basis, motion, i, s)
         elastic = clamped_inverse(F) * (wp.min(wp.float64(1.0), limit / stretch) * total)
         partner[slot] = pairs.other[i, s, slot] - progress.instance_start[instances.world[i]]
         for axis in range(3):
