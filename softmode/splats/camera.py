@@ -144,7 +144,7 @@ class SplatCamera:
     - `depth`: forward depth of splats and meshes [m], 0 for the sky, shape (view_count, height, width).
     - `alpha`: coverage by splats, same shape.
     - `object_id`: splat object per pixel, -1 where none (only with `RasterizerOptions.object_ids`).
-    - `overflow`: see `SplatRasterizer`.
+    - `median_depth`: see `SplatRasterizer` (only with `RasterizerOptions.median_depth`).
 
     Args:
         model: The model whose visible shapes are drawn.
@@ -260,9 +260,9 @@ class SplatCamera:
         return None if self.rasterizer is None else self.rasterizer.object_id
 
     @property
-    def overflow(self) -> wp.array | None:
-        """Number of (tile, splat) pairs that did not fit, shape (1,); None without splats."""
-        return None if self.rasterizer is None else self.rasterizer.overflow
+    def median_depth(self) -> wp.array | None:
+        """Median forward depth [m], shape (view_count, height, width); None without splats."""
+        return None if self.rasterizer is None else self.rasterizer.median_depth
 
     def images(self, name: str) -> wp.array:
         """Return the camera's part of `rgb`: uint8, shape (world_count, height, width, 3), no copy.

@@ -2,12 +2,13 @@
 
 One frame is a fixed launch sequence over all views (worlds x cameras):
 
-    project -> sort by depth -> count tiles -> scan -> emit pairs -> sort by tile (stable) -> ranges -> blend
+    project -> sort each view by depth -> cover: one bit per (tile, depth rank) -> blend
 
-Sorting whole splats by depth first and their (tile, splat) pairs by tile afterwards keeps the keys at 32 bits. Images
-follow the standard splat formula (Kerbl et al. 2023): alpha = min(0.99, o exp(-d^2/2)), cut below 1/255, front to back
-until less than 1e-4 of the light is left. The antialiased mode (on by default; Yu et al. 2024, "Mip-Splatting") scales
-opacities by the share of the footprint that the pixel filter adds, which is what keeps small images right.
+A tile's splats in depth order are the set bits of its row of words: no list of (tile, splat) pairs is made or sorted,
+and nothing can overflow. Images follow the standard splat formula (Kerbl et al. 2023): alpha = min(0.99, o
+exp(-d^2/2)), cut below 1/255, front to back until less than 1e-4 of the light is left. The antialiased mode (on by
+default; Yu et al. 2024, "Mip-Splatting") scales opacities by the share of the footprint that the pixel filter adds,
+which is what keeps small images right.
 """
 
 import functools
@@ -20,6 +21,9 @@ import warp as wp
 from softmode.errors import ConfigError
 from softmode.splats import rasterizer_kernels as kernels
 from softmode.splats.splats import MAX_SPLATS, Splats
+
+MAX_EDGE = 4096
+"""Largest width and height of an image [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,10 +38,8 @@ class RasterizerOptions:
     """Nearest visible forward depth [m]."""
     object_ids: bool = False
     """Write the object of the largest weight per pixel."""
-    tile: int = 8
-    """Tile edge [px], a multiple of the pixels per thread (8 on CPU, 1 on CUDA)."""
-    pairs_per_splat: int = 12
-    """Capacity: tiles that a splat touches on average. When it is exceeded, the farthest splats are left out."""
+    median_depth: bool = False
+    """Write the depth at which half of the light is gone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +126,8 @@ class SplatRasterizer:
     - `depth`: expected forward depth of what is seen, mesh included [m]; 0 where there is nothing.
     - `alpha`: coverage by splats.
     - `object_id`: object of the largest weight, -1 where there is none (only with `options.object_ids`).
-    - `overflow`: int32, shape (1,): pairs left out because the capacity was exceeded; 0 when the frame is complete.
+    - `median_depth`: forward depth of the splat, or of the mesh behind them, at which less than half of the light is
+      left [m]; 0 where more gets through (only with `options.median_depth`).
 
     Args:
         splat_count: Number of splats per world, all objects together.
@@ -151,43 +154,36 @@ class SplatRasterizer:
         """Allocate the buffers."""
         self.options = options if options is not None else RasterizerOptions()
         self.device = wp.get_device(device)
-        tile = self.options.tile
-        self._strip = 8 if self.device.is_cpu else 1
-        self.tile_count = (-(-width // tile) if tile > 0 else 0, -(-height // tile) if tile > 0 else 0)
+        self.tile = tile = (8, 8)
+        self.tile_count = (-(-width // tile[0]), -(-height // tile[1]))
         self.splat_count, self.view_count, self.width, self.height = splat_count, view_count, width, height
         total = splat_count * view_count
         tiles = self.tile_count[0] * self.tile_count[1] * view_count
-        self.capacity = max(total * self.options.pairs_per_splat, 1024)
-        if not (0 < splat_count <= MAX_SPLATS and view_count > 0 and self.capacity < 2**30 and tiles < 2**31 - 1):
+        words = -(-splat_count // 32)
+        if not (0 < width <= MAX_EDGE and 0 < height <= MAX_EDGE):
+            raise ConfigError(f"images of {width} x {height} px, expected 1 to {MAX_EDGE} px on each side")
+        if not (0 < splat_count <= MAX_SPLATS and view_count > 0 and total < 2**30 and tiles * words < 2**33):
             raise ConfigError(
-                f"{splat_count} splats in {view_count} views of {self.options.pairs_per_splat} pairs are out of range",
-                hint="Keep splats x views x pairs_per_splat between 1 and 2^30; render fewer views at a time",
-            )
-        if tile <= 0 or tile % self._strip or not (0 < self.tile_count[0] < 256 and 0 < self.tile_count[1] < 256):
-            raise ConfigError(
-                f"images of {width} x {height} px with tiles of {tile} px are out of range",
-                hint=f"Tiles must be a multiple of {self._strip} px and at most 255 along each side",
+                f"{splat_count} splats in {view_count} views of {width} x {height} px are out of range",
+                hint="Keep splats x views between 1 and 2^30; render fewer views or smaller images at a time",
             )
         allocate = functools.partial(wp.zeros, device=self.device)
         self._center = allocate(total, dtype=wp.vec4)
         self._shape = allocate(total, dtype=wp.vec4)
         self._color = allocate(total, dtype=wp.vec3)
-        self._box = allocate(total, dtype=wp.vec4ub)
-        # Radix sort wants twice the entries as its workspace.
+        self._box = allocate(total, dtype=wp.vec4us)
+        # The sort wants twice the entries as its workspace.
         self._depth_key = allocate(2 * total, dtype=wp.int32)
         self._order = allocate(2 * total, dtype=wp.int32)
-        self._count = allocate(total, dtype=wp.int32)
-        self._end = allocate(total, dtype=wp.int32)
-        self._pair_tile = allocate(2 * self.capacity, dtype=wp.int32)
-        self._pair_splat = allocate(2 * self.capacity, dtype=wp.int32)
-        self._range = allocate(tiles, dtype=wp.vec2i)
-        self._tile_bits = int(tiles).bit_length()
+        starts = np.arange(0, total + 1, splat_count, dtype=np.int32)
+        self._view_start = wp.array(starts, dtype=wp.int32, device=self.device)
+        self._cover = allocate((tiles, words), dtype=wp.uint32)
         shape = (view_count, height, width)
         self.rgb = allocate(shape, dtype=wp.vec3)
         self.depth = allocate(shape, dtype=wp.float32)
         self.alpha = allocate(shape, dtype=wp.float32)
         self.object_id = allocate(shape if self.options.object_ids else (1, 1, 1), dtype=wp.int32)
-        self.overflow = allocate(1, dtype=wp.int32)
+        self.median_depth = allocate(shape if self.options.median_depth else (1, 1, 1), dtype=wp.float32)
         self._no_rgb = allocate((1, 1, 1), dtype=wp.vec3)
         self._no_depth = allocate((1, 1, 1), dtype=wp.float32)
 
@@ -231,7 +227,8 @@ class SplatRasterizer:
                     f"{name} has shape {given}, expected {shape}", hint="Size the rasteriser for these arrays"
                 )
         self._project(splats, views)
-        self._bin()
+        self._sort()
+        self._cover_tiles()
         self._blend(splats, views, mesh_rgb, mesh_depth)
 
     def _project(self, splats: SplatArrays, views: ViewArrays) -> None:
@@ -242,35 +239,24 @@ class SplatRasterizer:
             inputs=[
                 splats.means, splats.covariances, splats.opacities, splats.sh, splats.object_index, splats.rotations,
                 views.world_to_camera, views.intrinsics, views.world,
-                wp.vec2i(self.width, self.height), options.tile, options.near, options.dilation, options.antialiased,
+                wp.vec2i(self.width, self.height), wp.vec2i(*self.tile),
+                options.near, options.dilation, options.antialiased,
             ],
             outputs=[self._center, self._shape, self._color, self._box, self._depth_key, self._order],
             device=self.device,
         )  # fmt: skip
 
-    def _bin(self) -> None:
+    def _sort(self) -> None:
         total = self.splat_count * self.view_count
-        tiles = self._range.shape[0]
-        wp.utils.radix_sort_pairs(self._depth_key, self._order, total, end_bit=31)
+        wp.utils.segmented_sort_pairs(self._depth_key, self._order, total, self._view_start)
+
+    def _cover_tiles(self) -> None:
+        self._cover.zero_()
         wp.launch(
-            kernels.count_tiles, dim=total, inputs=[self._order, self._box], outputs=[self._count], device=self.device
-        )
-        wp.utils.array_scan(self._count, self._end, inclusive=True)
-        self._pair_tile.fill_(tiles)
-        wp.launch(
-            kernels.emit_pairs,
-            dim=total,
-            inputs=[self._order, self._box, self._end, self.splat_count, wp.vec2i(*self.tile_count), self.capacity],
-            outputs=[self._pair_tile, self._pair_splat, self.overflow],
-            device=self.device,
-        )
-        wp.utils.radix_sort_pairs(self._pair_tile, self._pair_splat, self.capacity, end_bit=self._tile_bits)
-        self._range.zero_()
-        wp.launch(
-            kernels.find_ranges,
-            dim=self.capacity,
-            inputs=[self._pair_tile, tiles, self.capacity],
-            outputs=[self._range],
+            kernels.cover_tiles,
+            dim=(self.view_count, self.splat_count),
+            inputs=[self._order, self._box, self.splat_count, wp.vec2i(*self.tile_count)],
+            outputs=[self._cover],
             device=self.device,
         )
 
@@ -278,18 +264,18 @@ class SplatRasterizer:
         self, splats: SplatArrays, views: ViewArrays, mesh_rgb: wp.array | None, mesh_depth: wp.array | None
     ) -> None:
         options = self.options
-        tiles = self._range.shape[0]
+        strip = 8 if self.device.is_cpu else 1
         wp.launch(
-            kernels.blend_kernel(self._strip, mesh_depth is not None, options.object_ids),
-            dim=tiles * options.tile * (options.tile // self._strip),
+            kernels.blend_kernel(strip, mesh_depth is not None, options.object_ids, options.median_depth),
+            dim=self._cover.shape[0] * self.tile[1] * (self.tile[0] // strip),
             inputs=[
-                self._pair_splat, self._range, self._center, self._shape, self._color, splats.object_index,
+                self._order, self._cover, self._center, self._shape, self._color, splats.object_index,
                 views.background,
                 mesh_rgb if mesh_rgb is not None else self._no_rgb,
                 mesh_depth if mesh_depth is not None else self._no_depth,
-                wp.vec2i(self.width, self.height), wp.vec2i(*self.tile_count), options.tile,
+                wp.vec2i(self.width, self.height), wp.vec2i(*self.tile_count), wp.vec2i(*self.tile),
             ],
-            outputs=[self.rgb, self.depth, self.alpha, self.object_id],
+            outputs=[self.rgb, self.depth, self.alpha, self.object_id, self.median_depth],
             device=self.device,
             block_dim=64,
         )  # fmt: skip

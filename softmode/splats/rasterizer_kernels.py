@@ -1,8 +1,10 @@
-"""Device code of `rasterizer`: projection, binning and blending."""
+"""Device code of `rasterizer`: projection, covering and blending."""
 
 import functools
 
 import warp as wp
+
+from softmode.splats.lane_ops import lowest_bit
 
 wp.set_module_options({"enable_backward": False})
 
@@ -59,7 +61,7 @@ def project(
     view_world: wp.array[int],  # (view_count,)
     # Options:
     size: wp.vec2i,
-    tile: int,
+    tile: wp.vec2i,
     near: float,
     dilation: float,
     antialiased: bool,
@@ -67,9 +69,9 @@ def project(
     center_out: wp.array[wp.vec4],  # u, v [px], forward depth [m], largest d^2/2 that is drawn
     shape_out: wp.array[wp.vec4],  # slope b/c, c/det [1/px^2], 1/c [1/px^2], opacity
     color_out: wp.array[wp.vec3],
-    box_out: wp.array[wp.vec4ub],  # tiles: x0, x1, y0, y1, half open
+    box_out: wp.array[wp.vec4us],  # tiles: x0, x1, y0, y1, half open
     key_out: wp.array[int],  # bits of the depth
-    order_out: wp.array[int],
+    order_out: wp.array[int],  # this splat, to be sorted by the keys
 ):
     """Project splats: d^2 = (c/det) (dx - (b/c) dy)^2 + dy^2/c with the image covariance [[a, b], [b, c]].
 
@@ -79,8 +81,8 @@ def project(
     k = view * mean.shape[1] + i
     world = view_world[view]
     key_out[k] = FAR_KEY
-    order_out[k] = k
-    box_out[k] = wp.vec4ub(wp.uint8(0), wp.uint8(0), wp.uint8(0), wp.uint8(0))
+    order_out[k] = i
+    box_out[k] = wp.vec4us()
     m = world_to_camera[view]
     x = mean[world % mean.shape[0], i]
     r0 = wp.vec3(m[0, 0], m[0, 1], m[0, 2])
@@ -124,13 +126,12 @@ def project(
     half_y = wp.sqrt(2.0 * reach * c)
     if u + half_x < 0.0 or u - half_x > width or v + half_y < 0.0 or v - half_y > height:
         return
-    edge = float(tile)
-    x0 = int(wp.max(u - half_x, 0.0) / edge)
-    y0 = int(wp.max(v - half_y, 0.0) / edge)
-    x1 = (int(wp.min(u + half_x, width - 1.0)) + tile) / tile
-    y1 = (int(wp.min(v + half_y, height - 1.0)) + tile) / tile
+    x0 = int(wp.max(u - half_x, 0.0)) / tile[0]
+    y0 = int(wp.max(v - half_y, 0.0)) / tile[1]
+    x1 = int(wp.min(u + half_x, width - 1.0)) / tile[0] + 1
+    y1 = int(wp.min(v + half_y, height - 1.0)) / tile[1] + 1
     key_out[k] = wp.cast(z, wp.int32)
-    box_out[k] = wp.vec4ub(wp.uint8(x0), wp.uint8(x1), wp.uint8(y0), wp.uint8(y1))
+    box_out[k] = wp.vec4us(wp.uint16(x0), wp.uint16(x1), wp.uint16(y0), wp.uint16(y1))
     center_out[k] = wp.vec4(u, v, z, reach)
     shape_out[k] = wp.vec4(b / c, c / det, 1.0 / c, o)
     direction = wp.vec3(0.0, 0.0, 1.0)
@@ -142,70 +143,28 @@ def project(
 
 
 @wp.kernel
-def count_tiles(
-    order: wp.array[int],  # splats by depth
-    box: wp.array[wp.vec4ub],
-    # Out:
-    count_out: wp.array[int],
-):
-    """Count the tiles that each splat touches, in depth order."""
-    i = wp.tid()
-    b = box[order[i]]
-    count_out[i] = (int(b[1]) - int(b[0])) * (int(b[3]) - int(b[2]))
-
-
-@wp.kernel
-def emit_pairs(
-    order: wp.array[int],  # splats by depth
-    box: wp.array[wp.vec4ub],
-    end: wp.array[int],  # inclusive scan of the counts
+def cover_tiles(
+    order: wp.array[int],  # (>= view_count * splat_count,) splats of each view by depth
+    box: wp.array[wp.vec4us],  # (view_count * splat_count,)
     splat_count: int,
     tile_count: wp.vec2i,
-    capacity: int,
     # Out:
-    tile_out: wp.array[int],  # (capacity,) tile over all views
-    splat_out: wp.array[int],  # (capacity,)
-    overflow_out: wp.array[int],  # (1,) pairs beyond the capacity
+    cover_out: wp.array2d[wp.uint32],  # (tiles of all views, words), zeroed
 ):
-    """Write one (tile, splat) pair per touched tile; nearer splats come first."""
-    i = wp.tid()
-    if i == end.shape[0] - 1:
-        overflow_out[0] = wp.max(end[i] - capacity, 0)
-    k = order[i]
-    b = box[k]
-    x0 = int(b[0])
-    x1 = int(b[1])
-    slot = end[i] - (x1 - x0) * (int(b[3]) - int(b[2]))
-    first_tile = (k / splat_count) * tile_count[0] * tile_count[1]
+    """Set the bit of every depth rank in every tile that the splat touches."""
+    view, rank = wp.tid()
+    first = view * splat_count
+    b = box[first + order[first + rank]]
+    word = rank / 32
+    bit = wp.uint32(1) << wp.uint32(rank - 32 * word)
     for y in range(int(b[2]), int(b[3])):
-        for x in range(x0, x1):
-            if slot < capacity:
-                tile_out[slot] = first_tile + y * tile_count[0] + x
-                splat_out[slot] = k
-            slot += 1
-
-
-@wp.kernel
-def find_ranges(
-    tile: wp.array[int],  # (2 * capacity,) sorted; unused slots hold tile_count
-    tile_count: int,
-    capacity: int,
-    # Out:
-    range_out: wp.array[wp.vec2i],  # (tile_count,)
-):
-    """Find where each tile's pairs begin and end."""
-    i = wp.tid()
-    t = tile[i]
-    if t >= tile_count:
-        return
-    if i == 0 or tile[wp.max(i - 1, 0)] != t:
-        range_out[t][0] = i
-    if i == capacity - 1 or tile[wp.min(i + 1, capacity - 1)] != t:
-        range_out[t][1] = i + 1
+        row = (view * tile_count[1] + y) * tile_count[0]
+        for x in range(int(b[0]), int(b[1])):
+            wp.atomic_or(cover_out, row + x, word, bit)
 
 
 @functools.cache
-def blend_kernel(strip: int, has_mesh: bool, object_ids: bool) -> wp.Kernel:
+def blend_kernel(strip: int, has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Kernel:
     """Return the blend kernel whose threads own `strip` neighbouring pixels of a row.
 
     A strip of one is the usual choice on a GPU. On a CPU, where threads run one after another, a strip of a tile's
@@ -218,8 +177,8 @@ def blend_kernel(strip: int, has_mesh: bool, object_ids: bool) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
     def _blend(
         # Bins:
-        splat: wp.array[int],  # (capacity,) sorted by tile, then depth
-        tile_range: wp.array[wp.vec2i],  # (tile_count over all views,)
+        order: wp.array[int],  # (>= view_count * splat_count,) splats of each view by depth
+        cover: wp.array2d[wp.uint32],  # (tile_count over all views, words) bits of depth ranks
         # Projected splats:
         center: wp.array[wp.vec4],
         shape: wp.array[wp.vec4],
@@ -232,24 +191,25 @@ def blend_kernel(strip: int, has_mesh: bool, object_ids: bool) -> wp.Kernel:
         # Sizes:
         size: wp.vec2i,
         tile_count: wp.vec2i,
-        tile: int,
+        tile: wp.vec2i,
         # Out:
         rgb_out: wp.array3d[wp.vec3],
         depth_out: wp.array3d[float],
         alpha_out: wp.array3d[float],
         object_out: wp.array3d[int],
+        median_out: wp.array3d[float],
     ):
         """Blend front to back: C = sum_i c_i alpha_i T_i + T c_behind."""
         thread = wp.tid()
-        strips_per_row = tile / strip
-        strips_per_tile = strips_per_row * tile
+        strips_per_row = tile[0] / strip
+        strips_per_tile = strips_per_row * tile[1]
         tile_index = thread / strips_per_tile
         local = thread - tile_index * strips_per_tile
         per_view = tile_count[0] * tile_count[1]
         view = tile_index / per_view
         in_view = tile_index - view * per_view
-        row = (in_view / tile_count[0]) * tile + local / strips_per_row
-        first = (in_view % tile_count[0]) * tile + (local % strips_per_row) * strip
+        row = (in_view / tile_count[0]) * tile[1] + local / strips_per_row
+        first = (in_view % tile_count[0]) * tile[0] + (local % strips_per_row) * strip
         if row >= size[1] or first >= size[0]:
             return
         count = wp.min(strip, size[0] - first)
@@ -263,6 +223,7 @@ def blend_kernel(strip: int, has_mesh: bool, object_ids: bool) -> wp.Kernel:
         depth = strip_vec()
         best = strip_vec()
         winner = strip_int()
+        median = strip_vec()
         limit = strip_vec()
         for p in range(strip):
             light[p] = 1.0
@@ -275,9 +236,18 @@ def blend_kernel(strip: int, has_mesh: bool, object_ids: bool) -> wp.Kernel:
                     limit[p] = behind
         live = wp.int32(count)
 
-        pairs = tile_range[tile_index]
-        for slot in range(pairs[0], pairs[1]):
-            k = splat[slot]
+        splat_count = object_index.shape[0]
+        first_splat = view * splat_count
+        word = wp.int32(0)
+        bits = wp.uint32(0)
+        while live > 0:
+            while bits == wp.uint32(0) and word < cover.shape[1]:
+                bits = cover[tile_index, word]
+                word += 1
+            if bits == wp.uint32(0):
+                break
+            k = first_splat + order[first_splat + 32 * (word - 1) + lowest_bit(bits)]
+            bits = bits & (bits - wp.uint32(1))
             g = center[k]
             e = shape[k]
             dy = py - g[1]
@@ -314,12 +284,13 @@ def blend_kernel(strip: int, has_mesh: bool, object_ids: bool) -> wp.Kernel:
                             blue[p] += weight * c[2]
                             depth[p] += weight * g[2]
                             light[p] = after
+                            if wp.static(median_depth):
+                                if t > 0.5 and after <= 0.5:
+                                    median[p] = g[2]
                             if wp.static(object_ids):
                                 if weight > best[p]:
                                     best[p] = weight
-                                    winner[p] = object_index[k % object_index.shape[0]]
-            if live == 0:
-                break
+                                    winner[p] = object_index[k - first_splat]
 
         for p in range(count):
             t = light[p]
@@ -340,5 +311,11 @@ def blend_kernel(strip: int, has_mesh: bool, object_ids: bool) -> wp.Kernel:
             depth_out[view, row, first + p] = wp.where(total > 0.0, far / wp.max(total, 1.0e-6), 0.0)
             if wp.static(object_ids):
                 object_out[view, row, first + p] = winner[p]
+            if wp.static(median_depth):
+                middle_depth = median[p]
+                if wp.static(has_mesh):
+                    if t > 0.5 and limit[p] < 1.0e29:
+                        middle_depth = limit[p]
+                median_out[view, row, first + p] = middle_depth
 
     return _blend

@@ -20,6 +20,7 @@ class DenseImage:
 
     rgb: NDArray[np.float64]
     depth: NDArray[np.float64]
+    median_depth: NDArray[np.float64]
     alpha: NDArray[np.float64]
     object_id: NDArray[np.int64]
     margin: NDArray[np.float64]
@@ -101,6 +102,7 @@ def render_dense(
     transmittance = np.ones(len(xs))
     running = np.ones(len(xs), dtype=bool)
     rgb, depth = np.zeros((len(xs), 3)), np.zeros(len(xs))
+    median = np.zeros(len(xs))
     best, identity = np.zeros(len(xs)), np.full(len(xs), -1)
     margin = np.full(len(xs), np.inf)
     previous = np.full(len(xs), -np.inf)
@@ -123,6 +125,9 @@ def render_dense(
         depth += weight * p[i, 2]
         identity = np.where(weight > best, 0 if object_ids is None else object_ids[i], identity)
         best = np.maximum(best, weight)
+        half = hit & (transmittance > 0.5) & (after <= 0.5)
+        margin = np.where(hit, np.minimum(margin, np.abs(after / 0.5 - 1.0)), margin)
+        median = np.where(half, p[i, 2], median)
         transmittance = np.where(hit, after, transmittance)
     back = np.tile(np.asarray(background, dtype=np.float64), (len(xs), 1))
     if mesh_depth is not None and mesh_rgb is not None:
@@ -130,6 +135,7 @@ def render_dense(
         back = mesh_rgb.reshape(-1, 3)
         depth = depth + np.where(opaque, transmittance * np.where(opaque, limit, 0.0), 0.0)
         total = np.where(opaque, 1.0, 1.0 - transmittance)
+        median = np.where(opaque & (transmittance > 0.5), limit, median)
     else:
         total = 1.0 - transmittance
     depth = np.where(total > 0.0, depth / np.maximum(total, 1e-6), 0.0)
@@ -138,6 +144,7 @@ def render_dense(
     return DenseImage(
         rgb=rgb.reshape(*shape, 3),
         depth=depth.reshape(shape),
+        median_depth=median.reshape(shape),
         alpha=(1.0 - transmittance).reshape(shape),
         object_id=identity.reshape(shape),
         margin=margin.reshape(shape),

@@ -185,15 +185,14 @@ def test_smooth_mesh_edges_mix_object_and_sky() -> None:
 
 
 def test_object_ids_and_missing_splats() -> None:
-    """Object ids are handed through; without splats the camera has no alpha, ids or overflow."""
+    """Object ids are handed through; without splats the camera has neither alpha nor ids."""
     sensor = SplatCamera(
         scene(), arrays(make_plush(600)), [camera()], rasterizer_options=RasterizerOptions(object_ids=True)
     )  # fmt: skip
     sensor.render(sensor.model.state())
     assert sensor.object_id is not None and set(np.unique(sensor.object_id.numpy())) == {-1, 0}
-    assert sensor.overflow is not None and sensor.overflow.numpy()[0] == 0
     bare = SplatCamera(scene(), None, [camera()])
-    assert bare.alpha is None and bare.object_id is None and bare.overflow is None
+    assert bare.alpha is None and bare.object_id is None
 
 
 def test_refuses_bad_descriptions() -> None:
