@@ -1,6 +1,15 @@
-"""Bits and lanes in device code: what Warp lacks for words of bits and for the 32 threads of a CUDA warp."""
+"""Bits and lanes in device code: what Warp lacks for words of bits and for the 32 threads of a CUDA warp.
+
+The functions on lanes are for CUDA only: every lane of a warp must call them together. `load4` and the shared memory
+of a warp exist because Warp moves a vec4 as four numbers, where a GPU has instructions that move it at once.
+"""
 
 import warp as wp
+
+WARP = 32
+"""Threads of a CUDA warp, bits of a word."""
+BLOCK_WARPS = 4
+"""Warps of a block in kernels that use `queue_address` and `stage_address`."""
 
 
 @wp.func_native(
@@ -14,4 +23,185 @@ import warp as wp
 )
 def lowest_bit(word: wp.uint32) -> int:
     """Return the position of the lowest set bit of a word that is not zero."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    return __popc(word);
+#else
+    return __builtin_popcount(word);
+#endif
+"""
+)
+def bit_count(word: wp.uint32) -> int:
+    """Return the number of set bits."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    return __ballot_sync(0xffffffffu, flag);
+#else
+    return flag;
+#endif
+"""
+)
+def ballot(flag: bool) -> wp.uint32:
+    """Return the word whose bit i is the flag of lane i."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    for (int step = 1; step < 32; step *= 2) {
+        const int other = __shfl_up_sync(0xffffffffu, value, step);
+        if (lane >= step) value += other;
+    }
+#endif
+    return value;
+"""
+)
+def lane_scan(value: int, lane: int) -> int:
+    """Return the sum of the values of the lanes up to and including this one."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    return __shfl_sync(0xffffffffu, value, 31);
+#else
+    return value;
+#endif
+"""
+)
+def last_lane(value: int) -> int:
+    """Return the value of lane 31."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    __syncwarp();
+#endif
+"""
+)
+def sync_lanes() -> None:
+    """Make what the lanes wrote to memory visible to each other."""
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    float result;
+    asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(result) : "f"(x));
+    return result;
+#else
+    return exp2f(x);
+#endif
+"""
+)
+def exp2(x: float) -> float:
+    """Return 2^x, to two units in the last place."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    const float4 v = __ldg(reinterpret_cast<const float4*>(source.data + i));
+    return wp::vec4(v.x, v.y, v.z, v.w);
+#else
+    return source.data[i];
+#endif
+"""
+)
+def load4(source: wp.array[wp.vec4], i: int) -> wp.vec4:
+    """Return element i of an array that the kernel does not write, in one load."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    __shared__ unsigned short queue[4 * 1024];
+    return reinterpret_cast<uint64_t>(queue + (threadIdx.x >> 5) * 1024);
+#else
+    return 0;
+#endif
+"""
+)
+def queue_address() -> wp.uint64:
+    """Return this warp's 1024 uint16 of shared memory."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    reinterpret_cast<unsigned short*>(address)[i] = (unsigned short)value;
+#endif
+"""
+)
+def queue_put(address: wp.uint64, i: int, value: int) -> None:
+    """Write an entry of the warp's queue."""
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    return reinterpret_cast<unsigned short*>(address)[i];
+#else
+    return 0;
+#endif
+"""
+)
+def queue_get(address: wp.uint64, i: int) -> int:
+    """Read an entry of the warp's queue."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    __shared__ float4 stage[4 * 96];
+    return reinterpret_cast<uint64_t>(stage + (threadIdx.x >> 5) * 96);
+#else
+    return 0;
+#endif
+"""
+)
+def stage_address() -> wp.uint64:
+    """Return this warp's 96 vec4 of shared memory."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    reinterpret_cast<float4*>(address)[i] = make_float4(value[0], value[1], value[2], value[3]);
+#endif
+"""
+)
+def stage_put(address: wp.uint64, i: int, value: wp.vec4) -> None:
+    """Write an entry of the warp's stage."""
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    const float4 v = reinterpret_cast<const float4*>(address)[i];
+    return wp::vec4(v.x, v.y, v.z, v.w);
+#else
+    return wp::vec4();
+#endif
+"""
+)
+def stage_get(address: wp.uint64, i: int) -> wp.vec4:
+    """Read an entry of the warp's stage."""
     ...

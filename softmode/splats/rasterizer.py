@@ -19,9 +19,13 @@ import numpy as np
 import warp as wp
 
 from softmode.errors import ConfigError
+from softmode.splats import blend_cuda_kernels
 from softmode.splats import rasterizer_kernels as kernels
+from softmode.splats.lane_ops import BLOCK_WARPS
 from softmode.splats.splats import MAX_SPLATS, Splats
 
+TILE = (8, 8)
+"""Width and height of the tiles that list splats [px]."""
 MAX_EDGE = 4096
 """Largest width and height of an image [px]."""
 
@@ -154,7 +158,7 @@ class SplatRasterizer:
         """Allocate the buffers."""
         self.options = options if options is not None else RasterizerOptions()
         self.device = wp.get_device(device)
-        self.tile = tile = (8, 8)
+        self.tile = tile = TILE
         self.tile_count = (-(-width // tile[0]), -(-height // tile[1]))
         self.splat_count, self.view_count, self.width, self.height = splat_count, view_count, width, height
         total = splat_count * view_count
@@ -170,7 +174,7 @@ class SplatRasterizer:
         allocate = functools.partial(wp.zeros, device=self.device)
         self._center = allocate(total, dtype=wp.vec4)
         self._shape = allocate(total, dtype=wp.vec4)
-        self._color = allocate(total, dtype=wp.vec3)
+        self._color = allocate(total, dtype=wp.vec4)
         self._box = allocate(total, dtype=wp.vec4us)
         # The sort wants twice the entries as its workspace.
         self._depth_key = allocate(2 * total, dtype=wp.int32)
@@ -264,10 +268,14 @@ class SplatRasterizer:
         self, splats: SplatArrays, views: ViewArrays, mesh_rgb: wp.array | None, mesh_depth: wp.array | None
     ) -> None:
         options = self.options
-        strip = 8 if self.device.is_cpu else 1
+        variant = (mesh_depth is not None, options.object_ids, options.median_depth)
+        if self.device.is_cpu:
+            kernel, threads = kernels.blend_kernel(8, *variant), self.tile[1]
+        else:
+            kernel, threads = blend_cuda_kernels.blend_kernel(*variant), 32 * self.tile[1] // blend_cuda_kernels.ROWS
         wp.launch(
-            kernels.blend_kernel(strip, mesh_depth is not None, options.object_ids, options.median_depth),
-            dim=self._cover.shape[0] * self.tile[1] * (self.tile[0] // strip),
+            kernel,
+            dim=self._cover.shape[0] * threads,
             inputs=[
                 self._order, self._cover, self._center, self._shape, self._color, splats.object_index,
                 views.background,
@@ -277,5 +285,5 @@ class SplatRasterizer:
             ],
             outputs=[self.rgb, self.depth, self.alpha, self.object_id, self.median_depth],
             device=self.device,
-            block_dim=64,
+            block_dim=32 * BLOCK_WARPS,
         )  # fmt: skip

@@ -68,7 +68,7 @@ def project(
     # Out:
     center_out: wp.array[wp.vec4],  # u, v [px], forward depth [m], largest d^2/2 that is drawn
     shape_out: wp.array[wp.vec4],  # slope b/c, c/det [1/px^2], 1/c [1/px^2], opacity
-    color_out: wp.array[wp.vec3],
+    color_out: wp.array[wp.vec4],  # r, g, b, 0
     box_out: wp.array[wp.vec4us],  # tiles: x0, x1, y0, y1, half open
     key_out: wp.array[int],  # bits of the depth
     order_out: wp.array[int],  # this splat, to be sorted by the keys
@@ -139,7 +139,8 @@ def project(
         eye = -(m[0, 3] * r0 + m[1, 3] * r1 + m[2, 3] * r2)
         turn = rotation[world % rotation.shape[0], object_index[i]]
         direction = wp.quat_rotate_inv(turn, wp.normalize(x - eye))
-    color_out[k] = sh_color(sh, world % sh.shape[0], i, direction)
+    rgb = sh_color(sh, world % sh.shape[0], i, direction)
+    color_out[k] = wp.vec4(rgb[0], rgb[1], rgb[2], 0.0)
 
 
 @wp.kernel
@@ -182,7 +183,7 @@ def blend_kernel(strip: int, has_mesh: bool, object_ids: bool, median_depth: boo
         # Projected splats:
         center: wp.array[wp.vec4],
         shape: wp.array[wp.vec4],
-        color: wp.array[wp.vec3],
+        color: wp.array[wp.vec4],
         object_index: wp.array[int],  # (splat_count,)
         # Images in:
         background: wp.array[wp.vec3],  # (1|view_count,)

@@ -1,0 +1,225 @@
+"""Device code of `rasterizer`: the blend on CUDA, one warp for eight by four pixels."""
+
+import functools
+import math
+
+import warp as wp
+
+from softmode.splats.lane_ops import (
+    ballot,
+    bit_count,
+    exp2,
+    lane_scan,
+    last_lane,
+    load4,
+    lowest_bit,
+    queue_address,
+    queue_get,
+    queue_put,
+    stage_address,
+    stage_get,
+    stage_put,
+    sync_lanes,
+)
+from softmode.splats.rasterizer_kernels import ALPHA_MAX, TRANSMITTANCE_MIN
+
+wp.set_module_options({"enable_backward": False})
+
+COLUMNS = 8
+ROWS = 4
+"""Pixels of a warp."""
+LOG2_E = wp.constant(1.0 / math.log(2.0))
+LOG2_ALPHA_MIN = wp.constant(-math.log2(255.0))
+FINISHED = wp.constant(1.0e30)
+
+
+@wp.func
+def least_power(center: wp.vec4, shape: wp.vec4, low: wp.vec2, high: wp.vec2) -> float:
+    """Return the least d^2/2 of a splat over a rectangle of pixel centres, exactly.
+
+    Where the centre lies outside, the minimum of the convex form is on one of the two edges that face it.
+    """
+    x0 = low[0] - center[0]
+    x1 = high[0] - center[0]
+    y0 = low[1] - center[1]
+    y1 = high[1] - center[1]
+    slope = shape[0]
+    a = shape[1]
+    b = shape[2]
+    dx = wp.clamp(0.0, x0, x1)
+    dy = wp.clamp(0.0, y0, y1)
+    along = wp.clamp(a * slope * dx / (a * slope * slope + b), y0, y1)
+    off = dx - slope * along
+    at_side = a * off * off + b * along * along
+    off = wp.clamp(slope * dy, x0, x1) - slope * dy
+    at_top = a * off * off + b * dy * dy
+    return 0.5 * wp.min(at_side, at_top)
+
+
+@functools.cache
+def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Kernel:
+    """Return the blend kernel whose warps own COLUMNS x ROWS pixels, one per lane.
+
+    A warp gathers the ranks of its tile's bits, 1024 at a time, into a queue. Each lane then fetches one splat and
+    tests its ellipse against the warp's own pixels; those that touch are staged in shared memory, from where all lanes
+    read them. Warps do not wait for each other, and stop when all of their pixels are opaque.
+    """
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def _blend(
+        # Bins:
+        order: wp.array[int],  # (>= view_count * splat_count,) splats of each view by depth
+        cover: wp.array2d[wp.uint32],  # (tile_count over all views, words) bits of depth ranks
+        # Projected splats:
+        center: wp.array[wp.vec4],
+        shape: wp.array[wp.vec4],
+        color: wp.array[wp.vec4],
+        object_index: wp.array[int],  # (splat_count,)
+        # Images in:
+        background: wp.array[wp.vec3],  # (1|view_count,)
+        mesh_rgb: wp.array3d[wp.vec3],  # (view_count, height, width)
+        mesh_depth: wp.array3d[float],  # (view_count, height, width) [m], 0 where there is no mesh
+        # Sizes:
+        size: wp.vec2i,
+        tile_count: wp.vec2i,
+        tile: wp.vec2i,
+        # Out:
+        rgb_out: wp.array3d[wp.vec3],
+        depth_out: wp.array3d[float],
+        alpha_out: wp.array3d[float],
+        object_out: wp.array3d[int],
+        median_out: wp.array3d[float],
+    ):
+        """Blend front to back: C = sum_i c_i alpha_i T_i + T c_behind."""
+        thread = wp.tid()
+        lane = thread % 32
+        parts = tile[1] / ROWS
+        part = thread / 32
+        tile_index = part / parts
+        view = tile_index / (tile_count[0] * tile_count[1])
+        in_view = tile_index - view * tile_count[0] * tile_count[1]
+        left = (in_view % tile_count[0]) * tile[0]
+        top = (in_view / tile_count[0]) * tile[1] + (part - tile_index * parts) * ROWS
+        column = left + lane % COLUMNS
+        row = top + lane / COLUMNS
+        inside = column < size[0] and row < size[1]
+        low = wp.vec2(float(left) + 0.5, float(top) + 0.5)
+        high = wp.vec2(float(left + COLUMNS) - 0.5, float(top + ROWS) - 0.5)
+        px = float(column) + 0.5
+        py = float(row) + 0.5
+        queue = queue_address()
+        stage = stage_address()
+
+        light = float(1.0)
+        red = float(0.0)
+        green = float(0.0)
+        blue = float(0.0)
+        depth = float(0.0)
+        best = float(0.0)
+        winner = int(-1)
+        median = float(0.0)
+        limit = float(1.0e30)
+        cut = float(LOG2_ALPHA_MIN)  # exponent below which a splat is left out; FINISHED leaves out all
+        if not inside:
+            cut = FINISHED
+        if wp.static(has_mesh):
+            if inside:
+                behind = mesh_depth[view, row, column]
+                if behind > 0.0:
+                    limit = behind
+
+        splat_count = object_index.shape[0]
+        first = view * splat_count
+        words = cover.shape[1]
+        running = bool(True)
+        chunk = int(0)
+        while running and chunk < words:
+            bits = wp.uint32(0)
+            if chunk + lane < words:
+                bits = cover[tile_index, chunk + lane]
+            through = lane_scan(bit_count(bits), lane)
+            total = last_lane(through)
+            slot = through - bit_count(bits)
+            while bits != wp.uint32(0):
+                queue_put(queue, slot, 32 * lane + lowest_bit(bits))
+                slot += 1
+                bits = bits & (bits - wp.uint32(1))
+            sync_lanes()
+            begin = int(0)
+            while running and begin < total:
+                hit = bool(False)
+                k = int(0)
+                c = wp.vec4()
+                s = wp.vec4()
+                if begin + lane < total:
+                    k = order[first + 32 * chunk + queue_get(queue, begin + lane)]
+                    c = load4(center, first + k)
+                    s = load4(shape, first + k)
+                    hit = least_power(c, s, low, high) <= c[3] + 1.0e-3
+                hits = ballot(hit)
+                if hit:
+                    at = 3 * bit_count(hits & ((wp.uint32(1) << wp.uint32(lane)) - wp.uint32(1)))
+                    half = 0.5 * LOG2_E
+                    stage_put(stage, at, wp.vec4(c[0], c[1], s[0], c[2]))
+                    stage_put(stage, at + 1, wp.vec4(half * s[1], half * s[2], wp.log2(s[3]), wp.cast(k, wp.float32)))
+                    stage_put(stage, at + 2, load4(color, first + k))
+                sync_lanes()
+                count = 3 * bit_count(hits)
+                at = int(0)
+                while at < count:
+                    g = stage_get(stage, at)
+                    e = stage_get(stage, at + 1)
+                    if wp.static(has_mesh):
+                        if g[3] > limit:
+                            cut = FINISHED
+                    dy = py - g[1]
+                    dx = px - (g[0] + g[2] * dy)
+                    power = e[2] - e[0] * dx * dx - e[1] * dy * dy
+                    if power >= cut:
+                        rgb = stage_get(stage, at + 2)
+                        alpha = wp.min(ALPHA_MAX, exp2(power))
+                        after = light * (1.0 - alpha)
+                        if after < TRANSMITTANCE_MIN:
+                            cut = FINISHED
+                        else:
+                            weight = alpha * light
+                            red += weight * rgb[0]
+                            green += weight * rgb[1]
+                            blue += weight * rgb[2]
+                            depth += weight * g[3]
+                            if wp.static(object_ids):
+                                if weight > best:
+                                    best = weight
+                                    winner = object_index[wp.cast(e[3], wp.int32)]
+                            if wp.static(median_depth):
+                                if light > 0.5 and after <= 0.5:
+                                    median = g[3]
+                            light = after
+                    at += 3
+                sync_lanes()
+                running = ballot(cut != FINISHED) != wp.uint32(0)
+                begin += 32
+            chunk += 32
+
+        if inside:
+            behind_rgb = wp.vec3()
+            seen = 1.0 - light
+            if wp.static(has_mesh):
+                behind_rgb = mesh_rgb[view, row, column]
+                if limit < 1.0e29:
+                    depth += light * limit
+                    seen = 1.0
+                    if wp.static(median_depth):
+                        if light > 0.5:
+                            median = limit
+            else:
+                behind_rgb = background[view % background.shape[0]]
+            rgb_out[view, row, column] = wp.vec3(red, green, blue) + light * behind_rgb
+            alpha_out[view, row, column] = 1.0 - light
+            depth_out[view, row, column] = wp.where(seen > 0.0, depth / wp.max(seen, 1.0e-6), 0.0)
+            if wp.static(object_ids):
+                object_out[view, row, column] = winner
+            if wp.static(median_depth):
+                median_out[view, row, column] = median
+
+    return _blend
