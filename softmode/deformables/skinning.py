@@ -1,4 +1,4 @@
-"""Forward skinning on the device: splat means with F Sigma F^T from the reduced coordinates q.
+"""Forward skinning on the device: splat means, F Sigma F^T and the rotation of F from the reduced coordinates q.
 
 x(X) = X + sum_k b_k(X) q_k and F(X) = I + sum_k q_k grad b_k(X)^T. The displacement q carries the whole rigid motion of
 a body, metres of it, while splats are millimetres in size: positions are summed in float64 and rounded once at the end.
@@ -58,7 +58,6 @@ class SkinSplats:
         self.rest_means = wp.array(x.astype(np.float32), dtype=wp.vec3, device=self.device)
         self.rest_covariances = wp.array(six.astype(np.float32), dtype=kernels.vec6, device=self.device)
         self.basis = wp.array(basis4, dtype=wp.vec4, device=self.device)
-        self.mean_gradient = wp.array(g.mean(axis=0).astype(np.float32), dtype=wp.vec3, device=self.device)
 
     @property
     def count(self) -> int:
@@ -77,6 +76,7 @@ class SkinSplats:
         means: wp.array,
         covariances: wp.array,
         *,
+        rotations: wp.array | None = None,
         first_splat: int = 0,
     ) -> None:
         """Write the deformed means and covariances of all worlds; capturable.
@@ -86,8 +86,17 @@ class SkinSplats:
             function_start: First entry of q of this object's instance in each world, int32, shape (world_count,).
             means: Output centres [m], vec3, shape (world_count, total splats).
             covariances: Output covariances [m^2], vec6, shape (world_count, total splats).
+            rotations: Output rotations of F, rest frame to world, quat, like `means`; None, or shape (1, 1) as in
+                `SplatArrays` of degree 0, for colours that are the same from everywhere.
             first_splat: Column where this object's splats begin.
+
+        Raises:
+            BasisError: If `rotations` has another shape than `means`.
         """
+        if rotations is not None and rotations.shape != means.shape:
+            if rotations.shape != (1, 1):
+                raise BasisError(f"rotations has shape {rotations.shape}, means {means.shape}; one per splat is needed")
+            rotations = None
         wp.launch(
             kernels.skin_splats,
             dim=(function_start.shape[0], self.count),
@@ -100,25 +109,6 @@ class SkinSplats:
                 q,
                 first_splat,
             ],
-            outputs=[means, covariances],
-            device=self.device,
-        )
-
-    def launch_rotation(
-        self, q: wp.array, function_start: wp.array, rotations: wp.array, *, object_index: int = 0
-    ) -> None:
-        """Write the object's mean rotation in every world; turns view-dependent colour with the object.
-
-        Args:
-            q: Reduced coordinates of all instances [m], flat vec3d.
-            function_start: First entry of q of this object's instance in each world, int32, shape (world_count,).
-            rotations: Output quaternions, shape (world_count, object_count).
-            object_index: Column of this object.
-        """
-        wp.launch(
-            kernels.mean_rotation,
-            dim=function_start.shape[0],
-            inputs=[self.mean_gradient, function_start, q, object_index],
-            outputs=[rotations],
+            outputs=[means, covariances, rotations],
             device=self.device,
         )

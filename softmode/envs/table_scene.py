@@ -152,7 +152,6 @@ class TableScene:
         self._reset_mask = wp.ones(worlds + 1, dtype=wp.bool, device=device)
         self._place_position = wp.zeros(worlds, dtype=wp.vec3d, device=device)
         self._place_yaw = wp.zeros(worlds, dtype=wp.float64, device=device)
-        self.object_rotation = wp.zeros((worlds, 1), dtype=wp.quat, device=device)
         splats = self.soft.splats
         self.skin = SkinSplats(splats.means, splats.covariances(), self.soft.basis, self.soft.grad_basis, device=device)
 
@@ -279,7 +278,6 @@ class TableScene:
             outputs=[self.finger_force],
             device=self.device,
         )
-        self.skin.launch_rotation(state.softmode.q, data.function_start, self.object_rotation)
 
     def render(self, size: tuple[int, int]) -> SplatCamera:
         """Draw every camera of one image size and return it; its arrays are overwritten by the next frame."""
@@ -295,8 +293,9 @@ class TableScene:
     def _draw(self, camera: SplatCamera) -> None:
         """Deform the splats and draw one frame."""
         data, state, arrays = self.model.softmode, self.state, self.splat_arrays
-        self.skin.launch(state.softmode.q, data.function_start, arrays.means, arrays.covariances)
-        self.skin.launch_rotation(state.softmode.q, data.function_start, arrays.rotations)
+        self.skin.launch(
+            state.softmode.q, data.function_start, arrays.means, arrays.covariances, rotations=arrays.rotations
+        )
         camera.render(state)
 
     # -- reading ------------------------------------------------------------------------------------------------------

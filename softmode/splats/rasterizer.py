@@ -61,7 +61,8 @@ class SplatArrays:
     object_index: wp.array
     """Object of each splat, int32, shape (N,)."""
     rotations: wp.array
-    """Rotation of each object's colours, rest frame to world, quat, shape (1 or world_count, object_count)."""
+    """Rotation of each splat's colours, rest frame to world, quat, shape (1 or world_count, N); (1, 1) and not read if
+    K = 1, where colours are the same from everywhere."""
 
     @classmethod
     def from_splats(
@@ -90,7 +91,7 @@ class SplatArrays:
         six = np.stack([s[:, 0, 0], s[:, 0, 1], s[:, 0, 2], s[:, 1, 1], s[:, 1, 2], s[:, 2, 2]], axis=1)
         means = np.concatenate([splats.means for splats in objects])
         index = np.repeat(np.arange(len(objects), dtype=np.int32), [splats.count for splats in objects])
-        identity = np.tile(np.array([0.0, 0.0, 0.0, 1.0], dtype=np.float32), (world_count, len(objects), 1))
+        turns = (world_count, len(means)) if degree > 0 else (1, 1)
 
         def worlds(array: np.ndarray) -> np.ndarray:
             return np.repeat(array.astype(np.float32)[None], world_count, axis=0)
@@ -101,7 +102,7 @@ class SplatArrays:
             opacities=wp.array(np.concatenate([o.opacities for o in objects])[None], dtype=wp.float32, device=device),
             sh=wp.array(sh[None], dtype=wp.vec3, device=device),
             object_index=wp.array(index, dtype=wp.int32, device=device),
-            rotations=wp.array(identity, dtype=wp.quat, device=device),
+            rotations=wp.full(turns, wp.quat_identity(), dtype=wp.quat, device=device),
         )
 
 
@@ -214,10 +215,12 @@ class SplatRasterizer:
             ConfigError: If only one of the mesh images is given, or an array has another shape than the buffers.
         """
         images = (self.view_count, self.height, self.width)
+        turns = (splats.rotations.shape[0], self.splat_count)
         for name, array, shape in (
             ("splats.means", splats.means, (splats.means.shape[0], self.splat_count)),
             ("splats.covariances", splats.covariances, (splats.covariances.shape[0], self.splat_count)),
             ("splats.opacities", splats.opacities, (splats.opacities.shape[0], self.splat_count)),
+            ("splats.rotations", splats.rotations, turns if splats.sh.shape[2] > 1 else None),
             ("splats.object_index", splats.object_index, (self.splat_count,)),
             ("views.world_to_camera", views.world_to_camera, (self.view_count,)),
             ("views.intrinsics", views.intrinsics, (self.view_count,)),
@@ -241,7 +244,7 @@ class SplatRasterizer:
             kernels.project,
             dim=(self.view_count, self.splat_count),
             inputs=[
-                splats.means, splats.covariances, splats.opacities, splats.sh, splats.object_index, splats.rotations,
+                splats.means, splats.covariances, splats.opacities, splats.sh, splats.rotations,
                 views.world_to_camera, views.intrinsics, views.world,
                 wp.vec2i(self.width, self.height), wp.vec2i(*self.tile),
                 options.near, options.dilation, options.antialiased,

@@ -53,8 +53,7 @@ def project(
     covariance: wp.array2d[vec6],  # (1|world_count, splat_count) [m^2]
     opacity: wp.array2d[float],  # (1|world_count, splat_count)
     sh: wp.array3d[wp.vec3],  # (1|world_count, splat_count, K)
-    object_index: wp.array[int],  # (splat_count,)
-    rotation: wp.array2d[wp.quat],  # (1|world_count, object_count)
+    rotation: wp.array2d[wp.quat],  # (1|world_count, splat_count), not read if K = 1
     # Views:
     world_to_camera: wp.array[wp.mat44],  # (view_count,)
     intrinsics: wp.array[wp.vec4],  # (view_count,) [px]
@@ -137,7 +136,7 @@ def project(
     direction = wp.vec3(0.0, 0.0, 1.0)
     if sh.shape[2] > 1:
         eye = -(m[0, 3] * r0 + m[1, 3] * r1 + m[2, 3] * r2)
-        turn = rotation[world % rotation.shape[0], object_index[i]]
+        turn = rotation[world % rotation.shape[0], i]
         direction = wp.quat_rotate_inv(turn, wp.normalize(x - eye))
     rgb = sh_color(sh, world % sh.shape[0], i, direction)
     color_out[k] = wp.vec4(rgb[0], rgb[1], rgb[2], 0.0)

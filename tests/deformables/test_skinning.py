@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
+from scipy.linalg import polar
 
 from softmode.deformables.skinning import STRETCH_LIMIT, SkinSplats
 from softmode.deformables.skinning_kernels import vec6
 from softmode.errors import BasisError
+from softmode.splats.splats import rotations_from_quats
 
 FLOAT32 = np.finfo(np.float32).eps
 N, M, WORLDS = 60, 12, 3
@@ -49,7 +51,7 @@ class Case:
 
     def flat(self, values: np.ndarray, device: str) -> wp.array:
         """Return q of all instances in one array with foreign entries before each instance."""
-        padded = np.concatenate([np.full((WORLDS, self.pad, 3), 1e6), values], axis=1)
+        padded = np.concatenate([np.full((len(values), self.pad, 3), 1e6), values], axis=1)
         return wp.array(padded.reshape(-1, 3), dtype=wp.vec3d, device=device)
 
     def starts(self, device: str) -> wp.array:
@@ -128,19 +130,77 @@ def test_worlds_are_independent(device: str) -> None:
         np.testing.assert_array_equal(covariances[world], alone[1][0])
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.7, 3.0])
-def test_mean_rotation(device: str, angle: float) -> None:
-    """A rotation with stretch 0.8 in all directions yields that rotation for every world."""
+def rotated(f: np.ndarray, device: str) -> np.ndarray:
+    """Return the rotations that skinning finds of one F per world, as matrices; every splat of a world has the same."""
     case = Case(amplitude=0.0)
-    axis = np.array([0.6, 0.0, 0.8])
-    cross = np.cross(np.eye(3), axis)
-    r = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    case.q[:, :3] = (0.8 * r - np.eye(3)).T
-    rotations = wp.zeros((WORLDS, 2), dtype=wp.quat, device=device)
-    case.skin(device).launch_rotation(case.flat(case.q, device), case.starts(device), rotations, object_index=1)
-    expected = np.concatenate([np.sin(angle / 2) * axis, [np.cos(angle / 2)]])
-    got = rotations.numpy()[:, 1]
-    np.testing.assert_allclose(np.abs(got @ expected), 1.0, atol=1e-5)
+    q = np.zeros((len(f), M, 3))
+    q[:, :3] = (f - np.eye(3)).transpose(0, 2, 1)
+    start = wp.array((M + case.pad) * np.arange(len(f)) + case.pad, dtype=wp.int32, device=device)
+    means, covariances, rotations = (
+        wp.zeros((len(f), N + 3), dtype=dtype, device=device) for dtype in (wp.vec3, vec6, wp.quat)
+    )
+    case.skin(device).launch(case.flat(q, device), start, means, covariances, rotations=rotations, first_splat=3)
+    assert not rotations.numpy()[:, :3].any()
+    found = rotations.numpy()[:, 3:].astype(np.float64)
+    np.testing.assert_array_equal(found, np.broadcast_to(found[:, :1], found.shape))
+    np.testing.assert_allclose(np.linalg.norm(found, axis=2), 1.0, atol=4 * FLOAT32)
+    return rotations_from_quats(found[:, 0])
+
+
+def turns(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Return rotations about random axes by 0 to 180 degrees, a tenth of them by 180."""
+    axis = rng.normal(size=(count, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    angle = np.where(np.arange(count) % 10 == 0, np.pi, rng.uniform(0.0, np.pi, count))[:, None]
+    return rotations_from_quats(np.concatenate([np.sin(angle / 2) * axis, np.cos(angle / 2)], axis=1))
+
+
+@pytest.mark.parametrize(
+    ("third", "tolerance"),
+    [((0.2, 3.0), 16), ((1e-6, 1e-2), 16), ((-0.05, -0.01), 32)],
+    ids=["stretched", "nearly singular", "inverted"],
+)
+def test_rotation_of_the_deformation_gradient(device: str, third: tuple[float, float], tolerance: float) -> None:
+    """R maximises tr(R^T F) over the proper rotations: with the singular value decomposition U diag(1, 1, d) V^T.
+
+    Where det F > 0 that is the polar factor of scipy. The rounding of F alone turns R by about eps |F| / (s2 + s3).
+    """
+    rng = np.random.default_rng(1)
+    count = 1000
+    stretch = rng.uniform(0.2, 3.0, size=(count, 3))
+    stretch[:, 2] = rng.uniform(*third, size=count)
+    v = turns(rng, count)
+    f = turns(rng, count) @ v * stretch[:, None, :] @ v.transpose(0, 2, 1)
+    found = rotated(f, device)
+    left, s, right = np.linalg.svd(f)
+    left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
+    expected = left @ right
+    if third[0] > 0.0:
+        np.testing.assert_allclose(expected, [polar(matrix)[0] for matrix in f], atol=1e-9)
+    bound = tolerance * FLOAT32 * s[:, 0] / (s[:, 1] + np.sign(third[0]) * s[:, 2])
+    assert (np.abs(found - expected).max(axis=(1, 2)) < bound).all()
+
+
+def test_rotation_where_none_is_nearest(device: str) -> None:
+    """Point, line and mirrored F have no single nearest rotation: any proper one will do, NaN will not."""
+    u = np.array([0.6, 0.0, 0.8])
+    f = np.stack([np.zeros((3, 3)), np.outer(u, u), -np.eye(3), np.diag([1.0, 1.0, -1.0]), np.full((3, 3), 1e-30)])
+    for r in rotated(f, device):
+        np.testing.assert_allclose(r @ r.T, np.eye(3), atol=1e-6)
+        assert np.linalg.det(r) > 0.0
+
+
+def test_rotations_are_left_out_of_degree_zero(device: str) -> None:
+    """The placeholder of `SplatArrays` stays as it is; any other shape is refused."""
+    case = Case()
+    means = wp.zeros((WORLDS, N), dtype=wp.vec3, device=device)
+    covariances = wp.zeros((WORLDS, N), dtype=vec6, device=device)
+    q, starts, skin = case.flat(case.q, device), case.starts(device), case.skin(device)
+    none = wp.zeros((1, 1), dtype=wp.quat, device=device)
+    skin.launch(q, starts, means, covariances, rotations=none)
+    assert not none.numpy().any()
+    with pytest.raises(BasisError, match=r"rotations has shape \(1, 60\)"):
+        skin.launch(q, starts, means, covariances, rotations=wp.zeros((1, N), dtype=wp.quat, device=device))
 
 
 def test_refuses_shapes_that_do_not_belong_together() -> None:

@@ -177,8 +177,10 @@ def test_reset_options_place_the_object(lift: LiftSoftEnv) -> None:
     _, info = lift.reset(seed=0, options=given)
     assert info["youngs_modulus"] == 1.0e5
     np.testing.assert_allclose(lift.scene.object_position.numpy()[0, :2], given["position"], atol=1e-6)
-    x, y, z, w = lift.scene.object_rotation.numpy()[0, 0]
-    np.testing.assert_allclose([x, y, z, w], [0.0, 0.0, np.sin(0.25), np.cos(0.25)], atol=1e-5)
+    turn = np.array([[np.cos(0.5), -np.sin(0.5), 0.0], [np.sin(0.5), np.cos(0.5), 0.0], [0.0, 0.0, 1.0]])
+    rest = lift.scene.soft.body.surface_points
+    placed = lift.scene.state.particle_q.numpy()[: len(rest)]
+    np.testing.assert_allclose(placed - placed[0], (rest - rest[0]) @ turn.T, atol=1e-5)
     again, _ = lift.reset(options={**given, "position": np.array(given["position"]), "yaw": np.array(0.5)})
     np.testing.assert_array_equal(again, lift.reset(seed=3, options=given)[0])
 

@@ -118,7 +118,6 @@ def test_matches_dense_reference(device: str, antialiased: bool, width: int, hei
     arrays = replace(
         SplatArrays.from_splats([splats], device=device),
         object_index=wp.array(ids, dtype=wp.int32, device=device),
-        rotations=wp.array(np.tile(np.float32([0, 0, 0, 1]), (1, 3, 1)), dtype=wp.quat, device=device),
     )
     rasterizer.render(arrays, views_of(EYES, width, height, device))
     for view, eye in enumerate(EYES):
@@ -132,7 +131,7 @@ def test_spherical_harmonics_turn_with_the_object(device: str, coefficients: int
     quat = np.array([0.3, -0.5, 0.1, 0.8]) / np.linalg.norm([0.3, -0.5, 0.1, 0.8])
     turns = np.repeat(rotations_from_quats(quat[None]), splats.count, axis=0)
     arrays = SplatArrays.from_splats([splats], device=device)
-    arrays = replace(arrays, rotations=wp.array(quat[None, None].astype(np.float32), dtype=wp.quat, device=device))
+    arrays = replace(arrays, rotations=wp.full((1, splats.count), wp.quat(*quat), dtype=wp.quat, device=device))
     rasterizer = SplatRasterizer(splats.count, 1, 40, 32, device=device)
     rasterizer.render(arrays, views_of(EYES[:1], 40, 32, device))
     assert_matches(rasterizer, 0, dense(splats, EYES[0], 40, 32, rotations=turns))
@@ -151,8 +150,8 @@ def test_rigid_motion_of_splats_and_camera_changes_nothing(device: str) -> None:
         if turned:
             # Means and covariances move, coefficients stay in the rest frame: what skinning does.
             moved = SplatArrays.from_splats([splats.transformed(r)], device=device)
-            quat = quat_from_rotation(r)[None, None].astype(np.float32)
-            rotations = wp.array(quat, dtype=wp.quat, device=device)
+            quat = wp.quat(*quat_from_rotation(r))
+            rotations = wp.full((1, splats.count), quat, dtype=wp.quat, device=device)
             arrays = replace(arrays, means=moved.means, covariances=moved.covariances, rotations=rotations)
             eye = r @ eye
         rasterizer = SplatRasterizer(splats.count, 1, 40, 32, device=device)
