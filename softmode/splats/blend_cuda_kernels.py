@@ -6,9 +6,11 @@ import math
 import warp as wp
 
 from softmode.splats.lane_ops import (
+    BLOCK_WARPS,
     ballot,
     bit_count,
     exp2,
+    keep,
     lane_scan,
     last_lane,
     load4,
@@ -65,7 +67,7 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
     read them. Warps do not wait for each other, and stop when all of their pixels are opaque.
     """
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", launch_bounds=(32 * BLOCK_WARPS, 10))
     def _blend(
         # Bins:
         order: wp.array[int],  # (>= view_count * splat_count,) splats of each view by depth
@@ -105,8 +107,8 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
         inside = column < size[0] and row < size[1]
         low = wp.vec2(float(left) + 0.5, float(top) + 0.5)
         high = wp.vec2(float(left + COLUMNS) - 0.5, float(top + ROWS) - 0.5)
-        px = float(column) + 0.5
-        py = float(row) + 0.5
+        px = keep(float(column) + 0.5)
+        py = keep(float(row) + 0.5)
         queue = queue_address()
         stage = stage_address()
 
@@ -132,27 +134,32 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
         first = view * splat_count
         words = cover.shape[1]
         running = bool(True)
-        chunk = int(0)
+        pending = int(0)  # ranks in the queue
+        chunk = int(0)  # first of the 32 words that the lanes read together
         while running and chunk < words:
             bits = wp.uint32(0)
             if chunk + lane < words:
                 bits = cover[tile_index, chunk + lane]
-            through = lane_scan(bit_count(bits), lane)
-            total = last_lane(through)
-            slot = through - bit_count(bits)
+            found = bit_count(bits)
+            through = lane_scan(found, lane)
+            slot = pending + through - found
             while bits != wp.uint32(0):
-                queue_put(queue, slot, 32 * lane + lowest_bit(bits))
+                queue_put(queue, slot, 32 * (chunk + lane) + lowest_bit(bits))
                 slot += 1
                 bits = bits & (bits - wp.uint32(1))
+            pending += last_lane(through)
             sync_lanes()
+            # The queue keeps ranks modulo 2^16, so it is emptied at the end of every 2^16.
+            base = first + ((32 * chunk) & ~0xFFFF)
+            last = chunk + 32 >= words or (chunk & 2047) == 2016
             begin = int(0)
-            while running and begin < total:
+            while running and (begin + 32 <= pending or (last and begin < pending)):
                 hit = bool(False)
                 k = int(0)
                 c = wp.vec4()
                 s = wp.vec4()
-                if begin + lane < total:
-                    k = order[first + 32 * chunk + queue_get(queue, begin + lane)]
+                if begin + lane < pending:
+                    k = order[base + queue_get(queue, begin + lane)]
                     c = load4(center, first + k)
                     s = load4(shape, first + k)
                     hit = least_power(c, s, low, high) <= c[3] + 1.0e-3
@@ -169,36 +176,38 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
                 while at < count:
                     g = stage_get(stage, at)
                     e = stage_get(stage, at + 1)
-                    if wp.static(has_mesh):
-                        if g[3] > limit:
-                            cut = FINISHED
-                    dy = py - g[1]
-                    dx = px - (g[0] + g[2] * dy)
-                    power = e[2] - e[0] * dx * dx - e[1] * dy * dy
-                    if power >= cut:
-                        rgb = stage_get(stage, at + 2)
-                        alpha = wp.min(ALPHA_MAX, exp2(power))
-                        after = light * (1.0 - alpha)
-                        if after < TRANSMITTANCE_MIN:
-                            cut = FINISHED
-                        else:
-                            weight = alpha * light
-                            red += weight * rgb[0]
-                            green += weight * rgb[1]
-                            blue += weight * rgb[2]
-                            depth += weight * g[3]
-                            if wp.static(object_ids):
-                                if weight > best:
-                                    best = weight
-                                    winner = object_index[wp.cast(e[3], wp.int32)]
-                            if wp.static(median_depth):
-                                if light > 0.5 and after <= 0.5:
-                                    median = g[3]
-                            light = after
+                    rgb = stage_get(stage, at + 2)
                     at += 3
+                    if wp.static(has_mesh):
+                        cut = wp.where(g[3] > limit, FINISHED, cut)
+                    # No branches: all lanes work on all staged splats, and most of them count.
+                    dy = py - g[1]
+                    dx = px - g[0] - g[2] * dy
+                    power = e[2] - e[0] * dx * dx - e[1] * dy * dy
+                    alpha = wp.where(power >= cut, wp.min(ALPHA_MAX, exp2(power)), 0.0)
+                    weight = alpha * light
+                    stop = light - weight < TRANSMITTANCE_MIN
+                    cut = wp.where(stop, FINISHED, cut)
+                    weight = wp.where(stop, 0.0, weight)
+                    red += weight * rgb[0]
+                    green += weight * rgb[1]
+                    blue += weight * rgb[2]
+                    depth += weight * g[3]
+                    if wp.static(object_ids):
+                        if weight > best:
+                            best = weight
+                            winner = object_index[wp.cast(e[3], wp.int32)]
+                    if wp.static(median_depth):
+                        if light > 0.5 and light - weight <= 0.5:
+                            median = g[3]
+                    light = light - weight
                 sync_lanes()
                 running = ballot(cut != FINISHED) != wp.uint32(0)
                 begin += 32
+            rest = queue_get(queue, begin + lane)
+            sync_lanes()
+            queue_put(queue, lane, rest)
+            pending = wp.max(pending - begin, 0)
             chunk += 32
 
         if inside:

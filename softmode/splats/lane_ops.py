@@ -129,15 +129,15 @@ def load4(source: wp.array[wp.vec4], i: int) -> wp.vec4:
 @wp.func_native(
     snippet="""
 #if defined(__CUDA_ARCH__)
-    __shared__ unsigned short queue[4 * 1024];
-    return reinterpret_cast<uint64_t>(queue + (threadIdx.x >> 5) * 1024);
+    __shared__ unsigned short queue[4 * 1120];
+    return reinterpret_cast<uint64_t>(queue + (threadIdx.x >> 5) * 1120);
 #else
     return 0;
 #endif
 """
 )
 def queue_address() -> wp.uint64:
-    """Return this warp's 1024 uint16 of shared memory."""
+    """Return this warp's 1120 uint16 of shared memory: 1024 ranks, 31 left over, and room to read beyond them."""
     ...
 
 
@@ -204,4 +204,20 @@ def stage_put(address: wp.uint64, i: int, value: wp.vec4) -> None:
 )
 def stage_get(address: wp.uint64, i: int) -> wp.vec4:
     """Read an entry of the warp's stage."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    float result;
+    asm volatile("mov.f32 %0, %1;" : "=f"(result) : "f"(x));
+    return result;
+#else
+    return x;
+#endif
+"""
+)
+def keep(x: float) -> float:
+    """Return x from a register: the compiler would otherwise compute it anew in every turn of a loop."""
     ...
