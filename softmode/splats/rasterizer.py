@@ -19,6 +19,7 @@ import numpy as np
 import warp as wp
 
 from softmode.errors import ConfigError
+from softmode.splats import blend_cpu_kernels
 from softmode.splats import rasterizer_kernels as kernels
 from softmode.splats.splats import MAX_SPLATS, Splats
 
@@ -264,18 +265,24 @@ class SplatRasterizer:
         self, splats: SplatArrays, views: ViewArrays, mesh_rgb: wp.array | None, mesh_depth: wp.array | None
     ) -> None:
         options = self.options
-        strip = 8 if self.device.is_cpu else 1
-        wp.launch(
-            kernels.blend_kernel(strip, mesh_depth is not None, options.object_ids, options.median_depth),
-            dim=self._cover.shape[0] * self.tile[1] * (self.tile[0] // strip),
-            inputs=[
-                self._order, self._cover, self._center, self._shape, self._color, splats.object_index,
-                views.background,
-                mesh_rgb if mesh_rgb is not None else self._no_rgb,
-                mesh_depth if mesh_depth is not None else self._no_depth,
-                wp.vec2i(self.width, self.height), wp.vec2i(*self.tile_count), wp.vec2i(*self.tile),
-            ],
-            outputs=[self.rgb, self.depth, self.alpha, self.object_id, self.median_depth],
-            device=self.device,
-            block_dim=64,
-        )  # fmt: skip
+        variant = (mesh_depth is not None, options.object_ids, options.median_depth)
+        inputs = [
+            self._order, self._cover, self._center, self._shape, self._color, splats.object_index,
+            views.background,
+            mesh_rgb if mesh_rgb is not None else self._no_rgb,
+            mesh_depth if mesh_depth is not None else self._no_depth,
+            wp.vec2i(self.width, self.height), wp.vec2i(*self.tile_count),
+        ]  # fmt: skip
+        outputs = [self.rgb, self.depth, self.alpha, self.object_id, self.median_depth]
+        tiles = self._cover.shape[0]
+        if self.device.is_cpu:
+            wp.launch(blend_cpu_kernels.blend_kernel(*variant), tiles, inputs, outputs, device=self.device)
+        else:
+            wp.launch(
+                kernels.blend_kernel(1, *variant),
+                dim=tiles * self.tile[0] * self.tile[1],
+                inputs=[*inputs, wp.vec2i(*self.tile)],
+                outputs=outputs,
+                device=self.device,
+                block_dim=64,
+            )
