@@ -1,7 +1,7 @@
 """Device code of `rasterizer`: the blend on CPU, one thread per tile of eight by eight pixels.
 
-A tile's pixels are four pairs of rows of sixteen lanes, which stay in the innermost cache while the splats pass by. What
-every lane does is written as vector expressions of the compiler that Warp carries: the exponential of the standard
+A tile's pixels are four pairs of rows of sixteen lanes, which stay in the innermost cache while the splats pass by. All
+that lanes do is written as vector expressions of the compiler that Warp carries: the exponential of the standard
 library is a call per pixel, and with it nothing runs in lanes (measured: 4.4 ms instead of 0.7 ms a frame).
 """
 
@@ -191,14 +191,12 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
                 c = color[first + i]
                 u = g[0] - float(left) - 0.5
                 v = g[1] - float(top) - 0.5
-                half = wp.sqrt(2.0 * g[3] / e[2]) + 1.0e-3
-                begin = int(wp.clamp(wp.ceil(v - half), 0.0, float(EDGE))) / 2
-                end = (int(wp.clamp(wp.floor(v + half), -1.0, float(EDGE - 1))) + 2) / 2
                 # ln(255 o), the reach, is at hand: no logarithm.
                 peak = LOG2_E * g[3] - LOG2_255
                 a = 0.5 * LOG2_E * e[1]
                 b = 0.5 * LOG2_E * e[2]
-                for pair in range(begin, end):
+                # All rows: to look for those that the splat touches costs more than it saves (0.9 ms, not 0.65).
+                for pair in range(PAIRS):
                     before = light[pair]
                     if wp.static(has_mesh):
                         before = light_before(before, limit[pair], g[2])
