@@ -158,6 +158,7 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
         top = (in_view / tile_count[0]) * EDGE
         columns = wp.min(EDGE, size[0] - left)
         rows = wp.min(EDGE, size[1] - top)
+        pairs = (rows + 1) / 2  # not a constant, or Warp would unroll the loops over it and compile for 5 s
 
         light = tile_mat(-1.0)  # transmittance; its negative once the pixel is finished
         red = tile_mat()
@@ -196,7 +197,7 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
                 a = 0.5 * LOG2_E * e[1]
                 b = 0.5 * LOG2_E * e[2]
                 # All rows: to look for those that the splat touches costs more than it saves (0.9 ms, not 0.65).
-                for pair in range(PAIRS):
+                for pair in range(pairs):
                     before = light[pair]
                     if wp.static(has_mesh):
                         before = light_before(before, limit[pair], g[2])
@@ -217,7 +218,7 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
                 if patience == 0:
                     patience = PATIENCE
                     brightest = light[0]
-                    for pair in range(1, PAIRS):
+                    for pair in range(1, pairs):
                         brightest = wp.max(brightest, light[pair])
                     if wp.max(brightest) < 0.0:
                         running = False
