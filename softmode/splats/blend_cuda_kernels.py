@@ -23,13 +23,19 @@ from softmode.splats.lane_ops import (
     stage_put,
     sync_lanes,
 )
-from softmode.splats.rasterizer_kernels import ALPHA_MAX, TRANSMITTANCE_MIN
+from softmode.splats.rasterizer_kernels import ALPHA_MAX, TILE, TRANSMITTANCE_MIN
 
 wp.set_module_options({"enable_backward": False})
 
-COLUMNS = 8
+COLUMNS = TILE
 ROWS = 4
 """Pixels of a warp."""
+PARTS = TILE // ROWS
+"""Warps of a tile."""
+TILE_THREADS = 32 * PARTS
+"""Threads of a tile."""
+BLOCK_DIM = 32 * BLOCK_WARPS
+"""Block size of the launch."""
 LOG2_E = wp.constant(1.0 / math.log(2.0))
 LOG2_ALPHA_MIN = wp.constant(-math.log2(255.0))
 FINISHED = wp.constant(1.0e30)
@@ -67,7 +73,7 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
     read them. Warps do not wait for each other, and stop when all of their pixels are opaque.
     """
 
-    @wp.kernel(enable_backward=False, module="unique", launch_bounds=(32 * BLOCK_WARPS, 10))
+    @wp.kernel(enable_backward=False, module="unique", launch_bounds=(BLOCK_DIM, 10))
     def _blend(
         # Bins:
         order: wp.array[int],  # (>= view_count * splat_count,) splats of each view by depth
@@ -84,7 +90,6 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
         # Sizes:
         size: wp.vec2i,
         tile_count: wp.vec2i,
-        tile: wp.vec2i,
         # Out:
         rgb_out: wp.array3d[wp.vec3],
         depth_out: wp.array3d[float],
@@ -95,13 +100,12 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
         """Blend front to back: C = sum_i c_i alpha_i T_i + T c_behind."""
         thread = wp.tid()
         lane = thread % 32
-        parts = tile[1] / ROWS
         part = thread / 32
-        tile_index = part / parts
+        tile_index = part / PARTS
         view = tile_index / (tile_count[0] * tile_count[1])
         in_view = tile_index - view * tile_count[0] * tile_count[1]
-        left = (in_view % tile_count[0]) * tile[0]
-        top = (in_view / tile_count[0]) * tile[1] + (part - tile_index * parts) * ROWS
+        left = (in_view % tile_count[0]) * TILE
+        top = (in_view / tile_count[0]) * TILE + (part - tile_index * PARTS) * ROWS
         column = left + lane % COLUMNS
         row = top + lane / COLUMNS
         inside = column < size[0] and row < size[1]

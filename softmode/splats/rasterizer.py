@@ -19,13 +19,10 @@ import numpy as np
 import warp as wp
 
 from softmode.errors import ConfigError
-from softmode.splats import blend_cuda_kernels
+from softmode.splats import blend_cpu_kernels, blend_cuda_kernels
 from softmode.splats import rasterizer_kernels as kernels
-from softmode.splats.lane_ops import BLOCK_WARPS
 from softmode.splats.splats import MAX_SPLATS, Splats
 
-TILE = (8, 8)
-"""Width and height of the tiles that list splats [px]."""
 MAX_EDGE = 4096
 """Largest width and height of an image [px]."""
 
@@ -159,8 +156,7 @@ class SplatRasterizer:
         """Allocate the buffers."""
         self.options = options if options is not None else RasterizerOptions()
         self.device = wp.get_device(device)
-        self.tile = tile = TILE
-        self.tile_count = (-(-width // tile[0]), -(-height // tile[1]))
+        self.tile_count = (-(-width // kernels.TILE), -(-height // kernels.TILE))
         self.splat_count, self.view_count, self.width, self.height = splat_count, view_count, width, height
         total = splat_count * view_count
         tiles = self.tile_count[0] * self.tile_count[1] * view_count
@@ -246,8 +242,7 @@ class SplatRasterizer:
             inputs=[
                 splats.means, splats.covariances, splats.opacities, splats.sh, splats.rotations,
                 views.world_to_camera, views.intrinsics, views.world,
-                wp.vec2i(self.width, self.height), wp.vec2i(*self.tile),
-                options.near, options.dilation, options.antialiased,
+                wp.vec2i(self.width, self.height), options.near, options.dilation, options.antialiased,
             ],
             outputs=[self._center, self._shape, self._color, self._box, self._depth_key, self._order],
             device=self.device,
@@ -272,21 +267,18 @@ class SplatRasterizer:
     ) -> None:
         options = self.options
         variant = (mesh_depth is not None, options.object_ids, options.median_depth)
-        if self.device.is_cpu:
-            kernel, threads = kernels.blend_kernel(8, *variant), self.tile[1]
-        else:
-            kernel, threads = blend_cuda_kernels.blend_kernel(*variant), 32 * self.tile[1] // blend_cuda_kernels.ROWS
+        blend = blend_cpu_kernels if self.device.is_cpu else blend_cuda_kernels
         wp.launch(
-            kernel,
-            dim=self._cover.shape[0] * threads,
+            blend.blend_kernel(*variant),
+            dim=self._cover.shape[0] * blend.TILE_THREADS,
             inputs=[
                 self._order, self._cover, self._center, self._shape, self._color, splats.object_index,
                 views.background,
                 mesh_rgb if mesh_rgb is not None else self._no_rgb,
                 mesh_depth if mesh_depth is not None else self._no_depth,
-                wp.vec2i(self.width, self.height), wp.vec2i(*self.tile_count), wp.vec2i(*self.tile),
+                wp.vec2i(self.width, self.height), wp.vec2i(*self.tile_count),
             ],
             outputs=[self.rgb, self.depth, self.alpha, self.object_id, self.median_depth],
             device=self.device,
-            block_dim=32 * BLOCK_WARPS,
+            block_dim=blend_cuda_kernels.BLOCK_DIM,
         )  # fmt: skip

@@ -1,16 +1,14 @@
-"""Device code of `rasterizer`: projection, covering and blending."""
-
-import functools
+"""Device code of `rasterizer`: projection, and the tiles that splats cover."""
 
 import warp as wp
-
-from softmode.splats.lane_ops import lowest_bit
 
 wp.set_module_options({"enable_backward": False})
 
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
 """Symmetric matrix: xx, xy, xz, yy, yz, zz."""
 
+TILE = wp.constant(8)
+"""Edge of the tiles that list splats [px]."""
 ALPHA_MIN = wp.constant(1.0 / 255.0)
 ALPHA_MAX = wp.constant(0.99)
 TRANSMITTANCE_MIN = wp.constant(1.0e-4)
@@ -60,7 +58,6 @@ def project(
     view_world: wp.array[int],  # (view_count,)
     # Options:
     size: wp.vec2i,
-    tile: wp.vec2i,
     near: float,
     dilation: float,
     antialiased: bool,
@@ -125,10 +122,10 @@ def project(
     half_y = wp.sqrt(2.0 * reach * c)
     if u + half_x < 0.0 or u - half_x > width or v + half_y < 0.0 or v - half_y > height:
         return
-    x0 = int(wp.max(u - half_x, 0.0)) / tile[0]
-    y0 = int(wp.max(v - half_y, 0.0)) / tile[1]
-    x1 = int(wp.min(u + half_x, width - 1.0)) / tile[0] + 1
-    y1 = int(wp.min(v + half_y, height - 1.0)) / tile[1] + 1
+    x0 = int(wp.max(u - half_x, 0.0)) / TILE
+    y0 = int(wp.max(v - half_y, 0.0)) / TILE
+    x1 = int(wp.min(u + half_x, width - 1.0)) / TILE + 1
+    y1 = int(wp.min(v + half_y, height - 1.0)) / TILE + 1
     key_out[k] = wp.cast(z, wp.int32)
     box_out[k] = wp.vec4us(wp.uint16(x0), wp.uint16(x1), wp.uint16(y0), wp.uint16(y1))
     center_out[k] = wp.vec4(u, v, z, reach)
@@ -161,161 +158,3 @@ def cover_tiles(
         row = (view * tile_count[1] + y) * tile_count[0]
         for x in range(int(b[0]), int(b[1])):
             wp.atomic_or(cover_out, row + x, word, bit)
-
-
-@functools.cache
-def blend_kernel(strip: int, has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Kernel:
-    """Return the blend kernel whose threads own `strip` neighbouring pixels of a row.
-
-    A strip of one is the usual choice on a GPU. On a CPU, where threads run one after another, a strip of a tile's
-    width visits only the pixels that a splat covers, and shares a splat's data among them. The arithmetic per pixel
-    is the same.
-    """
-    strip_vec = wp.types.vector(length=strip, dtype=wp.float32)
-    strip_int = wp.types.vector(length=strip, dtype=wp.int32)
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def _blend(
-        # Bins:
-        order: wp.array[int],  # (>= view_count * splat_count,) splats of each view by depth
-        cover: wp.array2d[wp.uint32],  # (tile_count over all views, words) bits of depth ranks
-        # Projected splats:
-        center: wp.array[wp.vec4],
-        shape: wp.array[wp.vec4],
-        color: wp.array[wp.vec4],
-        object_index: wp.array[int],  # (splat_count,)
-        # Images in:
-        background: wp.array[wp.vec3],  # (1|view_count,)
-        mesh_rgb: wp.array3d[wp.vec3],  # (view_count, height, width)
-        mesh_depth: wp.array3d[float],  # (view_count, height, width) [m], 0 where there is no mesh
-        # Sizes:
-        size: wp.vec2i,
-        tile_count: wp.vec2i,
-        tile: wp.vec2i,
-        # Out:
-        rgb_out: wp.array3d[wp.vec3],
-        depth_out: wp.array3d[float],
-        alpha_out: wp.array3d[float],
-        object_out: wp.array3d[int],
-        median_out: wp.array3d[float],
-    ):
-        """Blend front to back: C = sum_i c_i alpha_i T_i + T c_behind."""
-        thread = wp.tid()
-        strips_per_row = tile[0] / strip
-        strips_per_tile = strips_per_row * tile[1]
-        tile_index = thread / strips_per_tile
-        local = thread - tile_index * strips_per_tile
-        per_view = tile_count[0] * tile_count[1]
-        view = tile_index / per_view
-        in_view = tile_index - view * per_view
-        row = (in_view / tile_count[0]) * tile[1] + local / strips_per_row
-        first = (in_view % tile_count[0]) * tile[0] + (local % strips_per_row) * strip
-        if row >= size[1] or first >= size[0]:
-            return
-        count = wp.min(strip, size[0] - first)
-        py = float(row) + 0.5
-        left = float(first) + 0.5
-
-        light = strip_vec()  # transmittance; negative once the pixel is finished: -(light + 1)
-        red = strip_vec()
-        green = strip_vec()
-        blue = strip_vec()
-        depth = strip_vec()
-        best = strip_vec()
-        winner = strip_int()
-        median = strip_vec()
-        limit = strip_vec()
-        for p in range(strip):
-            light[p] = 1.0
-            winner[p] = -1
-            limit[p] = 1.0e30
-        if wp.static(has_mesh):
-            for p in range(count):
-                behind = mesh_depth[view, row, first + p]
-                if behind > 0.0:
-                    limit[p] = behind
-        live = wp.int32(count)
-
-        splat_count = object_index.shape[0]
-        first_splat = view * splat_count
-        word = wp.int32(0)
-        bits = wp.uint32(0)
-        while live > 0:
-            while bits == wp.uint32(0) and word < cover.shape[1]:
-                bits = cover[tile_index, word]
-                word += 1
-            if bits == wp.uint32(0):
-                break
-            k = first_splat + order[first_splat + 32 * (word - 1) + lowest_bit(bits)]
-            bits = bits & (bits - wp.uint32(1))
-            g = center[k]
-            e = shape[k]
-            dy = py - g[1]
-            across = 0.5 * e[2] * dy * dy
-            if across > g[3]:
-                continue
-            middle = g[0] + e[0] * dy - left
-            begin = wp.int32(0)
-            end = wp.int32(count)
-            if wp.static(strip > 1):
-                half = wp.sqrt(2.0 * (g[3] - across) / e[1]) + 0.001
-                begin = wp.max(int(wp.ceil(wp.max(middle - half, -1.0))), 0)
-                end = wp.min(int(wp.floor(wp.min(middle + half, float(strip)))) + 1, count)
-            for p in range(begin, end):
-                t = light[p]
-                if t > 0.0:
-                    if wp.static(has_mesh):
-                        if g[2] > limit[p]:
-                            light[p] = -(t + 1.0)
-                            live -= 1
-                            continue
-                    dx = float(p) - middle
-                    alpha = wp.min(ALPHA_MAX, e[3] * wp.exp(-0.5 * e[1] * dx * dx - across))
-                    if alpha >= ALPHA_MIN:
-                        after = t * (1.0 - alpha)
-                        if after < TRANSMITTANCE_MIN:
-                            light[p] = -(t + 1.0)
-                            live -= 1
-                        else:
-                            weight = alpha * t
-                            c = color[k]
-                            red[p] += weight * c[0]
-                            green[p] += weight * c[1]
-                            blue[p] += weight * c[2]
-                            depth[p] += weight * g[2]
-                            light[p] = after
-                            if wp.static(median_depth):
-                                if t > 0.5 and after <= 0.5:
-                                    median[p] = g[2]
-                            if wp.static(object_ids):
-                                if weight > best[p]:
-                                    best[p] = weight
-                                    winner[p] = object_index[k - first_splat]
-
-        for p in range(count):
-            t = light[p]
-            if t < 0.0:
-                t = -t - 1.0
-            behind_rgb = wp.vec3()
-            total = 1.0 - t
-            far = depth[p]
-            if wp.static(has_mesh):
-                behind_rgb = mesh_rgb[view, row, first + p]
-                if limit[p] < 1.0e29:
-                    far += t * limit[p]
-                    total = 1.0
-            else:
-                behind_rgb = background[view % background.shape[0]]
-            rgb_out[view, row, first + p] = wp.vec3(red[p], green[p], blue[p]) + t * behind_rgb
-            alpha_out[view, row, first + p] = 1.0 - t
-            depth_out[view, row, first + p] = wp.where(total > 0.0, far / wp.max(total, 1.0e-6), 0.0)
-            if wp.static(object_ids):
-                object_out[view, row, first + p] = winner[p]
-            if wp.static(median_depth):
-                middle_depth = median[p]
-                if wp.static(has_mesh):
-                    if t > 0.5 and limit[p] < 1.0e29:
-                        middle_depth = limit[p]
-                median_out[view, row, first + p] = middle_depth
-
-    return _blend
