@@ -1,7 +1,8 @@
 """Forward skinning on the device: splat means, F Sigma F^T and the rotation of F from the reduced coordinates q.
 
 x(X) = X + sum_k b_k(X) q_k and F(X) = I + sum_k q_k grad b_k(X)^T. The displacement q carries the whole rigid motion of
-a body, metres of it, while splats are millimetres in size: positions are summed in float64 and rounded once at the end.
+a body, metres of it, while splats are millimetres in size: the mean displacement of the splats is summed in float64,
+what is left of it in float32, and their sum is rounded once at the end.
 """
 
 from typing import Any
@@ -54,10 +55,15 @@ class SkinSplats:
         self.stretch_limit = float(stretch_limit)
         self.device = wp.get_device(device)
         six = np.stack([s[:, 0, 0], s[:, 0, 1], s[:, 0, 2], s[:, 1, 1], s[:, 1, 2], s[:, 2, 2]], axis=1)
-        basis4 = np.concatenate([g, b[..., None]], axis=2).astype(np.float32)
+        mean = b.mean(axis=0)
+        basis4 = np.concatenate([g, (b - mean)[..., None]], axis=2).transpose(1, 0, 2).astype(np.float32)
         self.rest_means = wp.array(x.astype(np.float32), dtype=wp.vec3, device=self.device)
         self.rest_covariances = wp.array(six.astype(np.float32), dtype=kernels.vec6, device=self.device)
-        self.basis = wp.array(basis4, dtype=wp.vec4, device=self.device)
+        self.basis = wp.array(np.ascontiguousarray(basis4), dtype=wp.vec4, device=self.device)
+        """Gradient [1/m] and value less its average over the splats, shape (n, N)."""
+        self.mean_basis = wp.array(mean, dtype=wp.float64, device=self.device)
+        """Average of the basis values over the splats, shape (n,)."""
+        self._motion: dict[int, tuple[wp.array, wp.array]] = {}  # by world count; kept, as graphs may hold them
 
     @property
     def count(self) -> int:
@@ -67,7 +73,7 @@ class SkinSplats:
     @property
     def function_count(self) -> int:
         """Number of basis functions n."""
-        return self.basis.shape[1]
+        return self.basis.shape[0]
 
     def launch(
         self,
@@ -97,18 +103,28 @@ class SkinSplats:
             if rotations.shape != (1, 1):
                 raise BasisError(f"rotations has shape {rotations.shape}, means {means.shape}; one per splat is needed")
             rotations = None
+        worlds = function_start.shape[0]
+        if worlds not in self._motion:
+            self._motion[worlds] = (
+                wp.zeros(worlds, dtype=wp.vec3d, device=self.device),
+                wp.zeros((worlds, self.function_count), dtype=wp.vec4, device=self.device),
+            )
+        motion = self._motion[worlds]
         wp.launch(
-            kernels.skin_splats,
-            dim=(function_start.shape[0], self.count),
+            kernels.split_motion,
+            dim=worlds,
+            inputs=[self.mean_basis, function_start, q],
+            outputs=[*motion],
+            device=self.device,
+        )
+        together = 4 if self.device.is_cuda and worlds > 1 else 1
+        wp.launch(
+            kernels.skin_kernel(together),
+            dim=(-(-worlds // together), self.count),
             inputs=[
-                self.rest_means,
-                self.rest_covariances,
-                self.basis,
-                self.stretch_limit,
-                function_start,
-                q,
-                first_splat,
+                self.rest_means, self.rest_covariances, self.basis, self.stretch_limit, *motion, first_splat
             ],
             outputs=[means, covariances, rotations],
             device=self.device,
-        )
+            block_dim=128,
+        )  # fmt: skip

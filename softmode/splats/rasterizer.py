@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 
 from softmode.errors import ConfigError
-from softmode.splats import blend_cpu_kernels, blend_cuda_kernels
+from softmode.splats import blend_cpu_kernels, blend_cuda_kernels, depth_sort_kernels
 from softmode.splats import rasterizer_kernels as kernels
 from softmode.splats.splats import MAX_SPLATS, Splats
 
@@ -249,6 +249,16 @@ class SplatRasterizer:
         )  # fmt: skip
 
     def _sort(self) -> None:
+        if self.device.is_cuda and self.splat_count <= depth_sort_kernels.CAPACITY:
+            wp.launch(
+                depth_sort_kernels.sort_kernel(self.splat_count),
+                dim=(self.view_count, depth_sort_kernels.BLOCK_DIM),
+                inputs=[self._depth_key],
+                outputs=[self._order],
+                device=self.device,
+                block_dim=depth_sort_kernels.BLOCK_DIM,
+            )
+            return
         total = self.splat_count * self.view_count
         wp.utils.segmented_sort_pairs(self._depth_key, self._order, total, self._view_start)
 
