@@ -260,6 +260,9 @@ class SplatRasterizer:
             )
             return
         total = self.splat_count * self.view_count
+        if self.view_count == 1:
+            wp.utils.radix_sort_pairs(self._depth_key, self._order, total, end_bit=31)
+            return
         wp.utils.segmented_sort_pairs(self._depth_key, self._order, total, self._view_start)
 
     def _cover_tiles(self) -> None:
