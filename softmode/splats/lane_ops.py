@@ -98,6 +98,17 @@ def sync_lanes() -> None:
 @wp.func_native(
     snippet="""
 #if defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+"""
+)
+def sync_block() -> None:
+    """Wait for the other threads of the block."""
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
     float result;
     asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(result) : "f"(x));
     return result;

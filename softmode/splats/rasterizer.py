@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 
 from softmode.errors import ConfigError
-from softmode.splats import blend_cpu_kernels, blend_cuda_kernels, depth_sort_kernels
+from softmode.splats import blend_cpu_kernels, blend_cuda_kernels, cover_cuda_kernels, depth_sort_kernels
 from softmode.splats import rasterizer_kernels as kernels
 from softmode.splats.splats import MAX_SPLATS, Splats
 
@@ -238,7 +238,7 @@ class SplatRasterizer:
         options = self.options
         wp.launch(
             kernels.project,
-            dim=(self.view_count, self.splat_count),
+            dim=self.view_count * self.splat_count,
             inputs=[
                 splats.means, splats.covariances, splats.opacities, splats.sh, splats.rotations,
                 views.world_to_camera, views.intrinsics, views.world,
@@ -266,10 +266,23 @@ class SplatRasterizer:
         wp.utils.segmented_sort_pairs(self._depth_key, self._order, total, self._view_start)
 
     def _cover_tiles(self) -> None:
+        tiles = self.tile_count[0] * self.tile_count[1]
+        words = cover_cuda_kernels.words_per_block(tiles) if self.device.is_cuda else 0
+        if words:
+            block_dim = cover_cuda_kernels.BLOCK_DIM
+            wp.launch(
+                cover_cuda_kernels.cover_kernel(tiles, words),
+                dim=self.view_count * -(-self._cover.shape[1] // words) * block_dim,
+                inputs=[self._order, self._box, self.splat_count, self.tile_count[0]],
+                outputs=[self._cover],
+                device=self.device,
+                block_dim=block_dim,
+            )
+            return
         self._cover.zero_()
         wp.launch(
             kernels.cover_tiles,
-            dim=(self.view_count, self.splat_count),
+            dim=self.view_count * self.splat_count,
             inputs=[self._order, self._box, self.splat_count, wp.vec2i(*self.tile_count)],
             outputs=[self._cover],
             device=self.device,
