@@ -110,10 +110,11 @@ class SkinSplats:
                 wp.zeros((worlds, self.function_count), dtype=wp.vec4, device=self.device),
             )
         motion = self._motion[worlds]
+        lanes = 32 if self.device.is_cuda else 1
         wp.launch(
             kernels.split_motion,
-            dim=worlds,
-            inputs=[self.mean_basis, function_start, q],
+            dim=(worlds, lanes),
+            inputs=[self.mean_basis, function_start, q, lanes],
             outputs=[*motion],
             device=self.device,
         )

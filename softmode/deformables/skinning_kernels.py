@@ -91,6 +91,19 @@ def polar_rotation(f: wp.mat33) -> wp.quat:
     return wp.normalize(wp.quat_from_matrix(r / den))
 
 
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    for (int step = 16; step > 0; step /= 2) value += __shfl_xor_sync(0xffffffffu, value, step);
+#endif
+    return value;
+"""
+)
+def sum_over_lanes(value: wp.float64) -> wp.float64:
+    """Return the sum over the threads of a warp, to each of them; on CPU the value itself."""
+    ...
+
+
 @wp.kernel
 def split_motion(
     # Object:
@@ -98,6 +111,7 @@ def split_motion(
     # State in:
     function_start: wp.array[int],  # (world_count,) first entry of q of the object's instance in each world
     q_in: wp.array[wp.vec3d],  # [m]
+    lanes: int,  # threads per world: a warp on CUDA, 1 on CPU
     # Out:
     offset_out: wp.array[wp.vec3d],  # (world_count,) [m]
     q_out: wp.array2d[wp.vec4],  # (world_count, function_count) [m]; the fourth is not used
@@ -106,14 +120,16 @@ def split_motion(
 
     Metres of rigid motion go into the offset; the rest is of the size of the object, and float32 holds it.
     """
-    world = wp.tid()
+    world, lane = wp.tid()
     start = function_start[world]
     offset = wp.vec3d()
-    for k in range(mean_basis.shape[0]):
+    for k in range(lane, mean_basis.shape[0], lanes):
         q = q_in[start + k]
         offset = offset + mean_basis[k] * q
         q_out[world, k] = wp.vec4(float(q[0]), float(q[1]), float(q[2]), 0.0)
-    offset_out[world] = offset
+    offset = wp.vec3d(sum_over_lanes(offset[0]), sum_over_lanes(offset[1]), sum_over_lanes(offset[2]))
+    if lane == 0:
+        offset_out[world] = offset
 
 
 @wp.func

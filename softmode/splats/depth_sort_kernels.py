@@ -104,7 +104,7 @@ def sort_kernel(splat_count: int) -> wp.Kernel:
     def sort_view(depth_key: wp.array[int], first: int, count: int, order_out: wp.array[int]) -> None:
         """Write the indices 0..count - 1 of the keys from `first` on in ascending order of the keys."""
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", launch_bounds=(BLOCK_DIM, 2))
     def _sort(
         depth_key: wp.array[int],  # (>= view_count * splat_count,) bits of the depth
         # Out:
