@@ -29,7 +29,6 @@ def words_per_block(tile_count: int) -> int:
 @functools.cache
 def cover_kernel(tiles: int, words: int) -> wp.Kernel:
     """Return the kernel for pictures of that many tiles, launched with BLOCK_DIM threads per block of words."""
-
     snippet = f"""
 #if defined(__CUDA_ARCH__)
     __shared__ unsigned bits[{tiles * words}];
