@@ -192,8 +192,8 @@ class Splats:
             gradients: Deformation gradients F = dx/dX at the centres, shape (N, 3, 3), or (3, 3) for all.
 
         Raises:
-            AssetError: If the means are no finite (N, 3) array, or a gradient flattens a splat completely.
-            ConfigError: If the gradients have another shape or are not finite.
+            ConfigError: If an argument has another shape or is not finite.
+            AssetError: If a gradient is zero and leaves nothing of a splat.
         """
         f = self._matrices("gradients", gradients)
         frames, scales = axes_of_gradients(f, rotations_from_quats(self.quats), self.scales)
@@ -210,8 +210,8 @@ class Splats:
             rotations: Rotations from the rest state, which turn the view-dependent colour, shape (N, 3, 3) or (3, 3).
 
         Raises:
-            AssetError: If the means are no finite (N, 3) array, or a covariance is not positive definite.
-            ConfigError: If the other arrays have another shape or are not finite.
+            ConfigError: If an argument has another shape or is not finite.
+            AssetError: If a covariance is zero.
         """
         turn = self._matrices("rotations", rotations)
         sigma = self._matrices("covariances", covariances)
@@ -236,10 +236,16 @@ class Splats:
         rotations: NDArray[np.float64],
     ) -> Splats:
         """Return the splats with new centres, frames and scales; `rotations` turn the view-dependent colour."""
+        centres = np.asarray(means, dtype=np.float64)
+        if centres.shape != (self.count, 3) or not np.isfinite(centres).all():
+            raise ConfigError(
+                f"means must be finite and of shape ({self.count}, 3), got shape {centres.shape}",
+                hint="Pass one centre per splat, in the order of the splats",
+            )
         # What float32 or a singular gradient flattened keeps a millionth of the largest scale: solid and invertible.
         scales = np.maximum(scales, 1e-6 * scales.max(axis=1, keepdims=True))
         sh = rotate_sh(self.sh, rotations)
-        return replace(self, means=means, quats=quats_from_rotations(frames), scales=scales, sh=sh)
+        return replace(self, means=centres, quats=quats_from_rotations(frames), scales=scales, sh=sh)
 
     def oriented(self, up: UpAxis) -> Splats:
         """Return the splats turned so that the asset's `up` axis points along +Z.

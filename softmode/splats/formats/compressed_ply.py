@@ -66,7 +66,7 @@ def decode_compressed(chunk: NDArray[Any], vertex: NDArray[Any], sh: NDArray[Any
     rgb = within(_COLOR_BOUNDS, color[:, :3]) if with_colors else color[:, :3]
     coefficients = sh_from_colors(rgb)
     if sh is not None:
-        names = [f"f_rest_{i}" for i in range(len(sh.dtype))]
+        names = [f"f_rest_{i}" for i in range(len(sh.dtype.names or ()))]
         if len(sh) != count or len(names) not in (9, 24, 45):
             raise AssetError(
                 f"splat file {path}: {len(sh)} rows of {len(names)} spherical harmonics for {count} splats",

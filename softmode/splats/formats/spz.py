@@ -228,8 +228,8 @@ def write_spz(path: str | os.PathLike[str], splats: Splats, *, version: Literal[
     """Write a `.spz` file; the file appears complete or not at all.
 
     Splats keep their order. Positions are rounded to steps of 1 um within 8 m of the origin (2 um within 16 m, and so
-    on), scales to steps of 6 % (45 um to 373 m), rotations to 0.0014 in a component, opacities and colours to 1/255,
-    higher coefficients to 1/128 within -1..1.
+    on), scales to steps of 6 % (45 um to 373 m), rotations to 0.0014 in a component, opacities to 1/255, colours to
+    1/135 within -0.44..1.44, higher coefficients to 1/128 within -1..1.
 
     Args:
         path: File to write; its folder must exist.
