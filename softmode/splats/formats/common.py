@@ -33,8 +33,6 @@ def typed_errors(name: str) -> Iterator[None]:
         yield
     except AssetError:
         raise
-    except ImportError:
-        raise
     except (
         OSError,
         EOFError,

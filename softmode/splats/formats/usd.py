@@ -207,10 +207,11 @@ def write_usd(path: str | os.PathLike[str], splats: Splats | Sequence[Splats], *
     if suffix not in (".usd", ".usda", ".usdc"):
         raise AssetError(f"splat file {path}: cannot write {suffix!r}", hint="Name a .usdc, .usda or .usd file")
     _pxr_folder()
-    with tempfile.TemporaryDirectory() as folder:
+    with atomic_splat_file(path) as file, tempfile.TemporaryDirectory() as folder:
         scratch = os.path.join(folder, "splats" + suffix)
-        _build_layer(frames, fps).Export(scratch)
-        with atomic_splat_file(path) as file, open(scratch, "rb") as source:
+        if not _build_layer(frames, fps).Export(scratch):
+            raise OSError("OpenUSD could not write it")
+        with open(scratch, "rb") as source:
             shutil.copyfileobj(source, file)
 
 
