@@ -294,8 +294,8 @@ def ring_chain() -> Mesh:
 def from_newton(name: str) -> Mesh:
     """Load an asset that newton installs, scaled to a longest edge of one metre."""
     import newton.examples
-    from pxr import Usd, UsdGeom  # type: ignore[import-not-found]
 
+    Usd, UsdGeom = (importlib.import_module(name) for name in ("pxr.Usd", "pxr.UsdGeom"))  # they have no type stubs
     stage = Usd.Stage.Open(newton.examples.get_asset(f"{name}.usd"))
     mesh = next(UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh))
     vertices = np.asarray(mesh.GetPointsAttr().Get(), dtype=np.float64)

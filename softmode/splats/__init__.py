@@ -4,7 +4,7 @@ Importing this package is cheap; the device code lives in `softmode.splats.raste
 """
 
 from softmode.splats.components import split_components
-from softmode.splats.formats import read_splats, write_ply
+from softmode.splats.formats import read_splats, write_ply, write_splats, write_usd
 from softmode.splats.plush import make_plush, plush_bounds, plush_signed_distance
 from softmode.splats.splats import Splats
 
@@ -16,4 +16,6 @@ __all__ = [
     "read_splats",
     "split_components",
     "write_ply",
+    "write_splats",
+    "write_usd",
 ]

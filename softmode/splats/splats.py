@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.errors import AssetError, ConfigError
+from softmode.splats.principal_axes import axes_of_covariances, axes_of_gradients, nearest_rotations
 
 SH_DC = 0.28209479177387814
 """Value of the constant spherical harmonic: colour = 0.5 + SH_DC * sh[:, 0]."""
@@ -180,6 +181,72 @@ class Splats:
             sh = rotate_sh(self.sh, matrix)
         return replace(self, means=means, quats=quats, scales=self.scales * np.float32(scale), sh=sh)
 
+    def deformed(self, means: ArrayLike, gradients: ArrayLike) -> Splats:
+        """Return the splats after a deformation: covariances become F Sigma F^T, view-dependent colour turns along.
+
+        With means and gradients of a rigid motion or a uniform scaling this equals `transformed`. The principal axes
+        keep the order of the rest axes, so that quaternions vary smoothly over the frames of an animation.
+
+        Args:
+            means: Deformed centres [m], shape (N, 3).
+            gradients: Deformation gradients F = dx/dX at the centres, shape (N, 3, 3), or (3, 3) for all.
+
+        Raises:
+            ConfigError: If an argument has another shape or is not finite.
+            AssetError: If a gradient is zero and leaves nothing of a splat.
+        """
+        f = self._matrices("gradients", gradients)
+        frames, scales = axes_of_gradients(f, rotations_from_quats(self.quats), self.scales)
+        return self._placed(means, frames, scales, nearest_rotations(f))
+
+    def with_covariances(self, means: ArrayLike, covariances: ArrayLike, rotations: ArrayLike) -> Splats:
+        """Return the splats with the centres, covariances and rotations that skinning on the device leaves.
+
+        Prefer `deformed` where gradients are at hand: squared scales in float32 blur discs thinner than a thousandth.
+
+        Args:
+            means: Deformed centres [m], shape (N, 3).
+            covariances: Deformed covariances [m^2], shape (N, 3, 3).
+            rotations: Rotations from the rest state, which turn the view-dependent colour, shape (N, 3, 3) or (3, 3).
+
+        Raises:
+            ConfigError: If an argument has another shape or is not finite.
+            AssetError: If a covariance is zero.
+        """
+        turn = self._matrices("rotations", rotations)
+        sigma = self._matrices("covariances", covariances)
+        frames, scales = axes_of_covariances(sigma, turn @ rotations_from_quats(self.quats))
+        return self._placed(means, frames, scales, turn)
+
+    def _matrices(self, name: str, value: ArrayLike) -> NDArray[np.float64]:
+        """Return one finite (3, 3) matrix per splat."""
+        matrices = np.asarray(value, dtype=np.float64)
+        if matrices.shape not in ((3, 3), (self.count, 3, 3)) or not np.isfinite(matrices).all():
+            raise ConfigError(
+                f"{name} must be finite and of shape ({self.count}, 3, 3) or (3, 3), got shape {matrices.shape}",
+                hint="Pass one matrix per splat, in the order of the splats",
+            )
+        return np.broadcast_to(matrices, (self.count, 3, 3))
+
+    def _placed(
+        self,
+        means: ArrayLike,
+        frames: NDArray[np.float64],
+        scales: NDArray[np.float64],
+        rotations: NDArray[np.float64],
+    ) -> Splats:
+        """Return the splats with new centres, frames and scales; `rotations` turn the view-dependent colour."""
+        centres = np.asarray(means, dtype=np.float64)
+        if centres.shape != (self.count, 3) or not np.isfinite(centres).all():
+            raise ConfigError(
+                f"means must be finite and of shape ({self.count}, 3), got shape {centres.shape}",
+                hint="Pass one centre per splat, in the order of the splats",
+            )
+        # What float32 or a singular gradient flattened keeps a millionth of the largest scale: solid and invertible.
+        scales = np.maximum(scales, 1e-6 * scales.max(axis=1, keepdims=True))
+        sh = rotate_sh(self.sh, rotations)
+        return replace(self, means=centres, quats=quats_from_rotations(frames), scales=scales, sh=sh)
+
     def oriented(self, up: UpAxis) -> Splats:
         """Return the splats turned so that the asset's `up` axis points along +Z.
 
@@ -188,9 +255,19 @@ class Splats:
         Raises:
             ConfigError: If `up` is not one of "+x", "-x", "+y", "-y", "+z", "-z".
         """
-        if up not in _UP_ROTATIONS:
-            raise ConfigError(f"up must be one of {', '.join(_UP_ROTATIONS)}, got {up!r}")
-        return self if up == "+z" else self.transformed(rotation=_UP_ROTATIONS[up])
+        rotation = up_rotation(up)
+        return self if up == "+z" else self.transformed(rotation=rotation)
+
+
+def up_rotation(up: UpAxis) -> NDArray[np.float64]:
+    """Return the rotation matrix, shape (3, 3), that turns the axis `up` onto +Z.
+
+    Raises:
+        ConfigError: If `up` is not one of "+x", "-x", "+y", "-y", "+z", "-z".
+    """
+    if up not in _UP_ROTATIONS:
+        raise ConfigError(f"up must be one of {', '.join(_UP_ROTATIONS)}, got {up!r}")
+    return np.array(_UP_ROTATIONS[up], dtype=np.float64)
 
 
 def rotations_from_quats(quats: ArrayLike) -> NDArray[np.float64]:
@@ -269,19 +346,30 @@ def sh_basis(directions: ArrayLike, count: int) -> NDArray[np.float64]:
 
 
 def rotate_sh(sh: ArrayLike, rotation: ArrayLike) -> NDArray[np.float32]:
-    """Return coefficients of the turned colour function f'(d) = f(R^T d), shape (N, K, 3).
+    """Return coefficients of the turned colour functions f'(d) = f(R^T d), shape (N, K, 3).
 
     Each band is closed under rotation, so sampling it in a fixed set of directions gives its rotation matrix exactly.
+
+    Args:
+        sh: Coefficients, shape (N, K, 3), K in {1, 4, 9, 16}.
+        rotation: Orthogonal matrix for all splats, shape (3, 3), or one per splat, shape (N, 3, 3).
     """
     coefficients = np.asarray(sh, dtype=np.float64)
-    count = coefficients.shape[1]
+    count, turns = coefficients.shape[1], np.asarray(rotation, dtype=np.float64)
+    out = coefficients.copy()
+    if count == 1:
+        return out.astype(np.float32)
     directions = np.random.default_rng(0).normal(size=(32, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    turned = sh_basis(directions @ np.asarray(rotation, dtype=np.float64), count)
     basis = sh_basis(directions, count)
-    out = coefficients.copy()
-    for band in range(1, int(np.sqrt(count))):
-        part = slice(band * band, (band + 1) ** 2)
-        matrix = np.linalg.lstsq(basis[:, part], turned[:, part], rcond=None)[0]
-        out[:, part] = np.einsum("ab,nbc->nac", matrix, coefficients[:, part])
+    bands = [slice(band * band, (band + 1) ** 2) for band in range(1, int(np.sqrt(count)))]
+    inverses = [np.linalg.pinv(basis[:, band]) for band in bands]
+    # Splats go in blocks: 32 directions times 16 functions in float64 are 4 kB a splat.
+    step = len(coefficients) if turns.ndim == 2 else 4096
+    for start in range(0, len(coefficients), step):
+        rows = slice(start, start + step)
+        seen = directions @ (turns[None] if turns.ndim == 2 else turns[rows])
+        turned = sh_basis(seen.reshape(-1, 3), count).reshape(*seen.shape[:2], count)
+        for band, inverse in zip(bands, inverses, strict=True):
+            out[rows, band] = inverse @ turned[..., band] @ coefficients[rows, band]
     return out.astype(np.float32)

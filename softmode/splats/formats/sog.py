@@ -1,0 +1,228 @@
+"""SOG version 2 (read): quantised attributes in lossless WebP images; a folder, its `meta.json`, or a `.sog` archive.
+
+Reference:
+    PlayCanvas, "The SOG format", version 2.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from softmode.errors import AssetError
+from softmode.splats.formats.common import REEXPORT, exp_scales, quats_from_smallest_three
+from softmode.splats.splats import MAX_SPLATS, Splats
+
+_META_LIMIT = 16 * 1024 * 1024
+_IMAGE_FILE_LIMIT = 512 * 1024 * 1024
+
+
+def read_sog(path: str | os.PathLike[str]) -> Splats:
+    """Read a SOG v2 asset: a folder, its `meta.json` or a `.sog` archive.
+
+    Raises:
+        AssetError: If a member is missing, damaged or contradicts `meta.json`, or there are no usable splats.
+    """
+    file = Path(path)
+    if file.is_dir():
+        if not (file / "meta.json").is_file():
+            raise AssetError(
+                f"splat folder {file}: no meta.json in it", hint="Name a SOG v2 folder, or a splat file such as .ply"
+            )
+        return _decode(str(file), _folder_reader(file))
+    if file.suffix.lower() == ".json":
+        return _decode(str(file), _folder_reader(file.parent, file.name))
+    with zipfile.ZipFile(file) as archive:
+        return _decode(str(file), _archive_reader(archive, str(file)))
+
+
+_Reader = Callable[[str, int], bytes]
+"""Return the bytes of a named member, refusing more than the given number."""
+
+
+def _check_member(name: Any, source: str) -> str:
+    """Return the name if it is a plain file name, so that no member leads out of the asset."""
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.\-]{0,127}", name):
+        raise AssetError(
+            f"splat file {source}: member name {str(name)[:80]!r} is not a plain file name",
+            hint="Members must lie beside meta.json; do not trust this file",
+        )
+    return name
+
+
+def _folder_reader(folder: Path, meta: str = "meta.json") -> _Reader:
+    """Return a reader of the members of a SOG folder."""
+
+    def read(name: str, limit: int) -> bytes:
+        file = folder / (meta if name == "meta.json" else name)
+        if not file.is_file():
+            raise AssetError(
+                f"splat file {folder / meta}: member {name} is missing",
+                hint="Copy the whole folder, with all .webp files",
+            )
+        with open(file, "rb") as stream:
+            data = stream.read(limit + 1)
+        if len(data) > limit:
+            raise AssetError(f"splat file {file}: larger than {limit} bytes", hint="Decimate the asset first")
+        return data
+
+    return read
+
+
+def _archive_reader(archive: zipfile.ZipFile, source: str) -> _Reader:
+    """Return a reader of the members of a `.sog` archive, bounded against decompression bombs."""
+
+    def read(name: str, limit: int) -> bytes:
+        try:
+            info = archive.getinfo(name)
+        except KeyError:
+            raise AssetError(f"splat file {source}: member {name} is missing", hint=REEXPORT) from None
+        if info.file_size > limit:
+            raise AssetError(
+                f"splat file {source}: member {name} larger than {limit} bytes", hint="Decimate the asset first"
+            )
+        with archive.open(info) as stream:
+            return stream.read(limit)
+
+    return read
+
+
+def _webp_size(data: bytes) -> tuple[int, int]:
+    """Return width and height from a WebP header without decoding; (0, 0) if it is none."""
+    if len(data) < 30 or data[:4] != b"RIFF" or data[8:12] != b"WEBP":
+        return 0, 0
+    kind = data[12:16]
+    if kind == b"VP8L":
+        bits = int.from_bytes(data[21:25], "little")
+        return (bits & 0x3FFF) + 1, ((bits >> 14) & 0x3FFF) + 1
+    if kind == b"VP8X":
+        return int.from_bytes(data[24:27], "little") + 1, int.from_bytes(data[27:30], "little") + 1
+    if kind == b"VP8 ":
+        return int.from_bytes(data[26:28], "little") & 0x3FFF, int.from_bytes(data[28:30], "little") & 0x3FFF
+    return 0, 0
+
+
+class _SogMeta:
+    """Typed access to `meta.json`: every lookup that fails names the key."""
+
+    def __init__(self, value: Any, source: str, path: str = "meta.json") -> None:
+        self.value = value
+        self.source = source
+        self.path = path
+
+    def fail(self, problem: str) -> AssetError:
+        return AssetError(f"splat file {self.source}: {self.path}: {problem}", hint=REEXPORT)
+
+    def __contains__(self, key: str) -> bool:
+        return isinstance(self.value, dict) and key in self.value
+
+    def __getitem__(self, key: str) -> _SogMeta:
+        if key not in self:
+            raise self.fail(f"'{key}' is missing")
+        return _SogMeta(self.value[key], self.source, f"{self.path}: {key}")
+
+    def integer(self, low: int, high: int) -> int:
+        if type(self.value) is not int or not low <= self.value <= high:
+            raise self.fail(f"expected an integer in {low}..{high}, found {str(self.value)[:40]!r}")
+        return self.value
+
+    def numbers(self, length: int) -> NDArray[np.float64]:
+        values = self.value
+        if not isinstance(values, list) or len(values) != length or any(type(v) not in (int, float) for v in values):
+            raise self.fail(f"expected {length} numbers")
+        array = np.array(values, dtype=np.float64)
+        if not np.isfinite(array).all():
+            raise self.fail("holds NaN or infinity")
+        return array
+
+    def files(self, length: int) -> list[str]:
+        if not isinstance(self.value, list) or len(self.value) != length:
+            raise self.fail(f"expected {length} file names")
+        return [_check_member(name, self.source) for name in self.value]
+
+
+def _decode(source: str, read: _Reader) -> Splats:
+    """Decode SOG version 2: quantised attributes in lossless WebP images, one pixel per splat in row order."""
+    try:
+        meta = _SogMeta(json.loads(read("meta.json", _META_LIMIT)), source)
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise AssetError(f"splat file {source}: meta.json is no JSON ({error})", hint=REEXPORT) from error
+    if "version" not in meta or meta["version"].value != 2:
+        raise AssetError(
+            f"splat file {source}: not SOG version 2", hint="Convert it with splat-transform to SOG v2 or to .ply"
+        )
+    count = meta["count"].integer(1, MAX_SPLATS)
+
+    def image(name: str, low: int, high: int, width: int | None = None) -> NDArray[np.uint8]:
+        data = read(name, _IMAGE_FILE_LIMIT)
+        size = _webp_size(data)
+        # The header is judged before any decoder sees the data: an image may not unpack to more than its splats need.
+        if not low <= size[0] * size[1] <= high or (width is not None and size[0] != width):
+            raise AssetError(
+                f"splat file {source}: image {name} is {size[0]} x {size[1]} pixels, expected "
+                + (f"{width} wide and " if width else "")
+                + f"{low} to {high} pixels of lossless WebP for {count} splats",
+                hint=REEXPORT,
+            )
+        with Image.open(io.BytesIO(data), formats=["WEBP"]) as picture:
+            if picture.size != size:
+                raise AssetError(f"splat file {source}: image {name} contradicts its header", hint=REEXPORT)
+            return np.asarray(picture.convert("RGBA"))
+
+    def pixels(name: str) -> NDArray[np.uint8]:
+        return image(name, count, 4 * count + 65536).reshape(-1, 4)[:count]
+
+    # Means: 16 bit per axis over two images, in the symmetric logarithm sign(x) log(1 + |x|).
+    low, high = (pixels(name)[:, :3].astype(np.float64) for name in meta["means"]["files"].files(2))
+    lower, upper = meta["means"]["mins"].numbers(3), meta["means"]["maxs"].numbers(3)
+    with np.errstate(over="ignore", invalid="ignore"):
+        value = lower + (low + 256.0 * high) / 65535.0 * (upper - lower)
+        means = np.sign(value) * np.expm1(np.abs(value))
+
+    scale_index = pixels(meta["scales"]["files"].files(1)[0])[:, :3]
+    scales = exp_scales(meta["scales"]["codebook"].numbers(256)[scale_index])
+
+    # Quaternions: the largest of w, x, y, z is dropped (alpha - 252 names it), the others lie in +-1/sqrt(2).
+    packed = pixels(meta["quats"]["files"].files(1)[0])
+    if (packed[:, 3] < 252).any():
+        raise AssetError(f"splat file {source}: quats hold a mode below 252", hint=REEXPORT)
+    others = (packed[:, :3] / 255.0 - 0.5) * np.sqrt(2.0)
+    wxyz = quats_from_smallest_three(packed[:, 3] - 252, others)
+
+    color = pixels(meta["sh0"]["files"].files(1)[0])
+    sh = meta["sh0"]["codebook"].numbers(256)[color[:, :3]][:, None]
+    if "shN" in meta:
+        sh = np.concatenate([sh, _decode_palette(meta["shN"], pixels, image)], axis=1)
+    return Splats(
+        means=means,
+        quats=wxyz[:, [1, 2, 3, 0]],
+        scales=scales,
+        opacities=color[:, 3] / 255.0,
+        sh=sh,
+        name=f"splat file {source}",
+    )
+
+
+def _decode_palette(
+    meta: _SogMeta, pixels: Callable[[str], NDArray[np.uint8]], image: Callable[..., NDArray[np.uint8]]
+) -> NDArray[np.float64]:
+    """Decode the higher spherical harmonics: one of up to 65536 palette entries per splat, 64 entries per image row."""
+    coefficient_count = (meta["bands"].integer(1, 3) + 1) ** 2 - 1
+    centroid_file, label_file = meta["files"].files(2)
+    palette = image(centroid_file, 64 * coefficient_count, 65536 * coefficient_count, 64 * coefficient_count)
+    label = pixels(label_file).astype(np.int64)
+    entry = label[:, 0] + 256 * label[:, 1]
+    if entry.max() >= 64 * len(palette):
+        raise meta.fail(f"a splat names palette entry {entry.max()}, the palette holds {64 * len(palette)}")
+    column = (entry % 64)[:, None] * coefficient_count + np.arange(coefficient_count)
+    return meta["codebook"].numbers(256)[palette[(entry // 64)[:, None], column][..., :3]]

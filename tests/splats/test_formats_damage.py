@@ -1,0 +1,252 @@
+"""Damaged splat files of every format: a typed error or a valid load, within bounds of time and memory."""
+
+from __future__ import annotations
+
+import collections
+import gzip
+import importlib
+import importlib.util
+import resource
+import time
+import tracemalloc
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from softmode.errors import AssetError
+from softmode.splats import read_splats, write_splats
+from softmode.splats.formats import READABLE
+from tests.splats.test_formats import sog_members, write_sog, zip_sog
+from tests.splats.test_formats_quantised import compressed_ply, pack_spz, spz_3, spz_arrays
+from tests.splats.test_splats import random_splats
+
+TIME_LIMIT = 2.0
+MEMORY_LIMIT = 256 * 2**20
+
+
+def mutate(data: bytes, rng: np.random.Generator) -> bytes:
+    """Return the data with a few random bits or bytes changed, cut, doubled, inserted or, in a header, edited."""
+    out = bytearray(data)
+    kind, at = rng.integers(6), int(rng.integers(len(out)))
+    if kind == 0:
+        for _ in range(int(rng.integers(1, 8))):
+            out[int(rng.integers(len(out)))] ^= 1 << int(rng.integers(8))
+    elif kind == 1:
+        del out[at:]
+    elif kind == 2:
+        out[at:at] = out[at : at + int(rng.integers(1, 40))]
+    elif kind == 3:
+        out[at:at] = rng.bytes(int(rng.integers(1, 40)))
+    elif kind == 4:  # headers are small beside the data: aim at them, with values that declare much
+        start = int(rng.integers(min(len(out), 400)))
+        out[start : start + 4] = bytes(rng.choice([0, 9, 48, 57, 127, 128, 255], size=4).tolist())
+    else:  # tables of contents stand at the end of some formats
+        out[-1 - int(rng.integers(min(len(out), 600)))] = int(rng.integers(256))
+    return bytes(out)
+
+
+def usd_files(folder: Path) -> dict[str, bytes]:
+    """Return a small splat file of each kind that OpenUSD reads; none without the extra [usd]."""
+    if importlib.util.find_spec("pxr") is None:
+        return {}
+    for suffix in (".usdc", ".usda"):
+        write_splats(folder / f"valid{suffix}", random_splats(30))
+    with importlib.import_module("pxr.Sdf").ZipFileWriter.CreateNew(str(folder / "valid.usdz")) as archive:
+        archive.AddFile(str(folder / "valid.usdc"), "valid.usdc")
+    return {suffix: (folder / f"valid{suffix}").read_bytes() for suffix in (".usdc", ".usda", ".usdz")}
+
+
+def cases(folder: Path) -> dict[str, tuple[str, bytes, Callable[[bytes], bytes]]]:
+    """Return by name: suffix, what is damaged, and what wraps it into a file afterwards."""
+
+    def same(data: bytes) -> bytes:
+        return data
+
+    write_splats(folder / "valid.ply", random_splats())
+    write_splats(folder / "valid.splat", random_splats())
+    meta, images, _ = sog_members()
+    found: dict[str, tuple[str, bytes, Callable[[bytes], bytes]]] = {
+        "ply": (".ply", (folder / "valid.ply").read_bytes(), same),
+        "compressed ply": (".ply", compressed_ply(40, 9, True)[0], same),
+        "splat": (".splat", (folder / "valid.splat").read_bytes(), same),
+        "spz 3": (".spz", spz_3(), same),
+        "spz 3, unpacked": (".spz", gzip.decompress(spz_3()), gzip.compress),
+        "spz 2, unpacked": (".spz", gzip.decompress(pack_spz(2, 0, 40, 11, spz_arrays(2, 0)[0])), gzip.compress),
+        "spz 4": (".spz", pack_spz(4, 1, 40, 11, spz_arrays(4, 1)[0]), same),
+        "sog": (".sog", zip_sog(folder / "valid.sog", meta, images).read_bytes(), same),
+    }
+    for name, data in {
+        "meta.json": (write_sog(folder / "sog", meta, images) / "meta.json").read_bytes(),
+        **images,
+    }.items():
+
+        def archive(damaged: bytes, name: str = name) -> bytes:
+            with zipfile.ZipFile(folder / "member.sog", "w") as file:
+                for member in ("meta.json", *images):
+                    file.writestr(member, damaged if member == name else (folder / "sog" / member).read_bytes())
+            return (folder / "member.sog").read_bytes()
+
+        found[f"sog, {name}"] = (".sog", data, archive)
+    return found
+
+
+def read_damaged(path: Path, data: bytes) -> bool:
+    """Read a file; return whether it loads. Fails on anything but a valid asset or an AssetError with a remedy."""
+    path.write_bytes(data)
+    try:
+        splats = read_splats(path)
+    except AssetError as error:
+        assert error.hint and error.message
+        return False
+    finite = [np.isfinite(getattr(splats, name)).all() for name in ("means", "quats", "scales", "opacities", "sh")]
+    assert all(finite) and (splats.scales > 0.0).all() and splats.count >= 1
+    return True
+
+
+def processor_time() -> float:
+    """Return the processor time of this process and its children [s]."""
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + children.ru_utime + children.ru_stime
+
+
+def peak_memory() -> tuple[int, int]:
+    """Return the largest resident set of this process and of any child so far [bytes].
+
+    A child starts with the set of its parent: that of the children tells something only where it exceeds the parent's.
+    """
+    own, children = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return own * 1024, children * 1024
+
+
+def damage(folder: Path, trials: range) -> dict[str, list[int]]:
+    """Read damaged files of all formats, every tenth an OpenUSD one; return how many each refused and loaded."""
+    plain, usd = cases(folder), usd_files(folder)
+    outcomes: dict[str, list[int]] = collections.defaultdict(lambda: [0, 0])
+    resident, children = peak_memory()
+    tracemalloc.start()
+    try:
+        for trial in trials:
+            rng = np.random.default_rng(trial)
+            if trial % 10 == 9 and usd:
+                name = list(usd)[trial // 10 % len(usd)]
+                suffix, data = name, mutate(usd[name], rng)
+            else:
+                name = list(plain)[trial % len(plain)]
+                suffix, content, wrap = plain[name]
+                data = wrap(mutate(content, rng))
+            tracemalloc.reset_peak()
+            before, used = processor_time(), tracemalloc.get_traced_memory()[0]
+            loaded = read_damaged(folder / f"damaged{suffix}", data)
+            outcomes[name][loaded] += 1
+            assert processor_time() - before < TIME_LIMIT, (name, trial)
+            assert tracemalloc.get_traced_memory()[1] - used < MEMORY_LIMIT, (name, trial)
+    finally:
+        tracemalloc.stop()
+    assert peak_memory()[0] - resident < MEMORY_LIMIT, "decoders in C"
+    assert peak_memory()[1] <= max(children, resident, MEMORY_LIMIT), "processes that open OpenUSD files"
+    return outcomes
+
+
+def test_damaged_files(tmp_path: Path) -> None:
+    """200 damaged files over all formats: a typed error or a valid load, each within 2 s and 256 MB."""
+    outcomes = damage(tmp_path, range(200))
+    refused, loaded = np.sum(list(outcomes.values()), axis=0)
+    assert refused + loaded == 200 and refused > 50 and loaded > 10
+
+
+@pytest.mark.slow
+def test_damaged_files_at_length(tmp_path: Path) -> None:
+    """2,000 damaged files over all formats; every format refuses some and those without checksums load some."""
+    outcomes = damage(tmp_path, range(2000))
+    assert np.sum(list(outcomes.values())) == 2000
+    for name, (refused, loaded) in outcomes.items():
+        assert refused, name
+        assert loaded or name in ("spz 3", "spz 4", "sog"), name
+
+
+def bomb(name: str) -> tuple[str, bytes, str]:
+    """Return suffix, content and expected refusal of a small file that would unpack to much or declares much."""
+    raw = gzip.decompress(spz_3())
+    if name == "gzip beyond its header":
+        return ".spz", gzip.compress(raw[:16] + bytes(2**26)), "the file holds more than"
+    if name == "gzip without header":
+        return ".spz", gzip.compress(bytes(2**26)), "no SPZ header"
+    if name == "declared in gzip":
+        many = raw[:8] + (2**26).to_bytes(4, "little") + raw[12:]
+        return ".spz", gzip.compress(many), "cannot hold the 67108864 splats"
+    fields = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 rot_0 rot_1 rot_2 rot_3".split()
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {2**26}"]
+    header = "\n".join([*lines, *(f"property float {field}" for field in fields), "end_header\n"])
+    return ".ply", header.encode() + bytes(100), "the file holds"
+
+
+@pytest.mark.parametrize(
+    "name", ["gzip beyond its header", "gzip without header", "declared in gzip", "declared in ply"]
+)
+def test_bombs_are_not_unpacked(tmp_path: Path, name: str) -> None:
+    """A file that would unpack to much, or declares it, is refused before that memory is taken."""
+    suffix, data, message = bomb(name)
+    path = tmp_path / f"bomb{suffix}"
+    path.write_bytes(data)
+    tracemalloc.start()
+    try:
+        with pytest.raises(AssetError, match=message):
+            read_splats(path)
+        assert tracemalloc.get_traced_memory()[1] < 4 * len(data) + 2**20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("count", [2**28, 2**30])
+def test_endless_usd_is_stopped(tmp_path: Path, count: int) -> None:
+    """A usdc file that declares far more tokens than it holds, which OpenUSD believes, is refused within the bounds."""
+    pytest.importorskip("pxr", reason="needs the extra [usd]")
+    data = bytearray(usd_files(tmp_path)[".usdc"])
+    contents = int.from_bytes(data[16:24], "little")
+    entry = data.index(b"TOKENS", contents)
+    tokens = int.from_bytes(data[entry + 16 : entry + 24], "little")
+    data[tokens : tokens + 8] = count.to_bytes(8, "little")
+    before, memory = processor_time(), max(*peak_memory(), MEMORY_LIMIT)
+    assert not read_damaged(tmp_path / "damaged.usdc", bytes(data))
+    assert processor_time() - before < TIME_LIMIT
+    assert peak_memory()[1] <= memory
+
+
+@given(header=st.text(max_size=200), body=st.binary(max_size=200))
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_arbitrary_bytes_are_refused(tmp_path: Path, header: str, body: bytes) -> None:
+    """No arbitrary file is taken for a splat file, whatever its suffix; `.splat`, which has no header, may load."""
+    starts = {".ply": b"ply\nformat binary_little_endian 1.0\n", ".spz": b"NGSP\x04\x00\x00\x00"}
+    for suffix in (s for s in READABLE if not s.startswith(".usd")):
+        data = starts.get(suffix, b"") + header.encode("utf-8", "surrogatepass") + b"\nend_header\n" + body
+        assert not read_damaged(tmp_path / f"x{suffix}", data) or suffix == ".splat"
+
+
+@pytest.mark.parametrize("suffix", [".usda", ".usdc", ".usd", ".usdz"])
+def test_arbitrary_usd_is_refused(tmp_path: Path, suffix: str) -> None:
+    """Neither nothing nor noise is a stage."""
+    pytest.importorskip("pxr", reason="needs the extra [usd]")
+    for data in (b"", b"#usda 1.0\ndef", b"PXR-USDC" + bytes(range(256))):
+        assert not read_damaged(tmp_path / f"x{suffix}", data)
+
+
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+        lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
+        max_leaves=8,
+    ),
+    st.sampled_from(["version", "count", "means", "scales", "quats", "sh0", "shN"]),
+)
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_arbitrary_json_values_are_refused(tmp_path: Path, value: Any, key: str) -> None:
+    """Any JSON value in place of an entry gives a typed error (or the asset, if the value happens to fit)."""
+    meta, images, _ = sog_members()
+    path = write_sog(tmp_path / "sog", meta | {key: value}, images) / "meta.json"
+    read_damaged(path, path.read_bytes())
