@@ -35,9 +35,10 @@ def symmetric_matrix(c: vec6) -> wp.mat33:
 def limited_stretch(f: wp.mat33, limit: float) -> wp.mat33:
     """Return F with its singular values cut to at most `limit`.
 
-    Where a coarse basis shears or tears, single splats would be drawn out into spikes across the picture. Compression
-    needs no limit: a flattened splat only covers less. The Frobenius norm bounds the largest singular value, so the
-    decomposition is skipped for all but strongly stretched splats.
+    Where a basis tears, or a step has failed, single splats would be drawn out into spikes across the picture. Averaged
+    functions (`average_basis`) leave few; this is the guard behind them. Compression needs no limit: a flattened splat
+    only covers less. The Frobenius norm bounds the largest singular value, so the decomposition is skipped for all but
+    strongly stretched splats.
     """
     if wp.ddot(f, f) <= limit * limit:
         return f

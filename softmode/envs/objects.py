@@ -14,6 +14,7 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from softmode.deformables.body import BuildOptions, ReducedBody, build_body, cached_body
 from softmode.deformables.quadrature import Quadrature, quadrature_from_splats
+from softmode.deformables.skinning import average_basis
 from softmode.errors import AssetError, ConfigError
 from softmode.splats import Splats, make_plush, read_splats, split_components
 from softmode.splats.splats import UpAxis
@@ -72,9 +73,9 @@ class SoftObject:
     splats: Splats
     """Splats with centres in the body frame [m]."""
     basis: NDArray[np.float64]
-    """Functions at the splat centres, shape (N, n)."""
+    """Functions averaged over each splat, shape (N, n); see :func:`softmode.deformables.skinning.average_basis`."""
     grad_basis: NDArray[np.float64]
-    """Their gradients [1/m], shape (N, n, 3)."""
+    """Their gradients, averaged likewise [1/m], shape (N, n, 3)."""
     height: float
     """Height of the body frame's origin over the lowest surface sample [m]."""
 
@@ -95,7 +96,7 @@ def load_object(config: ObjectConfig, progress: Callable[[str, float], None] | b
     if not np.array_equal(turn, np.eye(3)):
         splats = splats.transformed(rotation=turn)
     shown = splats.subset(_drawn(splats, body)).transformed(translation=-body.offset)
-    basis, grad_basis = body.evaluate(shown.means)
+    basis, grad_basis = average_basis(lambda x: body.evaluate(x)[0], shown.means, shown.covariances())
     return SoftObject(body, shown, basis, grad_basis, float(-body.surface_points[:, 2].min()))
 
 

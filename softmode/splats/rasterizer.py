@@ -32,9 +32,10 @@ class RasterizerOptions:
     """How splats are drawn; fixed for a rasteriser's life."""
 
     antialiased: bool = True
-    """Compensate opacity for the pixel filter; False is the classic formula."""
-    dilation: float = 0.3
-    """Variance of the pixel filter [px^2]."""
+    """Compensate opacity for the pixel filter; False, with a dilation of 0.3, is the classic formula."""
+    dilation: float = 0.1
+    """Variance of the pixel filter [px^2]. A pixel's own is 1/12; 0.1, as in Mip-Splatting, comes 5 to 8 dB nearer to
+    eightfold supersampling than the classic 0.3."""
     near: float = 0.01
     """Nearest visible forward depth [m]."""
     object_ids: bool = False

@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 from scipy.linalg import polar
 
-from softmode.deformables.skinning import STRETCH_LIMIT, SkinSplats
+from softmode.deformables.skinning import STRETCH_LIMIT, SkinSplats, average_basis
 from softmode.deformables.skinning_kernels import vec6
 from softmode.errors import BasisError
 from softmode.splats.splats import rotations_from_quats
@@ -201,6 +201,36 @@ def test_rotations_are_left_out_of_degree_zero(device: str) -> None:
     assert not none.numpy().any()
     with pytest.raises(BasisError, match=r"rotations has shape \(1, 60\)"):
         skin.launch(q, starts, means, covariances, rotations=wp.zeros((1, N), dtype=wp.quat, device=device))
+
+
+def test_averages_of_quadratic_functions_are_exact() -> None:
+    """E[b] = b + tr(H Sigma) / 2 and E[grad b] = grad b for b of degree two, of discs, needles and points too."""
+    rng = np.random.default_rng(0)
+    case = Case()
+    case.covariances[0] = 0.0
+    case.covariances[1] = np.diag([1e-6, 0.0, 0.0])
+    hessian = rng.normal(size=(M, 3, 3))
+    hessian += hessian.transpose(0, 2, 1)
+    slope, constant = rng.normal(size=(M, 3)), rng.normal(size=M)
+
+    def values(x: np.ndarray) -> np.ndarray:
+        return constant + x @ slope.T + 0.5 * np.einsum("ni,kij,nj->nk", x, hessian, x)
+
+    basis, gradient = average_basis(values, case.means, case.covariances)
+    expected = values(case.means) + 0.5 * np.einsum("kij,nij->nk", hessian, case.covariances)
+    # A point is as wide as 1e-5 of the object, at most: its average is off by the square of that.
+    np.testing.assert_allclose(basis, expected, atol=1e-10)
+    np.testing.assert_allclose(gradient, slope + np.einsum("kij,nj->nki", hessian, case.means), atol=1e-8)
+
+
+def test_average_of_a_step_is_bounded_by_its_height() -> None:
+    """Across a jump of one between the cubature points F is 1 / (2 sqrt(3) sigma), however thin the jump is."""
+    sigma = 2e-3
+    for width in (1e-4, 1e-6):
+        _, gradient = average_basis(
+            lambda x, w=width: 0.5 * np.tanh(x[:, :1] / w), np.zeros((1, 3)), sigma**2 * np.eye(3)[None]
+        )
+        np.testing.assert_allclose(gradient[0, 0], [1.0 / (2.0 * np.sqrt(3.0) * sigma), 0.0, 0.0], rtol=1e-9)
 
 
 def test_refuses_shapes_that_do_not_belong_together() -> None:

@@ -38,7 +38,7 @@ def render_dense(
     height: int,
     *,
     antialiased: bool = True,
-    dilation: float = 0.3,
+    dilation: float = 0.1,
     near: float = 0.01,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     mesh_rgb: NDArray[np.float64] | None = None,
