@@ -32,16 +32,23 @@ class RasterizerOptions:
     """How splats are drawn; fixed for a rasteriser's life."""
 
     antialiased: bool = True
-    """Compensate opacity for the pixel filter; False, with a dilation of 0.3, is the classic formula."""
-    dilation: float = 0.1
-    """Variance of the pixel filter [px^2]. A pixel's own is 1/12; 0.1, as in Mip-Splatting, comes 5 to 8 dB nearer to
-    eightfold supersampling than the classic 0.3."""
+    """Compensate opacity for the pixel filter; False is the classic formula."""
+    dilation: float | None = None
+    """Variance of the pixel filter [px^2]; None is 0.1 antialiased, 0.3 classic. A pixel's own is 1/12; 0.1, as in
+    Mip-Splatting, comes 5 to 8 dB nearer to eightfold supersampling than 0.3."""
     near: float = 0.01
     """Nearest visible forward depth [m]."""
     object_ids: bool = False
     """Write the object of the largest weight per pixel."""
     median_depth: bool = False
     """Write the depth at which half of the light is gone."""
+
+    @property
+    def pixel_variance(self) -> float:
+        """The dilation that is meant [px^2]."""
+        if self.dilation is not None:
+            return self.dilation
+        return 0.1 if self.antialiased else 0.3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,7 +250,7 @@ class SplatRasterizer:
             inputs=[
                 splats.means, splats.covariances, splats.opacities, splats.sh, splats.rotations,
                 views.world_to_camera, views.intrinsics, views.world,
-                wp.vec2i(self.width, self.height), options.near, options.dilation, options.antialiased,
+                wp.vec2i(self.width, self.height), options.near, options.pixel_variance, options.antialiased,
             ],
             outputs=[self._center, self._shape, self._color, self._box, self._depth_key, self._order],
             device=self.device,
