@@ -29,6 +29,20 @@ def lowest_bit(word: wp.uint32) -> int:
 @wp.func_native(
     snippet="""
 #if defined(__CUDA_ARCH__)
+    return 31 - __clz(word);
+#else
+    return 31 - __builtin_clz(word);
+#endif
+"""
+)
+def highest_bit(word: wp.uint32) -> int:
+    """Return the position of the highest set bit of a word that is not zero."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
     return __popc(word);
 #else
     return __builtin_popcount(word);
@@ -81,6 +95,36 @@ def lane_scan(value: int, lane: int) -> int:
 )
 def last_lane(value: int) -> int:
     """Return the value of lane 31."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    for (int step = 16; step > 0; step /= 2) {
+        value += __shfl_xor_sync(0xffffffffu, value, step);
+    }
+#endif
+    return value;
+"""
+)
+def lane_sum(value: float) -> float:
+    """Return the sum of the values of all lanes."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    for (int step = 16; step > 0; step /= 2) {
+        value = max(value, __shfl_xor_sync(0xffffffffu, value, step));
+    }
+#endif
+    return value;
+"""
+)
+def lane_max(value: int) -> int:
+    """Return the largest value of all lanes."""
     ...
 
 

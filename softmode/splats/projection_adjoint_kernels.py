@@ -85,7 +85,6 @@ def project_adjoint(
     covariance: wp.array2d[vec6],
     opacity: wp.array2d[float],
     sh: wp.array3d[wp.vec3],
-    object_index: wp.array[int],
     rotation: wp.array2d[wp.quat],
     # Views:
     world_to_camera: wp.array[wp.mat44],
@@ -97,7 +96,7 @@ def project_adjoint(
     antialiased: bool,
     with_camera: bool,
     # Projected splats and the loss by them, (view_count * splat_count,):
-    color: wp.array[wp.vec3],
+    color: wp.array[wp.vec4],
     center_loss: wp.array[wp.vec4],
     shape_loss: wp.array[wp.vec4],
     color_loss: wp.array[wp.vec3],
@@ -215,7 +214,7 @@ def project_adjoint(
     turn = wp.quat()
     if sh.shape[2] > 1:
         eye = -(m[0, 3] * r0 + m[1, 3] * r1 + m[2, 3] * r2)
-        turn = rotation[world % rotation.shape[0], object_index[i]]
+        turn = rotation[world % rotation.shape[0], i]
         distance = wp.length(x - eye)
         sight = (x - eye) / distance
         direction = wp.quat_rotate_inv(turn, sight)
@@ -226,7 +225,7 @@ def project_adjoint(
         by_offset = (by_sight - wp.dot(by_sight, sight) * sight) / distance
         by_mean += by_offset
         wp.atomic_add(
-            rotation_out, world % rotation_out.shape[0], object_index[i], wp.cross(by_sight, sight)
+            rotation_out, world % rotation_out.shape[0], i, wp.cross(by_sight, sight)
         )
     wp.atomic_add(mean_out, world % mean_out.shape[0], i, by_mean)
 

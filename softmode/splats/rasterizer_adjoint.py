@@ -78,6 +78,7 @@ class AdjointRasterizer:
         self._shape = allocate(view_count * count, dtype=wp.vec4)
         self._color = allocate(view_count * count, dtype=wp.vec3)
         self._camera = allocate((view_count, count) if camera else (1, 1), dtype=projection_adjoint_kernels.vec10)
+        self._strip = (8, 1) if self.device.is_cpu else (1, 32)
         self._lanes = 1 if self.device.is_cpu else 64
         self._no_image = allocate((1, 1, 1), dtype=wp.float32)
         self._no_rgb = allocate((1, 1, 1), dtype=wp.vec3)
@@ -167,20 +168,21 @@ class AdjointRasterizer:
         mesh_rgb: wp.array | None,
         mesh_depth: wp.array | None,
     ) -> None:
-        r, tile = self.rasterizer, self.rasterizer.options.tile
+        r = self.rasterizer
+        strip, lanes = self._strip
         wp.launch(
             blend_adjoint_kernels.blend_adjoint_kernel(
-                r._strip, mesh_depth is not None, loss_alpha is not None, loss_depth is not None
+                strip, lanes, mesh_depth is not None, loss_alpha is not None, loss_depth is not None
             ),
-            dim=r._range.shape[0] * tile * (tile // r._strip),
+            dim=r._cover.shape[0] * r.tile[1] * (r.tile[0] // strip),
             inputs=[
-                r._pair_splat, r._range, r._center, r._shape, r._color, views.background,
+                r._order, r._cover, r._center, r._shape, r._color, views.background,
                 mesh_rgb if mesh_rgb is not None else self._no_rgb,
                 mesh_depth if mesh_depth is not None else self._no_image,
                 r.depth, r.alpha, loss_rgb,
                 loss_alpha if loss_alpha is not None else self._no_image,
                 loss_depth if loss_depth is not None else self._no_image,
-                wp.vec2i(r.width, r.height), wp.vec2i(*r.tile_count), tile,
+                r.splat_count, wp.vec2i(r.width, r.height), wp.vec2i(*r.tile_count), wp.vec2i(*r.tile),
             ],
             outputs=[self._center, self._shape, self._color],
             device=self.device,
@@ -193,7 +195,7 @@ class AdjointRasterizer:
             projection_adjoint_kernels.project_adjoint,
             dim=(r.view_count, r.splat_count),
             inputs=[
-                splats.means, splats.covariances, splats.opacities, splats.sh, splats.object_index, splats.rotations,
+                splats.means, splats.covariances, splats.opacities, splats.sh, splats.rotations,
                 views.world_to_camera, views.intrinsics, views.world,
                 wp.vec2i(r.width, r.height), r.options.dilation, r.options.antialiased, self.camera,
                 r._color, self._center, self._shape, self._color,
