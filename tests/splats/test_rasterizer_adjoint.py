@@ -95,8 +95,7 @@ class Scene:
         pose = np.zeros((4, 4))
         v, w = self.twist[view, :3], self.twist[view, 3:]
         pose[:3, :3], pose[:3, 3] = np.cross(np.eye(3), w), v
-        pose[:3, :3] = -np.cross(np.eye(3), w).T
-        turn = expm(-np.cross(np.eye(3), self.rotations[world % len(self.rotations), 0]).T) @ self.turn(world)
+        turn = expm(np.cross(np.eye(3), self.rotations[world, 0])) @ self.turn(world)
         extra: dict[str, Any] = {}
         if self.meshes is not None:
             extra = {"mesh_rgb": self.meshes[0][view], "mesh_depth": self.meshes[1][view]}
@@ -213,8 +212,132 @@ def test_matches_central_differences(device: str, antialiased: bool, parts: str)
     """dL/d(mean, covariance, opacity, colour, pose, intrinsics, background), each image on its own, two worlds."""
     scene = Scene.make(antialiased=antialiased)
     got = scene.gradients(device, parts)
+    assert not got["rotations"].any()
     for name in NAMES:
         if parts != "rgb" and name in ("sh", "background"):
             assert not got[name].any()
         else:
             assert deviation(got[name], scene.difference(name, parts)) < TOLERANCE, name
+
+
+@pytest.mark.parametrize("coefficients", [4, 9, 16])
+def test_direction_of_sight(device: str, coefficients: int) -> None:  # noqa: F811
+    """Colour that depends on the direction, degree 1 to 3: its coefficients, the centre, the eye, the colours' frame."""
+    scene = Scene.make(count=6, coefficients=coefficients)
+    got = scene.gradients(device, "rgb")
+    for name in ("means", "sh", "twist"):
+        assert deviation(got[name], scene.difference(name, "rgb")) < TOLERANCE, name
+    # All splats of a world turn together here.
+    assert deviation(got["rotations"].sum(axis=1, keepdims=True), scene.difference("rotations", "rgb")) < TOLERANCE
+
+
+def test_meshes_hide(device: str) -> None:  # noqa: F811
+    """With meshes: only splats in front of them have a gradient, of colour, alpha and the depth that mixes both."""
+    scene = Scene.make(mesh=True)
+    got = scene.gradients(device)
+    assert not got["background"].any()
+    for name in ("means", "covariances", "opacities", "sh", "twist"):
+        assert deviation(got[name], scene.difference(name, "rgb alpha depth")) < TOLERANCE, name
+    assert scene.meshes is not None
+    scene.meshes[1][:] = 0.05  # In front of everything.
+    for name, values in scene.gradients(device).items():
+        assert not values.any(), name
+
+
+def test_a_pixel_per_lane_gives_the_same(device: str) -> None:  # noqa: F811
+    """The kernel of one pixel per thread agrees with the strips of eight; sums have another order only."""
+    scene = Scene.make(mesh=True, coefficients=4)
+    expected = scene.gradients(device)
+    run, adjoint = scene.frame(device)
+    adjoint._strip = (1, 1)
+    run()
+    for name, values in adjoint.gradients.numpy().items():
+        np.testing.assert_allclose(values, expected[name], atol=1e-5 * max(np.abs(expected[name]).max(), 1e-9))
+
+
+def test_saturated_alpha_and_black_colour_let_nothing_through(device: str) -> None:  # noqa: F811
+    """An alpha cut at 0.99 does not feel its splat's opacity or shape; a colour cut at zero not its coefficients."""
+    scene = Scene.make(count=1, antialiased=False)
+    scene.means[:] = 0.0
+    scene.covariances[:] = [1e4, 0, 0, 1e4, 0, 1e4]
+    scene.opacities[:] = 1.0
+    scene.sh[0, 0, 0] = [1.0, -4.0, 0.5]
+    got = scene.gradients(device, "rgb")
+    assert not got["opacities"].any() and not got["covariances"].any() and not got["means"].any()
+    assert (got["sh"][0, 0, 0] != 0.0).tolist() == [True, False, True]
+
+
+def test_same_bits_captured_and_per_world(device: str) -> None:  # noqa: F811
+    """A captured frame replays the eager one; on CPU to the bit, and world i of many is the single world."""
+    scene = Scene.make(coefficients=4)
+    scene.covariances = np.repeat(scene.covariances, 2, axis=0)
+    run, adjoint = scene.frame(device)
+    run()
+    eager = adjoint.gradients.numpy()
+    for array in vars(adjoint.gradients).values():
+        array.fill_(7.0)
+    with wp.ScopedCapture(device=device) as capture:
+        run()
+    for _ in range(2):
+        wp.capture_launch(capture.graph)
+        for name, values in adjoint.gradients.numpy().items():
+            if device == "cpu":
+                np.testing.assert_array_equal(values, eager[name], err_msg=name)
+            else:
+                np.testing.assert_allclose(values, eager[name], atol=1e-5 * np.abs(eager[name]).max(), err_msg=name)
+    if device != "cpu":
+        return
+    # World 1 is seen by view 1 alone.
+    splats, views = scene.arrays(device)
+    splats = replace(splats, means=splats.means[1:], covariances=splats.covariances[1:], rotations=splats.rotations[1:])
+    views = ViewArrays(
+        world_to_camera=views.world_to_camera[1:2],
+        intrinsics=views.intrinsics[1:2],
+        world=wp.zeros(1, dtype=wp.int32, device=device),
+        background=views.background[1:2],
+    )
+    assert scene.weights is not None
+    losses = [
+        wp.array(w[1:2], dtype=dtype, device=device)
+        for w, dtype in zip(scene.weights, (wp.vec3, wp.float32, wp.float32), strict=True)
+    ]
+    rasterizer = SplatRasterizer(scene.means.shape[1], 1, WIDTH, HEIGHT, device=device)
+    alone = AdjointRasterizer(rasterizer, splats, views)
+    rasterizer.render(splats, views)
+    alone.backward(splats, views, loss_rgb=losses[0], loss_alpha=losses[1], loss_depth=losses[2])
+    for name, values in alone.gradients.numpy().items():
+        if name not in ("opacities", "sh"):
+            np.testing.assert_array_equal(values[0], eager[name][1], err_msg=name)
+
+
+def test_without_the_camera(device: str) -> None:  # noqa: F811
+    """Splats have the same gradients; twist and intrinsics stay zero."""
+    scene = Scene.make()
+    expected = scene.gradients(device)
+    run, adjoint = scene.frame(device)
+    adjoint = AdjointRasterizer(adjoint.rasterizer, *scene.arrays(device), camera=False)
+    splats, views = scene.arrays(device)
+    assert scene.weights is not None
+    adjoint.rasterizer.render(splats, views)
+    losses = [
+        wp.array(w, dtype=dtype, device=device)
+        for w, dtype in zip(scene.weights, (wp.vec3, wp.float32, wp.float32), strict=True)
+    ]
+    got = adjoint.backward(splats, views, loss_rgb=losses[0], loss_alpha=losses[1], loss_depth=losses[2]).numpy()
+    np.testing.assert_allclose(got["means"], expected["means"], atol=1e-6 * np.abs(expected["means"]).max())
+    assert not got["twist"].any() and not got["intrinsics"].any()
+
+
+def test_refuses_arrays_of_other_shapes() -> None:
+    """The message names the array."""
+    scene = Scene.make(count=3)
+    splats, views = scene.arrays("cpu")
+    rasterizer = SplatRasterizer(3, 3, WIDTH, HEIGHT, device="cpu")
+    adjoint = AdjointRasterizer(rasterizer, splats, views)
+    loss = wp.zeros((3, HEIGHT, WIDTH), dtype=wp.vec3, device="cpu")
+    with pytest.raises(ConfigError, match="loss_rgb has shape"):
+        adjoint.backward(splats, views, loss_rgb=loss[:1])
+    with pytest.raises(ConfigError, match="mesh_depth has shape None"):
+        adjoint.backward(splats, views, loss_rgb=loss, mesh_rgb=loss)
+    with pytest.raises(ConfigError, match="means has shape"):
+        adjoint.backward(replace(splats, means=splats.means[:1]), views, loss_rgb=loss)
