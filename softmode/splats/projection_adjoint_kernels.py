@@ -1,4 +1,4 @@
-"""Device code of `rasterizer_adjoint`: the adjoint of projection, from the projected splats to splats and cameras."""
+"""Device code of `rasterizer_adjoint`: from projected splats to splats and cameras, and from images to backgrounds."""
 
 import warp as wp
 
@@ -224,9 +224,7 @@ def project_adjoint(
         by_sight = wp.quat_rotate(turn, by_direction)
         by_offset = (by_sight - wp.dot(by_sight, sight) * sight) / distance
         by_mean += by_offset
-        wp.atomic_add(
-            rotation_out, world % rotation_out.shape[0], i, wp.cross(by_sight, sight)
-        )
+        wp.atomic_add(rotation_out, world % rotation_out.shape[0], i, wp.cross(by_sight, sight))
     wp.atomic_add(mean_out, world % mean_out.shape[0], i, by_mean)
 
     if with_camera:
@@ -261,3 +259,21 @@ def camera_adjoint(
             total[entry] += wp.float64(part[entry])
     wp.atomic_add(twist_out, view, wp.spatial_vectord(total[0], total[1], total[2], total[3], total[4], total[5]))
     wp.atomic_add(intrinsics_out, view, wp.vec4d(total[6], total[7], total[8], total[9]))
+
+
+@wp.kernel
+def background_adjoint(
+    alpha: wp.array3d[float],  # (view_count, height, width) as rendered
+    loss_rgb: wp.array3d[wp.vec3],  # (view_count, height, width)
+    lanes: int,
+    # Out, added to:
+    background_out: wp.array[wp.vec3d],  # (1|view_count,)
+):
+    """Sum (1 - alpha) dL/drgb; each lane strides over the rows of pixels."""
+    view, lane = wp.tid()
+    total = wp.vec3d()
+    for y in range(lane, alpha.shape[1], lanes):
+        for x in range(alpha.shape[2]):
+            loss = (1.0 - alpha[view, y, x]) * loss_rgb[view, y, x]
+            total += wp.vec3d(wp.float64(loss[0]), wp.float64(loss[1]), wp.float64(loss[2]))
+    wp.atomic_add(background_out, view % background_out.shape[0], total)

@@ -16,7 +16,8 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softmode.errors import ConfigError
-from softmode.splats import blend_adjoint_kernels, projection_adjoint_kernels
+from softmode.splats import blend_adjoint_cpu_kernels, blend_adjoint_cuda_kernels, projection_adjoint_kernels
+from softmode.splats.blend_cuda_kernels import BLOCK_DIM
 from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
 
 
@@ -78,7 +79,6 @@ class AdjointRasterizer:
         self._shape = allocate(view_count * count, dtype=wp.vec4)
         self._color = allocate(view_count * count, dtype=wp.vec3)
         self._camera = allocate((view_count, count) if camera else (1, 1), dtype=projection_adjoint_kernels.vec10)
-        self._strip = (8, 1) if self.device.is_cpu else (1, 32)
         self._lanes = 1 if self.device.is_cpu else 64
         self._no_image = allocate((1, 1, 1), dtype=wp.float32)
         self._no_rgb = allocate((1, 1, 1), dtype=wp.vec3)
@@ -151,7 +151,7 @@ class AdjointRasterizer:
         self._project(splats, views)
         if mesh_rgb is None:
             wp.launch(
-                blend_adjoint_kernels.background_adjoint,
+                projection_adjoint_kernels.background_adjoint,
                 dim=(r.view_count, self._lanes),
                 inputs=[r.alpha, loss_rgb, self._lanes],
                 outputs=[out.background],
@@ -169,12 +169,11 @@ class AdjointRasterizer:
         mesh_depth: wp.array | None,
     ) -> None:
         r = self.rasterizer
-        strip, lanes = self._strip
+        variant = (mesh_depth is not None, loss_alpha is not None, loss_depth is not None)
+        blend = blend_adjoint_cpu_kernels if self.device.is_cpu else blend_adjoint_cuda_kernels
         wp.launch(
-            blend_adjoint_kernels.blend_adjoint_kernel(
-                strip, lanes, mesh_depth is not None, loss_alpha is not None, loss_depth is not None
-            ),
-            dim=r._cover.shape[0] * r.tile[1] * (r.tile[0] // strip),
+            blend.blend_adjoint_kernel(*variant),
+            dim=r._cover.shape[0] * blend.TILE_THREADS,
             inputs=[
                 r._order, r._cover, r._center, r._shape, r._color, views.background,
                 mesh_rgb if mesh_rgb is not None else self._no_rgb,
@@ -182,11 +181,11 @@ class AdjointRasterizer:
                 r.depth, r.alpha, loss_rgb,
                 loss_alpha if loss_alpha is not None else self._no_image,
                 loss_depth if loss_depth is not None else self._no_image,
-                r.splat_count, wp.vec2i(r.width, r.height), wp.vec2i(*r.tile_count), wp.vec2i(*r.tile),
+                r.splat_count, wp.vec2i(r.width, r.height), wp.vec2i(*r.tile_count),
             ],
             outputs=[self._center, self._shape, self._color],
             device=self.device,
-            block_dim=64,
+            block_dim=BLOCK_DIM,
         )  # fmt: skip
 
     def _project(self, splats: SplatArrays, views: ViewArrays) -> None:

@@ -1,0 +1,304 @@
+"""Device code of `rasterizer_adjoint`: the adjoint of the blend on CPU, one thread per tile, in vector registers.
+
+The tile's pixels lie in pairs of rows as in `blend_cpu_kernels`, whose exponential and decisions these kernels share. A
+splat's sums over its tile stay in registers; memory sees them once, always in the same order.
+"""
+
+import functools
+
+import warp as wp
+
+from softmode.splats.blend_cpu_kernels import (
+    LANES,
+    LOG2_255,
+    LOG2_E,
+    PATIENCE,
+    TILE_THREADS,
+    _in_lanes,
+    add_weighted,
+    light_after,
+    light_before,
+    splat_alpha,
+    tile_mat,
+    vec16,
+)
+from softmode.splats.lane_ops import highest_bit, lowest_bit
+from softmode.splats.rasterizer_kernels import TILE
+
+wp.set_module_options({"enable_backward": False})
+
+NEVER = wp.constant(1.0e30)
+
+
+@wp.func_native(_in_lanes("stop after", "result = after < 0.0f ? __builtin_elementwise_min(stop, (lanes)rank) : stop;"))
+def end_where_finished(stop_in: vec16, after_in: vec16, rank: float) -> vec16:
+    """Return the rank at which each pixel ended."""
+    ...
+
+
+@wp.func_native(_in_lanes("light stop", "result = stop > rank ? light : (lanes)-1.0f;"))
+def light_if_open(light_in: vec16, stop_in: vec16, rank: float) -> vec16:
+    """Return the transmittance, -1 where the pixel ends before the splat."""
+    ...
+
+
+@wp.func_native(_in_lanes("light alpha", "result = light / (1.0f - alpha);"))
+def light_in_front(light_in: vec16, alpha_in: vec16) -> vec16:
+    """Return the transmittance in front of the splat from that behind it."""
+    ...
+
+
+@wp.func_native(_in_lanes("red green blue behind", "result = red * r + green * g + (blue * b - behind);"))
+def color_difference(
+    red_in: vec16, green_in: vec16, blue_in: vec16, behind_in: vec16, r: float, g: float, b: float
+) -> vec16:
+    """Return what the loss asks of the splat's colour, less that of what is seen behind it."""
+    ...
+
+
+@wp.func_native(_in_lanes("total far seen", "result = total + far * (depth - seen);"))
+def add_depth(total_in: vec16, far_in: vec16, seen_in: vec16, depth: float) -> vec16:
+    """Add what the loss asks of the splat's depth, counted from the depth that is seen."""
+    ...
+
+
+@wp.func_native(_in_lanes("weight alpha difference", "result = alpha < 0.99f ? weight * difference : (lanes)0.0f;"))
+def by_log_alpha(weight_in: vec16, alpha_in: vec16, difference_in: vec16) -> vec16:
+    """Return the loss by the logarithm of alpha, zero where alpha is cut."""
+    ...
+
+
+@wp.func_native(_in_lanes("x y", "result = x * y;"))
+def product(x_in: vec16, y_in: vec16) -> vec16:
+    """Return x y."""
+    ...
+
+
+@wp.func_native(_in_lanes("total x y", "result = total + x * y;"))
+def add_product(total_in: vec16, x_in: vec16, y_in: vec16) -> vec16:
+    """Return total + x y, fused."""
+    ...
+
+
+_ROW = "const lanes row = {0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1};"
+_COLUMN = "const lanes column = {0, 1, 2, 3, 4, 5, 6, 7, 0, 1, 2, 3, 4, 5, 6, 7};"
+
+
+@wp.func_native(_in_lanes("", f"{_ROW} result = row - v;"))
+def offset_y(v: float) -> vec16:
+    """Return dy = y - v."""
+    ...
+
+
+@wp.func_native(_in_lanes("dy", f"{_COLUMN} result = (column - u) - tilt * dy;"))
+def offset_x(dy_in: vec16, u: float, tilt: float) -> vec16:
+    """Return dx = x - u - tilt dy."""
+    ...
+
+
+@wp.func_native(
+    f"""
+    typedef float lanes16 __attribute__((ext_vector_type({LANES})));
+    typedef float lanes8 __attribute__((ext_vector_type({LANES // 2})));
+    typedef float lanes4 __attribute__((ext_vector_type({LANES // 4})));
+    lanes16 x;
+    __builtin_memcpy(&x, &x_in, sizeof(x));
+    const lanes8 y = x.lo + x.hi;
+    const lanes4 z = y.lo + y.hi;
+    return (z.x + z.z) + (z.y + z.w);
+"""
+)
+def lane_total(x_in: vec16) -> float:
+    """Return the sum over the lanes."""
+    ...
+
+
+@functools.cache
+def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool) -> wp.Kernel:
+    """Return the adjoint of `blend_cpu_kernels.blend_kernel`; `blend_adjoint_cuda_kernels` has the equations."""
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def _blend_adjoint(
+        # Bins:
+        order: wp.array[int],  # (>= view_count * splat_count,) splats of each view by depth
+        cover: wp.array2d[wp.uint32],  # (tile_count over all views, words) bits of depth ranks
+        # Projected splats:
+        center: wp.array[wp.vec4],
+        shape: wp.array[wp.vec4],
+        color: wp.array[wp.vec4],
+        # Images in:
+        background: wp.array[wp.vec3],  # (1|view_count,)
+        mesh_rgb: wp.array3d[wp.vec3],  # (view_count, height, width)
+        mesh_depth: wp.array3d[float],  # (view_count, height, width) [m], 0 where there is no mesh
+        depth: wp.array3d[float],  # as rendered
+        coverage: wp.array3d[float],  # alpha as rendered
+        # Loss by the images, (view_count, height, width):
+        loss_rgb: wp.array3d[wp.vec3],
+        loss_alpha: wp.array3d[float],
+        loss_depth: wp.array3d[float],
+        # Sizes:
+        splat_count: int,
+        size: wp.vec2i,
+        tile_count: wp.vec2i,
+        # Loss by the projected splats, added to:
+        center_out: wp.array[wp.vec4],  # by u, v, forward depth; the last entry is not used
+        shape_out: wp.array[wp.vec4],
+        color_out: wp.array[wp.vec3],
+    ):
+        """Accumulate the loss by center, shape and colour of each (view, splat)."""
+        tile = wp.tid()
+        view = tile / (tile_count[0] * tile_count[1])
+        in_view = tile - view * tile_count[0] * tile_count[1]
+        left = (in_view % tile_count[0]) * TILE
+        top = (in_view / tile_count[0]) * TILE
+        columns = wp.min(TILE, size[0] - left)
+        rows = wp.min(TILE, size[1] - top)
+        pairs = (rows + 1) / 2  # not a constant, or Warp would unroll the loops over it
+
+        light = tile_mat(-1.0)  # transmittance; its negative once the pixel is finished
+        stop = tile_mat(NEVER)  # rank at which the pixel ends; exact below 2^24
+        limit = tile_mat(1.0e30)
+        red = tile_mat()
+        green = tile_mat()
+        blue = tile_mat()
+        far = tile_mat()
+        seen = tile_mat()
+        behind = tile_mat()
+        background_rgb = background[view % background.shape[0]]
+        for y in range(rows):
+            for x in range(columns):
+                pair = y / 2
+                lane = TILE * (y % 2) + x
+                light[pair, lane] = 1.0
+                loss = loss_rgb[view, top + y, left + x]
+                red[pair, lane] = loss[0]
+                green[pair, lane] = loss[1]
+                blue[pair, lane] = loss[2]
+                if wp.static(has_mesh):
+                    there = mesh_depth[view, top + y, left + x]
+                    if there > 0.0:
+                        limit[pair, lane] = there
+                    background_rgb = mesh_rgb[view, top + y, left + x]
+                asked = wp.dot(loss, background_rgb)
+                if wp.static(has_alpha):
+                    asked -= loss_alpha[view, top + y, left + x]
+                if wp.static(has_depth):
+                    # The weights of a depth sum to its total, so depth may be counted from what is seen: exact, and
+                    # free of the difference between a sum and its total times the mean.
+                    middle = depth[view, top + y, left + x]
+                    total = coverage[view, top + y, left + x]
+                    if limit[pair, lane] < 1.0e29:
+                        total = 1.0
+                    if total > 0.0:
+                        share = loss_depth[view, top + y, left + x] / wp.max(total, 1.0e-6)
+                        far[pair, lane] = share
+                        seen[pair, lane] = middle
+                        if limit[pair, lane] < 1.0e29:
+                            asked += share * (limit[pair, lane] - middle)
+                behind[pair, lane] = asked
+
+        # Front to back: light left, and the rank at which each pixel ends.
+        first = view * splat_count
+        running = bool(True)
+        patience = int(PATIENCE)
+        words = int(0)
+        while running and words < cover.shape[1]:
+            bits = cover[tile, words]
+            while bits != wp.uint32(0):
+                rank = 32 * words + lowest_bit(bits)
+                bits = bits & (bits - wp.uint32(1))
+                i = order[first + rank]
+                g = center[first + i]
+                e = shape[first + i]
+                u = g[0] - float(left) - 0.5
+                v = g[1] - float(top) - 0.5
+                peak = LOG2_E * g[3] - LOG2_255
+                a = 0.5 * LOG2_E * e[1]
+                b = 0.5 * LOG2_E * e[2]
+                for pair in range(pairs):
+                    before = light[pair]
+                    if wp.static(has_mesh):
+                        before = light_before(before, limit[pair], g[2])
+                    alpha = splat_alpha(before, u, v - float(2 * pair), e[0], a, b, peak)
+                    after = light_after(before, alpha)
+                    light[pair] = after
+                    stop[pair] = end_where_finished(stop[pair], after, float(rank))
+                patience -= 1
+                if patience == 0:
+                    patience = PATIENCE
+                    brightest = light[0]
+                    for pair in range(1, pairs):
+                        brightest = wp.max(brightest, light[pair])
+                    if wp.max(brightest) < 0.0:
+                        running = False
+                        break
+            words += 1
+
+        # Back to front.
+        for pair in range(pairs):
+            light[pair] = wp.abs(light[pair])
+        for back in range(words):
+            word = words - 1 - back
+            bits = cover[tile, word]
+            while bits != wp.uint32(0):
+                high = highest_bit(bits)
+                bits = bits ^ (wp.uint32(1) << wp.uint32(high))
+                rank = 32 * word + high
+                k = first + order[first + rank]
+                g = center[k]
+                e = shape[k]
+                c = color[k]
+                u = g[0] - float(left) - 0.5
+                v = g[1] - float(top) - 0.5
+                peak = LOG2_E * g[3] - LOG2_255
+                a = 0.5 * LOG2_E * e[1]
+                b = 0.5 * LOG2_E * e[2]
+                sum_r = vec16()
+                sum_g = vec16()
+                sum_b = vec16()
+                sum_z = vec16()
+                power = vec16()
+                power_x = vec16()
+                power_y = vec16()
+                power_xx = vec16()
+                power_xy = vec16()
+                power_yy = vec16()
+                for pair in range(pairs):
+                    behind_splat = light[pair]
+                    open = light_if_open(behind_splat, stop[pair], float(rank))
+                    alpha = splat_alpha(open, u, v - float(2 * pair), e[0], a, b, peak)
+                    in_front = light_in_front(behind_splat, alpha)
+                    light[pair] = in_front
+                    weight = product(alpha, in_front)
+                    difference = color_difference(red[pair], green[pair], blue[pair], behind[pair], c[0], c[1], c[2])
+                    if wp.static(has_depth):
+                        difference = add_depth(difference, far[pair], seen[pair], g[2])
+                        sum_z = add_product(sum_z, weight, far[pair])
+                    behind[pair] = add_product(behind[pair], alpha, difference)
+                    sum_r = add_product(sum_r, weight, red[pair])
+                    sum_g = add_product(sum_g, weight, green[pair])
+                    sum_b = add_product(sum_b, weight, blue[pair])
+                    log_alpha = by_log_alpha(weight, alpha, difference)
+                    dy = offset_y(v - float(2 * pair))
+                    dx = offset_x(dy, u, e[0])
+                    along_x = product(log_alpha, dx)
+                    along_y = product(log_alpha, dy)
+                    power = add_weighted(power, log_alpha, 1.0)
+                    power_x = add_weighted(power_x, along_x, 1.0)
+                    power_y = add_weighted(power_y, along_y, 1.0)
+                    power_xx = add_product(power_xx, along_x, dx)
+                    power_xy = add_product(power_xy, along_x, dy)
+                    power_yy = add_product(power_yy, along_y, dy)
+                # log alpha = log o - e1/2 (dx)^2 - e2/2 dy^2 with dx = x - u - slope dy, dy = y - v
+                by_u = e[1] * lane_total(power_x)
+                by_v = e[2] * lane_total(power_y) - e[0] * by_u
+                center_out[k] += wp.vec4(by_u, by_v, lane_total(sum_z), 0.0)
+                shape_out[k] += wp.vec4(
+                    e[1] * lane_total(power_xy),
+                    -0.5 * lane_total(power_xx),
+                    -0.5 * lane_total(power_yy),
+                    lane_total(power) / e[3],
+                )
+                color_out[k] += wp.vec3(lane_total(sum_r), lane_total(sum_g), lane_total(sum_b))
+
+    return _blend_adjoint
