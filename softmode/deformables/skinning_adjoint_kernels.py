@@ -9,7 +9,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def stretched_adjoint(f: wp.mat33, limit: float, sigma: wp.mat33, loss: wp.mat33) -> wp.mat33:
-    """Return the loss by F from that by C Sigma C^T with C = `limited_stretch(F)` = U min(S, limit) V^T; loss symmetric.
+    """Return the loss by F from the symmetric one by C Sigma C^T, where C = `limited_stretch(F)` = U min(S, limit) V^T.
 
     With P = U^T dF V the differential is dC = U (a o sym P + b o skew P) V^T, a_ij = (g_i - g_j) / (s_i - s_j) and
     b_ij = (g_i + g_j) / (s_i + s_j) of g = min(s, limit), and its own transpose: nothing flows along a stretch at the

@@ -13,7 +13,6 @@ from softmode.splats.blend_cpu_kernels import (
     LOG2_255,
     LOG2_E,
     PATIENCE,
-    TILE_THREADS,
     _in_lanes,
     add_weighted,
     light_after,
@@ -27,6 +26,8 @@ from softmode.splats.rasterizer_kernels import TILE
 
 wp.set_module_options({"enable_backward": False})
 
+TILE_THREADS = 1
+"""Threads of a tile."""
 NEVER = wp.constant(1.0e30)
 
 

@@ -11,7 +11,6 @@ import functools
 from dataclasses import dataclass, fields
 from typing import Any
 
-import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
@@ -31,7 +30,7 @@ class RasterizerGradients:
     means: wp.array
     """By the centres [1/m], vec3, (1|world_count, N)."""
     covariances: wp.array
-    """By the six stored entries [1/m^2], vec6, (1|world_count, N); an off-diagonal entry stands for both of its places."""
+    """By the six stored entries [1/m^2], vec6, (1|world_count, N); an off-diagonal one is in two places."""
     opacities: wp.array
     """By the opacities, (1|world_count, N)."""
     sh: wp.array
@@ -93,6 +92,8 @@ class AdjointRasterizer:
             background=allocate(views.background.shape, dtype=wp.vec3d),
         )
         """What `backward` writes, overwritten by every call."""
+        self.frame: object = None
+        """Whose frame the rasteriser holds; kept by `rasterizer_torch`."""
 
     def backward(
         self,

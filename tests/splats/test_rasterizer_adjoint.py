@@ -20,13 +20,21 @@ from softmode.splats.rasterizer_adjoint import AdjointRasterizer
 from softmode.splats.rasterizer_kernels import vec6
 from softmode.splats.splats import quat_from_rotation
 from tests.splats.dense_reference import render_dense
-from tests.splats.test_rasterizer import EYES, UNDECIDED, device, look_at  # noqa: F401
+from tests.splats.test_rasterizer import EYES, UNDECIDED, look_at
 
 Array = NDArray[np.float64]
 WIDTH, HEIGHT = 24, 20
 STEP = 1e-6
 TOLERANCE = 2e-5
 FULL = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
+def device(request: pytest.FixtureRequest) -> str:
+    """Every device that is there."""
+    if request.param != "cpu" and not wp.is_cuda_available():
+        pytest.skip("no CUDA device")
+    return request.param
 
 
 @dataclass
@@ -45,7 +53,7 @@ class Scene:
     worlds: Any
     antialiased: bool
     meshes: tuple[Array, Array] | None = None
-    weights: tuple[Array, Array, Array] | None = None
+    weights: list[Array] | None = None
 
     @classmethod
     def make(cls, *, count: int = 16, coefficients: int = 1, antialiased: bool = True, mesh: bool = False) -> Scene:
@@ -88,7 +96,7 @@ class Scene:
             rng.normal(size=sure.shape) * sure,
             rng.normal(size=sure.shape) * seen,
         )
-        scene.weights = tuple(w.astype(np.float32).astype(np.float64) for w in weights)
+        scene.weights = [w.astype(np.float32).astype(np.float64) for w in weights]
         return scene
 
     def render(self, view: int) -> Any:
@@ -118,7 +126,7 @@ class Scene:
 
     def turn(self, world: int) -> Array:
         """Return the rotation of a world's colours."""
-        return expm(np.cross(np.eye(3), [0.4, -0.9, 0.2 + world]))
+        return np.asarray(expm(np.cross(np.eye(3), [0.4, -0.9, 0.2 + world])), dtype=np.float64)
 
     def loss(self, parts: str) -> float:
         """Return the loss: the weighted sum of colour, alpha and depth."""
@@ -210,7 +218,7 @@ NAMES = ("means", "covariances", "opacities", "sh", "twist", "intrinsics", "back
 
 @pytest.mark.parametrize("antialiased", [True, False])
 @pytest.mark.parametrize("parts", ["rgb", "alpha", "depth"])
-def test_matches_central_differences(device: str, antialiased: bool, parts: str) -> None:  # noqa: F811
+def test_matches_central_differences(device: str, antialiased: bool, parts: str) -> None:
     """dL/d(mean, covariance, opacity, colour, pose, intrinsics, background), each image on its own, two worlds."""
     scene = Scene.make(antialiased=antialiased)
     got = scene.gradients(device, parts)
@@ -223,8 +231,8 @@ def test_matches_central_differences(device: str, antialiased: bool, parts: str)
 
 
 @pytest.mark.parametrize("coefficients", [4, 9, 16])
-def test_direction_of_sight(device: str, coefficients: int) -> None:  # noqa: F811
-    """Colour that depends on the direction, degree 1 to 3: its coefficients, the centre, the eye, the colours' frame."""
+def test_direction_of_sight(device: str, coefficients: int) -> None:
+    """Colour of degree 1 to 3: its coefficients, the centre, the eye, the frame that colours turn with."""
     scene = Scene.make(count=6, coefficients=coefficients)
     got = scene.gradients(device, "rgb")
     for name in ("means", "sh", "twist"):
@@ -233,7 +241,7 @@ def test_direction_of_sight(device: str, coefficients: int) -> None:  # noqa: F8
     assert deviation(got["rotations"].sum(axis=1, keepdims=True), scene.difference("rotations", "rgb")) < TOLERANCE
 
 
-def test_meshes_hide(device: str) -> None:  # noqa: F811
+def test_meshes_hide(device: str) -> None:
     """With meshes: only splats in front of them have a gradient, of colour, alpha and the depth that mixes both."""
     scene = Scene.make(mesh=True)
     got = scene.gradients(device)
@@ -257,7 +265,7 @@ def test_the_kernel_of_cuda_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> N
         np.testing.assert_allclose(values, expected[name], atol=1e-5 * max(np.abs(expected[name]).max(), 1e-9))
 
 
-def test_saturated_alpha_and_black_colour_let_nothing_through(device: str) -> None:  # noqa: F811
+def test_saturated_alpha_and_black_colour_let_nothing_through(device: str) -> None:
     """An alpha cut at 0.99 does not feel its splat's opacity or shape; a colour cut at zero not its coefficients."""
     scene = Scene.make(count=1, antialiased=False)
     scene.means[:] = 0.0
@@ -269,7 +277,7 @@ def test_saturated_alpha_and_black_colour_let_nothing_through(device: str) -> No
     assert (got["sh"][0, 0, 0] != 0.0).tolist() == [True, False, True]
 
 
-def test_same_bits_captured_and_per_world(device: str) -> None:  # noqa: F811
+def test_same_bits_captured_and_per_world(device: str) -> None:
     """A captured frame replays the eager one; on CPU to the bit, and world i of many is the single world."""
     scene = Scene.make(coefficients=4)
     scene.covariances = np.repeat(scene.covariances, 2, axis=0)
@@ -312,15 +320,15 @@ def test_same_bits_captured_and_per_world(device: str) -> None:  # noqa: F811
             np.testing.assert_array_equal(values[0], eager[name][1], err_msg=name)
 
 
-def test_without_the_camera(device: str) -> None:  # noqa: F811
+def test_without_the_camera(device: str) -> None:
     """Splats have the same gradients; twist and intrinsics stay zero."""
     scene = Scene.make()
     expected = scene.gradients(device)
-    run, adjoint = scene.frame(device)
-    adjoint = AdjointRasterizer(adjoint.rasterizer, *scene.arrays(device), camera=False)
     splats, views = scene.arrays(device)
+    rasterizer = SplatRasterizer(scene.means.shape[1], 3, WIDTH, HEIGHT, device=device)
+    adjoint = AdjointRasterizer(rasterizer, splats, views, camera=False)
+    rasterizer.render(splats, views)
     assert scene.weights is not None
-    adjoint.rasterizer.render(splats, views)
     losses = [
         wp.array(w, dtype=dtype, device=device)
         for w, dtype in zip(scene.weights, (wp.vec3, wp.float32, wp.float32), strict=True)
