@@ -16,9 +16,6 @@ from softmode.deformables import skinning_adjoint_kernels as kernels
 from softmode.deformables.skinning import SkinSplats
 from softmode.errors import BasisError
 
-CHUNK = 256
-"""Splats that are summed by one thread."""
-
 
 class AdjointSkinning:
     """Differentiates `SkinSplats.launch`; all buffers are allocated here, 36 bytes per splat and world.
@@ -31,9 +28,9 @@ class AdjointSkinning:
     def __init__(self, skin: SkinSplats, world_count: int) -> None:
         """Allocate the buffers."""
         self.skin, self.world_count = skin, world_count
-        chunks = -(-skin.count // CHUNK)
+        lanes = 1 if skin.device.is_cpu else 64
         self._gradient = wp.zeros((world_count, skin.count), dtype=wp.mat33, device=skin.device)
-        self._chunk = wp.zeros((world_count, chunks, skin.function_count), dtype=wp.vec3d, device=skin.device)
+        self._lane = wp.zeros((world_count, lanes, skin.function_count), dtype=wp.vec3d, device=skin.device)
 
     def backward(
         self,
@@ -91,16 +88,16 @@ class AdjointSkinning:
             device=skin.device,
         )  # fmt: skip
         wp.launch(
-            kernels.sum_chunks,
-            dim=self._chunk.shape,
-            inputs=[skin.basis, first_splat, loss_means, self._gradient],
-            outputs=[self._chunk],
+            kernels.sum_splats,
+            dim=(self.world_count, -(-skin.function_count // 4), self._lane.shape[1]),
+            inputs=[skin.basis, skin.mean_basis, first_splat, loss_means, self._gradient],
+            outputs=[self._lane],
             device=skin.device,
         )
         wp.launch(
-            kernels.add_chunks,
+            kernels.add_lanes,
             dim=(self.world_count, skin.function_count),
-            inputs=[self._chunk, function_start],
+            inputs=[self._lane, function_start],
             outputs=[loss_q],
             device=skin.device,
         )

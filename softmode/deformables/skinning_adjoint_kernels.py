@@ -56,11 +56,17 @@ def polar_rotation_adjoint(f: wp.mat33, loss: wp.vec3) -> wp.mat33:
     return r * wp.skew(wp.inverse(k) * (wp.transpose(r) * loss))
 
 
+@wp.func
+def function_loss(b: wp.vec4, by_mean: wp.vec3, by_gradient: wp.mat33) -> wp.vec3:
+    """Return b dL/dx + (dL/dF) grad b."""
+    return b[3] * by_mean + by_gradient * wp.vec3(b[0], b[1], b[2])
+
+
 @wp.kernel
 def gradient_adjoint(
     # Object:
     rest_covariance: wp.array[vec6],  # (splat_count,) [m^2]
-    basis: wp.array2d[wp.vec4],  # (splat_count, function_count) grad b [1/m], b
+    basis: wp.array2d[wp.vec4],  # (function_count, splat_count) grad b [1/m], and b less its mean
     stretch_limit: float,
     # State in:
     function_start: wp.array[int],  # (world_count,)
@@ -78,8 +84,8 @@ def gradient_adjoint(
     r0 = wp.vec3(1.0, 0.0, 0.0)
     r1 = wp.vec3(0.0, 1.0, 0.0)
     r2 = wp.vec3(0.0, 0.0, 1.0)
-    for k in range(basis.shape[1]):
-        b = basis[i, k]
+    for k in range(basis.shape[0]):
+        b = basis[k, i]
         q = q_in[start + k]
         gradient = wp.vec3(b[0], b[1], b[2])
         r0 += float(q[0]) * gradient
@@ -96,37 +102,54 @@ def gradient_adjoint(
 
 
 @wp.kernel
-def sum_chunks(
+def sum_splats(
     # Object:
-    basis: wp.array2d[wp.vec4],  # (splat_count, function_count)
+    basis: wp.array2d[wp.vec4],  # (function_count, splat_count) grad b [1/m], b less its mean
+    mean_basis: wp.array[wp.float64],  # (function_count,)
     # Loss by:
     first_splat: int,
     mean_loss: wp.array2d[wp.vec3],  # (world_count, >= first_splat + splat_count) [1/m]
     gradient_loss: wp.array2d[wp.mat33],  # (world_count, splat_count)
     # Out:
-    chunk_out: wp.array3d[wp.vec3d],  # (world_count, chunk_count, function_count)
+    lane_out: wp.array3d[wp.vec3d],  # (world_count, lane_count, function_count)
 ):
-    """Sum b_k dL/dx + dL/dF grad b_k over a chunk of splats in their order."""
-    world, chunk, k = wp.tid()
-    size = (basis.shape[0] + chunk_out.shape[1] - 1) / chunk_out.shape[1]
-    total = wp.vec3d()
-    for i in range(chunk * size, wp.min((chunk + 1) * size, basis.shape[0])):
-        b = basis[i, k]
-        part = b[3] * mean_loss[world, first_splat + i] + gradient_loss[world, i] * wp.vec3(b[0], b[1], b[2])
-        total += wp.vec3d(wp.float64(part[0]), wp.float64(part[1]), wp.float64(part[2]))
-    chunk_out[world, chunk, k] = total
+    """Sum b_k dL/dx + (dL/dF) grad b_k over every lane_count-th splat, for four functions at a time."""
+    world, group, lane = wp.tid()
+    count = basis.shape[0]
+    k0 = 4 * group
+    k1 = wp.min(k0 + 1, count - 1)
+    k2 = wp.min(k0 + 2, count - 1)
+    k3 = wp.min(k0 + 3, count - 1)
+    moved = wp.vec3d()
+    sum0 = wp.vec3d()
+    sum1 = wp.vec3d()
+    sum2 = wp.vec3d()
+    sum3 = wp.vec3d()
+    for i in range(lane, basis.shape[1], lane_out.shape[1]):
+        by_mean = mean_loss[world, first_splat + i]
+        by_gradient = gradient_loss[world, i]
+        moved += wp.vec3d(by_mean)
+        sum0 += wp.vec3d(function_loss(basis[k0, i], by_mean, by_gradient))
+        sum1 += wp.vec3d(function_loss(basis[k1, i], by_mean, by_gradient))
+        sum2 += wp.vec3d(function_loss(basis[k2, i], by_mean, by_gradient))
+        sum3 += wp.vec3d(function_loss(basis[k3, i], by_mean, by_gradient))
+    # Beyond the last function the last one is written again, with the same number.
+    lane_out[world, lane, k0] = sum0 + mean_basis[k0] * moved
+    lane_out[world, lane, k1] = sum1 + mean_basis[k1] * moved
+    lane_out[world, lane, k2] = sum2 + mean_basis[k2] * moved
+    lane_out[world, lane, k3] = sum3 + mean_basis[k3] * moved
 
 
 @wp.kernel
-def add_chunks(
-    chunk: wp.array3d[wp.vec3d],  # (world_count, chunk_count, function_count)
+def add_lanes(
+    lane: wp.array3d[wp.vec3d],  # (world_count, lane_count, function_count)
     function_start: wp.array[int],  # (world_count,)
     # Out, added to:
     q_out: wp.array[wp.vec3d],
 ):
-    """Sum the chunks in their order and add to the loss by q."""
+    """Sum the lanes in their order and add to the loss by q."""
     world, k = wp.tid()
     total = wp.vec3d()
-    for c in range(chunk.shape[1]):
-        total += chunk[world, c, k]
+    for i in range(lane.shape[1]):
+        total += lane[world, i, k]
     wp.atomic_add(q_out, function_start[world] + k, total)

@@ -114,6 +114,25 @@ def lane_total(x_in: vec16) -> float:
     ...
 
 
+@wp.func_native(_in_lanes("x y", "result = __builtin_elementwise_max(x, y);"))
+def larger(x_in: vec16, y_in: vec16) -> vec16:
+    """Return the larger of x and y."""
+    ...
+
+
+@wp.func_native(
+    f"""
+    typedef float lanes16 __attribute__((ext_vector_type({LANES})));
+    lanes16 x;
+    __builtin_memcpy(&x, &x_in, sizeof(x));
+    return __builtin_reduce_max(x);
+"""
+)
+def lane_max(x_in: vec16) -> float:
+    """Return the largest lane."""
+    ...
+
+
 @functools.cache
 def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool) -> wp.Kernel:
     """Return the adjoint of `blend_cpu_kernels.blend_kernel`; `blend_adjoint_cuda_kernels` has the equations."""
@@ -236,6 +255,7 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool) -> wp
             words += 1
 
         # Back to front.
+        alphas = tile_mat()
         for pair in range(pairs):
             light[pair] = wp.abs(light[pair])
         for back in range(words):
@@ -264,10 +284,17 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool) -> wp
                 power_xx = vec16()
                 power_xy = vec16()
                 power_yy = vec16()
+                densest = vec16()
+                for pair in range(pairs):
+                    open = light_if_open(light[pair], stop[pair], float(rank))
+                    alpha = splat_alpha(open, u, v - float(2 * pair), e[0], a, b, peak)
+                    alphas[pair] = alpha
+                    densest = larger(densest, alpha)
+                if lane_max(densest) == 0.0:
+                    continue
                 for pair in range(pairs):
                     behind_splat = light[pair]
-                    open = light_if_open(behind_splat, stop[pair], float(rank))
-                    alpha = splat_alpha(open, u, v - float(2 * pair), e[0], a, b, peak)
+                    alpha = alphas[pair]
                     in_front = light_in_front(behind_splat, alpha)
                     light[pair] = in_front
                     weight = product(alpha, in_front)

@@ -56,7 +56,7 @@ class Scene:
     weights: list[Array] | None = None
 
     @classmethod
-    def make(cls, *, count: int = 16, coefficients: int = 1, antialiased: bool = True, mesh: bool = False) -> Scene:
+    def make(cls, *, count: int = 12, coefficients: int = 1, antialiased: bool = True, mesh: bool = False) -> Scene:
         """Return worlds with means of their own; covariances, opacities and colours are shared."""
         rng = np.random.default_rng(3)
         worlds, eyes = [0, 1, 0], EYES
