@@ -117,7 +117,7 @@ def project_adjoint(
     by_center = center_loss[k]
     by_shape = shape_loss[k]
     by_color = color_loss[k]
-    if wp.length_sq(by_center) + wp.length_sq(by_shape) + wp.length_sq(by_color) == 0.0:
+    if by_center == wp.vec4() and by_shape == wp.vec4() and by_color == wp.vec3():
         return
     world = view_world[view]
     m = world_to_camera[view]

@@ -22,10 +22,7 @@ from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
 
 @dataclass(frozen=True, kw_only=True)
 class RasterizerGradients:
-    """Derivatives of the loss; the first five have the shapes of `SplatArrays`, summed over the views that share them.
-
-    The rendering tangents are those of rigid motions: see `rotations` and `twist`.
-    """
+    """Derivatives of the loss, on the rasteriser's device; each is summed over the views that share its array."""
 
     means: wp.array
     """By the centres [1/m], vec3, (1|world_count, N)."""

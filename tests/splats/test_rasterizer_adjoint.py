@@ -23,7 +23,7 @@ from tests.splats.dense_reference import render_dense
 from tests.splats.test_rasterizer import EYES, UNDECIDED, look_at
 
 Array = NDArray[np.float64]
-WIDTH, HEIGHT = 24, 20
+WIDTH, HEIGHT = 21, 19
 STEP = 1e-6
 TOLERANCE = 2e-5
 FULL = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
