@@ -19,6 +19,7 @@ from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRast
 from softmode.splats.rasterizer_adjoint import AdjointRasterizer
 from softmode.splats.rasterizer_kernels import vec6
 from softmode.splats.splats import quat_from_rotation
+from tests.splats import dense_reference
 from tests.splats.dense_reference import render_dense
 from tests.splats.test_rasterizer import EYES, UNDECIDED, look_at
 
@@ -56,8 +57,16 @@ class Scene:
     weights: list[Array] | None = None
 
     @classmethod
-    def make(cls, *, count: int = 12, coefficients: int = 1, antialiased: bool = True, mesh: bool = False) -> Scene:
-        """Return worlds with means of their own; covariances, opacities and colours are shared."""
+    def make(
+        cls,
+        *,
+        count: int = 12,
+        coefficients: int = 1,
+        antialiased: bool = True,
+        mesh: bool = False,
+        opacity: float = 0.3,
+    ) -> Scene:
+        """Return worlds with means of their own, which share covariances, opacities from `opacity` up, and colours."""
         rng = np.random.default_rng(3)
         worlds, eyes = [0, 1, 0], EYES
         root = np.exp(0.7 * rng.normal(size=(count, 1, 3))) * 0.08 * np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
@@ -68,7 +77,7 @@ class Scene:
         scene = cls(
             means=0.3 * rng.normal(size=(2, count, 3)),
             covariances=np.stack([s[:, 0, 0], s[:, 0, 1], s[:, 0, 2], s[:, 1, 1], s[:, 1, 2], s[:, 2, 2]], 1)[None],
-            opacities=rng.uniform(0.3, 1.0, size=(1, count)),
+            opacities=rng.uniform(opacity, 1.0, size=(1, count)),
             sh=sh[None],
             rotations=np.zeros((2, 1, 3)),
             twist=np.zeros((3, 6)),
@@ -154,6 +163,17 @@ class Scene:
             array[at] = value
             out[at] = (values[0] - values[1]) / (2 * step)
         return out
+
+    def slope(self, name: str, along: Array, parts: str = "rgb alpha depth") -> float:
+        """Return the central difference of the loss along a direction of one array."""
+        array = getattr(self, name)
+        step = (0.01 * STEP if name == "covariances" else STEP) * (float(np.abs(array).max()) or 1.0)
+        values = []
+        for sign in (1, -1):
+            setattr(self, name, array + sign * step * along)
+            values.append(self.loss(parts))
+        setattr(self, name, array)
+        return (values[0] - values[1]) / (2 * step)
 
     def arrays(self, device: str) -> tuple[SplatArrays, ViewArrays]:
         """Upload."""
@@ -252,6 +272,20 @@ def test_meshes_hide(device: str) -> None:
     scene.meshes[1][:] = 0.05  # In front of everything.
     for name, values in scene.gradients(device).items():
         assert not values.any(), name
+
+
+def test_pixels_that_end(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where many opaque splats leave no light, what a pixel does not see has no part: by random directions."""
+    scene = Scene.make(count=80, opacity=0.97)
+    images = np.stack([scene.render(view).alpha for view in range(3)])
+    with monkeypatch.context() as patch:
+        patch.setattr(dense_reference, "TRANSMITTANCE_MIN", 1e-30)
+        assert (images != np.stack([scene.render(view).alpha for view in range(3)])).mean() > 0.1
+    got, rng = scene.gradients(device), np.random.default_rng(0)
+    for name in ("means", "covariances", "opacities", "sh"):
+        for _ in range(3):
+            along = rng.normal(size=got[name].shape)
+            assert abs((got[name] * along).sum() - scene.slope(name, along)) < TOLERANCE * np.linalg.norm(got[name])
 
 
 def test_the_kernel_of_cuda_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
