@@ -194,7 +194,7 @@ class AdjointRasterizer:
             inputs=[
                 splats.means, splats.covariances, splats.opacities, splats.sh, splats.rotations,
                 views.world_to_camera, views.intrinsics, views.world,
-                wp.vec2i(r.width, r.height), r.options.dilation, r.options.antialiased, self.camera,
+                wp.vec2i(r.width, r.height), r.options.pixel_variance, r.options.antialiased, self.camera,
                 r._color, self._center, self._shape, self._color,
             ],
             outputs=[
