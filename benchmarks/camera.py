@@ -27,6 +27,7 @@ import warp as wp
 from benchmarks.camera_scene import SceneCamera, blob, handle_scene, intrinsics, orbit
 from benchmarks.clock import Clock
 from benchmarks.step import product_rate
+from softmode.splats.rasterizer_kernels import TILE
 from softmode.splats.threaded_rasterizer import ThreadedRasterizer
 from tests.splats.dense_reference import render_dense
 
@@ -181,7 +182,7 @@ def least_work(camera: SceneCamera) -> tuple[float, float]:
     listed = views / sample * float(np.bitwise_count(part.numpy()).sum())
     functions = camera.skin.function_count
     moved = views * count * (2 * 36 + 2 * projected + 4 * 8) + 2 * 4 * words + views * pixels * 20
-    flops = views * count * (24 * functions + 300) + listed * raster.tile[0] * raster.tile[1] * 30
+    flops = views * count * (24 * functions + 300) + listed * TILE**2 * 30
     return float(moved), float(flops)
 
 
