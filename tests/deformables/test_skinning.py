@@ -212,7 +212,7 @@ def test_refuses_shapes_that_do_not_belong_together() -> None:
 
 @pytest.mark.parametrize("count", [1, 15, 16, 17, 53])
 def test_any_number_of_splats(device: str, count: int) -> None:
-    """x = X + sum_k b_k q_k and F Sigma F^T hold for counts around the blocks of neighbours that a thread may take.
+    """Centres X + sum_k b_k q_k and F Sigma F^T are right around the size of the blocks that a thread may take.
 
     World i of three equals the single world bitwise, and columns beside the object's stay as they were.
     """
