@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from softmode.deformables import skinning_cpu_kernels as cpu_kernels
 from softmode.deformables import skinning_kernels as kernels
 from softmode.errors import BasisError
 
@@ -153,14 +154,18 @@ class SkinSplats:
             outputs=[*motion],
             device=self.device,
         )
+        inputs = [self.rest_means, self.rest_covariances, self.basis, self.stretch_limit, *motion, first_splat]
+        outputs = [means, covariances, rotations]
+        if self.device.is_cpu and self.count >= cpu_kernels.BLOCK:
+            blocks = -(-self.count // cpu_kernels.BLOCK)
+            wp.launch(cpu_kernels.skin_blocks, (blocks, worlds), inputs, outputs, device=self.device)
+            return
         together = 4 if self.device.is_cuda and worlds > 1 else 1
         wp.launch(
             kernels.skin_kernel(together),
             dim=(-(-worlds // together), self.count),
-            inputs=[
-                self.rest_means, self.rest_covariances, self.basis, self.stretch_limit, *motion, first_splat
-            ],
-            outputs=[means, covariances, rotations],
+            inputs=inputs,
+            outputs=outputs,
             device=self.device,
             block_dim=128,
-        )  # fmt: skip
+        )

@@ -161,7 +161,12 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
         rows = wp.min(TILE, size[1] - top)
         pairs = (rows + 1) / 2  # not a constant, or Warp would unroll the loops over it and compile for 5 s
 
-        light = tile_mat(-1.0)  # transmittance; its negative once the pixel is finished
+        light = tile_mat(1.0)  # transmittance; its negative once the pixel is finished
+        if rows < TILE or columns < TILE:
+            light = tile_mat(-1.0)
+            for y in range(rows):
+                for x in range(columns):
+                    light[y / 2, TILE * (y % 2) + x] = 1.0
         red = tile_mat()
         green = tile_mat()
         blue = tile_mat()
@@ -170,10 +175,9 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
         winner = tile_mat(-1.0)
         median = tile_mat()
         limit = tile_mat(1.0e30)
-        for y in range(rows):
-            for x in range(columns):
-                light[y / 2, TILE * (y % 2) + x] = 1.0
-                if wp.static(has_mesh):
+        if wp.static(has_mesh):
+            for y in range(rows):
+                for x in range(columns):
                     behind = mesh_depth[view, top + y, left + x]
                     if behind > 0.0:
                         limit[y / 2, TILE * (y % 2) + x] = behind

@@ -238,3 +238,39 @@ def test_refuses_shapes_that_do_not_belong_together() -> None:
     case = Case()
     with pytest.raises(BasisError, match=r"basis \(60, 11\)"):
         SkinSplats(case.means, case.covariances, case.basis[:, 1:], case.grad, device="cpu")
+
+
+@pytest.mark.parametrize("count", [1, 15, 16, 17, 53])
+def test_any_number_of_splats(device: str, count: int) -> None:
+    """Centres X + sum_k b_k q_k and F Sigma F^T are right around the size of the blocks that a thread may take.
+
+    World i of three equals the single world bitwise, and columns beside the object's stay as they were.
+    """
+    rng = np.random.default_rng(count)
+    n, worlds, before, after = 5, 3, 2, 4
+    means = rng.normal(size=(count, 3)).astype(np.float32).astype(np.float64)
+    root = 0.1 * rng.normal(size=(count, 3, 3))
+    covariances = (root @ root.transpose(0, 2, 1)).astype(np.float32).astype(np.float64)
+    basis, gradients = rng.normal(size=(count, n)), 0.2 * rng.normal(size=(count, n, 3))
+    q = 0.3 * rng.normal(size=(worlds, n, 3))
+    skin = SkinSplats(means, covariances, basis, gradients, stretch_limit=100.0, device=device)
+
+    def moved(some: np.ndarray) -> list[np.ndarray]:
+        shape = (len(some), before + count + after)
+        out = [wp.full(shape, -7.0, dtype=wp.vec3, device=device), wp.full(shape, -7.0, dtype=vec6, device=device)]
+        start = wp.array(np.arange(len(some)) * n, dtype=wp.int32, device=device)
+        skin.launch(wp.array(some.reshape(-1, 3), dtype=wp.vec3d, device=device), start, *out, first_splat=before)
+        return [array.numpy() for array in out]
+
+    x, s = moved(q)
+    f = np.eye(3) + np.einsum("wka,nkb->wnab", q, gradients)
+    expected = f @ covariances @ f.transpose(0, 1, 3, 2)
+    six = expected[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    inside = slice(before, before + count)
+    np.testing.assert_allclose(x[:, inside], means + np.einsum("wka,nk->wna", q, basis), atol=1e-6 * n)
+    np.testing.assert_allclose(s[:, inside], six, atol=1e-5 * np.abs(six).max())
+    for array in (x, s):
+        assert (array[:, :before] == -7.0).all() and (array[:, before + count :] == -7.0).all()
+    for world in range(worlds):
+        for many, single in zip((x, s), moved(q[world : world + 1]), strict=True):
+            np.testing.assert_array_equal(many[world], single[0])

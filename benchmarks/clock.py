@@ -1,0 +1,42 @@
+"""Medians of the time that something takes on a device."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+
+class Clock:
+    """Times work on one device.
+
+    On CPU it reads the processor time of this process, which other processes do not disturb much.
+    """
+
+    def __init__(self, device: Any, repeats: int) -> None:
+        """Remember where and how often."""
+        self.device, self.repeats = wp.get_device(device), repeats
+
+    def median(self, run: Callable[[], Any]) -> float:
+        """Return the median time of a call, device included [ms]."""
+        now = time.perf_counter if self.device.is_cuda else time.process_time
+        times = []
+        for repeat in range(self.repeats + 2):
+            wp.synchronize_device(self.device)
+            start = now()
+            run()
+            wp.synchronize_device(self.device)
+            if repeat >= 2:
+                times.append(1e3 * (now() - start))
+        return float(np.median(times))
+
+    def replay(self, run: Callable[[], Any]) -> float:
+        """Return the median time of a captured call [ms]."""
+        run()
+        with wp.ScopedCapture(device=self.device) as capture:
+            run()
+        graph: Any = capture.graph
+        return self.median(lambda: wp.capture_launch(graph))
