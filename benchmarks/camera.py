@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from benchmarks.camera_scene import SceneCamera, blob, handle_scene, intrinsics, orbit
+from benchmarks.camera_scene import DILATION, SceneCamera, blob, handle_scene, intrinsics, orbit
 from benchmarks.clock import Clock
 from benchmarks.step import product_rate
 from softmode.splats.rasterizer_kernels import TILE
@@ -85,6 +85,7 @@ def check(size: int, count: int, device: str) -> bool:
             size,
             size,
             antialiased=antialiased,
+            dilation=DILATION,
         )
         decided = expected.margin > UNDECIDED
         error = np.abs(camera.rasterizer.rgb.numpy()[world] - expected.rgb)[decided].max()

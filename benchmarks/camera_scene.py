@@ -19,6 +19,8 @@ from softmode.splats.splats import SH_DC, Splats, quats_from_rotations
 
 FIELD_OF_VIEW = 0.8
 """Vertical field of view [rad]."""
+DILATION = 0.3
+"""Variance of the pixel filter [px^2]: gsplat's, and more work than softmode's own 0.1."""
 HANDLE_COUNT = 16
 HANDLE_VARIANCE = 0.09
 """Variance of the handles' Gaussian kernels [m^2]."""
@@ -158,7 +160,12 @@ class SceneCamera:
             background=wp.zeros(1, dtype=wp.vec3, device=self.device),
         )
         self.rasterizer = SplatRasterizer(
-            count, worlds, size, size, options=RasterizerOptions(antialiased=antialiased), device=self.device
+            count,
+            worlds,
+            size,
+            size,
+            options=RasterizerOptions(antialiased=antialiased, dilation=DILATION),
+            device=self.device,
         )
 
     def deform(self) -> None:

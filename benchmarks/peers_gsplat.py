@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.camera_scene import HandleScene, intrinsics, orbit
+from benchmarks.camera_scene import DILATION, HandleScene, intrinsics, orbit
 from softmode.splats.splats import SH_DC, rotations_from_quats
 
-NEAR, DILATION = 0.01, 0.3
+NEAR = 0.01
 TILES = (16, 8)
 """Tiles of the low-level calls that are tried [px]; the public interface keeps its default, 16."""
 
