@@ -150,7 +150,9 @@ def report_threads(options: argparse.Namespace) -> None:
             raster = camera.rasterizer
             walls, pictures = [], []
             for threads in (1, None):
-                threaded = ThreadedRasterizer(raster.splat_count, worlds, size, size, threads=threads)
+                threaded = ThreadedRasterizer(
+                    raster.splat_count, worlds, size, size, options=raster.options, threads=threads
+                )
                 replay = threaded.capture(camera.splats, camera.views)
                 walls.append(least_wall(replay, options.repeats))
                 pictures.append(threaded.rgb.numpy())
