@@ -152,6 +152,4 @@ class ViewVariation:
             ],
             device=self.device,
         )  # fmt: skip
-        wp.launch(
-            kernels.count_draw, dim=self.world_count, inputs=[mask], outputs=[self._episode], device=self.device
-        )
+        wp.launch(kernels.count_draw, dim=self.world_count, inputs=[mask], outputs=[self._episode], device=self.device)

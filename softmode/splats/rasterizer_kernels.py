@@ -62,6 +62,7 @@ def project(
     world_to_camera: wp.array[wp.mat44],  # (view_count,)
     intrinsics: wp.array[wp.vec4],  # (view_count,) [px]
     view_world: wp.array[int],  # (view_count,)
+    splat_gain: wp.array[wp.vec4],  # (1|view_count,) factor on colour and opacity
     # Options:
     size: wp.vec2i,
     near: float,
@@ -110,7 +111,8 @@ def project(
     a = wp.dot(j0, s0)
     b = wp.dot(j1, s0)
     c = wp.dot(j1, sigma * j1)
-    o = opacity[row_of(world, opacity.shape[0]), i]
+    gain = splat_gain[row_of(view, splat_gain.shape[0])]
+    o = wp.min(gain[3] * opacity[row_of(world, opacity.shape[0]), i], 1.0)
     sharp = wp.max(a * c - b * b, 0.0)
     a += dilation
     c += dilation
@@ -143,7 +145,7 @@ def project(
         turn = rotation[row_of(world, rotation.shape[0]), i]
         direction = wp.quat_rotate_inv(turn, wp.normalize(x - eye))
     rgb = sh_color(sh, row_of(world, sh.shape[0]), i, direction)
-    color_out[k] = wp.vec4(rgb[0], rgb[1], rgb[2], 0.0)
+    color_out[k] = wp.vec4(gain[0] * rgb[0], gain[1] * rgb[1], gain[2] * rgb[2], 0.0)
 
 
 @wp.kernel
