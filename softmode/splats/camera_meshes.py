@@ -83,7 +83,7 @@ class MeshImages:
         )
         # The first sample of a bundle sits in the middle: the sensor shades there.
         spread = [(0.5, 0.5)] if light.samples == 1 else [(0.5, 0.5), (0.17, 0.33), (0.67, 0.17), (0.83, 0.72)]
-        self._rays = [
+        self._rays: list[Any] = [
             wp.array(_rays(camera, np.asarray(spread), lens_per_world), dtype=wp.vec3, device=device)
             for camera in cameras
         ]

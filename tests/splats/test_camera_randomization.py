@@ -188,7 +188,7 @@ def test_gain_scales_colour_and_opacity_of_splats() -> None:
     """A view's gain draws the picture of splats whose opacities and colours were scaled, opacities up to one."""
     plush = make_plush(400)
     worlds = arrays(plush, 2)
-    gain = np.float32([[1.2, 0.5, 1.0, 0.5], [1.0, 1.0, 0.25, 1.5]])
+    gain = np.array([[1.2, 0.5, 1.0, 0.5], [1.0, 1.0, 0.25, 1.5]], dtype=np.float32)
     pose = np.eye(4, dtype=np.float32)
     pose[2, 3] = 0.5
     views = ViewArrays(
