@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import math
+from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -12,6 +13,8 @@ from softmode.errors import ConfigError
 from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.splats import rotations_from_quats
 from tests.splats.camera_scene import camera
+
+mujoco: Any = importlib.import_module("mujoco")
 
 
 def test_look_at_is_an_opencv_frame() -> None:
