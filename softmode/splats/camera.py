@@ -230,6 +230,13 @@ class SplatCamera:
         """
         return self._part(self.variation.intrinsics, name)
 
+    def extrinsics(self, name: str) -> wp.array:
+        """Return the world-to-camera matrices of the last frame, draws included, mat44, shape (world_count,); no copy.
+
+        A pixel (u, v) of depth z shows the point R^T (K^-1 (u, v, 1) z - t), K from `intrinsics`.
+        """
+        return self._part(self.views.world_to_camera, name)
+
     def _part(self, array: wp.array, name: str) -> wp.array:
         """Return the views of one camera."""
         names = [camera.name for camera in self.cameras]
