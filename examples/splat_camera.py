@@ -40,6 +40,7 @@ class Scene:
     def __init__(self, worlds: int) -> None:
         """Build model and solver, let everything fall, and draw a view per world."""
         soft, figure = load_object(ObjectConfig()), make_plush(2000, height=0.07)
+        figure = figure.transformed(translation=-figure.bounds().mean(axis=0))
         figure = replace(figure, sh=figure.sh[:, :, ::-1])  # red and blue swapped
         world, half = newton.ModelBuilder(), 0.5 * np.ptp(figure.bounds(), axis=0)
         SolverMuJoCo.register_custom_attributes(world)
@@ -58,19 +59,16 @@ class Scene:
         for _ in range(60):
             solver.step(self.state, after, control, None, DT)
             solver.step(after, self.state, control, None, DT)
-        part = RigidSplats(
-            splats=figure.transformed(translation=-figure.bounds().mean(axis=0)), body="toy", hide_meshes=True
-        )
+        part = RigidSplats(splats=figure, body="toy", hide_meshes=True)
         self.toy, rest = RigidSplatsSkin(model, [part]), soft.splats
         self.plush = SkinSplats(rest.means, rest.covariances(), soft.basis, soft.grad_basis)
         self.splats = splats = SplatArrays.from_splats([rest, *self.toy.objects], world_count=worlds)
         look, up = PinholeCamera.look_at, (1.0, 0.0, 0.0)
         fixed = look("fixed", position=(0.85, -0.25, 0.25), target=(0.46, 0.015, 0.03), fov_y=0.48)
         wrist = look("wrist", body="link7", position=(0.1, 0.0, 0.03), target=(0.02, 0.0, 0.3), up=up, fov_y=1.0)
-        both, median = [fixed, wrist], RasterizerOptions(median_depth=True)
-        options = CameraOptions(segmentation=True, mesh_samples=4)
+        options, median = CameraOptions(segmentation=True, mesh_samples=4), RasterizerOptions(median_depth=True)
+        both = fixed, wrist
         self.camera = SplatCamera(model, splats, both, options=options, rasterizer_options=median, randomization=DRAWN)
-
         q, start = self.state.softmode.q, model.softmode.function_start
         self.plush.launch(q, start, splats.means, splats.covariances, rotations=splats.rotations)
         self.toy.launch(self.state, splats)
