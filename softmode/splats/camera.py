@@ -7,7 +7,7 @@ Cameras are pinholes with the OpenCV frame, see `softmode.splats.pinhole`.
 import fnmatch
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import newton
 import numpy as np
@@ -207,8 +207,8 @@ class SplatCamera:
         Raises:
             ConfigError: If no camera has that name, or that output is not written.
         """
-        array = getattr(self, output, None)
-        if not isinstance(array, wp.array):
+        array = getattr(self, output) if output in get_args(Output) else None
+        if array is None:
             raise ConfigError(
                 f"the camera does not write {output!r}",
                 hint="Turn it on: CameraOptions.segmentation, RasterizerOptions.object_ids or .median_depth; "

@@ -15,7 +15,7 @@ SIZE = 64
 PLAIN = CameraOptions(shadows=False, splat_shadow=None)
 
 
-def scene(worlds: int = 1) -> newton.Model:
+def scene(worlds: int = 1, device: str = "cpu") -> newton.Model:
     """Return a table with its top at z = 0, a red box standing on it, and a hand above, in each world."""
     world = newton.ModelBuilder()
     pose = wp.transform
@@ -26,7 +26,7 @@ def scene(worlds: int = 1) -> newton.Model:
     world.add_shape_box(hand, xform=pose(wp.vec3(0.0, 0.0, 0.1), wp.quat_identity()), hx=0.02, hy=0.02, hz=0.02)
     builder = newton.ModelBuilder()
     builder.replicate(world, worlds)
-    return builder.finalize(device="cpu")
+    return builder.finalize(device=device)
 
 
 def camera(name: str = "front", **kwargs) -> PinholeCamera:

@@ -189,3 +189,20 @@ def test_shapes_of_all_worlds_and_of_one_are_told_apart() -> None:
     np.testing.assert_array_equal(image[0], image[1])
     left, right = (np.argwhere(image[0] == i)[:, 1].mean() for i in (1, 2))
     assert left < right and (image[0] == 0).any()
+
+
+def test_nothing_shows_the_sky() -> None:
+    """Where neither splat nor mesh is, colour is horizon + (zenith - horizon) clamp(2 sin elevation) of its ray."""
+    options = dataclasses.replace(PLAIN, sky=((0.9, 0.5, 0.1), (0.1, 0.3, 0.8)))
+    view = camera(target=(0.0, 0.1, 0.45), width=80, height=50, fov_y=1.2)
+    sensor = SplatCamera(scene(2), in_worlds([blob(0.2, 0.0, 0.3, 0.9)] * 2), [view], options=options)
+    sensor.render(sensor.model.state())
+    columns, rows = np.meshgrid(np.arange(80) + 0.5, np.arange(50) + 0.5)
+    rays = np.stack([(columns - view.cx) / view.fx, (rows - view.cy) / view.fy, np.ones_like(rows)], axis=-1)
+    sine = (rays @ rotations_from_quats([view.quat])[0][2]) / np.linalg.norm(rays, axis=-1)
+    horizon, zenith = np.array(options.sky)
+    sky = horizon + np.clip(2.0 * sine, 0.0, 1.0)[..., None] * (zenith - horizon)
+    empty = (sensor.depth.numpy() == 0.0) & (sensor.images("front", "alpha").numpy() == 0.0)
+    assert empty[0].mean() > 0.3 and (sine[empty[0]] > 0.3).any() and (sine[empty[0]] < 0.0).any()
+    for world in range(2):
+        assert np.abs(sensor.rgb.numpy()[world][empty[world]] - 255.0 * sky[empty[world]]).max() <= 0.51
