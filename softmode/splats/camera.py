@@ -1,116 +1,32 @@
 """`SplatCamera`: deforming splats and the meshes of a Newton model in one picture, for all worlds at once.
 
 Meshes (robot, table) come from Newton's `SensorCamera`, splats from `SplatRasterizer`; the two meet by forward depth.
-Cameras are pinholes with the OpenCV frame: x right, y down, z forward, pixel (0, 0) at the top left with its centre
-at (0.5, 0.5).
+Cameras are pinholes with the OpenCV frame, see `softmode.splats.pinhole`.
 """
 
-import math
+import fnmatch
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, get_args
 
 import newton
 import numpy as np
 import warp as wp
-from newton.sensors import SensorCamera
 
 from softmode.errors import ConfigError
 from softmode.splats import camera_kernels as kernels
+from softmode.splats.camera_labels import segmentation_table
+from softmode.splats.camera_meshes import MeshImages, MeshLight
+from softmode.splats.camera_randomization import CameraRandomization, ViewVariation
+from softmode.splats.pinhole import PinholeCamera, Vector
 from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
+from softmode.splats.rigid_splats import world_bodies
 from softmode.splats.shadow import ShadowOptions, SplatShadow
-from softmode.splats.splats import quat_from_rotation
 
-Vector = tuple[float, float, float]
+__all__ = ["CameraOptions", "CameraRandomization", "Output", "PinholeCamera", "SplatCamera"]
 
-
-@dataclass(frozen=True, kw_only=True)
-class PinholeCamera:
-    """One camera of every world; build it with `PinholeCamera.look_at`, or from a calibrated pose and intrinsics."""
-
-    name: str
-    """Unique name; key of the images."""
-    width: int
-    """Image width [px]."""
-    height: int
-    """Image height [px]."""
-    fx: float
-    """Horizontal focal length [px]."""
-    fy: float
-    """Vertical focal length [px]."""
-    cx: float
-    """Horizontal position of the optical axis [px]."""
-    cy: float
-    """Vertical position of the optical axis [px]."""
-    position: Vector
-    """Optical centre in the frame of `body`, or in the world [m]."""
-    quat: tuple[float, float, float, float]
-    """Rotation xyzw from the camera frame (OpenCV) to the frame of `body`, or to the world."""
-    body: str | None = None
-    """Label of the body that carries the camera (all of it or its last part); None for one fixed in the world."""
-
-    def __post_init__(self) -> None:
-        """Validate the numbers."""
-        numbers = (self.fx, self.fy, self.cx, self.cy, *self.position, *self.quat)
-        if not all(math.isfinite(x) for x in numbers) or self.fx <= 0.0 or self.fy <= 0.0:
-            raise ConfigError(f"camera {self.name!r}: intrinsics and pose must be finite, focal lengths positive")
-        if not (0 < self.width <= 2000 and 0 < self.height <= 2000):
-            raise ConfigError(f"camera {self.name!r}: {self.width} x {self.height} px, expected 1 to 2000 on each side")
-        if abs(sum(x * x for x in self.quat) - 1.0) > 1e-3:
-            raise ConfigError(f"camera {self.name!r}: quat {self.quat} is not of unit length")
-
-    @classmethod
-    def look_at(
-        cls,
-        name: str,
-        *,
-        position: Vector,
-        target: Vector,
-        up: Vector = (0.0, 0.0, 1.0),
-        width: int = 128,
-        height: int = 128,
-        fov_y: float = 0.8,
-        body: str | None = None,
-    ) -> "PinholeCamera":
-        """Return a camera at `position` that looks at `target`.
-
-        Args:
-            name: Unique name.
-            position: Optical centre in the frame of `body` or the world [m].
-            target: Point in the middle of the picture, in the same frame [m].
-            up: Direction that points up in the picture; not parallel to the line of sight.
-            width: Image width [px].
-            height: Image height [px].
-            fov_y: Vertical field of view [rad], in (0, pi).
-            body: Label of the body that carries the camera, or None.
-
-        Raises:
-            ConfigError: If the field of view is out of range or the directions are degenerate.
-        """
-        if not 0.0 < fov_y < math.pi:
-            raise ConfigError(f"camera {name!r}: fov_y must be in (0, pi) rad, got {fov_y}")
-        forward = np.subtract(target, position).astype(np.float64)
-        right = np.cross(forward, up)
-        if np.linalg.norm(forward) < 1e-9 or np.linalg.norm(right) < 1e-9 * np.linalg.norm(forward):
-            raise ConfigError(
-                f"camera {name!r}: position, target and up do not define a view", hint="Move target or up"
-            )
-        forward /= np.linalg.norm(forward)
-        right /= np.linalg.norm(right)
-        x, y, z, w = map(float, quat_from_rotation(np.stack([right, np.cross(forward, right), forward], axis=1)))
-        focal = 0.5 * height / math.tan(0.5 * fov_y)
-        return cls(
-            name=name,
-            width=width,
-            height=height,
-            fx=focal,
-            fy=focal,
-            cx=0.5 * width,
-            cy=0.5 * height,
-            position=(float(position[0]), float(position[1]), float(position[2])),
-            quat=(x, y, z, w),
-            body=body,
-        )
+Output = Literal["rgb", "depth", "median_depth", "alpha", "object_id", "segmentation"]
+"""What a camera writes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,20 +47,25 @@ class CameraOptions:
     """Shadow that the splats cast on the meshes; None for none."""
     mesh_samples: int = 1
     """Rays per pixel for the meshes: 1, or 4 for smooth edges at about twice the cost."""
+    segmentation: bool = False
+    """Write which object or shape is seen."""
+    lens_per_world: bool = False
+    """Meshes follow intrinsics that differ between worlds (`SplatCamera.intrinsics`); a randomised lens implies it."""
 
 
 class SplatCamera:
     """Renders cameras of one image size in all worlds of a Newton model, with deforming splats.
 
     Views are ordered by camera, then by world: view = camera * world_count + world. `render` only launches work, so
-    it can be captured in a graph on CPU and CUDA (after one frame that compiles the kernels). Outputs, overwritten by
-    every frame:
+    it can be captured in a graph on CPU and CUDA (after one frame that compiles the kernels), as can `randomize` and
+    `look_at`. Outputs, overwritten by every frame; `images(name, output)` is one camera's part of each:
 
-    - `rgb`: uint8, shape (view_count, height, width, 3), sRGB; `images(name)` is one camera's part of it.
-    - `depth`: forward depth of splats and meshes [m], 0 for the sky, shape (view_count, height, width).
+    - `rgb`: uint8, shape (view_count, height, width, 3), sRGB.
+    - `depth`: expected forward depth of splats and meshes [m], 0 for the sky, shape (view_count, height, width).
+    - `median_depth`: see `SplatRasterizer` (only with `RasterizerOptions.median_depth`).
     - `alpha`: coverage by splats, same shape.
     - `object_id`: splat object per pixel, -1 where none (only with `RasterizerOptions.object_ids`).
-    - `median_depth`: see `SplatRasterizer` (only with `RasterizerOptions.median_depth`).
+    - `segmentation`: int32, same shape: -1 sky, else an index of `labels` (only with `CameraOptions.segmentation`).
 
     Args:
         model: The model whose visible shapes are drawn.
@@ -152,6 +73,7 @@ class SplatCamera:
         cameras: Descriptions, all of one width and height, with unique names.
         options: Light and background.
         rasterizer_options: How the splats are drawn.
+        randomization: What `randomize` draws; nothing is drawn before its first call.
 
     Raises:
         ConfigError: If the cameras disagree in size, share a name, or name a body that some world lacks.
@@ -165,12 +87,13 @@ class SplatCamera:
         *,
         options: CameraOptions | None = None,
         rasterizer_options: RasterizerOptions | None = None,
+        randomization: CameraRandomization | None = None,
     ) -> None:
         """Allocate images and build the mesh sensor."""
         self.model, self.splats, self.cameras = model, splats, tuple(cameras)
         self.options = options if options is not None else CameraOptions()
         self.device: Any = model.device
-        self.world_count = max(int(model.world_count), 1)
+        self.world_count = worlds = max(int(model.world_count), 1)
         sizes = {(camera.width, camera.height) for camera in self.cameras}
         if len(sizes) != 1 or len({camera.name for camera in self.cameras}) != len(self.cameras):
             raise ConfigError(
@@ -180,74 +103,82 @@ class SplatCamera:
         if self.options.mesh_samples not in (1, 4):
             raise ConfigError(f"mesh_samples must be 1 or 4, got {self.options.mesh_samples}")
         (self.width, self.height) = sizes.pop()
-        worlds = self.world_count
         self.view_count = views = len(self.cameras) * worlds
 
+        self.variation = ViewVariation(
+            [(camera.fx, camera.fy, camera.cx, camera.cy) for camera in self.cameras],
+            self.options.sky,
+            worlds,
+            randomization if randomization is not None else CameraRandomization(),
+            device=self.device,
+        )
+        """What `randomize` draws, as arrays that may be overwritten."""
         poses = np.repeat([(*camera.position, *camera.quat) for camera in self.cameras], worlds, axis=0)
-        lenses = np.repeat([(camera.fx, camera.fy, camera.cx, camera.cy) for camera in self.cameras], worlds, axis=0)
         bodies = np.concatenate([_carriers(model, camera) for camera in self.cameras])
-        self.poses = wp.array(poses.astype(np.float32), dtype=wp.transform, device=self.device)
-        """Pose of every view's camera in its body or the world, transform, shape (view_count,); may be overwritten."""
+        self._poses = wp.array(poses.astype(np.float32), dtype=wp.transform, device=self.device)
         self._body = wp.array(bodies, dtype=wp.int32, device=self.device)
         self.views = ViewArrays(
             world_to_camera=wp.zeros(views, dtype=wp.mat44, device=self.device),
-            intrinsics=wp.array(lenses.astype(np.float32), dtype=wp.vec4, device=self.device),
+            intrinsics=self.variation.intrinsics,
             world=wp.array(np.tile(np.arange(worlds), len(self.cameras)), dtype=wp.int32, device=self.device),
             background=wp.array([self.options.sky[0]], dtype=wp.vec3, device=self.device),
+            splat_gain=self.variation.splat_gain,
         )
         self._sensor_pose = wp.zeros(views, dtype=wp.transform, device=self.device)
-        self._init_meshes()
+        self._meshes = self._make_meshes()
         shape = (views, self.height, self.width)
         self._mesh_rgb = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         self.rgb = wp.zeros((*shape, 3), dtype=wp.uint8, device=self.device)
         self.rasterizer: SplatRasterizer | None = None
         self._shadow: SplatShadow | None = None
         if splats is not None:
+            drawn = rasterizer_options if rasterizer_options is not None else RasterizerOptions()
+            if self.options.segmentation:
+                drawn = replace(drawn, object_ids=True)
             self.rasterizer = SplatRasterizer(
-                splats.means.shape[1], views, self.width, self.height, options=rasterizer_options, device=self.device
+                splats.means.shape[1], views, self.width, self.height, options=drawn, device=self.device
             )
             if self.options.splat_shadow is not None:
                 self._shadow = SplatShadow(
-                    splats, worlds, self.options.light_direction, options=self.options.splat_shadow, device=self.device
+                    worlds, self.options.light_direction, options=self.options.splat_shadow, device=self.device
                 )
+        self._init_segmentation()
 
-    def _init_meshes(self) -> None:
-        """Build Newton's sensor; the rays follow each camera's intrinsics, with OpenGL axes."""
-        options, samples = self.options, self.options.mesh_samples
-        shape = (self.view_count, self.height, self.width)
-        self._mesh_packed = wp.zeros(shape, dtype=wp.uint32, device=self.device)
-        self._mesh_depth = wp.zeros(shape, dtype=wp.float32, device=self.device)
-        self._sensor: SensorCamera | None = None
-        if self.model.shape_count == 0 or self.model.bvh_shapes is None:
-            return
-        sensor = SensorCamera(self.model, load_textures=False)
-        x, y, z = np.asarray(options.light_direction) / np.linalg.norm(options.light_direction)
-        sensor.create_default_light(
-            enable_shadows=options.shadows, direction=wp.vec3f(x, y, z), color=options.light_color
+    def _make_meshes(self) -> MeshImages:
+        """Build the sensor of the meshes."""
+        options = self.options
+        light = MeshLight(
+            direction=options.light_direction,
+            color=options.light_color,
+            ambient=options.ambient,
+            shadows=options.shadows,
+            samples=options.mesh_samples,
         )
-        sensor.set_ambient_light(*options.ambient)
-        self._sensor = sensor
-        self._render_config = SensorCamera.RenderConfig(
-            enable_particles=False,
-            enable_shadows=options.shadows,
-            anti_aliasing=SensorCamera.AntiAliasing.NONE if samples == 1 else SensorCamera.AntiAliasing.MSAA,
+        return MeshImages(
+            self.model,
+            self.cameras,
+            light,
+            lens_per_world=options.lens_per_world or self.variation.randomization.changes_lens,
+            shape_index=options.segmentation,
         )
-        # The first sample of a bundle sits in the middle: the sensor shades there.
-        spread = [(0.5, 0.5)] if samples == 1 else [(0.5, 0.5), (0.17, 0.33), (0.67, 0.17), (0.83, 0.72)]
-        offset = np.asarray(spread)
-        self._rays = []
-        for camera in self.cameras:
-            columns = (np.arange(self.width)[None, :, None] + offset[:, 0] - camera.cx) / camera.fx
-            rows = (np.arange(self.height)[:, None, None] + offset[:, 1] - camera.cy) / camera.fy
-            rays = np.zeros((self.height, self.width, samples, 2, 3))
-            rays[..., 1, 0], rays[..., 1, 1], rays[..., 1, 2] = columns, -rows, -1.0
-            rays[..., 1, :] /= np.linalg.norm(rays[..., 1, :], axis=-1, keepdims=True)
-            self._rays.append(wp.array(rays.astype(np.float32), dtype=wp.vec3, device=self.device))
+
+    def _init_segmentation(self) -> None:
+        """Name all ids and allocate their image."""
+        count = 0 if self.splats is None else int(self.splats.object_index.numpy().max()) + 1
+        table, self.labels = segmentation_table(self.model, tuple(f"splats/{i}" for i in range(count)))
+        """Label of each id of `segmentation`: splat objects, "splats/0" and on, then shapes, "body/shape"."""
+        self._segmentation: wp.array | None = None
+        if self.options.segmentation:
+            self._shape_segment = wp.array(table, dtype=wp.int32, device=self.device)
+            shape = (self.view_count, self.height, self.width)
+            self._segmentation = wp.full(shape, value=-1, dtype=wp.int32, device=self.device)
+            self._no_image = wp.zeros((1, 1, 1), dtype=wp.float32, device=self.device)
+            self._no_ids = wp.zeros((1, 1, 1), dtype=wp.int32, device=self.device)
 
     @property
     def depth(self) -> wp.array:
         """Forward depth of what is seen [m], 0 for the sky, shape (view_count, height, width)."""
-        return self._mesh_depth if self.rasterizer is None else self.rasterizer.depth
+        return self._meshes.depth if self.rasterizer is None else self.rasterizer.depth
 
     @property
     def alpha(self) -> wp.array | None:
@@ -256,26 +187,98 @@ class SplatCamera:
 
     @property
     def object_id(self) -> wp.array | None:
-        """Splat object per pixel, shape (view_count, height, width); None without splats."""
-        return None if self.rasterizer is None else self.rasterizer.object_id
+        """Splat object per pixel, shape (view_count, height, width); None if not written."""
+        return None if self.rasterizer is None or not self.rasterizer.options.object_ids else self.rasterizer.object_id
 
     @property
     def median_depth(self) -> wp.array | None:
-        """Median forward depth [m], shape (view_count, height, width); None without splats."""
-        return None if self.rasterizer is None else self.rasterizer.median_depth
+        """Median forward depth [m], shape (view_count, height, width); None if not written."""
+        written = self.rasterizer is not None and self.rasterizer.options.median_depth
+        return self.rasterizer.median_depth if written and self.rasterizer is not None else None
 
-    def images(self, name: str) -> wp.array:
-        """Return the camera's part of `rgb`: uint8, shape (world_count, height, width, 3), no copy.
+    @property
+    def segmentation(self) -> wp.array | None:
+        """Index into `labels` per pixel, -1 for the sky, shape (view_count, height, width); None if not written."""
+        return self._segmentation
+
+    def images(self, name: str, output: Output = "rgb") -> wp.array:
+        """Return one camera's part of an output, shape (world_count, height, width) and 3 for `rgb`; no copy.
 
         Raises:
-            ConfigError: If no camera has that name.
+            ConfigError: If no camera has that name, or that output is not written.
         """
+        array = getattr(self, output) if output in get_args(Output) else None
+        if array is None:
+            raise ConfigError(
+                f"the camera does not write {output!r}",
+                hint="Turn it on: CameraOptions.segmentation, RasterizerOptions.object_ids or .median_depth; "
+                "alpha needs splats",
+            )
+        return self._part(array, name)
+
+    def poses(self, name: str) -> wp.array:
+        """Return the pose of a camera in its body or the world, OpenCV axes, transform, shape (world_count,); no copy.
+
+        Write to it, from a kernel of your own or by `assign`, to move the camera in each world.
+        """
+        return self._part(self._poses, name)
+
+    def intrinsics(self, name: str) -> wp.array:
+        """Return fx, fy, cx, cy [px] of a camera, vec4, shape (world_count,); no copy.
+
+        Write to it for lenses of your own; meshes follow with `CameraOptions.lens_per_world` only.
+        """
+        return self._part(self.variation.intrinsics, name)
+
+    def extrinsics(self, name: str) -> wp.array:
+        """Return the world-to-camera matrices of the last frame, draws included, mat44, shape (world_count,); no copy.
+
+        A pixel (u, v) of depth z shows the point R^T (K^-1 (u, v, 1) z - t), K from `intrinsics`.
+        """
+        return self._part(self.views.world_to_camera, name)
+
+    def _part(self, array: wp.array, name: str) -> wp.array:
+        """Return the views of one camera."""
         names = [camera.name for camera in self.cameras]
         if name not in names:
             raise ConfigError(f"no camera {name!r}, there are {names}")
         first = names.index(name) * self.world_count
-        part: Any = self.rgb[first : first + self.world_count]
+        part: Any = array[first : first + self.world_count]
         return part
+
+    def look_at(self, name: str, position: wp.array, target: wp.array, up: Vector = (0.0, 0.0, 1.0)) -> None:
+        """Place a camera in every world; capturable. One that would look along `up` keeps its pose.
+
+        Args:
+            name: The camera.
+            position: Optical centre in the frame of the camera's body, or the world [m], vec3, shape (1 or
+                world_count,).
+            target: Point in the middle of the picture, in the same frame [m], same shapes.
+            up: Direction that points up in the picture.
+        """
+        wp.launch(
+            kernels.look_at,
+            dim=self.world_count,
+            inputs=[position, target, wp.vec3(*up)],
+            outputs=[self.poses(name)],
+            device=self.device,
+        )
+
+    def segmentation_ids(self, pattern: str) -> tuple[int, ...]:
+        """Return the ids of `segmentation` whose label matches a shell pattern such as "*/finger_left/*"."""
+        return tuple(i for i, label in enumerate(self.labels) if fnmatch.fnmatchcase(label, pattern))
+
+    def seed(self, seeds: Any) -> None:
+        """Set the seeds of `randomize` and count its draws from zero, see `ViewVariation.seed`."""
+        self.variation.seed(seeds)
+
+    def randomize(self, world_mask: wp.array | None = None) -> None:
+        """Draw new views for the masked worlds, the others keep theirs; capturable.
+
+        Args:
+            world_mask: Which worlds, bool, shape (world_count,); all if None.
+        """
+        self.variation.draw(world_mask)
 
     def render(self, state: newton.State) -> None:
         """Draw one frame of every camera in every world; capturable.
@@ -285,68 +288,52 @@ class SplatCamera:
         Args:
             state: Where the bodies are.
         """
-        options = self.options
-        size = (self.view_count, self.height, self.width)
+        size, meshes, variation = (self.view_count, self.height, self.width), self._meshes, self.variation
         wp.launch(
             kernels.place_cameras,
             dim=self.view_count,
-            inputs=[self.poses, self._body, state.body_q],
+            inputs=[self._poses, variation.offset, self._body, state.body_q],
             outputs=[self.views.world_to_camera, self._sensor_pose],
             device=self.device,
         )
-        if self._sensor is not None:
-            self._render_meshes(state, self._sensor)
+        meshes.render(state, self._sensor_pose, self.views.intrinsics)
         wp.launch(
             kernels.unpack_meshes,
             dim=size,
             inputs=[
-                self._mesh_packed, self._mesh_depth, self._sensor_pose, self.views.intrinsics,
-                wp.vec3(*options.sky[0]), wp.vec3(*options.sky[1]), self._sensor is not None,
+                meshes.packed, meshes.depth, meshes.active, meshes.lens_per_world,
+                self.views.world, self._sensor_pose, self.views.intrinsics,
+                variation.horizon, variation.zenith, variation.light_gain,
             ],
-            outputs=[self._mesh_rgb],
+            outputs=[self._mesh_rgb, meshes.depth],
             device=self.device,
         )  # fmt: skip
         rgb = self._mesh_rgb
         if self.rasterizer is not None and self.splats is not None:
             if self._shadow is not None:
-                self._shadow.cast(self.splats, self.views, self._sensor_pose, self._mesh_depth, self._mesh_rgb)
-            self.rasterizer.render(self.splats, self.views, mesh_rgb=self._mesh_rgb, mesh_depth=self._mesh_depth)
+                self._shadow.cast(self.splats, self.views, self._sensor_pose, meshes.depth, self._mesh_rgb)
+            self.rasterizer.render(self.splats, self.views, mesh_rgb=self._mesh_rgb, mesh_depth=meshes.depth)
             rgb = self.rasterizer.rgb
         wp.launch(kernels.pack_bytes, dim=size, inputs=[rgb], outputs=[self.rgb], device=self.device)
-
-    def _render_meshes(self, state: newton.State, sensor: SensorCamera) -> None:
-        """Draw the visible shapes of all views."""
-        self.model.bvh_refit_shapes(state)
-        for index, rays in enumerate(self._rays):
-            part = slice(index * self.world_count, (index + 1) * self.world_count)
-            pose: Any = self._sensor_pose[part]
-            color: Any = self._mesh_packed[part]
-            depth: Any = self._mesh_depth[part]
-            sensor.update(
-                state,
-                pose,
-                rays,
-                color_image=color,
-                forward_depth_image=depth,
-                render_config=self._render_config,
+        if self._segmentation is not None:
+            drawn = self.rasterizer
+            wp.launch(
+                kernels.segment,
+                dim=size,
+                inputs=[
+                    drawn is not None,
+                    self._no_image if drawn is None else drawn.alpha,
+                    self._no_ids if drawn is None else drawn.object_id,
+                    meshes.shape_index,
+                    self._shape_segment,
+                ],
+                outputs=[self._segmentation],
+                device=self.device,
             )
 
 
 def _carriers(model: newton.Model, camera: PinholeCamera) -> np.ndarray:
     """Return the body that carries the camera in every world, -1 for none, shape (world_count,)."""
-    worlds = max(int(model.world_count), 1)
     if camera.body is None:
-        return np.full(worlds, -1, dtype=np.int32)
-    named = [
-        index
-        for index, label in enumerate(model.body_label)
-        if camera.body in (label, label.rsplit("/", maxsplit=1)[-1])
-    ]
-    body_world: Any = model.body_world
-    world = body_world.numpy()[named] if named else np.zeros(0, dtype=np.int32)
-    if len(named) == worlds == 1 or np.array_equal(world, np.arange(worlds)):
-        return np.asarray(named, dtype=np.int32)
-    raise ConfigError(
-        f"camera {camera.name!r}: {len(named)} bodies are called {camera.body!r}, expected one in each of {worlds}",
-        hint=f"Known bodies: {', '.join(sorted({label for label in model.body_label})[:12])}",
-    )
+        return np.full(max(int(model.world_count), 1), -1, dtype=np.int32)
+    return world_bodies(model, camera.body, f"camera {camera.name!r}")

@@ -1,4 +1,4 @@
-"""Device code of `camera` and `shadow`: camera poses, sky, shadow map and byte images."""
+"""Device code of `camera`: poses, rays, sky, segmentation and byte images."""
 
 import warp as wp
 
@@ -9,6 +9,7 @@ wp.set_module_options({"enable_backward": False})
 def place_cameras(
     # Cameras:
     pose: wp.array[wp.transform],  # (view_count,) camera (OpenCV) to body or world
+    offset: wp.array[wp.transform],  # (view_count,) drawn pose in the camera's frame
     body: wp.array[int],  # (view_count,) carrying body, -1 for none
     # State in:
     body_q: wp.array[wp.transform],
@@ -18,7 +19,7 @@ def place_cameras(
 ):
     """Find where every camera is."""
     view = wp.tid()
-    x = pose[view]
+    x = pose[view] * offset[view]
     if body[view] >= 0:
         x = body_q[body[view]] * x
     position = wp.transform_get_translation(x)
@@ -33,6 +34,46 @@ def place_cameras(
     )  # fmt: skip
     half_turn = wp.quat(1.0, 0.0, 0.0, 0.0)
     sensor_pose_out[view] = wp.transform(position, rotation * half_turn)
+
+
+@wp.kernel
+def look_at(
+    position: wp.array[wp.vec3],  # (1|world_count,) [m]
+    target: wp.array[wp.vec3],  # (1|world_count,) [m]
+    up: wp.vec3,
+    # Out:
+    pose_out: wp.array[wp.transform],  # (world_count,) camera (OpenCV) to the frame of the points
+):
+    """Aim cameras; one that looks along `up` keeps its pose."""
+    world = wp.tid()
+    p = position[world % position.shape[0]]
+    ahead = target[world % target.shape[0]] - p
+    right = wp.cross(ahead, up)
+    if not (wp.length(right) > 1.0e-6 * wp.length(ahead)):
+        return
+    z = wp.normalize(ahead)
+    x = wp.normalize(right)
+    pose_out[world] = wp.transform(p, wp.quat_from_matrix(wp.matrix_from_cols(x, wp.cross(z, x), z)))
+
+
+@wp.kernel
+def aim_pixels(
+    sensor_pose: wp.array[wp.transform],  # (world_count,) camera to world, OpenGL axes
+    intrinsics: wp.array[wp.vec4],  # (world_count,) [px]
+    # Out:
+    pose_out: wp.array3d[wp.transform],  # (world_count, height, width)
+):
+    """Turn the axis of the camera to each pixel by the shortest arc, q = (a x d, 1 + a.d) / norm with a = -z."""
+    world, row, column = wp.tid()
+    lens = intrinsics[world]
+    x = (float(column) + 0.5 - lens[2]) / lens[0]
+    y = (float(row) + 0.5 - lens[3]) / lens[1]
+    d = wp.normalize(wp.vec3(x, -y, -1.0))
+    turn = wp.normalize(wp.quat(d[1], -d[0], 0.0, 1.0 - d[2]))
+    pose = sensor_pose[world]
+    pose_out[world, row, column] = wp.transform(
+        wp.transform_get_translation(pose), wp.transform_get_rotation(pose) * turn
+    )
 
 
 @wp.func
@@ -53,39 +94,72 @@ def unpack_meshes(
     # Images in:
     packed: wp.array3d[wp.uint32],  # RGBA, sRGB
     mesh_depth: wp.array3d[float],  # [m], 0 where there is no mesh
+    has_meshes: bool,
+    depth_per_pixel: bool,  # mesh_depth is along the ray of each pixel; turned into depth along the axis
     # Views:
+    view_world: wp.array[int],
     sensor_pose: wp.array[wp.transform],
     intrinsics: wp.array[wp.vec4],
-    # Options:
-    horizon: wp.vec3,
-    zenith: wp.vec3,
-    has_meshes: bool,
+    # Worlds:
+    horizon: wp.array[wp.vec3],
+    zenith: wp.array[wp.vec3],
+    light_gain: wp.array[wp.vec3],
     # Out:
     rgb_out: wp.array3d[wp.vec3],
+    depth_out: wp.array3d[float],  # may be mesh_depth; written with depth_per_pixel only
 ):
     """Unpack the mesh colours and paint the sky behind them."""
     view, row, column = wp.tid()
+    world = view_world[view]
+    lens = intrinsics[view]
+    local = wp.vec3((float(column) + 0.5 - lens[2]) / lens[0], -(float(row) + 0.5 - lens[3]) / lens[1], -1.0)
     mesh = wp.vec3()
     covered = wp.float32(0.0)
-    if has_meshes and mesh_depth[view, row, column] > 0.0:
-        c = packed[view, row, column]
-        red = float(c & wp.uint32(255))
-        green = float((c >> wp.uint32(8)) & wp.uint32(255))
-        blue = float((c >> wp.uint32(16)) & wp.uint32(255))
-        mesh = wp.vec3(red, green, blue) / 255.0
-        covered = float(c >> wp.uint32(24)) / 255.0
-        if covered > 0.999:
-            rgb_out[view, row, column] = mesh
-            return
-    lens = intrinsics[view]
-    x = (float(column) + 0.5 - lens[2]) / lens[0]
-    y = (float(row) + 0.5 - lens[3]) / lens[1]
-    ray = wp.transform_vector(sensor_pose[view], wp.vec3(x, -y, -1.0))
-    sky = wp.lerp(horizon, zenith, wp.clamp(2.0 * ray[2] / wp.length(ray), 0.0, 1.0))
+    if has_meshes:
+        z = mesh_depth[view, row, column]
+        if z > 0.0:
+            if depth_per_pixel:
+                depth_out[view, row, column] = z / wp.length(local)
+            c = packed[view, row, column]
+            red = float(c & wp.uint32(255))
+            green = float((c >> wp.uint32(8)) & wp.uint32(255))
+            blue = float((c >> wp.uint32(16)) & wp.uint32(255))
+            mesh = wp.cw_mul(light_gain[world], wp.vec3(red, green, blue) / 255.0)
+            covered = float(c >> wp.uint32(24)) / 255.0
+            if covered > 0.999:
+                rgb_out[view, row, column] = mesh
+                return
+    ray = wp.transform_vector(sensor_pose[view], local)
+    sky = wp.lerp(horizon[world], zenith[world], wp.clamp(2.0 * ray[2] / wp.length(ray), 0.0, 1.0))
     if covered > 0.0:
         # A multisampled edge: the sensor averaged its hits over all samples in linear light.
         sky = to_srgb(to_linear(mesh) + (1.0 - covered) * to_linear(sky))
     rgb_out[view, row, column] = sky
+
+
+@wp.kernel
+def segment(
+    # Splats:
+    has_splats: bool,
+    alpha: wp.array3d[float],
+    object_id: wp.array3d[int],
+    # Meshes:
+    shape_index: wp.array3d[wp.uint32],  # (1, 1, 1) without meshes
+    shape_segment: wp.array[int],  # (shape_count,)
+    # Out:
+    segment_out: wp.array3d[int],
+):
+    """Name what a pixel mostly shows: a splat object where splats cover more than half of it, else the shape."""
+    view, row, column = wp.tid()
+    found = wp.int32(-1)
+    if view < shape_index.shape[0] and row < shape_index.shape[1] and column < shape_index.shape[2]:
+        shape = shape_index[view, row, column]
+        if shape < wp.uint32(shape_segment.shape[0]):
+            found = shape_segment[int(shape)]
+    if has_splats:
+        if alpha[view, row, column] > 0.5:
+            found = object_id[view, row, column]
+    segment_out[view, row, column] = found
 
 
 @wp.kernel
@@ -99,90 +173,3 @@ def pack_bytes(
     c = rgb[view, row, column]
     for channel in range(3):
         bytes_out[view, row, column, channel] = wp.uint8(wp.clamp(c[channel], 0.0, 1.0) * 255.0 + 0.5)
-
-
-@wp.kernel
-def center_map(
-    mean: wp.array2d[wp.vec3],  # (1|world_count, splat_count) [m]
-    stride: int,
-    # Out:
-    center_out: wp.array[wp.vec3],  # (world_count,) [m]
-):
-    """Average some of the splat centres."""
-    world = wp.tid()
-    total = wp.vec3()
-    number = wp.float32(0.0)
-    for i in range(0, mean.shape[1], stride):
-        total += mean[world % mean.shape[0], i]
-        number += 1.0
-    center_out[world] = total / number
-
-
-@wp.kernel
-def fill_map(
-    # Splats:
-    mean: wp.array2d[wp.vec3],  # (1|world_count, splat_count) [m]
-    opacity: wp.array2d[float],
-    # Map:
-    center: wp.array[wp.vec3],  # (world_count,) [m]
-    frame: wp.mat33,  # rows: two axes across the light, the light's direction
-    cell: float,  # [m]
-    # Out:
-    depth_out: wp.array3d[float],  # (world_count, cells, cells) nearest depth along the light [m]
-):
-    """Keep the nearest splat per cell; a minimum does not depend on the order of threads."""
-    world, i = wp.tid()
-    if opacity[world % opacity.shape[0], i] < 0.3:
-        return
-    p = frame * (mean[world % mean.shape[0], i] - center[world])
-    cells = depth_out.shape[1]
-    x = int(wp.floor(p[0] / cell)) + cells / 2
-    y = int(wp.floor(p[1] / cell)) + cells / 2
-    if x >= 0 and y >= 0 and x < cells and y < cells:
-        wp.atomic_min(depth_out, world, y, x, p[2])
-
-
-@wp.kernel
-def darken(
-    # Map:
-    center: wp.array[wp.vec3],  # (world_count,) [m]
-    frame: wp.mat33,
-    cell: float,  # [m]
-    map_depth: wp.array3d[float],  # (world_count, cells, cells) [m]
-    # Views:
-    view_world: wp.array[int],
-    intrinsics: wp.array[wp.vec4],
-    sensor_pose: wp.array[wp.transform],  # camera to world, OpenGL axes
-    mesh_depth: wp.array3d[float],  # (view_count, height, width) [m]
-    # Options:
-    strength: float,
-    softness: float,
-    # Out:
-    rgb_out: wp.array3d[wp.vec3],
-):
-    """Darken the mesh pixels that lie behind the splats as the light sees them."""
-    view, row, column = wp.tid()
-    z = mesh_depth[view, row, column]
-    if z <= 0.0:
-        return
-    lens = intrinsics[view]
-    local = wp.vec3((float(column) + 0.5 - lens[2]) / lens[0], -(float(row) + 0.5 - lens[3]) / lens[1], -1.0)
-    world = view_world[view]
-    p = frame * (wp.transform_point(sensor_pose[view], z * local) - center[world])
-    cells = map_depth.shape[1]
-    x = p[0] / cell + 0.5 * float(cells) - 0.5
-    y = p[1] / cell + 0.5 * float(cells) - 0.5
-    reach = float(cells) + softness
-    if x < -softness or y < -softness or x > reach or y > reach:
-        return
-    covered = wp.float32(0.0)
-    total = wp.float32(0.0)
-    for j in range(int(wp.ceil(y - softness)), int(wp.floor(y + softness)) + 1):
-        for i in range(int(wp.ceil(x - softness)), int(wp.floor(x + softness)) + 1):
-            weight = (softness + 0.2 - wp.abs(float(i) - x)) * (softness + 0.2 - wp.abs(float(j) - y))
-            total += weight
-            if i >= 0 and j >= 0 and i < cells and j < cells:
-                if map_depth[world, j, i] < p[2]:
-                    covered += weight
-    if total > 0.0:
-        rgb_out[view, row, column] *= 1.0 - strength * covered / total

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from softmode.splats.rasterizer_kernels import FRUSTUM_MARGIN, vec6
+from softmode.splats.rasterizer_kernels import clamp_slope, row_of, vec6
 
 wp.set_module_options({"enable_backward": False})
 
@@ -90,6 +90,7 @@ def project_adjoint(
     world_to_camera: wp.array[wp.mat44],
     intrinsics: wp.array[wp.vec4],
     view_world: wp.array[int],
+    splat_gain: wp.array[wp.vec4],
     # Options:
     size: wp.vec2i,
     dilation: float,
@@ -129,10 +130,8 @@ def project_adjoint(
     px = (wp.dot(r0, x) + m[0, 3]) / z
     py = (wp.dot(r1, x) + m[1, 3]) / z
     lens = intrinsics[view]
-    limit_x = FRUSTUM_MARGIN * 0.5 * float(size[0]) / lens[0]
-    limit_y = FRUSTUM_MARGIN * 0.5 * float(size[1]) / lens[1]
-    tx = wp.clamp(px, -limit_x, limit_x)
-    ty = wp.clamp(py, -limit_y, limit_y)
+    tx = clamp_slope(px, lens[0], lens[2], float(size[0]))
+    ty = clamp_slope(py, lens[1], lens[3], float(size[1]))
     d0 = r0 - tx * r2
     d1 = r1 - ty * r2
     j0 = (lens[0] / z) * d0
@@ -157,17 +156,20 @@ def project_adjoint(
     by_b = -2.0 * slope * schur + e2 * by_shape[0]
     by_c = slope * slope * schur - slope * e2 * by_shape[0] - e2 * e2 * by_shape[2]
     by_o = by_shape[3]
+    gain = splat_gain[row_of(view, splat_gain.shape[0])]
+    gained = gain[3] * opacity[world % opacity.shape[0], i]
     if antialiased:
-        # o = opacity sqrt(sharp / det)
+        # o = min(gain opacity, 1) sqrt(sharp / det)
         sharp = wp.max(a0 * c0 - b * b, 0.0)
         share = wp.sqrt(sharp / det)
         if sharp > 0.0:
-            half = 0.5 * by_o * opacity[world % opacity.shape[0], i] * share
+            half = 0.5 * by_o * wp.min(gained, 1.0) * share
             by_a += half * (c0 / sharp - c / det)
             by_b += -2.0 * half * b * (1.0 / sharp - 1.0 / det)
             by_c += half * (a0 / sharp - a / det)
         by_o *= share
-    wp.atomic_add(opacity_out, world % opacity_out.shape[0], i, by_o)
+    if gained <= 1.0:
+        wp.atomic_add(opacity_out, world % opacity_out.shape[0], i, gain[3] * by_o)
 
     # Image covariance to covariance and Jacobian: a = j0 S j0, b = j0 S j1, c = j1 S j1. Off-diagonal entries are
     # stored once and stand for two.
@@ -191,14 +193,18 @@ def project_adjoint(
     by_py = lens[1] * by_center[1]
     by_fx = px * by_center[0] + wp.dot(by_j0, d0) / z
     by_fy = py * by_center[1] + wp.dot(by_j1, d1) / z
+    by_cx = by_center[0]
+    by_cy = by_center[1]
     if tx == px:
         by_px += by_tx
     else:
         by_fx -= by_tx * tx / lens[0]
+        by_cx -= by_tx / lens[0]
     if ty == py:
         by_py += by_ty
     else:
         by_fy -= by_ty * ty / lens[1]
+        by_cy -= by_ty / lens[1]
     by_z -= (by_px * px + by_py * py) / z
     by_point = wp.vec3(by_px / z, by_py / z, by_z)
     by_mean = by_point[0] * r0 + by_point[1] * r1 + by_point[2] * r2
@@ -206,8 +212,7 @@ def project_adjoint(
     # Colour, which is cut at zero, and the direction it is seen from.
     shown = color[k]
     for channel in range(3):
-        if shown[channel] <= 0.0:
-            by_color[channel] = 0.0
+        by_color[channel] = wp.where(shown[channel] > 0.0, gain[channel] * by_color[channel], 0.0)
     direction = wp.vec3(0.0, 0.0, 1.0)
     sight = wp.vec3()
     distance = float(1.0)
@@ -238,7 +243,7 @@ def project_adjoint(
         w += wp.cross(turned0, (lens[0] / z) * wp.vec3(1.0, 0.0, -tx))
         w += wp.cross(turned1, (lens[1] / z) * wp.vec3(0.0, 1.0, -ty))
         camera_out[view, i] = vec10(
-            v[0], v[1], v[2], w[0], w[1], w[2], by_fx, by_fy, by_center[0], by_center[1]
+            v[0], v[1], v[2], w[0], w[1], w[2], by_fx, by_fy, by_cx, by_cy
         )  # fmt: skip
 
 

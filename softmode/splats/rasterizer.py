@@ -123,6 +123,9 @@ class ViewArrays:
     """World that each view shows, int32, shape (view_count,)."""
     background: wp.array
     """Colour behind everything, vec3, shape (1 or view_count,)."""
+    splat_gain: wp.array | None = None
+    """Factor on the colours (xyz) and opacities (w, the product at most 1) of splats, vec4, shape (1 or view_count,);
+    None for ones."""
 
 
 class SplatRasterizer:
@@ -193,6 +196,7 @@ class SplatRasterizer:
         self.alpha = allocate(shape, dtype=wp.float32)
         self.object_id = allocate(shape if self.options.object_ids else (1, 1, 1), dtype=wp.int32)
         self.median_depth = allocate(shape if self.options.median_depth else (1, 1, 1), dtype=wp.float32)
+        self._no_gain = wp.ones(1, dtype=wp.vec4, device=self.device)
         self._no_rgb = allocate((1, 1, 1), dtype=wp.vec3)
         self._no_depth = allocate((1, 1, 1), dtype=wp.float32)
 
@@ -250,6 +254,7 @@ class SplatRasterizer:
             inputs=[
                 splats.means, splats.covariances, splats.opacities, splats.sh, splats.rotations,
                 views.world_to_camera, views.intrinsics, views.world,
+                self._no_gain if views.splat_gain is None else views.splat_gain,
                 wp.vec2i(self.width, self.height), options.near, options.pixel_variance, options.antialiased,
             ],
             outputs=[self._center, self._shape, self._color, self._box, self._depth_key, self._order],

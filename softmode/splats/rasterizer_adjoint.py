@@ -194,6 +194,7 @@ class AdjointRasterizer:
             inputs=[
                 splats.means, splats.covariances, splats.opacities, splats.sh, splats.rotations,
                 views.world_to_camera, views.intrinsics, views.world,
+                r._no_gain if views.splat_gain is None else views.splat_gain,
                 wp.vec2i(r.width, r.height), r.options.pixel_variance, r.options.antialiased, self.camera,
                 r._color, self._center, self._shape, self._color,
             ],

@@ -13,7 +13,8 @@ ALPHA_MIN = wp.constant(1.0 / 255.0)
 ALPHA_MAX = wp.constant(0.99)
 TRANSMITTANCE_MIN = wp.constant(1.0e-4)
 FAR_KEY = wp.constant(0x7F800000)
-FRUSTUM_MARGIN = wp.constant(1.3)
+IMAGE_MARGIN = wp.constant(0.15)
+"""Share of the image beyond each of its edges at which splats are linearised."""
 
 
 @wp.func
@@ -50,6 +51,13 @@ def sh_color(sh: wp.array3d[wp.vec3], w: int, i: int, d: wp.vec3) -> wp.vec3:
     return wp.max(c + wp.vec3(0.5, 0.5, 0.5), wp.vec3(0.0, 0.0, 0.0))
 
 
+@wp.func
+def clamp_slope(slope: float, focal: float, center: float, size: float) -> float:
+    """Clamp x/z or y/z to a little more than the image, whose edges lie at -center/focal and (size - center)/focal."""
+    margin = IMAGE_MARGIN * size
+    return wp.clamp(slope, -(center + margin) / focal, (size - center + margin) / focal)
+
+
 @wp.kernel
 def project(
     # Splats:
@@ -62,6 +70,7 @@ def project(
     world_to_camera: wp.array[wp.mat44],  # (view_count,)
     intrinsics: wp.array[wp.vec4],  # (view_count,) [px]
     view_world: wp.array[int],  # (view_count,)
+    splat_gain: wp.array[wp.vec4],  # (1|view_count,) factor on colour and opacity
     # Options:
     size: wp.vec2i,
     near: float,
@@ -100,17 +109,17 @@ def project(
     width = float(size[0])
     height = float(size[1])
     # The Jacobian is taken at a point clamped to a little more than the view, or splats at its rim would blow up.
-    limit_x = FRUSTUM_MARGIN * 0.5 * width / lens[0]
-    limit_y = FRUSTUM_MARGIN * 0.5 * height / lens[1]
-    j0 = (lens[0] / z) * (r0 - wp.clamp(px, -limit_x, limit_x) * r2)
-    j1 = (lens[1] / z) * (r1 - wp.clamp(py, -limit_y, limit_y) * r2)
+    slope = wp.vec2(clamp_slope(px, lens[0], lens[2], width), clamp_slope(py, lens[1], lens[3], height))
+    j0 = (lens[0] / z) * (r0 - slope[0] * r2)
+    j1 = (lens[1] / z) * (r1 - slope[1] * r2)
     s = covariance[row_of(world, covariance.shape[0]), i]
     sigma = wp.mat33(s[0], s[1], s[2], s[1], s[3], s[4], s[2], s[4], s[5])
     s0 = sigma * j0
     a = wp.dot(j0, s0)
     b = wp.dot(j1, s0)
     c = wp.dot(j1, sigma * j1)
-    o = opacity[row_of(world, opacity.shape[0]), i]
+    gain = splat_gain[row_of(view, splat_gain.shape[0])]
+    o = wp.min(gain[3] * opacity[row_of(world, opacity.shape[0]), i], 1.0)
     sharp = wp.max(a * c - b * b, 0.0)
     a += dilation
     c += dilation
@@ -143,7 +152,7 @@ def project(
         turn = rotation[row_of(world, rotation.shape[0]), i]
         direction = wp.quat_rotate_inv(turn, wp.normalize(x - eye))
     rgb = sh_color(sh, row_of(world, sh.shape[0]), i, direction)
-    color_out[k] = wp.vec4(rgb[0], rgb[1], rgb[2], 0.0)
+    color_out[k] = wp.vec4(gain[0] * rgb[0], gain[1] * rgb[1], gain[2] * rgb[2], 0.0)
 
 
 @wp.kernel

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from softmode.splats import camera_kernels as kernels
+from softmode.errors import ConfigError
+from softmode.splats import shadow_kernels as kernels
 from softmode.splats.rasterizer import SplatArrays, ViewArrays
 
 
@@ -17,20 +18,27 @@ class ShadowOptions:
     strength: float = 0.4
     """Share of the mesh's colour that full shadow takes away, 0..1."""
     cells: int = 40
-    """Cells of the depth map along each side."""
+    """Cells of the depth map along each side; more where small objects lie far apart."""
     margin: float = 1.6
-    """Width of the map in units of the rest extent of the splats."""
+    """Width of the map in units of the extent of the splats across the light, at least 1."""
     softness: float = 1.3
     """Half width of the blurred rim [cells]."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if not (0.0 <= self.strength <= 1.0 and self.cells >= 1 and self.margin >= 1.0 and self.softness >= 0.0):
+            raise ConfigError(
+                f"{self} is out of range", hint="Give strength in 0..1, cells >= 1, margin >= 1 and softness >= 0"
+            )
 
 
 class SplatShadow:
     """Casts the shadow of all splats of a world along one light direction; capturable.
 
-    The map follows the splats. Only meshes receive the shadow: splats carry the light they were captured in.
+    The map follows the splats and spans them all. Only meshes receive the shadow: splats carry the light they were
+    captured in.
 
     Args:
-        splats: The splats at rest; their extent sizes the map.
         world_count: Number of worlds.
         light_direction: Direction in which the light travels.
         options: Darkness and resolution.
@@ -39,7 +47,6 @@ class SplatShadow:
 
     def __init__(
         self,
-        splats: SplatArrays,
         world_count: int,
         light_direction: tuple[float, float, float],
         *,
@@ -52,13 +59,9 @@ class SplatShadow:
         first = np.cross(light, [1.0, 0.0, 0.0] if abs(light[0]) < 0.9 else [0.0, 1.0, 0.0])
         first /= np.linalg.norm(first)
         self._frame = wp.mat33(*np.stack([first, np.cross(light, first), light]).ravel())
-        means = splats.means.numpy()[0]
-        extent = float(np.linalg.norm(np.quantile(means, 0.99, axis=0) - np.quantile(means, 0.01, axis=0)))
-        self._cell = self.options.margin * max(extent, 1e-6) / self.options.cells
-        self._stride = max(1, len(means) // 64)
         self.world_count = world_count
         self.device = wp.get_device(device)
-        self._center = wp.zeros(world_count, dtype=wp.vec3, device=self.device)
+        self._bounds = wp.zeros(world_count, dtype=wp.vec4, device=self.device)
         shape = (world_count, self.options.cells, self.options.cells)
         self._map = wp.zeros(shape, dtype=wp.float32, device=self.device)
 
@@ -79,18 +82,19 @@ class SplatShadow:
             mesh_depth: Forward depth of the meshes [m], 0 where there is none, shape (view_count, height, width).
             mesh_rgb: Colours of the meshes, vec3, same shape; changed in place.
         """
-        wp.launch(
-            kernels.center_map,
-            dim=self.world_count,
-            inputs=[splats.means, self._stride],
-            outputs=[self._center],
-            device=self.device,
-        )
+        count = splats.means.shape[1]
         self._map.fill_(1.0e30)
         wp.launch(
+            kernels.bound_map,
+            dim=self.world_count,
+            inputs=[splats.means, splats.opacities, self._frame, max(1, count // 128)],
+            outputs=[self._bounds],
+            device=self.device,
+        )
+        wp.launch(
             kernels.fill_map,
-            dim=(self.world_count, splats.means.shape[1]),
-            inputs=[splats.means, splats.opacities, self._center, self._frame, self._cell],
+            dim=(self.world_count, count),
+            inputs=[splats.means, splats.opacities, self._bounds, self._frame, self.options.margin],
             outputs=[self._map],
             device=self.device,
         )
@@ -98,7 +102,7 @@ class SplatShadow:
             kernels.darken,
             dim=mesh_depth.shape,
             inputs=[
-                self._center, self._frame, self._cell, self._map, views.world, views.intrinsics, sensor_pose,
+                self._bounds, self._frame, self.options.margin, self._map, views.world, views.intrinsics, sensor_pose,
                 mesh_depth, self.options.strength, self.options.softness,
             ],
             outputs=[mesh_rgb],

@@ -158,6 +158,7 @@ class ThreadedRasterizer:
                 intrinsics=cut(views.intrinsics, s),
                 world=cut(views.world, s),
                 background=cut(views.background, s),
+                splat_gain=cut(views.splat_gain, s),
             )
             rgb, depth = cut(mesh_rgb, s), cut(mesh_depth, s)
             return lambda: part.render(splats, own, mesh_rgb=rgb, mesh_depth=depth)

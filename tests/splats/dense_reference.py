@@ -71,9 +71,9 @@ def render_dense(
     keep = p[:, 2] > near
     fx, fy, cx, cy = intrinsics
     z = np.where(keep, p[:, 2], 1.0)
-    # The linearisation point is clamped to 1.3 times the view frustum, as in the original code.
-    tx = np.clip(p[:, 0] / z, -(0.65 * width) / fx, (0.65 * width) / fx) * z
-    ty = np.clip(p[:, 1] / z, -(0.65 * height) / fy, (0.65 * height) / fy) * z
+    # The linearisation point is clamped to 1.3 times the view frustum, as in the original code, about the image.
+    tx = np.clip(p[:, 0] / z, -(cx + 0.15 * width) / fx, (1.15 * width - cx) / fx) * z
+    ty = np.clip(p[:, 1] / z, -(cy + 0.15 * height) / fy, (1.15 * height - cy) / fy) * z
     zero = np.zeros_like(z)
     jacobian = np.stack(
         [np.stack([fx / z, zero, -fx * tx / z**2], axis=-1), np.stack([zero, fy / z, -fy * ty / z**2], axis=-1)], axis=1

@@ -2,71 +2,25 @@
 
 from __future__ import annotations
 
-import math
+import dataclasses
 
-import newton
 import numpy as np
 import pytest
 import warp as wp
 
 from softmode.errors import ConfigError
-from softmode.splats import Splats, make_plush
+from softmode.splats import make_plush
 from softmode.splats.camera import CameraOptions, PinholeCamera, SplatCamera
-from softmode.splats.rasterizer import RasterizerOptions, SplatArrays
+from softmode.splats.rasterizer import RasterizerOptions
 from softmode.splats.shadow import ShadowOptions
-from softmode.splats.splats import SH_DC, rotations_from_quats
-
-SIZE = 64
-PLAIN = CameraOptions(shadows=False, splat_shadow=None)
-
-
-def scene(worlds: int = 1) -> newton.Model:
-    """Return a table with its top at z = 0, a red box standing on it, and a hand above, in each world."""
-    world = newton.ModelBuilder()
-    pose = wp.transform
-    world.add_shape_box(-1, xform=pose(wp.vec3(0.0, 0.0, -0.05), wp.quat_identity()), hx=0.5, hy=0.5, hz=0.05)
-    box = world.add_body(xform=pose(wp.vec3(0.1, 0.1, 0.05), wp.quat_identity()), label="box")
-    world.add_shape_box(box, hx=0.03, hy=0.03, hz=0.05, color=(0.9, 0.1, 0.1))
-    hand = world.add_body(xform=pose(wp.vec3(0.0, 0.0, 0.4), wp.quat_identity()), label="hand")
-    world.add_shape_box(hand, xform=pose(wp.vec3(0.0, 0.0, 0.1), wp.quat_identity()), hx=0.02, hy=0.02, hz=0.02)
-    builder = newton.ModelBuilder()
-    builder.replicate(world, worlds)
-    return builder.finalize(device="cpu")
-
-
-def camera(name: str = "front", **kwargs) -> PinholeCamera:
-    """Return a camera that looks along -x over the table."""
-    arguments = {"position": (0.6, 0.0, 0.3), "target": (0.0, 0.0, 0.05), "width": SIZE, "height": SIZE} | kwargs
-    return PinholeCamera.look_at(name, **arguments)
-
-
-def marker(position: tuple[float, float, float], sigma: float = 0.01) -> Splats:
-    """Return one opaque green dot."""
-    color = (np.array([0.1, 0.9, 0.1]) - 0.5) / SH_DC
-    return Splats(
-        means=[position], quats=[[0, 0, 0, 1]], scales=[[sigma] * 3], opacities=[1.0], sh=color[None, None]
-    )  # fmt: skip
-
-
-def arrays(splats: Splats, worlds: int = 1) -> SplatArrays:
-    """Upload the splats."""
-    return SplatArrays.from_splats([splats], world_count=worlds, device="cpu")
+from softmode.splats.splats import rotations_from_quats
+from tests.splats.camera_scene import PLAIN, SIZE, arrays, camera, marker, scene
 
 
 def is_green(rgb: np.ndarray) -> np.ndarray:
     """Return where the picture is green."""
     c = rgb.astype(int)
     return (c[..., 1] > c[..., 0] + 60) & (c[..., 1] > c[..., 2] + 60)
-
-
-def test_look_at_is_an_opencv_frame() -> None:
-    """Columns of the rotation are right, down and forward; the target lies in the middle, z up in the picture."""
-    view = camera(position=(1.0, 2.0, 3.0), target=(0.2, -0.3, 0.1), fov_y=0.7, height=100, width=160)
-    r = rotations_from_quats([view.quat])[0]
-    forward = np.subtract((0.2, -0.3, 0.1), (1.0, 2.0, 3.0))
-    np.testing.assert_allclose(r[:, 2], forward / np.linalg.norm(forward), atol=1e-12)
-    assert r[2, 1] < 0.0 and abs(r[2, 0]) < 1e-12 and np.linalg.det(r) == pytest.approx(1.0)
-    assert view.fy * math.tan(0.35) == pytest.approx(50.0) and (view.cx, view.cy) == (80.0, 50.0)
 
 
 def test_splats_and_meshes_land_on_the_same_pixel_and_depth() -> None:
@@ -198,16 +152,6 @@ def test_object_ids_and_missing_splats() -> None:
 def test_refuses_bad_descriptions() -> None:
     """Each message names the camera and what is wrong."""
     model, splats = scene(), arrays(make_plush(300))
-    with pytest.raises(ConfigError, match="do not define a view"):
-        camera(position=(0.0, 0.0, 1.0), target=(0.0, 0.0, 0.0))
-    with pytest.raises(ConfigError, match="fov_y"):
-        camera(fov_y=4.0)
-    with pytest.raises(ConfigError, match="'front': 0 x 64"):
-        camera(width=0)
-    with pytest.raises(ConfigError, match="unit length"):
-        PinholeCamera(**{**camera().__dict__, "quat": (0.0, 0.0, 0.0, 2.0)})
-    with pytest.raises(ConfigError, match="finite"):
-        PinholeCamera(**{**camera().__dict__, "fx": float("nan")})
     with pytest.raises(ConfigError, match="sizes"):
         SplatCamera(model, splats, [camera(), camera("b", width=32)])
     with pytest.raises(ConfigError, match="unique names"):
@@ -218,5 +162,62 @@ def test_refuses_bad_descriptions() -> None:
         SplatCamera(model, splats, [camera(body="wrist")])
     with pytest.raises(ConfigError, match="mesh_samples"):
         SplatCamera(model, splats, [camera()], options=CameraOptions(mesh_samples=3))
+    sensor = SplatCamera(model, splats, [camera()])
     with pytest.raises(ConfigError, match="no camera 'top'"):
-        SplatCamera(model, splats, [camera()]).images("top")
+        sensor.images("top")
+    for output in ("segmentation", "object_id", "median_depth", "sepia"):
+        with pytest.raises(ConfigError, match=f"does not write '{output}'.*Turn it on"):
+            sensor.images("front", output)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="cells"):
+        ShadowOptions(cells=0)
+
+
+def test_free_camera_moves_in_each_world() -> None:
+    """Poses written on the device place the camera per world as descriptions do, inside a captured graph too."""
+    model = scene(2)
+    free = SplatCamera(model, None, [camera(), camera("free")], options=PLAIN)
+    state = model.state()
+    places = np.float32([[0.4, 0.3, 0.3], [-0.3, 0.4, 0.5]])
+    target = wp.array([(0.1, 0.1, 0.05)], dtype=wp.vec3, device="cpu")
+    position = wp.zeros(2, dtype=wp.vec3, device="cpu")
+    free.look_at("free", position, target)
+    free.render(state)
+    with wp.ScopedCapture(device="cpu") as capture:
+        free.look_at("free", position, target)
+        free.render(state)
+    position.assign(places)
+    wp.capture_launch(capture.graph)
+    assert free.images("free").shape == (2, SIZE, SIZE, 3) and free.images("free", "depth").shape == (2, SIZE, SIZE)
+    for world, place in enumerate(places.tolist()):
+        fixed = camera("free", position=tuple(place), target=(0.1, 0.1, 0.05))
+        np.testing.assert_allclose(free.poses("free").numpy()[world], (*fixed.position, *fixed.quat), atol=2e-6)
+        alone = SplatCamera(scene(), None, [fixed], options=PLAIN)
+        alone.render(alone.model.state())
+        difference = np.abs(free.images("free", "depth").numpy()[world] - alone.depth.numpy()[0])
+        assert (difference > 1e-5).mean() < 0.005, "but for a pixel on an edge"
+    held = free.poses("free").numpy()
+    free.look_at("free", position, target, up=(0.0, 0.0, 0.0))
+    np.testing.assert_array_equal(free.poses("free").numpy(), held)
+
+
+@pytest.mark.parametrize(("width", "height"), [(64, 64), (100, 75), (128, 96), (320, 200), (640, 480)])
+def test_every_pixel_has_the_depth_of_the_pinhole(width: int, height: int) -> None:
+    """A tilted camera sees the table at z = 0 in forward depth -c_z / r_z, r the ray (x, y, 1) of the pixel centre."""
+    base = camera(position=(0.3, -0.1, 0.35), target=(0.0, -0.2, 0.0), width=width, height=height, fov_y=0.6)
+    view = dataclasses.replace(base, fx=1.1 * base.fx, cx=0.45 * width, cy=0.56 * height)
+    for lens_per_world in (False, True):
+        options = dataclasses.replace(PLAIN, lens_per_world=lens_per_world, segmentation=True)
+        sensor = SplatCamera(scene(), None, [view], options=options)
+        sensor.render(sensor.model.state())
+        columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        rays = np.stack([(columns - view.cx) / view.fx, (rows - view.cy) / view.fy, np.ones_like(rows)], axis=-1)
+        falls = rays @ rotations_from_quats([view.quat])[0][2]
+        table = sensor.images("front", "segmentation").numpy()[0] == sensor.segmentation_ids("world/shape_0")[0]
+        inside = table & (sensor.depth.numpy()[0] > 0.0)
+        assert inside.mean() > 0.5
+        hit = np.array(view.position) + (-view.position[2] / falls)[..., None] * (
+            rays @ rotations_from_quats([view.quat])[0].T
+        )
+        on_top = inside & (np.abs(hit[..., :2]) < 0.499).all(axis=-1)
+        assert on_top.sum() > 0.9 * inside.sum()
+        np.testing.assert_allclose(sensor.depth.numpy()[0][on_top], -view.position[2] / falls[on_top], rtol=1e-5)

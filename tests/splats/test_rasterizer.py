@@ -162,6 +162,29 @@ def test_rigid_motion_of_splats_and_camera_changes_nothing(device: str) -> None:
     assert difference.max() < 3 / 255 and np.median(difference) < TOLERANCE
 
 
+def test_an_off_centre_lens_shows_a_crop(device: str) -> None:
+    """A lens whose axis lies outside its image shows what the corner of a large picture of the same lens shows."""
+    splats, large, small, first = ball(300), 96, 32, 64
+    matrix = look_at((1.6, 0.3, 0.5)).astype(np.float32)
+    matrix[:2, 3] += 0.42
+    pictures = []
+    for edge, center in ((large, 0.5 * large), (small, 0.5 * large - first)):
+        views = ViewArrays(
+            world_to_camera=wp.array(matrix[None], dtype=wp.mat44, device=device),
+            intrinsics=wp.array([(80.0, 80.0, center, center)], dtype=wp.vec4, device=device),
+            world=wp.zeros(1, dtype=wp.int32, device=device),
+            background=wp.array([BACKGROUND], dtype=wp.vec3, device=device),
+        )
+        rasterizer = SplatRasterizer(splats.count, 1, edge, edge, device=device)
+        rasterizer.render(SplatArrays.from_splats([splats], device=device), views)
+        pictures.append((rasterizer.rgb.numpy()[0], rasterizer.alpha.numpy()[0]))
+    (rgb, alpha), (crop_rgb, crop_alpha) = pictures
+    assert (crop_alpha > 0.5).mean() > 0.3
+    # Splats whose centres lie far outside of the crop are linearised a little nearer to it.
+    np.testing.assert_allclose(crop_alpha, alpha[first:, first:], atol=2e-3)
+    np.testing.assert_allclose(crop_rgb, rgb[first:, first:], atol=2e-3)
+
+
 def test_antialiasing_keeps_the_energy_of_small_splats(device: str) -> None:
     """A splat far smaller than a pixel adds its area times its opacity; the classic mode adds that of the filter."""
     sigma, depth, focal = 1e-3, 2.0, 40.0

@@ -385,3 +385,29 @@ def test_refuses_arrays_of_other_shapes() -> None:
         adjoint.backward(splats, views, loss_rgb=loss, mesh_rgb=loss)
     with pytest.raises(ConfigError, match="means has shape"):
         adjoint.backward(replace(splats, means=splats.means[:1]), views, loss_rgb=loss)
+
+
+def test_gain_of_a_view_scales_what_flows_back(device: str) -> None:
+    """A view of gain (g, h) has the gradients of opacities h o and a loss g dL/drgb; dL/do is h times that."""
+    scene = Scene.make(coefficients=4)
+    assert scene.weights is not None
+    splats, views = scene.arrays(device)
+    black = wp.zeros(1, dtype=wp.vec3, device=device)
+    g, h = np.array([1.3, 0.5, 0.8]), 0.6
+    gain = wp.array([(*g, h)], dtype=wp.vec4, device=device)
+    scaled = replace(splats, opacities=wp.array(h * scene.opacities, dtype=wp.float32, device=device))
+    results = []
+    for drawn, seen, loss in (
+        (splats, replace(views, background=black, splat_gain=gain), scene.weights[0]),
+        (scaled, replace(views, background=black), scene.weights[0] * g),
+    ):
+        rasterizer = SplatRasterizer(scene.means.shape[1], 3, WIDTH, HEIGHT, device=device)
+        adjoint = AdjointRasterizer(rasterizer, drawn, seen)
+        rasterizer.render(drawn, seen)
+        results.append(adjoint.backward(drawn, seen, loss_rgb=wp.array(loss, dtype=wp.vec3, device=device)).numpy())
+    got, expected = results
+    for name in ("means", "covariances", "opacities", "sh", "rotations", "twist", "intrinsics"):
+        factor = h if name == "opacities" else 1.0
+        scale = np.abs(expected[name]).max()
+        assert scale > 0.0
+        np.testing.assert_allclose(got[name], factor * expected[name], atol=1e-5 * scale, err_msg=name)

@@ -77,6 +77,26 @@ def test_own_background_per_view() -> None:
         assert (threaded.rgb.numpy()[view][empty[view]] == color).all()
 
 
+def test_own_gain_per_view() -> None:
+    """The gain of a view goes with its view."""
+    splats = ball(20)
+    gain = wp.array([(1, 0, 0, 1), (0, 1, 0, 0.5), (0, 0, 1, 0)], dtype=wp.vec4, device="cpu")
+    black = wp.zeros(1, dtype=wp.vec3, device="cpu")
+    views = replace(views_of(EYES, WIDTH, HEIGHT, "cpu"), splat_gain=gain, background=black)
+    arrays = SplatArrays.from_splats([splats], device="cpu")
+    pictures = []
+    for kind in (SplatRasterizer, ThreadedRasterizer):
+        rasterizer = kind(splats.count, 3, WIDTH, HEIGHT)
+        rasterizer.render(arrays, views)
+        pictures.append(rasterizer.rgb.numpy())
+    np.testing.assert_array_equal(*pictures)
+    assert [image.reshape(-1, 3).any(axis=0).tolist() for image in pictures[0]] == [
+        [True, False, False],
+        [False, True, False],
+        [False, False, False],
+    ]
+
+
 def test_errors_of_a_thread_reach_the_caller() -> None:
     """Arrays of another size are refused, by whichever thread sees them; sizes out of range at once."""
     threaded = ThreadedRasterizer(100, 2, WIDTH, HEIGHT, threads=2)

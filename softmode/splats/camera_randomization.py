@@ -1,0 +1,155 @@
+"""Randomised views: every world sees the scene through its own lens, from its own place, in its own light.
+
+All draws happen on the device, so that a masked reset stays inside a captured graph. They depend on the seed of the
+world, on how often that world was drawn and on the index of the camera, and on nothing else: world i of many equals
+a single world with its seed. Host code that draws with NumPy passes its draws on as seeds.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
+
+from softmode.errors import ConfigError
+from softmode.splats import camera_randomization_kernels as kernels
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraRandomization:
+    """Half widths of uniform distributions around the description; 0 keeps a value as described.
+
+    Pose and lens are drawn per world and camera. Sky, light and splats belong to the world: all of its cameras, those
+    of other `SplatCamera` objects with the same seeds included, see the same.
+    """
+
+    rotation: float = 0.0
+    """Rotation vector of the camera, each component about an axis of the camera [rad]."""
+    translation: float = 0.0
+    """Shift along each axis of the camera [m]."""
+    focal: float = 0.0
+    """Focal lengths, both by the same factor, relative, < 1."""
+    principal_point: float = 0.0
+    """Shift of the optical axis in each direction of the image [px]."""
+    sky: float = 0.0
+    """Each channel of the sky at the horizon and overhead, sRGB 0..1."""
+    light: float = 0.0
+    """Brightness of the meshes in linear light (sun and ambient alike), relative, < 1."""
+    light_tint: float = 0.0
+    """Each channel of that light, relative, < 1."""
+    splat_opacity: float = 0.0
+    """Opacity of all splats of the world, relative, < 1; never above 1."""
+    splat_brightness: float = 0.0
+    """Colours of all splats of the world, gamma-encoded, relative, < 1."""
+    splat_tint: float = 0.0
+    """Each channel of those colours, relative, < 1."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        relative = ("focal", "light", "light_tint", "splat_opacity", "splat_brightness", "splat_tint")
+        for item in fields(self):
+            value, limit = getattr(self, item.name), 1.0 if item.name in relative else math.inf
+            if not 0.0 <= value < limit:
+                raise ConfigError(
+                    f"CameraRandomization.{item.name} is {value}, expected 0 <= {item.name} < {limit}",
+                    hint="Give half the width of the range around the described value",
+                )
+
+    @property
+    def changes_lens(self) -> bool:
+        """Whether worlds get different intrinsics."""
+        return self.focal > 0.0 or self.principal_point > 0.0
+
+
+class ViewVariation:
+    """What the views of a `SplatCamera` differ in beside their description; draws anew for chosen worlds.
+
+    Args:
+        lenses: fx, fy, cx, cy [px] of each camera, shape (camera_count, 4).
+        sky: Colour at the horizon and overhead.
+        world_count: Number of worlds.
+        randomization: Ranges of the draws.
+        device: Warp device.
+    """
+
+    def __init__(
+        self,
+        lenses: ArrayLike,
+        sky: tuple[Sequence[float], Sequence[float]],
+        world_count: int,
+        randomization: CameraRandomization,
+        *,
+        device: Any = None,
+    ) -> None:
+        """Allocate the arrays with the described values."""
+        self.randomization, self.world_count, self.device = randomization, world_count, wp.get_device(device)
+        described = np.asarray(lenses, dtype=np.float32)
+        self._views = views = len(described) * world_count
+        self._lenses = wp.array(described, dtype=wp.vec4, device=device)
+        self._sky = (wp.vec3(*sky[0]), wp.vec3(*sky[1]))
+
+        def full(count: int, value: Sequence[float], dtype: Any) -> wp.array:
+            return wp.array(np.tile(np.asarray(value, np.float32), (count, 1)), dtype=dtype, device=device)
+
+        self.offset = full(views, (0, 0, 0, 0, 0, 0, 1), wp.transform)
+        """Drawn pose of each camera in its described frame, transform, shape (view_count,)."""
+        self.intrinsics = wp.array(np.repeat(described, world_count, axis=0), dtype=wp.vec4, device=device)
+        """fx, fy, cx, cy [px], vec4, shape (view_count,)."""
+        self.horizon = full(world_count, sky[0], wp.vec3)
+        """Sky at and below the horizon, sRGB, vec3, shape (world_count,)."""
+        self.zenith = full(world_count, sky[1], wp.vec3)
+        """Sky overhead, sRGB, vec3, shape (world_count,)."""
+        self.light_gain = full(world_count, (1, 1, 1), wp.vec3)
+        """Factor on the sRGB colours of meshes (a gain g of linear light is g^(1/2.2)), vec3, shape (world_count,)."""
+        self.splat_gain = full(views, (1, 1, 1, 1), wp.vec4)
+        """Factor on the colour (xyz) and opacity (w) of splats, vec4, shape (view_count,)."""
+        self._seed = wp.zeros(world_count, dtype=wp.int32, device=device)
+        self._episode = wp.zeros(world_count, dtype=wp.int32, device=device)
+        self._all = wp.ones(world_count, dtype=wp.bool, device=device)
+        self.seed(0)
+
+    def seed(self, seeds: int | ArrayLike) -> None:
+        """Set the seeds and count draws from zero again; copies to the device, so not for a captured graph.
+
+        Args:
+            seeds: One integer s, for s + i in world i; or one per world, shape (world_count,).
+
+        Raises:
+            ConfigError: If there are not as many seeds as worlds.
+        """
+        values = np.asarray(seeds)
+        if values.dtype.kind not in "iu" or values.shape not in ((), (self.world_count,)):
+            raise ConfigError(
+                f"seeds are {values.dtype} of shape {values.shape}, expected integers, one or {self.world_count}",
+                hint="Pass an int, or rng.integers(2**31, size=world_count)",
+            )
+        values = values + np.arange(self.world_count) if values.ndim == 0 else values
+        self._seed.assign((values.astype(np.int64) & 0x7FFFFFFF).astype(np.int32))
+        self._episode.zero_()
+
+    def draw(self, world_mask: wp.array | None = None) -> None:
+        """Draw new values for the masked worlds; capturable.
+
+        Args:
+            world_mask: Which worlds, bool, shape (world_count,); all if None.
+        """
+        ranges = self.randomization
+        mask = self._all if world_mask is None else world_mask
+        wp.launch(
+            kernels.draw_views,
+            dim=self._views,
+            inputs=[
+                mask, self._seed, self._episode, self._lenses, self._sky[0], self._sky[1],
+                ranges.rotation, ranges.translation, ranges.focal, ranges.principal_point, ranges.sky,
+                ranges.light, ranges.light_tint,
+                ranges.splat_opacity, ranges.splat_brightness, ranges.splat_tint,
+            ],
+            outputs=[
+                self.offset, self.intrinsics, self.horizon, self.zenith, self.light_gain, self.splat_gain,
+            ],
+            device=self.device,
+        )  # fmt: skip
+        wp.launch(kernels.count_draw, dim=self.world_count, inputs=[mask], outputs=[self._episode], device=self.device)
