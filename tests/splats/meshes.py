@@ -1,0 +1,34 @@
+"""Meshes that the tests of mesh sampling and fitting share."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image
+
+
+def smooth_texture(size: int = 256) -> NDArray[np.uint8]:
+    """Return an image of a few slow waves that is asymmetric in both directions, shape (size, size, 3)."""
+    v, u = np.mgrid[0:size, 0:size] / size
+    waves = [
+        0.5 + 0.4 * np.sin(2 * np.pi * (2 * u + 0.3 * np.sin(2 * np.pi * v))),
+        0.5 + 0.4 * np.sin(2 * np.pi * (1.5 * v + 0.1)) * np.cos(2 * np.pi * u),
+        0.2 + 0.6 * v + 0.15 * np.cos(6 * np.pi * u),
+    ]
+    return np.rint(255 * np.clip(np.stack(waves, axis=-1), 0, 1)).astype(np.uint8)
+
+
+def bumpy_sphere(columns: int = 96, rows: int = 48, radius: float = 0.4) -> trimesh.Trimesh:
+    """Return a closed sphere with bumps of a fifth of its radius and a smooth texture."""
+    u, v = np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
+    phi, theta = 2 * np.pi * u, np.pi * (1 - v)
+    out = np.stack([np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta)], axis=-1)
+    points = radius * out * (1 + 0.2 * np.sin(3 * theta) ** 3 * np.cos(4 * phi))[..., None]
+    index = np.arange((columns + 1) * (rows + 1)).reshape(rows + 1, columns + 1)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    lower = np.stack([a, b, c], axis=-1)[1:].reshape(-1, 3)
+    upper = np.stack([b, d, c], axis=-1)[:-1].reshape(-1, 3)
+    material = trimesh.visual.material.SimpleMaterial(image=Image.fromarray(smooth_texture()))
+    visual = trimesh.visual.TextureVisuals(uv=np.stack([u, v], axis=-1).reshape(-1, 2), material=material)
+    return trimesh.Trimesh(points.reshape(-1, 3), np.concatenate([lower, upper]), visual=visual, process=False)
