@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -107,6 +107,13 @@ class ColoredMesh:
     def area(self) -> float:
         """Area of all triangles [m^2]."""
         return float(self.areas().sum())
+
+    def normalized(self) -> tuple[ColoredMesh, NDArray[np.float64], float]:
+        """Return the mesh moved and scaled into the unit sphere, its old centre [m], shape (3,), and radius [m]."""
+        points = self.corners.astype(np.float64)
+        center = 0.5 * (points.min(axis=(0, 1)) + points.max(axis=(0, 1)))
+        radius = float(np.linalg.norm(points - center, axis=2).max())
+        return replace(self, corners=((points - center) / radius).astype(np.float32)), center, radius
 
     def normals(self) -> NDArray[np.float64]:
         """Return the cross products of the edges, twice the area long [m^2], shape (F, 3)."""
