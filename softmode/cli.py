@@ -1,4 +1,4 @@
-"""The command line: ``softmode play``, ``softmode list-envs`` and ``softmode robots``."""
+"""The command line: ``softmode play``, ``softmode list-envs``, ``softmode robots`` and ``softmode splat``."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from softmode import ENVIRONMENTS
+from softmode.cli_splat import SplatConvert, SplatFromMesh, SplatInfo
 from softmode.errors import ConfigError, MaterialError, MissingExtraError, SoftmodeError
 
 if TYPE_CHECKING:
@@ -100,10 +101,17 @@ def main(arguments: list[str] | None = None) -> int:
             raise MissingExtraError(
                 "the command line needs tyro", hint="install it with: pip install 'softmode[demo]'"
             ) from error
+        splat = Annotated[
+            Annotated[SplatFromMesh, tyro.conf.subcommand("from-mesh")]
+            | Annotated[SplatInfo, tyro.conf.subcommand("info")]
+            | Annotated[SplatConvert, tyro.conf.subcommand("convert")],
+            tyro.conf.subcommand("splat", description="Make, inspect and convert splat files."),
+        ]
         command = tyro.cli(
             Annotated[Play, tyro.conf.subcommand("play")]
             | Annotated[ListEnvs, tyro.conf.subcommand("list-envs")]
-            | Annotated[Robots, tyro.conf.subcommand("robots")],  # type: ignore[arg-type]
+            | Annotated[Robots, tyro.conf.subcommand("robots")]
+            | splat,  # type: ignore[arg-type]
             prog="softmode",
             args=arguments,
             config=(tyro.conf.PositionalRequiredArgs,),

@@ -82,8 +82,9 @@ def eliminate_samples(
 ) -> NDArray[np.int64]:
     """Return the indices of the `count` points that are left when the most crowded one is removed again and again.
 
-    A point's crowding is the sum of (1 - d / (2 r))^8 over its neighbours that face the same way, d their distance and
-    r = sqrt(area / (2 sqrt(3) count)), the largest possible radius of that many disks (Yuksel 2015, section 3).
+    A point's crowding is the sum of (1 - d / (2 r))^8 over its neighbours at distances d < 2 r, unless their normals
+    are more than 120 degrees apart; r = sqrt(area / (2 sqrt(3) count)) is the largest possible radius of that many
+    disks (Yuksel 2015, section 3).
 
     Args:
         points: Positions [m], shape (N, 3).
@@ -93,7 +94,7 @@ def eliminate_samples(
     """
     reach = 2.0 * float(np.sqrt(area / (2.0 * np.sqrt(3.0) * count)))
     pairs = KDTree(points).query_pairs(reach, output_type="ndarray")
-    pairs = pairs[np.einsum("ni,ni->n", normals[pairs[:, 0]], normals[pairs[:, 1]]) > 0.0]
+    pairs = pairs[np.einsum("ni,ni->n", normals[pairs[:, 0]], normals[pairs[:, 1]]) > -0.5]
     crowding = (1.0 - np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1) / reach) ** 8
     total = len(points)
     both = np.concatenate([pairs, pairs[:, ::-1]])

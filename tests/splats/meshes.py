@@ -29,6 +29,24 @@ def bumpy_sphere(columns: int = 96, rows: int = 48, radius: float = 0.4) -> trim
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
     lower = np.stack([a, b, c], axis=-1)[1:].reshape(-1, 3)
     upper = np.stack([b, d, c], axis=-1)[:-1].reshape(-1, 3)
-    material = trimesh.visual.material.SimpleMaterial(image=Image.fromarray(smooth_texture()))
+    material = trimesh.visual.material.SimpleMaterial(image=Image.fromarray(smooth_texture()), diffuse=[255] * 4)
     visual = trimesh.visual.TextureVisuals(uv=np.stack([u, v], axis=-1).reshape(-1, 2), material=material)
     return trimesh.Trimesh(points.reshape(-1, 3), np.concatenate([lower, upper]), visual=visual, process=False)
+
+
+def painted_box() -> trimesh.Trimesh:
+    """Return a box with a colour at each vertex."""
+    box = trimesh.creation.box((0.5, 0.3, 0.2)).subdivide().subdivide().subdivide()
+    span = (box.vertices - box.bounds[0]) / np.ptp(box.bounds, axis=0)
+    colors = np.rint(255 * (0.15 + 0.7 * span)).astype(np.uint8)
+    return trimesh.Trimesh(box.vertices, box.faces, vertex_colors=colors, process=False)
+
+
+def two_objects() -> trimesh.Scene:
+    """Return a scene of a painted box and, beside it, a turned and smaller textured sphere."""
+    scene = trimesh.Scene()
+    scene.add_geometry(painted_box())
+    place = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]) @ np.diag([0.8, 0.8, 0.8, 1.0])
+    place[:3, 3] = [1.0, 0.2, 0.0]
+    scene.add_geometry(bumpy_sphere(48, 24), transform=place)
+    return scene
