@@ -51,10 +51,11 @@ class LearningRates:
 class FitOptions:
     """How splats are fitted to pictures of a mesh."""
 
-    iterations: int = 400
+    iterations: int = 200
     """Steps of gradient descent; 0 leaves the splats as they were sampled."""
     size: int = 128
-    """Edge of the square pictures [px]."""
+    """Edge of the square pictures [px], which the object fills. Splats look best at about the size they were fitted at:
+    the pixel filter widens outlines by a part of a pixel, and the fit makes up for that."""
     view_count: int = 64
     """Pictures to fit."""
     held_out_count: int = 16
@@ -129,7 +130,8 @@ def splats_from_mesh(
     unit, center, radius = mesh.normalized()
     rng = np.random.default_rng(options.seed)
     fit = _Fit(sample_mesh(unit, count, seed=options.seed), float(np.sqrt(unit.area / count)), options, device)
-    training, held_out = (_pictures(unit, views, options, rng, device) for views in (options.view_count, options.held_out_count))
+    training = _pictures(unit, options.view_count, options, rng, device)
+    held_out = _pictures(unit, options.held_out_count, options, rng, device)
     history = [(0, fit.psnr(held_out))]
     order = np.zeros(0, dtype=np.int64)
     for iteration in range(options.iterations):
@@ -150,12 +152,10 @@ def _pictures(
     mesh: ColoredMesh, count: int, options: FitOptions, rng: np.random.Generator, device: Any
 ) -> ReferenceViews:
     """Draw the mesh, whose bounding sphere has radius one, from all around."""
-    focal, middle = 0.5 * options.size / np.tan(0.5 * FIELD_OF_VIEW), 0.5 * options.size
+    size, focal = options.size, 0.5 * options.size / np.tan(0.5 * FIELD_OF_VIEW)
     poses = orbit_poses(count, 1.02 / np.sin(0.5 * FIELD_OF_VIEW), rng)
-    lens = (focal, focal, middle, middle)
-    return render_mesh(
-        mesh, poses, lens, width=options.size, height=options.size, samples=options.samples, device=device
-    )
+    lens = (focal, focal, 0.5 * size, 0.5 * size)
+    return render_mesh(mesh, poses, lens, width=size, height=size, samples=options.samples, device=device)
 
 
 class _Fit:
