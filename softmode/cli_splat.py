@@ -43,11 +43,11 @@ class SplatFromMesh:
 
         from tqdm import tqdm
 
-        from softmode.cli import _bar_interval, _device, _quiet_warp
+        from softmode.cli_common import bar_interval, quiet_warp, warp_device
         from softmode.splats.colored_mesh import read_mesh
         from softmode.splats.formats import write_ply
 
-        with _quiet_warp():
+        with quiet_warp():
             from softmode.splats.mesh_fit import FitOptions, splats_from_mesh
 
             options = FitOptions(
@@ -59,14 +59,14 @@ class SplatFromMesh:
             )
             mesh = read_mesh(self.mesh)
             print(f"{mesh.name}: {len(mesh.corners)} triangles, {len(mesh.textures)} textures", flush=True)
-            with tqdm(total=options.iterations, desc="fitting", unit="step", mininterval=_bar_interval()) as bar:
+            with tqdm(total=options.iterations, desc="fitting", unit="step", mininterval=bar_interval()) as bar:
 
                 def advance(done: int, loss: float) -> None:
                     bar.set_postfix_str(f"loss {loss:.2e}", refresh=False)
                     bar.update(done - bar.n)
 
                 fit = splats_from_mesh(
-                    mesh, count=self.count, options=options, device=_device(self.device), progress=advance
+                    mesh, count=self.count, options=options, device=warp_device(self.device), progress=advance
                 )
         splats = fit.splats
         if self.size is not None:

@@ -126,4 +126,4 @@ def _nearest(
 ) -> NDArray[np.int64]:
     """Return for every point the nearest kept one, by a distance in which opposite sides of a sheet are far apart."""
     lifted = np.concatenate([points, spacing * normals], axis=1)
-    return KDTree(lifted[kept]).query(lifted)[1]
+    return np.asarray(KDTree(lifted[kept]).query(lifted)[1], dtype=np.int64)

@@ -6,6 +6,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import SimpleMaterial
 
 
 def smooth_texture(size: int = 256) -> NDArray[np.uint8]:
@@ -19,8 +21,17 @@ def smooth_texture(size: int = 256) -> NDArray[np.uint8]:
     return np.rint(255 * np.clip(np.stack(waves, axis=-1), 0, 1)).astype(np.uint8)
 
 
-def bumpy_sphere(columns: int = 96, rows: int = 48, radius: float = 0.4) -> trimesh.Trimesh:
-    """Return a closed sphere with bumps of a fifth of its radius and a smooth texture."""
+def checker_texture(size: int = 256) -> NDArray[np.uint8]:
+    """Return the smooth image under a hard-edged checker of 16 x 8 fields, shape (size, size, 3)."""
+    y, x = np.mgrid[0:size, 0:size] / size
+    dark = ((np.floor(16 * x) + np.floor(8 * y)) % 2)[..., None]
+    return np.rint(smooth_texture(size) * (1.0 - 0.55 * dark)).astype(np.uint8)
+
+
+def bumpy_sphere(
+    columns: int = 96, rows: int = 48, radius: float = 0.4, texture: NDArray[np.uint8] | None = None
+) -> trimesh.Trimesh:
+    """Return a closed sphere with bumps of a fifth of its radius and a texture, the smooth one by default."""
     u, v = np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     phi, theta = 2 * np.pi * u, np.pi * (1 - v)
     out = np.stack([np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta)], axis=-1)
@@ -29,8 +40,9 @@ def bumpy_sphere(columns: int = 96, rows: int = 48, radius: float = 0.4) -> trim
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
     lower = np.stack([a, b, c], axis=-1)[1:].reshape(-1, 3)
     upper = np.stack([b, d, c], axis=-1)[:-1].reshape(-1, 3)
-    material = trimesh.visual.material.SimpleMaterial(image=Image.fromarray(smooth_texture()), diffuse=[255] * 4)
-    visual = trimesh.visual.TextureVisuals(uv=np.stack([u, v], axis=-1).reshape(-1, 2), material=material)
+    image = Image.fromarray(smooth_texture() if texture is None else texture)
+    material = SimpleMaterial(image=image, diffuse=[255] * 4)
+    visual = TextureVisuals(uv=np.stack([u, v], axis=-1).reshape(-1, 2), material=material)
     return trimesh.Trimesh(points.reshape(-1, 3), np.concatenate([lower, upper]), visual=visual, process=False)
 
 

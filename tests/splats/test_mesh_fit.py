@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import warp as wp
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -190,7 +192,7 @@ def test_fitted_splats_enclose_the_volume_of_the_mesh(fitted: MeshFit) -> None:
 
 
 @pytest.mark.parametrize("source", [painted_box, two_objects])
-def test_vertex_colors_and_scenes_are_fitted(source) -> None:  # noqa: ANN001
+def test_vertex_colors_and_scenes_are_fitted(source: Callable[[], trimesh.Trimesh | trimesh.Scene]) -> None:
     """The PSNR of a painted box, and of a scene of a box and a textured sphere, rises by 4 dB or more."""
     fit = splats_from_mesh(source(), count=1000, options=FAST)
     assert fit.psnr > fit.history[0][1] + 4.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ import trimesh
 import warp as wp
 from PIL import Image
 from scipy.spatial import KDTree
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from softmode.errors import AssetError, ConfigError
 from softmode.splats.colored_mesh import GREY, ColoredMesh, read_mesh
@@ -26,8 +29,8 @@ CORNERS = np.eye(3)
 
 def textured_square(pixels: np.ndarray, uv: np.ndarray) -> ColoredMesh:
     """Return one triangle pair over the unit square with texture coordinates uv, shape (4, 2)."""
-    material = trimesh.visual.material.SimpleMaterial(image=Image.fromarray(pixels))
-    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    material = SimpleMaterial(image=Image.fromarray(pixels))
+    visual = TextureVisuals(uv=uv, material=material)
     points = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
     return ColoredMesh.from_trimesh(trimesh.Trimesh(points, [[0, 1, 2], [0, 2, 3]], visual=visual, process=False))
 
@@ -63,10 +66,10 @@ def test_vertex_and_face_colors_are_taken_as_they_are() -> None:
 def test_materials_without_a_texture_color_the_mesh() -> None:
     """A .obj material's diffuse colour is gamma-encoded; glTF's base colour is linear: 0.5 becomes 188/255."""
     uv = np.zeros((3, 2))
-    simple = trimesh.visual.material.SimpleMaterial(diffuse=[10, 200, 128, 255])
-    metallic = trimesh.visual.material.PBRMaterial(baseColorFactor=[0, 255, 128, 255])
+    simple = SimpleMaterial(diffuse=[10, 200, 128, 255])
+    metallic = PBRMaterial(baseColorFactor=[0, 255, 128, 255])
     for material, expected in ((simple, [10, 200, 128]), (metallic, [0, 255, 188])):
-        visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+        visual = TextureVisuals(uv=uv, material=material)
         mesh = ColoredMesh.from_trimesh(trimesh.Trimesh(CORNERS, [[0, 1, 2]], visual=visual, process=False))
         np.testing.assert_allclose(255 * mesh.colors_at([0], [[0.2, 0.3, 0.5]])[0], expected, atol=0.5)
 
@@ -213,6 +216,7 @@ def test_pictures_agree_with_newtons_camera() -> None:
 
     size, focal = 48, 60.0
     source = bumpy_sphere()
+    visual: Any = source.visual
     views = render_mesh(
         ColoredMesh.from_trimesh(source), orbit_poses(4, 1.5, np.random.default_rng(2)),
         (focal, focal, size / 2, size / 2), width=size, height=size, samples=1,
@@ -220,7 +224,7 @@ def test_pictures_agree_with_newtons_camera() -> None:
     builder = newton.ModelBuilder()
     builder.begin_world()
     mesh = newton.Mesh(
-        source.vertices, source.faces.reshape(-1), uvs=source.visual.uv, texture=smooth_texture(), compute_inertia=False
+        source.vertices, source.faces.reshape(-1), uvs=visual.uv, texture=smooth_texture(), compute_inertia=False
     )
     builder.add_shape_mesh(-1, mesh=mesh, color=(1.0, 1.0, 1.0))
     builder.end_world()
@@ -234,7 +238,7 @@ def test_pictures_agree_with_newtons_camera() -> None:
     for pose in poses:
         turn = wp.quat_from_matrix(wp.mat33(*(pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])).reshape(-1)))  # OpenGL axes
         frames.append(wp.transform(wp.vec3(*pose[:3, 3]), turn))
-    albedo = camera.allocate_image_albedo(len(poses), size, size)
+    albedo: Any = camera.allocate_image_albedo(len(poses), size, size)
     camera.update(
         model.state(), wp.array(frames, dtype=wp.transform, device="cpu"), rays, albedo_image=albedo,
         world_indices=wp.zeros(len(poses), dtype=wp.int32, device="cpu"),
