@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from pathlib import Path
+from typing import Literal
 
 from softmode.errors import AssetError, ConfigError
 
@@ -16,7 +17,7 @@ class SplatFromMesh:
     mesh: Path
     """Mesh file of any kind that trimesh reads (.glb, .obj, .ply, .stl, ...), with its textures."""
     out: Path | None = None
-    """Splat file to write; MESH_splats.ply beside the mesh if omitted."""
+    """Splat file to write, of the kind its suffix names; MESH_splats.ply beside the mesh if omitted."""
     count: int = 10_000
     """Number of splats."""
     size: float | None = None
@@ -45,7 +46,7 @@ class SplatFromMesh:
 
         from softmode.cli_common import bar_interval, quiet_warp, warp_device
         from softmode.splats.colored_mesh import read_mesh
-        from softmode.splats.formats import write_ply
+        from softmode.splats.formats import write_splats
 
         with quiet_warp():
             from softmode.splats.mesh_fit import FitOptions, splats_from_mesh
@@ -73,7 +74,7 @@ class SplatFromMesh:
             low, high = splats.bounds()
             extent = float((high - low).max())
             splats = splats.transformed(scale=self.size / extent)
-        write_ply(out, splats)
+        write_splats(out, splats)
         print(
             f"PSNR over {options.held_out_count} held-out views of {options.size} px: "
             f"{fit.history[0][1]:.1f} dB sampled, {fit.psnr:.1f} dB fitted"
@@ -120,23 +121,30 @@ class SplatConvert:
     source: Path
     """File to read."""
     target: Path
-    """File to write."""
+    """File to write: .ply, .compressed.ply, .splat, .spz, .usd, .usda or .usdc."""
+    up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] = "+z"
+    """Axis of the written file onto which +z of the read one is turned; +z leaves it."""
 
     def run(self) -> int:
         """Read and write."""
-        from softmode.splats.formats import read_splats, write_ply
+        from softmode.splats.formats import read_splats, write_splats
 
         _check_target(self.target)
         splats = read_splats(self.source)
-        write_ply(self.target, splats)
+        write_splats(self.target, splats, up=self.up)
         print(f"wrote {splats.count} splats of degree {splats.sh_degree} to {self.target}")
         return 0
 
 
 def _check_target(path: Path) -> None:
     """Refuse a file that cannot be written before any work is done."""
-    if path.suffix.lower() != ".ply":
-        raise AssetError(f"splat file {path}: cannot write the kind {path.suffix!r}", hint="name it like toy.ply")
+    from softmode.splats.formats import WRITABLE
+
+    if not path.name.lower().endswith(WRITABLE):
+        raise AssetError(
+            f"splat file {path}: cannot write {path.suffix or '(no suffix)'!r}",
+            hint=f"name it like toy.ply; writable are {', '.join(WRITABLE)}",
+        )
     folder = path.absolute().parent
     if not folder.is_dir():
         raise AssetError(f"splat file {path}: there is no folder {folder}", hint="make the folder first")

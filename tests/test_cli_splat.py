@@ -59,16 +59,20 @@ def test_info_describes_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert float(lines["opacities"].split()[1]) == pytest.approx(np.median(plush.opacities), abs=1e-3)
 
 
-def test_convert_keeps_the_splats(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What was read is what is written."""
-    source, target = tmp_path / "a.ply", tmp_path / "b.ply"
-    write_ply(source, make_plush(count=500))
+@pytest.mark.parametrize("kind", [".ply", ".spz"])
+def test_convert_keeps_the_splats(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What was read is what is written, to what the kind can hold; --up -y turns z up into y down."""
+    source, target = tmp_path / "a.ply", tmp_path / f"b{kind}"
+    plush = make_plush(count=500)
+    write_ply(source, plush)
     assert main(["splat", "convert", str(source), str(target)]) == 0
-    a, b = read_splats(source), read_splats(target)
-    np.testing.assert_allclose(a.means, b.means, atol=1e-6)
-    np.testing.assert_allclose(a.scales, b.scales, rtol=1e-5)
-    np.testing.assert_allclose(a.sh, b.sh, atol=1e-6)
-    assert f"wrote {a.count} splats" in capsys.readouterr().out
+    assert f"wrote {plush.count} splats" in capsys.readouterr().out
+    read = read_splats(target)
+    np.testing.assert_allclose(read.means, plush.means, atol=1e-6 if kind == ".ply" else 2.0**-12)
+    np.testing.assert_allclose(read.colors(), plush.colors(), atol=0.02)
+    assert main(["splat", "convert", str(source), str(target), "--up", "-y"]) == 0
+    np.testing.assert_allclose(read_splats(target).oriented("-y").means, read.means, atol=2.0**-11)
+    assert np.abs(read_splats(target).means[:, 1] + read.means[:, 2]).max() < 2.0**-11
 
 
 FAILURES: dict[str, tuple[list[str], str]] = {
