@@ -14,7 +14,7 @@ from softmode.splats.splats import SH_DC, Splats, quats_from_rotations
 
 CANDIDATES_PER_SAMPLE = 4
 """Random points of which each kept one is chosen."""
-TANGENTIAL_SCALE = 0.5
+TANGENTIAL_SCALE = 0.6
 """Standard deviation of a new splat along the surface over the spacing sqrt(area / count)."""
 NORMAL_SCALE = 0.05
 """Standard deviation across the surface over the spacing."""
