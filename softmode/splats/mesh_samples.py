@@ -63,8 +63,8 @@ def sample_mesh(mesh: ColoredMesh, count: int, *, seed: int = 0) -> Splats:
     colors = total[:, :3] / total[:, 3:]
 
     normal = normals[kept]
-    helper = np.where(np.abs(normal[:, :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
-    first = np.cross(normal, helper)
+    other = np.where(np.abs(normal[:, :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    first = np.cross(normal, other)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     frame = np.stack([first, np.cross(normal, first), normal], axis=2)
     return Splats(

@@ -26,6 +26,14 @@ from tests.splats.meshes import bumpy_sphere, painted_box, two_objects
 FAST = FitOptions(iterations=40, size=64, view_count=16, held_out_count=6, samples=3, report_every=20)
 
 
+@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
+def device(request: pytest.FixtureRequest) -> str:
+    """Every device that is there."""
+    if request.param != "cpu" and not wp.is_cuda_available():
+        pytest.skip("no CUDA device")
+    return request.param
+
+
 def parameters(count: int, seed: int = 0) -> list[np.ndarray]:
     """Return random centres, unit quaternions, log-scales, logits and colours."""
     rng = np.random.default_rng(seed)
@@ -192,9 +200,11 @@ def test_fitted_splats_enclose_the_volume_of_the_mesh(fitted: MeshFit) -> None:
 
 
 @pytest.mark.parametrize("source", [painted_box, two_objects])
-def test_vertex_colors_and_scenes_are_fitted(source: Callable[[], trimesh.Trimesh | trimesh.Scene]) -> None:
+def test_vertex_colors_and_scenes_are_fitted(
+    device: str, source: Callable[[], trimesh.Trimesh | trimesh.Scene]
+) -> None:
     """The PSNR of a painted box, and of a scene of a box and a textured sphere, rises by 4 dB or more."""
-    fit = splats_from_mesh(source(), count=1000, options=FAST)
+    fit = splats_from_mesh(source(), count=1000, options=FAST, device=device)
     assert fit.psnr > fit.history[0][1] + 4.0
 
 

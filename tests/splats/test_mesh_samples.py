@@ -24,6 +24,14 @@ from tests.splats.meshes import bumpy_sphere, painted_box, smooth_texture, two_o
 CORNERS = np.eye(3)
 
 
+@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
+def device(request: pytest.FixtureRequest) -> str:
+    """Every device that is there."""
+    if request.param != "cpu" and not wp.is_cuda_available():
+        pytest.skip("no CUDA device")
+    return request.param
+
+
 # -- colour -----------------------------------------------------------------------------------------------------------
 
 
@@ -195,10 +203,11 @@ def test_samples_repeat_with_the_seed() -> None:
 # -- pictures ---------------------------------------------------------------------------------------------------------
 
 
-def test_coverage_of_a_sphere_is_that_of_its_outline() -> None:
+def test_coverage_of_a_sphere_is_that_of_its_outline(device: str) -> None:
     """A sphere of radius r at distance d is seen as a disc of radius f r / sqrt(d^2 - r^2), area to 1 %."""
     mesh = ColoredMesh.from_trimesh(trimesh.creation.icosphere(subdivisions=5, radius=0.5))
-    views = render_mesh(mesh, orbit_poses(3, 2.0, np.random.default_rng(0)), (60, 60, 32, 32), width=64, height=64)
+    poses = orbit_poses(3, 2.0, np.random.default_rng(0))
+    views = render_mesh(mesh, poses, (60, 60, 32, 32), width=64, height=64, device=device)
     expected = np.pi * (60 * 0.5 / np.sqrt(2.0**2 - 0.5**2)) ** 2
     alpha = views.alpha.numpy()
     np.testing.assert_allclose(alpha.sum(axis=(1, 2)), expected, rtol=0.01)
