@@ -1,4 +1,4 @@
-"""The command line: ``softmode play``, ``softmode list-envs`` and ``softmode robots``."""
+"""The command line: ``softmode play``, ``softmode list-envs``, ``softmode robots`` and ``softmode splat``."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ import dataclasses
 import os
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from softmode import ENVIRONMENTS
+from softmode.cli_common import bar_interval, quiet_warp, warp_device
+from softmode.cli_splat import SplatConvert, SplatFromMesh, SplatInfo
 from softmode.errors import ConfigError, MaterialError, MissingExtraError, SoftmodeError
 
 if TYPE_CHECKING:
@@ -100,10 +101,17 @@ def main(arguments: list[str] | None = None) -> int:
             raise MissingExtraError(
                 "the command line needs tyro", hint="install it with: pip install 'softmode[demo]'"
             ) from error
+        splat = Annotated[
+            Annotated[SplatFromMesh, tyro.conf.subcommand("from-mesh")]
+            | Annotated[SplatInfo, tyro.conf.subcommand("info")]
+            | Annotated[SplatConvert, tyro.conf.subcommand("convert")],
+            tyro.conf.subcommand("splat", description="Make, inspect and convert splat files."),
+        ]
         command = tyro.cli(
             Annotated[Play, tyro.conf.subcommand("play")]
             | Annotated[ListEnvs, tyro.conf.subcommand("list-envs")]
-            | Annotated[Robots, tyro.conf.subcommand("robots")],  # type: ignore[arg-type]
+            | Annotated[Robots, tyro.conf.subcommand("robots")]
+            | splat,  # type: ignore[arg-type]
             prog="softmode",
             args=arguments,
             config=(tyro.conf.PositionalRequiredArgs,),
@@ -150,7 +158,7 @@ def _play(options: Play, film: _Film | None) -> int:
     import warp as wp
 
     started = time.perf_counter()
-    with _quiet_warp():
+    with quiet_warp():
         if not any(Path(wp.config.kernel_cache_dir or "").glob("wp_softmode.deformables.kernels_*")):
             print("compiling kernels (first run only, a minute or two)", file=sys.stderr, flush=True)
         with _BuildBar() as progress:
@@ -158,7 +166,7 @@ def _play(options: Play, film: _Film | None) -> int:
                 options.env,
                 render_mode="rgb_array" if film else None,
                 config=_task_config(options),
-                device=_device(options.device),
+                device=warp_device(options.device),
                 progress=progress,
             )
         try:
@@ -179,20 +187,6 @@ def _play(options: Play, film: _Film | None) -> int:
     return 0
 
 
-@contextlib.contextmanager
-def _quiet_warp() -> Iterator[None]:
-    """Start Warp and silence what it tells about every module it loads; its warnings stay."""
-    import warp as wp
-
-    before = wp.config.log_level
-    wp.config.log_level = max(before, wp.LOG_WARNING)
-    try:
-        wp.init()
-        yield
-    finally:
-        wp.config.log_level = before
-
-
 def _play_episode(env: Any, options: Play, seed: int, film: _Film | None, fps: int) -> bool:
     """Play one episode, print its outcome, return whether it succeeded."""
     import gymnasium as gym
@@ -204,7 +198,7 @@ def _play_episode(env: Any, options: Play, seed: int, film: _Film | None, fps: i
     policy = _policy(options.policy, env)
     total, steps, seconds = 0.0, 0, 0.0
     limit = gym.spec(options.env).max_episode_steps
-    with tqdm(total=limit, desc=f"seed {seed}", unit="step", mininterval=_bar_interval()) as bar:
+    with tqdm(total=limit, desc=f"seed {seed}", unit="step", mininterval=bar_interval()) as bar:
         done = False
         while not done:
             action = policy(observation)
@@ -247,24 +241,6 @@ def _task_config(options: Play) -> Any:
     return LiftSoftConfig(scene=TableSceneConfig(object=thing), mesh_samples=4 if options.video else 1)
 
 
-def _device(name: str | None) -> Any:
-    """Return the device, or raise ConfigError when it is not there."""
-    import warp as wp
-
-    if name is None:
-        return None
-    try:
-        return wp.get_device(name)
-    except (ValueError, RuntimeError) as error:
-        known = ", ".join(str(device) for device in wp.get_devices())
-        raise ConfigError(f"device {name!r} is not available", hint=f"use one of {known}") from error
-
-
-def _bar_interval() -> float:
-    """Return how often a progress bar is drawn [s]: smoothly on a terminal, seldom in a log."""
-    return 0.1 if sys.stderr.isatty() else 5.0
-
-
 class _BuildBar:
     """A progress bar over the build of a body, on stderr; it appears with the first report."""
 
@@ -278,7 +254,7 @@ class _BuildBar:
         if self._bar is None:
             from tqdm import tqdm
 
-            self._bar = tqdm(total=100, desc="building the body", unit="%", mininterval=_bar_interval())
+            self._bar = tqdm(total=100, desc="building the body", unit="%", mininterval=bar_interval())
         self._bar.set_postfix_str(stage, refresh=False)
         self._bar.update(round(100.0 * fraction) - self._bar.n)
 

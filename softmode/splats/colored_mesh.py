@@ -1,0 +1,249 @@
+"""`ColoredMesh`: the triangles of a mesh file or scene with one rule for the colour of every surface point."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softmode.errors import AssetError
+
+if TYPE_CHECKING:
+    import trimesh
+
+GREY = 0.6
+"""Colour of a mesh that names none; gamma-encoded."""
+
+_TEXEL_LIMIT = 2**26
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ColoredMesh:
+    """Triangles whose surface colour is corner colour times texture, both gamma-encoded, opaque and without lighting.
+
+    Corner colours are interpolated linearly over a triangle. A texture is looked up bilinearly at the interpolated
+    texture coordinates, v up, repeated outside 0..1. All parts of a scene are one such mesh.
+    """
+
+    corners: NDArray[np.float32]
+    """Corner positions [m], shape (F, 3, 3)."""
+    corner_colors: NDArray[np.float32]
+    """Colour at each corner, 0..1, shape (F, 3, 3)."""
+    corner_uvs: NDArray[np.float32]
+    """Texture coordinates at each corner, shape (F, 3, 2)."""
+    texture_index: NDArray[np.int32]
+    """Texture of each triangle, -1 for none, shape (F,)."""
+    textures: tuple[NDArray[np.uint8], ...]
+    """Images, first row at v = 1, each of shape (height, width, 3)."""
+    name: str = "mesh"
+    """Where the mesh comes from; used in messages."""
+
+    def __post_init__(self) -> None:
+        """Refuse what has no surface."""
+        if not len(self.corners):
+            raise AssetError(f"{self.name}: holds no triangles", hint="Export a triangle mesh, not points or curves")
+        if not (np.isfinite(self.corners).all() and np.isfinite(self.corner_uvs).all()):
+            raise AssetError(f"{self.name}: holds NaN or infinity", hint="Export the mesh again")
+        if not self.area > 0.0:
+            raise AssetError(f"{self.name}: its triangles have no area", hint="Export the mesh again at another scale")
+
+    @classmethod
+    def from_trimesh(cls, source: trimesh.Trimesh | trimesh.Scene, *, name: str = "mesh") -> ColoredMesh:
+        """Gather the triangles and colours of a mesh, or of all meshes that a scene places.
+
+        The colour is, in this order: the material's texture (glTF: times its base colour and the vertex colours), the
+        vertex or face colours, the material's colour, grey. glTF's base colour is linear and becomes gamma-encoded;
+        vertex colours are taken as they are. Transparency, lighting and further maps are left out.
+
+        Args:
+            source: The mesh or scene.
+            name: Where it comes from; used in messages.
+
+        Raises:
+            AssetError: If there are no triangles, they have no area, or a number is not finite.
+        """
+        import trimesh
+
+        parts: list[tuple[Any, NDArray[np.float64]]] = []
+        if isinstance(source, trimesh.Scene):
+            for node in source.graph.nodes_geometry:
+                transform, key = source.graph[node]
+                parts.append((source.geometry[key], np.asarray(transform)))
+        else:
+            parts.append((source, np.eye(4)))
+        corners, colors, uvs, index, textures = [], [], [], [], []
+        known: dict[int, int] = {}
+        for mesh, transform in parts:
+            if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+                continue
+            faces = np.asarray(mesh.faces)
+            placed = np.asarray(mesh.vertices) @ transform[:3, :3].T + transform[:3, 3]
+            color, uv, image = _appearance(mesh, name)
+            chosen = -1
+            if image is not None:
+                chosen = known.setdefault(id(image), len(textures))
+                if chosen == len(textures):
+                    textures.append(_pixels(image, name))
+            corners.append(placed[faces])
+            colors.append(color)
+            uvs.append(uv)
+            index.append(np.full(len(faces), chosen))
+        if not corners:
+            raise AssetError(f"{name}: holds no triangles", hint="Export a triangle mesh, not points or curves")
+        return cls(
+            corners=np.concatenate(corners).astype(np.float32),
+            corner_colors=np.concatenate(colors).astype(np.float32),
+            corner_uvs=np.concatenate(uvs).astype(np.float32),
+            texture_index=np.concatenate(index).astype(np.int32),
+            textures=tuple(textures),
+            name=name,
+        )
+
+    @property
+    def area(self) -> float:
+        """Area of all triangles [m^2]."""
+        return float(self.areas().sum())
+
+    def normalized(self) -> tuple[ColoredMesh, NDArray[np.float64], float]:
+        """Return the mesh moved and scaled into the unit sphere, its old centre [m], shape (3,), and radius [m]."""
+        points = self.corners.astype(np.float64)
+        center = 0.5 * (points.min(axis=(0, 1)) + points.max(axis=(0, 1)))
+        radius = float(np.linalg.norm(points - center, axis=2).max())
+        return replace(self, corners=((points - center) / radius).astype(np.float32)), center, radius
+
+    def normals(self) -> NDArray[np.float64]:
+        """Return the cross products of the edges, twice the area long [m^2], shape (F, 3)."""
+        a, b, c = np.swapaxes(self.corners.astype(np.float64), 0, 1)
+        return np.cross(b - a, c - a)
+
+    def areas(self) -> NDArray[np.float64]:
+        """Return the area of each triangle [m^2], shape (F,)."""
+        return 0.5 * np.linalg.norm(self.normals(), axis=1)
+
+    def colors_at(self, faces: ArrayLike, barycentric: ArrayLike) -> NDArray[np.float64]:
+        """Return the surface colour 0..1, shape (N, 3).
+
+        Args:
+            faces: Triangle of each point, shape (N,).
+            barycentric: Weights of its three corners, shape (N, 3).
+        """
+        face, weights = np.asarray(faces), np.asarray(barycentric, dtype=np.float64)
+        color = np.einsum("nk,nkc->nc", weights, self.corner_colors[face])
+        uv = np.einsum("nk,nkc->nc", weights, self.corner_uvs[face])
+        for i, texture in enumerate(self.textures):
+            here = self.texture_index[face] == i
+            color[here] *= _bilinear(texture, uv[here])
+        return color
+
+
+def read_mesh(path: str | os.PathLike[str]) -> ColoredMesh:
+    """Read a mesh file of any kind that trimesh reads (.obj, .glb, .gltf, .ply, .stl, .off, ...), with its textures.
+
+    Args:
+        path: The file. The result keeps its frame and unit.
+
+    Raises:
+        AssetError: If the file is missing, of an unknown kind, damaged, or holds no surface.
+    """
+    import trimesh
+
+    file = Path(path)
+    name = f"mesh file {file}"
+    if not file.is_file():
+        raise AssetError(f"{name}: no such file", hint="Check the path")
+    known = sorted(set(trimesh.available_formats()))
+    if file.suffix.lower().lstrip(".") not in known:
+        raise AssetError(
+            f"{name}: unknown kind {file.suffix or '(no suffix)'!r}",
+            hint=f"Readable here are {', '.join('.' + kind for kind in known)}; convert others to .glb",
+        )
+    try:
+        scene = trimesh.load_scene(file)
+    except Exception as error:  # its readers raise whatever a damaged file leads them to
+        raise AssetError(
+            f"{name}: cannot be read ({type(error).__name__}: {error})",
+            hint="The file is damaged or incomplete: copy or export it again",
+        ) from error
+    return ColoredMesh.from_trimesh(scene, name=name)
+
+
+def _appearance(mesh: Any, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64], Any]:
+    """Return corner colours (F, 3, 3), corner texture coordinates (F, 3, 2) and the image or None."""
+    faces = np.asarray(mesh.faces)
+    color, uv, image = np.ones((len(faces), 3, 3)), np.zeros((len(faces), 3, 2)), None
+    visual = mesh.visual
+    if visual.kind == "vertex":
+        color = np.asarray(visual.vertex_colors)[faces][..., :3] / 255.0
+    elif visual.kind == "face":
+        color = np.repeat(np.asarray(visual.face_colors)[:, None, :3] / 255.0, 3, axis=1)
+    elif visual.kind == "texture":
+        material = visual.material
+        factor = getattr(material, "baseColorFactor", None)
+        if hasattr(material, "baseColorTexture"):
+            image = material.baseColorTexture
+            if factor is not None:
+                color *= _gamma_encoded(np.asarray(factor)[:3] / 255.0)
+            vertex = visual.vertex_attributes.get("color") if hasattr(visual, "vertex_attributes") else None
+            if vertex is not None and len(vertex) == len(mesh.vertices):
+                color *= _unit(vertex)[faces][..., :3]
+            if image is None and factor is None and vertex is None:
+                color *= GREY
+        else:
+            image = getattr(material, "image", None)
+            if image is None:
+                color *= np.asarray(material.diffuse)[:3] / 255.0
+        if image is not None and visual.uv is None:
+            image = None
+        if image is not None:
+            uv = np.asarray(visual.uv, dtype=np.float64)
+            if uv.shape != (len(mesh.vertices), 2):
+                raise AssetError(
+                    f"{name}: texture coordinates have shape {uv.shape}, expected ({len(mesh.vertices)}, 2)",
+                    hint="Export the mesh again",
+                )
+            uv = uv[faces]
+    else:
+        color *= GREY
+    return color, uv, image
+
+
+def _unit(values: ArrayLike) -> NDArray[np.float64]:
+    """Return colours stored as integers or as numbers of 0..1, as the latter."""
+    array = np.asarray(values)
+    scale = np.iinfo(array.dtype).max if np.issubdtype(array.dtype, np.integer) else 1.0
+    return array.astype(np.float64) / scale
+
+
+def _gamma_encoded(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sRGB code values 0..1 of linear light (IEC 61966-2-1)."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def _pixels(image: Any, name: str) -> NDArray[np.uint8]:
+    """Decode an image, bounded."""
+    if image.width * image.height > _TEXEL_LIMIT:
+        raise AssetError(
+            f"{name}: a texture of {image.width} x {image.height} px, at most {_TEXEL_LIMIT} px",
+            hint="Scale the texture down: splats of this size cannot show it",
+        )
+    try:
+        return np.ascontiguousarray(np.asarray(image.convert("RGB"), dtype=np.uint8))
+    except (OSError, ValueError, SyntaxError) as error:
+        raise AssetError(f"{name}: a texture cannot be decoded ({error})", hint="Export the mesh again") from error
+
+
+def _bilinear(texture: NDArray[np.uint8], uv: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return colours 0..1 between the centres of the four nearest texels, repeated at the rims, shape (N, 3)."""
+    height, width = texture.shape[:2]
+    x, y = uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5
+    left, top = np.floor(x), np.floor(y)
+    fx, fy = (x - left)[:, None], (y - top)[:, None]
+    i, j = left.astype(np.int64) % width, top.astype(np.int64) % height
+    k, l = (i + 1) % width, (j + 1) % height
+    upper = texture[j, i] * (1.0 - fx) + texture[j, k] * fx
+    lower = texture[l, i] * (1.0 - fx) + texture[l, k] * fx
+    return (upper * (1.0 - fy) + lower * fy) / 255.0

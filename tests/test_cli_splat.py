@@ -1,0 +1,110 @@
+"""The command ``softmode splat``: what it writes, what it says, how it fails."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softmode.cli import main
+from softmode.splats import make_plush, read_splats, write_ply
+from tests.splats.meshes import bumpy_sphere
+from tests.test_cli import listing
+
+QUICK = ["--count", "300", "--iterations", "6", "--pixels", "32", "--views", "4"]
+
+
+@pytest.fixture(scope="module")
+def mesh(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write a textured mesh."""
+    file = tmp_path_factory.mktemp("mesh") / "toy.glb"
+    bumpy_sphere(48, 24).export(file)
+    return file
+
+
+def test_from_mesh_writes_splats_of_the_wanted_size(
+    mesh: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """It writes the file, tells how well the splats do, and shows its progress."""
+    out = tmp_path / "toy.ply"
+    assert main(["splat", "from-mesh", str(mesh), "--out", str(out), "--size", "0.08", *QUICK]) == 0
+    splats = read_splats(out)
+    assert splats.count == 300
+    assert np.ptp(splats.bounds(), axis=0).max() == pytest.approx(0.08, rel=1e-5)
+    said, err = capfd.readouterr()
+    for words in ("toy.glb", "1 textures", "dB sampled", "dB fitted", f"wrote 300 splats to {out}"):
+        assert words in said
+    assert "6/6" in err and "Module" not in said + err
+    assert listing(tmp_path) == ["toy.ply"]
+
+
+def test_from_mesh_names_the_file_itself(mesh: Path) -> None:
+    """Without --out the splats lie beside the mesh, which stays as it is."""
+    before = mesh.read_bytes()
+    assert main(["splat", "from-mesh", str(mesh), *QUICK, "--iterations", "0"]) == 0
+    assert listing(mesh.parent) == ["toy.glb", "toy_splats.ply"]
+    assert mesh.read_bytes() == before
+
+
+def test_info_describes_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Count, degree, box and quantiles are those of the splats."""
+    plush = make_plush(count=500)
+    write_ply(tmp_path / "plush.ply", plush)
+    assert main(["splat", "info", str(tmp_path / "plush.ply")]) == 0
+    lines = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
+    assert lines["splats"] == str(plush.count)
+    size = [float(word) for word in lines["size"].split()]
+    np.testing.assert_allclose(size, np.ptp(plush.bounds(), axis=0), rtol=1e-3)
+    assert float(lines["opacities"].split()[1]) == pytest.approx(np.median(plush.opacities), abs=1e-3)
+
+
+@pytest.mark.parametrize("kind", [".ply", ".spz"])
+def test_convert_keeps_the_splats(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What was read is what is written, to what the kind can hold; --up -y turns z up into y down."""
+    source, target = tmp_path / "a.ply", tmp_path / f"b{kind}"
+    plush = make_plush(count=500)
+    write_ply(source, plush)
+    assert main(["splat", "convert", str(source), str(target)]) == 0
+    assert f"wrote {plush.count} splats" in capsys.readouterr().out
+    read = read_splats(target)
+    np.testing.assert_allclose(read.means, plush.means, atol=1e-6 if kind == ".ply" else 2.0**-12)
+    np.testing.assert_allclose(read.colors(), plush.colors(), atol=0.02)
+    assert main(["splat", "convert", str(source), str(target), "--up", "-y"]) == 0
+    np.testing.assert_allclose(read_splats(target).oriented("-y").means, read.means, atol=2.0**-11)
+    assert np.abs(read_splats(target).means[:, 1] + read.means[:, 2]).max() < 2.0**-11
+
+
+FAILURES: dict[str, tuple[list[str], str]] = {
+    "missing mesh": (["from-mesh", "{folder}/none.glb"], "none.glb"),
+    "no mesh": (["from-mesh", "{folder}/text.glb"], "text.glb"),
+    "unknown kind": (["from-mesh", "{folder}/text.docx"], "text.docx"),
+    "count": (["from-mesh", "{mesh}", "--count", "0"], "count"),
+    "size": (["from-mesh", "{mesh}", "--size", "-1"], "size"),
+    "iterations": (["from-mesh", "{mesh}", "--iterations", "-1"], "iterations"),
+    "seed": (["from-mesh", "{mesh}", "--seed", "-1"], "seed"),
+    "device": (["from-mesh", "{mesh}", "--device", "abacus:9"], "abacus:9"),
+    "no folder": (["from-mesh", "{mesh}", "--out", "{folder}/deep/toy.ply"], "deep"),
+    "other kind": (["from-mesh", "{mesh}", "--out", "{folder}/toy.jpg"], "toy.jpg"),
+    "info missing": (["info", "{folder}/none.ply"], "none.ply"),
+    "convert missing": (["convert", "{folder}/none.ply", "{folder}/b.ply"], "none.ply"),
+    "convert to other kind": (["convert", "{folder}/none.ply", "{folder}/b.jpg"], "b.jpg"),
+}
+
+
+@pytest.mark.parametrize("case", FAILURES)
+def test_expected_errors_are_one_line_and_leave_nothing(
+    case: str, mesh: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Exit code 2, one line that names the argument and a remedy, no traceback, no new file."""
+    (tmp_path / "text.glb").write_text("no mesh")
+    (tmp_path / "text.docx").write_text("no mesh")
+    before, beside = listing(tmp_path), listing(mesh.parent)
+    arguments, name = FAILURES[case]
+    arguments = [word.replace("{folder}", str(tmp_path)).replace("{mesh}", str(mesh)) for word in arguments]
+    assert main(["splat", *arguments]) == 2
+    error = capsys.readouterr().err
+    lines = [line for line in error.splitlines() if line.startswith("softmode: error: ")]
+    assert len(lines) == 1 and name in lines[0] and "Traceback" not in error
+    assert ". " in lines[0]  # the remedy
+    assert listing(tmp_path) == before and listing(mesh.parent) == beside
