@@ -87,11 +87,11 @@ class Splats:
                 value = np.array(getattr(self, field), dtype=np.float32, order="C")
         except (TypeError, ValueError) as error:
             raise AssetError(f"{self.name}: {field} is no array of numbers", hint="Pass arrays of float32") from error
-        expected = tuple("N" if size is None else size for size in shape)
+        expected = tuple(("K" if axis else "N") if size is None else size for axis, size in enumerate(shape))
         if value.ndim != len(shape) or any(s is not None and s != v for s, v in zip(shape, value.shape, strict=True)):
             raise AssetError(
                 f"{self.name}: {field} has shape {value.shape}, expected ({', '.join(map(str, expected))})",
-                hint="All arrays of one asset need the same number of splats",
+                hint="All arrays of one asset need the same number of splats; sh has K = 1, 4, 9 or 16 coefficients",
             )
         self._require(np.asarray(np.isfinite(value).all(axis=tuple(range(1, value.ndim)))), field, "NaN or infinity")
         return value
@@ -202,17 +202,30 @@ class Splats:
     def with_covariances(self, means: ArrayLike, covariances: ArrayLike, rotations: ArrayLike) -> Splats:
         """Return the splats with the centres, covariances and rotations that skinning on the device leaves.
 
-        Prefer `deformed` where gradients are at hand: squared scales in float32 blur discs thinner than a thousandth.
+        Takes the rows of `SplatArrays` of one world as they are. Prefer `deformed` where gradients are at hand: squared
+        scales in float32 blur discs thinner than a thousandth.
 
         Args:
             means: Deformed centres [m], shape (N, 3).
-            covariances: Deformed covariances [m^2], shape (N, 3, 3).
-            rotations: Rotations from the rest state, which turn the view-dependent colour, shape (N, 3, 3) or (3, 3).
+            covariances: Deformed covariances [m^2], shape (N, 3, 3), or (N, 6) as xx, xy, xz, yy, yz, zz.
+            rotations: Rotations from the rest state, which turn the view-dependent colour, shape (N, 3, 3) or (3, 3),
+                or quaternions xyzw, shape (N, 4) or (1, 4).
 
         Raises:
             ConfigError: If an argument has another shape or is not finite.
             AssetError: If a covariance is zero.
         """
+        six, quats = np.asarray(covariances, dtype=np.float64), np.asarray(rotations, dtype=np.float64)
+        if six.shape == (self.count, 6):
+            covariances = six[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        if quats.shape in ((self.count, 4), (1, 4)):
+            norm = np.linalg.norm(quats, axis=1)
+            if not (np.isfinite(norm) & (norm > 1e-8)).all():
+                raise ConfigError(
+                    "rotations holds a quaternion of length zero or not finite",
+                    hint="Launch the skinning before reading what it writes",
+                )
+            rotations = np.broadcast_to(rotations_from_quats(quats), (self.count, 3, 3))
         turn = self._matrices("rotations", rotations)
         sigma = self._matrices("covariances", covariances)
         frames, scales = axes_of_covariances(sigma, turn @ rotations_from_quats(self.quats))

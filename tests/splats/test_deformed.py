@@ -109,6 +109,16 @@ def test_covariances_from_skinning_give_the_same() -> None:
     size = sigma.max()
     np.testing.assert_allclose(found.covariances() / size, expected.covariances() / size, atol=16 * EPSILON)
     np.testing.assert_allclose(found.sh, expected.sh, atol=16 * EPSILON)
+    six = sigma.astype(np.float32)[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    quats = Rotation.from_matrix(nearest_rotations(gradients)).as_quat().astype(np.float32)
+    rows = splats.with_covariances(splats.means, six, quats)
+    np.testing.assert_allclose(rows.covariances() / size, expected.covariances() / size, atol=16 * EPSILON)
+    np.testing.assert_allclose(rows.sh, expected.sh, atol=32 * EPSILON)
+    still = splats.with_covariances(splats.means, splats.covariances(), [[0.0, 0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(still.sh, splats.sh, atol=16 * EPSILON)
+    with pytest.raises(ConfigError, match="length zero") as caught:
+        splats.with_covariances(splats.means, six, 0.0 * quats)
+    assert "skinning" in caught.value.hint
 
 
 def test_axes_follow_a_slow_deformation() -> None:
