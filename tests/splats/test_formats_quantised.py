@@ -440,4 +440,8 @@ def test_unwritable_suffix_and_axis(tmp_path: Path) -> None:
         assert ".ply" in caught.value.hint
     with pytest.raises(ConfigError, match="up must be"):
         write_splats(tmp_path / "a.ply", random_splats(), up="y")  # type: ignore[arg-type]
+    for suffix in ("usd", "usda", "usdc"):
+        with pytest.raises(ConfigError, match="stage says itself") as refused:
+            write_splats(tmp_path / f"a.{suffix}", random_splats(), up="+y")
+        assert "+z" in refused.value.hint
     assert not list(tmp_path.iterdir())

@@ -13,7 +13,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from softmode.errors import AssetError
+from softmode.errors import AssetError, ConfigError
 from softmode.splats.formats.common import typed_errors
 from softmode.splats.formats.compressed_ply import write_compressed_ply
 from softmode.splats.formats.ply import read_ply, write_ply
@@ -99,12 +99,12 @@ def write_splats(path: str | os.PathLike[str], splats: Splats, *, up: UpAxis = "
             (exact). What each format loses stands in docs/splat_files.md. The folder must exist.
         splats: What to write.
         up: Axis of the file onto which +Z of the splats is turned; viewers of trained `.ply`, `.splat` and SOG files
-            mostly take "-y" for up, those of SPZ "+y". "+z" writes the splats as they are. OpenUSD records its own up
-            axis, leave "+z" there.
+            mostly take "-y" for up, those of SPZ "+y". "+z" writes the splats as they are. OpenUSD files say which axis
+            is up and take "+z" only.
 
     Raises:
         AssetError: If the suffix names no writable format, or the file cannot be written.
-        ConfigError: If `up` is no axis.
+        ConfigError: If `up` is no axis, or not "+z" for OpenUSD.
         MissingExtraError: If OpenUSD is to be written without the extra `[usd]`.
     """
     file = Path(path)
@@ -115,5 +115,10 @@ def write_splats(path: str | os.PathLike[str], splats: Splats, *, up: UpAxis = "
             hint=f"Writable are {', '.join(WRITABLE)}",
         )
     if up != "+z":
+        if suffix in _USD:
+            raise ConfigError(
+                f"splat file {file}: up is {up!r}, but an OpenUSD stage says itself that z is up",
+                hint='Leave up="+z" for OpenUSD; viewers and readers turn the stage',
+            )
         splats = splats.transformed(rotation=up_rotation(up).T)
     _WRITERS[suffix](file, splats)
