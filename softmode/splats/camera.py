@@ -76,7 +76,8 @@ class SplatCamera:
         randomization: What `randomize` draws; nothing is drawn before its first call.
 
     Raises:
-        ConfigError: If the cameras disagree in size, share a name, or name a body that some world lacks.
+        ConfigError: If the cameras disagree in size, share a name, or name a body that some world lacks, or the splats
+            are of another number of worlds.
     """
 
     def __init__(
@@ -99,6 +100,11 @@ class SplatCamera:
             raise ConfigError(
                 f"cameras have sizes {sorted(sizes)} and names {[camera.name for camera in self.cameras]}",
                 hint="Give at least one camera, unique names and one size; use one SplatCamera per image size",
+            )
+        if splats is not None and splats.means.shape[0] not in (1, worlds):
+            raise ConfigError(
+                f"splats are of {splats.means.shape[0]} worlds, the model has {worlds}",
+                hint="Build them by SplatArrays.from_splats(objects, world_count=model.world_count)",
             )
         if self.options.mesh_samples not in (1, 4):
             raise ConfigError(f"mesh_samples must be 1 or 4, got {self.options.mesh_samples}")
@@ -255,7 +261,20 @@ class SplatCamera:
                 world_count,).
             target: Point in the middle of the picture, in the same frame [m], same shapes.
             up: Direction that points up in the picture.
+
+        Raises:
+            ConfigError: If there is no such camera, or position or target are no such arrays.
         """
+        for what, array in (("position", position), ("target", target)):
+            if (
+                not isinstance(array, wp.array)
+                or array.dtype != wp.vec3
+                or array.shape not in ((1,), (self.world_count,))
+            ):
+                raise ConfigError(
+                    f"{what} must be a wp.array of wp.vec3 of shape (1,) or ({self.world_count},)",
+                    hint="For poses known on the host: camera.poses(name).assign(...), or PinholeCamera.look_at",
+                )
         wp.launch(
             kernels.look_at,
             dim=self.world_count,

@@ -135,7 +135,17 @@ class ViewVariation:
 
         Args:
             world_mask: Which worlds, bool, shape (world_count,); all if None.
+
+        Raises:
+            ConfigError: If the mask is no such array.
         """
+        if world_mask is not None and not (
+            isinstance(world_mask, wp.array) and world_mask.dtype == wp.bool and world_mask.shape == (self.world_count,)
+        ):
+            raise ConfigError(
+                f"world_mask must be a wp.array of wp.bool of shape ({self.world_count},)",
+                hint="wp.array(mask, dtype=wp.bool, device=model.device)",
+            )
         ranges = self.randomization
         mask = self._all if world_mask is None else world_mask
         wp.launch(

@@ -85,9 +85,16 @@ class SplatArrays:
             world_count: Number of worlds.
             sh_degree: Degree kept, 0 to 3; None for the highest of the objects. Lower ones are padded with zeros.
             device: Warp device.
+
+        Raises:
+            ConfigError: If there are no objects or worlds, or the degree is out of range.
         """
-        if not objects:
-            raise ConfigError("objects is empty", hint="Pass at least one Splats")
+        if isinstance(objects, Splats) or not objects:
+            raise ConfigError("objects is empty or no list", hint="Pass a list of at least one Splats")
+        if world_count < 1:
+            raise ConfigError(f"world_count must be at least 1, got {world_count}", hint="Pass model.world_count")
+        if sh_degree is not None and not 0 <= sh_degree <= 3:
+            raise ConfigError(f"sh_degree must be 0 to 3, got {sh_degree}", hint="Pass None for that of the objects")
         degree = max(splats.sh_degree for splats in objects) if sh_degree is None else sh_degree
         width = (degree + 1) ** 2
         sh = [splats.sh[:, :width] for splats in objects]

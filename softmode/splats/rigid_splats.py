@@ -30,6 +30,12 @@ class RigidSplats:
     hide_meshes: bool = False
     """Do not draw the body's own shapes; they collide as before."""
 
+    def __post_init__(self) -> None:
+        """Check the rotation."""
+        norm = float(np.linalg.norm(self.quat))
+        if len(self.quat) != 4 or not (np.isfinite(norm) and norm > 1e-8):
+            raise ConfigError(f"RigidSplats: quat is {self.quat}", hint="Pass a unit quaternion (x, y, z, w)")
+
     def in_body(self) -> Splats:
         """Return the splats in the frame of the body, view-dependent colour turned along."""
         return self.splats.transformed(rotation=rotations_from_quats([self.quat])[0], translation=self.position)
@@ -49,8 +55,8 @@ class RigidSplatsSkin:
 
     def __init__(self, model: newton.Model, parts: Sequence[RigidSplats]) -> None:
         """Upload the splats in the frames of their bodies."""
-        if not parts:
-            raise ConfigError("parts is empty", hint="Pass at least one RigidSplats")
+        if isinstance(parts, RigidSplats) or not parts:
+            raise ConfigError("parts is empty or no list", hint="Pass a list of at least one RigidSplats")
         self.objects = tuple(part.in_body() for part in parts)
         """The splats in the frames of their bodies; append them to the objects of `SplatArrays.from_splats`."""
         self.device: Any = model.device

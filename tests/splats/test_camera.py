@@ -11,7 +11,7 @@ import warp as wp
 from softmode.errors import ConfigError
 from softmode.splats import make_plush
 from softmode.splats.camera import CameraOptions, PinholeCamera, SplatCamera
-from softmode.splats.rasterizer import RasterizerOptions
+from softmode.splats.rasterizer import RasterizerOptions, SplatArrays
 from softmode.splats.shadow import ShadowOptions
 from softmode.splats.splats import rotations_from_quats
 from tests.splats.camera_scene import PLAIN, SIZE, arrays, camera, marker, scene
@@ -168,6 +168,13 @@ def test_refuses_bad_descriptions() -> None:
     for output in ("segmentation", "object_id", "median_depth", "sepia"):
         with pytest.raises(ConfigError, match=f"does not write '{output}'.*Turn it on"):
             sensor.images("front", output)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="of 3 worlds, the model has 2"):
+        SplatCamera(scene(2), SplatArrays.from_splats([make_plush(300)], world_count=3, device="cpu"), [camera()])
+    point = wp.zeros(1, dtype=wp.vec3, device="cpu")
+    for wrong in ((0.0, 0.0, 1.0), np.zeros((1, 3)), wp.zeros(5, dtype=wp.vec3, device="cpu")):
+        with pytest.raises(ConfigError, match=r"target must be .* shape \(1,\)") as caught:
+            sensor.look_at("front", point, wrong)  # type: ignore[arg-type]
+        assert "poses" in caught.value.hint
     with pytest.raises(ConfigError, match="cells"):
         ShadowOptions(cells=0)
 

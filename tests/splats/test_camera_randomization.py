@@ -216,3 +216,6 @@ def test_refuses_bad_ranges_and_seeds() -> None:
     for seeds in (1.5, [1, 2], np.zeros(3)):
         with pytest.raises(ConfigError, match="seeds"):
             make(3).seed(seeds)
+    for mask in (np.ones(3, bool), wp.ones(2, dtype=wp.bool, device="cpu"), wp.ones(3, dtype=wp.int32, device="cpu")):
+        with pytest.raises(ConfigError, match="world_mask"):
+            make(3).draw(mask)  # type: ignore[arg-type]

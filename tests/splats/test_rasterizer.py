@@ -359,5 +359,10 @@ def test_refuses_arrays_of_another_size() -> None:
         rasterizer.render(arrays, views_of(EYES, 32, 32, "cpu"))
     with pytest.raises(ConfigError, match="mesh_rgb has shape None"):
         rasterizer.render(arrays, views, mesh_depth=wp.zeros((1, 32, 32), device="cpu"))
+    for name, value in (("world_count", 0), ("sh_degree", 4)):
+        with pytest.raises(ConfigError, match=name):
+            SplatArrays.from_splats([make_plush(200)], **{name: value}, device="cpu")
+    with pytest.raises(ConfigError, match="no list"):
+        SplatArrays.from_splats(make_plush(200), device="cpu")  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="objects is empty"):
         SplatArrays.from_splats([], device="cpu")

@@ -169,6 +169,10 @@ def test_refuses_what_does_not_fit() -> None:
     model, part = scene(2), RigidSplats(splats=make_plush(200), body="hand")
     with pytest.raises(ConfigError, match="parts is empty"):
         RigidSplatsSkin(model, [])
+    with pytest.raises(ConfigError, match="parts is empty or no list"):
+        RigidSplatsSkin(model, part)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="quat"):
+        dataclasses.replace(part, quat=(0.0, 0.0, 0.0, 0.0))
     with pytest.raises(ConfigError, match=r"RigidSplats: 0 bodies are called 'foot'.*box, hand"):
         RigidSplatsSkin(model, [dataclasses.replace(part, body="foot")])
     skin = RigidSplatsSkin(model, [part])
