@@ -49,7 +49,9 @@ def _function() -> Any:
     try:
         import torch
     except ImportError as error:
-        raise MissingExtraError("PyTorch is not installed", hint="pip install 'softmode[rl]'") from error
+        raise MissingExtraError(
+            "PyTorch is not installed", hint="install it with: pip install 'softmode[rl]'"
+        ) from error
 
     def view(tensor: Tensor, adjoint: AdjointReduced, dtype: Any = wp.vec3d) -> wp.array:
         """Return a tensor as a Warp array on the adjoint's device, sharing memory where it can."""

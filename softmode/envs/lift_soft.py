@@ -142,6 +142,10 @@ class LiftSoftEnv(gym.Env, gym.utils.EzPickle):
             )
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ConfigError(f"render_mode is {render_mode!r}", hint="use 'rgb_array' or None")
+        if config is not None and not isinstance(config, LiftSoftConfig):
+            raise ConfigError(
+                f"config is a {type(config).__name__}", hint="pass LiftSoftConfig(image_size=128), of this module"
+            )
         self.config = _configured(config or LiftSoftConfig(), control_mode, splat, size)
         self.obs_type, self.render_mode = obs_type, render_mode
         self.metadata = {**self.metadata, "render_fps": round(self.config.scene.control_hz)}

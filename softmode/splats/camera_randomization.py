@@ -144,7 +144,7 @@ class ViewVariation:
         ):
             raise ConfigError(
                 f"world_mask must be a wp.array of wp.bool of shape ({self.world_count},)",
-                hint="wp.array(mask, dtype=wp.bool, device=model.device)",
+                hint="Pass wp.array(mask, dtype=wp.bool, device=model.device)",
             )
         ranges = self.randomization
         mask = self._all if world_mask is None else world_mask

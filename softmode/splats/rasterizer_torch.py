@@ -68,7 +68,9 @@ def _function() -> Any:
     try:
         import torch
     except ImportError as error:
-        raise MissingExtraError("PyTorch is not installed", hint="pip install 'softmode[rl]'") from error
+        raise MissingExtraError(
+            "PyTorch is not installed", hint="install it with: pip install 'softmode[rl]'"
+        ) from error
 
     def view(tensor: Tensor, like: wp.array) -> wp.array:
         """Return a tensor as a Warp array, sharing memory where it can."""

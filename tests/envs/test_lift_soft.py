@@ -234,7 +234,14 @@ def test_large_actions_are_clamped(lift: LiftSoftEnv) -> None:
 
 
 @pytest.mark.parametrize(
-    "given", [{"obs_type": "depth"}, {"render_mode": "human"}, {"control_mode": "torque"}, {"size": 0.0}]
+    "given",
+    [
+        {"obs_type": "depth"},
+        {"render_mode": "human"},
+        {"control_mode": "torque"},
+        {"size": 0.0},
+        {"config": {"image_size": 128}},
+    ],
 )
 def test_unknown_arguments_are_refused(given: dict[str, Any]) -> None:
     """The constructor checks its arguments before it builds."""

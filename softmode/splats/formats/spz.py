@@ -150,7 +150,8 @@ def _zstd() -> Any:
             from backports import zstd
     except ImportError as error:
         raise MissingExtraError(
-            "SPZ version 4 needs Zstandard", hint="pip install 'softmode[spz]', or convert the file to SPZ version 3"
+            "SPZ version 4 needs Zstandard",
+            hint="install it with: pip install 'softmode[spz]', or convert the file to SPZ version 3",
         ) from error
     return zstd
 

@@ -40,7 +40,7 @@ def _pxr_folder() -> str:
     """Return the folder that holds `pxr` without importing it."""
     spec = importlib.util.find_spec("pxr")
     if spec is None or not spec.submodule_search_locations:
-        raise MissingExtraError("OpenUSD splats need usd-core", hint="pip install 'softmode[usd]'")
+        raise MissingExtraError("OpenUSD splats need usd-core", hint="install it with: pip install 'softmode[usd]'")
     return str(Path(next(iter(spec.submodule_search_locations))).parent)
 
 
@@ -222,7 +222,8 @@ def _build_layer(frames: list[Splats], fps: float) -> Any:
     Sdf, Usd, UsdGeom, UsdVol, Vt = pxr
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         raise MissingExtraError(
-            "the installed usd-core has no ParticleField3DGaussianSplat", hint="pip install 'softmode[usd]'"
+            "the installed usd-core has no ParticleField3DGaussianSplat",
+            hint="install it with: pip install 'softmode[usd]'",
         )
     layer = Sdf.Layer.CreateAnonymous(".usdc")
     stage = Usd.Stage.Open(layer)
