@@ -131,6 +131,13 @@ class SplatCamera:
             splat_gain=self.variation.splat_gain,
         )
         self._sensor_pose = wp.zeros(views, dtype=wp.transform, device=self.device)
+        self._light = MeshLight(
+            direction=self.options.light_direction,
+            color=self.options.light_color,
+            ambient=self.options.ambient,
+            shadows=self.options.shadows,
+            samples=self.options.mesh_samples,
+        )
         self._meshes = self._make_meshes()
         shape = (views, self.height, self.width)
         self._mesh_rgb = wp.zeros(shape, dtype=wp.vec3, device=self.device)
@@ -145,27 +152,19 @@ class SplatCamera:
                 splats.means.shape[1], views, self.width, self.height, options=drawn, device=self.device
             )
             if self.options.splat_shadow is not None:
-                self._shadow = SplatShadow(
-                    worlds, self.options.light_direction, options=self.options.splat_shadow, device=self.device
-                )
+                self._shadow = SplatShadow(worlds, self._light, options=self.options.splat_shadow, device=self.device)
         self._init_segmentation()
 
     def _make_meshes(self) -> MeshImages:
         """Build the sensor of the meshes."""
         options = self.options
-        light = MeshLight(
-            direction=options.light_direction,
-            color=options.light_color,
-            ambient=options.ambient,
-            shadows=options.shadows,
-            samples=options.mesh_samples,
-        )
         return MeshImages(
             self.model,
             self.cameras,
-            light,
+            self._light,
             lens_per_world=options.lens_per_world or self.variation.randomization.changes_lens,
             shape_index=options.segmentation,
+            surface=self.splats is not None and options.splat_shadow is not None,
         )
 
     def _init_segmentation(self) -> None:
@@ -329,8 +328,8 @@ class SplatCamera:
         )  # fmt: skip
         rgb = self._mesh_rgb
         if self.rasterizer is not None and self.splats is not None:
-            if self._shadow is not None:
-                self._shadow.cast(self.splats, self.views, self._sensor_pose, meshes.depth, self._mesh_rgb)
+            if self._shadow is not None and meshes.active:
+                self._shadow.cast(self.splats, self.views, self._sensor_pose, meshes, self._mesh_rgb)
             self.rasterizer.render(self.splats, self.views, mesh_rgb=self._mesh_rgb, mesh_depth=meshes.depth)
             rgb = self.rasterizer.rgb
         wp.launch(kernels.pack_bytes, dim=size, inputs=[rgb], outputs=[self.rgb], device=self.device)

@@ -77,6 +77,15 @@ def aim_pixels(
 
 
 @wp.func
+def unpack_rgb(packed: wp.uint32) -> wp.vec3:
+    """Return the colours 0..1 of packed RGBA bytes."""
+    red = float(packed & wp.uint32(255))
+    green = float((packed >> wp.uint32(8)) & wp.uint32(255))
+    blue = float((packed >> wp.uint32(16)) & wp.uint32(255))
+    return wp.vec3(red, green, blue) / 255.0
+
+
+@wp.func
 def to_linear(c: wp.vec3) -> wp.vec3:
     """Return linear light of gamma-encoded colour, by the power 2.2."""
     return wp.vec3(wp.pow(c[0], 2.2), wp.pow(c[1], 2.2), wp.pow(c[2], 2.2))
@@ -121,10 +130,7 @@ def unpack_meshes(
             if depth_per_pixel:
                 depth_out[view, row, column] = z / wp.length(local)
             c = packed[view, row, column]
-            red = float(c & wp.uint32(255))
-            green = float((c >> wp.uint32(8)) & wp.uint32(255))
-            blue = float((c >> wp.uint32(16)) & wp.uint32(255))
-            mesh = wp.cw_mul(light_gain[world], wp.vec3(red, green, blue) / 255.0)
+            mesh = wp.cw_mul(light_gain[world], unpack_rgb(c))
             covered = float(c >> wp.uint32(24)) / 255.0
             if covered > 0.999:
                 rgb_out[view, row, column] = mesh

@@ -45,6 +45,7 @@ class MeshImages:
         light: Light and sampling.
         lens_per_world: Worlds have intrinsics of their own.
         shape_index: Write which shape is seen.
+        surface: Write albedo and normal of what is seen.
     """
 
     def __init__(
@@ -55,6 +56,7 @@ class MeshImages:
         *,
         lens_per_world: bool = False,
         shape_index: bool = False,
+        surface: bool = False,
     ) -> None:
         """Allocate the images and build Newton's sensor."""
         self.model, self.lens_per_world = model, lens_per_world
@@ -68,7 +70,12 @@ class MeshImages:
             shape if shape_index else (1, 1, 1), value=0xFFFFFFFF, dtype=wp.uint32, device=device
         )
         """Shape per pixel, 0xFFFFFFFF where none is."""
-        self._wants_shape = shape_index
+        part = shape if surface else (1, 1, 1)
+        self.albedo = wp.zeros(part, dtype=wp.uint32, device=device)
+        """Colours without light RGBA, 8 bit each, sRGB."""
+        self.normal = wp.zeros(part, dtype=wp.vec3, device=device)
+        """Surface normals in the world."""
+        self._wants_shape, self._wants_surface = shape_index, surface
         self._sensor: SensorCamera | None = None
         if model.shape_count == 0 or model.bvh_shapes is None:
             return
@@ -114,6 +121,7 @@ class MeshImages:
             pose, worlds = _part(sensor_pose, part), None
             images = [_part(image, part) for image in (self.packed, self.depth)]
             images.append(_part(self.shape_index, part) if self._wants_shape else None)
+            images += [_part(a, part) if self._wants_surface else None for a in (self.albedo, self.normal)]
             if self.lens_per_world:
                 wp.launch(
                     kernels.aim_pixels,
@@ -132,6 +140,8 @@ class MeshImages:
                 color_image=images[0],
                 forward_depth_image=images[1],
                 shape_index_image=images[2],
+                albedo_image=images[3],
+                normal_image=images[4],
                 world_indices=worlds,
                 render_config=self._config,
             )

@@ -8,6 +8,7 @@ import warp as wp
 
 from softmode.errors import ConfigError
 from softmode.splats import shadow_kernels as kernels
+from softmode.splats.camera_meshes import MeshImages, MeshLight
 from softmode.splats.rasterizer import SplatArrays, ViewArrays
 
 
@@ -15,8 +16,8 @@ from softmode.splats.rasterizer import SplatArrays, ViewArrays
 class ShadowOptions:
     """How dark and how fine the shadow is."""
 
-    strength: float = 0.4
-    """Share of the mesh's colour that full shadow takes away, 0..1."""
+    strength: float = 1.0
+    """How dark full shadow is: 1 as dark as the shadow of a mesh, 0 not at all."""
     cells: int = 40
     """Cells of the depth map along each side; more where small objects lie far apart."""
     margin: float = 1.6
@@ -40,7 +41,7 @@ class SplatShadow:
 
     Args:
         world_count: Number of worlds.
-        light_direction: Direction in which the light travels.
+        light: The light on the meshes.
         options: Darkness and resolution.
         device: Warp device.
     """
@@ -48,17 +49,18 @@ class SplatShadow:
     def __init__(
         self,
         world_count: int,
-        light_direction: tuple[float, float, float],
+        light: MeshLight,
         *,
         options: ShadowOptions | None = None,
         device: Any = None,
     ) -> None:
         """Allocate the map."""
+        self._light = [wp.vec3(*radiance) for radiance in (*light.ambient, light.color)]
         self.options = options if options is not None else ShadowOptions()
-        light = np.asarray(light_direction, dtype=np.float64) / np.linalg.norm(light_direction)
-        first = np.cross(light, [1.0, 0.0, 0.0] if abs(light[0]) < 0.9 else [0.0, 1.0, 0.0])
+        ahead = np.asarray(light.direction, dtype=np.float64) / np.linalg.norm(light.direction)
+        first = np.cross(ahead, [1.0, 0.0, 0.0] if abs(ahead[0]) < 0.9 else [0.0, 1.0, 0.0])
         first /= np.linalg.norm(first)
-        self._frame = wp.mat33(*np.stack([first, np.cross(light, first), light]).ravel())
+        self._frame = wp.mat33(*np.stack([first, np.cross(ahead, first), ahead]).ravel())
         self.world_count = world_count
         self.device = wp.get_device(device)
         self._bounds = wp.zeros(world_count, dtype=wp.vec4, device=self.device)
@@ -70,17 +72,17 @@ class SplatShadow:
         splats: SplatArrays,
         views: ViewArrays,
         sensor_pose: wp.array,
-        mesh_depth: wp.array,
+        meshes: MeshImages,
         mesh_rgb: wp.array,
     ) -> None:
-        """Darken `mesh_rgb` where the splats stand in the light.
+        """Take the sunlight from `mesh_rgb` where the splats stand in it; what has none already stays as it is.
 
         Args:
             splats: The splats where they are now.
             views: The cameras.
             sensor_pose: Camera to world with OpenGL axes, transform, shape (view_count,).
-            mesh_depth: Forward depth of the meshes [m], 0 where there is none, shape (view_count, height, width).
-            mesh_rgb: Colours of the meshes, vec3, same shape; changed in place.
+            meshes: The meshes as the sensor saw them, with their surfaces.
+            mesh_rgb: Colours of the meshes, vec3, shape (view_count, height, width); changed in place.
         """
         count = splats.means.shape[1]
         self._map.fill_(1.0e30)
@@ -100,10 +102,11 @@ class SplatShadow:
         )
         wp.launch(
             kernels.darken,
-            dim=mesh_depth.shape,
+            dim=meshes.depth.shape,
             inputs=[
                 self._bounds, self._frame, self.options.margin, self._map, views.world, views.intrinsics, sensor_pose,
-                mesh_depth, self.options.strength, self.options.softness,
+                meshes.depth, meshes.packed, meshes.albedo, meshes.normal, *self._light,
+                self.options.strength, self.options.softness,
             ],
             outputs=[mesh_rgb],
             device=self.device,

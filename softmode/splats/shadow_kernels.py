@@ -2,11 +2,15 @@
 
 import warp as wp
 
+from softmode.splats.camera_kernels import to_linear, to_srgb, unpack_rgb
+
 wp.set_module_options({"enable_backward": False})
 
 
 SOLID = wp.constant(0.3)
 """Least opacity of a splat that casts a shadow."""
+SHADOW_LIGHT = wp.constant(0.3)
+"""Share of the sunlight that Newton's sensor leaves in the shadow of a mesh."""
 
 
 @wp.func
@@ -77,14 +81,25 @@ def darken(
     view_world: wp.array[int],
     intrinsics: wp.array[wp.vec4],
     sensor_pose: wp.array[wp.transform],  # camera to world, OpenGL axes
+    # Meshes:
     mesh_depth: wp.array3d[float],  # (view_count, height, width) [m]
+    packed: wp.array3d[wp.uint32],  # RGBA, sRGB, as lit
+    albedo: wp.array3d[wp.uint32],  # RGBA, sRGB
+    normal: wp.array3d[wp.vec3],
+    ambient_above: wp.vec3,  # linear radiance
+    ambient_below: wp.vec3,
+    sun: wp.vec3,
     # Options:
     strength: float,
     softness: float,
     # Out:
     rgb_out: wp.array3d[wp.vec3],
 ):
-    """Darken the mesh pixels that lie behind the splats as the light sees them."""
+    """Take the sunlight from mesh pixels that lie behind the splats as the light sees them.
+
+    What would be left of the lit colour in the shadow of a mesh is found from albedo and normal, channel by channel;
+    where a mesh keeps the sun off already, that is all of it.
+    """
     view, row, column = wp.tid()
     z = mesh_depth[view, row, column]
     if z <= 0.0:
@@ -109,5 +124,17 @@ def darken(
             if i >= 0 and j >= 0 and i < cells and j < cells:
                 if map_depth[world, j, i] < p[2]:
                     covered += weight
-    if total > 0.0:
-        rgb_out[view, row, column] *= 1.0 - strength * covered / total
+    if covered <= 0.0:
+        return
+    up = 0.5 * (normal[view, row, column][2] + 1.0)
+    ahead = wp.vec3(frame[2, 0], frame[2, 1], frame[2, 2])
+    sunlight = SHADOW_LIGHT * wp.max(-wp.dot(normal[view, row, column], ahead), 0.0) * sun
+    light = up * ambient_above + (1.0 - up) * ambient_below + sunlight
+    lit = to_linear(unpack_rgb(packed[view, row, column]))
+    dark = wp.cw_mul(to_linear(unpack_rgb(albedo[view, row, column])), light)
+    taken = strength * covered / total
+    left = wp.vec3()
+    for channel in range(3):
+        share = wp.min(dark[channel] / wp.max(lit[channel], 1.0e-6), 1.0)
+        left[channel] = 1.0 - taken * (1.0 - share)
+    rgb_out[view, row, column] = wp.cw_mul(rgb_out[view, row, column], to_srgb(left))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import newton
 import numpy as np
 import pytest
 import warp as wp
@@ -122,6 +123,35 @@ def test_splats_cast_a_shadow_on_the_table_only() -> None:
     change = images[1] - images[0]
     assert change.max() <= 0 and (change < -60).sum() > 10
     assert np.abs(change[alpha > 0.995]).max() <= 2
+
+
+def test_splats_and_meshes_cast_the_same_shadow() -> None:
+    """Under a plush the table is as dark as under a slab, and no darker where both keep the sun off."""
+    pictures = {}
+    for slab in (False, True):
+        builder = newton.ModelBuilder()
+        builder.add_shape_plane(width=2.0, length=2.0, color=(0.7, 0.6, 0.5))
+        if slab:
+            builder.add_shape_box(-1, xform=wp.transform((0.0, 0.0, 0.5), wp.quat_identity()), hx=0.3, hy=0.3, hz=0.01)
+        model = builder.finalize(device="cpu")
+        for plush in (False, True):
+            # Lifted off the ground, between the ground and the slab, and seen from below the slab.
+            toy = arrays(make_plush(1500).transformed(translation=(0.0, 0.0, 0.15)))
+            shadow = ShadowOptions() if plush else None
+            options = CameraOptions(light_direction=(0.0, 0.0, -1.0), splat_shadow=shadow)
+            view = camera(position=(0.5, 0.0, 0.1), target=(0.0, 0.0, 0.0), fov_y=0.25)
+            sensor = SplatCamera(model, toy, [view], options=options)
+            sensor.render(model.state())
+            pictures[slab, plush] = sensor.rgb.numpy()[0].astype(int)
+            alpha = sensor.alpha.numpy()[0]  # type: ignore[union-attr]
+    ground = alpha == 0.0
+    lit, under_slab = pictures[False, False][ground], pictures[True, False][ground]
+    assert np.median(lit - under_slab) > 20
+    np.testing.assert_allclose(pictures[True, True][ground], under_slab, atol=2)
+    under_plush = pictures[False, True][ground]
+    deepest = (lit - under_plush).sum(axis=1) > 0.95 * np.median((lit - under_slab).sum(axis=1))
+    assert deepest.sum() > 10
+    assert (under_plush >= under_slab - 3).all(), "never darker than the shadow of a mesh"
 
 
 def test_smooth_mesh_edges_mix_object_and_sky() -> None:
