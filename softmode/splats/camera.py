@@ -282,6 +282,19 @@ class SplatCamera:
             device=self.device,
         )
 
+    @property
+    def mesh_rgb(self) -> wp.array:
+        """Meshes, sky and shadows without the splats, vec3 0..1, shape (view_count, height, width).
+
+        With `mesh_depth`, `views` and `rasterizer` it is what `AdjointRasterizer` needs for gradients of the frame.
+        """
+        return self._mesh_rgb
+
+    @property
+    def mesh_depth(self) -> wp.array:
+        """Forward depth of the meshes alone [m], 0 for the sky, shape (view_count, height, width)."""
+        return self._meshes.depth
+
     def segmentation_ids(self, pattern: str) -> tuple[int, ...]:
         """Return the ids of `segmentation` whose label matches a shell pattern such as "*/finger_left/*"."""
         return tuple(i for i, label in enumerate(self.labels) if fnmatch.fnmatchcase(label, pattern))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.errors import ConfigError
-from softmode.splats.splats import quat_from_rotation
+from softmode.splats.splats import quat_from_rotation, rotations_from_quats
 
 Vector = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
@@ -193,6 +193,14 @@ class PinholeCamera:
     def matrix(self) -> NDArray[np.float64]:
         """Intrinsics K [px], shape (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def world_to_camera(self) -> NDArray[np.float64]:
+        """Rigid transform from the frame of `body`, or the world, to the camera, shape (4, 4)."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = rotations_from_quats(np.asarray(self.quat)[None])[0].T
+        matrix[:3, 3] = -matrix[:3, :3] @ np.asarray(self.position)
+        return matrix
 
     @property
     def opengl_quat(self) -> Quat:

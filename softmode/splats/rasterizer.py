@@ -12,6 +12,7 @@ which is what keeps small images right.
 """
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +22,7 @@ import warp as wp
 from softmode.errors import ConfigError
 from softmode.splats import blend_cpu_kernels, blend_cuda_kernels, cover_cuda_kernels, depth_sort_kernels
 from softmode.splats import rasterizer_kernels as kernels
+from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.splats import MAX_SPLATS, Splats
 
 MAX_EDGE = 4096
@@ -133,6 +135,43 @@ class ViewArrays:
     splat_gain: wp.array | None = None
     """Factor on the colours (xyz) and opacities (w, the product at most 1) of splats, vec4, shape (1 or view_count,);
     None for ones."""
+
+    @classmethod
+    def from_cameras(
+        cls,
+        cameras: Sequence[PinholeCamera],
+        *,
+        world: Sequence[int] | None = None,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        device: Any = None,
+    ) -> "ViewArrays":
+        """Return one view per camera fixed in the world.
+
+        Args:
+            cameras: Descriptions of one image size, none of them on a body.
+            world: World that each of them shows; world 0 if None.
+            background: Colour behind everything, 0..1.
+            device: Warp device.
+
+        Raises:
+            ConfigError: If there is no camera, one is on a body, or sizes or numbers disagree.
+        """
+        sizes = {(camera.width, camera.height) for camera in cameras}
+        carried = [camera.name for camera in cameras if camera.body is not None]
+        shown = [0] * len(cameras) if world is None else list(world)
+        if len(sizes) != 1 or carried or len(shown) != len(cameras):
+            raise ConfigError(
+                f"{len(cameras)} cameras of sizes {sorted(sizes)}, {carried} on bodies, {len(shown)} worlds",
+                hint="Give fixed cameras of one size and one world for each; SplatCamera draws those on bodies",
+            )
+        matrices = np.stack([camera.world_to_camera for camera in cameras]).astype(np.float32)
+        lenses = np.array([(camera.fx, camera.fy, camera.cx, camera.cy) for camera in cameras], dtype=np.float32)
+        return cls(
+            world_to_camera=wp.array(matrices, dtype=wp.mat44, device=device),
+            intrinsics=wp.array(lenses, dtype=wp.vec4, device=device),
+            world=wp.array(shown, dtype=wp.int32, device=device),
+            background=wp.array([background], dtype=wp.vec3, device=device),
+        )
 
 
 class SplatRasterizer:

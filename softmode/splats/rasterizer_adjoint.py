@@ -11,13 +11,26 @@ import functools
 from dataclasses import dataclass, fields
 from typing import Any
 
+import numpy as np
 import warp as wp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import expm
 
 from softmode.errors import ConfigError
 from softmode.splats import blend_adjoint_cpu_kernels, blend_adjoint_cuda_kernels, projection_adjoint_kernels
 from softmode.splats.blend_cuda_kernels import BLOCK_DIM
 from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
+
+
+def exp_twist(twist: ArrayLike) -> NDArray[np.float64]:
+    """Return the rigid motion exp(v, w), shape (4, 4), of a twist v [m], w [rad], shape (6,).
+
+    A step of gradient descent on a camera is ``pose = exp_twist(-rate * gradients.twist) @ pose``.
+    """
+    v, w = np.asarray(twist, dtype=np.float64).reshape(2, 3)
+    generator = np.zeros((4, 4))
+    generator[:3, :3], generator[:3, 3] = np.cross(np.eye(3), w), v
+    return np.asarray(expm(generator), dtype=np.float64)
 
 
 @dataclass(frozen=True, kw_only=True)

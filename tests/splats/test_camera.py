@@ -12,7 +12,8 @@ import warp as wp
 from softmode.errors import ConfigError
 from softmode.splats import make_plush
 from softmode.splats.camera import CameraOptions, PinholeCamera, SplatCamera
-from softmode.splats.rasterizer import RasterizerOptions, SplatArrays
+from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
+from softmode.splats.rasterizer_adjoint import AdjointRasterizer
 from softmode.splats.shadow import ShadowOptions
 from softmode.splats.splats import rotations_from_quats
 from tests.splats.camera_scene import PLAIN, SIZE, arrays, camera, marker, scene
@@ -152,6 +153,24 @@ def test_splats_and_meshes_cast_the_same_shadow() -> None:
     deepest = (lit - under_plush).sum(axis=1) > 0.95 * np.median((lit - under_slab).sum(axis=1))
     assert deepest.sum() > 10
     assert (under_plush >= under_slab - 3).all(), "never darker than the shadow of a mesh"
+
+
+def test_a_composited_frame_is_drawn_and_differentiated_from_its_parts() -> None:
+    """What the camera shows of meshes and views is all that the rasteriser and its adjoint need."""
+    eye = camera()
+    sensor = SplatCamera(scene(), arrays(make_plush(600)), [eye], options=CameraOptions(splat_shadow=None))
+    sensor.render(sensor.model.state())
+    assert sensor.rasterizer is not None and sensor.splats is not None
+    again = SplatRasterizer(600, 1, eye.width, eye.height, device="cpu")
+    meshes = {"mesh_rgb": sensor.mesh_rgb, "mesh_depth": sensor.mesh_depth}
+    again.render(sensor.splats, ViewArrays.from_cameras([eye], device="cpu"), **meshes)
+    np.testing.assert_allclose(again.rgb.numpy(), sensor.rasterizer.rgb.numpy(), atol=1e-4)
+    adjoint = AdjointRasterizer(sensor.rasterizer, sensor.splats, sensor.views)
+    ones = wp.ones(sensor.rasterizer.rgb.shape, dtype=wp.vec3, device="cpu")
+    found = adjoint.backward(sensor.splats, sensor.views, loss_rgb=ones, **meshes)
+    assert np.linalg.norm(found.twist.numpy()) > 0.0
+    with pytest.raises(ConfigError, match="on bodies"):
+        ViewArrays.from_cameras([camera(body="hand")])
 
 
 def test_smooth_mesh_edges_mix_object_and_sky() -> None:

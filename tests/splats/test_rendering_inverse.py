@@ -17,7 +17,7 @@ from softmode.deformables.skinning import SkinSplats
 from softmode.deformables.skinning_adjoint import AdjointSkinning
 from softmode.splats import Splats
 from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
-from softmode.splats.rasterizer_adjoint import AdjointRasterizer
+from softmode.splats.rasterizer_adjoint import AdjointRasterizer, exp_twist
 from tests.splats.test_rasterizer import look_at
 
 Array = NDArray[np.float64]
@@ -52,13 +52,6 @@ def views(poses: list[Array]) -> ViewArrays:
 POSES = [look_at((0.05, -0.4, 0.15)), look_at((-0.15, 0.25, 0.3))]
 
 
-def twist_matrix(twist: Array) -> Array:
-    """Return the rigid motion exp(v, w)."""
-    out = np.zeros((4, 4))
-    out[:3, :3], out[:3, 3] = np.cross(np.eye(3), twist[3:]), twist[:3]
-    return np.asarray(expm(out), dtype=np.float64)
-
-
 def left_jacobian(twist: Array) -> Array:
     """Return J with exp(x + dx) = exp(J dx) exp(x), the integral of exp(s ad(x)) over s in 0..1."""
     v, w = np.cross(np.eye(3), twist[:3]), np.cross(np.eye(3), twist[3:])
@@ -83,7 +76,7 @@ def test_camera_pose_is_found_from_one_picture() -> None:
     scale = np.array([0.01] * 3 + [0.03] * 3)
 
     def loss(x: Array) -> tuple[float, Array]:
-        moved = views([twist_matrix(scale * x) @ POSES[0]])
+        moved = views([exp_twist(scale * x) @ POSES[0]])
         rasterizer.render(arrays, moved)
         error = rasterizer.rgb.numpy() - target
         found = adjoint.backward(arrays, moved, loss_rgb=wp.array(error, dtype=wp.vec3, device="cpu"))
