@@ -255,6 +255,9 @@ def test_contradictory_stages(tmp_path: Path) -> None:
     )
     refused(lambda prim: UsdGeom.Xformable(prim).AddScaleOp().Set((1, 0, 1)), "singular")
     refused(lambda prim: UsdGeom.Imageable(prim).MakeInvisible(), "no visible ParticleField3DGaussianSplat")
+    refused(lambda prim: prim.GetStage().SetMetadata("upAxis", "W"), "upAxis is 'W'")
+    with pytest.raises(AssetError, match="cannot be read"):
+        read_usd(tmp_path / "nowhere.usda")
 
 
 def test_refusals_of_the_writer(tmp_path: Path) -> None:
