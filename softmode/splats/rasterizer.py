@@ -12,6 +12,7 @@ which is what keeps small images right.
 """
 
 import functools
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,6 +43,15 @@ class RasterizerOptions:
     """Write the object of the largest weight per pixel."""
     median_depth: bool = False
     """Write the depth at which half of the light is gone."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        # Depths are sorted by their bits, which do so for positive numbers only.
+        if not 0.0 < self.near < math.inf or not 0.0 <= self.pixel_variance < math.inf:
+            raise ConfigError(
+                f"near is {self.near} m and the dilation {self.pixel_variance} px^2",
+                hint="Give near > 0 and dilation >= 0; None for the dilation takes the usual one",
+            )
 
     @property
     def pixel_variance(self) -> float:
@@ -180,7 +190,10 @@ class SplatRasterizer:
         tiles = self.tile_count[0] * self.tile_count[1] * view_count
         words = -(-splat_count // 32)
         if not (0 < width <= MAX_EDGE and 0 < height <= MAX_EDGE):
-            raise ConfigError(f"images of {width} x {height} px, expected 1 to {MAX_EDGE} px on each side")
+            raise ConfigError(
+                f"images of {width} x {height} px, expected 1 to {MAX_EDGE} px on each side",
+                hint="Draw parts of the image, each with the principal point of its own",
+            )
         # Indices are of 32 bits: two sort entries per splat and view, 64 threads per tile.
         if not (
             0 < splat_count <= MAX_SPLATS

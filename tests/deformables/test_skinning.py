@@ -238,6 +238,10 @@ def test_refuses_shapes_that_do_not_belong_together() -> None:
     case = Case()
     with pytest.raises(BasisError, match=r"basis \(60, 11\)"):
         SkinSplats(case.means, case.covariances, case.basis[:, 1:], case.grad, device="cpu")
+    for shape, first in (((1, N), 0), ((WORLDS, N - 1), 0), ((WORLDS, N), 1), ((WORLDS, N), -1)):
+        outputs = wp.zeros(shape, dtype=wp.vec3, device="cpu"), wp.zeros(shape, dtype=vec6, device="cpu")
+        with pytest.raises(BasisError, match="of 3 worlds"):
+            case.skin("cpu").launch(case.flat(case.q, "cpu"), case.starts("cpu"), *outputs, first_splat=first)
 
 
 def test_a_first_launch_is_not_captured(device: str) -> None:

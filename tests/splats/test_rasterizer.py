@@ -393,6 +393,13 @@ def test_refuses_sizes_out_of_range(arguments: Any, message: str) -> None:
         SplatRasterizer(*arguments, device="cpu")
 
 
+@pytest.mark.parametrize("options", [{"near": 0.0}, {"near": -1.0}, {"near": float("nan")}, {"dilation": -0.1}])
+def test_refuses_options_out_of_range(options: Any) -> None:
+    """Near planes behind the camera and negative variances."""
+    with pytest.raises(ConfigError, match="near is"):
+        RasterizerOptions(**options)
+
+
 def test_refuses_arrays_of_another_size() -> None:
     """Arrays that do not fit the buffers are named."""
     rasterizer = SplatRasterizer(100, 1, 32, 32, device="cpu")

@@ -80,6 +80,8 @@ def _read_stage(file: Path, time_code: float | None) -> Splats:
         if child.returncode == 3:  # an error of OpenUSD: where in its sources : 'what'
             report = child.stderr.decode("utf-8", "replace").rpartition("\nreason: ")[2]
             reason = (re.findall(r" : '(.+?)'(?: Error in|$)", report) or [report])[0].strip()
+        elif child.returncode == 1:  # an error of Python, before OpenUSD saw the file
+            reason = (child.stderr.decode("utf-8", "replace").strip().splitlines() or ["no message"])[-1]
         raise AssetError(f"splat file {file}: cannot be read ({reason[:300]})", hint=REEXPORT)
     body = memoryview(child.stdout)
     end = child.stdout.index(b"\n")
