@@ -110,11 +110,6 @@ class SplatCamera:
             raise ConfigError(
                 f"mesh_samples is {self.options.mesh_samples}", hint="Take 1, or 4 for smooth edges of meshes"
             )
-        if splats is not None and not {splats.means.shape[0], splats.covariances.shape[0]} <= {1, worlds}:
-            raise ConfigError(
-                f"splats of {splats.means.shape[0]} worlds, the model has {worlds}",
-                hint="Build them by SplatArrays.from_splats(..., world_count=model.world_count)",
-            )
         (self.width, self.height) = sizes.pop()
         self.view_count = views = len(self.cameras) * worlds
 

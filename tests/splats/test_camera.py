@@ -190,8 +190,6 @@ def test_refuses_bad_descriptions() -> None:
         SplatCamera(model, splats, [])
     with pytest.raises(ConfigError, match=r"0 bodies are called 'wrist'.*hand"):
         SplatCamera(model, splats, [camera(body="wrist")])
-    with pytest.raises(ConfigError, match="splats of 2 worlds, the model has 3"):
-        SplatCamera(scene(3), arrays(marker((0.0, 0.0, 0.1)), worlds=2), [camera()])
     with pytest.raises(ConfigError, match="mesh_samples"):
         SplatCamera(model, splats, [camera()], options=CameraOptions(mesh_samples=3))
     sensor = SplatCamera(model, splats, [camera()])
