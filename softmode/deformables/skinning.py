@@ -121,7 +121,7 @@ class SkinSplats:
         rotations: wp.array | None = None,
         first_splat: int = 0,
     ) -> None:
-        """Write the deformed means and covariances of all worlds; capturable.
+        """Write the deformed means and covariances of all worlds; capturable after one launch for as many worlds.
 
         Args:
             q: Reduced coordinates of all instances [m], flat vec3d.
@@ -133,14 +133,27 @@ class SkinSplats:
             first_splat: Column where this object's splats begin.
 
         Raises:
-            BasisError: If `rotations` has another shape than `means`.
+            BasisError: If an output has not a row per world or too few columns, `rotations` has another shape than
+                `means`, or the first launch for that number of worlds is captured.
         """
         if rotations is not None and rotations.shape != means.shape:
             if rotations.shape != (1, 1):
                 raise BasisError(f"rotations has shape {rotations.shape}, means {means.shape}; one per splat is needed")
             rotations = None
         worlds = function_start.shape[0]
+        shape, columns = (worlds, means.shape[-1]), first_splat + self.count
+        if means.shape != shape or covariances.shape != shape or not 0 <= first_splat <= columns <= shape[1]:
+            raise BasisError(
+                f"means {means.shape} and covariances {covariances.shape} do not hold columns {first_splat} to "
+                f"{columns} of {worlds} worlds",
+                hint="Build them by SplatArrays.from_splats(..., world_count=...)",
+            )
         if worlds not in self._motion:
+            if self.device.is_capturing:  # what a capture allocates belongs to its graph, and goes with it
+                raise BasisError(
+                    f"the first launch for {worlds} worlds is being captured",
+                    hint="Launch once before the capture; that compiles the kernels too",
+                )
             self._motion[worlds] = (
                 wp.zeros(worlds, dtype=wp.vec3d, device=self.device),
                 wp.zeros((worlds, self.function_count), dtype=wp.vec4, device=self.device),

@@ -208,10 +208,12 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
                 sync_lanes()
                 running = ballot(cut != FINISHED) != wp.uint32(0)
                 begin += 32
+            pending = wp.max(pending - begin, 0)
             rest = queue_get(queue, begin + lane)
             sync_lanes()
-            queue_put(queue, lane, rest)
-            pending = wp.max(pending - begin, 0)
+            # No lane writes beyond the rest: the others go on to put the next ranks there.
+            if lane < pending:
+                queue_put(queue, lane, rest)
             chunk += 32
 
         if inside:

@@ -107,7 +107,9 @@ class SplatCamera:
                 hint="Build them by SplatArrays.from_splats(objects, world_count=model.world_count)",
             )
         if self.options.mesh_samples not in (1, 4):
-            raise ConfigError(f"mesh_samples must be 1 or 4, got {self.options.mesh_samples}")
+            raise ConfigError(
+                f"mesh_samples is {self.options.mesh_samples}", hint="Take 1, or 4 for smooth edges of meshes"
+            )
         (self.width, self.height) = sizes.pop()
         self.view_count = views = len(self.cameras) * worlds
 

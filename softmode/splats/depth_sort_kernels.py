@@ -17,11 +17,12 @@ CAPACITY = 14 * BLOCK_DIM
 
 
 @functools.cache
-def sort_kernel(splat_count: int) -> wp.Kernel:
-    """Return the kernel, launched with (view_count, BLOCK_DIM) threads, for up to CAPACITY splats per view."""
-    # Each thread holds `items` of the keys in registers, so their number is a constant of the kernel. The items of a
-    # warp are neighbours, 32 apart for a thread: equal keys keep their order.
-    items = -(-splat_count // BLOCK_DIM)
+def sort_kernel(items: int) -> wp.Kernel:
+    """Return the kernel, launched with (view_count, BLOCK_DIM) threads, for up to items * BLOCK_DIM splats per view.
+
+    Each thread holds `items` of the keys in registers, so their number is a constant of the kernel. The items of a warp
+    are neighbours, 32 apart for a thread: equal keys keep their order.
+    """
     snippet = f"""
 #if defined(__CUDA_ARCH__)
     constexpr int ITEMS = {items}, WARPS = {BLOCK_DIM // 32}, DIGITS = 256;
@@ -107,6 +108,7 @@ def sort_kernel(splat_count: int) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=(BLOCK_DIM, 2))
     def _sort(
         depth_key: wp.array[int],  # (>= view_count * splat_count,) bits of the depth
+        splat_count: int,
         # Out:
         order_out: wp.array[int],  # (>= view_count * splat_count,) splats of each view by depth
     ):

@@ -49,11 +49,19 @@ class PinholeCamera:
         """Validate the numbers."""
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.position, *self.quat)
         if not all(math.isfinite(x) for x in numbers) or self.fx <= 0.0 or self.fy <= 0.0:
-            raise ConfigError(f"camera {self.name!r}: intrinsics and pose must be finite, focal lengths positive")
+            raise ConfigError(
+                f"camera {self.name!r}: intrinsics and pose must be finite, focal lengths positive",
+                hint="Flip the image or the pose rather than the sign of a focal length",
+            )
         if not (0 < self.width <= 2000 and 0 < self.height <= 2000):
-            raise ConfigError(f"camera {self.name!r}: {self.width} x {self.height} px, expected 1 to 2000 on each side")
+            raise ConfigError(
+                f"camera {self.name!r}: {self.width} x {self.height} px, expected 1 to 2000 on each side",
+                hint="Scale width, height, fx, fy, cx and cy down together",
+            )
         if abs(sum(x * x for x in self.quat) - 1.0) > 1e-3:
-            raise ConfigError(f"camera {self.name!r}: quat {self.quat} is not of unit length")
+            raise ConfigError(
+                f"camera {self.name!r}: quat {self.quat} is not of unit length", hint="Normalise it; the order is xyzw"
+            )
 
     @classmethod
     def look_at(

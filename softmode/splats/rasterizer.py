@@ -12,6 +12,7 @@ which is what keeps small images right.
 """
 
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -44,6 +45,15 @@ class RasterizerOptions:
     """Write the object of the largest weight per pixel."""
     median_depth: bool = False
     """Write the depth at which half of the light is gone."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        # Depths are sorted by their bits, which do so for positive numbers only.
+        if not 0.0 < self.near < math.inf or not 0.0 <= self.pixel_variance < math.inf:
+            raise ConfigError(
+                f"near is {self.near} m and the dilation {self.pixel_variance} px^2",
+                hint="Give near > 0 and dilation >= 0; None for the dilation takes the usual one",
+            )
 
     @property
     def pixel_variance(self) -> float:
@@ -219,11 +229,22 @@ class SplatRasterizer:
         tiles = self.tile_count[0] * self.tile_count[1] * view_count
         words = -(-splat_count // 32)
         if not (0 < width <= MAX_EDGE and 0 < height <= MAX_EDGE):
-            raise ConfigError(f"images of {width} x {height} px, expected 1 to {MAX_EDGE} px on each side")
-        if not (0 < splat_count <= MAX_SPLATS and view_count > 0 and total < 2**30 and tiles * words < 2**33):
+            raise ConfigError(
+                f"images of {width} x {height} px, expected 1 to {MAX_EDGE} px on each side",
+                hint="Draw parts of the image, each with the principal point of its own",
+            )
+        # Indices are of 32 bits: two sort entries per splat and view, 64 threads per tile.
+        if not (
+            0 < splat_count <= MAX_SPLATS
+            and view_count > 0
+            and total < 2**30
+            and tiles < 2**25
+            and tiles * words < 2**33
+        ):
             raise ConfigError(
                 f"{splat_count} splats in {view_count} views of {width} x {height} px are out of range",
-                hint="Keep splats x views between 1 and 2^30; render fewer views or smaller images at a time",
+                hint="Keep splats x views between 1 and 2^30, and pixels below 2^31; render fewer views or smaller "
+                "images at a time",
             )
         allocate = functools.partial(wp.zeros, device=self.device)
         self._center = allocate(total, dtype=wp.vec4)
@@ -242,6 +263,8 @@ class SplatRasterizer:
         self.alpha = allocate(shape, dtype=wp.float32)
         self.object_id = allocate(shape if self.options.object_ids else (1, 1, 1), dtype=wp.int32)
         self.median_depth = allocate(shape if self.options.median_depth else (1, 1, 1), dtype=wp.float32)
+        self.frame: object = None
+        """Stands for the frame that `render` drew last; replays of a captured graph leave it as it is."""
         self._no_gain = wp.ones(1, dtype=wp.vec4, device=self.device)
         self._no_rgb = allocate((1, 1, 1), dtype=wp.vec3)
         self._no_depth = allocate((1, 1, 1), dtype=wp.float32)
@@ -260,37 +283,57 @@ class SplatRasterizer:
             splats: The splats of all worlds.
             views: The cameras.
             mesh_rgb: Colours of opaque meshes and of the sky around them, vec3, shape (view_count, height, width);
-            replaces
-                the background of the views.
+                replaces the background of the views.
             mesh_depth: Forward depth of the meshes [m], 0 where there is none. A splat behind a mesh, by its centre, is
                 not drawn.
 
         Raises:
             ConfigError: If only one of the mesh images is given, or an array has another shape than the buffers.
         """
-        images = (self.view_count, self.height, self.width)
-        turns = (splats.rotations.shape[0], self.splat_count)
-        for name, array, shape in (
-            ("splats.means", splats.means, (splats.means.shape[0], self.splat_count)),
-            ("splats.covariances", splats.covariances, (splats.covariances.shape[0], self.splat_count)),
-            ("splats.opacities", splats.opacities, (splats.opacities.shape[0], self.splat_count)),
-            ("splats.rotations", splats.rotations, turns if splats.sh.shape[2] > 1 else None),
-            ("splats.object_index", splats.object_index, (self.splat_count,)),
-            ("views.world_to_camera", views.world_to_camera, (self.view_count,)),
-            ("views.intrinsics", views.intrinsics, (self.view_count,)),
-            ("views.world", views.world, (self.view_count,)),
-            ("mesh_rgb", mesh_rgb, None if mesh_rgb is None and mesh_depth is None else images),
-            ("mesh_depth", mesh_depth, None if mesh_rgb is None and mesh_depth is None else images),
-        ):
-            if shape is not None and (array is None or tuple(array.shape) != shape):
-                given = "None" if array is None else str(tuple(array.shape))
-                raise ConfigError(
-                    f"{name} has shape {given}, expected {shape}", hint="Size the rasteriser for these arrays"
-                )
+        self._check_shapes(splats, views, mesh_rgb, mesh_depth)
+        self.frame = object()
         self._project(splats, views)
         self._sort()
         self._cover_tiles()
         self._blend(splats, views, mesh_rgb, mesh_depth)
+
+    def _check_shapes(
+        self, splats: SplatArrays, views: ViewArrays, mesh_rgb: wp.array | None, mesh_depth: wp.array | None
+    ) -> None:
+        """Raise a ConfigError unless kernels find in every array what they will read."""
+        count, turned = self.splat_count, splats.sh.shape[2] > 1
+        degrees = [k for k in (1, 4, 9, 16) if k >= splats.sh.shape[2]]
+        shared: list[wp.array] = [splats.means, splats.covariances, splats.opacities, splats.sh]
+        if turned:
+            shared.append(splats.rotations)
+        worlds = max(array.shape[0] for array in shared)
+        images = None if mesh_rgb is None and mesh_depth is None else (self.view_count, self.height, self.width)
+
+        def rows(array: wp.array, count: int) -> int:
+            return 1 if array.shape[0] == 1 else count
+
+        gain = views.splat_gain
+        for name, array, shape in (
+            ("splats.means", splats.means, (rows(splats.means, worlds), count)),
+            ("splats.covariances", splats.covariances, (rows(splats.covariances, worlds), count)),
+            ("splats.opacities", splats.opacities, (rows(splats.opacities, worlds), count)),
+            ("splats.sh", splats.sh, (rows(splats.sh, worlds), count, degrees[0] if degrees else 16)),
+            ("splats.rotations", splats.rotations, (rows(splats.rotations, worlds), count) if turned else None),
+            ("splats.object_index", splats.object_index, (count,)),
+            ("views.world_to_camera", views.world_to_camera, (self.view_count,)),
+            ("views.intrinsics", views.intrinsics, (self.view_count,)),
+            ("views.world", views.world, (self.view_count,)),
+            ("views.background", views.background, (rows(views.background, self.view_count),)),
+            ("views.splat_gain", gain, None if gain is None else (rows(gain, self.view_count),)),
+            ("mesh_rgb", mesh_rgb, images),
+            ("mesh_depth", mesh_depth, images),
+        ):
+            if shape is not None and (array is None or tuple(array.shape) != shape):
+                given = "None" if array is None else str(tuple(array.shape))
+                raise ConfigError(
+                    f"{name} has shape {given}, expected {shape}",
+                    hint="Size the rasteriser for these arrays; arrays have one row, or one for every world or view",
+                )
 
     def _project(self, splats: SplatArrays, views: ViewArrays) -> None:
         options = self.options
@@ -309,13 +352,14 @@ class SplatRasterizer:
 
     def _sort(self) -> None:
         if self.device.is_cuda and self.splat_count <= depth_sort_kernels.CAPACITY:
+            block_dim = depth_sort_kernels.BLOCK_DIM
             wp.launch(
-                depth_sort_kernels.sort_kernel(self.splat_count),
-                dim=(self.view_count, depth_sort_kernels.BLOCK_DIM),
-                inputs=[self._depth_key],
+                depth_sort_kernels.sort_kernel(-(-self.splat_count // block_dim)),
+                dim=(self.view_count, block_dim),
+                inputs=[self._depth_key, self.splat_count],
                 outputs=[self._order],
                 device=self.device,
-                block_dim=depth_sort_kernels.BLOCK_DIM,
+                block_dim=block_dim,
             )
             return
         total = self.splat_count * self.view_count

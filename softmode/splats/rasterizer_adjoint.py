@@ -102,8 +102,6 @@ class AdjointRasterizer:
             background=allocate(views.background.shape, dtype=wp.vec3d),
         )
         """What `backward` writes, overwritten by every call."""
-        self.frame: object = None
-        """Whose frame the rasteriser holds; kept by `rasterizer_torch`."""
 
     def backward(
         self,

@@ -119,7 +119,9 @@ def project(
     b = wp.dot(j1, s0)
     c = wp.dot(j1, sigma * j1)
     gain = splat_gain[row_of(view, splat_gain.shape[0])]
-    o = wp.min(gain[3] * opacity[row_of(world, opacity.shape[0]), i], 1.0)
+    o = gain[3] * opacity[row_of(world, opacity.shape[0]), i]
+    if o > 1.0:  # wp.min would make 1 of NaN
+        o = 1.0
     sharp = wp.max(a * c - b * b, 0.0)
     a += dilation
     c += dilation
@@ -128,7 +130,7 @@ def project(
         return
     if antialiased:
         o *= wp.sqrt(sharp / det)
-    if o < ALPHA_MIN:
+    if not (o >= ALPHA_MIN):
         return
     # Opacity-aware extent: alpha falls to 1/255 where d^2/2 = ln(255 o).
     reach = wp.log(255.0 * o)

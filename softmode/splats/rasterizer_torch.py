@@ -109,7 +109,7 @@ def _function() -> Any:
             views = replace(views, **{k: view(given[k], getattr(views, k)) for k in VIEW_INPUTS if k in given})
             rasterizer = adjoint.rasterizer
             rasterizer.render(splats, views, mesh_rgb=mesh_rgb, mesh_depth=mesh_depth)
-            adjoint.frame = ctx.frame = object()
+            ctx.frame = rasterizer.frame
             ctx.adjoint, ctx.splats, ctx.views, ctx.meshes = adjoint, splats, views, (mesh_rgb, mesh_depth)
             ctx.kinds = [None if value is None else (value.dtype, value.device) for value in values]
             return tuple(wp.to_torch(image).clone() for image in (rasterizer.rgb, rasterizer.alpha, rasterizer.depth))
@@ -119,9 +119,9 @@ def _function() -> Any:
             adjoint, splats, views = ctx.adjoint, ctx.splats, ctx.views
             mesh: dict[str, Any] = dict(zip(("mesh_rgb", "mesh_depth"), ctx.meshes, strict=True))
             rasterizer = adjoint.rasterizer
-            if adjoint.frame is not ctx.frame:
+            if rasterizer.frame is not ctx.frame:
                 rasterizer.render(splats, views, **mesh)
-                adjoint.frame = ctx.frame
+                ctx.frame = rasterizer.frame
             images = (rasterizer.rgb, rasterizer.alpha, rasterizer.depth)
             rgb, alpha, depth = (view(loss, image) for loss, image in zip(losses, images, strict=True))
             found = adjoint.backward(splats, views, loss_rgb=rgb, loss_alpha=alpha, loss_depth=depth, **mesh)

@@ -80,7 +80,7 @@ class RigidSplatsSkin:
 
         Args:
             state: Where the bodies are.
-            arrays: Splats of all objects, with means and covariances per world.
+            arrays: Splats of all objects, with means, covariances and, above degree 0, rotations per world.
             first_splat: Column where the parts begin; None if they are the last ones.
 
         Raises:
@@ -88,10 +88,13 @@ class RigidSplatsSkin:
         """
         worlds, total = self._body.shape[0], arrays.means.shape[1]
         first = total - self.count if first_splat is None else first_splat
-        if arrays.means.shape[0] != worlds or not 0 <= first <= total - self.count:
+        shapes = {arrays.covariances.shape, arrays.means.shape}
+        if arrays.rotations.shape != (1, 1):  # read by nobody
+            shapes.add(arrays.rotations.shape)
+        if shapes != {(worlds, total)} or not 0 <= first <= total - self.count:
             raise ConfigError(
-                f"splats of shape {tuple(arrays.means.shape)} do not hold {self.count} from column {first} on in each "
-                f"of {worlds} worlds",
+                f"splats of shape {' or '.join(map(str, sorted(shapes)))} do not hold {self.count} from column "
+                f"{first} on in each of {worlds} worlds",
                 hint="Build them by SplatArrays.from_splats([*soft, *skin.objects], world_count=model.world_count)",
             )
         wp.launch(

@@ -136,14 +136,16 @@ class ThreadedRasterizer:
         self, splats: SplatArrays, views: ViewArrays, mesh_rgb: wp.array | None, mesh_depth: wp.array | None
     ) -> list[Callable[[], None]]:
         """Return what each thread has to do."""
-        for name, array in (
-            ("views.world_to_camera", views.world_to_camera),
-            ("views.intrinsics", views.intrinsics),
-            ("views.world", views.world),
-            ("mesh_rgb", mesh_rgb),
-            ("mesh_depth", mesh_depth),
+        for name, array, shared in (
+            ("views.world_to_camera", views.world_to_camera, False),
+            ("views.intrinsics", views.intrinsics, False),
+            ("views.world", views.world, False),
+            ("views.background", views.background, True),
+            ("views.splat_gain", views.splat_gain, True),
+            ("mesh_rgb", mesh_rgb, False),
+            ("mesh_depth", mesh_depth, False),
         ):
-            if array is not None and array.shape[0] != self.view_count:
+            if array is not None and array.shape[0] != self.view_count and not (shared and array.shape[0] == 1):
                 raise ConfigError(
                     f"{name} has shape {tuple(array.shape)}, expected {self.view_count} views",
                     hint="Size the rasteriser for these arrays",

@@ -238,16 +238,38 @@ def test_refuses_shapes_that_do_not_belong_together() -> None:
     case = Case()
     with pytest.raises(BasisError, match=r"basis \(60, 11\)"):
         SkinSplats(case.means, case.covariances, case.basis[:, 1:], case.grad, device="cpu")
+    for shape, first in (((1, N), 0), ((WORLDS, N - 1), 0), ((WORLDS, N), 1), ((WORLDS, N), -1)):
+        outputs = wp.zeros(shape, dtype=wp.vec3, device="cpu"), wp.zeros(shape, dtype=vec6, device="cpu")
+        with pytest.raises(BasisError, match="of 3 worlds"):
+            case.skin("cpu").launch(case.flat(case.q, "cpu"), case.starts("cpu"), *outputs, first_splat=first)
 
 
-@pytest.mark.parametrize("count", [1, 15, 16, 17, 53])
-def test_any_number_of_splats(device: str, count: int) -> None:
+def test_a_first_launch_is_not_captured(device: str) -> None:
+    """Buffers made in a capture would go with its graph; after one launch for as many worlds, it is captured."""
+    case = Case()
+    q, starts, skin = case.flat(case.q, device), case.starts(device), case.skin(device)
+    means = wp.zeros((WORLDS, N), dtype=wp.vec3, device=device)
+    covariances = wp.zeros((WORLDS, N), dtype=vec6, device=device)
+    case.skin(device).launch(q, starts, means, covariances)  # compiles
+    eager = means.numpy()
+    with wp.ScopedCapture(device=device), pytest.raises(BasisError, match="first launch for 3 worlds"):
+        skin.launch(q, starts, means, covariances)
+    skin.launch(q, starts, means, covariances)
+    with wp.ScopedCapture(device=device) as capture:
+        skin.launch(q, starts, means, covariances)
+    means.zero_()
+    wp.capture_launch(capture.graph)
+    np.testing.assert_array_equal(means.numpy(), eager)
+
+
+@pytest.mark.parametrize(("count", "worlds"), [(1, 3), (15, 2), (16, 5), (17, 4), (53, 9)])
+def test_any_number_of_splats_and_worlds(device: str, count: int, worlds: int) -> None:
     """Centres X + sum_k b_k q_k and F Sigma F^T are right around the size of the blocks that a thread may take.
 
-    World i of three equals the single world bitwise, and columns beside the object's stay as they were.
+    World i of many equals the single world bitwise, and columns beside the object's stay as they were.
     """
     rng = np.random.default_rng(count)
-    n, worlds, before, after = 5, 3, 2, 4
+    n, before, after = 5, 2, 4
     means = rng.normal(size=(count, 3)).astype(np.float32).astype(np.float64)
     root = 0.1 * rng.normal(size=(count, 3, 3))
     covariances = (root @ root.transpose(0, 2, 1)).astype(np.float32).astype(np.float64)

@@ -6,6 +6,8 @@ import collections
 import gzip
 import importlib
 import importlib.util
+import io
+import json
 import resource
 import time
 import tracemalloc
@@ -18,6 +20,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from softmode.errors import AssetError
 from softmode.splats import read_splats, write_splats
@@ -170,6 +173,33 @@ def test_damaged_files_at_length(tmp_path: Path) -> None:
         assert loaded or name in ("spz 3", "spz 4", "sog"), name
 
 
+def flat_sog(side: int) -> bytes:
+    """Return a SOG archive whose images are of one colour: five kilobytes for any number of splats."""
+    image, archive = io.BytesIO(), io.BytesIO()
+    Image.new("RGBA", (side, side), (128, 128, 128, 255)).save(image, "WEBP", lossless=True)
+    names = [f"{i}.webp" for i in range(5)]
+    meta = {
+        "version": 2,
+        "count": side * side,
+        "means": {"mins": [0, 0, 0], "maxs": [1, 1, 1], "files": names[:2]},
+        "scales": {"codebook": [-3.0] * 256, "files": names[2:3]},
+        "quats": {"files": names[3:4]},
+        "sh0": {"codebook": [0.0] * 256, "files": names[4:]},
+    }
+    with zipfile.ZipFile(archive, "w") as members:
+        members.writestr("meta.json", json.dumps(meta))
+        for name in names:
+            members.writestr(name, image.getvalue())
+    return archive.getvalue()
+
+
+def test_images_of_one_colour_may_hold_few_splats(tmp_path: Path) -> None:
+    """What packs well is no damage: a small asset of equal splats loads."""
+    path = tmp_path / "flat.sog"
+    path.write_bytes(flat_sog(256))
+    assert read_splats(path).count == 256**2
+
+
 def bomb(name: str) -> tuple[str, bytes, str]:
     """Return suffix, content and expected refusal of a small file that would unpack to much or declares much."""
     raw = gzip.decompress(spz_3())
@@ -180,6 +210,14 @@ def bomb(name: str) -> tuple[str, bytes, str]:
     if name == "declared in gzip":
         many = raw[:8] + (2**26).to_bytes(4, "little") + raw[12:]
         return ".spz", gzip.compress(many), "cannot hold the 67108864 splats"
+    if name == "one colour in sog":
+        return ".sog", flat_sog(2048), "cannot hold the 4194304 splats"
+    if name == "deflated in sog":
+        archive = io.BytesIO()
+        with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as members:
+            members.writestr("meta.json", json.dumps(sog_members()[0]))
+            members.writestr("means_l.webp", bytes(2**26))
+        return ".sog", archive.getvalue(), "which no image does"
     fields = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 rot_0 rot_1 rot_2 rot_3".split()
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {2**26}"]
     header = "\n".join([*lines, *(f"property float {field}" for field in fields), "end_header\n"])
@@ -187,7 +225,15 @@ def bomb(name: str) -> tuple[str, bytes, str]:
 
 
 @pytest.mark.parametrize(
-    "name", ["gzip beyond its header", "gzip without header", "declared in gzip", "declared in ply"]
+    "name",
+    [
+        "gzip beyond its header",
+        "gzip without header",
+        "declared in gzip",
+        "declared in ply",
+        "one colour in sog",
+        "deflated in sog",
+    ],
 )
 def test_bombs_are_not_unpacked(tmp_path: Path, name: str) -> None:
     """A file that would unpack to much, or declares it, is refused before that memory is taken."""

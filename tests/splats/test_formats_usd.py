@@ -13,7 +13,7 @@ import pytest
 
 from softmode.errors import AssetError, ConfigError, MissingExtraError
 from softmode.splats import Splats, read_splats, write_splats, write_usd
-from softmode.splats.formats import read_usd
+from softmode.splats.formats import read_usd, usd
 from softmode.splats.splats import sh_basis, up_rotation
 from tests.splats.test_splats import random_splats
 
@@ -255,6 +255,9 @@ def test_contradictory_stages(tmp_path: Path) -> None:
     )
     refused(lambda prim: UsdGeom.Xformable(prim).AddScaleOp().Set((1, 0, 1)), "singular")
     refused(lambda prim: UsdGeom.Imageable(prim).MakeInvisible(), "no visible ParticleField3DGaussianSplat")
+    refused(lambda prim: prim.GetStage().SetMetadata("upAxis", "W"), "upAxis is 'W'")
+    with pytest.raises(AssetError, match="cannot be read"):
+        read_usd(tmp_path / "nowhere.usda")
 
 
 def test_refusals_of_the_writer(tmp_path: Path) -> None:
@@ -269,6 +272,16 @@ def test_refusals_of_the_writer(tmp_path: Path) -> None:
     with pytest.raises(AssetError, match="cannot write"):
         write_usd(tmp_path / "a.usdz", random_splats())
     assert not list(tmp_path.iterdir())
+
+
+def test_a_broken_installation_is_not_blamed_on_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the process of its own cannot load OpenUSD, the message says what is missing."""
+    (tmp_path / "a.usda").write_text("#usda 1.0\n")
+    (tmp_path / "pxr").mkdir()
+    (tmp_path / "pxr" / "__init__.py").touch()
+    monkeypatch.setattr(usd, "_pxr_folder", lambda: str(tmp_path))
+    with pytest.raises(AssetError, match=r"No module named 'pxr\.Usd'"):
+        read_splats(tmp_path / "a.usda")
 
 
 def test_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

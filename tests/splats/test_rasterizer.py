@@ -305,6 +305,49 @@ def test_non_finite_and_hidden_splats_are_left_out(device: str) -> None:
     assert_matches(rasterizer, 0, dense(kept, EYES[0], 48, 40))
 
 
+def test_an_opacity_that_is_no_number_draws_nothing(device: str) -> None:
+    """Opacities above one draw as one, NaN as nothing."""
+    splats = ball(100)
+    arrays = SplatArrays.from_splats([splats], device=device)
+    opacities = splats.opacities[None].copy()
+    opacities[0, :2] = np.nan, 2.0
+    arrays.opacities.assign(opacities)
+    rasterizer = SplatRasterizer(100, 1, 48, 40, device=device)
+    rasterizer.render(arrays, views_of(EYES[:1], 48, 40, device))
+    kept = replace(splats, opacities=np.nan_to_num(opacities[0]).clip(0.0, 1.0)).subset(np.arange(1, 100))
+    assert_matches(rasterizer, 0, dense(kept, EYES[0], 48, 40))
+
+
+@pytest.mark.parametrize("ahead", [900, 8000, 70000])
+def test_a_picture_does_not_depend_on_the_ranks_of_its_splats(device: str, ahead: int) -> None:
+    """What lies behind many splats in the corner is drawn as without them: lists go on beyond any number of ranks."""
+    behind = ball(40)
+    eye, width, height = (3.0, 0.0, 0.0), 64, 48
+    x, y = np.meshgrid(np.linspace(0.72, 0.78, 10), np.linspace(0.52, 0.58, 10))  # up to the right of the ball
+    corner = np.tile(np.stack([np.full(100, 1.0), x.ravel(), y.ravel()], axis=1), (ahead // 100, 1))
+    front = Splats(
+        means=corner,
+        quats=np.tile([0.0, 0.0, 0.0, 1.0], (ahead, 1)),
+        scales=np.full((ahead, 3), 0.01),
+        opacities=np.full(ahead, 0.1),
+        sh=np.ones((ahead, 1, 3)),
+    )
+    views = views_of([eye, eye], width, height, device)
+    images = []
+    for objects in ([behind], [front, behind]):
+        arrays = SplatArrays.from_splats(objects, device=device)
+        rasterizer = SplatRasterizer(arrays.means.shape[1], 2, width, height, device=device)
+        rasterizer.render(arrays, views)
+        images.append((rasterizer.rgb.numpy(), rasterizer.alpha.numpy()))
+    (rgb, alpha), (together, covered) = images
+    same = (together == rgb).all(axis=(0, 3))
+    assert (covered[:, ~same] > 0.9).any(axis=0).any(), "the corner is drawn"
+    corner_rows, corner_columns = np.nonzero(~same)
+    seen = alpha[0] > 0.0
+    assert seen.sum() > 100 and same[seen].all() and corner_rows.max() < height // 2
+    assert corner_columns.min() > np.nonzero(seen)[1].max() or corner_rows.max() < np.nonzero(seen)[0].min()
+
+
 def test_several_objects_share_a_frame(device: str) -> None:
     """Objects of different degree are drawn together, each with its id."""
     near = ball(100).transformed(translation=(0.5, 0.0, 0.0), scale=0.3)
@@ -341,12 +384,20 @@ def test_plush_is_solid() -> None:
         ((10, 1, 0, 32), "0 x 32"),
         ((10, 1, 5000, 32), "5000 x 32"),
         ((2**24, 100, 32, 32), "out of range"),
+        ((1, 128, 4096, 4096), "out of range"),
     ],
 )
 def test_refuses_sizes_out_of_range(arguments: Any, message: str) -> None:
     """Sizes that the buffers cannot hold are refused before anything is allocated."""
     with pytest.raises(ConfigError, match=message):
         SplatRasterizer(*arguments, device="cpu")
+
+
+@pytest.mark.parametrize("options", [{"near": 0.0}, {"near": -1.0}, {"near": float("nan")}, {"dilation": -0.1}])
+def test_refuses_options_out_of_range(options: Any) -> None:
+    """Near planes behind the camera and negative variances."""
+    with pytest.raises(ConfigError, match="near is"):
+        RasterizerOptions(**options)
 
 
 def test_refuses_arrays_of_another_size() -> None:
@@ -357,6 +408,22 @@ def test_refuses_arrays_of_another_size() -> None:
         rasterizer.render(SplatArrays.from_splats([ball(99)], device="cpu"), views)
     with pytest.raises(ConfigError, match=r"views\.world_to_camera"):
         rasterizer.render(arrays, views_of(EYES, 32, 32, "cpu"))
+    for part, field, shape in (
+        (arrays, "sh", (1, 99, 1)),
+        (arrays, "sh", (1, 100, 2)),
+        (views, "background", (2,)),
+        (views, "splat_gain", (3,)),
+    ):
+        other = wp.zeros(shape, dtype=wp.vec4 if field == "splat_gain" else wp.vec3, device="cpu")
+        changed = replace(part, **{field: other})
+        with pytest.raises(ConfigError, match=field):
+            rasterizer.render(
+                changed if part is arrays else arrays, changed if part is views else views
+            )  # fmt: skip
+    worlds = SplatArrays.from_splats([ball(100)], world_count=3, device="cpu")
+    few = replace(worlds, covariances=worlds.covariances[:2])
+    with pytest.raises(ConfigError, match=r"splats\.covariances has shape \(2, 100\), expected \(3, 100\)"):
+        rasterizer.render(few, views)
     with pytest.raises(ConfigError, match="mesh_rgb has shape None"):
         rasterizer.render(arrays, views, mesh_depth=wp.zeros((1, 32, 32), device="cpu"))
     for name, value in (("world_count", 0), ("sh_degree", 4)):

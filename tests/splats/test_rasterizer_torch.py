@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,24 @@ def test_gradients_are_the_adjoint_s() -> None:
     expected = scene.gradients("cpu")
     for name in ("means", "covariances", "opacities", "sh", "intrinsics", "background"):
         np.testing.assert_allclose(tensors[name].grad.numpy(), expected[name], rtol=1e-6, atol=1e-6)
+
+
+def test_a_frame_drawn_by_others_is_drawn_again() -> None:
+    """Whoever used the rasteriser between a frame and its gradient, be it another adjoint, the gradient is the same."""
+    _, adjoint, splats, views, tensors = case(1)
+    other = AdjointRasterizer(adjoint.rasterizer, splats, views, camera=False)
+    moved = tensors["means"].detach() + 0.1
+    gradients = []
+    for between in (
+        lambda: None,
+        lambda: render(other, splats, views, means=moved),
+        lambda: adjoint.rasterizer.render(replace(splats, means=splats.means[:1]), views),
+    ):
+        loss = render(adjoint, splats, views, means=tensors["means"])[0].square().sum()
+        between()
+        gradients.append(torch.autograd.grad(loss, tensors["means"])[0].numpy())
+    for gradient in gradients[1:]:
+        np.testing.assert_array_equal(gradient, gradients[0])
 
 
 def test_pose_and_quaternions_as_parameters() -> None:

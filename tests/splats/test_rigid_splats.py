@@ -176,7 +176,11 @@ def test_refuses_what_does_not_fit() -> None:
     with pytest.raises(ConfigError, match=r"RigidSplats: 0 bodies are called 'foot'.*box, hand"):
         RigidSplatsSkin(model, [dataclasses.replace(part, body="foot")])
     skin = RigidSplatsSkin(model, [part])
+    fitting = SplatArrays.from_splats(skin.objects, world_count=2, device="cpu")
+    shared = wp.zeros((1, 200), dtype=wp.quat, device="cpu")
     for arrays in (
+        dataclasses.replace(fitting, rotations=shared),
+        dataclasses.replace(fitting, covariances=fitting.covariances[:1]),
         SplatArrays.from_splats(skin.objects, world_count=1, device="cpu"),
         SplatArrays.from_splats([make_plush(200).subset(range(50))], world_count=2, device="cpu"),
     ):

@@ -106,6 +106,11 @@ def test_errors_of_a_thread_reach_the_caller() -> None:
         )  # fmt: skip
     with pytest.raises(ConfigError, match=r"views\.world_to_camera"):
         threaded.render(SplatArrays.from_splats([ball(100)], device="cpu"), views_of(EYES, WIDTH, HEIGHT, "cpu"))
+    four = ThreadedRasterizer(100, 4, WIDTH, HEIGHT, threads=2)
+    views = views_of([EYES[0]] * 4, WIDTH, HEIGHT, "cpu")
+    three = replace(views, background=wp.zeros(3, dtype=wp.vec3, device="cpu"))
+    with pytest.raises(ConfigError, match=r"views\.background"):
+        four.render(SplatArrays.from_splats([ball(100)], device="cpu"), three)
     with pytest.raises(ConfigError, match="threads is 0"):
         ThreadedRasterizer(100, 2, WIDTH, HEIGHT, threads=0)
     with pytest.raises(ConfigError, match="view_count is 0"):

@@ -20,11 +20,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from softmode.errors import AssetError
-from softmode.splats.formats.common import REEXPORT, exp_scales, quats_from_smallest_three
+from softmode.splats.formats.common import MAX_RATIO, REEXPORT, exp_scales, quats_from_smallest_three
 from softmode.splats.splats import MAX_SPLATS, Splats
 
 _META_LIMIT = 16 * 1024 * 1024
 _IMAGE_FILE_LIMIT = 512 * 1024 * 1024
+_ARCHIVE_RATIO = 16
+"""Largest ratio of unpacked to packed bytes of a large member of an archive; WebP images are packed already."""
+_FREE_BYTES = 4 * 1024 * 1024
+"""Bytes that a member of an archive, and the images of an asset, may unpack to however small their files are."""
 
 
 def read_sog(path: str | os.PathLike[str]) -> Splats:
@@ -90,6 +94,12 @@ def _archive_reader(archive: zipfile.ZipFile, source: str) -> _Reader:
         if info.file_size > limit:
             raise AssetError(
                 f"splat file {source}: member {name} larger than {limit} bytes", hint="Decimate the asset first"
+            )
+        if info.file_size > max(_FREE_BYTES, _ARCHIVE_RATIO * info.compress_size):
+            raise AssetError(
+                f"splat file {source}: member {name} unpacks from {info.compress_size} to {info.file_size} bytes, "
+                "which no image does",
+                hint=REEXPORT,
             )
         with archive.open(info) as stream:
             return stream.read(limit)
@@ -162,8 +172,10 @@ def _decode(source: str, read: _Reader) -> Splats:
             f"splat file {source}: not SOG version 2", hint="Convert it with splat-transform to SOG v2 or to .ply"
         )
     count = meta["count"].integer(1, MAX_SPLATS)
+    file_bytes = image_bytes = 0
 
     def image(name: str, low: int, high: int, width: int | None = None) -> NDArray[np.uint8]:
+        nonlocal file_bytes, image_bytes
         data = read(name, _IMAGE_FILE_LIMIT)
         size = _webp_size(data)
         # The header is judged before any decoder sees the data: an image may not unpack to more than its splats need.
@@ -172,6 +184,14 @@ def _decode(source: str, read: _Reader) -> Splats:
                 f"splat file {source}: image {name} is {size[0]} x {size[1]} pixels, expected "
                 + (f"{width} wide and " if width else "")
                 + f"{low} to {high} pixels of lossless WebP for {count} splats",
+                hint=REEXPORT,
+            )
+        # A single colour packs without bound; together, the images of real splats pack by less than ten.
+        file_bytes, image_bytes = file_bytes + len(data), image_bytes + 4 * size[0] * size[1]
+        if image_bytes > max(_FREE_BYTES, MAX_RATIO * file_bytes):
+            raise AssetError(
+                f"splat file {source}: images of {file_bytes} bytes cannot hold the {count} splats that meta.json "
+                "declares",
                 hint=REEXPORT,
             )
         with Image.open(io.BytesIO(data), formats=["WEBP"]) as picture:

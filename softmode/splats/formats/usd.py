@@ -26,13 +26,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.errors import AssetError, ConfigError, MissingExtraError
-from softmode.splats.formats.common import REEXPORT, atomic_splat_file
-from softmode.splats.splats import MAX_SPLATS, Splats, rotate_sh, up_rotation
+from softmode.splats.formats.common import REEXPORT, atomic_splat_file, typed_errors
+from softmode.splats.splats import MAX_SPLATS, Splats, UpAxis, rotate_sh, up_rotation
 
 _CHILD = Path(__file__).with_name("usd_child.py")
 _DTYPES = {"f": np.dtype("<f4"), "e": np.dtype("<f2"), "d": np.dtype("<f8")}
 _SH = "radiance:sphericalHarmonicsCoefficients"
 _WIDTHS = {"positions": 3, "orientations": 4, "scales": 3, "opacities": 1, _SH: 3}
+_UP: dict[str, UpAxis] = {"X": "+x", "Y": "+y", "Z": "+z"}
 _MIRROR = np.diag([-1.0, 1.0, 1.0])
 
 
@@ -60,6 +61,12 @@ def read_usd(path: str | os.PathLike[str], *, time_code: float | None = None) ->
         MissingExtraError: If the extra `[usd]` is not installed.
     """
     file = Path(path)
+    with typed_errors(str(file)):
+        return _read_stage(file, time_code)
+
+
+def _read_stage(file: Path, time_code: float | None) -> Splats:
+    """Open the stage in a process of its own and join what that sends back."""
     folder = _pxr_folder()
     size = file.stat().st_size
     command = [sys.executable, "-I", str(_CHILD), folder, str(file.absolute())]
@@ -73,9 +80,12 @@ def read_usd(path: str | os.PathLike[str], *, time_code: float | None = None) ->
         if child.returncode == 3:  # an error of OpenUSD: where in its sources : 'what'
             report = child.stderr.decode("utf-8", "replace").rpartition("\nreason: ")[2]
             reason = (re.findall(r" : '(.+?)'(?: Error in|$)", report) or [report])[0].strip()
+        elif child.returncode == 1:  # an error of Python, before OpenUSD saw the file
+            reason = (child.stderr.decode("utf-8", "replace").strip().splitlines() or ["no message"])[-1]
         raise AssetError(f"splat file {file}: cannot be read ({reason[:300]})", hint=REEXPORT)
-    head, _, body = child.stdout.partition(b"\n")
-    stage = json.loads(head)
+    body = memoryview(child.stdout)
+    end = child.stdout.index(b"\n")
+    stage, body = json.loads(body[:end].tobytes()), body[end + 1 :]
     if not stage["prims"]:
         raise AssetError(
             f"splat file {file}: holds no visible ParticleField3DGaussianSplat prim",
@@ -86,14 +96,18 @@ def read_usd(path: str | os.PathLike[str], *, time_code: float | None = None) ->
         name = f"splat file {file}: {prim['path']}"
         arrays, body = _take_arrays(prim["arrays"], body, name)
         parts.append(_placed(_from_arrays(prim, arrays, name), np.array(prim["matrix"]).reshape(4, 4).T))
-    up = up_rotation({"X": "+x", "Y": "+y", "Z": "+z"}[stage["up"]])  # type: ignore[arg-type]
+    if stage["up"] not in _UP:
+        raise AssetError(f"splat file {file}: upAxis is {stage['up'][:20]!r}", hint="Set it to X, Y or Z")
+    up = up_rotation(_UP[stage["up"]])
     meters = float(stage["meters"])
     if not (np.isfinite(meters) and meters > 0.0):
         raise AssetError(f"splat file {file}: metersPerUnit is {meters}", hint="Set it to the length of the unit in m")
     return _joined(parts, f"splat file {file}").transformed(rotation=up, scale=meters)
 
 
-def _take_arrays(described: dict[str, Any], body: bytes, name: str) -> tuple[dict[str, NDArray[np.float32]], bytes]:
+def _take_arrays(
+    described: dict[str, Any], body: memoryview, name: str
+) -> tuple[dict[str, NDArray[np.float32]], memoryview]:
     """Return the arrays of one prim, each of shape (rows, width), and the bytes behind them."""
     arrays: dict[str, NDArray[np.float32]] = {}
     for key, (kind, shape) in described.items():
