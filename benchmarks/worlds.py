@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -67,9 +68,10 @@ def report_pictures(scene: TableScene, camera: PinholeCamera, repeats: int) -> N
     bare.render(scene.state)
     with wp.ScopedCapture(device=scene.device) as capture:
         bare.render(scene.state)
+    graph: Any = capture.graph
     frames = {
         "whole": lambda: scene.render((camera.width, camera.height)),
-        "meshes alone": lambda: wp.capture_launch(capture.graph),
+        "meshes alone": lambda: wp.capture_launch(graph),
     }
     for name, frame in frames.items():
         frame()

@@ -5,6 +5,7 @@ Cameras are pinholes with the OpenCV frame, see `softmode.splats.pinhole`.
 """
 
 import fnmatch
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
@@ -51,6 +52,17 @@ class CameraOptions:
     """Write which object or shape is seen."""
     lens_per_world: bool = False
     """Meshes follow intrinsics that differ between worlds (`SplatCamera.intrinsics`); a randomised lens implies it."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        colors = (*self.sky, self.light_color, *self.ambient)
+        if not all(math.isfinite(x) and x >= 0.0 for color in colors for x in color):
+            raise ConfigError(f"sky, light_color and ambient must be finite and >= 0, got {colors}")
+        length = math.hypot(*self.light_direction)
+        if not (math.isfinite(length) and length > 1e-6):
+            raise ConfigError(f"light_direction {self.light_direction} has no direction", hint="Down is (0, 0, -1)")
+        if self.mesh_samples not in (1, 4):
+            raise ConfigError(f"mesh_samples is {self.mesh_samples}", hint="Take 1, or 4 for smooth edges of meshes")
 
 
 class SplatCamera:
@@ -105,10 +117,6 @@ class SplatCamera:
             raise ConfigError(
                 f"splats are of {splats.means.shape[0]} worlds, the model has {worlds}",
                 hint="Build them by SplatArrays.from_splats(objects, world_count=model.world_count)",
-            )
-        if self.options.mesh_samples not in (1, 4):
-            raise ConfigError(
-                f"mesh_samples is {self.options.mesh_samples}", hint="Take 1, or 4 for smooth edges of meshes"
             )
         (self.width, self.height) = sizes.pop()
         self.view_count = views = len(self.cameras) * worlds

@@ -182,9 +182,9 @@ def load4(source: wp.array[wp.vec4], i: int) -> wp.vec4:
 
 
 @wp.func_native(
-    snippet="""
+    snippet=f"""
 #if defined(__CUDA_ARCH__)
-    __shared__ unsigned short queue[4 * 1120];
+    __shared__ unsigned short queue[{BLOCK_WARPS} * 1120];
     return reinterpret_cast<uint64_t>(queue + (threadIdx.x >> 5) * 1120);
 #else
     return 0;
@@ -222,9 +222,9 @@ def queue_get(address: wp.uint64, i: int) -> int:
 
 
 @wp.func_native(
-    snippet="""
+    snippet=f"""
 #if defined(__CUDA_ARCH__)
-    __shared__ float4 stage[4 * 96];
+    __shared__ float4 stage[{BLOCK_WARPS} * 96];
     return reinterpret_cast<uint64_t>(stage + (threadIdx.x >> 5) * 96);
 #else
     return 0;

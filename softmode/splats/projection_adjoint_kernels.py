@@ -122,7 +122,7 @@ def project_adjoint(
         return
     world = view_world[view]
     m = world_to_camera[view]
-    x = mean[world % mean.shape[0], i]
+    x = mean[row_of(world, mean.shape[0]), i]
     r0 = wp.vec3(m[0, 0], m[0, 1], m[0, 2])
     r1 = wp.vec3(m[1, 0], m[1, 1], m[1, 2])
     r2 = wp.vec3(m[2, 0], m[2, 1], m[2, 2])
@@ -136,7 +136,7 @@ def project_adjoint(
     d1 = r1 - ty * r2
     j0 = (lens[0] / z) * d0
     j1 = (lens[1] / z) * d1
-    s = covariance[world % covariance.shape[0], i]
+    s = covariance[row_of(world, covariance.shape[0]), i]
     sigma = wp.mat33(s[0], s[1], s[2], s[1], s[3], s[4], s[2], s[4], s[5])
     s0 = sigma * j0
     s1 = sigma * j1
@@ -157,7 +157,7 @@ def project_adjoint(
     by_c = slope * slope * schur - slope * e2 * by_shape[0] - e2 * e2 * by_shape[2]
     by_o = by_shape[3]
     gain = splat_gain[row_of(view, splat_gain.shape[0])]
-    gained = gain[3] * opacity[world % opacity.shape[0], i]
+    gained = gain[3] * opacity[row_of(world, opacity.shape[0]), i]
     if antialiased:
         # o = min(gain opacity, 1) sqrt(sharp / det)
         sharp = wp.max(a0 * c0 - b * b, 0.0)
@@ -169,7 +169,7 @@ def project_adjoint(
             by_c += half * (a0 / sharp - a / det)
         by_o *= share
     if gained <= 1.0:
-        wp.atomic_add(opacity_out, world % opacity_out.shape[0], i, gain[3] * by_o)
+        wp.atomic_add(opacity_out, row_of(world, opacity_out.shape[0]), i, gain[3] * by_o)
 
     # Image covariance to covariance and Jacobian: a = j0 S j0, b = j0 S j1, c = j1 S j1. Off-diagonal entries are
     # stored once and stand for two.
@@ -181,7 +181,7 @@ def project_adjoint(
         2.0 * by_a * j0[1] * j0[2] + by_b * (j0[1] * j1[2] + j0[2] * j1[1]) + 2.0 * by_c * j1[1] * j1[2],
         by_a * j0[2] * j0[2] + by_b * j0[2] * j1[2] + by_c * j1[2] * j1[2],
     )
-    wp.atomic_add(covariance_out, world % covariance_out.shape[0], i, by_sigma)
+    wp.atomic_add(covariance_out, row_of(world, covariance_out.shape[0]), i, by_sigma)
     by_j0 = 2.0 * by_a * s0 + by_b * s1
     by_j1 = by_b * s0 + 2.0 * by_c * s1
 
@@ -219,18 +219,18 @@ def project_adjoint(
     turn = wp.quat()
     if sh.shape[2] > 1:
         eye = -(m[0, 3] * r0 + m[1, 3] * r1 + m[2, 3] * r2)
-        turn = rotation[world % rotation.shape[0], i]
+        turn = rotation[row_of(world, rotation.shape[0]), i]
         distance = wp.length(x - eye)
         sight = (x - eye) / distance
         direction = wp.quat_rotate_inv(turn, sight)
-    by_direction = sh_adjoint(sh, world % sh.shape[0], i, direction, by_color, sh_out)
+    by_direction = sh_adjoint(sh, row_of(world, sh.shape[0]), i, direction, by_color, sh_out)
     by_offset = wp.vec3()
     if sh.shape[2] > 1:
         by_sight = wp.quat_rotate(turn, by_direction)
         by_offset = (by_sight - wp.dot(by_sight, sight) * sight) / distance
         by_mean += by_offset
-        wp.atomic_add(rotation_out, world % rotation_out.shape[0], i, wp.cross(by_sight, sight))
-    wp.atomic_add(mean_out, world % mean_out.shape[0], i, by_mean)
+        wp.atomic_add(rotation_out, row_of(world, rotation_out.shape[0]), i, wp.cross(by_sight, sight))
+    wp.atomic_add(mean_out, row_of(world, mean_out.shape[0]), i, by_mean)
 
     if with_camera:
         # exp of the twist (v, w) acts from the left: points of the camera's frame move by v + w x p, the rows of the

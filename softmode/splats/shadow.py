@@ -27,9 +27,9 @@ class ShadowOptions:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        if not (0.0 <= self.strength <= 1.0 and self.cells >= 1 and self.margin >= 1.0 and self.softness >= 0.0):
+        if not (0.0 <= self.strength <= 1.0 and self.cells >= 1 and self.margin >= 1.0 and 0.0 <= self.softness <= 8.0):
             raise ConfigError(
-                f"{self} is out of range", hint="Give strength in 0..1, cells >= 1, margin >= 1 and softness >= 0"
+                f"{self} is out of range", hint="Give strength in 0..1, cells >= 1, margin >= 1 and softness in 0..8"
             )
 
 

@@ -64,8 +64,8 @@ def fill_map(
         return
     cells = depth_out.shape[1]
     place = map_place(bounds[world], cells, margin)
-    x = int((p[0] - place[0]) / place[2])
-    y = int((p[1] - place[1]) / place[2])
+    x = int(wp.floor((p[0] - place[0]) / place[2]))
+    y = int(wp.floor((p[1] - place[1]) / place[2]))
     if x >= 0 and y >= 0 and x < cells and y < cells:
         wp.atomic_min(depth_out, world, y, x, p[2])
 

@@ -11,7 +11,7 @@ one graph per slice.
 import itertools
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
 import warp as wp
@@ -129,8 +129,9 @@ class ThreadedRasterizer:
         try:
             jobs[0]()
         finally:
-            for job in running:
-                job.result()
+            wait(running)  # all of them, whichever fails
+        for job in running:
+            job.result()
 
     def _jobs(
         self, splats: SplatArrays, views: ViewArrays, mesh_rgb: wp.array | None, mesh_depth: wp.array | None

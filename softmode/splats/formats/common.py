@@ -22,6 +22,8 @@ from softmode.splats.splats import MAX_SPLATS, SH_DC
 REEXPORT = "The file is damaged or incomplete: copy or export it again"
 """The remedy for a file that contradicts itself."""
 
+FREE_BYTES = 8 * 2**20
+"""Bytes that anything may unpack to however small it is: Zstandard and WebP pack what is all the same without limit."""
 MAX_RATIO = 1032
 """Largest ratio of unpacked to packed bytes that a reader accepts: what deflate can reach at most."""
 

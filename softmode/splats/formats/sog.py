@@ -20,15 +20,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from softmode.errors import AssetError
-from softmode.splats.formats.common import MAX_RATIO, REEXPORT, exp_scales, quats_from_smallest_three
+from softmode.splats.formats.common import FREE_BYTES, MAX_RATIO, REEXPORT, exp_scales, quats_from_smallest_three
 from softmode.splats.splats import MAX_SPLATS, Splats
 
 _META_LIMIT = 16 * 1024 * 1024
 _IMAGE_FILE_LIMIT = 512 * 1024 * 1024
 _ARCHIVE_RATIO = 16
 """Largest ratio of unpacked to packed bytes of a large member of an archive; WebP images are packed already."""
-_FREE_BYTES = 4 * 1024 * 1024
-"""Bytes that a member of an archive, and the images of an asset, may unpack to however small their files are."""
 
 
 def read_sog(path: str | os.PathLike[str]) -> Splats:
@@ -95,7 +93,7 @@ def _archive_reader(archive: zipfile.ZipFile, source: str) -> _Reader:
             raise AssetError(
                 f"splat file {source}: member {name} larger than {limit} bytes", hint="Decimate the asset first"
             )
-        if info.file_size > max(_FREE_BYTES, _ARCHIVE_RATIO * info.compress_size):
+        if info.file_size > max(FREE_BYTES, _ARCHIVE_RATIO * info.compress_size):
             raise AssetError(
                 f"splat file {source}: member {name} unpacks from {info.compress_size} to {info.file_size} bytes, "
                 "which no image does",
@@ -188,7 +186,7 @@ def _decode(source: str, read: _Reader) -> Splats:
             )
         # A single colour packs without bound; together, the images of real splats pack by less than ten.
         file_bytes, image_bytes = file_bytes + len(data), image_bytes + 4 * size[0] * size[1]
-        if image_bytes > max(_FREE_BYTES, MAX_RATIO * file_bytes):
+        if image_bytes > max(FREE_BYTES, MAX_RATIO * file_bytes):
             raise AssetError(
                 f"splat file {source}: images of {file_bytes} bytes cannot hold the {count} splats that meta.json "
                 "declares",

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from softmode.errors import AssetError, ConfigError, MissingExtraError
 from softmode.splats.formats.common import (
+    FREE_BYTES,
     MAX_RATIO,
     REEXPORT,
     atomic_splat_file,
@@ -108,7 +109,7 @@ def _check_header(fields: tuple[Any, ...], versions: range, packed_size: int, pa
         fractional_bits=fractional_bits,
         flags=flags,
     )
-    if sum(header.sizes().values()) > MAX_RATIO * packed_size:
+    if sum(header.sizes().values()) > max(FREE_BYTES, MAX_RATIO * packed_size):
         raise AssetError(
             f"splat file {path}: {packed_size} bytes cannot hold the {count} splats that the header declares",
             hint=REEXPORT,
