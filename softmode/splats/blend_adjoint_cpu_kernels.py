@@ -22,7 +22,7 @@ from softmode.splats.blend_cpu_kernels import (
     vec16,
 )
 from softmode.splats.lane_ops import highest_bit, lowest_bit
-from softmode.splats.rasterizer_kernels import TILE
+from softmode.splats.rasterizer_kernels import TILE, Frame
 
 wp.set_module_options({"enable_backward": False})
 
@@ -139,27 +139,14 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool) -> wp
 
     @wp.kernel(enable_backward=False, module="unique")
     def _blend_adjoint(
-        # Bins:
-        order: wp.array[int],  # (>= view_count * splat_count,) splats of each view by depth
-        cover: wp.array2d[wp.uint32],  # (tile_count over all views, words) bits of depth ranks
-        # Projected splats:
-        center: wp.array[wp.vec4],
-        shape: wp.array[wp.vec4],
-        color: wp.array[wp.vec4],
-        # Images in:
-        background: wp.array[wp.vec3],  # (1|view_count,)
-        mesh_rgb: wp.array3d[wp.vec3],  # (view_count, height, width)
-        mesh_depth: wp.array3d[float],  # (view_count, height, width) [m], 0 where there is no mesh
-        depth: wp.array3d[float],  # as rendered
+        frame: Frame,
+        # Images as rendered:
+        depth: wp.array3d[float],
         coverage: wp.array3d[float],  # alpha as rendered
         # Loss by the images, (view_count, height, width):
         loss_rgb: wp.array3d[wp.vec3],
         loss_alpha: wp.array3d[float],
         loss_depth: wp.array3d[float],
-        # Sizes:
-        splat_count: int,
-        size: wp.vec2i,
-        tile_count: wp.vec2i,
         # Loss by the projected splats, added to:
         center_out: wp.array[wp.vec4],  # by u, v, forward depth; the last entry is not used
         shape_out: wp.array[wp.vec4],
@@ -167,12 +154,12 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool) -> wp
     ):
         """Accumulate the loss by center, shape and colour of each (view, splat)."""
         tile = wp.tid()
-        view = tile / (tile_count[0] * tile_count[1])
-        in_view = tile - view * tile_count[0] * tile_count[1]
-        left = (in_view % tile_count[0]) * TILE
-        top = (in_view / tile_count[0]) * TILE
-        columns = wp.min(TILE, size[0] - left)
-        rows = wp.min(TILE, size[1] - top)
+        view = tile / (frame.tile_count[0] * frame.tile_count[1])
+        in_view = tile - view * frame.tile_count[0] * frame.tile_count[1]
+        left = (in_view % frame.tile_count[0]) * TILE
+        top = (in_view / frame.tile_count[0]) * TILE
+        columns = wp.min(TILE, frame.size[0] - left)
+        rows = wp.min(TILE, frame.size[1] - top)
         pairs = (rows + 1) / 2  # not a constant, or Warp would unroll the loops over it
 
         light = tile_mat(-1.0)  # transmittance; its negative once the pixel is finished
@@ -184,7 +171,7 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool) -> wp
         far = tile_mat()
         seen = tile_mat()
         behind = tile_mat()
-        background_rgb = background[view % background.shape[0]]
+        background_rgb = frame.background[view % frame.background.shape[0]]
         for y in range(rows):
             for x in range(columns):
                 pair = y / 2
@@ -195,10 +182,10 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool) -> wp
                 green[pair, lane] = loss[1]
                 blue[pair, lane] = loss[2]
                 if wp.static(has_mesh):
-                    there = mesh_depth[view, top + y, left + x]
+                    there = frame.mesh_depth[view, top + y, left + x]
                     if there > 0.0:
                         limit[pair, lane] = there
-                    background_rgb = mesh_rgb[view, top + y, left + x]
+                    background_rgb = frame.mesh_rgb[view, top + y, left + x]
                 asked = wp.dot(loss, background_rgb)
                 if wp.static(has_alpha):
                     asked -= loss_alpha[view, top + y, left + x]
@@ -218,18 +205,18 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool) -> wp
                 behind[pair, lane] = asked
 
         # Front to back: light left, and the rank at which each pixel ends.
-        first = view * splat_count
+        first = view * frame.splat_count
         running = bool(True)
         patience = int(PATIENCE)
         words = int(0)
-        while running and words < cover.shape[1]:
-            bits = cover[tile, words]
+        while running and words < frame.cover.shape[1]:
+            bits = frame.cover[tile, words]
             while bits != wp.uint32(0):
                 rank = 32 * words + lowest_bit(bits)
                 bits = bits & (bits - wp.uint32(1))
-                i = order[first + rank]
-                g = center[first + i]
-                e = shape[first + i]
+                i = frame.order[first + rank]
+                g = frame.center[first + i]
+                e = frame.shape[first + i]
                 u = g[0] - float(left) - 0.5
                 v = g[1] - float(top) - 0.5
                 peak = LOG2_E * g[3] - LOG2_255
@@ -260,15 +247,15 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool) -> wp
             light[pair] = wp.abs(light[pair])
         for back in range(words):
             word = words - 1 - back
-            bits = cover[tile, word]
+            bits = frame.cover[tile, word]
             while bits != wp.uint32(0):
                 high = highest_bit(bits)
                 bits = bits ^ (wp.uint32(1) << wp.uint32(high))
                 rank = 32 * word + high
-                k = first + order[first + rank]
-                g = center[k]
-                e = shape[k]
-                c = color[k]
+                k = first + frame.order[first + rank]
+                g = frame.center[k]
+                e = frame.shape[k]
+                c = frame.color[k]
                 u = g[0] - float(left) - 0.5
                 v = g[1] - float(top) - 0.5
                 peak = LOG2_E * g[3] - LOG2_255

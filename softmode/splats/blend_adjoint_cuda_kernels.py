@@ -6,7 +6,7 @@ import warp as wp
 
 from softmode.splats.blend_cuda_kernels import COLUMNS, ROWS, TILE_THREADS
 from softmode.splats.lane_ops import ballot, highest_bit, lane_max, lane_sum, lowest_bit
-from softmode.splats.rasterizer_kernels import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
+from softmode.splats.rasterizer_kernels import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN, Frame
 
 wp.set_module_options({"enable_backward": False})
 
@@ -27,27 +27,14 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool, lanes
 
     @wp.kernel(enable_backward=False, module="unique")
     def _blend_adjoint(
-        # Bins:
-        order: wp.array[int],  # (>= view_count * splat_count,) splats of each view by depth
-        cover: wp.array2d[wp.uint32],  # (tile_count over all views, words) bits of depth ranks
-        # Projected splats:
-        center: wp.array[wp.vec4],
-        shape: wp.array[wp.vec4],
-        color: wp.array[wp.vec4],
-        # Images in:
-        background: wp.array[wp.vec3],  # (1|view_count,)
-        mesh_rgb: wp.array3d[wp.vec3],  # (view_count, height, width)
-        mesh_depth: wp.array3d[float],  # (view_count, height, width) [m], 0 where there is no mesh
-        depth: wp.array3d[float],  # as rendered
+        frame: Frame,
+        # Images as rendered:
+        depth: wp.array3d[float],
         coverage: wp.array3d[float],  # alpha as rendered
         # Loss by the images, (view_count, height, width):
         loss_rgb: wp.array3d[wp.vec3],
         loss_alpha: wp.array3d[float],
         loss_depth: wp.array3d[float],
-        # Sizes:
-        splat_count: int,
-        size: wp.vec2i,
-        tile_count: wp.vec2i,
         # Loss by the projected splats, added to:
         center_out: wp.array[wp.vec4],  # by u, v, forward depth; the last entry is not used
         shape_out: wp.array[wp.vec4],
@@ -57,24 +44,24 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool, lanes
         thread = wp.tid()
         tile_index = thread / TILE_THREADS
         local = thread - tile_index * TILE_THREADS
-        view = tile_index / (tile_count[0] * tile_count[1])
-        in_view = tile_index - view * tile_count[0] * tile_count[1]
+        view = tile_index / (frame.tile_count[0] * frame.tile_count[1])
+        in_view = tile_index - view * frame.tile_count[0] * frame.tile_count[1]
         # Lanes of a warp are COLUMNS x ROWS pixels, as in the blend.
         part = local / (COLUMNS * ROWS)
         lane = local - part * COLUMNS * ROWS
-        column = (in_view % tile_count[0]) * TILE + lane % COLUMNS
-        row = (in_view / tile_count[0]) * TILE + part * ROWS + lane / COLUMNS
-        inside = column < size[0] and row < size[1]
+        column = (in_view % frame.tile_count[0]) * TILE + lane % COLUMNS
+        row = (in_view / frame.tile_count[0]) * TILE + part * ROWS + lane / COLUMNS
+        inside = column < frame.size[0] and row < frame.size[1]
         px = float(column) + 0.5
         py = float(row) + 0.5
-        first = view * splat_count
+        first = view * frame.splat_count
 
         # Front to back: light left, and the rank at which the pixel ends.
         light = float(1.0)
         limit = float(1.0e30)
         if wp.static(has_mesh):
             if inside:
-                there = mesh_depth[view, row, column]
+                there = frame.mesh_depth[view, row, column]
                 if there > 0.0:
                     limit = there
         live = inside
@@ -82,16 +69,16 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool, lanes
         word = int(0)
         bits = wp.uint32(0)
         while live:
-            while bits == wp.uint32(0) and word < cover.shape[1]:
-                bits = cover[tile_index, word]
+            while bits == wp.uint32(0) and word < frame.cover.shape[1]:
+                bits = frame.cover[tile_index, word]
                 word += 1
             if bits == wp.uint32(0):
                 break
             rank = 32 * (word - 1) + lowest_bit(bits)
             bits = bits & (bits - wp.uint32(1))
-            k = first + order[first + rank]
-            g = center[k]
-            e = shape[k]
+            k = first + frame.order[first + rank]
+            g = frame.center[k]
+            e = frame.shape[k]
             if wp.static(has_mesh):
                 if g[2] > limit:
                     break
@@ -114,9 +101,9 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool, lanes
         if inside:
             loss = loss_rgb[view, row, column]
             if wp.static(has_mesh):
-                behind = wp.dot(loss, mesh_rgb[view, row, column])
+                behind = wp.dot(loss, frame.mesh_rgb[view, row, column])
             else:
-                behind = wp.dot(loss, background[view % background.shape[0]])
+                behind = wp.dot(loss, frame.background[view % frame.background.shape[0]])
             if wp.static(has_alpha):
                 behind -= loss_alpha[view, row, column]
             if wp.static(has_depth):
@@ -138,17 +125,17 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool, lanes
         word = wp.max(end, 0) / 32
         bits = wp.uint32(0)
         if end >= 0:
-            bits = cover[tile_index, word] & (~wp.uint32(0) >> wp.uint32(31 - end + 32 * word))
+            bits = frame.cover[tile_index, word] & (~wp.uint32(0) >> wp.uint32(31 - end + 32 * word))
         while bits != wp.uint32(0):
             high = highest_bit(bits)
             rank = 32 * word + high
             bits = bits ^ (wp.uint32(1) << wp.uint32(high))
             while bits == wp.uint32(0) and word > 0:
                 word -= 1
-                bits = cover[tile_index, word]
-            k = first + order[first + rank]
-            g = center[k]
-            e = shape[k]
+                bits = frame.cover[tile_index, word]
+            k = first + frame.order[first + rank]
+            g = frame.center[k]
+            e = frame.shape[k]
             dy = py - g[1]
             dx = px - g[0] - e[0] * dy
             raw = e[3] * wp.exp(-0.5 * (e[1] * dx * dx + e[2] * dy * dy))
@@ -162,7 +149,7 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool, lanes
             if touched:
                 light = light / (1.0 - alpha)
                 weight = alpha * light
-                c = color[k]
+                c = frame.color[k]
                 difference = loss[0] * c[0] + loss[1] * c[1] + loss[2] * c[2] - behind
                 if wp.static(has_depth):
                     difference += far * (g[2] - seen)

@@ -11,7 +11,7 @@ import math
 import warp as wp
 
 from softmode.splats.lane_ops import lowest_bit
-from softmode.splats.rasterizer_kernels import TILE
+from softmode.splats.rasterizer_kernels import TILE, Frame
 
 wp.set_module_options({"enable_backward": False})
 
@@ -129,21 +129,8 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
 
     @wp.kernel(enable_backward=False, module="unique")
     def _blend(
-        # Bins:
-        order: wp.array[int],  # (>= view_count * splat_count,) splats of each view by depth
-        cover: wp.array2d[wp.uint32],  # (tile_count over all views, words) bits of depth ranks
-        # Projected splats:
-        center: wp.array[wp.vec4],
-        shape: wp.array[wp.vec4],
-        color: wp.array[wp.vec4],
+        frame: Frame,
         object_index: wp.array[int],  # (splat_count,)
-        # Images in:
-        background: wp.array[wp.vec3],  # (1|view_count,)
-        mesh_rgb: wp.array3d[wp.vec3],  # (view_count, height, width)
-        mesh_depth: wp.array3d[float],  # (view_count, height, width) [m], 0 where there is no mesh
-        # Sizes:
-        size: wp.vec2i,
-        tile_count: wp.vec2i,
         # Out:
         rgb_out: wp.array3d[wp.vec3],
         depth_out: wp.array3d[float],
@@ -153,12 +140,12 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
     ):
         """Blend front to back: C = sum_i c_i alpha_i T_i + T c_behind."""
         tile = wp.tid()
-        view = tile / (tile_count[0] * tile_count[1])
-        in_view = tile - view * tile_count[0] * tile_count[1]
-        left = (in_view % tile_count[0]) * TILE
-        top = (in_view / tile_count[0]) * TILE
-        columns = wp.min(TILE, size[0] - left)
-        rows = wp.min(TILE, size[1] - top)
+        view = tile / (frame.tile_count[0] * frame.tile_count[1])
+        in_view = tile - view * frame.tile_count[0] * frame.tile_count[1]
+        left = (in_view % frame.tile_count[0]) * TILE
+        top = (in_view / frame.tile_count[0]) * TILE
+        columns = wp.min(TILE, frame.size[0] - left)
+        rows = wp.min(TILE, frame.size[1] - top)
         pairs = (rows + 1) / 2  # not a constant, or Warp would unroll the loops over it and compile for 5 s
 
         light = tile_mat(1.0)  # transmittance; its negative once the pixel is finished
@@ -178,23 +165,23 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
         if wp.static(has_mesh):
             for y in range(rows):
                 for x in range(columns):
-                    behind = mesh_depth[view, top + y, left + x]
+                    behind = frame.mesh_depth[view, top + y, left + x]
                     if behind > 0.0:
                         limit[y / 2, TILE * (y % 2) + x] = behind
 
-        first = view * object_index.shape[0]
+        first = view * frame.splat_count
         running = bool(True)
         patience = int(PATIENCE)
-        for word in range(cover.shape[1]):
+        for word in range(frame.cover.shape[1]):
             if not running:
                 break
-            bits = cover[tile, word]
+            bits = frame.cover[tile, word]
             while bits != wp.uint32(0):
-                i = order[first + 32 * word + lowest_bit(bits)]
+                i = frame.order[first + 32 * word + lowest_bit(bits)]
                 bits = bits & (bits - wp.uint32(1))
-                g = center[first + i]
-                e = shape[first + i]
-                c = color[first + i]
+                g = frame.center[first + i]
+                e = frame.shape[first + i]
+                c = frame.color[first + i]
                 u = g[0] - float(left) - 0.5
                 v = g[1] - float(top) - 0.5
                 # ln(255 o), the reach, is at hand: no logarithm.
@@ -229,7 +216,7 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
                         running = False
                         break
 
-        behind_rgb = background[view % background.shape[0]]
+        behind_rgb = frame.background[view % frame.background.shape[0]]
         for y in range(rows):
             for x in range(columns):
                 pair = y / 2
@@ -239,7 +226,7 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
                 far = depth[pair, lane]
                 middle = median[pair, lane]
                 if wp.static(has_mesh):
-                    behind_rgb = mesh_rgb[view, top + y, left + x]
+                    behind_rgb = frame.mesh_rgb[view, top + y, left + x]
                     if limit[pair, lane] < 1.0e29:
                         far += t * limit[pair, lane]
                         seen = 1.0

@@ -23,7 +23,7 @@ from softmode.splats.lane_ops import (
     stage_put,
     sync_lanes,
 )
-from softmode.splats.rasterizer_kernels import ALPHA_MAX, TILE, TRANSMITTANCE_MIN
+from softmode.splats.rasterizer_kernels import ALPHA_MAX, TILE, TRANSMITTANCE_MIN, Frame
 
 wp.set_module_options({"enable_backward": False})
 
@@ -75,21 +75,8 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=(BLOCK_DIM, 10))
     def _blend(
-        # Bins:
-        order: wp.array[int],  # (>= view_count * splat_count,) splats of each view by depth
-        cover: wp.array2d[wp.uint32],  # (tile_count over all views, words) bits of depth ranks
-        # Projected splats:
-        center: wp.array[wp.vec4],
-        shape: wp.array[wp.vec4],
-        color: wp.array[wp.vec4],
+        frame: Frame,
         object_index: wp.array[int],  # (splat_count,)
-        # Images in:
-        background: wp.array[wp.vec3],  # (1|view_count,)
-        mesh_rgb: wp.array3d[wp.vec3],  # (view_count, height, width)
-        mesh_depth: wp.array3d[float],  # (view_count, height, width) [m], 0 where there is no mesh
-        # Sizes:
-        size: wp.vec2i,
-        tile_count: wp.vec2i,
         # Out:
         rgb_out: wp.array3d[wp.vec3],
         depth_out: wp.array3d[float],
@@ -102,13 +89,13 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
         lane = thread % 32
         part = thread / 32
         tile_index = part / PARTS
-        view = tile_index / (tile_count[0] * tile_count[1])
-        in_view = tile_index - view * tile_count[0] * tile_count[1]
-        left = (in_view % tile_count[0]) * TILE
-        top = (in_view / tile_count[0]) * TILE + (part - tile_index * PARTS) * ROWS
+        view = tile_index / (frame.tile_count[0] * frame.tile_count[1])
+        in_view = tile_index - view * frame.tile_count[0] * frame.tile_count[1]
+        left = (in_view % frame.tile_count[0]) * TILE
+        top = (in_view / frame.tile_count[0]) * TILE + (part - tile_index * PARTS) * ROWS
         column = left + lane % COLUMNS
         row = top + lane / COLUMNS
-        inside = column < size[0] and row < size[1]
+        inside = column < frame.size[0] and row < frame.size[1]
         low = wp.vec2(float(left) + 0.5, float(top) + 0.5)
         high = wp.vec2(float(left + COLUMNS) - 0.5, float(top + ROWS) - 0.5)
         px = keep(float(column) + 0.5)
@@ -130,20 +117,19 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
             cut = FINISHED
         if wp.static(has_mesh):
             if inside:
-                behind = mesh_depth[view, row, column]
+                behind = frame.mesh_depth[view, row, column]
                 if behind > 0.0:
                     limit = behind
 
-        splat_count = object_index.shape[0]
-        first = view * splat_count
-        words = cover.shape[1]
+        first = view * frame.splat_count
+        words = frame.cover.shape[1]
         running = bool(True)
         pending = int(0)  # ranks in the queue
         chunk = int(0)  # first of the 32 words that the lanes read together
         while running and chunk < words:
             bits = wp.uint32(0)
             if chunk + lane < words:
-                bits = cover[tile_index, chunk + lane]
+                bits = frame.cover[tile_index, chunk + lane]
             found = bit_count(bits)
             through = lane_scan(found, lane)
             slot = pending + through - found
@@ -163,9 +149,9 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
                 c = wp.vec4()
                 s = wp.vec4()
                 if begin + lane < pending:
-                    k = order[base + queue_get(queue, begin + lane)]
-                    c = load4(center, first + k)
-                    s = load4(shape, first + k)
+                    k = frame.order[base + queue_get(queue, begin + lane)]
+                    c = load4(frame.center, first + k)
+                    s = load4(frame.shape, first + k)
                     hit = least_power(c, s, low, high) <= c[3] + 1.0e-3
                 hits = ballot(hit)
                 if hit:
@@ -173,7 +159,7 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
                     half = 0.5 * LOG2_E
                     stage_put(stage, at, wp.vec4(c[0], c[1], s[0], c[2]))
                     stage_put(stage, at + 1, wp.vec4(half * s[1], half * s[2], wp.log2(s[3]), wp.cast(k, wp.float32)))
-                    stage_put(stage, at + 2, load4(color, first + k))
+                    stage_put(stage, at + 2, load4(frame.color, first + k))
                 sync_lanes()
                 count = 3 * bit_count(hits)
                 at = int(0)
@@ -220,7 +206,7 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
             behind_rgb = wp.vec3()
             seen = 1.0 - light
             if wp.static(has_mesh):
-                behind_rgb = mesh_rgb[view, row, column]
+                behind_rgb = frame.mesh_rgb[view, row, column]
                 if limit < 1.0e29:
                     depth += light * limit
                     seen = 1.0
@@ -228,7 +214,7 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
                         if light > 0.5:
                             median = limit
             else:
-                behind_rgb = background[view % background.shape[0]]
+                behind_rgb = frame.background[view % frame.background.shape[0]]
             rgb_out[view, row, column] = wp.vec3(red, green, blue) + light * behind_rgb
             alpha_out[view, row, column] = 1.0 - light
             depth_out[view, row, column] = wp.where(seen > 0.0, depth / wp.max(seen, 1.0e-6), 0.0)

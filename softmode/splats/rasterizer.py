@@ -400,14 +400,21 @@ class SplatRasterizer:
         wp.launch(
             blend.blend_kernel(*variant),
             dim=self._cover.shape[0] * blend.TILE_THREADS,
-            inputs=[
-                self._order, self._cover, self._center, self._shape, self._color, splats.object_index,
-                views.background,
-                mesh_rgb if mesh_rgb is not None else self._no_rgb,
-                mesh_depth if mesh_depth is not None else self._no_depth,
-                wp.vec2i(self.width, self.height), wp.vec2i(*self.tile_count),
-            ],
+            inputs=[self._frame(views, mesh_rgb, mesh_depth), splats.object_index],
             outputs=[self.rgb, self.depth, self.alpha, self.object_id, self.median_depth],
             device=self.device,
             block_dim=blend_cuda_kernels.BLOCK_DIM,
-        )  # fmt: skip
+        )
+
+    def _frame(self, views: ViewArrays, mesh_rgb: wp.array | None, mesh_depth: wp.array | None) -> Any:
+        """Return the `Frame` that a blend reads."""
+        frame = kernels.Frame()
+        frame.order, frame.cover = self._order, self._cover
+        frame.center, frame.shape, frame.color = self._center, self._shape, self._color
+        frame.background = views.background
+        frame.mesh_rgb = self._no_rgb if mesh_rgb is None else mesh_rgb
+        frame.mesh_depth = self._no_depth if mesh_depth is None else mesh_depth
+        frame.splat_count = self.splat_count
+        frame.size = wp.vec2i(self.width, self.height)
+        frame.tile_count = wp.vec2i(*self.tile_count)
+        return frame

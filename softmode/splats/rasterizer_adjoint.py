@@ -90,7 +90,6 @@ class AdjointRasterizer:
         self._camera = allocate((view_count, count) if camera else (1, 1), dtype=projection_adjoint_kernels.vec10)
         self._lanes = 1 if self.device.is_cpu else 64
         self._no_image = allocate((1, 1, 1), dtype=wp.float32)
-        self._no_rgb = allocate((1, 1, 1), dtype=wp.vec3)
         self.gradients = RasterizerGradients(
             means=wp.zeros_like(splats.means, requires_grad=False),
             covariances=wp.zeros_like(splats.covariances, requires_grad=False),
@@ -184,13 +183,9 @@ class AdjointRasterizer:
             blend.blend_adjoint_kernel(*variant),
             dim=r._cover.shape[0] * blend.TILE_THREADS,
             inputs=[
-                r._order, r._cover, r._center, r._shape, r._color, views.background,
-                mesh_rgb if mesh_rgb is not None else self._no_rgb,
-                mesh_depth if mesh_depth is not None else self._no_image,
-                r.depth, r.alpha, loss_rgb,
+                r._frame(views, mesh_rgb, mesh_depth), r.depth, r.alpha, loss_rgb,
                 loss_alpha if loss_alpha is not None else self._no_image,
                 loss_depth if loss_depth is not None else self._no_image,
-                r.splat_count, wp.vec2i(r.width, r.height), wp.vec2i(*r.tile_count),
             ],
             outputs=[self._center, self._shape, self._color],
             device=self.device,

@@ -17,6 +17,23 @@ IMAGE_MARGIN = wp.constant(0.15)
 """Share of the image beyond each of its edges at which splats are linearised."""
 
 
+@wp.struct
+class Frame:
+    """What a blend and its adjoint read: the projected splats of all views, the bits of the tiles, what is behind."""
+
+    order: wp.array[int]  # (>= view_count * splat_count,) splats of each view by depth
+    cover: wp.array2d[wp.uint32]  # (tiles of all views, words) bits of depth ranks
+    center: wp.array[wp.vec4]  # (view_count * splat_count,), as `project` writes them
+    shape: wp.array[wp.vec4]
+    color: wp.array[wp.vec4]
+    background: wp.array[wp.vec3]  # (1|view_count,)
+    mesh_rgb: wp.array3d[wp.vec3]  # (view_count, height, width)
+    mesh_depth: wp.array3d[float]  # (view_count, height, width) [m], 0 where there is no mesh
+    splat_count: int
+    size: wp.vec2i
+    tile_count: wp.vec2i
+
+
 @wp.func
 def row_of(world: int, rows: int):
     """Return the row of a table with one row for all worlds or one for each."""
