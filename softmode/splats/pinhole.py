@@ -17,6 +17,10 @@ Vector = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
 
 
+MAX_EDGE = 4096
+"""Largest width and height of an image [px]."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class PinholeCamera:
     """One camera of every world: fixed, carried by a body, or moved by hand through `SplatCamera.poses`.
@@ -53,9 +57,9 @@ class PinholeCamera:
                 f"camera {self.name!r}: intrinsics and pose must be finite, focal lengths positive",
                 hint="Flip the image or the pose rather than the sign of a focal length",
             )
-        if not (0 < self.width <= 2000 and 0 < self.height <= 2000):
+        if not (0 < self.width <= MAX_EDGE and 0 < self.height <= MAX_EDGE):
             raise ConfigError(
-                f"camera {self.name!r}: {self.width} x {self.height} px, expected 1 to 2000 on each side",
+                f"camera {self.name!r}: {self.width} x {self.height} px, expected 1 to {MAX_EDGE} on each side",
                 hint="Scale width, height, fx, fy, cx and cy down together",
             )
         if abs(sum(x * x for x in self.quat) - 1.0) > 1e-3:

@@ -23,11 +23,8 @@ import warp as wp
 from softmode.errors import ConfigError
 from softmode.splats import blend_cpu_kernels, blend_cuda_kernels, cover_cuda_kernels, depth_sort_kernels
 from softmode.splats import rasterizer_kernels as kernels
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.pinhole import MAX_EDGE, PinholeCamera
 from softmode.splats.splats import MAX_SPLATS, Splats
-
-MAX_EDGE = 4096
-"""Largest width and height of an image [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)
