@@ -10,13 +10,13 @@ import warp as wp
 
 from softmode.splats.blend_cpu_kernels import (
     LANES,
-    LOG2_255,
-    LOG2_E,
     PATIENCE,
     _in_lanes,
     add_weighted,
+    has_light,
     light_after,
     light_before,
+    seen_from_tile,
     splat_alpha,
     tile_mat,
     vec16,
@@ -217,27 +217,20 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool) -> wp
                 i = frame.order[first + rank]
                 g = frame.center[first + i]
                 e = frame.shape[first + i]
-                u = g[0] - float(left) - 0.5
-                v = g[1] - float(top) - 0.5
-                peak = LOG2_E * g[3] - LOG2_255
-                a = 0.5 * LOG2_E * e[1]
-                b = 0.5 * LOG2_E * e[2]
+                s = seen_from_tile(g, e, left, top)
                 for pair in range(pairs):
                     before = light[pair]
                     if wp.static(has_mesh):
                         before = light_before(before, limit[pair], g[2])
-                    alpha = splat_alpha(before, u, v - float(2 * pair), e[0], a, b, peak)
+                    alpha = splat_alpha(before, s[0], s[1] - float(2 * pair), e[0], s[2], s[3], s[4])
                     after = light_after(before, alpha)
                     light[pair] = after
                     stop[pair] = end_where_finished(stop[pair], after, float(rank))
                 patience -= 1
                 if patience == 0:
                     patience = PATIENCE
-                    brightest = light[0]
-                    for pair in range(1, pairs):
-                        brightest = wp.max(brightest, light[pair])
-                    if wp.max(brightest) < 0.0:
-                        running = False
+                    running = has_light(light, pairs)
+                    if not running:
                         break
             words += 1
 
@@ -256,11 +249,7 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool) -> wp
                 g = frame.center[k]
                 e = frame.shape[k]
                 c = frame.color[k]
-                u = g[0] - float(left) - 0.5
-                v = g[1] - float(top) - 0.5
-                peak = LOG2_E * g[3] - LOG2_255
-                a = 0.5 * LOG2_E * e[1]
-                b = 0.5 * LOG2_E * e[2]
+                s = seen_from_tile(g, e, left, top)
                 sum_r = vec16()
                 sum_g = vec16()
                 sum_b = vec16()
@@ -274,7 +263,7 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool) -> wp
                 densest = vec16()
                 for pair in range(pairs):
                     open = light_if_open(light[pair], stop[pair], float(rank))
-                    alpha = splat_alpha(open, u, v - float(2 * pair), e[0], a, b, peak)
+                    alpha = splat_alpha(open, s[0], s[1] - float(2 * pair), e[0], s[2], s[3], s[4])
                     alphas[pair] = alpha
                     densest = larger(densest, alpha)
                 if lane_max(densest) == 0.0:
@@ -294,8 +283,8 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool) -> wp
                     sum_g = add_product(sum_g, weight, green[pair])
                     sum_b = add_product(sum_b, weight, blue[pair])
                     log_alpha = by_log_alpha(weight, alpha, difference)
-                    dy = offset_y(v - float(2 * pair))
-                    dx = offset_x(dy, u, e[0])
+                    dy = offset_y(s[1] - float(2 * pair))
+                    dx = offset_x(dy, s[0], e[0])
                     along_x = product(log_alpha, dx)
                     along_y = product(log_alpha, dy)
                     power = add_weighted(power, log_alpha, 1.0)

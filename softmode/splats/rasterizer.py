@@ -13,7 +13,7 @@ which is what keeps small images right.
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -181,6 +181,14 @@ class ViewArrays:
         )
 
 
+def require_shapes(expected: Iterable[tuple[str, wp.array | None, tuple[int, ...] | None]], hint: str) -> None:
+    """Raise a ConfigError that names the first array of another shape than expected; a shape of None is not asked."""
+    for name, array, shape in expected:
+        if shape is not None and (array is None or tuple(array.shape) != tuple(shape)):
+            given = "None" if array is None else str(tuple(array.shape))
+            raise ConfigError(f"{name} has shape {given}, expected {tuple(shape)}", hint=hint)
+
+
 class SplatRasterizer:
     """Draws splats into images of one size for a fixed number of views.
 
@@ -310,7 +318,7 @@ class SplatRasterizer:
             return 1 if array.shape[0] == 1 else count
 
         gain = views.splat_gain
-        for name, array, shape in (
+        expected = (
             ("splats.means", splats.means, (rows(splats.means, worlds), count)),
             ("splats.covariances", splats.covariances, (rows(splats.covariances, worlds), count)),
             ("splats.opacities", splats.opacities, (rows(splats.opacities, worlds), count)),
@@ -324,13 +332,10 @@ class SplatRasterizer:
             ("views.splat_gain", gain, None if gain is None else (rows(gain, self.view_count),)),
             ("mesh_rgb", mesh_rgb, images),
             ("mesh_depth", mesh_depth, images),
-        ):
-            if shape is not None and (array is None or tuple(array.shape) != shape):
-                given = "None" if array is None else str(tuple(array.shape))
-                raise ConfigError(
-                    f"{name} has shape {given}, expected {shape}",
-                    hint="Size the rasteriser for these arrays; arrays have one row, or one for every world or view",
-                )
+        )
+        require_shapes(
+            expected, "Size the rasteriser for these arrays; arrays have one row, or one for every world or view"
+        )
 
     def _project(self, splats: SplatArrays, views: ViewArrays) -> None:
         options = self.options

@@ -16,10 +16,9 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import expm
 
-from softmode.errors import ConfigError
 from softmode.splats import blend_adjoint_cpu_kernels, blend_adjoint_cuda_kernels, projection_adjoint_kernels
 from softmode.splats.blend_cuda_kernels import BLOCK_DIM
-from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
+from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays, require_shapes
 
 
 def exp_twist(twist: ArrayLike) -> NDArray[np.float64]:
@@ -133,7 +132,7 @@ class AdjointRasterizer:
         r, out = self.rasterizer, self.gradients
         images = (r.view_count, r.height, r.width)
         meshes = None if mesh_rgb is None and mesh_depth is None else images
-        for name, array, shape in (
+        expected = (
             ("loss_rgb", loss_rgb, images),
             ("loss_alpha", loss_alpha, None if loss_alpha is None else images),
             ("loss_depth", loss_depth, None if loss_depth is None else images),
@@ -146,13 +145,8 @@ class AdjointRasterizer:
             ("splats.rotations", splats.rotations, out.rotations.shape),
             ("views.world_to_camera", views.world_to_camera, (r.view_count,)),
             ("views.background", views.background, out.background.shape),
-        ):
-            if shape is not None and (array is None or tuple(array.shape) != tuple(shape)):
-                given = "None" if array is None else str(tuple(array.shape))
-                raise ConfigError(
-                    f"{name} has shape {given}, expected {tuple(shape)}",
-                    hint="Give the arrays of the last render, and build the adjoint for their shapes",
-                )
+        )
+        require_shapes(expected, "Give the arrays of the last render, and build the adjoint for their shapes")
         for array in (self._center, self._shape, self._color, *(getattr(out, f.name) for f in fields(out))):
             array.zero_()
         self._blend(views, loss_rgb, loss_alpha, loss_depth, mesh_rgb, mesh_depth)
