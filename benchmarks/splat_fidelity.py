@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import functools
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -29,6 +30,7 @@ from softmode.deformables.quadrature import quadrature_from_box
 from softmode.deformables.skinning import STRETCH_LIMIT, SkinSplats, average_basis
 from softmode.envs.objects import ObjectConfig, load_object
 from softmode.splats import Splats
+from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
 from softmode.splats.splats import SH_DC, quats_from_rotations, rotations_from_quats
 
@@ -263,19 +265,12 @@ class Moved:
 
 def look(size: int, center: Array | None = None) -> ViewArrays:
     """Return a camera that looks at the centre from the front, a little from above, 0.52 m away."""
-    eye = 0.52 * np.array([-0.25, -0.9, 0.4]) / np.linalg.norm([-0.25, -0.9, 0.4])
-    z = -eye / np.linalg.norm(eye)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.stack([x, np.cross(z, x), z])
-    matrix[:3, 3] = -matrix[:3, :3] @ (eye if center is None else eye + center)
-    return ViewArrays(
-        world_to_camera=wp.array(matrix[None].astype(np.float32), dtype=wp.mat44, device="cpu"),
-        intrinsics=wp.array([[1.5 * size, 1.5 * size, 0.5 * size, 0.5 * size]], dtype=wp.vec4, device="cpu"),
-        world=wp.zeros(1, dtype=wp.int32, device="cpu"),
-        background=wp.array([BACKGROUND], dtype=wp.vec3, device="cpu"),
+    u, v, w = np.zeros(3) if center is None else center
+    x, y, z = np.array([u, v, w]) + 0.52 * np.array([-0.25, -0.9, 0.4]) / np.linalg.norm([-0.25, -0.9, 0.4])
+    camera = PinholeCamera.look_at(
+        "front", position=(x, y, z), target=(u, v, w), width=size, height=size, fov_y=2.0 * math.atan(1.0 / 3.0)
     )
+    return ViewArrays.from_cameras([camera], background=BACKGROUND, device="cpu")
 
 
 def psnr(a: Array, b: Array) -> float:

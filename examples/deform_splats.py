@@ -8,6 +8,7 @@ Run: ``python examples/deform_splats.py [FILE] [--short]``; writes ``out/deform_
 """
 
 import argparse
+import math
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from PIL import Image
 from softmode.deformables.body import BuildOptions
 from softmode.deformables.skinning import SkinSplats
 from softmode.envs.objects import ObjectConfig, load_object
+from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
 
 SIZE, DISTANCE = 128, 2.4
@@ -65,16 +67,16 @@ class Deformed:
 
     def draw(self, size: int) -> np.ndarray:
         """Draw every world from the front, shape (world, size, size, 3)."""
-        # OpenCV axes: x right, y down, z forward. The camera looks along -X of the object.
-        extent = float(np.ptp(self.thing.splats.means, axis=0).max())
-        view = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [-1.0, 0.0, 0.0, DISTANCE * extent]])
-        view = np.vstack([view, [0.0, 0.0, 0.0, 1.0]]).astype(np.float32)
-        views = ViewArrays(
-            world_to_camera=wp.array(np.tile(view, (self.worlds, 1, 1)), dtype=wp.mat44),
-            intrinsics=wp.array([[1.5 * size, 1.5 * size, 0.5 * size, 0.5 * size]] * self.worlds, dtype=wp.vec4),
-            world=wp.array(np.arange(self.worlds), dtype=wp.int32),
-            background=wp.array([[0.85, 0.88, 0.92]], dtype=wp.vec3),
+        distance = DISTANCE * float(np.ptp(self.thing.splats.means, axis=0).max())
+        camera = PinholeCamera.look_at(
+            "front",
+            position=(distance, 0.0, 0.0),
+            target=(0.0, 0.0, 0.0),
+            width=size,
+            height=size,
+            fov_y=2.0 * math.atan(1.0 / 3.0),
         )
+        views = ViewArrays.from_cameras([camera] * self.worlds, world=range(self.worlds), background=(0.85, 0.88, 0.92))
         rasterizer = SplatRasterizer(self.thing.splats.count, self.worlds, size, size)
         rasterizer.render(self.arrays, views)
         return np.clip(rasterizer.rgb.numpy(), 0.0, 1.0)
