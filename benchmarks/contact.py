@@ -145,7 +145,7 @@ def print_lift(youngs_modulus: float) -> None:
 
     def eager(actions: np.ndarray) -> None:
         scene.actions.assign(np.asarray(actions, np.float32).reshape(scene.actions.shape))
-        scene._control_step()
+        scene.control_step()
 
     scene.solver.step, scene.step = watched, eager
     info: dict[str, Any] = {}

@@ -97,7 +97,7 @@ def print_substep(env: LiftSoftEnv, repeats: int, iterations: float) -> None:
         soft.progress.renew.zero_()
         milliseconds = measure(stage, repeats, device)
         print(f"  {name:<44}{milliseconds:8.3f} ms  {milliseconds / whole:6.1%}")
-    frame = measure(scene._control_step, max(repeats // 10, 5), device)
+    frame = measure(scene.control_step, max(repeats // 10, 5), device)
     print(
         f"control step: {frame:.2f} ms for {scene.config.substeps} substeps, "
         f"{1e3 / scene.config.control_hz / frame:.2f} x real time"

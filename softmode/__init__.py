@@ -4,6 +4,7 @@ Importing the package registers its environments and loads nothing heavy::
 
     import gymnasium as gym, softmode
     env = gym.make("softmode/LiftSoft-v0", obs_type="pixels_agent_pos", render_mode="rgb_array")
+    envs = gym.make_vec("softmode/LiftSoft-v0", num_envs=1024, device="cuda:0", output="torch")
 """
 
 from __future__ import annotations
@@ -12,18 +13,26 @@ from gymnasium.envs.registration import register, registry
 
 __version__ = "0.1.0"
 
-ENVIRONMENTS = {"softmode/LiftSoft-v0": "Pick a soft object from a table and hold it at a goal height."}
+ENVIRONMENTS = {
+    "softmode/LiftSoft-v0": "Pick a soft object from a table and hold it at a goal.",
+}
 """Ids of the registered environments and what their task is."""
+_EPISODE_STEPS = {"LiftSoft": 150}
+"""Control steps of an episode."""
 
 
 def _register() -> None:
-    """Register every environment once."""
-    if "softmode/LiftSoft-v0" not in registry:
-        register(
-            id="softmode/LiftSoft-v0",
-            entry_point="softmode.envs.lift_soft:LiftSoftEnv",
-            max_episode_steps=150,
-        )
+    """Register every environment once; task Name lives in ``softmode.envs.name`` as NameEnv and NameVectorEnv."""
+    for name in ENVIRONMENTS:
+        task = name.removeprefix("softmode/").removesuffix("-v0")
+        module = "softmode.envs." + "".join(f"_{c.lower()}" if c.isupper() else c for c in task).lstrip("_")
+        if name not in registry:
+            register(
+                id=name,
+                entry_point=f"{module}:{task}Env",
+                vector_entry_point=f"{module}:{task}VectorEnv",
+                max_episode_steps=_EPISODE_STEPS[task],
+            )
 
 
 _register()

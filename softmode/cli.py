@@ -209,8 +209,9 @@ def _play_episode(env: Any, options: Play, seed: int, film: _Film | None, fps: i
             if film:
                 film.add(env.render(), fps)
             bar.update()
+    modulus = info["parameters"]["youngs_modulus"]
     print(
-        f"seed {seed}: E {info['youngs_modulus']:.3g} Pa, {1e3 * seconds / max(steps - 1, 1):.1f} ms per control step, "
+        f"seed {seed}: E {modulus:.3g} Pa, {1e3 * seconds / max(steps - 1, 1):.1f} ms per control step, "
         f"return {total:.1f}, success: {info['is_success']}"
     )
     return bool(info["is_success"])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.envs.lift_soft import LiftSoftEnv
+from softmode.envs.lift_soft import LiftSoft
 from softmode.errors import ConfigError
 
 
@@ -40,7 +40,7 @@ class ScriptedLift:
     def __init__(self, env: Any, *, squeeze: float = 5.0) -> None:
         """Remember the environment and plan nothing yet."""
         base = env.unwrapped
-        if not isinstance(base, LiftSoftEnv) or base.config.scene.control.mode != "pose_delta":
+        if not isinstance(getattr(base, "task", None), LiftSoft) or base.config.scene.control.mode != "pose_delta":
             raise ConfigError(
                 "the scripted policy plays LiftSoft in pose_delta mode only",
                 hint="make the environment with control_mode='pose_delta'",
@@ -63,8 +63,8 @@ class ScriptedLift:
     def __call__(self, observation: Any = None) -> NDArray[np.float32]:
         """Return the action for the present state."""
         scene = self.env.scene
-        centre = scene.object_position.numpy()[0].astype(float)
-        still = np.linalg.norm(scene.object_velocity.numpy()[0]) < self.STILL
+        centre = scene.object_position.numpy()[0, 0].astype(float)
+        still = np.linalg.norm(scene.object_velocity.numpy()[0, 0]) < self.STILL
         tool = scene.controller.target_position.numpy()[0].astype(float)
         force = np.linalg.norm(scene.finger_force.numpy()[0], axis=1)
         if self._phase in ("align", "descend") and np.linalg.norm(centre - self._planned_at) > self.MOVED:
@@ -96,8 +96,7 @@ class ScriptedLift:
         else:
             self._count = self._count + 1 if force.min() < 0.02 else 0
             self._grip = self._regulated(force)
-            rise = self.env.config.goal_height - self.env.rise()
-            goal = tool + np.array([0.0, 0.0, np.clip(rise, -0.008, 0.008)])
+            goal = tool + self._way(centre)
             if self._count > 8:
                 self.reset()
                 goal = tool
@@ -106,13 +105,20 @@ class ScriptedLift:
         spin = np.clip(turn / options.rotation_scale, -1.0, 1.0)
         return np.array([*move, spin, self._grip], np.float32)
 
+    def _way(self, centre: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the next move of a held object: up first, sideways once it is clear of the table."""
+        task = self.env.task
+        way = task.observation.numpy()[0, task.segments["goal"][0]] - centre
+        way[:2] *= float(centre[2] - task.scene.soft.height > 0.02)
+        return way * min(1.0, 0.008 / max(float(np.linalg.norm(way)), 1.0e-9))
+
     def _plan(self) -> tuple[NDArray[np.float64], float]:
         """Choose grasp point and yaw from the surface samples."""
         scene, gripper = self.env.scene, self.env.config.scene.arm.gripper
-        points = scene.state.particle_q.numpy().astype(float)
+        points = scene.state.particle_q.numpy()[: scene.soft.body.surface_count].astype(float)
         top, bottom = points[:, 2].max(), points[:, 2].min()
         depth = min(0.5 * gripper.pad_size[2], 0.5 * (top - bottom))
-        centre = scene.object_position.numpy()[0].astype(float)
+        centre = scene.object_position.numpy()[0, 0].astype(float)
         # at the height of the centre of mass, unless the palm would press on the top
         under_palm = top - (gripper.finger_length - 0.5 * gripper.pad_size[2]) + self.PALM_GAP
         height = max(centre[2], bottom + depth, under_palm, self.env.config.scene.control.workspace_lower[2])

@@ -9,28 +9,29 @@ wp.set_module_options({"enable_backward": False})
 def place_objects(
     # Instances:
     function_start: wp.array[int],
-    world: wp.array[int],
+    stride: int,  # soft objects per world
+    object_index: int,
     # Asset:
     linear_coordinates: wp.array2d[wp.float64],  # (function_count, 4)
     # Reset:
     world_mask: wp.array[wp.bool],
-    position: wp.array[wp.vec3d],  # (world_count,) [m]
-    yaw: wp.array[wp.float64],  # (world_count,) [rad]
+    position: wp.array[wp.vec3d],  # (instance_count,) [m]
+    yaw: wp.array[wp.float64],  # (instance_count,) [rad]
     # Out:
     q_out: wp.array[wp.vec3d],
     qd_out: wp.array[wp.vec3d],
 ):
-    """Set q to the rigid placement x = R(yaw) X + position, at rest."""
-    i, k = wp.tid()
-    w = world[i]
+    """Set q of one object of each world to the rigid placement x = R(yaw) X + position, at rest."""
+    w, k = wp.tid()
     if not world_mask[w]:
         return
-    c = wp.cos(yaw[w]) - wp.float64(1.0)
-    s = wp.sin(yaw[w])
+    i = w * stride + object_index
+    c = wp.cos(yaw[i]) - wp.float64(1.0)
+    s = wp.sin(yaw[i])
     x = linear_coordinates[k, 0]
     y = linear_coordinates[k, 1]
     q_out[function_start[i] + k] = wp.vec3d(c * x - s * y, s * x + c * y, wp.float64(0.0)) + (
-        linear_coordinates[k, 3] * position[w]
+        linear_coordinates[k, 3] * position[i]
     )
     qd_out[function_start[i] + k] = wp.vec3d()
 
@@ -39,23 +40,26 @@ def place_objects(
 def observe_objects(
     # Instances:
     function_start: wp.array[int],
+    stride: int,  # soft objects per world
+    object_index: int,
     mean_basis: wp.array[wp.float64],
     # State in:
     q: wp.array[wp.vec3d],
     qd: wp.array[wp.vec3d],
-    # Out:
-    position_out: wp.array[wp.vec3],
-    velocity_out: wp.array[wp.vec3],
+    # Out, (world_count, objects):
+    position_out: wp.array2d[wp.vec3],
+    velocity_out: wp.array2d[wp.vec3],
 ):
     """Compute position and velocity of the centre of mass: sum_k mean(b_k) q_k."""
-    i = wp.tid()
+    w = wp.tid()
+    start = function_start[w * stride + object_index]
     x = wp.vec3d()
     v = wp.vec3d()
     for k in range(mean_basis.shape[0]):
-        x += mean_basis[k] * q[function_start[i] + k]
-        v += mean_basis[k] * qd[function_start[i] + k]
-    position_out[i] = wp.vec3(x)
-    velocity_out[i] = wp.vec3(v)
+        x += mean_basis[k] * q[start + k]
+        v += mean_basis[k] * qd[start + k]
+    position_out[w, object_index] = wp.vec3(x)
+    velocity_out[w, object_index] = wp.vec3(v)
 
 
 @wp.kernel
@@ -68,3 +72,16 @@ def observe_fingers(
     """Read the force of the soft object on each finger."""
     w, f = wp.tid()
     force_out[w, f] = wp.spatial_top(body_wrench[finger_body[w, f]])
+
+
+@wp.kernel
+def place_marker(
+    rest: wp.array[wp.vec3],
+    place: wp.array[wp.transform],
+    first: int,
+    # Out:
+    means: wp.array2d[wp.vec3],
+):
+    """Move the centres of the marker's splats to its place."""
+    w, i = wp.tid()
+    means[w, first + i] = wp.transform_point(place[w], rest[i])

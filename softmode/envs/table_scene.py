@@ -1,8 +1,8 @@
-"""A robot arm at a table with one soft object, in any number of worlds: model, solver, controller, cameras, graphs."""
+"""A robot arm at a table with soft objects, in any number of worlds: model, solver, controller, cameras, graphs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import newton
 import numpy as np
@@ -23,8 +23,46 @@ from softmode.envs.objects import ObjectConfig, SoftObject, load_object
 from softmode.errors import ConfigError
 from softmode.robots import ArmDescription, add_arm
 from softmode.robots.control import ArmController, ArmControlOptions
+from softmode.splats import Splats
 from softmode.splats.camera import CameraOptions, PinholeCamera, SplatCamera
+from softmode.splats.camera_randomization import CameraRandomization
 from softmode.splats.rasterizer import RasterizerOptions, SplatArrays
+
+GAP = 2.0e-4
+"""Height over the table at which objects are put down [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fixture:
+    """A rigid shape that stays where it is: a wall of a bin, a peg."""
+
+    label: str
+    """Name of the shape."""
+    shape: Literal["box", "sphere", "capsule", "cylinder"] = "box"
+    """Its kind; capsules and cylinders stand along z."""
+    size: tuple[float, ...]
+    """Half extents of a box, radius of a sphere, radius and half height of the others [m]."""
+    position: tuple[float, float, float]
+    """Its centre [m]; the table's top is z = 0."""
+    yaw: float = 0.0
+    """Rotation about the vertical [rad]."""
+    color: tuple[float, float, float] = (0.62, 0.62, 0.60)
+    """Its colour, sRGB."""
+    friction: float = 0.8
+    """Coulomb coefficient."""
+
+    def __post_init__(self) -> None:
+        """Check kind and size."""
+        counts = {"box": 3, "sphere": 1, "capsule": 2, "cylinder": 2}
+        if self.shape not in counts:
+            raise ConfigError(f"fixture {self.label!r} is a {self.shape!r}", hint=f"use one of {', '.join(counts)}")
+        if len(self.size) != counts[self.shape] or not all(0.0 < x < np.inf for x in self.size):
+            raise ConfigError(
+                f"fixture {self.label!r} has size {self.size}",
+                hint=f"give {counts[self.shape]} positive lengths [m] for a {self.shape}",
+            )
+        if not np.isfinite(self.position).all():
+            raise ConfigError(f"fixture {self.label!r} stands at {self.position}", hint="give finite coordinates [m]")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +71,10 @@ class TableSceneConfig:
 
     object: ObjectConfig = field(default_factory=ObjectConfig)
     """The soft object."""
+    others: tuple[ObjectConfig, ...] = ()
+    """More soft objects, of the same material."""
+    fixtures: tuple[Fixture, ...] = ()
+    """Rigid shapes on the table."""
     material: Material = field(default_factory=lambda: Material(youngs_modulus=2.0e5, density=250.0))
     """Its material; Young's modulus may be changed per world at reset."""
     arm: ArmDescription = field(default_factory=ArmDescription)
@@ -47,6 +89,10 @@ class TableSceneConfig:
     """Physics steps per control step; even."""
     table_friction: float = 0.8
     """Coulomb coefficient of the table."""
+    constraint_max: int = 64
+    """Rows of MuJoCo's constraints per world."""
+    rigid_contact_max: int = 32
+    """Contacts between rigid shapes per world."""
     object_position: tuple[float, float] = (0.45, 0.0)
     """Where the object stands by default [m]."""
 
@@ -67,6 +113,9 @@ class TableScene:
         config: What to build.
         world_count: Number of replicas.
         cameras: Cameras to draw, grouped by image size; none draws nothing.
+        camera_options: Light and background.
+        camera_randomization: What `randomize` of the cameras draws.
+        marker: Splats around the origin that mark a place, such as a goal, in pictures; they touch nothing.
         device: Warp device; the default one if None.
         progress: Reports the build of the object, see :func:`softmode.deformables.body.build_body`.
     """
@@ -78,6 +127,8 @@ class TableScene:
         world_count: int = 1,
         cameras: Sequence[PinholeCamera] = (),
         camera_options: CameraOptions | None = None,
+        camera_randomization: CameraRandomization | None = None,
+        marker: Splats | None = None,
         device: Any = None,
         progress: Any = None,
     ) -> None:
@@ -88,18 +139,30 @@ class TableScene:
         self.world_count = world_count
         self.device = wp.get_device(device)
         self.dt = 1.0 / (config.control_hz * config.substeps)
-        self.soft: SoftObject = load_object(config.object, progress)
+        kinds = (config.object, *config.others)
+        loaded = {kind: load_object(kind, progress) for kind in dict.fromkeys(kinds)}
+        self.objects: tuple[SoftObject, ...] = tuple(loaded[kind] for kind in kinds)
+        """The soft objects of a world; their instances follow each other, world by world."""
         self._build_model()
         self._build_solver()
-        self._build_cameras(cameras, camera_options)
+        self.marker_place = wp.zeros(world_count, dtype=wp.transform, device=self.device)
+        """Where the marker is drawn, transform, shape (world_count,)."""
+        self.marker_place.fill_(wp.transform_identity())
+        self._marker = marker
+        self._build_cameras(cameras, camera_options, camera_randomization)
         self._graph: Any = None
         self._camera_graphs: dict[tuple[int, int], Any] = {}
         self.reset()
 
+    @property
+    def soft(self) -> SoftObject:
+        """The first soft object."""
+        return self.objects[0]
+
     # -- construction -------------------------------------------------------------------------------------------------
 
     def _build_model(self) -> None:
-        """Add arm, table and object to a world and replicate it."""
+        """Add arm, table, fixtures and objects to a world and replicate it."""
         config = self.config
         world = newton.ModelBuilder()
         self.arm = add_arm(world, config.arm)
@@ -114,12 +177,12 @@ class TableScene:
             color=(0.42, 0.48, 0.54),
             label="table",
         )
-        add_reduced_body(
-            world,
-            self.soft.body,
-            material=config.material,
-            position=(*config.object_position, self.soft.height),
-        )
+        for fixture in config.fixtures:
+            _add_fixture(world, fixture)
+        for thing in self.objects:
+            add_reduced_body(
+                world, thing.body, material=config.material, position=(*config.object_position, thing.height)
+            )
         builder = newton.ModelBuilder()
         register_custom_attributes(builder)
         SolverMuJoCo.register_custom_attributes(builder)
@@ -129,8 +192,9 @@ class TableScene:
     def _build_solver(self) -> None:
         """Make the coupled solver, the controller and the buffers of a control step."""
         config, model, worlds = self.config, self.model, self.world_count
-        rigid = SolverMuJoCo(model, njmax=64, nconmax=32)
-        self.solver = SolverCoupledReduced(model, [self.soft.body], options=config.solver, rigid=rigid)
+        rigid = SolverMuJoCo(model, njmax=config.constraint_max, nconmax=config.rigid_contact_max)
+        bodies = list({id(thing.body): thing.body for thing in self.objects}.values())
+        self.solver = SolverCoupledReduced(model, bodies, options=config.solver, rigid=rigid)
         self.state: Any = model.state()
         self._scratch: Any = model.state()
         self.control = model.control()
@@ -139,34 +203,61 @@ class TableScene:
         self.controller = ArmController(model, self.arm, config.control)
         device = self.device
         self.actions = wp.zeros((worlds, config.control.action_size), dtype=float, device=device)
-        self.object_position = wp.zeros(worlds, dtype=wp.vec3, device=device)
-        self.object_velocity = wp.zeros(worlds, dtype=wp.vec3, device=device)
+        self.object_position = wp.zeros((worlds, len(self.objects)), dtype=wp.vec3, device=device)
+        """Centre of mass of each soft object [m], shape (world_count, objects)."""
+        self.object_velocity = wp.zeros_like(self.object_position)
+        """Its velocity [m/s]."""
         self.finger_force = wp.zeros((worlds, 2), dtype=wp.vec3, device=device)
         starts = model.body_world_start.numpy()[:worlds]
         fingers = starts[:, None] + np.asarray(self.arm.finger_bodies)[None]
         self._finger_body = wp.array(fingers, dtype=int, device=device)
-        body = self.soft.body
-        self._linear = wp.array(body.linear_coordinates, dtype=wp.float64, device=device)
-        self._mean_basis = wp.array(body.mean_basis, dtype=wp.float64, device=device)
-        self._world_mask = wp.ones(worlds, dtype=wp.bool, device=device)
-        self._reset_mask = wp.ones(worlds + 1, dtype=wp.bool, device=device)
-        self._place_position = wp.zeros(worlds, dtype=wp.vec3d, device=device)
-        self._place_yaw = wp.zeros(worlds, dtype=wp.float64, device=device)
-        splats = self.soft.splats
-        self.skin = SkinSplats(splats.means, splats.covariances(), self.soft.basis, self.soft.grad_basis, device=device)
+        bodies = [thing.body for thing in self.objects]
+        self._linear = [wp.array(body.linear_coordinates, dtype=wp.float64, device=device) for body in bodies]
+        self._mean_basis = [wp.array(body.mean_basis, dtype=wp.float64, device=device) for body in bodies]
+        self.world_mask = wp.ones(worlds, dtype=wp.bool, device=device)
+        """Which worlds `reset_worlds` resets, shape (world_count,)."""
+        self._solver_mask = wp.zeros(worlds + 1, dtype=wp.bool, device=device)
+        instances = worlds * len(self.objects)
+        self.place_position = wp.zeros(instances, dtype=wp.vec3d, device=device)
+        """Where `reset_worlds` puts the centre of mass of each object [m], shape (world_count * objects,)."""
+        self.place_yaw = wp.zeros(instances, dtype=wp.float64, device=device)
+        """Its rotation about the vertical [rad]."""
 
-    def _build_cameras(self, cameras: Sequence[PinholeCamera], options: CameraOptions | None) -> None:
+    def _build_cameras(
+        self,
+        cameras: Sequence[PinholeCamera],
+        options: CameraOptions | None,
+        randomization: CameraRandomization | None,
+    ) -> None:
         """Make one SplatCamera per image size; they share the splats."""
         self.cameras: dict[tuple[int, int], SplatCamera] = {}
         if not cameras:
             return
-        self.splat_arrays = SplatArrays.from_splats(
-            [self.soft.splats], world_count=self.world_count, device=self.device
-        )
+        stride, starts = len(self.objects), self.model.softmode.function_start.numpy()
+        self._skins = []
+        first = 0
+        for o, thing in enumerate(self.objects):
+            skin = SkinSplats(
+                thing.splats.means, thing.splats.covariances(), thing.basis, thing.grad_basis, device=self.device
+            )
+            start = wp.array(np.ascontiguousarray(starts[o::stride]), dtype=int, device=self.device)
+            self._skins.append((skin, start, first))
+            first += thing.splats.count
+        drawn = [thing.splats for thing in self.objects]
+        if self._marker is not None:
+            self._marker_first = first
+            self._marker_means = wp.array(self._marker.means, dtype=wp.vec3, device=self.device)
+            drawn.append(self._marker)
+        self.splat_arrays = SplatArrays.from_splats(drawn, world_count=self.world_count, device=self.device)
         for size in sorted({(camera.width, camera.height) for camera in cameras}):
             mine = [camera for camera in cameras if (camera.width, camera.height) == size]
             self.cameras[size] = SplatCamera(
-                self.model, self.splat_arrays, mine, options=options, rasterizer_options=RasterizerOptions()
+                self.model,
+                self.splat_arrays,
+                mine,
+                options=options,
+                rasterizer_options=RasterizerOptions(),
+                randomization=randomization,
             )
 
     # -- time ---------------------------------------------------------------------------------------------------------
@@ -187,44 +278,56 @@ class TableScene:
             yaw: Its rotation about the vertical [rad], shape (world_count,); zero if None.
             youngs_modulus: E [Pa] of the object, shape (world_count,); unchanged if None.
         """
-        worlds = self.world_count
+        worlds, count = self.world_count, len(self.objects)
         mask = np.ones(worlds, bool) if world_mask is None else np.asarray(world_mask, bool)
-        place = np.empty((worlds, 3))
-        place[:, :2] = self.config.object_position if position is None else position
-        place[:, 2] = self.soft.height + 2.0e-4
-        self._world_mask.assign(mask)
-        self._reset_mask.assign(np.append(mask, False))
-        self._place_position.assign(place)
-        self._place_yaw.assign(np.zeros(worlds) if yaw is None else np.asarray(yaw, float))
+        place = np.empty((worlds, count, 3))
+        place[:, :, :2] = self.config.object_position
+        place[:, :, 2] = [thing.height + GAP for thing in self.objects]
+        turn = np.zeros((worlds, count))
+        if position is not None:
+            place[:, 0, :2] = position
+        if yaw is not None:
+            turn[:, 0] = yaw
+        self.world_mask.assign(mask)
+        self.place_position.assign(place.reshape(-1, 3))
+        self.place_yaw.assign(turn.reshape(-1))
         if youngs_modulus is not None:
             self._set_stiffness(mask, np.asarray(youngs_modulus, float))
-        self.solver.reset(self.state, self._reset_mask)
-        data = self.model.softmode
-        wp.launch(
-            kernels.place_objects,
-            dim=(worlds, self.soft.body.function_count),
-            inputs=[
-                data.function_start,
-                self.solver.reduced.instances.world,
-                self._linear,
-                self._world_mask,
-                self._place_position,
-                self._place_yaw,
-            ],
-            outputs=[self.state.softmode.q, self.state.softmode.qd],
-            device=self.device,
-        )
-        self.solver.reduced.update_particles(self.state)
-        self.controller.reset(self.state, self._world_mask)
+        self.reset_worlds()
+
+    def reset_worlds(self) -> None:
+        """Put arm and objects of the worlds in `world_mask` back, objects where `place_position` says; capturable."""
+        worlds, data, state = self.world_count, self.model.softmode, self.state
+        wp.copy(self._solver_mask, self.world_mask, count=worlds)
+        self.solver.reset(state, self._solver_mask)
+        for o, linear in enumerate(self._linear):
+            wp.launch(
+                kernels.place_objects,
+                dim=(worlds, linear.shape[0]),
+                inputs=[
+                    data.function_start,
+                    len(self.objects),
+                    o,
+                    linear,
+                    self.world_mask,
+                    self.place_position,
+                    self.place_yaw,
+                ],
+                outputs=[state.softmode.q, state.softmode.qd],
+                device=self.device,
+            )
+        self.solver.reduced.update_particles(state)
+        self.controller.reset(state, self.world_mask)
         self.controller.write_targets(self.control)
-        self._observe()
+        self.observe()
 
     def _set_stiffness(self, mask: np.ndarray, youngs_modulus: np.ndarray) -> None:
         """Change E in the masked worlds."""
         array = self.model.softmode.youngs_modulus
         modulus = array.numpy()
         for w in np.flatnonzero(mask):
-            modulus[w] = replace(self.config.material, youngs_modulus=float(youngs_modulus[w])).youngs_modulus
+            checked = replace(self.config.material, youngs_modulus=float(youngs_modulus[w])).youngs_modulus
+            modulus[w * len(self.objects) : (w + 1) * len(self.objects)] = checked
         array.assign(modulus)
 
     def step(self, actions: np.ndarray) -> None:
@@ -242,15 +345,15 @@ class TableScene:
         """Compile what a control step needs, then record it; leaves the state as it was."""
         saved = self.model.state()
         saved.assign(self.state)
-        self._control_step()
+        self.control_step()
         with wp.ScopedCapture(device=self.device) as capture:
-            self._control_step()
+            self.control_step()
         self.state.assign(saved)
         self.controller.reset(self.state)
         return capture.graph
 
-    def _control_step(self) -> None:
-        """Move the command, run the substeps, observe."""
+    def control_step(self) -> None:
+        """Move the command by `actions`, run the substeps, observe; capturable."""
         config = self.config
         self.solver.reduced.status.zero_()
         self.controller.command(self.actions, self.state)
@@ -258,19 +361,27 @@ class TableScene:
             self.controller.write_targets(self.control, (substep + 1) / config.substeps)
             first, second = (self.state, self._scratch) if substep % 2 == 0 else (self._scratch, self.state)
             self.solver.step(first, second, self.control, None, self.dt)
-        self._observe()
+        self.observe()
 
-    def _observe(self) -> None:
-        """Refresh what observations are made of."""
+    def observe(self) -> None:
+        """Refresh what observations are made of; capturable."""
         data, state, worlds = self.model.softmode, self.state, self.world_count
         self.controller.measure(state)
-        wp.launch(
-            kernels.observe_objects,
-            dim=worlds,
-            inputs=[data.function_start, self._mean_basis, state.softmode.q, state.softmode.qd],
-            outputs=[self.object_position, self.object_velocity],
-            device=self.device,
-        )
+        for o, mean_basis in enumerate(self._mean_basis):
+            wp.launch(
+                kernels.observe_objects,
+                dim=worlds,
+                inputs=[
+                    data.function_start,
+                    len(self.objects),
+                    o,
+                    mean_basis,
+                    state.softmode.q,
+                    state.softmode.qd,
+                ],
+                outputs=[self.object_position, self.object_velocity],
+                device=self.device,
+            )
         wp.launch(
             kernels.observe_fingers,
             dim=(worlds, 2),
@@ -283,19 +394,33 @@ class TableScene:
         """Draw every camera of one image size and return it; its arrays are overwritten by the next frame."""
         camera = self.cameras[size]
         if size not in self._camera_graphs:
-            self._draw(camera)
+            self.draw(camera)
             with wp.ScopedCapture(device=self.device) as capture:
-                self._draw(camera)
+                self.draw(camera)
             self._camera_graphs[size] = capture.graph
         wp.capture_launch(self._camera_graphs[size])
         return camera
 
-    def _draw(self, camera: SplatCamera) -> None:
-        """Deform the splats and draw one frame."""
-        data, state, arrays = self.model.softmode, self.state, self.splat_arrays
-        self.skin.launch(
-            state.softmode.q, data.function_start, arrays.means, arrays.covariances, rotations=arrays.rotations
-        )
+    def draw(self, camera: SplatCamera) -> None:
+        """Deform the splats and draw one frame; capturable after a first frame."""
+        state, arrays = self.state, self.splat_arrays
+        for skin, start, first in self._skins:
+            skin.launch(
+                state.softmode.q,
+                start,
+                arrays.means,
+                arrays.covariances,
+                rotations=arrays.rotations,
+                first_splat=first,
+            )
+        if self._marker is not None:
+            wp.launch(
+                kernels.place_marker,
+                dim=(self.world_count, self._marker.count),
+                inputs=[self._marker_means, self.marker_place, self._marker_first],
+                outputs=[arrays.means],
+                device=self.device,
+            )
         camera.render(state)
 
     # -- reading ------------------------------------------------------------------------------------------------------
@@ -309,3 +434,20 @@ class TableScene:
     def status_reasons(self) -> tuple[tuple[str, ...], ...]:
         """Names of those bits per world."""
         return tuple(status_reasons(int(bits)) for bits in self.status)
+
+
+def _add_fixture(world: newton.ModelBuilder, fixture: Fixture) -> None:
+    """Add a rigid shape that belongs to the world."""
+    half = 0.5 * fixture.yaw
+    place = wp.transform(fixture.position, wp.quat(0.0, 0.0, float(np.sin(half)), float(np.cos(half))))
+    shape = newton.ModelBuilder.ShapeConfig(mu=fixture.friction, has_shape_collision=True)
+    given: dict[str, Any] = {"xform": place, "cfg": shape, "color": fixture.color, "label": fixture.label}
+    size = fixture.size
+    if fixture.shape == "box":
+        world.add_shape_box(-1, hx=size[0], hy=size[1], hz=size[2], **given)
+    elif fixture.shape == "sphere":
+        world.add_shape_sphere(-1, radius=size[0], **given)
+    elif fixture.shape == "capsule":
+        world.add_shape_capsule(-1, radius=size[0], half_height=size[1], **given)
+    else:
+        world.add_shape_cylinder(-1, radius=size[0], half_height=size[1], **given)

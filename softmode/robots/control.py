@@ -102,6 +102,7 @@ class ArmController:
     Attributes:
         commanded_q: Commanded joint coordinates, (world_count, 9) [rad, m].
         tool_pose: Measured pose of the tool frame, (world_count,) transforms, of the last `measure` or `command`.
+        coord_start: First joint coordinate of the arm in each world, (world_count,) int32.
         opening: Measured distance between the pads [m], (world_count,).
         target_position: Commanded tool position [m], (world_count,) vec3.
         target_yaw: Commanded tool yaw [rad], (world_count,); zero in the home pose.
@@ -128,7 +129,7 @@ class ArmController:
             return wp.array(offset + first, dtype=wp.int32, device=device)
 
         self._joint_start = starts(model.joint_world_start, arm.joint_start)
-        self._coord_start = starts(model.joint_coord_world_start, arm.coord_start)
+        self.coord_start = starts(model.joint_coord_world_start, arm.coord_start)
         self._dof_start = starts(model.joint_dof_world_start, arm.dof_start)
         description = arm.description
         self._chain = kernels.Chain()
@@ -137,7 +138,7 @@ class ArmController:
         self._chain.lower = model.joint_limit_lower
         self._chain.upper = model.joint_limit_upper
         self._chain.joint_start = self._joint_start
-        self._chain.coord_start = self._coord_start
+        self._chain.coord_start = self.coord_start
         self._chain.dof_start = self._dof_start
         self._chain.tool_length = description.tool_length
         self._chain.home = kernels.vec7(*description.home_joint_q[:ARM_JOINT_COUNT].tolist())
@@ -237,7 +238,7 @@ class ArmController:
         wp.launch(
             kernels.write_targets,
             dim=(self.world_count, ARM_JOINT_COUNT + 2),
-            inputs=[self._coord_start, self._previous_q, self.commanded_q, fraction],
+            inputs=[self.coord_start, self._previous_q, self.commanded_q, fraction],
             outputs=[control.joint_target_q],
             device=self._device,
         )

@@ -111,11 +111,12 @@ class ViewVariation:
         self._all = wp.ones(world_count, dtype=wp.bool, device=device)
         self.seed(0)
 
-    def seed(self, seeds: int | ArrayLike) -> None:
+    def seed(self, seeds: int | ArrayLike, world_mask: ArrayLike | None = None) -> None:
         """Set the seeds and count draws from zero again; copies to the device, so not for a captured graph.
 
         Args:
             seeds: One integer s, for s + i in world i; or one per world, shape (world_count,).
+            world_mask: Which worlds, shape (world_count,); all if None.
 
         Raises:
             ConfigError: If there are not as many seeds as worlds.
@@ -127,8 +128,10 @@ class ViewVariation:
                 hint="Pass an int, or rng.integers(2**31, size=world_count)",
             )
         values = values + np.arange(self.world_count) if values.ndim == 0 else values
-        self._seed.assign((values.astype(np.int64) & 0x7FFFFFFF).astype(np.int32))
-        self._episode.zero_()
+        values = (values.astype(np.int64) & 0x7FFFFFFF).astype(np.int32)
+        mask = np.ones(self.world_count, bool) if world_mask is None else np.asarray(world_mask, bool)
+        self._seed.assign(np.where(mask, values, self._seed.numpy()))
+        self._episode.assign(np.where(mask, 0, self._episode.numpy()).astype(np.int32))
 
     def draw(self, world_mask: wp.array | None = None) -> None:
         """Draw new values for the masked worlds; capturable.

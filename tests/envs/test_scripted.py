@@ -29,13 +29,13 @@ def play(env: gym.Env, seed: int, **options: float) -> tuple[dict[str, Any], lis
 
 @pytest.mark.parametrize(("seed", "modulus"), [(0, 2.0e4), (1, 2.0e5), (2, 2.0e6)])
 def test_lifts_soft_and_stiff_objects(lift: LiftSoftEnv, seed: int, modulus: float) -> None:
-    """The object ends at the goal height within the tolerance, in both fingers, the solver without a complaint.
+    """The object ends at the goal within the tolerance, in both fingers, the solver without a complaint.
 
     Success begins after `hold_steps` steps at the goal and lasts to the end.
     """
     info, success = play(lift, seed, youngs_modulus=modulus)
     assert info["is_success"]
-    assert info["object_height"] == pytest.approx(lift.config.goal_height, abs=lift.config.goal_tolerance)
+    assert info["goal_distance"] < lift.config.goal_tolerance
     assert (info["finger_force"] > 0.5).all()
     assert info["reward_terms"]["hold"] == 2.0
     first = success.index(True)
@@ -56,14 +56,14 @@ def test_tries_again_after_a_loss(lift: LiftSoftEnv) -> None:
     """Knocked out of the gripper and put elsewhere, the object is found and lifted again."""
     observation, _ = lift.reset(seed=0, options={"youngs_modulus": 2.0e5, "position": (0.45, 0.0)})
     policy = ScriptedLift(lift)
+    info: dict[str, Any] = {}
     for _ in range(75):
-        observation, *_ = lift.step(policy(observation))
-    assert lift.rise() > 0.02
+        observation, *_, info = lift.step(policy(observation))
+    assert info["object_height"] > 0.02
     q, qd = lift.scene.state.softmode.q, lift.scene.state.softmode.qd
     body = lift.scene.soft.body
     q.assign(body.affine(np.eye(3), (0.47, 0.09, lift.scene.soft.height + 1e-3)))
     qd.zero_()
-    info: dict[str, Any] = {}
     for _ in range(125):
         observation, _, terminated, _, info = lift.step(policy(observation))
         assert not terminated

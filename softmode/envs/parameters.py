@@ -1,0 +1,136 @@
+"""What differs between episodes: named columns that are drawn on the device at every reset."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from softmode.errors import ConfigError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter:
+    """A quantity drawn at reset, one or several numbers, each uniform between its bounds."""
+
+    name: str
+    """Key of the reset option and of ``info["parameters"]``."""
+    low: tuple[float, ...]
+    """Least value of each number."""
+    high: tuple[float, ...]
+    """Largest value; equal to `low` for what is not random."""
+    log: bool = False
+    """Uniform in the logarithm."""
+    least: tuple[float, ...] | None = None
+    """Least value that a reset option may set; `low` if None."""
+    most: tuple[float, ...] | None = None
+    """Largest value that a reset option may set; `high` if None."""
+
+    def __post_init__(self) -> None:
+        """Check the range."""
+        ordered = len(self.low) == len(self.high) and all(
+            np.isfinite(a) and np.isfinite(b) and a <= b for a, b in zip(self.low, self.high, strict=False)
+        )
+        if not ordered or (self.log and min(self.low) <= 0.0):
+            raise ConfigError(
+                f"{self.name} ranges from {self.low} to {self.high}",
+                hint="give finite bounds, low <= high" + (", above 0" if self.log else ""),
+            )
+
+    @property
+    def size(self) -> int:
+        """How many numbers it is."""
+        return len(self.low)
+
+
+class ParameterTable:
+    """The parameters of all worlds on the device.
+
+    Args:
+        parameters: What is drawn; a later parameter replaces an earlier one of the same name.
+        world_count: Number of worlds.
+        device: Warp device.
+
+    Attributes:
+        values: The drawn numbers, float32, shape (world_count, columns).
+    """
+
+    def __init__(self, parameters: Sequence[Parameter], world_count: int, device: Any = None) -> None:
+        """Lay out the columns and upload their ranges."""
+        self.parameters = {parameter.name: parameter for parameter in parameters}
+        self.world_count = world_count
+        self._column: dict[str, int] = {}
+        columns = 0
+        for name, parameter in self.parameters.items():
+            self._column[name] = columns
+            columns += parameter.size
+
+        def upload(rows: list[Any], dtype: Any) -> wp.array:
+            return wp.array(np.concatenate(rows), dtype=dtype, device=device)
+
+        chosen = self.parameters.values()
+        self.low = upload([np.array(p.low, np.float32) for p in chosen], float)
+        self.high = upload([np.array(p.high, np.float32) for p in chosen], float)
+        self.log = upload([np.full(p.size, p.log) for p in chosen], wp.bool)
+        self.values = wp.zeros((world_count, columns), dtype=float, device=device)
+
+    def column(self, name: str) -> int:
+        """Return the first column of a parameter."""
+        return self._column[name]
+
+    def columns(self, name: str) -> slice:
+        """Return the columns of a parameter."""
+        return slice(self._column[name], self._column[name] + self.parameters[name].size)
+
+    def check(self, options: Mapping[str, Any] | None) -> dict[str, NDArray[np.float32]]:
+        """Return reset options as arrays, see `check_options`."""
+        return check_options(self.parameters, options, self.world_count)
+
+
+def check_options(
+    parameters: Mapping[str, Parameter], options: Mapping[str, Any] | None, world_count: int
+) -> dict[str, NDArray[np.float32]]:
+    """Return reset options as arrays of shape (world_count, size), or raise before anything changes.
+
+    Args:
+        parameters: The parameters by name.
+        options: A value, or one per world, by the name of a parameter.
+        world_count: Number of worlds.
+
+    Raises:
+        ConfigError: If a name is unknown, or a value no finite number within its range.
+    """
+    given = dict(options or {})
+    unknown = sorted(set(given) - set(parameters))
+    if unknown:
+        raise ConfigError(f"unknown reset options {unknown}", hint=f"use {', '.join(parameters)}")
+    return {name: _checked(parameters[name], value, world_count) for name, value in given.items()}
+
+
+def _checked(parameter: Parameter, value: Any, world_count: int) -> NDArray[np.float32]:
+    """Return one option as an array."""
+    try:
+        numbers = np.asarray(value, np.float32)
+    except (TypeError, ValueError):
+        numbers = np.full(1, np.nan, np.float32)
+    size = parameter.size
+    if numbers.size == size * world_count:
+        numbers = numbers.reshape(world_count, size)
+    elif numbers.size == size:
+        numbers = np.tile(numbers.reshape(1, size), (world_count, 1))
+    if numbers.shape != (world_count, size) or not np.isfinite(numbers).all():
+        what = "a finite number" if size == 1 else f"{size} finite numbers"
+        each = f", or that for each of {world_count} worlds" if world_count > 1 else ""
+        raise ConfigError(f"{parameter.name} must be {what}{each}, got {value!r}")
+    least = np.array(parameter.low if parameter.least is None else parameter.least, np.float32)
+    most = np.array(parameter.high if parameter.most is None else parameter.most, np.float32)
+    if not ((numbers >= least) & (numbers <= most)).all():
+        raise ConfigError(
+            f"{parameter.name} = {value!r} lies outside its range",
+            hint=f"stay within {least.tolist()} to {most.tolist()}",
+        )
+    return numbers

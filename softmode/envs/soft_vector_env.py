@@ -1,0 +1,375 @@
+"""A task as a Gymnasium vector environment: all worlds in one captured graph, on CPU in one per process."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import gymnasium as gym
+import numpy as np
+import warp as wp
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from softmode.envs.parameters import check_options
+from softmode.envs.soft_env import checked_actions, checked_config, world_seed
+from softmode.envs.task import ObservationType, Task, TaskConfig
+from softmode.envs.worlds import LocalWorlds, RemoteWorlds
+from softmode.errors import ConfigError, MissingExtraError
+
+Output = Literal["numpy", "torch"]
+
+
+class SoftVectorEnv(gym.vector.VectorEnv):
+    """`num_envs` worlds of a task; subclasses name the task. See :class:`SoftEnv` for actions, observations and infos.
+
+    Infos are dicts of arrays over the worlds, each with its mask ``_key``. With SAME_STEP autoreset ``final_obs`` and
+    ``final_info`` hold the end of the episodes marked in ``_final_obs``; with NEXT_STEP the step after an episode's end
+    returns the first observation of the next one, with reward 0, and ignores the action; with DISABLED worlds wait for
+    ``reset(options={"reset_mask": mask})``.
+
+    World i of ``reset(seed=s)`` plays what the single environment plays after ``reset(seed=s + i)``.
+
+    Args:
+        num_envs: Number of worlds.
+        obs_type: What ``reset`` and ``step`` return.
+        render_mode: "rgb_array" or None.
+        control_mode: What actions mean.
+        splat: Splat file of the object; None for the built-in one.
+        size: Longest edge of the object [m].
+        config: Everything else.
+        max_episode_steps: Control steps after which an episode is truncated; None for never.
+        autoreset_mode: When the next episode of a world begins.
+        output: "numpy", or "torch" for tensors on the device: float32 rewards, no copy to the host, and actions that
+            are not finite count as zero (nothing is read back to refuse them).
+        processes: Child processes that share the worlds on CPU, each on its own core; 1 keeps them in this process.
+        device: Warp device; the default one if None.
+        progress: Reports the build of the object.
+
+    Raises:
+        ConfigError: If an option is unknown or out of range, or there is no such device.
+        MissingExtraError: If torch is asked for and not installed.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012  (gymnasium's convention)
+    task_class: ClassVar[type[Task]] = Task
+    """The task."""
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        obs_type: ObservationType = "state",
+        render_mode: str | None = None,
+        control_mode: str | None = None,
+        splat: str | Path | None = None,
+        size: float | None = None,
+        config: TaskConfig | None = None,
+        max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        output: Output = "numpy",
+        processes: int = 1,
+        device: Any = None,
+        progress: Any = None,
+    ) -> None:
+        """Build the scene, capture the step and make the spaces."""
+        if isinstance(num_envs, bool) or not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
+            raise ConfigError(f"num_envs is {num_envs!r}", hint="give a whole number of at least 1")
+        if max_episode_steps is not None and not max_episode_steps >= 1:
+            raise ConfigError(
+                f"max_episode_steps is {max_episode_steps!r}", hint="give at least 1, or None for no limit"
+            )
+        if output not in ("numpy", "torch"):
+            raise ConfigError(f"output is {output!r}", hint="use 'numpy' or 'torch'")
+        try:
+            mode = AutoresetMode(autoreset_mode)
+        except ValueError as error:
+            known = ", ".join(f"AutoresetMode.{choice.name}" for choice in AutoresetMode)
+            raise ConfigError(f"autoreset_mode is {autoreset_mode!r}", hint=f"use one of {known}") from error
+        config = checked_config(self, config, obs_type, render_mode, control_mode, splat, size)
+        if output == "torch":
+            try:
+                import torch  # noqa: F401
+            except ImportError as error:
+                raise MissingExtraError(
+                    "output='torch' needs torch", hint="install it with: pip install 'softmode[rl]'"
+                ) from error
+        self.config, self.obs_type, self.render_mode, self.output = config, obs_type, render_mode, output
+        self.num_envs, self.autoreset_mode = int(num_envs), mode
+        self.metadata = {
+            **self.metadata,
+            "render_fps": round(config.scene.control_hz),
+            "autoreset_mode": mode,
+        }
+        self.device = checked_device(device)
+        self.max_episode_steps = max_episode_steps
+        shards = checked_processes(processes, self.num_envs, self.device, output)
+        edges = np.linspace(0, self.num_envs, shards + 1).astype(int)
+        self._slices = [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
+        arguments = [
+            {
+                "config": config,
+                "obs_type": obs_type,
+                "world_count": part.stop - part.start,
+                "limit": max_episode_steps or 0,
+                "autoreset_mode": mode,
+                "render": render_mode is not None,
+                "device": str(self.device),
+                "progress": progress,
+            }
+            for part in self._slices
+        ]
+        self._worlds: list[Any] = []
+        if shards == 1:
+            self._worlds = [LocalWorlds(self.task_class, arguments[0])]
+        else:
+            try:
+                for given in arguments:
+                    self._worlds.append(RemoteWorlds(self.task_class, given))
+                for worlds in self._worlds:
+                    worlds.connect()
+            except BaseException:
+                self.close_extras()
+                raise
+        self._random: list[np.random.Generator] | None = None
+        self._streams: dict[int, Any] = {}
+        self._results: list[dict[str, Any]] = []
+        self.single_action_space = self._worlds[0].action_space
+        self.single_observation_space = self._worlds[0].observation_space
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+
+    # -- gymnasium ----------------------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start new episodes, in all worlds or those of ``options["reset_mask"]``.
+
+        Args:
+            seed: Seed s, for s + i in world i; or one per world, None among them to go on; or None.
+            options: ``reset_mask`` (num_envs,) bool, and parameters of the task, one value or one per world.
+        """
+        given = dict(options or {})
+        mask = self._checked_mask(given.pop("reset_mask", None))
+        chosen = check_options(self._worlds[0].parameters, given, self.num_envs)
+        seeds = self._seeds(seed, mask)
+        with self._stream():
+            for worlds, part in zip(self._worlds, self._slices, strict=True):
+                mine = {name: numbers[part] for name, numbers in chosen.items()}
+                worlds.reset(mask[part], seeds[part], mine)
+            self._results = [worlds.result() for worlds in self._worlds]
+            return self._gather("observation"), self._masked(self._gather("info"), self._everywhere())
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Advance every world by one control step.
+
+        Args:
+            actions: Actions in [-1, 1], shape (num_envs, action_size).
+
+        Raises:
+            ConfigError: If the actions have another shape, or hold NaN (numpy output only); nothing has moved then.
+        """
+        numbers = self._tensors_assigned(actions) if self.output == "torch" else self._checked_actions(actions)
+        with self._stream():
+            for worlds, part in zip(self._worlds, self._slices, strict=True):
+                worlds.step(None if numbers is None else numbers[part])
+            self._results = [worlds.result() for worlds in self._worlds]
+            terminated, truncated = self._gather("terminated"), self._gather("truncated")
+            infos = self._masked(self._gather("info"), self._everywhere())
+            if self.autoreset_mode == AutoresetMode.SAME_STEP:
+                self._add_final(infos, terminated | truncated)
+            return self._gather("observation"), self._gather("reward"), terminated, truncated, infos
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Return a frame per world."""
+        if self.render_mode is None:
+            return None
+        return tuple(frame for worlds in self._worlds for frame in worlds.render())
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Stop the child processes."""
+        for worlds in self._worlds:
+            worlds.close()
+
+    @property
+    def task(self) -> Task:
+        """The task, if all worlds live in this process.
+
+        Raises:
+            ConfigError: If they do not.
+        """
+        if not isinstance(self._worlds[0], LocalWorlds):
+            raise ConfigError("the worlds live in other processes", hint="make the environment with processes=1")
+        return self._worlds[0].task
+
+    @property
+    def state_observation(self) -> Any:
+        """The full observation vector of every world whatever `obs_type`, shape (num_envs, D): for a critic."""
+        with self._stream():
+            return self._gather("state")
+
+    # -- arguments ----------------------------------------------------------------------------------------------------
+
+    def _checked_mask(self, mask: Any) -> NDArray[np.bool_]:
+        """Return which worlds a reset concerns."""
+        if mask is None:
+            return np.ones(self.num_envs, bool)
+        if hasattr(mask, "cpu"):
+            mask = mask.cpu()
+        mask = np.asarray(mask)
+        if mask.dtype != bool or mask.shape != (self.num_envs,) or not mask.any():
+            raise ConfigError(
+                f"reset_mask is {mask.dtype} of shape {mask.shape}",
+                hint=f"give booleans of shape ({self.num_envs},), at least one of them True",
+            )
+        if self._random is None and not mask.all():
+            raise ConfigError("the first reset is partial", hint="call reset() for all worlds once")
+        return mask
+
+    def _seeds(self, seed: Any, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Return the seed of every world's draws, -1 where they go on."""
+        first = self._random is None
+        if seed is None:
+            given: list[Any] = [None] * self.num_envs
+        elif isinstance(seed, (int, np.integer)):
+            given = [int(seed) + i for i in range(self.num_envs)]
+        else:
+            given = list(seed)
+        if len(given) != self.num_envs or not all(
+            s is None or (isinstance(s, (int, np.integer)) and s >= 0) for s in given
+        ):
+            raise ConfigError(f"seed is {seed!r}", hint=f"give a number >= 0, or {self.num_envs} of them")
+        if self._random is None:
+            self._random = [np.random.default_rng() for _ in range(self.num_envs)]
+        seeds = np.full(self.num_envs, -1, np.int64)
+        for i in np.flatnonzero(mask):
+            if given[i] is not None:
+                self._random[i] = seeding.np_random(int(given[i]))[0]
+            if first or given[i] is not None:
+                seeds[i] = world_seed(self._random[i])
+        return seeds
+
+    def _checked_actions(self, actions: Any) -> NDArray[np.float32]:
+        """Return actions as an array, or raise before anything moves."""
+        return checked_actions(actions, self.action_space)  # type: ignore[arg-type]
+
+    def _tensors_assigned(self, actions: Any) -> None:
+        """Copy a tensor of actions to the task, on the device."""
+        import torch
+
+        tensor = actions if isinstance(actions, torch.Tensor) else torch.from_numpy(self._checked_actions(actions))
+        if tuple(tensor.shape) != self.action_space.shape:
+            raise ConfigError(
+                f"actions have shape {tuple(tensor.shape)}, expected {self.action_space.shape}",
+                hint="give one row per world and one number in [-1, 1] per entry of env.single_action_space",
+            )
+        wp.to_torch(self.task.scene.actions).copy_(tensor.detach())
+
+    # -- results ------------------------------------------------------------------------------------------------------
+
+    def _stream(self) -> Any:
+        """Return the context in which kernels run on torch's stream, if tensors are the output."""
+        if self.output == "numpy" or not self.device.is_cuda:
+            return wp.ScopedDevice(self.device)
+        import torch
+
+        stream = torch.cuda.current_stream(wp.device_to_torch(self.device))
+        if stream.cuda_stream not in self._streams:
+            self._streams[stream.cuda_stream] = wp.stream_from_torch(stream)
+        return wp.ScopedStream(self._streams[stream.cuda_stream])
+
+    def _gather(self, name: str) -> Any:
+        """Return part of the last results of all worlds, in memory of its own."""
+        return self._join([result[name] for result in self._results])
+
+    def _join(self, trees: list[Any]) -> Any:
+        """Return the trees of arrays of all parts as one tree."""
+        first = trees[0]
+        if isinstance(first, dict):
+            return {name: self._join([tree[name] for tree in trees]) for name in first}
+        if len(trees) > 1:
+            return np.concatenate(trees)
+        if self.output == "numpy":
+            return first.numpy().copy()
+        import torch
+
+        return wp.to_torch(first).clone(memory_format=torch.contiguous_format)
+
+    def _add_final(self, infos: dict[str, Any], ended: Any) -> None:
+        """Add the last observation and info of the episodes that ended; always, where nothing may be read back."""
+        numpy = self.output == "numpy"
+        if numpy and not ended.any():
+            return
+        final = self._join([worlds.final() for worlds in self._worlds])
+        observation = final["observation"]
+        if numpy:
+            rows = np.full(self.num_envs, None, dtype=object)
+            for i in np.flatnonzero(ended):
+                rows[i] = _row(observation, int(i))
+            observation = rows
+        infos["final_obs"], infos["_final_obs"] = observation, _copy(ended)
+        infos["final_info"], infos["_final_info"] = self._masked(final["info"], ended), _copy(ended)
+
+    def _everywhere(self) -> Any:
+        """Return a mask of all worlds."""
+        if self.output == "numpy":
+            return np.ones(self.num_envs, bool)
+        import torch
+
+        return torch.ones(self.num_envs, dtype=torch.bool, device=wp.device_to_torch(self.device))
+
+    def _masked(self, tree: dict[str, Any], mask: Any) -> dict[str, Any]:
+        """Add the mask `_key` of every key."""
+        out: dict[str, Any] = {}
+        for name, value in tree.items():
+            out[name] = self._masked(value, mask) if isinstance(value, dict) else value
+            out[f"_{name}"] = _copy(mask)
+        return out
+
+
+def checked_processes(processes: Any, num_envs: int, device: Any, output: str) -> int:
+    """Return how many processes share the worlds.
+
+    Raises:
+        ConfigError: If they cannot.
+    """
+    if isinstance(processes, bool) or not isinstance(processes, (int, np.integer)) or processes < 1:
+        raise ConfigError(f"processes is {processes!r}", hint="give a whole number of at least 1")
+    if processes > 1 and (not device.is_cpu or output != "numpy"):
+        raise ConfigError(
+            f"processes is {processes} on {device} with output {output!r}",
+            hint="several processes serve CPU and numpy only; leave processes at 1",
+        )
+    return min(int(processes), num_envs)
+
+
+def checked_device(device: Any) -> Any:
+    """Return a Warp device.
+
+    Raises:
+        ConfigError: If there is no such device.
+    """
+    if isinstance(device, str) and device == "cuda":
+        device = "cuda:0"
+    try:
+        return wp.get_device(device)
+    except (ValueError, RuntimeError) as error:
+        known = ", ".join(str(found) for found in wp.get_devices())
+        raise ConfigError(f"there is no device {device!r}", hint=f"use one of {known}") from error
+
+
+def _row(tree: Any, index: int) -> Any:
+    """Return one world of a tree of numpy arrays."""
+    if isinstance(tree, dict):
+        return {name: _row(value, index) for name, value in tree.items()}
+    return tree[index].copy()
+
+
+def _copy(mask: Any) -> Any:
+    """Return a mask in memory of its own."""
+    return mask.clone() if hasattr(mask, "clone") else mask.copy()

@@ -1,0 +1,174 @@
+"""Where the worlds of a vector environment live: in this process, or in one of several child processes.
+
+Warp keeps the scratch memory of tiles, which MuJoCo-Warp's kernels use, once per process on CPU, so that worlds cannot
+be shared among threads; processes can share them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from softmode.envs.soft_env import info_arrays, observation_arrays, render_worlds
+from softmode.envs.task import Task
+from softmode.errors import SoftmodeError
+
+
+class LocalWorlds:
+    """A task in this process; results are trees of Warp arrays, overwritten by the next call.
+
+    Args:
+        task_class: The task.
+        arguments: What it is made from.
+    """
+
+    def __init__(self, task_class: type[Task], arguments: dict[str, Any]) -> None:
+        """Build the task."""
+        self.task = task_class(**arguments)
+        self.parameters = self.task.table.parameters
+        self.action_space = self.task.action_space
+        self.observation_space = self.task.observation_space()
+
+    def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64], options: dict[str, NDArray[np.float32]]) -> None:
+        """Start episodes in the masked worlds; a seed below 0 lets the world's draws go on."""
+        for some, value in ((mask & (seeds >= 0), seeds), (mask & (seeds < 0), None)):
+            if some.any():
+                self.task.reset(world_mask=some, seeds=value, options=options)
+
+    def step(self, actions: NDArray[np.float32] | None) -> None:
+        """Advance all worlds; None takes the actions that are on the device already."""
+        if actions is not None:
+            self.task.scene.actions.assign(actions)
+        self.task.step()
+
+    def result(self) -> dict[str, Any]:
+        """Return what the last reset or step made."""
+        task = self.task
+        return {
+            "observation": observation_arrays(task),
+            "state": task.observation,
+            "reward": task.reward,
+            "terminated": task.terminated,
+            "truncated": task.truncated,
+            "info": info_arrays(task),
+        }
+
+    def final(self) -> dict[str, Any]:
+        """Return how the episodes that ended in the last step ended."""
+        return {"observation": observation_arrays(self.task, final=True), "info": info_arrays(self.task, final=True)}
+
+    def render(self) -> NDArray[np.uint8]:
+        """Return a frame per world."""
+        return render_worlds(self.task)
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class RemoteWorlds:
+    """The same in a child process; results are trees of numpy arrays.
+
+    Args:
+        task_class: The task.
+        arguments: What it is made from; picklable.
+
+    Raises:
+        SoftmodeError: What the task raised, here or in any call.
+        RuntimeError: If the child died.
+    """
+
+    def __init__(self, task_class: type[Task], arguments: dict[str, Any]) -> None:
+        """Start the child; `connect` waits until it is built."""
+        context: Any = multiprocessing.get_context()
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(
+            target=_serve, args=(theirs, task_class, {**arguments, "progress": None}), daemon=True
+        )
+        self._process.start()
+        theirs.close()
+        self._result: dict[str, Any] = {}
+
+    def connect(self) -> None:
+        """Wait until the task is built."""
+        self.parameters, self.action_space, self.observation_space = self._receive()
+
+    def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64], options: dict[str, NDArray[np.float32]]) -> None:
+        """Start episodes; see :meth:`LocalWorlds.reset`."""
+        self._send("reset", mask, seeds, options)
+
+    def step(self, actions: NDArray[np.float32] | None) -> None:
+        """Have the child advance its worlds; `result` waits for it."""
+        self._send("step", actions)
+
+    def result(self) -> dict[str, Any]:
+        """Return what the last reset or step made."""
+        self._result = self._receive()
+        return self._result
+
+    def final(self) -> dict[str, Any]:
+        """Return how the episodes that ended in the last step ended."""
+        self._send("final")
+        return self._receive()
+
+    def render(self) -> NDArray[np.uint8]:
+        """Return a frame per world."""
+        self._send("render")
+        return self._receive()
+
+    def close(self) -> None:
+        """Stop the child."""
+        with contextlib.suppress(OSError):
+            self._send("close")
+        self._process.join(timeout=5.0)
+        if self._process.is_alive():
+            self._process.terminate()
+        self._pipe.close()
+
+    def _send(self, name: str, *arguments: Any) -> None:
+        try:
+            self._pipe.send((name, arguments))
+        except (BrokenPipeError, ConnectionError) as error:
+            raise RuntimeError("a process that holds worlds has died; make the environment again") from error
+
+    def _receive(self) -> Any:
+        try:
+            fine, value = self._pipe.recv()
+        except (EOFError, ConnectionError) as error:
+            raise RuntimeError(
+                f"a process that holds worlds has died (exit code {self._process.exitcode}); make the environment again"
+            ) from error
+        if not fine:
+            raise value
+        return value
+
+
+def _serve(pipe: Any, task_class: type[Task], arguments: dict[str, Any]) -> None:
+    """Build the worlds and do what the parent says until it hangs up."""
+    try:
+        with wp.ScopedDevice("cpu"):
+            worlds = LocalWorlds(task_class, arguments)
+        pipe.send((True, (worlds.parameters, worlds.action_space, worlds.observation_space)))
+        while True:
+            name, given = pipe.recv()
+            if name == "close":
+                return
+            value = getattr(worlds, name)(*given)
+            pipe.send((True, _to_numpy(worlds.result() if name in ("reset", "step") else value)))
+    except (EOFError, KeyboardInterrupt, ConnectionError):
+        return
+    except SoftmodeError as error:
+        pipe.send((False, error))
+    except Exception as error:  # the parent reports what went wrong here
+        pipe.send((False, RuntimeError(f"{type(error).__name__} in a process that holds worlds: {error}")))
+
+
+def _to_numpy(tree: Any) -> Any:
+    """Return a tree of arrays as numpy arrays."""
+    if isinstance(tree, dict):
+        return {name: _to_numpy(value) for name, value in tree.items()}
+    return tree.numpy() if isinstance(tree, wp.array) else tree
