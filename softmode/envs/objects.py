@@ -6,48 +6,76 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from softmode.deformables.body import BuildOptions, ReducedBody, build_body, cached_body
-from softmode.deformables.quadrature import Quadrature, quadrature_from_splats
+from softmode.deformables.quadrature import Quadrature, quadrature_from_mesh, quadrature_from_splats
 from softmode.deformables.skinning import average_basis
+from softmode.envs.primitives import (
+    Color,
+    Extents,
+    find_axis,
+    primitive_mesh,
+    primitive_quadrature,
+    surface_splats,
+    turned,
+)
 from softmode.errors import AssetError, ConfigError
 from softmode.splats import Splats, make_plush, read_splats, split_components
-from softmode.splats.splats import UpAxis
+from softmode.splats.colored_mesh import ColoredMesh, read_mesh
+from softmode.splats.splats import UpAxis, up_rotation
 
+Shape = Literal["plush", "box", "cylinder", "capsule", "sphere"]
 Part = Literal["thickest", "tallest", "largest", "all"]
 Pose = Literal["stable", "captured"]
 
-RECIPE = 3
-"""Part of the cache key; raise it when the way from a splat file to a body changes."""
+RECIPE = 4
+"""Part of the cache key; raise it when the way from a file or shape to a body changes."""
+DEFAULT_COLORS: tuple[Color, Color] = ((0.93, 0.55, 0.22), (0.97, 0.90, 0.76))
+"""Colours of a shape that is given none."""
 STABLE_TILT = 0.1
 """A pose is stable if tilting the object by this angle [rad] in any direction raises its centre of mass."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectConfig:
-    """Which soft object, how large, how finely reduced. `part`, `up`, `crop` and `pose` concern splat files only."""
+    """Which soft object, how large, how finely reduced: the built-in plush, a shape, a mesh file or a splat file."""
 
+    shape: Shape = "plush"
+    """What it is where neither `splat` nor `mesh` is given: "plush", or a "box", "cylinder", "capsule" or "sphere" of
+    `extents`."""
+    extents: Extents | None = None
+    """Edges of a shape's bounding box along x, y and z [m]. A round shape needs two that are equal, a sphere three; a
+    capsule lies along the third, its longest, a cylinder along the third, its length or the thickness of a disc."""
     splat: str | Path | None = None
-    """Splat file (INRIA .ply, SOG v2); None for the built-in plush."""
+    """Splat file (INRIA .ply, SOG v2)."""
+    mesh: str | Path | None = None
+    """Mesh file (.obj, .glb, .stl, ... whatever trimesh reads). One that is not closed stands for what it encloses."""
     size: float = 0.08
-    """Longest edge of the object's bounding box, upright [m]; the gripper opens 0.09 m."""
-    up: UpAxis = "-y"
-    """Axis of the splat file that points up; trained captures mostly have y down."""
+    """Longest edge of the bounding box of plush, splat file or mesh, upright [m]; the gripper opens 0.09 m."""
+    colors: tuple[Color, Color] | None = None
+    """Two colours, 0..1, of a shape or mesh, as a checker pattern; None for orange and cream, or the mesh's own."""
+    splat_count: int = 2000
+    """Number of splats on a shape or mesh."""
+    surface_count: int = 400
+    """Number of surface samples, the points that feel contact."""
+    up: UpAxis | None = None
+    """Axis of the file that points up; None for "-y" (splat files: trained captures mostly have y down), "+y" (glTF) or
+    "+z" (other meshes)."""
     crop: tuple[float, float, float, float, float, float] | None = None
-    """Box (x0, y0, z0, x1, y1, z1) of the file, after turning it up, outside which splats are dropped; cuts an object
-    off what it touched when it was captured."""
+    """Box (x0, y0, z0, x1, y1, z1) of the splat file, after turning it up, outside which splats are dropped; cuts an
+    object off what it touched when it was captured."""
     part: Part = "thickest"
-    """Which of the capture's separate parts is the object: the one with the largest least spread, so that neither the
-    ground it was captured on, wide but thin, nor loose small parts win; the one with the greatest height; the one with
-    most splats; or whatever there is."""
+    """Which of the separate parts of a splat file is the object: the one with the largest least spread, so that neither
+    the ground it was captured on, wide but thin, nor loose small parts win; the one with the greatest height; the one
+    with most splats; or whatever there is."""
     pose: Pose = "stable"
-    """"stable" lays an object that cannot stand as captured (on a pointed foot, say) on the side that needs the least
-    turn; "captured" lets it topple."""
+    """"stable" lays an object from a file that cannot stand as it is there (on a pointed foot, say) on the side that
+    needs the least turn; "captured" lets it topple."""
     build: BuildOptions = field(default_factory=BuildOptions)
     """How the body is reduced."""
 
@@ -57,11 +85,42 @@ class ObjectConfig:
             raise ConfigError(f"size must lie in 0.005..1 m, got {self.size!r}", hint="give the longest edge in metres")
         if self.crop is not None and not all(a < b for a, b in zip(self.crop[:3], self.crop[3:], strict=True)):
             raise ConfigError(f"crop {self.crop} is empty", hint="give x0 y0 z0 x1 y1 z1 with every 0 below its 1")
-        for name, known in (("up", UpAxis), ("part", Part), ("pose", Pose)):
-            if getattr(self, name) not in get_args(known):
+        for name, known in (("shape", Shape), ("up", UpAxis), ("part", Part), ("pose", Pose)):
+            if getattr(self, name) not in (*get_args(known), *((None,) if name == "up" else ())):
                 raise ConfigError(
                     f"{name} is {getattr(self, name)!r}", hint=f"use one of {', '.join(map(repr, get_args(known)))}"
                 )
+        for name, low in (("splat_count", 100), ("surface_count", 16)):
+            if getattr(self, name) < low:
+                raise ConfigError(f"{name} must be at least {low}, got {getattr(self, name)!r}")
+        if (self.splat is not None) + (self.mesh is not None) + (self.shape != "plush") > 1:
+            raise ConfigError(
+                f"shape {self.shape!r}, splat {self.splat!r} and mesh {self.mesh!r} exclude each other",
+                hint="give one of them",
+            )
+        self._check_extents()
+        if self.colors is not None:
+            if self.shape == "plush" and self.mesh is None:
+                raise ConfigError("colors are for shapes and meshes", hint="leave them out; splats have their own")
+            if np.shape(self.colors) != (2, 3) or not all(0.0 <= x <= 1.0 for color in self.colors for x in color):
+                raise ConfigError(f"colors {self.colors} are not two colours", hint="give two of (r, g, b) in 0..1")
+
+    def _check_extents(self) -> None:
+        """Check that a shape has extents that fit it, and nothing else has any."""
+        if (self.extents is None) != (self.shape == "plush"):
+            raise ConfigError(
+                f"shape {self.shape!r} with extents {self.extents}",
+                hint="give a box, cylinder, capsule or sphere three lengths in metres, and anything else a size",
+            )
+        if self.extents is None or self.shape == "plush":
+            return
+        if len(self.extents) != 3 or not all(1.0e-3 <= x <= 2.0 for x in self.extents):
+            raise ConfigError(f"extents must be three lengths in 0.001..2 m, got {self.extents!r}")
+        if find_axis(self.shape, self.extents) is None:
+            raise ConfigError(
+                f"extents {self.extents} are not those of a {self.shape}",
+                hint="give a sphere three equal lengths, a cylinder two, a capsule two and a third not below them",
+            )
 
 
 @dataclass(frozen=True)
@@ -90,8 +149,25 @@ def load_object(config: ObjectConfig, progress: Callable[[str, float], None] | b
     Raises:
         AssetError: If the file cannot be read or encloses no volume.
     """
-    splats = _read(config)
-    body = _body(splats, config, progress)
+    splats, solid, name, key = _source(config)
+    turns = config.pose == "stable" and (config.splat is not None or config.mesh is not None)
+
+    def build() -> ReducedBody:
+        try:
+            quadrature = solid()
+        except AssetError as error:
+            raise AssetError(f"{splats.name}: {error.message}", hint=error.hint) from error
+        turn = None
+        if turns:
+            centre = quadrature.weights @ quadrature.points / quadrature.volume
+            turn = stable_rotation(quadrature.surface_points - centre)
+        if turn is not None:
+            quadrature = turned(quadrature, turn)
+        body = build_body(quadrature, config.build, name=name, progress=progress)
+        rows = np.eye(3).tolist() if turn is None else turn.tolist()
+        return replace(body, provenance={**body.provenance, "turn": json.dumps(rows)})
+
+    body = cached_body((RECIPE, *key, turns, config.surface_count, config.build), build)
     turn = np.array(json.loads(str(body.provenance["turn"])))
     if not np.array_equal(turn, np.eye(3)):
         splats = splats.transformed(rotation=turn)
@@ -153,51 +229,59 @@ def stable_rotation(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
     return np.eye(3) + cross + cross @ cross / (1.0 + cosine)
 
 
-def _body(splats: Splats, config: ObjectConfig, progress: Callable[[str, float], None] | bool | None) -> ReducedBody:
-    """Build the body of the solid that the splats enclose, or recall it; its provenance holds the turn to its pose."""
+_Source = tuple[Splats, Callable[[], Quadrature], str, tuple[Any, ...]]
+"""Splats, how their solid is integrated, its name, and what it depends on beside the configuration."""
+
+
+def _source(config: ObjectConfig) -> _Source:
+    """Return what an object is made of, before it is turned to a stable pose."""
+    count = config.surface_count
+    if config.mesh is not None:
+        mesh = _read_mesh(config)
+        splats = surface_splats(mesh, config.splat_count, config.colors)
+        return splats, lambda: _mesh_solid(mesh, count), Path(config.mesh).name, ("mesh", mesh.corners)
+    if config.shape != "plush" and config.extents is not None:
+        shape, extents = config.shape, config.extents
+        mesh = ColoredMesh.from_trimesh(primitive_mesh(shape, extents), name=shape)
+        splats = surface_splats(mesh, config.splat_count, config.colors or DEFAULT_COLORS)
+        return splats, lambda: primitive_quadrature(shape, extents, count), shape, (shape, extents)
+    splats = _read_splats(config)
     name = "plush"
     if config.splat is not None:
         file = Path(config.splat).resolve()
         name = file.parent.name if file.name == "meta.json" else file.name
-
-    def build() -> ReducedBody:
-        try:
-            quadrature = quadrature_from_splats(splats.means, splats.scales, splats.quats, splats.opacities)
-        except AssetError as error:
-            raise AssetError(f"{splats.name}: {error.message}", hint=error.hint) from error
-        turn = None
-        if config.splat is not None and config.pose == "stable":
-            centre = quadrature.weights @ quadrature.points / quadrature.volume
-            turn = stable_rotation(quadrature.surface_points - centre)
-        if turn is not None:
-            quadrature = _turned(quadrature, turn)
-        body = build_body(quadrature, config.build, name=name, progress=progress)
-        rows = np.eye(3).tolist() if turn is None else turn.tolist()
-        return replace(body, provenance={**body.provenance, "turn": json.dumps(rows)})
-
-    pose = config.pose if config.splat is not None else "captured"
-    key = ("splats", RECIPE, splats.means, splats.scales, splats.quats, splats.opacities, pose, config.build)
-    return cached_body(key, build)
+    arrays = (splats.means, splats.scales, splats.quats, splats.opacities)
+    return splats, lambda: quadrature_from_splats(*arrays, surface_count=count), name, ("splats", *arrays)
 
 
-def _turned(quadrature: Quadrature, turn: NDArray[np.float64]) -> Quadrature:
-    """Return the quadrature after the rotation; the same points, so that a stable pose stays one."""
-    surface = quadrature.surface_points @ turn.T
-    return replace(
-        quadrature,
-        points=quadrature.points @ turn.T,
-        surface_points=surface,
-        surface_normals=quadrature.surface_normals @ turn.T,
-        bounds=np.stack([surface.min(axis=0), surface.max(axis=0)]),
-    )
+def _read_mesh(config: ObjectConfig) -> ColoredMesh:
+    """Return the mesh upright, standing on z = 0 around the origin, scaled to the wanted size."""
+    mesh = read_mesh(str(config.mesh))
+    gltf = Path(str(config.mesh)).suffix.lower() in (".glb", ".gltf")
+    corners = mesh.corners.astype(np.float64) @ up_rotation(config.up or ("+y" if gltf else "+z")).T
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    centre = np.array([*(0.5 * (low + high))[:2], low[2]])
+    return replace(mesh, corners=((corners - centre) * (config.size / (high - low).max())).astype(np.float32))
 
 
-def _read(config: ObjectConfig) -> Splats:
+def _mesh_solid(mesh: ColoredMesh, surface_count: int) -> Quadrature:
+    """Integrate a mesh or, if it is not closed, what a dense cover of splats encloses."""
+    corners = mesh.corners.astype(np.float64).reshape(-1, 3)
+    try:
+        return quadrature_from_mesh(corners, np.arange(len(corners)).reshape(-1, 3), surface_count=surface_count)
+    except AssetError:
+        cover = surface_splats(mesh, 8000)
+        return quadrature_from_splats(
+            cover.means, cover.scales, cover.quats, cover.opacities, surface_count=surface_count
+        )
+
+
+def _read_splats(config: ObjectConfig) -> Splats:
     """Return the splats upright, standing on z = 0 around the origin, scaled to the wanted size."""
     if config.splat is None:
         splats = make_plush()
     else:
-        splats = read_splats(config.splat).oriented(config.up)
+        splats = read_splats(config.splat).oriented(config.up or "-y")
         if config.crop is not None:
             inside = (splats.means >= config.crop[:3]).all(axis=1) & (splats.means <= config.crop[3:]).all(axis=1)
             if not inside.any():

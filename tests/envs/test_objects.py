@@ -152,8 +152,8 @@ def test_up_axis_turns_the_file_upright(tmp_path: Path) -> None:
     down = make_plush().transformed(rotation=[[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # z up -> y down
     write_ply(tmp_path / "down.ply", down)
     write_ply(tmp_path / "up.ply", make_plush())
-    a = objects._read(ObjectConfig(splat=tmp_path / "down.ply", up="-y", part="all"))
-    b = objects._read(ObjectConfig(splat=tmp_path / "up.ply", up="+z", part="all"))
+    a = objects._read_splats(ObjectConfig(splat=tmp_path / "down.ply", up="-y", part="all"))
+    b = objects._read_splats(ObjectConfig(splat=tmp_path / "up.ply", up="+z", part="all"))
     np.testing.assert_allclose(a.means, b.means, atol=1e-6)
 
 
