@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from softmode import cli
 from softmode.cli import main
+from softmode.film import Film
 from softmode.splats import make_plush, write_ply
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -215,7 +215,7 @@ def test_interrupted_film_leaves_the_old_one(
     video = tmp_path / "lift.mp4"
     video.write_bytes(b"old film")
     video.with_suffix(".png").write_bytes(b"old sheet")
-    add, count = cli._Film.add, [0]
+    add, count = Film.add, [0]
 
     def fail(film: Any, *arguments: Any) -> None:
         add(film, *arguments)
@@ -223,7 +223,7 @@ def test_interrupted_film_leaves_the_old_one(
         if count[0] == 3:
             raise failure
 
-    monkeypatch.setattr(cli._Film, "add", fail)
+    monkeypatch.setattr(Film, "add", fail)
     assert main([*PLAY, "--policy", "zero", "--video", str(video)]) == code
     assert "softmode: " in capsys.readouterr().err
     assert listing(tmp_path) == ["lift.mp4", "lift.png"]
