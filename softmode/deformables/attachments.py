@@ -105,9 +105,9 @@ def attach(
         inside = ((body.surface_points >= lower) & (body.surface_points <= upper)).all(axis=1)
         X, pins = body.surface_points[inside], s * s * per_area * body.surface_areas[inside]
     if len(X) == 0:
+        low, high = s * body.surface_points.min(axis=0), s * body.surface_points.max(axis=0)
         raise ConfigError(
-            f"the attachment of body {body.name!r} holds no point",
-            hint=f"its surface spans {s * body.surface_points.min(axis=0)} to {s * body.surface_points.max(axis=0)} [m]",
+            f"the attachment of body {body.name!r} holds no point", hint=f"its surface spans {low} to {high} [m]"
         )
     first = _column(builder, "pin_instance").count(instance)
     pose: Any = wp.transform_identity()

@@ -18,7 +18,7 @@ PARAMETER_LIMITS: dict[str, tuple[float, float]] = {
     "friction": (0.0, 100.0),
     "scale": (SCALE_MIN, SCALE_MAX),
 }
-"""Closed ranges, inside the open ones of :class:`softmode.deformables.materials.Material`, that values are clamped to."""
+"""Closed ranges that values are clamped to, inside the open ones of ``Material``."""
 PARAMETER_FLAGS = {name: 1 << k for k, name in enumerate(PARAMETER_LIMITS)} | {"held_scale": 32}
 """Bits of what :func:`set_parameters` returns; "held_scale": the body is pinned or driven and kept its scale."""
 

@@ -92,9 +92,9 @@ class ContactSensor:
 class SurfacePressure:
     """Pressure on the surface samples of a soft body, and its contact with everything.
 
-    sum_s s^2 area_s (pressure_s normal_s + traction_s) = total_force, s the body's scale. Where two soft bodies touch, each sample of either
-    finds the surface of the other: what it presses there between samples counts for the nearest that faces it. Contact
-    of the body with itself puts no force on it and is not sensed.
+    sum_k s^2 area_k (pressure_k normal_k + traction_k) = total_force, s the body's scale. Where two soft bodies touch,
+    each sample of either finds the surface of the other: what it presses there between samples counts for the nearest
+    that faces it. Contact of the body with itself puts no force on it and is not sensed.
 
     Args:
         solver: As for :class:`ContactSensor`.
