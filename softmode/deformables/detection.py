@@ -511,7 +511,7 @@ def gather_contacts(
             if body >= 0 and prescribed == 0:
                 partner_mass = shapes.body_mass[body]
             kappa = stiffness_per_area(instances, i, partner_mass, shape_area(shapes, shape), dt)
-            stiffness = wp.float64(kappa * sample_area(instances, basis, i, row))
+            stiffness = wp.float64(kappa * sample_area(instances.scale[i], basis.row_area[row]))
             slip, anchor = remembered_slip(
                 shapes,
                 shape,

@@ -256,10 +256,10 @@ def elastic_gradient(
 ):
     """Return F / s - I, the displacement gradient by the rest shape s X of a body of scale s."""
     G = displacement_gradient(gradient, q, i, point, function_count)
-    excess = scale - wp.float64(1.0)
-    for axis in range(3):
-        G[axis, axis] -= excess
-    return wp.float64(1.0) / scale * G
+    if scale != wp.float64(1.0):
+        excess = scale - wp.float64(1.0)
+        G = wp.float64(1.0) / scale * (G - wp.diag(wp.vec3d(excess, excess, excess)))
+    return G
 
 
 @wp.func

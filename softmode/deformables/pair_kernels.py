@@ -503,7 +503,7 @@ def write_pairs(
     ki = stiffness_per_area(instances, i, float(instances.mass[j]), instances.area[j], dt)
     kj = stiffness_per_area(instances, j, float(instances.mass[i]), instances.area[i], dt)
     # two layers in series; each of the two surfaces brings its samples, so that each counts one half
-    stiffness = wp.float64(0.5 * ki * kj / (ki + kj) * sample_area(instances, basis, i, own))
+    stiffness = wp.float64(0.5 * ki * kj / (ki + kj) * sample_area(instances.scale[i], basis.row_area[own]))
     friction = wp.float64(wp.sqrt(instances.friction[i] * instances.friction[j]))
     n = pairs.normal[i, s, slot]
     deepest = -wp.float64(OVERLAP * wp.min(instances.size[i], instances.size[j]))

@@ -213,9 +213,9 @@ def in_mask(world: int, world_mask: wp.array[wp.bool]):
 
 
 @wp.func
-def sample_area(instances: Instances, basis: Basis, i: int, row: int):
-    """Return the area of a surface sample of an instance [m^2]."""
-    return instances.scale[i] * instances.scale[i] * basis.row_area[row]
+def sample_area(scale: float, area: float):
+    """Return the area [m^2] that a surface sample of the asset has on a body of some scale."""
+    return scale * scale * area
 
 
 @wp.func
