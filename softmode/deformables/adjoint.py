@@ -177,7 +177,9 @@ class AdjointReduced:
         self._gmres = Gmres(solver, cycle_length=self.options.cycle_length, cycle_max=self.options.cycle_max)
         self._driven = self._zeros(solver.functions, vec8d)
         self._state = solver.model.state()
-        self._resolution = wp.array(1.0e-9 * layout.size, dtype=wp.float64, device=self.device)
+        self._resolution = wp.array(
+            1.0e-9 * layout.size * solver.instances.scale.numpy(), dtype=wp.float64, device=self.device
+        )
 
     @property
     def step_count(self) -> int:

@@ -7,7 +7,7 @@ linear system: contact couples a body with rigid shapes only. Every sum runs in 
 import warp as wp
 
 from softmode.deformables.contact import friction_potential, normal_potential
-from softmode.deformables.kernels import displacement_gradient, material_of
+from softmode.deformables.kernels import displacement_gradient, elastic_gradient, material_of
 from softmode.deformables.lanes import LANES, free_part, vec8d
 from softmode.deformables.materials import (
     green_strain,
@@ -24,7 +24,7 @@ wp.set_module_options({"enable_backward": False})
 class Linearised:
     """A recorded step at its root."""
 
-    place: wp.array2d[wp.mat33d]  # (instance_count, point_max), G = F - I
+    place: wp.array2d[wp.mat33d]  # (instance_count, point_max), G = F / s - I, s the scale of the body
     place_start: wp.array2d[wp.mat33d]  # the same at the start of the step
     point: wp.array2d[wp.mat33d]  # V times what is summed over the points next [N m]
     entry_slip: wp.array2d[wp.vec3d]  # pins: x - target [m]; contacts: friction force per coefficient, times -1 [N]
@@ -104,14 +104,15 @@ def place_points(
     # Out:
     step: Linearised,
 ):
-    """Evaluate the displacement gradient at both ends of the step."""
+    """Evaluate the elastic displacement gradient at both ends of the step."""
     i, p = wp.tid()
     if p >= instances.point_count[i]:
         return
     point = instances.point_start[i] + p
     n = instances.function_count[i]
-    step.place[i, p] = displacement_gradient(basis.gradient, q, i, point, n)
-    step.place_start[i, p] = displacement_gradient(basis.gradient, motion.q_start, i, point, n)
+    s = wp.float64(instances.scale[i])
+    step.place[i, p] = elastic_gradient(basis.gradient, q, i, point, n, s)
+    step.place_start[i, p] = elastic_gradient(basis.gradient, motion.q_start, i, point, n, s)
 
 
 @wp.kernel
@@ -209,8 +210,11 @@ def apply_points(
     point = instances.point_start[i] + p
     dF = displacement_gradient(basis.gradient, direction, i, point, instances.function_count[i])
     material = material_of(instances, basis, i, point)
-    step.point[i, p] = basis.point_weight[point] * stress_derivative(
-        material, step.place[i, p], step.place_start[i, p], dt, dF
+    # V s^3 of the energy, less one s for each of the two derivatives by F = s (I + place)
+    step.point[i, p] = (
+        wp.float64(instances.scale[i])
+        * basis.point_weight[point]
+        * stress_derivative(material, step.place[i, p], step.place_start[i, p], dt, dF)
     )
 
 
@@ -295,7 +299,8 @@ def accumulate_points(
     if p >= instances.point_count[i]:
         return
     point = instances.point_start[i] + p
-    V = basis.point_weight[point]
+    s = wp.float64(instances.scale[i])
+    V = s * s * basis.point_weight[point]  # of the stress by F = s (I + place)
     G = step.place[i, p]
     G_start = step.place_start[i, p]
     material = material_of(instances, basis, i, point)
@@ -326,7 +331,7 @@ def accumulate_points(
     by_tau = one / dt * (F * hooke_stress(material, green_strain(G) - green_strain(G_start)))
     viscosity[i, p] = viscosity[i, p] - V * wp.ddot(L, by_tau)
     F_start = wp.identity(n=3, dtype=wp.float64) + G_start
-    strain = wp.float64(0.5) * (wp.transpose(F) * L + wp.transpose(L) * F)
+    strain = wp.float64(0.5) / s * (wp.transpose(F) * L + wp.transpose(L) * F)
     step.point[i, p] = -V * material.viscosity / dt * (F_start * hooke_stress(material, strain))
 
 

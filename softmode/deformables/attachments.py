@@ -53,8 +53,8 @@ def attach(
         body: The soft body.
         link: Rigid body of the builder, -1 for the world.
         region: Name of a soft region that the body was built with; or
-        box: lower and upper corner in the body's rest frame [m]: the surface samples inside; or
-        points: rest points [m], shape (count, 3). One of the three.
+        box: lower and upper corner in the body's rest frame, at its scale [m]: the surface samples inside; or
+        points: rest points, likewise [m], shape (count, 3). One of the three.
         stiffness: Per area of surface [Pa/m]; default twenty times the bulk's. A region brings its own, as it was
             built; for points it is shared equally, as if they covered the whole surface.
         link_pose: Pose of the link in the world, a ``wp.transform``; default ``builder.body_q[link]``. Give it when the
@@ -83,29 +83,31 @@ def attach(
             f"instance {instance} is not of body {body.name!r}", hint="pass the body that add_reduced_body was given"
         )
     modulus, ratio = (float(_column(builder, name)[instance]) for name in ("youngs_modulus", "poissons_ratio"))
-    per_area = bulk_stiffness(body, modulus, ratio) if stiffness is None else stiffness
+    s = float(_column(builder, "scale")[instance])
+    per_area = bulk_stiffness(body, modulus, ratio, s) if stiffness is None else stiffness
     if not 0.0 < per_area < np.inf:
         raise ConfigError(f"stiffness must be a finite number > 0 [Pa/m], got {stiffness!r}")
     if region is not None:
         X, pins = _region_pins(body, region, modulus)
+        pins = s * pins  # kappa of the larger region is less by s^2, its volume more by s^3
     elif points is not None:
-        X = np.asarray(points, float).reshape(-1, 3)
-        pins = np.full(len(X), per_area * body.surface_areas.sum() / max(len(X), 1))
+        X = np.asarray(points, float).reshape(-1, 3) / s
+        pins = np.full(len(X), s * s * per_area * body.surface_areas.sum() / max(len(X), 1))
         outside = X[~np.isfinite(X).all(axis=1)] if not np.isfinite(X).all() else X[~body.covers(X)]
         if len(outside):
             raise ConfigError(
-                f"{len(outside)} of {len(X)} points lie outside body {body.name!r}, the first at {outside[0]} [m]",
-                hint=f"give points of its rest frame; it spans {body.bounds[0]} to {body.bounds[1]}",
+                f"{len(outside)} of {len(X)} points lie outside body {body.name!r}, the first at {s * outside[0]} [m]",
+                hint=f"give points of its rest frame; it spans {s * body.bounds[0]} to {s * body.bounds[1]}",
             )
     else:
         assert box is not None
-        lower, upper = np.asarray(box[0], float), np.asarray(box[1], float)
+        lower, upper = np.asarray(box[0], float) / s, np.asarray(box[1], float) / s
         inside = ((body.surface_points >= lower) & (body.surface_points <= upper)).all(axis=1)
-        X, pins = body.surface_points[inside], per_area * body.surface_areas[inside]
+        X, pins = body.surface_points[inside], s * s * per_area * body.surface_areas[inside]
     if len(X) == 0:
+        low, high = s * body.surface_points.min(axis=0), s * body.surface_points.max(axis=0)
         raise ConfigError(
-            f"the attachment of body {body.name!r} holds no point",
-            hint=f"its surface spans {body.surface_points.min(axis=0)} to {body.surface_points.max(axis=0)} [m]",
+            f"the attachment of body {body.name!r} holds no point", hint=f"its surface spans {low} to {high} [m]"
         )
     first = _column(builder, "pin_instance").count(instance)
     pose: Any = wp.transform_identity()
@@ -113,7 +115,7 @@ def attach(
         pose = builder.body_q[link] if link_pose is None else link_pose
     world = X + body.evaluate(X)[0] @ _coordinates(builder, instance, body)
     matrix = np.asarray(wp.transform_to_matrix(pose), float).reshape(4, 4)
-    add_pins(builder, instance, X, stiffness=pins, targets=(world - matrix[:3, 3]) @ matrix[:3, :3], link=link)
+    add_pins(builder, instance, s * X, stiffness=pins, targets=(world - matrix[:3, 3]) @ matrix[:3, :3], link=link)
     return Attachment(instance=instance, first=first, count=len(X))
 
 

@@ -21,6 +21,9 @@ _PIN = f"{NAMESPACE}:pin"
 MATERIAL_FIELDS = ("youngs_modulus", "poissons_ratio", "density", "viscosity", "mass_damping", "friction")
 """Numbers of a :class:`Material` that a model stores per instance."""
 
+SCALE_MIN, SCALE_MAX = 0.25, 4.0
+"""Sizes that an asset may be scaled to; beyond, build one: splats follow a total stretch up to 8, scale included."""
+
 CONTACT_FIELDS = ("contact_stiffness", "contact_radius", "self_contact")
 """What a model stores per instance of its surface."""
 
@@ -51,6 +54,8 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
     declare("material_model", wp.int32, _INSTANCE)
     for name in MATERIAL_FIELDS:
         declare(name, wp.float32, _INSTANCE)
+    declare("scale", wp.float32, _INSTANCE, default=1.0)
+    declare("placed_scale", wp.float32, _INSTANCE, default=1.0)  # what q and qd of the model were made for
     declare("contact_stiffness", wp.float32, _INSTANCE)  # 0: follows the body, see ``contact``
     declare("contact_radius", wp.float32, _INSTANCE)
     declare("self_contact", wp.int32, _INSTANCE)
@@ -75,11 +80,11 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
     declare("pin_target", wp.vec3d, _PIN, assignment=assignment.CONTROL)
 
 
-def bulk_stiffness(body: ReducedBody, youngs_modulus: float, poissons_ratio: float) -> float:
+def bulk_stiffness(body: ReducedBody, youngs_modulus: float, poissons_ratio: float, scale: float = 1.0) -> float:
     """Return twenty times the stiffness per area [Pa/m] of the bulk: the P-wave modulus over the size."""
     nu = poissons_ratio
     wave = youngs_modulus * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
-    return 20.0 * wave / float(np.linalg.norm(np.ptp(body.bounds, axis=0)))
+    return 20.0 * wave / (scale * float(np.linalg.norm(np.ptp(body.bounds, axis=0))))
 
 
 def add_reduced_body(
@@ -95,6 +100,7 @@ def add_reduced_body(
     contact_radius: float = 0.0,
     self_contact: bool = False,
     particle_radius: float | None = None,
+    scale: float = 1.0,
 ) -> int:
     """Add a body to a world; its surface samples become Newton particles.
 
@@ -111,12 +117,15 @@ def add_reduced_body(
         contact_radius: How far the surface that touches stands out from the body's [m].
         self_contact: Whether the body may touch itself.
         particle_radius: Radius of the particles for viewers and picking [m]; default half their spacing.
+        scale: Size over that of ``body``, 0.25 to 4: the body that ``body`` would be had the same object been built so
+            much larger. ``model.softmode.scale`` holds it; see ``docs/bodies.md`` for what follows it.
 
     Returns:
         Index of the instance in this builder.
 
     Raises:
-        ConfigError: If the pose, a stiffness or a radius is not finite or the rotation is no rotation.
+        ConfigError: If the pose, a stiffness or a radius is not finite, the rotation is no rotation, or the scale lies
+            outside its range.
     """
     register_custom_attributes(builder)
     material = material or Material()
@@ -133,15 +142,21 @@ def add_reduced_body(
     if not 0.0 <= contact_radius < np.inf:
         raise ConfigError(f"contact_radius must be a finite number >= 0 [m], got {contact_radius!r}")
 
+    if not SCALE_MIN <= scale <= SCALE_MAX:
+        raise ConfigError(
+            f"scale must lie in [{SCALE_MIN}, {SCALE_MAX}], got {scale!r}", hint="build the body at that size instead"
+        )
+
+    s = float(np.float32(scale))  # as the model stores it
     omega = np.asarray(angular_velocity, float)
     spin = np.array([[0, -omega[2], omega[1]], [omega[2], 0, -omega[0]], [-omega[1], omega[0], 0]])
-    q = body.affine(R, p)
-    # the velocity field v + omega x (R X) as coordinates: affine() of I + A subtracts the identity again
-    qd = body.affine(np.eye(3) + spin @ R, np.asarray(velocity, float))
-    x = body.surface_points @ R.T + p
+    q = body.affine(s * R, p)
+    # the velocity field v + omega x (R s X) as coordinates: affine() of I + A subtracts the identity again
+    qd = body.affine(np.eye(3) + spin @ (s * R), np.asarray(velocity, float))
+    x = s * body.surface_points @ R.T + p
     v = np.asarray(velocity, float) + x @ spin.T - p @ spin.T
-    radius = 0.5 * float(np.sqrt(body.surface_areas.mean())) if particle_radius is None else particle_radius
-    mass = material.density * body.volume / body.surface_count
+    radius = 0.5 * s * float(np.sqrt(body.surface_areas.mean())) if particle_radius is None else particle_radius
+    mass = material.density * s**3 * body.volume / body.surface_count
 
     particle_start = builder.particle_count
     builder.add_particles(
@@ -162,6 +177,8 @@ def add_reduced_body(
         "function_start": function_start,
         "particle_start": particle_start,
         "material_model": int(material.model),
+        "scale": s,
+        "placed_scale": s,
         "contact_stiffness": float(stiffness),
         "contact_radius": float(contact_radius),
         "self_contact": int(self_contact),
@@ -186,7 +203,7 @@ def add_pins(
     Args:
         builder: Builder that holds the instance.
         instance: Index from :func:`add_reduced_body`.
-        points: Rest points in the body frame [m], shape (pin_count, 3).
+        points: Rest points of the body, at its scale, in the body frame [m], shape (pin_count, 3).
         stiffness: Spring stiffness [N/m], a number or one per pin; scale it with a volume or an area for a clamp.
         targets: Positions in the frame of the link, or in the world [m], shape (pin_count, 3); default: the points
             themselves, so give them for a body that is not placed at the origin. Move them at run time through
@@ -210,6 +227,8 @@ def add_pins(
         )
     if not (np.isfinite(k).all() and (k >= 0).all() and np.isfinite(X).all() and np.isfinite(T).all()):
         raise ConfigError("stiffness must be finite and >= 0 [N/m], points and targets finite [m]")
+    scales = scales_of(builder)
+    s = scales[instance] if 0 <= instance < len(scales) else 1.0  # the solver refuses an instance that is not there
     builder.add_custom_values_batch(
         [
             {
@@ -219,9 +238,15 @@ def add_pins(
                 f"{NAMESPACE}:pin_stiffness": float(b),
                 f"{NAMESPACE}:pin_target": wp.vec3d(*c),
             }
-            for a, b, c in zip(X, k, T, strict=True)
+            for a, b, c in zip(X / s, k, T, strict=True)
         ]
     )
+
+
+def scales_of(builder: newton.ModelBuilder) -> list[float]:
+    """Return the scales of the bodies that a builder holds so far."""
+    values: Any = builder.custom_attributes[f"{NAMESPACE}:scale"].values
+    return list(values.values() if isinstance(values, dict) else values or [])
 
 
 def drive_regions(
@@ -237,10 +262,12 @@ def drive_regions(
         control: Its control.
         instance: Index of the instance in the model.
         body: Its body.
-        matrices: Matrix A of each region, x = A X + t with X in the body frame, shape (region_count, 3, 3).
+        matrices: Matrix A of each region, x = A X + t with X the rest position of the body, at its scale, in the body
+            frame, shape (region_count, 3, 3).
         translations: Vector t of each region [m], shape (region_count, 3).
     """
-    q = body.driven_affine(matrices, translations)
-    start = int(getattr(model, NAMESPACE).function_start.numpy()[instance])
+    data = getattr(model, NAMESPACE)
+    q = body.driven_affine(float(data.scale.numpy()[instance]) * np.asarray(matrices, float), translations)
+    start = int(data.function_start.numpy()[instance])
     target = getattr(control, NAMESPACE).q_driven
     target[start : start + len(q)].assign(q)

@@ -32,6 +32,7 @@ from softmode.deformables.tables import (
     interpolate,
     interpolate_change,
     mat23d,
+    sample_area,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -304,7 +305,7 @@ def find_contacts(
         along = wp.vec3()
         end = float(0.0)
         back = int(0)
-        depth = float(wp.length(basis.inner_point[row]))
+        depth = instances.scale[i] * float(wp.length(basis.inner_point[row]))
         travel = wp.length(drift)
         if query.distance < 2.0 * depth:
             bent = interpolate(basis.inner_row, row, motion.q_start, i, instances.function_count[i])
@@ -510,7 +511,7 @@ def gather_contacts(
             if body >= 0 and prescribed == 0:
                 partner_mass = shapes.body_mass[body]
             kappa = stiffness_per_area(instances, i, partner_mass, shape_area(shapes, shape), dt)
-            stiffness = wp.float64(kappa * basis.row_area[row])
+            stiffness = wp.float64(kappa * sample_area(instances.scale[i], basis.row_area[row]))
             slip, anchor = remembered_slip(
                 shapes,
                 shape,

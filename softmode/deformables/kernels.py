@@ -251,6 +251,18 @@ def displacement_gradient(gradient: wp.array3d[vec8], q: wp.array2d[vec8d], i: i
 
 
 @wp.func
+def elastic_gradient(
+    gradient: wp.array3d[vec8], q: wp.array2d[vec8d], i: int, point: int, function_count: int, scale: wp.float64
+):
+    """Return F / s - I, the displacement gradient by the rest shape s X of a body of scale s."""
+    G = displacement_gradient(gradient, q, i, point, function_count)
+    if scale != wp.float64(1.0):
+        excess = scale - wp.float64(1.0)
+        G = wp.float64(1.0) / scale * (G - wp.diag(wp.vec3d(excess, excess, excess)))
+    return G
+
+
+@wp.func
 def material_of(instances: Instances, basis: Basis, i: int, point: int):
     """Return the material of an instance at a cubature point."""
     parameters = MaterialParameters()
@@ -276,21 +288,25 @@ def evaluate_points(
     # Out:
     points: Points,
 ):
-    """Evaluate V_p Psi(F_p) and, where asked, its derivatives at every cubature point."""
+    """Evaluate V_p Psi(F_p) and, where asked, its derivatives by F_p at every cubature point.
+
+    A body of scale s has V_p s^3 and the elastic F_p / s: each derivative takes one s off.
+    """
     i, p = wp.tid()
     if selected[instances.world[i]] == 0 or p >= instances.point_count[i]:
         return
     point = instances.point_start[i] + p
     parameters = material_of(instances, basis, i, point)
-    weight = basis.point_weight[point]
+    s = wp.float64(instances.scale[i])
+    weight = s * basis.point_weight[point]
 
-    G = displacement_gradient(basis.gradient, q, i, point, instances.function_count[i])
+    G = elastic_gradient(basis.gradient, q, i, point, instances.function_count[i], s)
     G_start = G
     if instances.viscosity[i] > 0.0:
-        G_start = displacement_gradient(basis.gradient, motion.q_start, i, point, instances.function_count[i])
-    points.energy[i, p] = weight * energy(parameters, G, G_start, dt)
+        G_start = elastic_gradient(basis.gradient, motion.q_start, i, point, instances.function_count[i], s)
+    points.energy[i, p] = s * s * weight * energy(parameters, G, G_start, dt)
     if derivatives != 0:
-        points.stress[i, p] = weight * stress(parameters, G, G_start, dt)
+        points.stress[i, p] = s * weight * stress(parameters, G, G_start, dt)
         points.volume_ratio[i, p] = float(wp.float64(1.0) + determinant_minus_one(G))
     if derivatives != 0 and progress.renew[instances.world[i]] != 0:
         C = float(weight) * hessian(parameters, G, G_start, dt, progress.project[instances.world[i]])
@@ -499,24 +515,33 @@ def skin_samples(
     particle_qd_out[instances.particle_start[i] + s] = wp.vec3(v)
 
 
-@wp.kernel
-def set_masses(
-    volume: wp.array[wp.float64],  # (instance_count,) [m^3]
-    size: wp.array[float],
-    density: wp.array[float],
-    # Out:
-    mass_out: wp.array[wp.float64],
-    inertia_out: wp.array[float],
-):
-    """Compute the masses of the bodies from their densities."""
-    i = wp.tid()
-    mass_out[i] = wp.float64(density[i]) * volume[i]
-    inertia_out[i] = density[i] * size[i] * size[i]
+@wp.func
+def scaled_about_centre(basis: Basis, a: int, k: int, x: wp.vec3d, centre: wp.vec3d, ratio: wp.float64, rest: int):
+    """Return coordinate k of centre + ratio (x - centre), of a field with coordinates x and mean ``centre``.
+
+    ``rest`` says whether the field is a placement, which the rest position X is added to, or a velocity.
+    """
+    c = basis.linear[a, k]
+    shift = -c[3] * centre
+    if rest != 0:
+        shift += wp.vec3d(c[0], c[1], c[2])
+    return ratio * x + (ratio - wp.float64(1.0)) * shift
+
+
+@wp.func
+def mean_of_functions(basis: Basis, a: int, q: wp.array[wp.vec3d], first: int, count: int):
+    """Return the mean over the mass of a field with coordinates q: of a placement, the centre of mass."""
+    total = wp.vec3d()
+    for k in range(count):
+        total += basis.mean[a, k / LANES][k % LANES] * q[first + k]
+    return total
 
 
 @wp.kernel
 def reset_functions(
     instances: Instances,
+    basis: Basis,
+    placed_scale: wp.array[float],  # (instance_count,), of the initial coordinates
     instance_world: wp.array[int],
     world_mask: wp.array[wp.bool],
     positions: int,
@@ -528,15 +553,30 @@ def reset_functions(
     qd_out: wp.array[wp.vec3d],
     dt_before_out: wp.array[wp.float64],
 ):
-    """Copy the initial coordinates of the bodies in masked worlds and forget the step before."""
+    """Copy the initial coordinates of the bodies in masked worlds and forget the step before.
+
+    A body that has another scale than it was placed with is scaled about its centre of mass, and its motion with it.
+    """
     i, k = wp.tid()
     if k >= instances.function_count[i] or not in_mask(instance_world[i], world_mask):
         return
-    f = instances.function_start[i] + k
+    first = instances.function_start[i]
+    f = first + k
+    a = instances.asset[i]
+    ratio = wp.float64(instances.scale[i]) / wp.float64(placed_scale[i])
+    other = ratio != wp.float64(1.0)
     if positions != 0:
-        q_out[f] = q_in[f]
+        x = q_in[f]
+        if other:
+            centre = mean_of_functions(basis, a, q_in, first, instances.function_count[i])
+            x = scaled_about_centre(basis, a, k, x, centre, ratio, 1)
+        q_out[f] = x
     if velocities != 0:
-        qd_out[f] = qd_in[f]
+        v = qd_in[f]
+        if other:
+            centre = mean_of_functions(basis, a, qd_in, first, instances.function_count[i])
+            v = scaled_about_centre(basis, a, k, v, centre, ratio, 0)
+        qd_out[f] = v
     dt_before_out[i] = wp.float64(0.0)
 
 

@@ -40,12 +40,12 @@ class Layout:
     first_pin_row: int
     """Row of the first pin in ``basis.row``."""
     size: np.ndarray
-    """Diagonal of the bounding box per instance [m]."""
+    """Diagonal of the bounding box of each instance's asset [m]."""
     basis: Any
     """The bases, a :class:`softmode.deformables.tables.Basis`."""
     instances: Any
-    """Offsets, counts and parameters, :class:`softmode.deformables.tables.Instances`; masses and tolerances are the
-    solver's to fill."""
+    """Offsets, counts and parameters, :class:`softmode.deformables.tables.Instances`; scale and what follows from it
+    are :class:`softmode.deformables.sizes.Sizes`' to fill."""
 
     @property
     def instance_count(self) -> int:
@@ -108,8 +108,6 @@ def lay_out(model: Any, bodies: Sequence[ReducedBody]) -> Layout:
     for name in ("function_start", "particle_start", "material_model", *CONTACT_FIELDS, *MATERIAL_FIELDS):
         if name != "density":
             setattr(instances, name, getattr(data, name))
-    area = np.array([body.surface_areas.sum() for body in bodies])[asset]
-    instances.area = wp.array(area, dtype=float, device=device)
     return Layout(
         bodies=tuple(bodies),
         asset=asset,
@@ -174,6 +172,10 @@ def _basis(
     basis.point_weight = table(joined("weights"), wp.float64)
     basis.stiffness_scale = table(joined("stiffness_scale"), float, np.float32)
     basis.mean = table(mean.reshape(len(bodies), -1, LANES), vec8d)
+    linear = np.zeros((len(bodies), stride, 4))
+    for a, body in enumerate(bodies):
+        linear[a, : body.function_count] = body.linear_coordinates
+    basis.linear = table(linear, wp.vec4d)
     basis.row = table(row.reshape(len(row), -1, LANES), vec8, np.float32)
     basis.row_point = table(np.concatenate([joined("surface_points"), pin_points]), wp.vec3d)
     inner = [inner_offsets(body.surface_points, body.surface_normals, _size(body)) for body in bodies]

@@ -13,7 +13,7 @@ class Markers:
 
     Args:
         solver: Solver that holds the body.
-        points: Rest points in the body frame [m], shape (K, 3).
+        points: Rest points in the frame of the asset, the body of scale 1 [m], shape (K, 3).
         instance: The body.
     """
 

@@ -29,7 +29,17 @@ from softmode.deformables.detection import Samples, rank_contacts
 from softmode.deformables.kernels import displacement_gradient
 from softmode.deformables.lanes import vec8
 from softmode.deformables.status import WORLD_CONTACT_OVERFLOW
-from softmode.deformables.tables import OVERLAP, SLOTS, Basis, Entries, Instances, Motion, Progress, mat23d
+from softmode.deformables.tables import (
+    OVERLAP,
+    SLOTS,
+    Basis,
+    Entries,
+    Instances,
+    Motion,
+    Progress,
+    mat23d,
+    sample_area,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -61,7 +71,7 @@ SELF_DISTANCE = wp.constant(wp.float64(4.0))
 SELF_OPENING = wp.constant(wp.float64(1.0))
 """they see each other across an opening at least so wide."""
 VOLUME_RATIO_MIN = wp.constant(wp.float64(1.0e-2))
-"""det F below which F^-1 is kept from growing."""
+"""det F / s^3 below which F^-1 is kept from growing."""
 
 
 @wp.struct
@@ -71,7 +81,7 @@ class Pairs:
     first_row: int  # first dynamic row
     neighbour: wp.array2d[int]  # (sample_total, NEIGHBOURS), nearest samples at rest, the sample itself first; -1 pads
     surface_normal: wp.array2d[wp.vec3]  # outward, of unit length
-    thickness: wp.array[float]  # (sample_total,), of the body at rest below each static row [m]
+    thickness: wp.array[float]  # (sample_total,), of the asset at rest below each static row [m]
     spacing: wp.array[float]  # (instance_count,) of the samples [m]
     near: wp.array[int]  # (instance_count,), whether its bounds meet those of another body
     other: wp.array3d[int]  # (..., SLOTS), instance, -1 where empty
@@ -114,9 +124,10 @@ def cofactor(F: wp.mat33d):
 
 
 @wp.func
-def clamped_inverse(F: wp.mat33d):
-    """Return F^-1, with det F raised where the body is crushed."""
-    return wp.transpose(cofactor(F)) / wp.max(wp.determinant(F), VOLUME_RATIO_MIN)
+def clamped_inverse(F: wp.mat33d, scale: float):
+    """Return F^-1, with det F raised where a body of scale s is crushed."""
+    s = wp.float64(scale)
+    return wp.transpose(cofactor(F)) / wp.max(wp.determinant(F), s * s * s * VOLUME_RATIO_MIN)
 
 
 @wp.func
@@ -174,7 +185,7 @@ def may_touch(instances: Instances, basis: Basis, pairs: Pairs, i: int, s: int, 
         return False
     own = instances.row_start[i] + s
     row = instances.row_start[i] + t
-    away = basis.row_point[row] - basis.row_point[own]
+    away = wp.float64(instances.scale[i]) * (basis.row_point[row] - basis.row_point[own])
     spacing = wp.float64(pairs.spacing[i])
     opening = wp.min(wp.dot(wp.vec3d(basis.row_normal[own]), away), -wp.dot(wp.vec3d(basis.row_normal[row]), away))
     return wp.length(away) > SELF_DISTANCE * spacing or opening > SELF_OPENING * spacing
@@ -259,7 +270,8 @@ def fit_patch(instances: Instances, basis: Basis, samples: Samples, pairs: Pairs
     patch.drift = float(inverse) * patch.drift
     offset = inverse * offset
     lateral = offset - wp.dot(offset, patch.normal) * patch.normal
-    thick = wp.max(pairs.thickness[instances.row_start[i] + s], pairs.thickness[row])
+    own = instances.scale[i] * pairs.thickness[instances.row_start[i] + s]
+    thick = wp.max(own, instances.scale[j] * pairs.thickness[row])
     if wp.length(lateral) > LATERAL * wp.float64(pairs.spacing[j]) or patch.gap < wp.float64(-DEPTH * thick):
         patch.total = wp.float64(0.0)
     elif flat < FLAT and not looks_at(pairs, i, s, j, t):
@@ -477,7 +489,8 @@ def write_pairs(
     inverse = wp.float64(1.0) / total
     # carried on to x; of the same body, the difference to it
     offset = inverse * offset - wp.max(pairs.gap[i, s, slot], wp.float64(0.0)) * pairs.normal[i, s, slot]
-    X = wp.vec3(clamped_inverse(gradient_at(instances, basis, motion, j, nearest)) * offset)
+    F = gradient_at(instances, basis, motion, j, nearest)
+    X = wp.vec3(clamped_inverse(F, instances.scale[j]) * offset)
     for b in range(basis.row.shape[1]):
         value = float(inverse) * basis.row[row, b]
         value = value + X[0] * basis.row_gradient[b, at, 0]
@@ -490,7 +503,7 @@ def write_pairs(
     ki = stiffness_per_area(instances, i, float(instances.mass[j]), instances.area[j], dt)
     kj = stiffness_per_area(instances, j, float(instances.mass[i]), instances.area[i], dt)
     # two layers in series; each of the two surfaces brings its samples, so that each counts one half
-    stiffness = wp.float64(0.5 * ki * kj / (ki + kj) * basis.row_area[own])
+    stiffness = wp.float64(0.5 * ki * kj / (ki + kj) * sample_area(instances.scale[i], basis.row_area[own]))
     friction = wp.float64(wp.sqrt(instances.friction[i] * instances.friction[j]))
     n = pairs.normal[i, s, slot]
     deepest = -wp.float64(OVERLAP * wp.min(instances.size[i], instances.size[j]))
@@ -560,7 +573,7 @@ def remember_pairs(
         if not (limit > wp.float64(0.0) and stretch > wp.float64(0.0) and wp.isfinite(stretch + limit)):
             continue
         F = gradient_at(instances, basis, motion, i, s)
-        elastic = clamped_inverse(F) * (wp.min(wp.float64(1.0), limit / stretch) * total)
+        elastic = clamped_inverse(F, instances.scale[i]) * (wp.min(wp.float64(1.0), limit / stretch) * total)
         partner[slot] = pairs.other[i, s, slot] - progress.instance_start[instances.world[i]]
         for axis in range(3):
             slips[slot, axis] = elastic[axis]

@@ -21,16 +21,16 @@ class SoftPairs:
         layout: Its layout; rows of surface gradients and dynamic rows are added to the basis.
         pair_max: Pairs per instance at most.
         stick_ratio: Tangential over normal stiffness of a contact that sticks; 0 for friction without memory.
+        spacing: Of the surface samples of each instance [m], shape (instance_count,).
     """
 
-    def __init__(self, model: Any, layout: Layout, pair_max: int, stick_ratio: float) -> None:
+    def __init__(self, model: Any, layout: Layout, pair_max: int, stick_ratio: float, spacing: wp.array) -> None:
         """Allocate everything once."""
         self.model, self.layout, self.stick_ratio = model, layout, stick_ratio
         self.device, count, sample_max = model.device, layout.instance_count, layout.sample_max
-        spacing = np.array([np.sqrt(body.surface_areas.mean()) for body in layout.bodies])
         pairs: Any = kernels.Pairs()
         pairs.first_row = layout.basis.row.shape[0]
-        pairs.spacing = wp.array(spacing[layout.asset], dtype=float, device=self.device)
+        pairs.spacing = spacing
         table = np.concatenate([neighbours(body) for body in layout.bodies])
         pairs.neighbour = wp.array(table, dtype=int, device=self.device)
         pairs.surface_normal = self._zeros((count, sample_max), wp.vec3)

@@ -27,7 +27,7 @@ from softmode.deformables.solver_reduced import SolverReduced, SolverReducedOpti
 from softmode.deformables.step_checks import check_step
 from softmode.errors import ConfigError
 
-LIVE_FIELDS = ("material_model", *MATERIAL_FIELDS, "contact_stiffness")
+LIVE_FIELDS = ("material_model", *MATERIAL_FIELDS, "contact_stiffness", "scale")
 """Attributes of ``model.softmode`` that may change at run time and that a view copies."""
 
 

@@ -92,9 +92,9 @@ class ContactSensor:
 class SurfacePressure:
     """Pressure on the surface samples of a soft body, and its contact with everything.
 
-    sum_s area_s (pressure_s normal_s + traction_s) = total_force. Where two soft bodies touch, each sample of either
-    finds the surface of the other: what it presses there between samples counts for the nearest that faces it. Contact
-    of the body with itself puts no force on it and is not sensed.
+    sum_k s^2 area_k (pressure_k normal_k + traction_k) = total_force, s the body's scale. Where two soft bodies touch,
+    each sample of either finds the surface of the other: what it presses there between samples counts for the nearest
+    that faces it. Contact of the body with itself puts no force on it and is not sensed.
 
     Args:
         solver: As for :class:`ContactSensor`.
@@ -105,7 +105,7 @@ class SurfacePressure:
         traction: Friction force over area [Pa] on the sample, vec3, shape (world_count, sample_count).
         normal: Direction of the normal force on the sample, into the body, shape (world_count, sample_count); zero
             where nothing presses.
-        area: Area of each sample [m^2], NumPy, shape (sample_count,).
+        area: Area of each sample of the asset [m^2], NumPy, shape (sample_count,); a body of scale s has s^2 of it.
         total_force: Contact force on the body [N], vec3, shape (world_count,), as all that follow.
         total_force_friction: Its tangential part [N].
         total_torque: Its torque about the body's centre of mass [N m].

@@ -3,7 +3,7 @@
 import warp as wp
 
 from softmode.deformables.lanes import sum8d
-from softmode.deformables.tables import Basis, Entries, Instances, Motion, blocks_of, interpolate
+from softmode.deformables.tables import Basis, Entries, Instances, Motion, blocks_of, interpolate, sample_area
 
 wp.set_module_options({"enable_backward": False})
 
@@ -126,7 +126,7 @@ def read_contacts(
                 position += pressing * x
                 normal += pressing * n
                 if first_of_sample(entries, first, i, e):
-                    area += wp.float64(basis.row_area[entries.row[i, e]])
+                    area += wp.float64(sample_area(instances.scale[i], basis.row_area[entries.row[i, e]]))
     position = mean_of(position, weight)
     normal = wp.normalize(normal)
     if column < soft.shape[0]:
@@ -260,7 +260,7 @@ def gather_pressure(
         normal_force[w, s] = normal_force[w, s] + pressing * n
         friction[w, s] = friction[w, s] + (f - pressing * n)
         if before == wp.float64(0.0) and pressing > wp.float64(0.0):
-            area += wp.float64(basis.row_area[instances.row_start[i] + s])
+            area += wp.float64(sample_area(instances.scale[i], basis.row_area[instances.row_start[i] + s]))
     patch_out.force[w] = wp.vec3(total)
     patch_out.friction[w] = wp.vec3(tangential)
     patch_out.torque[w] = wp.vec3(torque)
@@ -285,7 +285,9 @@ def spread_pressure(
     """Divide the forces on the samples by their areas."""
     w, s = wp.tid()
     i = instance_start[w] + soft
-    area = wp.max(wp.float64(basis.row_area[instances.row_start[i] + s]), wp.float64(1.0e-30))
+    area = wp.max(
+        wp.float64(sample_area(instances.scale[i], basis.row_area[instances.row_start[i] + s])), wp.float64(1.0e-30)
+    )
     pressure_out[w, s] = float(wp.length(normal_force[w, s]) / area)
     traction_out[w, s] = wp.vec3(friction[w, s] / area)
     normal_out[w, s] = wp.vec3(wp.normalize(normal_force[w, s]))

@@ -30,6 +30,7 @@ from softmode.deformables.observables import REDUCED_KINDS, ReducedObservableKin
 from softmode.deformables.pairs import SoftPairs
 from softmode.deformables.rigid_dofs import RigidDofs
 from softmode.deformables.shape_tables import heightfields, mesh_sources, solid_shapes
+from softmode.deformables.sizes import Sizes
 from softmode.deformables.step_checks import check_step
 from softmode.errors import ConfigError
 
@@ -147,20 +148,15 @@ class SolverReduced(SolverBase):
         self.instance_count, self.world_count = layout.instance_count, layout.world_count
         self.stride = LANES * layout.block_count
         self.basis, self.instances = layout.basis, layout.instances
-        for name, fraction in (
-            ("size", 1.0),
-            ("tolerance", options.tolerance),
-            ("margin", options.contact_margin),
-            ("smoothing", options.contact_smoothing),
-        ):
-            setattr(self.instances, name, wp.array(fraction * layout.size, dtype=float, device=device))
-        volumes = np.array([body.volume for body in self.bodies])[layout.asset]
-        self.volume = wp.array(volumes, dtype=wp.float64, device=device)
-        self.instances.mass = wp.zeros(self.instance_count, dtype=wp.float64, device=device)
-        self.instances.inertia = wp.zeros(self.instance_count, dtype=float, device=device)
-        smallest = np.full(self.world_count, np.inf)
-        np.minimum.at(smallest, self.instances.world.numpy(), options.tolerance * layout.size)
-        self.rigid_tolerance = wp.array(smallest, dtype=float, device=device)
+        fractions = {
+            "tolerance": options.tolerance,
+            "margin": options.contact_margin,
+            "smoothing": options.contact_smoothing,
+        }
+        self.sizes = Sizes(model, layout, self.parameters, **fractions)
+        self.rigid_tolerance = self.sizes.rigid_tolerance
+        self.parameter_flags = wp.zeros(self.instance_count, dtype=int, device=device)
+        """What :func:`softmode.deformables.parameters.set_parameters` had to clamp, per instance."""
         self.candidate = wp.array(candidate_shapes(model, layout), dtype=int, device=device)
         self.near = wp.zeros_like(self.candidate)
         self.shapes = self._shapes()
@@ -176,7 +172,7 @@ class SolverReduced(SolverBase):
         crowded = bool((np.diff(layout.instance_start) > 1).any()) or bool(self.parameters.self_contact.numpy().any())
         self.pairs = None
         if options.soft_contact and crowded:
-            self.pairs = SoftPairs(model, layout, options.contact_max // 2, options.stick_ratio)
+            self.pairs = SoftPairs(model, layout, options.contact_max // 2, options.stick_ratio, self.sizes.spacing)
         """Contact between soft bodies, None where there is never any."""
         self.progress = make_progress(layout.instance_start, self.team, device)
         self.q, self.q_trial = (wp.zeros(functions, dtype=vec8d, device=device) for _ in range(2))
@@ -250,11 +246,13 @@ class SolverReduced(SolverBase):
         """Newton iterations of the last step per world."""
         return self.progress.iteration
 
-    def refresh(self) -> None:
-        """Compute what follows from the model's parameters: masses from densities."""
-        instances = self.instances
-        inputs = [self.volume, instances.size, self.parameters.density]
-        self._launch(kernels.set_masses, self.instance_count, inputs, [instances.mass, instances.inertia])
+    def refresh(self, world_mask: wp.array | None = None) -> None:
+        """Compute what follows from the model's densities and scales in the masked worlds; see :class:`Sizes`.
+
+        Args:
+            world_mask: Boolean mask of shape (world_count + 1,) as for :meth:`reset`; None for all worlds.
+        """
+        self.sizes.derive(self.checked_mask(world_mask))
 
     def _check_materials(self) -> None:
         """Refuse materials that the bodies cannot have."""
@@ -266,7 +264,7 @@ class SolverReduced(SolverBase):
             )
 
     def notify_model_changed(self, flags: int) -> None:
-        """Follow changes of the model: call it, with any flags, after a change of density or material model.
+        """Follow changes of the model: call it, with any flags, after a change of density, scale or material model.
 
         Everything else (Young's modulus, Poisson's ratio, viscosity, damping, friction, contact stiffness, pins,
         gravity, shapes' poses and friction) is read in every step. May be captured, and then checks nothing.
@@ -648,6 +646,8 @@ class SolverReduced(SolverBase):
     def reset(self, state: newton.State, world_mask: wp.array | None = None, flags: Any = None) -> None:
         """Put the bodies of the chosen worlds back to the model's initial state and clear what those worlds report.
 
+        A body whose scale has changed since it was added is placed at its new size about its centre of mass.
+
         Args:
             state: State to reset in place.
             world_mask: Boolean mask of shape (world_count + 1,), the last entry for entities outside worlds; or None
@@ -658,14 +658,23 @@ class SolverReduced(SolverBase):
         Raises:
             ConfigError: If the mask has another shape or type.
         """
-        mask = self._mask(world_mask)
+        mask = self.checked_mask(world_mask)
         flags = int(newton.StateFlags.ALL if flags is None else flags)
         initial, out = self.parameters, getattr(state, NAMESPACE)
         chosen = [flags & int(newton.StateFlags.PARTICLE_Q), flags & int(newton.StateFlags.PARTICLE_QD)]
         self._launch(
             kernels.reset_functions,
             (self.instance_count, self.stride),
-            [self.instances, initial.instance_world, mask, *chosen, initial.q, initial.qd],
+            [
+                self.instances,
+                self.basis,
+                initial.placed_scale,
+                initial.instance_world,
+                mask,
+                *chosen,
+                initial.q,
+                initial.qd,
+            ],
             [out.q, out.qd, out.dt_before],
         )
         dim = (self.instance_count, self.layout.sample_max)
@@ -700,7 +709,7 @@ class SolverReduced(SolverBase):
         self._hold(attachment, world_mask, 1.0)
 
     def _hold(self, attachment: Attachment, world_mask: wp.array | None, sign: float) -> None:
-        mask = self._mask(world_mask)
+        mask = self.checked_mask(world_mask)
         where = [attachment.instance, attachment.first, sign]
         self._launch(
             attachment_kernels.hold_pins,
@@ -709,8 +718,12 @@ class SolverReduced(SolverBase):
             [self.parameters.pin_stiffness],
         )
 
-    def _mask(self, world_mask: wp.array | None) -> wp.array:
-        """Return the mask, all worlds if there is none; refuse what a kernel would misread."""
+    def checked_mask(self, world_mask: wp.array | None) -> wp.array:
+        """Return the mask, all worlds if there is none; refuse what a kernel would misread.
+
+        Raises:
+            ConfigError: If the mask has another shape or type.
+        """
         if world_mask is None:
             return self.every_world
         mask: Any = world_mask

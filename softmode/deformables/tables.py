@@ -28,6 +28,7 @@ class Basis:
     point_weight: wp.array[wp.float64]  # (point_total,) [m^3]
     stiffness_scale: wp.array[float]  # (point_total,)
     mean: wp.array2d[vec8d]  # (asset_count, block_count)
+    linear: wp.array2d[wp.vec4d]  # (asset_count, stride), c with sum_k b_k c_k = (X, Y, Z, 1)
     row: wp.array2d[vec8]  # (row_total, block_count): surface samples of all bodies, then pins, then dynamic rows
     row_point: wp.array[wp.vec3d]  # (row_total,) [m]
     row_area: wp.array[float]  # (row_total,) [m^2]
@@ -56,6 +57,7 @@ class Instances:
     pin_start: wp.array[int]
     pin_count: wp.array[int]
     link_pin_count: wp.array[int]  # pins that follow a rigid body
+    scale: wp.array[float]  # size over that of the asset, s; what follows from it and from density is derived with it:
     mass: wp.array[wp.float64]  # [kg]
     inertia: wp.array[float]  # density times the square of the size [kg/m]
     size: wp.array[float]  # diagonal of the bounding box [m]
@@ -208,6 +210,12 @@ def in_mask(world: int, world_mask: wp.array[wp.bool]):
     if world < 0:
         return world_mask[world_mask.shape[0] - 1]
     return world_mask[world]
+
+
+@wp.func
+def sample_area(scale: float, area: float):
+    """Return the area [m^2] that a surface sample of the asset has on a body of some scale."""
+    return scale * scale * area
 
 
 @wp.func
