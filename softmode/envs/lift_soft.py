@@ -97,6 +97,7 @@ class LiftSoft(Task):
                 self.table.column("goal"),
                 scene.object_position,
                 scene.soft.height,
+                self.table.column("scale"),
                 self.column("goal"),
             ],
             [self.observation, self.metrics, scene.marker_place],

@@ -12,7 +12,8 @@ def observe(
     parameters: wp.array2d[float],
     goal_parameter: int,
     object_position: wp.array2d[wp.vec3],
-    rest_height: float,
+    height: float,  # of the unscaled object's centre at rest [m]
+    scale_parameter: int,
     goal_column: int,
     # Out:
     observation: wp.array2d[float],
@@ -21,6 +22,7 @@ def observe(
 ):
     """Write the goal, relative to the object and as a position, the rise and the distance."""
     w = wp.tid()
+    rest_height = height * parameters[w, scale_parameter]
     goal = wp.vec3(
         parameters[w, goal_parameter],
         parameters[w, goal_parameter + 1],

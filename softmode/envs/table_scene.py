@@ -312,6 +312,7 @@ class TableScene:
                     self.world_mask,
                     self.place_position,
                     self.place_yaw,
+                    data.scale,
                 ],
                 outputs=[state.softmode.q, state.softmode.qd],
                 device=self.device,

@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables import status as bits
+from softmode.deformables.parameters import set_parameters
 from softmode.deformables.rkpm import sample_farthest
 from softmode.envs import task_kernels as kernels
 from softmode.envs.parameters import Parameter, ParameterTable
@@ -29,8 +30,8 @@ CameraName = Literal["front", "wrist"]
 ImageOutput = Literal["depth", "segmentation"]
 FALL = 0.05
 """How far under its resting height on the table object 0 counts as dropped [m]."""
-MATERIAL = ("youngs_modulus", "poissons_ratio", "density", "friction")
-"""Parameters of the material, in the order of their columns."""
+MATERIAL = ("youngs_modulus", "poissons_ratio", "density", "friction", "scale")
+"""Parameters of the soft bodies, in the order of their columns."""
 
 
 class EndReason(IntEnum):
@@ -88,6 +89,8 @@ class TaskConfig:
     """Range of the random density [kg/m^3], log-uniform."""
     friction_range: tuple[float, float] | None = None
     """Range of the random friction coefficient of the object."""
+    scale_range: tuple[float, float] | None = None
+    """Range of the random size of the objects, as a factor."""
     camera: CameraName = "front"
     """Camera of pixel observations: one in front of the table, or one on the hand."""
     image_size: int = 96
@@ -110,6 +113,7 @@ class TaskConfig:
             "poissons_ratio_range": (-1.0, 0.5),
             "density_range": (0.0, np.inf),
             "friction_range": (-1e-9, np.inf),
+            "scale_range": (0.49, 2.01),
         }
         for name, (least, most) in limits.items():
             chosen = getattr(self, name)
@@ -256,6 +260,9 @@ class Task:
         self.final_parameters = wp.zeros_like(self.table.values)
         self._never, self._fresh = zeros(dtype=wp.bool), zeros(dtype=wp.bool)
         self.any_done = wp.zeros(1, dtype=int, device=device)
+        instances = worlds * len(self.scene.objects)
+        self._material = wp.zeros((len(MATERIAL), instances), dtype=float, device=device)
+        self._solver_mask = wp.zeros(worlds + 1, dtype=wp.bool, device=device)
         self._low = wp.array(self.low, dtype=float, device=device)
         self._high = wp.array(self.high, dtype=float, device=device)
         self.images: dict[str, wp.array] = {}
@@ -284,7 +291,7 @@ class Task:
 
         def ranged(name: str, least: float, most: float, *, log: bool = False) -> Parameter:
             given = getattr(config, f"{name}_range")
-            low, high = (getattr(material, name),) * 2 if given is None else given
+            low, high = (getattr(material, name, 1.0),) * 2 if given is None else given
             return Parameter(name=name, low=(low,), high=(high,), log=log, least=(least,), most=(most,))
 
         return (
@@ -296,6 +303,7 @@ class Task:
             ranged("poissons_ratio", -0.9, 0.499),
             ranged("density", 1.0, 2.0e4, log=True),
             ranged("friction", 0.0, 10.0),
+            ranged("scale", 0.5, 2.0),
         )
 
     def goal_segments(self) -> tuple[Segment, ...]:
@@ -346,7 +354,9 @@ class Task:
                 table.values,
                 table.column(position),
                 table.column(yaw),
-                scene.objects[index].height + GAP,
+                table.column("scale"),
+                scene.objects[index].height,
+                GAP,
                 len(scene.objects),
                 index,
             ],
@@ -406,14 +416,15 @@ class Task:
         """Set those worlds up from their parameters."""
         scene, table = self.scene, self.table
         mask, stride = scene.world_mask, len(scene.objects)
-        data = scene.model.softmode
         self.launch(
-            kernels.set_materials,
-            [mask, table.values, table.column(MATERIAL[0]), stride],
-            [data.youngs_modulus, data.poissons_ratio, data.density, data.friction],
+            kernels.spread_materials,
+            [table.values, table.column(MATERIAL[0]), stride],
+            [self._material],
             self.world_count * stride,
         )
-        scene.solver.reduced.refresh()
+        wp.copy(self._solver_mask, mask, count=self.world_count)
+        values: Any = self._material
+        set_parameters(scene.solver, self._solver_mask, **{name: values[k] for k, name in enumerate(MATERIAL)})
         self.place()
         scene.reset_worlds()
         for camera in scene.cameras.values():

@@ -44,7 +44,9 @@ def place_object(
     parameters: wp.array2d[float],
     position_column: int,  # of x and y [m]
     yaw_column: int,  # [rad]
-    height: float,
+    scale_column: int,
+    height: float,  # of the unscaled object's centre [m]
+    gap: float,  # [m]
     stride: int,  # soft objects per world
     object_index: int,
     # Out, per instance:
@@ -57,31 +59,22 @@ def place_object(
         return
     x = wp.float64(parameters[w, position_column])
     y = wp.float64(parameters[w, position_column + 1])
-    position_out[w * stride + object_index] = wp.vec3d(x, y, wp.float64(height))
+    position_out[w * stride + object_index] = wp.vec3d(x, y, wp.float64(height * parameters[w, scale_column] + gap))
     yaw_out[w * stride + object_index] = wp.float64(parameters[w, yaw_column])
 
 
 @wp.kernel
-def set_materials(
-    world_mask: wp.array[wp.bool],
+def spread_materials(
     parameters: wp.array2d[float],
-    column: int,  # of E, nu, rho, friction
+    column: int,  # of the first
     stride: int,  # soft objects per world
-    # Out, per instance:
-    youngs_modulus_out: wp.array[float],
-    poissons_ratio_out: wp.array[float],
-    density_out: wp.array[float],
-    friction_out: wp.array[float],
+    # Out, (5, instance_count):
+    values: wp.array2d[float],
 ):
-    """Give all soft objects of a world the drawn material."""
+    """Give all soft objects of a world the drawn material and scale."""
     i = wp.tid()
-    w = i // stride
-    if not world_mask[w]:
-        return
-    youngs_modulus_out[i] = parameters[w, column]
-    poissons_ratio_out[i] = parameters[w, column + 1]
-    density_out[i] = parameters[w, column + 2]
-    friction_out[i] = parameters[w, column + 3]
+    for m in range(values.shape[0]):
+        values[m, i] = parameters[i // stride, column + m]
 
 
 @wp.kernel
