@@ -10,8 +10,10 @@ import warp as wp
 from softmode.envs import lift_soft_kernels as kernels
 from softmode.envs.markers import sphere_marker
 from softmode.envs.parameters import Parameter
+from softmode.envs.presets import BEAM, BEAM_MATERIAL
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
+from softmode.envs.table_scene import TableSceneConfig
 from softmode.envs.task import Segment, Task, TaskConfig
 from softmode.errors import ConfigError
 from softmode.splats import Splats
@@ -43,6 +45,12 @@ class LiftSoftConfig(TaskConfig):
             raise ConfigError(f"goal_tolerance must lie in 0..goal_height, got {self.goal_tolerance}")
         if self.hold_steps < 1:
             raise ConfigError(f"hold_steps must be at least 1, got {self.hold_steps}")
+
+    @classmethod
+    def presets(cls) -> dict[str, LiftSoftConfig]:
+        """Return "beam": object and goals of Isaac Lab's `Isaac-Lift-Soft-Franka`, as high as this arm reaches."""
+        scene = TableSceneConfig(object=BEAM, material=BEAM_MATERIAL, substeps=4)
+        return {"beam": cls(scene=scene, yaw_range=0.5, goal_height=0.2, goal_range=(0.08, 0.15, 0.08))}
 
 
 class LiftSoft(Task):

@@ -52,6 +52,7 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         control_mode: What actions mean.
         splat: Splat file of the object; None for the built-in one.
         size: Longest edge of the object [m].
+        preset: Named variant of the task, instead of `config`.
         config: Everything else.
         device: Warp device.
         progress: Reports the build of the object: a callable (stage, fraction), or True or False for a bar or none.
@@ -73,6 +74,7 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         control_mode: str | None = None,
         splat: str | Path | None = None,
         size: float | None = None,
+        preset: str | None = None,
         config: TaskConfig | None = None,
         device: Any = None,
         progress: Any = None,
@@ -86,10 +88,11 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
             control_mode=control_mode,
             splat=splat,
             size=size,
+            preset=preset,
             config=config,
             device=None if device is None else str(device),
         )
-        self.config = checked_config(self, config, obs_type, render_mode, control_mode, splat, size)
+        self.config = checked_config(self, config, preset, obs_type, render_mode, control_mode, splat, size)
         self.obs_type, self.render_mode = obs_type, render_mode
         self.metadata = {**self.metadata, "render_fps": round(self.config.scene.control_hz)}
         self.task = self.task_class(
@@ -148,6 +151,7 @@ def world_seed(random: np.random.Generator) -> int:
 def checked_config(
     env: Any,
     config: TaskConfig | None,
+    preset: str | None,
     obs_type: str,
     render_mode: str | None,
     control_mode: str | None,
@@ -172,7 +176,11 @@ def checked_config(
             f"config is a {type(config).__name__}",
             hint=f"pass {wanted.__name__}(image_size=128), of {wanted.__module__}",
         )
-    chosen = wanted() if config is None else config
+    if config is not None and preset is not None:
+        raise ConfigError(f"preset {preset!r} and config exclude each other", hint="give one of them")
+    chosen = config
+    if chosen is None:
+        chosen = wanted() if preset is None else wanted.preset(preset)
     scene = chosen.scene
     if control_mode is not None:
         scene = replace(scene, control=replace(scene.control, mode=control_mode))  # type: ignore[arg-type]
@@ -208,11 +216,11 @@ def checked_actions(actions: Any, space: gym.Space) -> NDArray[np.float32]:
 
 def observation_arrays(task: Task, *, final: bool = False) -> Any:
     """Return the observation of all worlds as Warp arrays, in the structure of `Task.observation_space`."""
-    vector = task.final_observation if final else task.observation
+    vector: Any = task.final_observation if final else task.observation
     if task.obs_type == "state":
         keys = task.state_keys()
         return {name: vector[:, columns] for name, columns in keys.items()} if keys else vector
-    images = dict(task.final_images if final else task.images)
+    images: dict[str, Any] = dict(task.final_images if final else task.images)
     if task.obs_type == "pixels_agent_pos":
         images["agent_pos"] = vector[:, : task.agent_size]
     return images["pixels"] if list(images) == ["pixels"] else images
@@ -231,7 +239,7 @@ def info_arrays(task: Task, *, final: bool = False) -> dict[str, Any]:
     info["parameters"] = {
         name: parameters[:, c.start] if c.stop - c.start == 1 else parameters[:, c] for name, c in columns.items()
     }
-    vector = task.final_observation if final else task.observation
+    vector: Any = task.final_observation if final else task.observation
     info["finger_force"] = vector[:, task.segments["finger_force"][0]]
     info["solver_status"] = task.scene.solver.reduced.status
     info["end_reason"] = task.end

@@ -41,6 +41,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         control_mode: What actions mean.
         splat: Splat file of the object; None for the built-in one.
         size: Longest edge of the object [m].
+        preset: Named variant of the task, instead of `config`.
         config: Everything else.
         max_episode_steps: Control steps after which an episode is truncated; None for never.
         autoreset_mode: When the next episode of a world begins.
@@ -68,6 +69,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         control_mode: str | None = None,
         splat: str | Path | None = None,
         size: float | None = None,
+        preset: str | None = None,
         config: TaskConfig | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
@@ -90,7 +92,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         except ValueError as error:
             known = ", ".join(f"AutoresetMode.{choice.name}" for choice in AutoresetMode)
             raise ConfigError(f"autoreset_mode is {autoreset_mode!r}", hint=f"use one of {known}") from error
-        config = checked_config(self, config, obs_type, render_mode, control_mode, splat, size)
+        config = checked_config(self, config, preset, obs_type, render_mode, control_mode, splat, size)
         if output == "torch":
             try:
                 import torch  # noqa: F401
@@ -212,6 +214,10 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         """The full observation vector of every world whatever `obs_type`, shape (num_envs, D): for a critic."""
         with self._stream():
             return self._gather("state")
+
+    def task_columns(self, segment: str) -> slice:
+        """Return the columns of a segment of the full observation vector, such as "object_offset"."""
+        return self._worlds[0].segments[segment]
 
     # -- arguments ----------------------------------------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, Self, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -129,6 +129,24 @@ class TaskConfig:
             raise ConfigError(f"render_size must lie in 64..1024 px, got {self.render_size}")
         if self.mesh_samples not in (1, 4):
             raise ConfigError(f"mesh_samples must be 1 or 4, got {self.mesh_samples}")
+
+    @classmethod
+    def preset(cls, name: str) -> Self:
+        """Return a named variant of the task.
+
+        Raises:
+            ConfigError: If there is none of that name.
+        """
+        known = cls.presets()
+        if name not in known:
+            names = ", ".join(map(repr, known)) or "none"
+            raise ConfigError(f"{cls.__name__} has no preset {name!r}", hint=f"there are: {names}")
+        return known[name]
+
+    @classmethod
+    def presets(cls) -> dict[str, Self]:
+        """Return the named variants of the task."""
+        return {}
 
 
 class Task:

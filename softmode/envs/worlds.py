@@ -31,6 +31,7 @@ class LocalWorlds:
         """Build the task."""
         self.task = task_class(**arguments)
         self.parameters = self.task.table.parameters
+        self.segments = {name: columns for name, (columns, _) in self.task.segments.items()}
         self.action_space = self.task.action_space
         self.observation_space = self.task.observation_space()
 
@@ -95,7 +96,7 @@ class RemoteWorlds:
 
     def connect(self) -> None:
         """Wait until the task is built."""
-        self.parameters, self.action_space, self.observation_space = self._receive()
+        self.parameters, self.segments, self.action_space, self.observation_space = self._receive()
 
     def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64], options: dict[str, NDArray[np.float32]]) -> None:
         """Start episodes; see :meth:`LocalWorlds.reset`."""
@@ -152,7 +153,7 @@ def _serve(pipe: Any, task_class: type[Task], arguments: dict[str, Any]) -> None
     try:
         with wp.ScopedDevice("cpu"):
             worlds = LocalWorlds(task_class, arguments)
-        pipe.send((True, (worlds.parameters, worlds.action_space, worlds.observation_space)))
+        pipe.send((True, (worlds.parameters, worlds.segments, worlds.action_space, worlds.observation_space)))
         while True:
             name, given = pipe.recv()
             if name == "close":

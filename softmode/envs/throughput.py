@@ -1,0 +1,162 @@
+"""How many steps a vector environment makes per second, and whether anything happens in them."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import warp as wp
+
+from softmode.envs.soft_vector_env import SoftVectorEnv
+from softmode.envs.task import Task
+
+Actions = Literal["random", "grasp"]
+TOUCH = 0.02
+"""Force from which a finger counts as touching [N]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Throughput:
+    """What `measure_throughput` found."""
+
+    num_envs: int
+    """Worlds."""
+    seconds: float
+    """Time of all measured steps [s]."""
+    steps: int
+    """Measured control steps."""
+    touching: float
+    """Share of worlds and steps in which a finger touched the object."""
+    failures: int
+    """Episodes that ended by a failure."""
+    megabytes: float
+    """Device memory taken since before the environment was made, 0 on CPU."""
+
+    @property
+    def rate(self) -> float:
+        """Environment steps per second, all worlds together."""
+        return self.num_envs * self.steps / self.seconds
+
+
+def measure_throughput(
+    env: SoftVectorEnv,
+    *,
+    steps: int = 500,
+    warmup: int = 100,
+    actions: Actions = "random",
+    seed: int = 0,
+    free_before: int = 0,
+) -> Throughput:
+    """Time `env.step` with random actions.
+
+    Args:
+        env: State or pixel observations, numpy or torch.
+        steps: Measured control steps.
+        warmup: Steps before them.
+        actions: "random": uniform in [-1, 1]; "grasp": noise around going to the object, the gripper closing on it
+            most of the time, so that contact is active.
+        seed: Seed of episodes and actions.
+        free_before: Free device memory before the environment was made [bytes].
+    """
+    tensors = env.output == "torch"
+    env.reset(seed=seed)
+    source = _Source(env, actions, seed)
+    failures = touching = 0.0
+    clock = time.perf_counter()
+    column = env.task_columns("finger_force")
+    for step in range(warmup + steps):
+        if step == warmup:
+            wp.synchronize_device(env.device)
+            clock, failures, touching = time.perf_counter(), 0.0, 0.0
+        _, _, terminated, _, _ = env.step(source(step))
+        force = env.state_observation[:, column]
+        failures = failures + terminated.sum()
+        touching = touching + (force > TOUCH).any(1).sum()
+    wp.synchronize_device(env.device)
+    seconds = time.perf_counter() - clock
+    taken = (free_before - env.device.free_memory) / 1e6 if tensors and env.device.is_cuda and free_before else 0.0
+    return Throughput(
+        num_envs=env.num_envs,
+        seconds=seconds,
+        steps=steps,
+        touching=float(touching) / (steps * env.num_envs),
+        failures=int(failures),
+        megabytes=max(taken, 0.0),
+    )
+
+
+class _Source:
+    """Actions, made where the observations are."""
+
+    KEPT = 32
+    """Random batches that are made once and used in turn."""
+
+    def __init__(self, env: SoftVectorEnv, kind: Actions, seed: int) -> None:
+        self._env, self._kind = env, kind
+        assert env.action_space.shape is not None
+        random = np.random.default_rng(seed).uniform(-1.0, 1.0, (self.KEPT, *env.action_space.shape))
+        self._batches: Any = random.astype(np.float32)
+        if env.output == "torch":
+            import torch
+
+            self._batches = torch.from_numpy(self._batches).to(wp.device_to_torch(env.device))
+        self._offset = env.task_columns("object_offset")
+        self._scale = env.config.scene.control.translation_scale
+
+    def __call__(self, step: int) -> Any:
+        noise = self._batches[step % self.KEPT]
+        if self._kind == "random":
+            return noise
+        offset = self._env.state_observation[:, self._offset]
+        actions = 0.3 * noise
+        aside = (offset[:, :2] ** 2).sum(1) > 0.02**2
+        actions[:, :2] += 0.5 * offset[:, :2] / self._scale
+        actions[:, 2] += 0.5 * (offset[:, 2] + 0.08 * aside) / self._scale
+        # a world's gripper closes in five of six spells of sixteen steps
+        actions[:, -1] = 1.0 if (step // 16) % 6 == 0 else -0.6
+        return actions.clip(-1.0, 1.0)
+
+
+def stage_times(task: Task, repeats: int = 20) -> dict[str, float]:
+    """Return the median time of parts of a control step [ms], each captured as a graph of its own.
+
+    Args:
+        task: The task; its worlds go on from where they are.
+        repeats: Replays per part.
+    """
+    scene = task.scene
+
+    def physics() -> None:
+        scene.control_step()
+
+    def judging() -> None:
+        task._observe()
+        task._finish(task._never)
+
+    def reset() -> None:
+        task._restart(task._never)
+
+    parts: dict[str, Any] = {"physics": physics, "observe and judge": judging, "masked reset": reset}
+    if task.images:
+        parts["camera"] = task._draw_pictures
+    times = {"whole step": _median(task.graph, task.device, repeats)}
+    for name, part in parts.items():
+        with wp.ScopedCapture(device=task.device) as capture:
+            part()
+        graph: Any = capture.graph
+        times[name] = _median(graph, task.device, repeats)
+    return times
+
+
+def _median(graph: Any, device: Any, repeats: int) -> float:
+    """Return the median time of a graph's replay [ms]."""
+    spent = []
+    for _ in range(repeats + 2):
+        wp.synchronize_device(device)
+        clock = time.perf_counter()
+        wp.capture_launch(graph)
+        wp.synchronize_device(device)
+        spent.append(1e3 * (time.perf_counter() - clock))
+    return float(np.median(spent[2:]))
