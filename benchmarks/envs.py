@@ -52,7 +52,7 @@ def main() -> None:
         )
         print(
             f"{count} worlds, {options.actions}: {result.rate:,.0f} env-steps/s, "
-            f"{1e3 * result.seconds / result.steps:.2f} ms per step, finger on the object {100 * result.touching:.0f} %, "
+            f"{1e3 * result.seconds / result.steps:.2f} ms per step, touching {100 * result.touching:.0f} %, "
             f"{result.failures} failures, {result.megabytes:.0f} MB, made in {made:.1f} s",
             flush=True,
         )
