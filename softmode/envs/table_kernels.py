@@ -11,6 +11,7 @@ def place_objects(
     function_start: wp.array[int],
     stride: int,  # soft objects per world
     object_index: int,
+    scale: wp.array[float],  # (instance_count,)
     # Asset:
     linear_coordinates: wp.array2d[wp.float64],  # (function_count, 4)
     # Reset:
@@ -21,18 +22,18 @@ def place_objects(
     q_out: wp.array[wp.vec3d],
     qd_out: wp.array[wp.vec3d],
 ):
-    """Set q of one object of each world to the rigid placement x = R(yaw) X + position, at rest."""
+    """Set q of one object of each world to the placement x = scale R(yaw) X + position, at rest."""
     w, k = wp.tid()
     if not world_mask[w]:
         return
     i = w * stride + object_index
-    c = wp.cos(yaw[i]) - wp.float64(1.0)
-    s = wp.sin(yaw[i])
+    size = wp.float64(scale[i])
+    c = size * wp.cos(yaw[i]) - wp.float64(1.0)
+    s = size * wp.sin(yaw[i])
+    z = (size - wp.float64(1.0)) * linear_coordinates[k, 2]
     x = linear_coordinates[k, 0]
     y = linear_coordinates[k, 1]
-    q_out[function_start[i] + k] = wp.vec3d(c * x - s * y, s * x + c * y, wp.float64(0.0)) + (
-        linear_coordinates[k, 3] * position[i]
-    )
+    q_out[function_start[i] + k] = wp.vec3d(c * x - s * y, s * x + c * y, z) + (linear_coordinates[k, 3] * position[i])
     qd_out[function_start[i] + k] = wp.vec3d()
 
 

@@ -308,6 +308,7 @@ class TableScene:
                     data.function_start,
                     len(self.objects),
                     o,
+                    data.scale,
                     linear,
                     self.world_mask,
                     self.place_position,
