@@ -20,6 +20,7 @@ from softmode.errors import ConfigError
 from tests.deformables.affine_body import affine_cube, mean_gradient
 from tests.deformables.test_adjoint import EXACT
 from tests.deformables.test_many_bodies import clamped
+from tests.deformables.test_pairs import ring
 from tests.scenes import GRAVITY, GRIPPER, Scene, add_gripper, cube, rotation
 
 FLOAT32 = float(np.finfo(np.float32).eps)
@@ -69,12 +70,6 @@ def both(populate, body, s, **options):
 def particles(scene):
     """Return the surface samples [m]."""
     return scene.state.particle_q.numpy().astype(float)
-
-
-def strain_of(scene, s):
-    """Return the coordinates relative to the rest shape, in sizes."""
-    body = scene.body()
-    return np.linalg.norm(scene.q() - (s - 1.0) * body.linear_coordinates[:, :3]) / (s * EDGE)
 
 
 # -- what a build gives ------------------------------------------------------------------------------------------------
@@ -208,6 +203,19 @@ def test_derivatives(s):
     np.testing.assert_allclose(product, change, atol=1e-5 * np.abs(change).max())
 
 
+@pytest.mark.parametrize("s", SCALES)
+def test_recovery_from_a_point(s):
+    """Squeezed to a hundredth, the body goes back to its own size: det F = s^3."""
+    material = Material(youngs_modulus=1.0e5, mass_damping=20.0)
+    scene = Scene(lambda world: add_reduced_body(world, cube(), material=material, scale=s), [cube()], dt=0.01)
+    scene.set(q=cube().affine(0.01 * np.eye(3)))
+    scene.step(150)
+    np.testing.assert_allclose(scene.reduced.points.volume_ratio.numpy(), 1.0, atol=1e-3)
+    x, X = particles(scene), stored(s) * cube().surface_points
+    far = np.linalg.norm(x[:, None] - x, axis=2).max()
+    assert far == pytest.approx(np.linalg.norm(X[:, None] - X, axis=2).max(), rel=1e-3)
+
+
 # -- equal to the body built at that size ------------------------------------------------------------------------------
 
 
@@ -322,6 +330,30 @@ def test_a_stack_and_self_contact():
     x, twin = (particles(scene) for scene in scenes)
     assert scenes[0].reduced.entries.pair_count.numpy().min() > 3
     np.testing.assert_allclose(x, twin, atol=1e-5 * EDGE)
+
+
+def test_ring_squeezed_shut():
+    """The tips of an open ring, pulled at each other by pins, touch as those of the built ring do: to 1e-5 sizes."""
+    s, body = stored(1.3), ring()
+    X = np.array([[0.048, side * 0.014, z] for side in (-1, 1) for z in (-0.01, 0.01)])
+    X = np.concatenate([X, [[-0.05, 0.0, -0.01], [-0.05, 0.0, 0.01]]])
+    pull = np.array([[0.0, 0.0175, 0.0]]) * -np.sign(X[:, 1:2])
+
+    def populate(world, asset, scale):
+        i = add_reduced_body(
+            world, asset, material=Material(youngs_modulus=2.0e4), self_contact=True, contact_radius=0.002, scale=scale
+        )
+        add_pins(world, i, s * X, stiffness=1000.0)
+
+    scenes = both(populate, body, s)
+    for scene in scenes:
+        for k in range(30):
+            scene.control.softmode.pin_target.assign(s * (X + min(k / 20, 1.0) * pull))
+            scene.step()
+    assert scenes[0].reduced.entries.pair_count.numpy()[0] > 0
+    assert scenes[0].reduced.entries.pair_count.numpy()[0] == scenes[1].reduced.entries.pair_count.numpy()[0]
+    x, twin = (particles(scene) for scene in scenes)
+    np.testing.assert_allclose(x, twin, atol=1e-5 * s * EDGE)
 
 
 def test_driven_region():
