@@ -77,8 +77,8 @@ class FlatAdam:
         gradient = torch.where(finite, self.gradient * (self.max_norm / (norm + 1e-6)).clamp(max=1.0), 0.0)
         self.skipped += ~finite
         self.steps += finite
-        self.first.lerp_(gradient, 1.0 - self.BETA1)
-        self.second.lerp_(gradient.square(), 1.0 - self.BETA2)
+        self.first.lerp_(gradient, (1.0 - self.BETA1) * finite)
+        self.second.lerp_(gradient.square(), (1.0 - self.BETA2) * finite)
         steps = self.steps.clamp(min=1.0)
         first = self.first / (1.0 - self.BETA1**steps)
         second = self.second / (1.0 - self.BETA2**steps)

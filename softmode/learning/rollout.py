@@ -193,8 +193,8 @@ def generalized_advantage(
         discount: Discount per step.
         decay: Decay lambda.
     """
-    delta = reward + discount * next_value * (~terminated).float() - value
-    keep = discount * decay * (~done).float()
+    delta = reward + discount * next_value * (~terminated).to(value.dtype) - value
+    keep = discount * decay * (~done).to(value.dtype)
     advantage = torch.empty_like(delta)
     running = torch.zeros_like(delta[0])
     for t in range(len(delta) - 1, -1, -1):
