@@ -38,7 +38,9 @@ class NanGuard:
 
     def keep(self, rollout: Rollout) -> None:
         """Remember the end of a rollout that was fine."""
-        self._past = {name: value[-self.history :].clone() for name, value in self._series(rollout).items()}
+        for name, value in self._series(rollout).items():
+            past = torch.cat([self._past[name], value]) if name in self._past else value
+            self._past[name] = past[-self.history :].clone()
 
     def dump(self, rollout: Rollout, folder: RunFolder, iteration: int, rank: int) -> TrainingDiverged:
         """Write the last steps of the offending worlds; return the error to raise.

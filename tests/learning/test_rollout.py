@@ -5,18 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 
-import gymnasium as gym  # noqa: E402
-from gymnasium.vector import AutoresetMode  # noqa: E402
-from tests.learning.point_env import PointVectorEnv  # noqa: E402
+import gymnasium as gym
+import torch
+from gymnasium.vector import AutoresetMode
 
-from softmode.learning.distributed import Ranks  # noqa: E402
-from softmode.learning.hyperparameters import Hyperparameters  # noqa: E402
-from softmode.learning.networks import ActorCritic  # noqa: E402
-from softmode.learning.ppo import PPO  # noqa: E402
-from softmode.learning.rollout import Collector, generalized_advantage  # noqa: E402
-from softmode.learning.vector_tensors import TensorVectorEnv  # noqa: E402
+from softmode.learning.distributed import Ranks
+from softmode.learning.hyperparameters import Hyperparameters
+from softmode.learning.networks import ActorCritic
+from softmode.learning.ppo import PPO
+from softmode.learning.rollout import Collector, generalized_advantage
+from softmode.learning.vector_tensors import TensorVectorEnv
+from tests.learning.point_env import PointVectorEnv
 
 OPTIONS = Hyperparameters(rollout_steps=40, hidden=(16,), scale_rewards=False, normalize_observations=False)
 
@@ -65,6 +66,7 @@ class Scripted(torch.nn.Module):
         self.env = env
 
     def forward(self, encoding: torch.Tensor) -> torch.Tensor:
+        """Return the means of the actions."""
         return actions(self.env.age, self.env.num_envs)
 
 
@@ -74,7 +76,7 @@ def test_both_autoreset_modes_give_the_same_advantages():
     for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
         env = PointVectorEnv(6, mode=mode)
         collect, ppo = collector(env)
-        ppo.model.actor.mean = Scripted(env)
+        ppo.model.actor.mean = torch.nn.Sequential(Scripted(env))
         with torch.no_grad():
             ppo.model.actor.log_std.fill_(-30.0)  # no exploration
         rollout = collect.collect(torch.Generator())
@@ -110,7 +112,7 @@ def test_truncation_bootstraps_from_the_last_state(mode: AutoresetMode):
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 def test_gymnasium_environments_bootstrap_too(mode: AutoresetMode):
-    """Arrays with None where an episode goes on are read: the pendulum's truncations get the value of its last state."""
+    """Arrays with None where an episode goes on are read: truncations get the value of the pendulum's last state."""
     env = gym.make_vec(
         "Pendulum-v1", 3, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, max_episode_steps=9
     )
