@@ -44,7 +44,7 @@ $(VENV)/.demo: $(VENV)/.created pyproject.toml constraints.txt
 $(VENV)/.dev: $(VENV)/.created pyproject.toml constraints.txt
 	$(INSTALL) --editable '.[dev]' || $(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[dev]'
 	$(BIN)/python -c 'import torch' 2>/dev/null || $(BIN)/python -m pip install --quiet '$(TORCH)'
-	$(BIN)/python -m pip install --quiet stable-baselines3
+	$(BIN)/python -m pip install --quiet stable-baselines3 tensorboard
 	@touch $@ $(VENV)/.demo
 
 lock: $(VENV)/.created  ## pin the newest versions that pyproject.toml allows

@@ -1,4 +1,4 @@
-"""The command line: ``softmode play``, ``softmode list-envs``, ``softmode robots`` and ``softmode splat``."""
+"""The command line: ``softmode play``, ``train``, ``evaluate``, ``list-envs``, ``robots`` and ``splat``."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from softmode import ENVIRONMENTS
 from softmode.cli_common import bar_interval, quiet_warp, warp_device
 from softmode.cli_splat import SplatConvert, SplatFromMesh, SplatInfo
+from softmode.cli_train import Evaluate, Train, policy_file
 from softmode.errors import ConfigError, MaterialError, MissingExtraError, SoftmodeError
 from softmode.film import Film
 
@@ -24,7 +25,7 @@ class Play:
     env: str
     """Id of the environment, for example softmode/LiftSoft-v0."""
     policy: str = "scripted"
-    """scripted, random or zero."""
+    """scripted, random, zero, or the checkpoint of a run, for example runs/LiftSoft-v0/*/best.npz."""
     episodes: int = 1
     """Episodes to play."""
     seed: int = 0
@@ -104,6 +105,8 @@ def main(arguments: list[str] | None = None) -> int:
         ]
         command = tyro.cli(
             Annotated[Play, tyro.conf.subcommand("play")]
+            | Annotated[Train, tyro.conf.subcommand("train")]
+            | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
             | Annotated[ListEnvs, tyro.conf.subcommand("list-envs")]
             | Annotated[Robots, tyro.conf.subcommand("robots")]
             | splat,  # type: ignore[arg-type]
@@ -125,8 +128,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 def play(options: Play) -> int:
     """Play episodes; see :class:`Play`."""
-    if options.policy not in POLICIES:
-        raise ConfigError(f"unknown policy {options.policy!r}", hint=f"use one of {', '.join(POLICIES)}")
+    if options.policy not in POLICIES and not Path(options.policy).suffix:
+        hint = f"use one of {', '.join(POLICIES)}, or a checkpoint (.npz)"
+        raise ConfigError(f"unknown policy {options.policy!r}", hint=hint)
     if options.env not in ENVIRONMENTS:
         raise ConfigError(f"unknown environment {options.env!r}", hint=f"use one of {', '.join(ENVIRONMENTS)}")
     if options.episodes < 1:
@@ -153,6 +157,8 @@ def _play(options: Play, film: Film | None) -> int:
     import warp as wp
 
     started = time.perf_counter()
+    trained = None if options.policy in POLICIES else policy_file(options.policy, options.env)
+    given = dict(trained.env_options) if trained else {}
     with quiet_warp():
         if not any(Path(wp.config.kernel_cache_dir or "").glob("wp_softmode.deformables.kernels_*")):
             print("compiling kernels (first run only, a minute or two)", file=sys.stderr, flush=True)
@@ -160,18 +166,23 @@ def _play(options: Play, film: Film | None) -> int:
             env = gym.make(
                 options.env,
                 render_mode="rgb_array" if film else None,
-                config=_task_config(options),
+                config=_task_config(options, given.pop("config", {})),
+                **given,
                 device=warp_device(options.device),
                 progress=progress,
             )
         try:
+            if trained:
+                trained.check(env)
             body = env.unwrapped.scene.soft.body  # type: ignore[attr-defined]
             print(
                 f"body {body.name!r}: {body.function_count} functions, {body.point_count} cubature points, "
                 f"built in {body.build_seconds:.2f} s; scene ready after {time.perf_counter() - started:.1f} s"
             )
             fps = env.metadata["render_fps"]
-            successes = sum(_play_episode(env, options, options.seed + k, film, fps) for k in range(options.episodes))
+            policy = trained or _policy(options.policy, env)
+            seeds = range(options.seed, options.seed + options.episodes)
+            successes = sum(_play_episode(env, options, policy, seed, film, fps) for seed in seeds)
         finally:
             env.close()
     if film:
@@ -182,7 +193,7 @@ def _play(options: Play, film: Film | None) -> int:
     return 0
 
 
-def _play_episode(env: Any, options: Play, seed: int, film: Film | None, fps: int) -> bool:
+def _play_episode(env: Any, options: Play, policy: Any, seed: int, film: Film | None, fps: int) -> bool:
     """Play one episode, print its outcome, return whether it succeeded."""
     import gymnasium as gym
     from tqdm import tqdm
@@ -190,7 +201,6 @@ def _play_episode(env: Any, options: Play, seed: int, film: Film | None, fps: in
     given = {} if options.youngs_modulus is None else {"youngs_modulus": options.youngs_modulus}
     observation, info = env.reset(seed=seed, options=given)
     env.action_space.seed(seed)
-    policy = _policy(options.policy, env)
     total, steps, seconds = 0.0, 0, 0.0
     limit = gym.spec(options.env).max_episode_steps
     with tqdm(total=limit, desc=f"seed {seed}", unit="step", mininterval=bar_interval()) as bar:
@@ -224,17 +234,19 @@ def _policy(name: str, env: Any) -> Any:
     return lambda observation: zero
 
 
-def _task_config(options: Play) -> Any:
-    """Turn the options that concern the object into a configuration."""
+def _task_config(options: Play, trained: dict[str, Any]) -> Any:
+    """Turn the options that concern the object into a configuration, else as that of a trained policy."""
     from softmode.envs.lift_soft import LiftSoftConfig
     from softmode.envs.objects import ObjectConfig
-    from softmode.envs.table_scene import TableSceneConfig
+    from softmode.learning.config_values import config_of
 
     size = ObjectConfig().size if options.size is None else options.size
     thing = ObjectConfig(
         splat=options.splat, size=size, up=options.up, crop=options.crop, part=options.part, pose=options.pose
     )
-    return LiftSoftConfig(scene=TableSceneConfig(object=thing), mesh_samples=4 if options.video else 1)
+    base = config_of(LiftSoftConfig, trained)
+    scene = dataclasses.replace(base.scene, object=thing) if thing != ObjectConfig() else base.scene
+    return dataclasses.replace(base, scene=scene, mesh_samples=4 if options.video else base.mesh_samples)
 
 
 class _BuildBar:

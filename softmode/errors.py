@@ -46,3 +46,15 @@ class MissingExtraError(SoftmodeError, ImportError):
 
 class SolverDiverged(SoftmodeError, RuntimeError):
     """A step produced no finite state."""
+
+
+class CheckpointError(SoftmodeError, ValueError):
+    """A policy or checkpoint file is missing, damaged, foreign, or belongs to another environment or version."""
+
+
+class RunError(SoftmodeError, OSError):
+    """The folder of a training run exists, is missing, or cannot be written."""
+
+
+class TrainingDiverged(SoftmodeError, RuntimeError):
+    """Training met a value that is not finite."""

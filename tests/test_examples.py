@@ -21,12 +21,12 @@ def test_there_are_examples():
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_example_reads_well(path: Path):
-    """A header with the command, a test_final that main calls, at most 120 lines, no work on import."""
+    """A header with the command, a test_final that main calls, at most 120 lines (training: 220), no work on import."""
     text = path.read_text()
     tree = ast.parse(text)
     assert f"python examples/{path.name}" in (ast.get_docstring(tree) or "")
     assert "def test_final" in text and text.count("test_final(") >= 2
-    assert len(text.splitlines()) <= 120
+    assert len(text.splitlines()) <= (220 if path.stem.startswith("train_") else 120)
     allowed = (ast.Import, ast.ImportFrom, ast.FunctionDef, ast.ClassDef, ast.Assign, ast.AnnAssign, ast.Expr, ast.If)
     assert all(isinstance(node, allowed) for node in tree.body)
     guards = [ast.unparse(node.test) for node in tree.body if isinstance(node, ast.If)]
@@ -36,6 +36,8 @@ def test_example_reads_well(path: Path):
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_example_runs(path: Path, tmp_path: Path):
     """The short version ends without error; its test_final asserts the physics."""
+    if path.stem.startswith("train_"):
+        pytest.importorskip("torch")
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         [sys.executable, str(path), "--short"],

@@ -1,0 +1,188 @@
+"""The commands ``softmode train`` and ``softmode evaluate``."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+from softmode.cli_common import quiet_warp
+from softmode.errors import ConfigError, MissingExtraError
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Train:
+    """Train a policy; several GPUs: torchrun --nproc-per-node 2 -m softmode.cli train ID --device cuda."""
+
+    env: str
+    """Id of the environment, for example softmode/LiftSoft-v0."""
+    algo: Literal["ppo"] = "ppo"
+    """Algorithm."""
+    num_envs: int = 16
+    """Worlds of each process: 16 on a CPU, 4096 on a GPU."""
+    device: str = "cpu"
+    """cpu, cuda:0, or cuda under torchrun."""
+    seed: int = 0
+    """Seed of networks, exploration and worlds."""
+    obs_type: Literal["state", "pixels", "pixels_agent_pos"] | None = None
+    """What the policy sees; the environment's own choice if omitted."""
+    env_options: str = "{}"
+    """Further keyword arguments of the environment as JSON."""
+    total_steps: float | None = None
+    """Environment steps of all worlds together after which training ends; 1e7 if no limit is given."""
+    time_limit: float | None = None
+    """Seconds of training after which it ends."""
+    set: tuple[str, ...] = ()
+    """Hyperparameters other than the preset's, as NAME=VALUE, for example discount=0.97 hidden=[64,64]."""
+    run_dir: Path | None = None
+    """Folder of the run, not there yet; runs/<Env>/<time>[_name] if omitted."""
+    name: str | None = None
+    """Suffix of the folder's name."""
+    resume: bool = False
+    """Go on with the run in --run-dir after it was ended or killed."""
+    init: Path | None = None
+    """Checkpoint of the same environment whose networks training starts from."""
+    nan_guard: bool = False
+    """Check every observation and reward; dump the last steps of worlds that are not finite, and stop."""
+    eval_episodes: int = 200
+    """Episodes of the evaluation at the end; none with 0."""
+    checkpoint_seconds: float = 30.0
+    """Seconds between two checkpoints."""
+
+    def run(self) -> int:
+        """Train; return the exit code."""
+        require_torch()
+        from softmode.learning.train_options import TrainOptions
+        from softmode.learning.trainer import train
+
+        options = TrainOptions(
+            env=self.env,
+            num_envs=self.num_envs,
+            device=self.device,
+            seed=self.seed,
+            total_steps=None if self.total_steps is None else int(self.total_steps),
+            time_limit=self.time_limit,
+            env_options=self._env_options(),
+            overrides=parse_overrides(self.set),
+            run_dir=self.run_dir,
+            name=self.name,
+            resume=self.resume,
+            init=self.init,
+            nan_guard=self.nan_guard,
+            eval_episodes=self.eval_episodes,
+            checkpoint_seconds=self.checkpoint_seconds,
+        )
+        with quiet_warp():
+            try:
+                train(options, report=lambda line: print(line, flush=True))
+            except KeyboardInterrupt:
+                return 130
+        return 0
+
+    def _env_options(self) -> dict[str, Any]:
+        options = parse_env_options(self.env_options)
+        return options if self.obs_type is None else {**options, "obs_type": self.obs_type}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Evaluate:
+    """Play whole episodes with a trained policy and print how often it succeeds."""
+
+    env: str
+    """Id of the environment, for example softmode/LiftSoft-v0."""
+    policy: Path
+    """Checkpoint of a run, for example best.npz."""
+    episodes: int = 200
+    """Number of episodes."""
+    num_envs: int = 16
+    """Worlds that play them."""
+    device: str = "cpu"
+    """cpu or cuda:0."""
+    seed: int = 1_000_000_000
+    """Seed of the first world; the others' count up."""
+    obs_type: Literal["state", "pixels", "pixels_agent_pos"] | None = None
+    """What the policy sees; as in its run if omitted."""
+    env_options: str = "{}"
+    """Further keyword arguments of the environment as JSON."""
+
+    def run(self) -> int:
+        """Evaluate; return the exit code."""
+        require_torch()
+        from softmode.learning.distributed import local_device
+        from softmode.learning.environments import make_vector_env
+        from softmode.learning.policy import evaluate, load_policy
+
+        if self.num_envs < 1:
+            raise ConfigError(f"num_envs must be at least 1, got {self.num_envs}", hint="give a count like 16")
+        policy = load_policy(self.policy, self.device)
+        options = {**policy.env_options, **parse_env_options(self.env_options)}
+        if self.obs_type is not None:
+            options["obs_type"] = self.obs_type
+        device = local_device(self.device)
+        with quiet_warp():
+            env = make_vector_env(self.env, self.num_envs, device, options)
+            try:
+                policy.check(env)
+                print(evaluate(env, policy, self.episodes, seed=self.seed, device=device))
+            finally:
+                env.close()
+        return 0
+
+
+def policy_file(path: str, env: str) -> Any:
+    """Return the policy in a checkpoint of an environment.
+
+    Raises:
+        CheckpointError: If the file is missing, damaged, foreign, or of another environment.
+        MissingExtraError: If torch is not installed.
+    """
+    require_torch()
+    from softmode.errors import CheckpointError
+    from softmode.learning.policy import load_policy
+
+    policy = load_policy(path)
+    if policy.env != env:
+        raise CheckpointError(f"checkpoint {path} is of {policy.env}, not of {env}", hint=f"play {policy.env}")
+    return policy
+
+
+def require_torch() -> None:
+    """Raise MissingExtraError where torch is not installed."""
+    try:
+        import torch  # noqa: F401
+    except ImportError as error:
+        raise MissingExtraError("training needs torch", hint="install it with: pip install 'softmode[rl]'") from error
+
+
+def parse_env_options(text: str) -> dict[str, Any]:
+    """Return the keyword arguments in a JSON object.
+
+    Raises:
+        ConfigError: If it is none.
+    """
+    try:
+        options = json.loads(text)
+    except ValueError as error:
+        raise ConfigError(f"env-options is no JSON ({error})", hint='write it like {"obs_type": "state"}') from error
+    if not isinstance(options, dict):
+        raise ConfigError("env-options is no JSON object", hint='write it like {"obs_type": "state"}')
+    return options
+
+
+def parse_overrides(pairs: tuple[str, ...]) -> dict[str, Any]:
+    """Return the values of NAME=VALUE pairs; a value is JSON, or a word.
+
+    Raises:
+        ConfigError: If a pair is none.
+    """
+    overrides: dict[str, Any] = {}
+    for pair in pairs:
+        name, equals, text = pair.partition("=")
+        if not equals or not name:
+            raise ConfigError(f"{pair!r} is no NAME=VALUE", hint="write it like discount=0.97")
+        try:
+            overrides[name.replace("-", "_")] = json.loads(text)
+        except ValueError:
+            overrides[name.replace("-", "_")] = text
+    return overrides

@@ -1,0 +1,180 @@
+"""Checkpoint files: one .npz without pickle, arrays by name and everything else in a JSON header."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import math
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softmode import __version__
+from softmode.atomic import atomic_write
+from softmode.errors import CheckpointError, ConfigError
+from softmode.learning.hyperparameters import Hyperparameters
+from softmode.learning.spaces import Interface
+
+FORMAT = "softmode.Checkpoint"
+FORMAT_VERSION = 1
+MAX_HEADER = 1 << 20
+"""Largest header that is read [bytes]."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Checkpoint:
+    """A policy and, unless it was exported without, what training goes on from."""
+
+    env: str
+    """Id of the environment."""
+    env_options: dict[str, Any]
+    """Keyword arguments that it was made with."""
+    interface: Interface
+    """Spaces of the environment."""
+    privileged: int
+    """Length of the full state that the critic reads, 0 if it reads what the actor sees."""
+    hyperparameters: Hyperparameters
+    """Hyperparameters of the run."""
+    progress: dict[str, Any]
+    """Counters of the run: iteration, env_steps, seconds, seed, best and others."""
+    arrays: dict[str, NDArray[Any]]
+    """Arrays by name: ``actor.*``, ``critic.*``, ``predict.*``, ``optimizer.*``, ``reward.*``."""
+
+    def part(self, prefix: str) -> dict[str, NDArray[Any]]:
+        """Return the arrays below a prefix, without it."""
+        return {name[len(prefix) + 1 :]: a for name, a in self.arrays.items() if name.startswith(prefix + ".")}
+
+
+def write_checkpoint(checkpoint: Checkpoint, path: str | os.PathLike[str]) -> None:
+    """Write a checkpoint; the file appears complete or not at all.
+
+    Raises:
+        OSError: If it cannot be written; what was there before stays.
+    """
+    header = {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        "softmode": __version__,
+        "env": checkpoint.env,
+        "env_options": checkpoint.env_options,
+        "interface": checkpoint.interface.to_json(),
+        "privileged": checkpoint.privileged,
+        "hyperparameters": checkpoint.hyperparameters.to_json(),
+        "progress": checkpoint.progress,
+        "arrays": sorted(checkpoint.arrays),
+    }
+    arrays = dict(checkpoint.arrays)
+    arrays["header"] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **arrays)
+    with atomic_write(path) as file:
+        file.write(buffer.getbuffer())
+
+
+def read_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
+    """Read a file that :func:`write_checkpoint` wrote. No code in it is ever run.
+
+    Raises:
+        CheckpointError: If the file is missing, damaged, foreign, or of another version.
+    """
+    hint = "give the policy.npz, best.npz or latest.npz of a run of this version of softmode"
+    try:
+        stored = _read_arrays(Path(path))
+        header = json.loads(stored.pop("header").tobytes().decode())
+    except FileNotFoundError as error:
+        raise CheckpointError(f"checkpoint {path} does not exist", hint=hint) from error
+    except OSError as error:
+        raise CheckpointError(f"checkpoint {path} cannot be read ({error.strerror or error})", hint=hint) from error
+    except KeyError as error:
+        raise CheckpointError(f"{path} is no checkpoint of softmode: it has no header", hint=hint) from error
+    except RecursionError as error:
+        raise CheckpointError(f"{path} is no checkpoint of softmode: its header is nested", hint=hint) from error
+    except Exception as error:  # errors of a damaged archive have no common base
+        raise CheckpointError(
+            f"checkpoint {path} is damaged or no .npz file ({type(error).__name__}: {error})", hint=hint
+        ) from error
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise CheckpointError(f"{path} is no checkpoint of softmode", hint=hint)
+    if header.get("version") != FORMAT_VERSION:
+        raise CheckpointError(
+            f"checkpoint {path} has format version {header.get('version')}, this softmode reads {FORMAT_VERSION}",
+            hint="train again, or use the version of softmode that wrote it: " + str(header.get("softmode")),
+        )
+    try:
+        if header["arrays"] != sorted(stored):
+            raise ValueError("arrays are missing or were added")
+        progress, privileged = header["progress"], header["privileged"]
+        env_options = header["env_options"]
+        if not (isinstance(progress, dict) and isinstance(env_options, dict) and isinstance(header["env"], str)):
+            raise TypeError("a field has another type")
+        if not isinstance(privileged, int) or isinstance(privileged, bool) or not 0 <= privileged < 2**31:
+            raise TypeError("privileged is no length")
+        for name, array in stored.items():
+            if not np.all(np.isfinite(array)):
+                raise ValueError(f"{name} is not finite")
+        return Checkpoint(
+            env=header["env"],
+            env_options=env_options,
+            interface=Interface.from_json(header["interface"]),
+            privileged=privileged,
+            hyperparameters=Hyperparameters.from_json(header["hyperparameters"]),
+            progress=progress,
+            arrays=stored,
+        )
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, ConfigError) as error:
+        raise CheckpointError(f"checkpoint {path} is damaged ({error})", hint=hint) from error
+
+
+def check_env(checkpoint: Checkpoint, path: object, env: str | None, interface: Interface) -> None:
+    """Refuse a checkpoint of another environment or other spaces.
+
+    Raises:
+        CheckpointError: If it is one.
+    """
+    if env is not None and checkpoint.env != env:
+        raise CheckpointError(f"checkpoint {path} is of {checkpoint.env}, not of {env}", hint=f"play {checkpoint.env}")
+    if checkpoint.interface != interface:
+        raise CheckpointError(
+            f"checkpoint {path} was trained with other spaces: {_describe(checkpoint.interface)}, "
+            f"the environment has {_describe(interface)}",
+            hint="use the obs_type, action type and picture size of its run, see config.json there",
+        )
+
+
+def _describe(interface: Interface) -> str:
+    seen = {**interface.vectors, **interface.pictures}
+    return f"observation {seen}, action {interface.action_size} in {interface.action_low} to {interface.action_high}"
+
+
+def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an uncompressed .npz file; nothing larger than the file is ever allocated."""
+    arrays: dict[str, NDArray[Any]] = {}
+    with zipfile.ZipFile(path) as archive:
+        for member in archive.infolist():
+            if member.compress_type != zipfile.ZIP_STORED or member.file_size != member.compress_size:
+                raise ValueError(f"{member.filename} is compressed")
+            name = member.filename.removesuffix(".npy")
+            if name == "header" and member.file_size > MAX_HEADER:
+                raise ValueError("the header is too large")
+            if name in arrays:
+                raise ValueError(f"{name} is there twice")
+            arrays[name] = _parse_array(archive.read(member), name)
+    return arrays
+
+
+def _parse_array(content: bytes, name: str) -> NDArray[Any]:
+    """Return the array in the bytes of a .npy file of numbers."""
+    stream = io.BytesIO(content)
+    if np.lib.format.read_magic(stream) != (1, 0):
+        raise ValueError(f"{name} has another version of the .npy format")
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+    if fortran or dtype.kind not in "fiu" or dtype.hasobject:
+        raise ValueError(f"{name} holds no plain numbers")
+    if any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize != len(content) - stream.tell():
+        raise ValueError(f"{name} has another size than its shape says")
+    return np.frombuffer(content, dtype, offset=stream.tell()).reshape(shape).copy()

@@ -1,0 +1,50 @@
+"""Vector environments to train on, by id and options that JSON can hold."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import gymnasium as gym
+import torch
+
+from softmode import ENVIRONMENTS
+from softmode.errors import ConfigError
+from softmode.learning.config_values import config_of
+
+
+def make_vector_env(env: str, num_envs: int, device: torch.device, options: dict[str, Any]) -> gym.vector.VectorEnv:
+    """Return the vector environment of an id: softmode's own with tensors on the device, others as gymnasium has them.
+
+    Args:
+        env: Id of the environment.
+        num_envs: Number of worlds.
+        device: Where a softmode environment computes.
+        options: Keyword arguments of the environment; ``config`` may be a dict of the fields that differ.
+
+    Raises:
+        ConfigError: If the id is not registered or an option is unknown.
+    """
+    given = dict(options)
+    try:
+        spec = gym.spec(env)
+        if env not in ENVIRONMENTS:
+            return gym.make_vec(env, num_envs=num_envs, vectorization_mode="sync", **given)
+    except (gym.error.UnregisteredEnv, gym.error.NameNotFound, gym.error.NamespaceNotFound) as error:
+        raise ConfigError(f"unknown environment {env!r}", hint=f"use one of {', '.join(ENVIRONMENTS)}") from error
+    if isinstance(given.get("config"), dict):
+        given["config"] = config_of(env_class(spec).task_class.config_class, given["config"])
+    try:
+        return gym.make_vec(env, num_envs=num_envs, **{"device": str(device), "output": "torch", **given})
+    except TypeError as error:
+        if "unexpected keyword" not in str(error):
+            raise
+        raise ConfigError(
+            f"unknown option of {env}: {error}", hint="see the documentation of the environment"
+        ) from error
+
+
+def env_class(spec: Any) -> Any:
+    """Return the class of a registered vector environment."""
+    module, _, name = str(spec.vector_entry_point).partition(":")
+    return getattr(importlib.import_module(module), name)

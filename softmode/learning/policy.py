@@ -1,0 +1,246 @@
+"""Trained policies: loading them from a file, and how often they succeed."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from softmode.errors import CheckpointError, ConfigError
+from softmode.learning.checkpoints import Checkpoint, check_env, read_checkpoint
+from softmode.learning.distributed import local_device
+from softmode.learning.networks import Actor, Observation
+from softmode.learning.spaces import Interface
+from softmode.learning.vector_tensors import TensorVectorEnv
+
+EVALUATION_SEED = 1_000_000_000
+"""First seed of evaluation episodes; training draws its seeds below."""
+
+
+class Policy:
+    """A deterministic policy: the mean of the trained Gaussian.
+
+    Call it with the observation of a single environment or of a vector environment, arrays or tensors; it returns an
+    action of the same kind in the environment's own range.
+
+    Args:
+        checkpoint: What to load; optimizer and critic are not read.
+        device: Where it computes.
+        path: Named in errors.
+
+    Raises:
+        CheckpointError: If arrays are missing or have other shapes than the header says.
+    """
+
+    def __init__(self, checkpoint: Checkpoint, device: torch.device, path: object = "") -> None:
+        """Build the actor."""
+        self.env = checkpoint.env
+        self.env_options = checkpoint.env_options
+        self.interface = checkpoint.interface
+        self.checkpoint, self.device, self._path = checkpoint, device, path
+        self.actor = actor_of(checkpoint, device, path)
+        low = torch.tensor(self.interface.action_low, device=device)
+        high = torch.tensor(self.interface.action_high, device=device)
+        self._center, self._half = (high + low) / 2.0, (high - low) / 2.0
+
+    def check(self, env: Any) -> None:
+        """Refuse an environment other than the policy's.
+
+        Raises:
+            CheckpointError: If id or spaces differ.
+        """
+        spec = getattr(env, "spec", None)
+        check_env(self.checkpoint, self._path, None if spec is None else spec.id, Interface.of(env))
+
+    @torch.no_grad()
+    def __call__(self, observation: Any) -> Any:
+        """Return the action for one observation or a batch of them."""
+        if not isinstance(observation, dict):
+            key = next(iter((*self.interface.vectors, *self.interface.pictures)))
+            observation = {key: observation}
+        ranks = {**dict.fromkeys(self.interface.vectors, 1), **dict.fromkeys(self.interface.pictures, 3)}
+        try:
+            tensors: Observation = {
+                key: torch.as_tensor(observation[key], device=self.device).to(
+                    torch.uint8 if key in self.interface.pictures else torch.float32
+                )
+                for key in ranks
+            }
+        except KeyError as error:
+            raise ConfigError(f"the observation has no {error}", hint="use the obs_type of the policy's run") from error
+        single = all(tensors[key].ndim == rank for key, rank in ranks.items())
+        if single:
+            tensors = {key: value[None] for key, value in tensors.items()}
+        shapes = {**{key: (size,) for key, size in self.interface.vectors.items()}, **self.interface.pictures}
+        for key, shape in shapes.items():
+            if tuple(tensors[key].shape[1:]) != shape:
+                raise ConfigError(
+                    f"observation {key} has shape {tuple(tensors[key].shape)}, expected (n, *{shape}) or {shape}",
+                    hint="use the obs_type of the policy's run",
+                )
+        action = self._center + self._half * self.actor(tensors)
+        action = action[0] if single else action
+        given = next(iter(observation.values()))
+        return action if isinstance(given, torch.Tensor) else action.cpu().numpy()
+
+
+def load_policy(path: str | os.PathLike[str], device: str = "cpu") -> Policy:
+    """Load a policy from a checkpoint of a run.
+
+    Args:
+        path: The file.
+        device: Where the policy computes, for example cpu or cuda:0.
+
+    Raises:
+        CheckpointError: If the file is missing, damaged, foreign, or of another version.
+        ConfigError: If the device is not there.
+    """
+    return Policy(read_checkpoint(path), local_device(device), path)
+
+
+def actor_of(checkpoint: Checkpoint, device: torch.device, path: object = "") -> Actor:
+    """Return the actor of a checkpoint.
+
+    Raises:
+        CheckpointError: If arrays are missing or have other shapes than the header says.
+    """
+    try:
+        with torch.device("meta"):  # takes no memory whatever the header says
+            actor = Actor(checkpoint.interface, checkpoint.hyperparameters)
+        arrays = {name: torch.from_numpy(array) for name, array in checkpoint.part("actor").items()}
+        for name, value in actor.state_dict().items():
+            if name in arrays and arrays[name].dtype != value.dtype:
+                raise ValueError(f"{name} is {arrays[name].dtype}, not {value.dtype}")
+        actor.load_state_dict(arrays, strict=True, assign=True)
+    except (RuntimeError, ValueError, TypeError, OverflowError) as error:
+        raise CheckpointError(
+            f"checkpoint {path} holds other arrays than its header says ({error})", hint="use the file of another run"
+        ) from error
+    return actor.to(device).eval()
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """How a policy did over whole episodes."""
+
+    episodes: int
+    """Number of episodes."""
+    success_rate: float | None
+    """Share of episodes that ended in success; none where the environment does not tell."""
+    mean_return: float
+    """Mean undiscounted return."""
+    std_return: float
+    """Standard deviation of the return."""
+    mean_length: float
+    """Mean length [control steps]."""
+
+    def interval(self) -> tuple[float, float]:
+        """Return the 95 % interval of the success rate (Wilson 1927)."""
+        n, p, z = self.episodes, self.success_rate or 0.0, 1.96
+        center = (p + z * z / (2 * n)) / (1 + z * z / n)
+        half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+        return max(center - half, 0.0), min(center + half, 1.0)
+
+    def __str__(self) -> str:
+        """Return one line for people."""
+        line = f"{self.episodes} episodes: return {self.mean_return:.4g} +- {self.std_return:.3g}"
+        line += f", length {self.mean_length:.1f}"
+        if self.success_rate is None:
+            return line
+        low, high = self.interval()
+        return f"{line}, success {100 * self.success_rate:.1f} % (95 %: {100 * low:.1f} to {100 * high:.1f})"
+
+
+@torch.no_grad()
+def evaluate(
+    env: gym.Env | gym.vector.VectorEnv,
+    policy: Callable[[Any], Any],
+    episodes: int = 200,
+    *,
+    seed: int = EVALUATION_SEED,
+    device: str | torch.device = "cpu",
+) -> Evaluation:
+    """Play whole episodes and count.
+
+    Every world plays its share of the episodes, its first ones, however long the others' are: short episodes are not
+    counted more often than long ones, as they would be if the first ``episodes`` to end were taken.
+
+    Args:
+        env: A single or a vector environment (NEXT_STEP or SAME_STEP).
+        policy: Gives actions in the environment's own range, as :class:`Policy` does.
+        episodes: Number of episodes.
+        seed: Seed of the first world; the others' count up.
+        device: Where a vector environment's tensors are.
+
+    Raises:
+        ConfigError: If ``episodes`` is not at least 1 or the worlds do not reset themselves.
+    """
+    if episodes < 1:
+        raise ConfigError(f"episodes must be at least 1, got {episodes}", hint="give a count like 200")
+    if isinstance(env, gym.vector.VectorEnv):
+        return _evaluate_vector(env, policy, episodes, seed, torch.device(device))
+    returns, lengths, successes = [], [], []
+    for k in range(episodes):
+        observation, info = env.reset(seed=seed + k)
+        total, length, done = 0.0, 0, False
+        while not done:
+            observation, reward, terminated, truncated, info = env.step(policy(observation))
+            total, length, done = total + float(reward), length + 1, terminated or truncated
+        returns.append(total)
+        lengths.append(length)
+        successes.append(info.get("is_success"))
+    known = all(success is not None for success in successes)
+    return _summary(np.array(returns), np.array(lengths), np.array(successes, float) if known else None)
+
+
+def _evaluate_vector(
+    env: gym.vector.VectorEnv, policy: Callable[[Any], Any], episodes: int, seed: int, device: torch.device
+) -> Evaluation:
+    worlds = TensorVectorEnv(env, device)
+    n = worlds.count
+    # The first worlds play one episode more than the last where the number does not divide.
+    quota = torch.tensor([episodes // n + (i < episodes % n) for i in range(n)], device=device)
+    played = torch.zeros_like(quota)
+    sums = torch.zeros(3, n, device=device)  # running return, length of this episode; unused in the last row
+    ended: list[torch.Tensor] = []
+    observation, _ = env.reset(seed=seed)
+    just_reset = torch.zeros(n, dtype=torch.bool, device=device)
+    knows = False
+    step_index = 0
+    while True:
+        step = worlds.step_raw(policy(observation))
+        observation = step.raw
+        done = step.terminated | step.truncated
+        valid = torch.ones(n, device=device) if worlds.same_step else (~just_reset).float()
+        sums[0] += step.reward * valid
+        sums[1] += valid
+        counted = done & (played < quota)
+        success = torch.zeros(n, device=device) if step.success is None else step.success
+        knows |= step.success is not None
+        ended.append(torch.stack([counted.float(), sums[0], sums[1], success]))
+        played += counted
+        sums *= (~done).float()
+        just_reset = done
+        step_index += 1
+        # The host looks only now and then, so that the device is not kept waiting.
+        if step_index % 16 == 0 and bool((played >= quota).all()):
+            break
+    table = torch.stack(ended).permute(0, 2, 1).flatten(0, 1).cpu().numpy()
+    table = table[table[:, 0] > 0]
+    return _summary(table[:, 1], table[:, 2], table[:, 3] if knows else None)
+
+
+def _summary(returns: np.ndarray, lengths: np.ndarray, successes: np.ndarray | None) -> Evaluation:
+    return Evaluation(
+        episodes=len(returns),
+        success_rate=None if successes is None else float(np.mean(successes)),
+        mean_return=float(np.mean(returns)),
+        std_return=float(np.std(returns)),
+        mean_length=float(np.mean(lengths)),
+    )

@@ -1,0 +1,165 @@
+"""The folder of a run: its configuration, the table of its progress, its checkpoints."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import re
+import time
+from pathlib import Path
+from typing import Any
+
+from softmode.atomic import atomic_write
+from softmode.errors import MissingExtraError, RunError
+
+CONFIG, PROGRESS, LATEST, BEST = "config.json", "progress.csv", "latest.npz", "best.npz"
+"""Names of the files of a run."""
+
+
+class RunFolder:
+    """A folder that one run writes to.
+
+    Args:
+        path: The folder.
+        resume: Whether it must hold a run to go on with, or must not be there.
+        writes: Whether this process makes the folder, or another did.
+
+    Raises:
+        RunError: If it is there and should not be, is missing and should be there, or cannot be made.
+    """
+
+    def __init__(self, path: Path, *, resume: bool, writes: bool = True) -> None:
+        """Make the folder or find the run in it."""
+        self.path = path
+        self._writer: Any = None
+        self._columns: list[str] | None = None
+        if not writes:
+            return
+        if resume:
+            if not (path / CONFIG).is_file() or not (path / LATEST).is_file():
+                raise RunError(
+                    f"{path} holds no run to go on with ({CONFIG} and {LATEST})",
+                    hint="give the folder of a run, or drop --resume to start one",
+                )
+            return
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError as error:
+            raise RunError(
+                f"run folder {path} exists", hint="choose another one, or go on with its run: --resume"
+            ) from error
+        except OSError as error:
+            raise RunError(
+                f"run folder {path} cannot be made ({error.strerror or error})", hint="choose another folder"
+            ) from error
+
+    @staticmethod
+    def name_for(root: Path, env: str, name: str | None) -> Path:
+        """Return ``root/<Env>/<YYYYmmdd-HHMMSS>[_name]``, a folder that is not there yet."""
+        base = root / env.rpartition("/")[2] / (time.strftime("%Y%m%d-%H%M%S") + (f"_{name}" if name else ""))
+        path, k = base, 1
+        while path.exists():
+            path, k = base.with_name(f"{base.name}-{k}"), k + 1
+        return path
+
+    def write_config(self, config: dict[str, Any]) -> None:
+        """Write the configuration of the run."""
+        self.write(CONFIG, json.dumps(config, indent=2).encode() + b"\n")
+
+    def read_config(self) -> dict[str, Any]:
+        """Return the configuration of the run.
+
+        Raises:
+            RunError: If it cannot be read.
+        """
+        try:
+            config = json.loads((self.path / CONFIG).read_text())
+        except (OSError, ValueError, RecursionError) as error:
+            raise RunError(f"{self.path / CONFIG} cannot be read ({error})", hint="start a new run") from error
+        if not isinstance(config, dict):
+            raise RunError(f"{self.path / CONFIG} is no configuration", hint="start a new run")
+        return config
+
+    def write(self, name: str, content: bytes) -> None:
+        """Write a file; it appears complete or not at all.
+
+        Raises:
+            RunError: If it cannot be written; what was there before stays.
+        """
+        try:
+            with atomic_write(self.path / name) as file:
+                file.write(content)
+        except OSError as error:
+            raise self.cannot_write(name, error) from error
+
+    def cannot_write(self, name: str, error: OSError) -> RunError:
+        """Return the error of a file that could not be written."""
+        return RunError(
+            f"{self.path / name} cannot be written ({error.strerror or error})",
+            hint=f"earlier checkpoints are intact: free some space and go on with --run-dir {self.path} --resume",
+        )
+
+    def forget_after(self, iteration: int) -> None:
+        """Drop rows of the table behind the checkpoint that the run goes on from."""
+        try:
+            with (self.path / PROGRESS).open(newline="") as file:
+                rows = list(csv.reader(file))
+        except (OSError, csv.Error):
+            return
+        if not rows:
+            return
+        kept = [row for row in rows[1:] if len(row) == len(rows[0]) and re.fullmatch(r"\d+", row[0])]
+        kept = [row for row in kept if int(row[0]) <= iteration]
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([rows[0], *kept])
+        self.write(PROGRESS, text.getvalue().encode())
+        self._columns = rows[0]
+
+    def log(self, row: dict[str, float | int | None]) -> None:
+        """Append a row to the table and to TensorBoard; the first entry is the iteration.
+
+        Raises:
+            RunError: If it cannot be written.
+        """
+        try:
+            if self._columns is None:
+                self._columns = list(row)
+                (self.path / PROGRESS).write_text(",".join(self._columns) + "\n")
+            cells = (row.get(name) for name in self._columns)
+            texts = ("" if cell is None else f"{cell:.6g}" if isinstance(cell, float) else str(cell) for cell in cells)
+            with (self.path / PROGRESS).open("a") as file:
+                file.write(",".join(texts) + "\n")
+        except OSError as error:
+            raise self.cannot_write(PROGRESS, error) from error
+        if self._writer is not None:
+            try:
+                for name, value in row.items():
+                    if value is not None and name not in ("iteration", "env_steps"):
+                        self._writer.add_scalar(name, value, row["env_steps"])
+            except OSError as error:
+                raise self.cannot_write("tensorboard", error) from error
+
+    def start_tensorboard(self, purge_after: int | None) -> None:
+        """Write scalars for TensorBoard too.
+
+        Args:
+            purge_after: Environment step behind which earlier scalars are hidden, for runs that go on.
+
+        Raises:
+            MissingExtraError: If tensorboard is not installed.
+        """
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError as error:
+            raise MissingExtraError(
+                "TensorBoard scalars need tensorboard", hint="install it with: pip install 'softmode[rl]'"
+            ) from error
+        self._writer = SummaryWriter(os.fspath(self.path / "tensorboard"), purge_step=purge_after)
+
+    def close(self) -> None:
+        """Flush TensorBoard."""
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None

@@ -1,0 +1,113 @@
+"""What a training run is asked for, and how it ended."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from softmode.errors import ConfigError
+from softmode.learning.hyperparameters import Hyperparameters, preset
+
+if TYPE_CHECKING:
+    from softmode.learning.policy import Evaluation
+
+DEFAULT_STEPS = 10_000_000
+"""Environment steps of a run without a limit."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainOptions:
+    """What to train, how long, and where the run is kept.
+
+    Raises:
+        ConfigError: If an option lies outside its range.
+    """
+
+    env: str
+    """Id of the environment."""
+    num_envs: int = 16
+    """Worlds of each process."""
+    device: str = "cpu"
+    """cpu, cuda:0, or cuda under torchrun."""
+    seed: int = 0
+    """Seed of networks, exploration and worlds."""
+    total_steps: int | None = None
+    """Environment steps of all worlds together after which training ends; ten million if no limit is given."""
+    time_limit: float | None = None
+    """Seconds of training after which it ends, those before a resumption included."""
+    env_options: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Keyword arguments of the environment as JSON values, for example obs_type; config as a dict of its fields."""
+    hyperparameters: Hyperparameters | None = None
+    """The preset of the number of worlds if omitted."""
+    overrides: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Hyperparameters that differ from those."""
+    run_dir: Path | None = None
+    """Folder of the run; runs/<Env>/<time>[_name] if omitted."""
+    name: str | None = None
+    """Suffix of the folder's name."""
+    resume: bool = False
+    """Go on with the run in run_dir: its worlds, seed and hyperparameters are taken from there."""
+    init: Path | None = None
+    """Checkpoint of the same environment whose networks training starts from."""
+    nan_guard: bool = False
+    """Check every observation and reward, and dump the last steps of worlds that are not finite."""
+    eval_episodes: int = 200
+    """Episodes of the evaluation at the end; none with 0."""
+    checkpoint_seconds: float = 30.0
+    """Seconds between two checkpoints."""
+    tensorboard: bool = True
+    """Write scalars for TensorBoard where it is installed; progress.csv is always written."""
+
+    def __post_init__(self) -> None:
+        """Check every range."""
+        if self.num_envs < 1:
+            raise ConfigError(f"num_envs must be at least 1, got {self.num_envs}", hint="give a count like 16")
+        if not 0 <= self.seed < 2**31:
+            raise ConfigError(f"seed must lie in 0..2^31-1, got {self.seed}", hint="give a whole number like 0")
+        if self.total_steps is not None and self.total_steps < 1:
+            raise ConfigError(f"total_steps must be at least 1, got {self.total_steps}", hint="give a count like 1e6")
+        if self.time_limit is not None and not 0.0 < self.time_limit < math.inf:
+            raise ConfigError(f"time_limit must be > 0 s, got {self.time_limit}", hint="give seconds like 300")
+        if self.eval_episodes < 0:
+            raise ConfigError(f"eval_episodes must be at least 0, got {self.eval_episodes}", hint="0 evaluates nothing")
+        if not self.checkpoint_seconds >= 0.0:
+            raise ConfigError(f"checkpoint_seconds must be >= 0, got {self.checkpoint_seconds}", hint="give seconds")
+        if self.resume and self.run_dir is None:
+            raise ConfigError("resume needs the folder of the run", hint="name it with --run-dir")
+        if self.resume and self.init is not None:
+            raise ConfigError("resume and init exclude each other", hint="drop --init: the run has its own networks")
+        if self.name is not None and ("/" in self.name or self.name in ("", ".", "..")):
+            raise ConfigError(f"name {self.name!r} is no suffix of a folder", hint="give a word like baseline")
+        try:
+            json.dumps(self.env_options)
+        except (TypeError, ValueError) as error:
+            raise ConfigError(
+                f"env_options hold what JSON cannot ({error})", hint="give config as a dict of the fields that differ"
+            ) from error
+
+    def resolved(self, worlds: int) -> Hyperparameters:
+        """Return the hyperparameters of a run with this many worlds on all ranks together.
+
+        Raises:
+            ConfigError: If an override is unknown or outside its range.
+        """
+        pixels = "pixels" in str(self.env_options.get("obs_type", ""))
+        base = self.hyperparameters or preset(worlds, pixels=pixels)
+        return Hyperparameters.from_json({**base.to_json(), **self.overrides})
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainResult:
+    """How a run ended."""
+
+    run_dir: Path
+    """Folder of the run."""
+    env_steps: int
+    """Environment steps of all worlds together."""
+    seconds: float
+    """Seconds of training."""
+    evaluation: Evaluation | None
+    """Evaluation of the last policy; None on other ranks than the first, or if it was switched off."""

@@ -1,0 +1,373 @@
+"""A training run from its first step to its evaluation."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import platform
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from softmode import __version__
+from softmode.errors import CheckpointError, ConfigError, MissingExtraError, RunError, TrainingDiverged
+from softmode.learning.checkpoints import Checkpoint, check_env, read_checkpoint, write_checkpoint
+from softmode.learning.distributed import Ranks, local_device
+from softmode.learning.environments import make_vector_env
+from softmode.learning.nan_guard import NanGuard
+from softmode.learning.networks import ActorCritic
+from softmode.learning.policy import EVALUATION_SEED, Policy, evaluate
+from softmode.learning.ppo import PPO
+from softmode.learning.rollout import Collector, Rollout
+from softmode.learning.run_folder import BEST, LATEST, RunFolder
+from softmode.learning.train_options import DEFAULT_STEPS, TrainOptions, TrainResult
+from softmode.learning.training_log import WINDOW, TrainingLog, describe
+from softmode.learning.vector_tensors import TensorVectorEnv
+
+MakeVectorEnv = Callable[[str, int, torch.device, dict[str, Any]], gym.vector.VectorEnv]
+
+
+def train(
+    options: TrainOptions, *, make: MakeVectorEnv = make_vector_env, report: Callable[[str], None] = print
+) -> TrainResult:
+    """Train a policy.
+
+    Under torchrun every process steps its own worlds, gradients are averaged, and the first process writes.
+
+    Args:
+        options: What to train.
+        make: Makes the worlds of this process: id, number of worlds, device, options of the environment.
+        report: Takes one line per iteration, on the first rank.
+
+    Raises:
+        ConfigError: If an option lies outside its range or the device is not there.
+        CheckpointError: If the checkpoint to start from cannot be used.
+        RunError: If the folder exists, is missing, or cannot be written; earlier checkpoints stay intact.
+        TrainingDiverged: If a value is not finite; earlier checkpoints stay intact.
+    """
+    device = local_device(options.device)
+    ranks = Ranks.start(device)
+    run = None
+    try:
+        options, start = _starting_point(options)
+        if ranks.rank == 0 and not options.resume and options.run_dir is not None and options.run_dir.exists():
+            RunFolder(options.run_dir, resume=False)  # refuses, before the worlds are built
+        worlds = make(options.env, options.num_envs, device, options.env_options)
+        try:
+            run = _Run(options, TensorVectorEnv(worlds, device), ranks, start, report)
+            run.loop()
+            return run.finish()
+        finally:
+            worlds.close()
+            if run is not None:
+                run.folder.close()
+    finally:
+        ranks.stop()
+
+
+def _starting_point(options: TrainOptions) -> tuple[TrainOptions, Checkpoint | None]:
+    """Return the options, those of the run that goes on where they are its own, and the checkpoint to start from."""
+    if not options.resume:
+        return options, None if options.init is None else read_checkpoint(options.init)
+    assert options.run_dir is not None
+    config = RunFolder(options.run_dir, resume=True).read_config()
+    start = read_checkpoint(options.run_dir / LATEST)
+    if start.env != options.env:
+        raise CheckpointError(
+            f"the run in {options.run_dir} trains {start.env}, not {options.env}", hint=f"train {start.env}"
+        )
+    try:
+        for name in ("iteration", "env_steps", "seconds", "resumed", "best_success", "best_return"):
+            if not isinstance(start.progress[name], int | float):
+                raise TypeError(name)
+        return dataclasses.replace(
+            options,
+            num_envs=int(config["num_envs"]),
+            seed=int(config["seed"]),
+            env_options=start.env_options,
+            hyperparameters=start.hyperparameters,
+        ), start
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunError(
+            f"the run in {options.run_dir} cannot go on: {error} is missing or of another type",
+            hint="start a new run, with --init if its policy is worth it",
+        ) from error
+
+
+class _Run:
+    """The state of a run."""
+
+    def __init__(
+        self,
+        options: TrainOptions,
+        env: TensorVectorEnv,
+        ranks: Ranks,
+        start: Checkpoint | None,
+        report: Callable[[str], None],
+    ) -> None:
+        self.options, self.env, self.ranks, self.device = options, env, ranks, env.device
+        self.report = report if ranks.rank == 0 else lambda line: None
+        self.iteration = self.env_steps = self.resumed = 0
+        self.seconds_before = 0.0
+        self.best = (-sys.float_info.max, -sys.float_info.max)
+        if start is not None and options.resume:
+            progress = start.progress
+            self.iteration, self.env_steps = int(progress["iteration"]), int(progress["env_steps"])
+            self.seconds_before, self.resumed = float(progress["seconds"]), int(progress["resumed"]) + 1
+            self.best = (float(progress["best_success"]), float(progress["best_return"]))
+        worlds = options.num_envs * ranks.count
+        self.hyperparameters = options.resolved(worlds)
+        torch.manual_seed(options.seed)
+        # Worlds of all ranks, seeds and resumptions have seeds of their own.
+        first_seed = ((options.seed * 1009 + self.resumed) * worlds + ranks.rank * options.num_envs) % EVALUATION_SEED
+        first = env.reset(first_seed)
+        self.privileged = self._privileged_size()
+        self.model = ActorCritic(env.interface, self.privileged, self.hyperparameters).to(self.device)
+        self.ppo = PPO(self.model, self.hyperparameters, ranks)
+        if start is not None:
+            self._load(start)
+        options_ = self.hyperparameters
+        self.collector = Collector(env, self.model, first, options_.rollout_steps, options_.discount)
+        self.log = TrainingLog(self.collector.statistics, self.ppo, ranks)
+        self.generator = torch.Generator(self.device)
+        self.guard = NanGuard() if options.nan_guard else None
+        self.warm_until = self.iteration + self._stagger_iterations(start is None)
+        self.folder = self._open_folder()
+
+    def _privileged_size(self) -> int:
+        """Return the length of the state that the critic reads beside what the actor sees, 0 for none."""
+        if not (self.hyperparameters.asymmetric_critic and self.env.interface.pictures):
+            return 0
+        state = self.env.privileged()
+        if state is None:
+            return 0
+        if self.env.same_step:
+            raise ConfigError(
+                "the critic reads the full state, which SAME_STEP does not give for last steps",
+                hint="make the environment with AutoresetMode.NEXT_STEP, or set asymmetric_critic=false",
+            )
+        return int(state.shape[1])
+
+    def _stagger_iterations(self, fresh: bool) -> int:
+        """Return how many rollouts pass before the first update.
+
+        They spread the worlds over their episodes, so that a rollout shorter than an episode holds all of its parts,
+        and tell the scale of observations and rewards.
+        """
+        steps = self.hyperparameters.rollout_steps
+        limit = self.env.episode_steps
+        if limit is None or steps >= limit:
+            return int(fresh)
+        self.collector.stagger(limit)
+        return -(-limit // steps)
+
+    def _load(self, start: Checkpoint) -> None:
+        """Take over networks, and what else the run needs to go on."""
+        options = self.options
+        path = options.init or options.run_dir
+        check_env(start, path, options.env, self.env.interface)
+        try:
+            for name, module in self._modules().items():
+                arrays = {key: torch.from_numpy(array) for key, array in start.part(name).items()}
+                fits = {k: v.shape for k, v in module.state_dict().items()} == {k: v.shape for k, v in arrays.items()}
+                if fits or name == "actor" or options.resume:  # else a critic of another kind, which starts anew
+                    module.load_state_dict(arrays, strict=True)
+            if options.resume:
+                self.ppo.optimizer.load({k: torch.from_numpy(a) for k, a in start.part("optimizer").items()})
+        except (RuntimeError, ValueError) as error:
+            raise CheckpointError(
+                f"checkpoint {path} holds other networks than this run ({error})",
+                hint="use the hyperparameters of the run that wrote it",
+            ) from error
+
+    def _modules(self) -> dict[str, torch.nn.Module]:
+        modules: dict[str, torch.nn.Module] = {
+            "actor": self.model.actor,
+            "critic": self.model.critic,
+            "reward": self.ppo.reward_moments,
+        }
+        return modules | ({} if self.model.predict is None else {"predict": self.model.predict})
+
+    def _open_folder(self) -> RunFolder:
+        """Return the folder; the first rank makes it, and an error there reaches all."""
+        options = self.options
+        path = options.run_dir or RunFolder.name_for(Path("runs"), options.env, options.name)
+        folder, error = None, None
+        try:
+            if self.ranks.rank == 0:
+                folder = RunFolder(path, resume=options.resume)
+                if options.resume:
+                    folder.forget_after(self.iteration)
+                else:
+                    folder.write_config(self._config())
+        except RunError as caught:
+            error = caught
+        if self.ranks.sum(torch.tensor([float(error is not None)], device=self.device)).item() > 0:
+            raise error or RunError("the first rank could not open the run folder", hint="see its message")
+        folder = folder or RunFolder(path, resume=options.resume, writes=False)
+        if self.ranks.rank == 0 and options.tensorboard:
+            try:
+                folder.start_tensorboard(self.env_steps if options.resume else None)
+            except MissingExtraError as missing:
+                self.report(f"{missing}; progress.csv is written")
+        self.report(f"run folder {path}")
+        return folder
+
+    def _config(self) -> dict[str, Any]:
+        options, cuda = self.options, self.device.type == "cuda"
+        return {
+            "env": options.env,
+            "env_options": options.env_options,
+            "num_envs": options.num_envs,
+            "ranks": self.ranks.count,
+            "seed": options.seed,
+            "device": str(self.device),
+            "device_name": torch.cuda.get_device_name(self.device) if cuda else platform.machine(),
+            "total_steps": options.total_steps,
+            "time_limit": options.time_limit,
+            "init": None if options.init is None else str(options.init),
+            "interface": self.env.interface.to_json(),
+            "privileged": self.privileged,
+            "hyperparameters": self.hyperparameters.to_json(),
+            "versions": {
+                "softmode": __version__,
+                "torch": torch.__version__,
+                "gymnasium": gym.__version__,
+                "numpy": np.__version__,
+                "python": platform.python_version(),
+            },
+            "command": sys.argv,
+            "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        }
+
+    def loop(self) -> None:
+        """Collect and update until a limit is reached."""
+        self.started = saved = time.perf_counter()
+        per_rollout = self.hyperparameters.rollout_steps * self.options.num_envs * self.ranks.count
+        progress = self._progress()
+        try:
+            while progress < 1.0:
+                clock = time.perf_counter()
+                self.iteration += 1
+                seed = (self.options.seed * 1_000_003 + self.iteration) * 4099 + self.ranks.rank
+                self.generator.manual_seed(seed)
+                rollout = self.collector.collect(self.generator)
+                collected = time.perf_counter()
+                bad = self.guard.bad(rollout).any() if self.guard else torch.zeros((), device=self.device)
+                losses = self._update(rollout, progress)
+                self.env_steps += per_rollout
+                row, progress, any_bad = self.log.read(losses, bad, self._progress())
+                now = time.perf_counter()
+                row = {
+                    "iteration": self.iteration,
+                    "env_steps": self.env_steps,
+                    "seconds": self._seconds(),
+                    "steps_per_second": per_rollout / (now - clock),
+                    "update_share": (now - collected) / (now - clock),
+                    **row,
+                }
+                if any_bad or row["skipped_updates"]:
+                    raise self._diverged(rollout, any_bad, bool(bad))
+                if self.guard:
+                    self.guard.keep(rollout)
+                if self.ranks.rank == 0:
+                    self.folder.log(row)
+                    self.report(describe(row))
+                    if progress >= 1.0 or now - saved >= self.options.checkpoint_seconds:
+                        self._save(row)
+                        saved = now
+        except KeyboardInterrupt:
+            if self.ranks.rank == 0:
+                self.report(f"interrupted; go on from the last checkpoint: --run-dir {self.folder.path} --resume")
+            raise
+
+    def _update(self, rollout: Rollout, progress: float) -> torch.Tensor:
+        """Update networks, then the scales of observations and rewards, which thus are those of the whole rollout."""
+        if self.iteration <= self.warm_until:
+            losses = torch.zeros(len(PPO.LOSSES), device=self.device)
+        else:
+            train_actor = self.iteration - self.warm_until > self.hyperparameters.critic_warmup or self.resumed > 0
+            losses = self.ppo.update(rollout, self.generator, progress, train_actor)
+        self.collector.update_moments(self.ppo.reward_moments, self.ranks)
+        return losses
+
+    def _seconds(self) -> float:
+        return self.seconds_before + time.perf_counter() - self.started
+
+    def _progress(self) -> float:
+        """Return how much of the run is over, 1 at its end."""
+        steps, seconds = self.options.total_steps, self.options.time_limit
+        if steps is None and seconds is None:
+            steps = DEFAULT_STEPS
+        by_steps = 0.0 if steps is None else self.env_steps / steps
+        return min(max(by_steps, 0.0 if seconds is None else self._seconds() / seconds), 1.0)
+
+    def _diverged(self, rollout: Rollout, known: bool, here: bool) -> TrainingDiverged:
+        """Return the error of values that are not finite, the guard's file written where they are."""
+        if known and self.guard and here:
+            return self.guard.dump(rollout, self.folder, self.iteration, self.ranks.rank)
+        if known:
+            return TrainingDiverged("worlds of another rank are not finite", hint="see its message")
+        return TrainingDiverged(
+            f"iteration {self.iteration}: the loss is not finite",
+            hint=f"find the cause with --run-dir {self.folder.path} --resume --nan-guard, or lower the learning rate",
+        )
+
+    def _save(self, row: dict[str, Any]) -> None:
+        """Write the latest checkpoint, and the best where this is it."""
+        # JSON has no infinity.
+        success, mean = (-sys.float_info.max if row[name] is None else row[name] for name in ("success", "return"))
+        score = (success, mean)
+        better = self.log.episodes >= min(WINDOW, 2 * self.options.num_envs) and score > self.best
+        if better:
+            self.best = score
+        self._write(LATEST)
+        if better or not (self.folder.path / BEST).exists():
+            self._write(BEST)
+
+    def _write(self, name: str) -> None:
+        arrays: dict[str, np.ndarray] = {}
+        for prefix, module in self._modules().items():
+            arrays |= {f"{prefix}.{key}": value.cpu().numpy() for key, value in module.state_dict().items()}
+        arrays |= {f"optimizer.{key}": value.cpu().numpy() for key, value in self.ppo.optimizer.state().items()}
+        checkpoint = Checkpoint(
+            env=self.options.env,
+            env_options=self.options.env_options,
+            interface=self.env.interface,
+            privileged=self.privileged,
+            hyperparameters=self.hyperparameters,
+            progress={
+                "iteration": self.iteration,
+                "env_steps": self.env_steps,
+                "seconds": self._seconds(),
+                "seed": self.options.seed,
+                "resumed": self.resumed,
+                "best_success": self.best[0],
+                "best_return": self.best[1],
+            },
+            arrays=arrays,
+        )
+        try:
+            write_checkpoint(checkpoint, self.folder.path / name)
+        except OSError as error:
+            raise self.folder.cannot_write(name, error) from error
+
+    def finish(self) -> TrainResult:
+        """Evaluate the last policy on the first rank."""
+        seconds, evaluation = self._seconds(), None
+        if self.ranks.rank == 0 and self.options.eval_episodes:
+            path = self.folder.path / LATEST
+            policy = Policy(read_checkpoint(path), self.device, path)
+            evaluation = evaluate(self.env.env, policy, self.options.eval_episodes, device=self.device)
+            self.report(f"evaluation of the last policy, {evaluation}")
+            result = {"env_steps": self.env_steps, "train_seconds": seconds, "first_seed": EVALUATION_SEED}
+            result |= dataclasses.asdict(evaluation)
+            self.folder.write("evaluation.json", json.dumps(result, indent=2).encode() + b"\n")
+        self.ranks.barrier()
+        return TrainResult(run_dir=self.folder.path, env_steps=self.env_steps, seconds=seconds, evaluation=evaluation)

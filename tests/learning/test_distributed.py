@@ -1,0 +1,124 @@
+"""Several processes train as one."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+import torch
+
+from softmode.learning.distributed import Ranks
+from softmode.learning.hyperparameters import Hyperparameters
+from softmode.learning.networks import ActorCritic
+from softmode.learning.ppo import PPO
+from softmode.learning.rollout import Rollout
+from softmode.learning.spaces import Interface
+
+ROOT = Path(__file__).resolve().parents[2]
+TRAIN = """
+import sys
+from pathlib import Path
+import numpy as np
+from softmode.learning import trainer
+from tests.learning.test_runs import run
+folder, ranks = Path(sys.argv[1]), {}
+finish = trainer._Run.finish
+def keep(self):
+    ranks["own"], ranks["value"] = self.ranks, self.ppo.optimizer.value.numpy()
+    ranks["moments"] = self.model.actor.encoder.moments["state"].mean.numpy()
+    ranks["seen"] = self.collector.observation["state"].numpy()
+    return finish(self)
+trainer._Run.finish = keep
+result = run(folder / "run", 2048)
+rank = ranks.pop("own").rank
+np.savez(folder / f"rank{rank}.npz", steps=result.env_steps, **ranks)
+"""
+UPDATE = """
+import sys
+from pathlib import Path
+import numpy as np, torch
+from softmode.learning.distributed import Ranks
+from tests.learning.test_distributed import updated
+ranks = Ranks.start(torch.device("cpu"))
+np.save(Path(sys.argv[1]) / f"rank{ranks.rank}.npy", updated(ranks))
+ranks.stop()
+"""
+
+
+def torchrun(code: str, folder: Path, processes: int = 2) -> None:
+    """Run the code in processes that know of each other as torchrun's do."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = str(probe.getsockname()[1])
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1"}
+    environment |= {"MASTER_PORT": port, "WORLD_SIZE": str(processes)}
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-c", code, str(folder)],
+            env={**environment, "RANK": str(rank), "LOCAL_RANK": str(rank)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        for rank in range(processes)
+    ]
+    outputs = [process.communicate()[0] for process in started]
+    assert all(process.returncode == 0 for process in started), "\n".join(outputs)
+
+
+def updated(ranks: Ranks) -> np.ndarray:
+    """Return the parameters after one update with this rank's share of a rollout of eight worlds."""
+    interface = Interface(vectors={"state": 3}, pictures={}, action_low=(-1.0, -1.0), action_high=(1.0, 1.0))
+    options = Hyperparameters(hidden=(8,), epochs=1, minibatches=1)
+    torch.manual_seed(0)
+    ppo = PPO(ActorCritic(interface, 0, options), options, ranks)
+    share = slice(8 * ranks.rank // ranks.count, 8 * (ranks.rank + 1) // ranks.count)
+    whole = torch.Generator().manual_seed(1)
+    rollout = Rollout(6, {"state": torch.zeros(8, 3)}, 2, False)
+    rollout.observation["state"].normal_(generator=whole)
+    for array in (rollout.sample, rollout.mean, rollout.reward):
+        array.normal_(generator=whole)
+    rollout.terminated.copy_(torch.rand(6, 8, generator=whole) < 0.2)
+    rollout.valid.copy_(torch.rand(6, 8, generator=whole) < 0.7)  # unequal numbers on the ranks
+    mine = Rollout(6, {"state": torch.zeros(share.stop - share.start, 3)}, 2, False)
+    mine.observation["state"].copy_(rollout.observation["state"][:, share])
+    for name in ("sample", "mean", "reward", "terminated", "truncated", "valid"):
+        getattr(mine, name).copy_(getattr(rollout, name)[:, share])
+    ppo.reward_moments.update(mine.reward.flatten(), ranks)
+    ppo.model.actor.encoder.moments["state"].update(mine.observation["state"].flatten(0, 1), ranks)  # type: ignore[operator]
+    ppo.model.critic.encoder.moments["state"].update(mine.observation["state"].flatten(0, 1), ranks)  # type: ignore[operator]
+    ppo.update(mine, torch.Generator(), 0.0, True)
+    return ppo.optimizer.value.numpy().copy()
+
+
+def test_two_processes_stay_equal(tmp_path: Path):
+    """After training both hold the same bits, from worlds of their own; steps count those of both."""
+    torchrun(TRAIN, tmp_path)
+    first, second = (np.load(tmp_path / f"rank{rank}.npz") for rank in range(2))
+    assert np.array_equal(first["value"], second["value"]) and np.array_equal(first["moments"], second["moments"])
+    assert not np.array_equal(first["seen"], second["seen"])
+    assert int(first["steps"]) == int(second["steps"]) == 2048
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {
+        "config.json",
+        "progress.csv",
+        "latest.npz",
+        "best.npz",
+    }
+
+
+def test_two_processes_update_as_one_with_all_worlds(tmp_path: Path):
+    """One update of two halves equals that of the whole up to rounding: scales, advantages, gradients, divergence."""
+    torchrun(UPDATE, tmp_path)
+    first, second = (np.load(tmp_path / f"rank{rank}.npy") for rank in range(2))
+    assert np.array_equal(first, second)
+    alone = updated(Ranks())
+    # Adam's first step is the learning rate times the sign of the gradient, whose rounding errs by 1e-6 at most.
+    np.testing.assert_allclose(first, alone, rtol=0.0, atol=2e-5)

@@ -1,0 +1,80 @@
+"""The commands of training."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("torch")
+
+from softmode import cli
+from softmode.cli_train import parse_env_options, parse_overrides
+from softmode.errors import ConfigError
+from softmode.learning.config_values import config_of
+
+QUICK = ["--num-envs", "2", "--total-steps", "128", "--set", "rollout_steps=32", "hidden=[8]", "--eval-episodes"]
+
+
+def test_train_and_evaluate(tmp_path: Path, capsys):
+    """Training prints a line per iteration and an evaluation; evaluate repeats it; another environment is refused."""
+    folder = tmp_path / "run"
+    assert cli.main(["train", "Pendulum-v1", "--run-dir", str(folder), *QUICK, "3"]) == 0
+    out = capsys.readouterr().out
+    assert "128 steps" in out and "3 episodes: return" in out
+    line = out.splitlines()[-1].partition(", ")[2]
+    assert cli.main(["evaluate", "Pendulum-v1", str(folder / "latest.npz"), "--episodes", "3", "--num-envs", "2"]) == 0
+    assert capsys.readouterr().out.strip() == line
+    assert cli.main(["evaluate", "MountainCarContinuous-v0", str(folder / "latest.npz")]) == 2
+    assert "Pendulum-v1" in capsys.readouterr().err
+    assert cli.main(["train", "Pendulum-v1", "--run-dir", str(folder), *QUICK, "0"]) == 2
+    assert "--resume" in capsys.readouterr().err
+    assert cli.main(["play", "softmode/LiftSoft-v0", "--policy", str(folder / "latest.npz")]) == 2
+    assert "Pendulum-v1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["train", "softmode/Nothing-v0"], "softmode/LiftSoft-v0"),
+        (["train", "Pendulum-v1", "--num-envs", "0"], "num_envs"),
+        (["train", "Pendulum-v1", "--device", "cuda:99"], "cpu"),
+        (["train", "Pendulum-v1", "--set", "discount"], "NAME=VALUE"),
+        (["train", "Pendulum-v1", "--set", "gamma=0.9"], "discount"),
+        (["train", "Pendulum-v1", "--env-options", "["], "JSON"),
+        (["train", "softmode/LiftSoft-v0", "--env-options", '{"config": {"colour": 1}}'], "image_size"),
+        (["train", "Pendulum-v1", "--resume"], "--run-dir"),
+        (["evaluate", "Pendulum-v1", "missing.npz"], "missing.npz"),
+        (["play", "softmode/LiftSoft-v0", "--policy", "missing.npz"], "missing.npz"),
+    ],
+)
+def test_mistakes_name_the_remedy(arguments, named, capsys, tmp_path, monkeypatch):
+    """One line, exit code 2, no folder."""
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(arguments) == 2
+    err = capsys.readouterr().err
+    assert named in err and err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_values_are_parsed():
+    """JSON where it is, words where it is not; dicts become configurations down to the leaves."""
+    assert parse_overrides(("discount=0.9", "hidden=[8,8]", "schedule=linear", "clip-value=null")) == {
+        "discount": 0.9, "hidden": [8, 8], "schedule": "linear", "clip_value": None,
+    }  # fmt: skip
+    assert parse_env_options('{"obs_type": "pixels"}') == {"obs_type": "pixels"}
+    from softmode.envs.lift_soft import LiftSoftConfig
+
+    config = config_of(LiftSoftConfig, {"image_size": 64, "scene": {"object": {"size": 0.07}}, "goal_range": [0, 0, 0]})
+    assert config.image_size == 64 and config.scene.object.size == 0.07 and config.goal_range == (0, 0, 0)
+    with pytest.raises(ConfigError, match="colour"):
+        config_of(LiftSoftConfig, {"scene": {"object": {"colour": 1}}})
+
+
+def test_the_command_line_stays_light():
+    """Parsing loads no torch."""
+    code = "import sys, softmode.cli; print([name for name in ('torch', 'tensorboard') if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
