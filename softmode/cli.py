@@ -1,4 +1,4 @@
-"""The command line: ``softmode play``, ``softmode list-envs``, ``softmode robots`` and ``softmode splat``."""
+"""The command line: ``softmode play``, ``record``, ``list-envs``, ``robots`` and ``splat``."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ import dataclasses
 import os
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from softmode import ENVIRONMENTS
 from softmode.cli_common import bar_interval, quiet_warp, warp_device
+from softmode.cli_record import Record
 from softmode.cli_splat import SplatConvert, SplatFromMesh, SplatInfo
 from softmode.errors import ConfigError, MaterialError, MissingExtraError, SoftmodeError
+from softmode.policies import check_policy, policy_factory
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-
-POLICIES = ("scripted", "random", "zero")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -29,7 +30,7 @@ class Play:
     env: str
     """Id of the environment, for example softmode/LiftSoft-v0."""
     policy: str = "scripted"
-    """scripted, random or zero."""
+    """scripted, random, zero, or the file of a trained policy."""
     episodes: int = 1
     """Episodes to play."""
     seed: int = 0
@@ -109,6 +110,7 @@ def main(arguments: list[str] | None = None) -> int:
         ]
         command = tyro.cli(
             Annotated[Play, tyro.conf.subcommand("play")]
+            | Annotated[Record, tyro.conf.subcommand("record")]
             | Annotated[ListEnvs, tyro.conf.subcommand("list-envs")]
             | Annotated[Robots, tyro.conf.subcommand("robots")]
             | splat,  # type: ignore[arg-type]
@@ -130,8 +132,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def play(options: Play) -> int:
     """Play episodes; see :class:`Play`."""
-    if options.policy not in POLICIES:
-        raise ConfigError(f"unknown policy {options.policy!r}", hint=f"use one of {', '.join(POLICIES)}")
+    check_policy(options.policy)
     if options.env not in ENVIRONMENTS:
         raise ConfigError(f"unknown environment {options.env!r}", hint=f"use one of {', '.join(ENVIRONMENTS)}")
     if options.episodes < 1:
@@ -176,7 +177,9 @@ def _play(options: Play, film: _Film | None) -> int:
                 f"built in {body.build_seconds:.2f} s; scene ready after {time.perf_counter() - started:.1f} s"
             )
             fps = env.metadata["render_fps"]
-            successes = sum(_play_episode(env, options, options.seed + k, film, fps) for k in range(options.episodes))
+            policy = policy_factory(options.policy, env)
+            seeds = range(options.seed, options.seed + options.episodes)
+            successes = sum(_play_episode(env, options, policy, seed, film, fps) for seed in seeds)
         finally:
             env.close()
     if film:
@@ -187,15 +190,16 @@ def _play(options: Play, film: _Film | None) -> int:
     return 0
 
 
-def _play_episode(env: Any, options: Play, seed: int, film: _Film | None, fps: int) -> bool:
+def _play_episode(
+    env: Any, options: Play, factory: Callable[[int], Any], seed: int, film: _Film | None, fps: int
+) -> bool:
     """Play one episode, print its outcome, return whether it succeeded."""
     import gymnasium as gym
     from tqdm import tqdm
 
     given = {} if options.youngs_modulus is None else {"youngs_modulus": options.youngs_modulus}
     observation, info = env.reset(seed=seed, options=given)
-    env.action_space.seed(seed)
-    policy = _policy(options.policy, env)
+    policy = factory(seed)
     total, steps, seconds = 0.0, 0, 0.0
     limit = gym.spec(options.env).max_episode_steps
     with tqdm(total=limit, desc=f"seed {seed}", unit="step", mininterval=bar_interval()) as bar:
@@ -215,18 +219,6 @@ def _play_episode(env: Any, options: Play, seed: int, film: _Film | None, fps: i
         f"return {total:.1f}, success: {info['is_success']}"
     )
     return bool(info["is_success"])
-
-
-def _policy(name: str, env: Any) -> Any:
-    """Return a callable from observation to action."""
-    if name == "scripted":
-        from softmode.envs.scripted import ScriptedLift
-
-        return ScriptedLift(env)
-    if name == "random":
-        return lambda observation: env.action_space.sample()
-    zero = env.action_space.low * 0
-    return lambda observation: zero
 
 
 def _task_config(options: Play) -> Any:
