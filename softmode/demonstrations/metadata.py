@@ -40,7 +40,7 @@ class Metadata:
     frame_count: int
     """Frames of all episodes."""
     rows: list[dict[str, Any]]
-    """The row of every episode, without its statistics."""
+    """The row of every episode."""
     statistics: list[dict[str, Statistics]]
     """Statistics of every episode by feature."""
 

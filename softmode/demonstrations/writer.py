@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import json
 import os
 import secrets
 import shutil
@@ -12,14 +11,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from softmode.demonstrations import schema
+from softmode.demonstrations.episode import Episode
 from softmode.demonstrations.metadata import Metadata, read_metadata
-from softmode.demonstrations.pictures import FilmWriter, encode_png
 from softmode.demonstrations.schema import INDEX_FEATURES, Feature
-from softmode.demonstrations.statistics import PictureStatistics, Statistics, combine, number_statistics
+from softmode.demonstrations.statistics import Statistics, combine
+from softmode.demonstrations.tables import listed, rows_table, sync, tasks_table, write_json, write_table
 from softmode.errors import ConfigError, StorageError
 
 STAGE = ".recording"
@@ -32,8 +29,8 @@ class DatasetWriter:
 
     The folder appears with its first complete episode and is a complete dataset after every further one: all files of
     an episode are written beside the old ones first and then renamed into place, ``meta/info.json``, which says how
-    many episodes there are, last. Whatever interrupts a recording, the episodes before stay readable, and ``append=True``
-    goes on from them::
+    many episodes there are, last. Whatever interrupts a recording, the episodes before stay readable, and
+    ``append=True`` goes on from them::
 
         features = {"observation.state": Feature(dtype="float32", shape=(7,)), "action": Feature(...)}
         with DatasetWriter("out/lift", features, fps=30) as writer:
@@ -94,6 +91,7 @@ class DatasetWriter:
         self._films_done = -1  # number of the last film
         self._root, self._is_new, self._lock = self.folder, False, None
         self._made: list[Path] = []
+        self._episode: Any = None
         try:
             exists = self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir()))
             if exists and not append:
@@ -173,12 +171,7 @@ class DatasetWriter:
 
     def _begin(self) -> None:
         """Begin an episode."""
-        self._frames = 0
-        self._columns: dict[str, list[Any]] = {
-            name: [] for name, kind in self.features.items() if kind.dtype != "video"
-        }
-        self._pictures = {name: PictureStatistics() for name, kind in self.features.items() if kind.is_picture}
-        self._films: dict[str, FilmWriter] = {}
+        self._episode = Episode(self.features, self._fps, self._root / STAGE)
 
     @property
     def episode_count(self) -> int:
@@ -202,50 +195,23 @@ class DatasetWriter:
                 taken then.
             StorageError: If a film cannot be written; the episode is lost then, those before it are not.
         """
-        given = set(frame)
-        expected = set(self.features) - set(INDEX_FEATURES)
-        if given != expected:
-            raise ConfigError(
-                f"frame lacks {sorted(expected - given)} and has unknown {sorted(given - expected)}",
-                hint="give a value for every feature",
-            )
+        self._check_open()
+        try:
+            self._episode.add(frame)
+        except ConfigError:
+            raise
+        except BaseException:
+            self.discard_episode()
+            raise
+
+    def _check_open(self) -> None:
+        """Raise ConfigError after close."""
         if self._lock is None:
             raise ConfigError(f"the writer of {self.folder} is closed", hint="open it again with append=True")
-        values = {name: _checked(name, frame[name], self.features[name]) for name in expected}
-        for name, value in values.items():
-            kind = self.features[name]
-            if kind.dtype == "video":
-                try:
-                    self._film(name).add(value)
-                except BaseException:
-                    self.discard_episode()
-                    raise
-            elif kind.dtype == "image":
-                path = f"frame-{self._frames:06d}.png"
-                self._columns[name].append({"bytes": encode_png(value), "path": path})
-            else:
-                self._columns[name].append(value)
-            if kind.is_picture:
-                self._pictures[name].add(value)
-        self._frames += 1
-
-    def _film(self, name: str) -> FilmWriter:
-        """Return the film of the present episode."""
-        if name not in self._films:
-            stage = self._root / STAGE
-            try:
-                stage.mkdir(exist_ok=True)
-            except OSError as error:
-                raise StorageError(f"{stage} cannot be made: {error.strerror}", hint="free some space") from error
-            height, width, _ = self.features[name].shape
-            self._films[name] = FilmWriter(stage / f"{name}.mp4", height, width, self._fps)
-        return self._films[name]
 
     def discard_episode(self) -> None:
         """Forget the frames since the last saved episode."""
-        for film in self._films.values():
-            film.abort()
-        shutil.rmtree(self._root / STAGE, ignore_errors=True)
+        self._episode.abort()
         self._begin()
 
     # -- episodes -----------------------------------------------------------------------------------------------------
@@ -263,7 +229,8 @@ class DatasetWriter:
             ConfigError: If there is no frame, or the task is empty.
             StorageError: If the files cannot be written; the dataset is what it was before this episode.
         """
-        if not self._frames:
+        self._check_open()
+        if not self._episode.length:
             raise ConfigError("the episode has no frames", hint="add some before saving it")
         if not isinstance(task, str) or not task.strip():
             raise ConfigError(f"the task is {task!r}", hint="describe it in words")
@@ -286,45 +253,42 @@ class DatasetWriter:
 
     def _save(self, task: str) -> None:
         """Stage the files of the dataset with the present episode, then put them in place."""
-        number, count, start = self._episode_count, self._frames, self._frame_count
+        episode, number, start = self._episode, self._episode_count, self._frame_count
+        count = episode.length
         tasks = {**self._tasks}
         tasks.setdefault(task, len(tasks))
-        for film in self._films.values():
+        for film in episode.films.values():
             film.close()
-        arrays = self._arrays(number, tasks[task])
-        table = self._table(arrays)
-        found: dict[str, Statistics] = {}
-        for name, kind in self.features.items():
-            found[name] = self._pictures[name].result() if kind.is_picture else number_statistics(arrays[name])
+        arrays = episode.arrays(number, start, tasks[task])
+        table, found = episode.table(arrays, self._schema), episode.statistics(arrays)
         total = {n: combine([self._statistics[n], s]) if n in self._statistics else s for n, s in found.items()}
 
         rows, tables, file = self._rows, self._tables, self._file
         size = sum(part.nbytes for part in tables)
         if rows and (size + table.nbytes > self._limit or len(rows) >= EPISODES_PER_FILE):
             rows, tables, file = [], [], file + 1
-        film = self._films_done + 1
-        row = self._row(number, task, start, count, file, film, found)
+        film_number = self._films_done + 1
+        row = self._row(number, task, start, count, file, film_number, found)
         rows, tables = [*rows, row], [*tables, table]
 
         stage = self._root / STAGE
         stage.mkdir(exist_ok=True)
         moves: list[tuple[Path, str]] = []
-        for name, writer in self._films.items():
-            path = schema.VIDEO_PATH.format(
-                video_key=name, chunk_index=film // schema.CHUNK_SIZE, file_index=film % schema.CHUNK_SIZE
-            )
-            moves.append((writer.path, path))
+        for name, film in episode.films.items():
+            chunk, within = divmod(film_number, schema.CHUNK_SIZE)
+            path = schema.VIDEO_PATH.format(video_key=name, chunk_index=chunk, file_index=within)
+            moves.append((film.path, path))
         where = {"chunk_index": file // schema.CHUNK_SIZE, "file_index": file % schema.CHUNK_SIZE}
-        moves.append((_write_table(stage / "data.parquet", tables), schema.DATA_PATH.format(**where)))
+        moves.append((write_table(stage / "data.parquet", tables), schema.DATA_PATH.format(**where)))
         if len(tasks) > len(self._tasks):
-            moves.append((_write_table(stage / "tasks.parquet", [_tasks_table(tasks)]), schema.TASKS_PATH))
+            moves.append((write_table(stage / "tasks.parquet", [tasks_table(tasks)]), schema.TASKS_PATH))
         moves.append(
-            (_write_table(stage / "episodes.parquet", [_rows_table(rows)]), schema.EPISODES_PATH.format(**where))
+            (write_table(stage / "episodes.parquet", [rows_table(rows)]), schema.EPISODES_PATH.format(**where))
         )
-        moves.append((_write_json(stage / "stats.json", _listed(total)), schema.STATISTICS_PATH))
-        moves.append((_write_json(stage / "info.json", self._info(number + 1, start + count, tasks)), schema.INFO_PATH))
+        moves.append((write_json(stage / "stats.json", listed(total)), schema.STATISTICS_PATH))
+        moves.append((write_json(stage / "info.json", self._info(number + 1, start + count, tasks)), schema.INFO_PATH))
         for source, _ in moves:
-            _sync(source)
+            sync(source)
         for source, target in moves:
             (self._root / target).parent.mkdir(parents=True, exist_ok=True)
             os.replace(source, self._root / target)
@@ -335,38 +299,7 @@ class DatasetWriter:
         self._rows, self._tables, self._file = rows, tables, file
         self._tasks, self._statistics = tasks, total
         self._episode_count, self._frame_count = number + 1, start + count
-        self._films_done = film
-
-    def _arrays(self, number: int, task: int) -> dict[str, NDArray[Any]]:
-        """Return the numbers of the present episode, each of shape (frames, D)."""
-        frames = np.arange(self._frames)
-        filled = {
-            "timestamp": (frames / self._fps).astype(np.float32),
-            "frame_index": frames,
-            "episode_index": np.full(self._frames, number),
-            "index": self._frame_count + frames,
-            "task_index": np.full(self._frames, task),
-        }
-        arrays = {
-            name: np.array(self._columns[name], np.dtype(kind.dtype))
-            for name, kind in self.features.items()
-            if not kind.is_picture and name not in filled
-        }
-        return arrays | {name: values[:, None] for name, values in filled.items()}
-
-    def _table(self, arrays: Mapping[str, NDArray[Any]]) -> Any:
-        """Return the present episode as a table."""
-        pa = schema.arrow()
-        columns = []
-        for field in self._schema:
-            if field.name not in arrays:
-                columns.append(pa.array(self._columns[field.name], field.type))
-                continue
-            flat = pa.array(arrays[field.name].ravel())
-            if pa.types.is_fixed_size_list(field.type):
-                flat = pa.FixedSizeListArray.from_arrays(flat, type=field.type)
-            columns.append(flat)
-        return pa.table(columns, schema=self._schema)
+        self._films_done = film_number
 
     def _row(
         self, number: int, task: str, start: int, count: int, file: int, film: int, found: Mapping[str, Statistics]
@@ -382,7 +315,7 @@ class DatasetWriter:
             "dataset_from_index": start,
             "dataset_to_index": start + count,
         }
-        for name in self._films:
+        for name in self._episode.films:
             row[f"videos/{name}/chunk_index"], row[f"videos/{name}/file_index"] = divmod(film, schema.CHUNK_SIZE)
             row[f"videos/{name}/from_timestamp"] = 0.0
             row[f"videos/{name}/to_timestamp"] = count / self._fps
@@ -413,8 +346,8 @@ class DatasetWriter:
 
     def close(self) -> None:
         """Drop what belongs to no saved episode and let go of the folder; harmless twice."""
-        for film in getattr(self, "_films", {}).values():
-            film.abort()
+        if self._episode is not None:
+            self._episode.abort()
         if self._lock is not None:
             shutil.rmtree(self._root if self._is_new else self._root / STAGE, ignore_errors=True)
             os.close(self._lock)
@@ -438,60 +371,3 @@ class DatasetWriter:
 def _described(features: Mapping[str, Feature]) -> str:
     """Return features in a line."""
     return ", ".join(f"{name} {kind.dtype}{list(kind.shape)}" for name, kind in features.items())
-
-
-def _checked(name: str, value: Any, kind: Feature) -> NDArray[Any]:
-    """Return a value of a frame as an array of its feature's shape and type."""
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{name} is no array: {error}") from error
-    if kind.is_picture:
-        if array.dtype != np.uint8 or array.shape != kind.shape:
-            raise ConfigError(f"{name} is {array.dtype}{list(array.shape)}, expected uint8{list(kind.shape)}")
-        return array
-    if array.ndim == 0 and kind.shape == (1,):
-        array = array.reshape(1)
-    wanted = np.dtype(kind.dtype)
-    if array.shape != kind.shape or not (np.can_cast(array.dtype, wanted, "same_kind")):
-        raise ConfigError(f"{name} is {array.dtype}{list(array.shape)}, expected {wanted}{list(kind.shape)}")
-    array = array.astype(wanted)
-    if not np.isfinite(array).all():
-        raise ConfigError(f"{name} holds NaN or infinity", hint="discard the episode")
-    return array
-
-
-def _tasks_table(tasks: Mapping[str, int]) -> Any:
-    """Return the table of tasks."""
-    return schema.arrow().table([list(tasks.values()), list(tasks)], schema=schema.tasks_schema())
-
-
-def _rows_table(rows: list[dict[str, Any]]) -> Any:
-    """Return the table of episodes."""
-    return schema.arrow().table({key: [row[key] for row in rows] for key in rows[0]})
-
-
-def _write_table(path: Path, tables: list[Any]) -> Path:
-    """Write tables of one schema as a Parquet file with a row group for each."""
-    pq = schema.arrow().parquet
-    with pq.ParquetWriter(path, tables[0].schema, compression="snappy", write_page_checksum=True) as writer:
-        for table in tables:
-            writer.write_table(table)
-    return path
-
-
-def _write_json(path: Path, content: Any) -> Path:
-    """Write a JSON file."""
-    path.write_text(json.dumps(content, indent=4, ensure_ascii=False, allow_nan=False), encoding="utf-8")
-    return path
-
-
-def _listed(statistics: Mapping[str, Statistics]) -> dict[str, dict[str, Any]]:
-    """Return statistics as lists."""
-    return {name: {key: value.tolist() for key, value in values.items()} for name, values in statistics.items()}
-
-
-def _sync(path: Path) -> None:
-    """Make sure that a file's bytes are on the disk before it is renamed."""
-    with path.open("rb") as file:
-        os.fsync(file.fileno())

@@ -104,6 +104,9 @@ def test_discarded_frames_leave_no_trace(tmp_path: Path):
         writer.add_frame(frames[0])
     assert [path.name for path in tmp_path.iterdir()] == ["d"]
     assert_holds(read_dataset(tmp_path / "d"), [frames], film=True)
+    for act in (lambda: writer.add_frame(frames[0]), lambda: writer.save_episode("lift")):
+        with pytest.raises(ConfigError, match="closed"):
+            act()
     assert not list((tmp_path / "d").glob(".*"))
 
 
