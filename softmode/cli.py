@@ -1,21 +1,22 @@
-"""The command line: ``softmode play``, ``train``, ``evaluate``, ``list-envs``, ``robots`` and ``splat``."""
+"""The command line: ``softmode play``, ``train``, ``evaluate``, ``record``, ``list-envs``, ``robots``, ``splat``."""
 
 from __future__ import annotations
 
 import dataclasses
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from softmode import ENVIRONMENTS
 from softmode.cli_common import bar_interval, quiet_warp, warp_device
+from softmode.cli_record import Record
 from softmode.cli_splat import SplatConvert, SplatFromMesh, SplatInfo
 from softmode.cli_train import Evaluate, Train, policy_file
 from softmode.errors import ConfigError, MaterialError, MissingExtraError, SoftmodeError
 from softmode.film import Film
-
-POLICIES = ("scripted", "random", "zero")
+from softmode.policies import POLICIES, check_policy, policy_factory
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -107,6 +108,7 @@ def main(arguments: list[str] | None = None) -> int:
             Annotated[Play, tyro.conf.subcommand("play")]
             | Annotated[Train, tyro.conf.subcommand("train")]
             | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+            | Annotated[Record, tyro.conf.subcommand("record")]
             | Annotated[ListEnvs, tyro.conf.subcommand("list-envs")]
             | Annotated[Robots, tyro.conf.subcommand("robots")]
             | splat,  # type: ignore[arg-type]
@@ -128,9 +130,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def play(options: Play) -> int:
     """Play episodes; see :class:`Play`."""
-    if options.policy not in POLICIES and not Path(options.policy).suffix:
-        hint = f"use one of {', '.join(POLICIES)}, or a checkpoint (.npz)"
-        raise ConfigError(f"unknown policy {options.policy!r}", hint=hint)
+    check_policy(options.policy)
     if options.env not in ENVIRONMENTS:
         raise ConfigError(f"unknown environment {options.env!r}", hint=f"use one of {', '.join(ENVIRONMENTS)}")
     if options.episodes < 1:
@@ -180,7 +180,7 @@ def _play(options: Play, film: Film | None) -> int:
                 f"built in {body.build_seconds:.2f} s; scene ready after {time.perf_counter() - started:.1f} s"
             )
             fps = env.metadata["render_fps"]
-            policy = trained or _policy(options.policy, env)
+            policy = policy_factory(options.policy, env, trained)
             seeds = range(options.seed, options.seed + options.episodes)
             successes = sum(_play_episode(env, options, policy, seed, film, fps) for seed in seeds)
         finally:
@@ -193,14 +193,16 @@ def _play(options: Play, film: Film | None) -> int:
     return 0
 
 
-def _play_episode(env: Any, options: Play, policy: Any, seed: int, film: Film | None, fps: int) -> bool:
+def _play_episode(
+    env: Any, options: Play, factory: Callable[[int], Any], seed: int, film: Film | None, fps: int
+) -> bool:
     """Play one episode, print its outcome, return whether it succeeded."""
     import gymnasium as gym
     from tqdm import tqdm
 
     given = {} if options.youngs_modulus is None else {"youngs_modulus": options.youngs_modulus}
     observation, info = env.reset(seed=seed, options=given)
-    env.action_space.seed(seed)
+    policy = factory(seed)
     total, steps, seconds = 0.0, 0, 0.0
     limit = gym.spec(options.env).max_episode_steps
     with tqdm(total=limit, desc=f"seed {seed}", unit="step", mininterval=bar_interval()) as bar:
@@ -222,30 +224,22 @@ def _play_episode(env: Any, options: Play, policy: Any, seed: int, film: Film | 
     return bool(info["is_success"])
 
 
-def _policy(name: str, env: Any) -> Any:
-    """Return a callable from observation to action."""
-    if name == "scripted":
-        from softmode.envs.scripted import ScriptedLift
-
-        return ScriptedLift(env)
-    if name == "random":
-        return lambda observation: env.action_space.sample()
-    zero = env.action_space.low * 0
-    return lambda observation: zero
-
-
 def _task_config(options: Play, trained: dict[str, Any]) -> Any:
     """Turn the options that concern the object into a configuration, else as that of a trained policy."""
-    from softmode.envs.lift_soft import LiftSoftConfig
+    from softmode.envs.catalogue import config_class
     from softmode.envs.objects import ObjectConfig
     from softmode.learning.config_values import config_of
 
-    size = ObjectConfig().size if options.size is None else options.size
-    thing = ObjectConfig(
-        splat=options.splat, size=size, up=options.up, crop=options.crop, part=options.part, pose=options.pose
-    )
-    base = config_of(LiftSoftConfig, trained)
-    scene = dataclasses.replace(base.scene, object=thing) if thing != ObjectConfig() else base.scene
+    base = config_of(config_class(options.env), trained)
+    scene = base.scene
+    if options.splat is not None or options.size is not None:
+        size = scene.object.size if options.size is None else options.size
+        thing = dataclasses.replace(scene.object, size=size)
+        if options.splat is not None:
+            thing = ObjectConfig(
+                splat=options.splat, size=size, up=options.up, crop=options.crop, part=options.part, pose=options.pose
+            )
+        scene = dataclasses.replace(scene, object=thing)
     return dataclasses.replace(base, scene=scene, mesh_samples=4 if options.video else base.mesh_samples)
 
 

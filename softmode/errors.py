@@ -44,6 +44,10 @@ class MissingExtraError(SoftmodeError, ImportError):
     """An optional dependency is absent."""
 
 
+class StorageError(SoftmodeError, OSError):
+    """A file cannot be written: no space is left, or the place may not be written to."""
+
+
 class SolverDiverged(SoftmodeError, RuntimeError):
     """A step produced no finite state."""
 

@@ -17,6 +17,7 @@ HEAVY = (
     "scipy",
     "trimesh",
     "imageio",
+    "pyarrow",
     "tyro",
 )
 

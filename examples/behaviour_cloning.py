@@ -1,0 +1,123 @@
+"""Behaviour cloning: record scripted demonstrations as a LeRobot dataset, learn them, count the successes.
+
+A network maps the normalised state to the next few actions of the script (action chunking, Zhao et al. 2023); each is
+played for a fraction of a second before the next are asked for. While recording, the robot is pushed off its way now
+and then (DART, Laskey et al. 2017) and the script's corrections are what is learned; without that, errors add up.
+Writes the dataset to out/behaviour_cloning and prints how often script and network succeed on unseen objects.
+
+Needs the extras data and rl. Run: ``python examples/behaviour_cloning.py [--env ID] [--demonstrations N] [--short]``
+"""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import nn
+
+import softmode
+from softmode.demonstrations import Dataset, DatasetWriter, read_dataset
+from softmode.demonstrations.recording import environment_features, record_episodes
+from softmode.policies import policy_factory
+
+KEYS = ("observation.state", "observation.environment_state", "action")
+CHUNK, PLAYED, NOISE = 8, 4, 0.3
+"""Actions predicted at once, those of them played, pushes while recording."""
+
+
+class Clone(nn.Module):
+    """A network from states to chunks of actions, with the normalisation of its data."""
+
+    def __init__(self, data: Dataset) -> None:
+        """Read mean and standard deviation from the dataset."""
+        super().__init__()
+        parts = [data.statistics[key] for key in KEYS[:-1]]
+        self.mean = torch.tensor(np.concatenate([part["mean"] for part in parts]), dtype=torch.float32)
+        self.scale = torch.tensor(np.concatenate([part["std"] for part in parts]), dtype=torch.float32).clamp(min=1e-3)
+        self.actions = data.columns["action"].shape[1]
+        first, last = nn.Linear(len(self.mean), 512), nn.Linear(512, CHUNK * self.actions)
+        self.net = nn.Sequential(first, nn.GELU(), nn.Linear(512, 512), nn.GELU(), last)
+
+    def forward(self, state: torch.Tensor) -> torch.Tensor:
+        """Return actions of shape (batch, CHUNK, D) for states of shape (batch, D)."""
+        return self.net(((state - self.mean) / self.scale).clamp(-5.0, 5.0)).reshape(-1, CHUNK, self.actions)
+
+    def start(self, seed: int) -> Callable[[Any], Any]:
+        """Return the policy for an episode: it plays the beginning of a chunk, then asks for the next."""
+        self.queue: list[Any] = []
+        return self.act
+
+    def act(self, state: Any) -> Any:
+        """Return the next action."""
+        if not self.queue:
+            with torch.no_grad():
+                self.queue = list(self(torch.from_numpy(state)[None])[0, :PLAYED].clamp(-1.0, 1.0).numpy())
+        return self.queue.pop(0)
+
+
+def train(data: Dataset, steps: int, seed: int = 0) -> Clone:
+    """Fit a clone to the demonstrations; the absolute error keeps the script's abrupt actions sharp."""
+    torch.manual_seed(seed)
+    clone = Clone(data)
+    states = torch.from_numpy(np.concatenate([data.columns[key] for key in KEYS[:-1]], axis=1))
+    last = np.repeat(data.episode_stop, data.episode_stop - data.episode_start) - 1
+    frames = np.minimum(np.arange(len(last))[:, None] + np.arange(CHUNK), last[:, None])  # the last action is repeated
+    actions = torch.from_numpy(data.columns["action"][frames])
+    optimizer = torch.optim.AdamW(clone.parameters(), lr=1e-3, weight_decay=1e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 1e-3, total_steps=steps)
+    for _ in range(steps):
+        batch = torch.randint(len(states), (512,))
+        loss = (clone(states[batch]) - actions[batch]).abs().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    print(f"{len(states)} frames, {steps} steps: mean error of an action {loss.item():.3f}")
+    return clone.eval()
+
+
+def successes(env: gym.Env, policy: Callable[[int], Callable[[Any], Any]], episodes: int, seed: int) -> int:
+    """Play episodes; return how many ended in success."""
+    count = 0
+    for episode in range(seed, seed + episodes):
+        (state, info), act, done = env.reset(seed=episode), policy(episode), False
+        while not done:
+            state, _, terminated, truncated, info = env.step(act(state))
+            done = terminated or truncated
+        count += bool(info["is_success"])
+    return count
+
+
+def test_final(data: Dataset, script: int, clone: int, short: bool) -> None:
+    """The script succeeds, while recorded too, and the network, given enough to learn from, half as often."""
+    assert script > 0 and data.columns["next.success"][data.episode_stop - 1].mean() >= 0.5
+    assert short or clone > 0.5 * script
+
+
+def main() -> None:
+    """Record, learn, evaluate."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--env", default="softmode/LiftSoft-v0", choices=softmode.ENVIRONMENTS)
+    parser.add_argument("--demonstrations", type=int, default=100)
+    parser.add_argument("--episodes", type=int, default=50, help="to evaluate with")
+    parser.add_argument("--short", action="store_true", help="two demonstrations, one episode")
+    args = parser.parse_args()
+    demonstrations, episodes, steps = (2, 1, 50) if args.short else (args.demonstrations, args.episodes, 10_000)
+    env, out = gym.make(args.env), Path("out", "behaviour_cloning", args.env.replace("/", "_"))
+    script, task = policy_factory("scripted", env), softmode.ENVIRONMENTS[args.env]
+    with DatasetWriter(out, environment_features(env), fps=env.metadata["render_fps"], append=True) as writer:
+        have = writer.episode_count  # of an interrupted run
+        if have < demonstrations:
+            record_episodes(env, script, writer, episodes=demonstrations - have, task=task, seed=have, noise=NOISE)
+    data = read_dataset(out)
+    players = {"script": script, "clone": train(data, steps).start}
+    count = {name: successes(env, policy, episodes, seed=1_000_000) for name, policy in players.items()}
+    print(f"{args.env}, {data.episode_count} demonstrations, successes in {episodes} unseen episodes: {count}")
+    test_final(data, count["script"], count["clone"], args.short)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,198 @@
+"""Reading what a dataset says about itself, with every claim checked before it is used."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softmode.demonstrations import schema
+from softmode.demonstrations.schema import INDEX_FEATURES, Feature
+from softmode.demonstrations.statistics import QUANTILES, Statistics
+from softmode.errors import AssetError, ConfigError
+
+LARGEST_JSON = 64 << 20
+LARGEST_TABLE = 4 << 30
+"""Bytes of a table, uncompressed, that are read at most."""
+REMEDY = "restore the folder from a copy, or record it again"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Metadata:
+    """What a dataset says about itself."""
+
+    folder: Path
+    """Its folder."""
+    fps: int
+    """Frames per second."""
+    robot_type: str | None
+    """Name of the robot."""
+    features: dict[str, Feature]
+    """Columns by name, the indices last."""
+    tasks: tuple[str, ...]
+    """Task sentences by number."""
+    episode_count: int
+    """Episodes."""
+    frame_count: int
+    """Frames of all episodes."""
+    rows: list[dict[str, Any]]
+    """The row of every episode."""
+    statistics: list[dict[str, Statistics]]
+    """Statistics of every episode by feature."""
+
+    def data_table(self, row: Mapping[str, Any]) -> Any:
+        """Return the table that holds an episode's frames; raises AssetError if it does not."""
+        path = self.folder / schema.DATA_PATH.format(
+            chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]
+        )
+        return read_table(path)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file; raises AssetError if there is none."""
+    try:
+        if path.stat().st_size > LARGEST_JSON:
+            raise AssetError(f"{path} is larger than {LARGEST_JSON >> 20} MB", hint=REMEDY)
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise AssetError(f"{path} cannot be read: {error.strerror or error}", hint=REMEDY) from error
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, AssetError):
+            raise
+        raise AssetError(f"{path} is no JSON file: {error}", hint=REMEDY) from error
+    if not isinstance(content, dict):
+        raise AssetError(f"{path} holds no JSON object", hint=REMEDY)
+    return content
+
+
+def read_table(path: Path, columns: list[str] | None = None) -> Any:
+    """Return a Parquet file's table; raises AssetError if it is damaged or unreasonably large."""
+    pa = schema.arrow()
+    try:
+        with pa.parquet.ParquetFile(path, page_checksum_verification=True) as file:
+            size = sum(file.metadata.row_group(k).total_byte_size for k in range(file.metadata.num_row_groups))
+            if size > LARGEST_TABLE:
+                raise AssetError(f"{path} holds {size} bytes", hint="read datasets of at most 4 GB per file")
+            table = file.read(columns=columns, use_threads=False)
+            table.validate(full=True)
+            return table
+    except (OSError, ValueError, pa.ArrowException, KeyError, OverflowError, MemoryError) as error:
+        if isinstance(error, AssetError):
+            raise
+        raise AssetError(f"{path} cannot be read: {error}", hint=REMEDY) from error
+
+
+def read_metadata(folder: str | Path) -> Metadata:
+    """Return what the dataset in a folder says about itself.
+
+    Rows behind those that ``info.json`` counts are left out: a recording that was killed while it put its files in
+    place leaves them.
+
+    Raises:
+        AssetError: If the folder holds no dataset of version 3.0, or a damaged one.
+    """
+    folder = Path(folder).absolute()
+    path = folder / schema.INFO_PATH
+    info = read_json(path)
+    try:
+        version = info["codebase_version"]
+        if version != schema.CODEBASE_VERSION:
+            raise AssetError(f"{folder} has format {version!r}", hint="convert it to v3.0 with LeRobot's own tool")
+        fps = info["fps"]
+        if not isinstance(fps, int | float) or fps != int(fps) or not 0 < fps <= 10_000:
+            raise AssetError(f"{path}: fps is {fps!r}", hint=REMEDY)
+        features = {str(name): schema.feature_from_json(entry) for name, entry in info["features"].items()}
+        schema.check_features({n: f for n, f in features.items() if n not in INDEX_FEATURES})
+        for name, kind in INDEX_FEATURES.items():
+            if features.get(name) != kind:
+                raise AssetError(f"{path}: feature {name} is {features.get(name)}, expected {kind}", hint=REMEDY)
+        episodes, frames = info["total_episodes"], info["total_frames"]
+        if not (type(episodes) is int and type(frames) is int and 0 <= episodes <= frames):
+            raise AssetError(f"{path}: {episodes!r} episodes of {frames!r} frames", hint=REMEDY)
+        if info["data_path"] != schema.DATA_PATH or info["video_path"] not in (None, schema.VIDEO_PATH):
+            raise AssetError(f"{path} places the data elsewhere than format v3.0 does", hint=REMEDY)
+        robot = info["robot_type"]
+    except (KeyError, TypeError, AttributeError, OverflowError, ConfigError) as error:
+        raise AssetError(f"{path} describes no dataset: {error!r}", hint=REMEDY) from error
+    rows, statistics = _read_episodes(folder, features, episodes, frames)
+    return Metadata(
+        folder=folder,
+        fps=int(fps),
+        robot_type=robot if isinstance(robot, str) else None,
+        features=_ordered(features),
+        tasks=_read_tasks(folder),
+        episode_count=episodes,
+        frame_count=frames,
+        rows=rows,
+        statistics=statistics,
+    )
+
+
+def _ordered(features: dict[str, Feature]) -> dict[str, Feature]:
+    """Return the features with the indices last, and without the names that a picture's axes have anyway."""
+    plain = {
+        name: Feature(dtype=kind.dtype, shape=kind.shape) if kind.names == schema.IMAGE_NAMES else kind
+        for name, kind in features.items()
+    }
+    return {n: f for n, f in plain.items() if n not in INDEX_FEATURES} | INDEX_FEATURES
+
+
+def _read_tasks(folder: Path) -> tuple[str, ...]:
+    """Return the task sentences by number."""
+    path = folder / schema.TASKS_PATH
+    table = read_table(path)
+    names = [name for name in table.column_names if name != "task_index"]
+    if len(names) != 1 or "task_index" not in table.column_names:
+        raise AssetError(f"{path} has columns {table.column_names}", hint=REMEDY)
+    numbers, tasks = table["task_index"].to_pylist(), table[names[0]].to_pylist()
+    if numbers != list(range(len(numbers))) or not all(isinstance(task, str) for task in tasks):
+        raise AssetError(f"{path} does not number its tasks 0, 1, 2 ...", hint=REMEDY)
+    return tuple(tasks)
+
+
+def _read_episodes(
+    folder: Path, features: Mapping[str, Feature], episodes: int, frames: int
+) -> tuple[list[dict[str, Any]], list[dict[str, Statistics]]]:
+    """Return row and statistics of every episode, checked to lie one behind the other."""
+    rows: list[dict[str, Any]] = []
+    for path in sorted((folder / "meta" / "episodes").glob("chunk-*/file-*.parquet")):
+        if len(rows) >= episodes:
+            break
+        rows += read_table(path).to_pylist()
+    rows = rows[:episodes]
+    statistics, end = [], 0
+    try:
+        for number, row in enumerate(rows):
+            start, stop = row["dataset_from_index"], row["dataset_to_index"]
+            whole = [row["data/chunk_index"], row["data/file_index"]]
+            for name, kind in features.items():
+                if kind.dtype == "video":
+                    whole += [row[f"videos/{name}/chunk_index"], row[f"videos/{name}/file_index"]]
+                    if not 0.0 <= row[f"videos/{name}/from_timestamp"] < row[f"videos/{name}/to_timestamp"] < np.inf:
+                        raise ValueError(f"episode {number} has no time in its film")
+            if row["episode_index"] != number or start != end or not start < stop or row["length"] != stop - start:
+                raise ValueError(f"row {number} is episode {row['episode_index']}, frames {start} to {stop}")
+            if not all(type(value) is int and 0 <= value < 1_000_000 for value in whole):
+                raise ValueError(f"episode {number} names files {whole}")
+            end = stop
+            statistics.append(
+                {
+                    name: {key: np.array(row[f"stats/{name}/{key}"]) for key in _KEYS}
+                    for name in features
+                    if f"stats/{name}/count" in row
+                }
+            )
+    except (KeyError, TypeError, ValueError) as error:
+        raise AssetError(f"{folder / 'meta' / 'episodes'} is damaged: {error!r}", hint=REMEDY) from error
+    if (len(rows), end) != (episodes, frames):
+        raise AssetError(
+            f"{folder} counts {episodes} episodes of {frames} frames and lists {len(rows)} of {end}", hint=REMEDY
+        )
+    return rows, statistics
+
+
+_KEYS = ("min", "max", "mean", "std", "count", *QUANTILES)

@@ -1,0 +1,196 @@
+"""The LeRobot v3.0 dataset format: file layout, features, and the schemas of its tables.
+
+A dataset is a folder::
+
+    meta/info.json                                  sizes, frame rate, features, path templates
+    meta/stats.json                                 statistics of every feature over all frames
+    meta/tasks.parquet                              task sentences and their numbers
+    meta/episodes/chunk-000/file-000.parquet        one row per episode: where its frames are, its statistics
+    data/chunk-000/file-000.parquet                 one row per frame
+    videos/KEY/chunk-000/file-000.mp4               pictures, when they are stored as video
+
+Reference: the format that ``lerobot`` 0.4 (https://github.com/huggingface/lerobot) reads and writes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+from softmode.errors import ConfigError, MissingExtraError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+FeatureType = Literal["float32", "float64", "int64", "bool", "image", "video"]
+
+CODEBASE_VERSION = "v3.0"
+CHUNK_SIZE = 1000
+"""Files per chunk folder."""
+DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+INFO_PATH, STATISTICS_PATH, TASKS_PATH = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"
+IMAGE_NAMES = ("height", "width", "channels")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Feature:
+    """One column of a dataset.
+
+    Raises:
+        ConfigError: If type and shape do not fit together.
+    """
+
+    dtype: FeatureType
+    """Type of a number; ``image`` for pictures stored as PNG in the table, ``video`` for pictures stored as film."""
+    shape: tuple[int, ...]
+    """(D,) for numbers, (height, width, 3) for pictures."""
+    names: tuple[str, ...] | None = None
+    """Name of every entry of a vector, or of the axes of a picture."""
+
+    def __post_init__(self) -> None:
+        """Check the combination."""
+        if self.dtype not in get_args(FeatureType):
+            raise ConfigError(f"feature type {self.dtype!r} is unknown", hint=f"use one of {get_args(FeatureType)}")
+        if not all(type(edge) is int and 0 < edge <= 1 << 20 for edge in self.shape):
+            raise ConfigError(f"feature shape {self.shape} must hold positive whole numbers")
+        if self.is_picture:
+            if len(self.shape) != 3 or self.shape[2] != 3:
+                raise ConfigError(f"a picture's shape is {self.shape}", hint="use (height, width, 3)")
+            if self.dtype == "video" and (self.shape[0] % 2 or self.shape[1] % 2):
+                raise ConfigError(f"a video needs even edges, got {self.shape}", hint="store PNG pictures instead")
+        elif len(self.shape) != 1:
+            raise ConfigError(f"a feature of numbers has shape {self.shape}", hint="use (D,)")
+        if self.names is not None:
+            count = 3 if self.is_picture else self.shape[0]
+            if len(self.names) != count or not all(isinstance(name, str) for name in self.names):
+                raise ConfigError(f"feature names {self.names} must be {count} strings")
+
+    @property
+    def is_picture(self) -> bool:
+        """Whether the column holds pictures."""
+        return self.dtype in ("image", "video")
+
+
+INDEX_FEATURES = {
+    "timestamp": Feature(dtype="float32", shape=(1,)),
+    "frame_index": Feature(dtype="int64", shape=(1,)),
+    "episode_index": Feature(dtype="int64", shape=(1,)),
+    "index": Feature(dtype="int64", shape=(1,)),
+    "task_index": Feature(dtype="int64", shape=(1,)),
+}
+"""Columns that every dataset has and that the writer fills in: time within the episode [s], number of the frame within
+its episode, of the episode, of the frame within the dataset, and of the task."""
+
+
+def check_features(features: Mapping[str, Feature]) -> None:
+    """Raise ConfigError if a name cannot be a column, or is one that the writer fills in."""
+    if not features:
+        raise ConfigError("a dataset needs at least one feature", hint="give for example an action")
+    for name in features:
+        parts = name.split(".")
+        if name in INDEX_FEATURES or not all(part.isidentifier() for part in parts):
+            raise ConfigError(
+                f"feature name {name!r} cannot be used", hint="name it like observation.state, and none of the indices"
+            )
+
+
+def feature_to_json(feature: Feature, fps: int) -> dict[str, Any]:
+    """Return how info.json describes a feature."""
+    names = feature.names
+    if feature.is_picture and names is None:
+        names = IMAGE_NAMES
+    entry: dict[str, Any] = {
+        "dtype": feature.dtype,
+        "shape": list(feature.shape),
+        "names": None if names is None else list(names),
+    }
+    if feature.dtype == "video":
+        entry["info"] = {
+            "video.height": feature.shape[0],
+            "video.width": feature.shape[1],
+            "video.codec": "h264",
+            "video.pix_fmt": "yuv420p",
+            "video.is_depth_map": False,
+            "video.fps": fps,
+            "video.channels": 3,
+            "has_audio": False,
+        }
+    return entry
+
+
+def feature_from_json(entry: Any) -> Feature:
+    """Return the feature that info.json describes; raises ConfigError, KeyError or TypeError if it describes none."""
+    names = entry["names"]
+    return Feature(
+        dtype=entry["dtype"], shape=tuple(entry["shape"]), names=None if names is None else tuple(map(str, names))
+    )
+
+
+def arrow() -> Any:
+    """Return pyarrow, or raise MissingExtraError."""
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise MissingExtraError(
+            "datasets need pyarrow", hint="install it with: pip install 'softmode[data]'"
+        ) from error
+    return pyarrow
+
+
+def data_schema(features: Mapping[str, Feature]) -> pa.Schema:
+    """Return the schema of a data file, with the description that Hugging Face ``datasets`` keeps in its metadata."""
+    pa = arrow()
+    fields, described = [], {}
+    for name, feature in features.items():
+        if feature.dtype == "video":
+            continue  # lives in its own file
+        if feature.dtype == "image":
+            kind, description = pa.struct([("bytes", pa.binary()), ("path", pa.string())]), {"_type": "Image"}
+        else:
+            kind = {"bool": pa.bool_()}.get(feature.dtype) or getattr(pa, feature.dtype)()
+            description = {"dtype": feature.dtype, "_type": "Value"}
+            if feature.shape != (1,):
+                kind = pa.list_(kind, feature.shape[0])
+                description = {"feature": description, "length": feature.shape[0], "_type": "List"}
+        fields.append(pa.field(name, kind))
+        described[name] = description
+    return pa.schema(fields, metadata={"huggingface": json.dumps({"info": {"features": described}})})
+
+
+def tasks_schema() -> pa.Schema:
+    """Return the schema of the table of tasks, a pandas frame whose index is the sentence."""
+    pa = arrow()
+
+    def column(name: str | None, field: str, kind: str, numpy_kind: str) -> dict[str, Any]:
+        return {
+            "name": name,
+            "field_name": field,
+            "pandas_type": kind,
+            "numpy_type": numpy_kind,
+            "metadata": None,
+        }
+
+    index = "__index_level_0__"
+    pandas = {
+        "index_columns": [index],
+        "column_indexes": [
+            {
+                "name": None,
+                "field_name": None,
+                "pandas_type": "unicode",
+                "numpy_type": "object",
+                "metadata": {"encoding": "UTF-8"},
+            }
+        ],
+        "columns": [column("task_index", "task_index", "int64", "int64"), column(None, index, "unicode", "object")],
+        "creator": {"library": "pyarrow", "version": pa.__version__},
+        "pandas_version": "2.2.0",
+    }
+    return pa.schema(
+        [pa.field("task_index", pa.int64()), pa.field(index, pa.string())], metadata={"pandas": json.dumps(pandas)}
+    )

@@ -1,0 +1,373 @@
+"""Writing demonstrations as a LeRobot dataset that is complete after every episode."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import secrets
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from softmode.demonstrations import schema
+from softmode.demonstrations.episode import Episode
+from softmode.demonstrations.metadata import Metadata, read_metadata
+from softmode.demonstrations.schema import INDEX_FEATURES, Feature
+from softmode.demonstrations.statistics import Statistics, combine
+from softmode.demonstrations.tables import listed, rows_table, sync, tasks_table, write_json, write_table
+from softmode.errors import ConfigError, StorageError
+
+STAGE = ".recording"
+"""Folder inside a dataset where files of an unfinished episode are written."""
+EPISODES_PER_FILE = 500
+
+
+class DatasetWriter:
+    """Writes episodes as a LeRobot v3.0 dataset.
+
+    The folder appears with its first complete episode and is a complete dataset after every further one: all files of
+    an episode are written beside the old ones first and then renamed into place, ``meta/info.json``, which says how
+    many episodes there are, last. Whatever interrupts a recording, the episodes before stay readable, and
+    ``append=True`` goes on from them::
+
+        features = {"observation.state": Feature(dtype="float32", shape=(7,)), "action": Feature(...)}
+        with DatasetWriter("out/lift", features, fps=30) as writer:
+            for observation, action in episode:
+                writer.add_frame({"observation.state": observation, "action": action})
+            writer.save_episode("lift the toy")
+
+    Table files hold several episodes and are written anew with each of them, so ``file_megabytes`` bounds the work per
+    episode; a film holds one episode.
+
+    Args:
+        folder: The dataset's folder; its parents are made.
+        features: Columns by name, without the indices of :data:`~softmode.demonstrations.schema.INDEX_FEATURES`.
+        fps: Frames per second.
+        robot_type: Name of the robot.
+        append: Add to the dataset that is there, if there is one.
+        file_megabytes: Size at which the next table file is begun.
+
+    Raises:
+        ConfigError: If the folder exists and ``append`` is false, if what is there has other features or another frame
+            rate, or if another writer is at work there.
+        AssetError: If the dataset to append to is damaged.
+        StorageError: If the folder cannot be made.
+        MissingExtraError: If pyarrow, or for films imageio-ffmpeg, is not installed.
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        features: Mapping[str, Feature],
+        *,
+        fps: int,
+        robot_type: str | None = None,
+        append: bool = False,
+        file_megabytes: int = 20,
+    ) -> None:
+        """Make or open the folder."""
+        schema.arrow()
+        schema.check_features(features)
+        if type(fps) is not int or not 0 < fps <= 10_000:
+            raise ConfigError(f"fps must be a whole number of frames per second, got {fps!r}", hint="give it like 30")
+        if type(file_megabytes) is not int or not 0 < file_megabytes <= 1000:
+            raise ConfigError(f"file_megabytes must lie in 1..1000, got {file_megabytes!r}")
+        if any(feature.dtype == "video" for feature in features.values()):
+            from softmode.demonstrations.pictures import ffmpeg
+
+            ffmpeg()
+        self.folder = Path(folder).absolute()
+        self.features = {**features, **INDEX_FEATURES}
+        self._schema = schema.data_schema(self.features)
+        self._fps, self._robot_type, self._limit = fps, robot_type, file_megabytes << 20
+        self._rows: list[dict[str, Any]] = []  # episodes of the present table file
+        self._tables: list[Any] = []  # and their frames
+        self._file = 0
+        self._tasks: dict[str, int] = {}
+        self._statistics: dict[str, Statistics] = {}
+        self._episode_count = self._frame_count = 0
+        self._films_done = -1  # number of the last film
+        self._root, self._is_new, self._lock = self.folder, False, None
+        self._made: list[Path] = []
+        self._episode: Any = None
+        try:
+            exists = self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir()))
+            if exists and not append:
+                raise ConfigError(f"{self.folder} exists", hint="choose another folder, or append to it")
+            if not exists:
+                self._make_root()
+            self._take_lock()
+            if exists:
+                self._continue()
+            shutil.rmtree(self._root / STAGE, ignore_errors=True)
+        except OSError as error:
+            if isinstance(error, StorageError):
+                raise
+            self.close()
+            raise StorageError(
+                f"dataset {self.folder} cannot be written: {error.strerror or error}", hint="choose another folder"
+            ) from error
+        except BaseException:
+            self.close()
+            raise
+        self._begin()
+
+    def _make_root(self) -> None:
+        """Make the folder under a name of its own; it takes its place with the first episode."""
+        self._made = [parent for parent in self.folder.parents if not parent.exists()]
+        self.folder.parent.mkdir(parents=True, exist_ok=True)
+        root = self.folder.with_name(f".{self.folder.name}.{secrets.token_hex(6)}.tmp")
+        root.mkdir()
+        self._root, self._is_new = root, True
+
+    def _take_lock(self) -> None:
+        """Hold the folder against a second writer."""
+        self._lock = os.open(self._root, os.O_RDONLY)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ConfigError(
+                f"{self.folder} is being written by another recording", hint="wait for its end"
+            ) from error
+
+    def _continue(self) -> None:
+        """Read the state of the dataset that is there."""
+        found: Metadata = read_metadata(self.folder)
+        if found.features != self.features or found.fps != self._fps:
+            raise ConfigError(
+                f"{self.folder} holds features {_described(found.features)} at {found.fps} frames per second, not "
+                f"{_described(self.features)} at {self._fps}",
+                hint="record into another folder",
+            )
+        self._tasks = {task: number for number, task in enumerate(found.tasks)}
+        self._episode_count, self._frame_count = found.episode_count, found.frame_count
+        self._robot_type = found.robot_type
+        if not found.rows:
+            return
+        self._statistics = {name: combine([row[name] for row in found.statistics]) for name in found.statistics[0]}
+        last = found.rows[-1]
+        if (last["meta/episodes/chunk_index"], last["meta/episodes/file_index"]) != (
+            last["data/chunk_index"],
+            last["data/file_index"],
+        ):
+            raise ConfigError(f"{self.folder} was written by another program", hint="record into another folder")
+        self._file = last["data/chunk_index"] * schema.CHUNK_SIZE + last["data/file_index"]
+        videos = [row for row in (last.get(f"videos/{name}/file_index") for name in self.features) if row is not None]
+        if videos:
+            self._films_done = self._episode_count - 1
+        table = found.data_table(last)
+        if not table.schema.equals(self._schema):
+            raise ConfigError(f"{self.folder} was written by another program", hint="record into another folder")
+        here = [row for row in found.rows if row["data/file_index"] == last["data/file_index"]]
+        here = [row for row in here if row["data/chunk_index"] == last["data/chunk_index"]]
+        first = here[0]["dataset_from_index"]
+        for row in here:  # what a killed recording left behind the last episode is not taken over
+            self._rows.append({key: value for key, value in row.items()})
+            self._tables.append(table.slice(row["dataset_from_index"] - first, row["length"]))
+
+    # -- frames -------------------------------------------------------------------------------------------------------
+
+    def _begin(self) -> None:
+        """Begin an episode."""
+        self._episode = Episode(self.features, self._fps, self._root / STAGE)
+
+    @property
+    def episode_count(self) -> int:
+        """Episodes in the dataset."""
+        return self._episode_count
+
+    @property
+    def frame_count(self) -> int:
+        """Frames in the dataset, those of the present episode not counted."""
+        return self._frame_count
+
+    def add_frame(self, frame: Mapping[str, Any]) -> None:
+        """Append a frame to the present episode.
+
+        Args:
+            frame: A value for every feature: numbers of shape (D,), or a scalar where D is 1; pictures uint8 of shape
+                (height, width, 3).
+
+        Raises:
+            ConfigError: If a feature is missing, unknown, of another shape or type, or not finite; the frame is not
+                taken then.
+            StorageError: If a film cannot be written; the episode is lost then, those before it are not.
+        """
+        self._check_open()
+        try:
+            self._episode.add(frame)
+        except ConfigError:
+            raise
+        except BaseException:
+            self.discard_episode()
+            raise
+
+    def _check_open(self) -> None:
+        """Raise ConfigError after close."""
+        if self._lock is None:
+            raise ConfigError(f"the writer of {self.folder} is closed", hint="open it again with append=True")
+
+    def discard_episode(self) -> None:
+        """Forget the frames since the last saved episode."""
+        self._episode.abort()
+        self._begin()
+
+    # -- episodes -----------------------------------------------------------------------------------------------------
+
+    def save_episode(self, task: str) -> int:
+        """Add the frames since the last saved episode to the dataset.
+
+        Args:
+            task: What was to be done, as a sentence.
+
+        Returns:
+            The number of the episode.
+
+        Raises:
+            ConfigError: If there is no frame, or the task is empty.
+            StorageError: If the files cannot be written; the dataset is what it was before this episode.
+        """
+        self._check_open()
+        if not self._episode.length:
+            raise ConfigError("the episode has no frames", hint="add some before saving it")
+        if not isinstance(task, str) or not task.strip():
+            raise ConfigError(f"the task is {task!r}", hint="describe it in words")
+        try:
+            self._save(task)
+        except OSError as error:
+            self.discard_episode()
+            if isinstance(error, StorageError):
+                raise
+            raise StorageError(
+                f"dataset {self.folder} cannot take another episode: {error.strerror or error}; its "
+                f"{self._episode_count} episodes are complete",
+                hint="free some space and append",
+            ) from error
+        except BaseException:
+            self.discard_episode()
+            raise
+        self._begin()
+        return self._episode_count - 1
+
+    def _save(self, task: str) -> None:
+        """Stage the files of the dataset with the present episode, then put them in place."""
+        episode, number, start = self._episode, self._episode_count, self._frame_count
+        count = episode.length
+        tasks = {**self._tasks}
+        tasks.setdefault(task, len(tasks))
+        for film in episode.films.values():
+            film.close()
+        arrays = episode.arrays(number, start, tasks[task])
+        table, found = episode.table(arrays, self._schema), episode.statistics(arrays)
+        total = {n: combine([self._statistics[n], s]) if n in self._statistics else s for n, s in found.items()}
+
+        rows, tables, file = self._rows, self._tables, self._file
+        size = sum(part.nbytes for part in tables)
+        if rows and (size + table.nbytes > self._limit or len(rows) >= EPISODES_PER_FILE):
+            rows, tables, file = [], [], file + 1
+        film_number = self._films_done + 1
+        row = self._row(number, task, start, count, file, film_number, found)
+        rows, tables = [*rows, row], [*tables, table]
+
+        stage = self._root / STAGE
+        stage.mkdir(exist_ok=True)
+        moves: list[tuple[Path, str]] = []
+        for name, film in episode.films.items():
+            chunk, within = divmod(film_number, schema.CHUNK_SIZE)
+            path = schema.VIDEO_PATH.format(video_key=name, chunk_index=chunk, file_index=within)
+            moves.append((film.path, path))
+        where = {"chunk_index": file // schema.CHUNK_SIZE, "file_index": file % schema.CHUNK_SIZE}
+        moves.append((write_table(stage / "data.parquet", tables), schema.DATA_PATH.format(**where)))
+        if len(tasks) > len(self._tasks):
+            moves.append((write_table(stage / "tasks.parquet", [tasks_table(tasks)]), schema.TASKS_PATH))
+        moves.append(
+            (write_table(stage / "episodes.parquet", [rows_table(rows)]), schema.EPISODES_PATH.format(**where))
+        )
+        moves.append((write_json(stage / "stats.json", listed(total)), schema.STATISTICS_PATH))
+        moves.append((write_json(stage / "info.json", self._info(number + 1, start + count, tasks)), schema.INFO_PATH))
+        for source, _ in moves:
+            sync(source)
+        for source, target in moves:
+            (self._root / target).parent.mkdir(parents=True, exist_ok=True)
+            os.replace(source, self._root / target)
+        if self._is_new:
+            shutil.rmtree(stage)
+            os.rename(self._root, self.folder)  # replaces an empty folder, and fails on any other
+            self._root, self._is_new, self._made = self.folder, False, []
+        self._rows, self._tables, self._file = rows, tables, file
+        self._tasks, self._statistics = tasks, total
+        self._episode_count, self._frame_count = number + 1, start + count
+        self._films_done = film_number
+
+    def _row(
+        self, number: int, task: str, start: int, count: int, file: int, film: int, found: Mapping[str, Statistics]
+    ) -> dict[str, Any]:
+        """Return the row of an episode."""
+        chunk, within = divmod(file, schema.CHUNK_SIZE)
+        row: dict[str, Any] = {
+            "episode_index": number,
+            "tasks": [task],
+            "length": count,
+            "data/chunk_index": chunk,
+            "data/file_index": within,
+            "dataset_from_index": start,
+            "dataset_to_index": start + count,
+        }
+        for name in self._episode.films:
+            row[f"videos/{name}/chunk_index"], row[f"videos/{name}/file_index"] = divmod(film, schema.CHUNK_SIZE)
+            row[f"videos/{name}/from_timestamp"] = 0.0
+            row[f"videos/{name}/to_timestamp"] = count / self._fps
+        for name, values in found.items():
+            row.update({f"stats/{name}/{key}": value.tolist() for key, value in values.items()})
+        return row | {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": within}
+
+    def _info(self, episodes: int, frames: int, tasks: Mapping[str, int]) -> dict[str, Any]:
+        """Return the content of info.json."""
+        has_video = any(kind.dtype == "video" for kind in self.features.values())
+        return {
+            "codebase_version": schema.CODEBASE_VERSION,
+            "robot_type": self._robot_type,
+            "total_episodes": episodes,
+            "total_frames": frames,
+            "total_tasks": len(tasks),
+            "chunks_size": schema.CHUNK_SIZE,
+            "data_files_size_in_mb": self._limit >> 20,
+            "video_files_size_in_mb": self._limit >> 20,
+            "fps": self._fps,
+            "splits": {"train": f"0:{episodes}"},
+            "data_path": schema.DATA_PATH,
+            "video_path": schema.VIDEO_PATH if has_video else None,
+            "features": {name: schema.feature_to_json(kind, self._fps) for name, kind in self.features.items()},
+        }
+
+    # -- end ----------------------------------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Drop what belongs to no saved episode and let go of the folder; harmless twice."""
+        if self._episode is not None:
+            self._episode.abort()
+        if self._lock is not None:
+            shutil.rmtree(self._root if self._is_new else self._root / STAGE, ignore_errors=True)
+            os.close(self._lock)
+            self._lock = None
+        elif self._is_new:
+            shutil.rmtree(self._root, ignore_errors=True)
+        for parent in self._made:
+            with contextlib.suppress(OSError):
+                parent.rmdir()
+        self._made = []
+
+    def __enter__(self) -> DatasetWriter:
+        """Return the writer."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close it; frames that were not saved are dropped."""
+        self.close()
+
+
+def _described(features: Mapping[str, Feature]) -> str:
+    """Return features in a line."""
+    return ", ".join(f"{name} {kind.dtype}{list(kind.shape)}" for name, kind in features.items())
