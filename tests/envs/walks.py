@@ -125,3 +125,32 @@ class WalkVectorEnv(gym.vector.VectorEnv):
             tensor = torch.from_numpy(value)
             return tensor.float() if tensor.dtype == torch.float64 else tensor
         return value
+
+
+class GoalWalkVectorEnv(WalkVectorEnv):
+    """The same with a goal: Dict observations, and a reward that can be computed for other goals."""
+
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
+        place = gym.spaces.Box(-9.0, 9.0, (2,), np.float32)
+        self.single_observation_space = gym.spaces.Dict(
+            {"observation": place, "achieved_goal": place, "desired_goal": place}
+        )
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.goal = np.full((num_envs, 2), 0.5, np.float32)
+        self.calls = 0
+
+    def observe(self) -> Any:
+        return {
+            "observation": self.place.copy(),
+            "achieved_goal": self.place.copy(),
+            "desired_goal": self.goal.copy(),
+        }
+
+    def reward(self) -> np.ndarray:
+        return self.compute_reward(self.place, self.goal, None)
+
+    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> np.ndarray:
+        """Return the distance to a goal, negative."""
+        self.calls += info is not None
+        return -np.linalg.norm(achieved - desired, axis=-1)
