@@ -152,7 +152,7 @@ def test_stable_baselines_reaches_attributes() -> None:
     env = StableBaselinesVecEnv(GoalWalkVectorEnv(3))
     assert env.get_attr("max_episode_steps") == [6] * 3 and env.get_attr("num_envs", indices=[0, 2]) == [3, 3]
     env.set_attr("max_episode_steps", 9)
-    assert env.env.unwrapped.max_episode_steps == 9
+    assert env.get_attr("max_episode_steps", indices=0) == [9]
     with pytest.raises(ConfigError, match="share one object"):
         env.set_attr("max_episode_steps", 3, indices=[1])
     goals = np.zeros((5, 2), np.float32)

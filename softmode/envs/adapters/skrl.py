@@ -44,9 +44,7 @@ class SkrlWrapper(Wrapper):
     @property
     def device(self) -> torch.device:
         """Where the tensors lie."""
-        if self._observations is None:
-            self.reset()
-        return self._observations.device
+        return self.reset()[0].device
 
     @property
     def observation_space(self) -> gym.Space:

@@ -13,7 +13,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 from numpy.typing import NDArray
 
-from softmode.envs.check_values import (
+from softmode.envs.check.values import (
     as_numpy,
     check_flag,
     check_infos,

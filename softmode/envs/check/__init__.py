@@ -7,26 +7,27 @@ from dataclasses import dataclass, field
 
 from gymnasium.vector import VectorEnv
 
-from softmode.envs.check_episodes import Event, Subject
-from softmode.envs.check_rules import DEPTH, Rules, Skip
-from softmode.envs.check_values import equal
+from softmode.envs.check import actions, autoreset, isolation, seeding
+from softmode.envs.check.episodes import Event, Subject
+from softmode.envs.check.reference import DEPTH, Reference, Skip
+from softmode.envs.check.values import equal
 from softmode.errors import ConfigError, EnvironmentCheckError
 
-RULES: dict[str, str] = {
-    "same seed": "same_seed",
-    "isolation of actions": "actions_apart",
-    "seed per world": "seed_per_world",
-    "seed list": "seed_list",
-    "seed none": "seed_none",
-    "autoreset": "autoreset",
-    "time limit": "time_limit",
-    "partial reset": "partial_reset",
-    "no shared buffers": "no_shared_buffers",
-    "large action": "large_action",
-    "wrong shape": "wrong_shape",
-    "nan action": "nan_action",
+RULES: dict[str, Callable[[Reference], str | None]] = {
+    "same seed": seeding.same_seed,
+    "isolation of actions": isolation.actions_apart,
+    "seed per world": seeding.seed_per_world,
+    "seed list": seeding.seed_list,
+    "seed none": seeding.seed_none,
+    "autoreset": autoreset.autoreset,
+    "time limit": autoreset.time_limit,
+    "partial reset": isolation.partial_reset,
+    "no shared buffers": isolation.no_shared_buffers,
+    "large action": actions.large_action,
+    "wrong shape": actions.wrong_shape,
+    "nan action": actions.nan_action,
 }
-"""The checks on behaviour, by the name that reports and ``skip`` use, and the method of `Rules` that makes each."""
+"""The checks on behaviour, by the name that reports and ``skip`` use."""
 
 VALUES: tuple[str, ...] = ("spaces", "autoreset mode", "observations", "rewards", "flags", "array kind", "info masks")
 """The rules that every call is held to."""
@@ -107,8 +108,8 @@ def check_vector_env(
             )
         limit = max_episode_steps or _time_limit(candidate)
         subject = Subject(candidate, steps=steps, seed=seed)
-        rules = Rules(subject, max_episode_steps=limit, exchangeable=exchangeable, ignored=frozenset(ignored_infos))
-        return _apply(subject, rules, skip), rules.reference
+        run = Reference(subject, max_episode_steps=limit, exchangeable=exchangeable, ignored=frozenset(ignored_infos))
+        return _apply(subject, run, skip), run.events
 
     if isinstance(env, VectorEnv):
         report, _ = check(env)
@@ -148,15 +149,15 @@ def _time_limit(env: VectorEnv) -> int | None:
     return limit if limit is not None and limit > 0 else None
 
 
-def _apply(subject: Subject, rules: Rules, skip: Collection[str]) -> VectorEnvReport:
+def _apply(subject: Subject, run: Reference, skip: Collection[str]) -> VectorEnvReport:
     """Apply the rules in turn."""
     checked, skipped, notes = [*VALUES], {}, []
-    for name, method in RULES.items():
+    for name, rule in RULES.items():
         if name in skip:
             skipped[name] = "asked to"
             continue
         try:
-            note = getattr(rules, method)()
+            note = rule(run)
         except Skip as reason:
             skipped[name] = str(reason)
             continue
