@@ -8,8 +8,8 @@ BIN    := $(VENV)/bin
 UV     := $(BIN)/uv
 ARGS   ?=
 
-# The environment checker of stable-baselines3 imports torch; a CPU wheel (200 MB) is enough. Where pip's own settings find
-# no CPU wheel, the default one for Linux brings gigabytes of CUDA libraries: point PIP_EXTRA_INDEX_URL at PyTorch's index
+# Tests train with stable-baselines3, rsl_rl and skrl, which need torch; a CPU wheel (200 MB) is enough, and the three and
+# what they bring are 32 MB more. Where pip's own settings find no CPU wheel, the default one for Linux brings gigabytes of CUDA libraries: point PIP_EXTRA_INDEX_URL at PyTorch's index
 # of CPU wheels to avoid that.
 TORCH ?= torch==2.13.0
 
@@ -44,12 +44,14 @@ $(VENV)/.demo: $(VENV)/.created pyproject.toml constraints.txt
 $(VENV)/.dev: $(VENV)/.created pyproject.toml constraints.txt
 	$(INSTALL) --editable '.[dev]' || $(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[dev]'
 	$(BIN)/python -c 'import torch' 2>/dev/null || $(BIN)/python -m pip install --quiet '$(TORCH)'
-	$(BIN)/python -m pip install --quiet stable-baselines3 tensorboard
+	$(BIN)/python -m pip install --quiet -c constraints.txt stable-baselines3 tensorboard rsl-rl-lib skrl
 	@touch $@ $(VENV)/.demo
 
+# All but torch, whose wheel (CPU, or one of several for CUDA) is the machine's choice, and what only that needs.
 lock: $(VENV)/.created  ## pin the newest versions that pyproject.toml allows
-	$(UV) pip compile --quiet --universal --upgrade --python-version 3.11 --extra demo --extra dev --extra bench --no-header \
-	  --no-annotate --no-emit-index-url pyproject.toml -o constraints.txt
+	$(UV) pip compile --quiet --universal --upgrade --python-version 3.11 --extra demo --extra dev --extra bench --extra rl \
+	  --extra rsl-rl --extra skrl --override <(echo "torch; python_version < '3'") --no-header --no-annotate \
+	  --no-emit-index-url pyproject.toml -o constraints.txt
 
 demo: $(VENV)/.demo  ## play the scripted lift and write out/lift.mp4
 	$(BIN)/softmode play softmode/LiftSoft-v0 --policy scripted --video out/lift.mp4 $(ARGS)

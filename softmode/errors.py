@@ -62,3 +62,21 @@ class RunError(SoftmodeError, OSError):
 
 class TrainingDiverged(SoftmodeError, RuntimeError):
     """Training met a value that is not finite."""
+
+
+class EnvironmentCheckError(SoftmodeError, AssertionError):
+    """A vector environment breaks a rule of Gymnasium's vector API.
+
+    Args:
+        message: What was seen and what the rule asks.
+        rule: Name of the broken rule, one of `softmode.envs.check.RULES`.
+        world: Index of the world at fault; None where no single world is.
+        hint: The remedy.
+    """
+
+    def __init__(self, message: str, *, rule: str, world: int | None = None, hint: str = "") -> None:
+        """Put rule and world before the message."""
+        where = "" if world is None else f", world {world}"
+        super().__init__(f"{rule}{where}: {message}", hint=hint)
+        self.rule = rule
+        self.world = world

@@ -1,0 +1,149 @@
+"""Rule ``bad actions``: NaN, numbers beyond the bounds, other shapes."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AsyncVectorEnv
+
+from softmode.envs.check.episodes import Event, is_continuous
+from softmode.envs.check.reference import REFUSALS, Reference, Skip
+from softmode.envs.check.values import leaves
+from softmode.errors import EnvironmentCheckError
+
+_NAN = "refuse actions that are not finite, or end the episode of their world alone"
+
+
+def nan_action(run: Reference) -> str | None:
+    """NaN is refused before anything moves, or harms no other world and is gone after a reset."""
+    _for_floats(run)
+    subject = run.subject
+    world, at = subject.num_envs - 1, _quiet_step(run)
+    bad = subject.replace_action(
+        subject.actions[at],
+        world,
+        np.full_like(subject.action_of(subject.actions[at], world), np.nan),
+    )
+    subject.run(at)
+    note = None
+    try:
+        event = _quietly(run, bad, lenient=world)
+    except EnvironmentCheckError:
+        raise
+    except Exception as error:
+        _refused(run, error, at, "NaN")
+    else:
+        what = f"NaN in the action of world {world}"
+        run.same_worlds(run.steps[at], event, "bad actions", what, _NAN, without=world, same=True)
+        if any(array.dtype.kind == "f" and np.isnan(array).any() for _, array in leaves(event.observation[world])):
+            note = "NaN in an action is accepted, and its world's observation is NaN until the next reset"
+    run.same_worlds(run.events[0], subject.reset(seed=subject.seed), "bad actions", "a reset after NaN", _NAN)
+    return note
+
+
+def large_action(run: Reference) -> None:
+    """Actions beyond the bounds are clipped or refused."""
+    _for_floats(run)
+    subject = run.subject
+    space = subject.env.action_space
+    assert isinstance(space, gym.spaces.Box)
+    for sign in (1.0, -1.0):
+        bound = np.where(np.isfinite(space.high), np.abs(space.high), 1.0)
+        subject.run(0)
+        try:
+            _quietly(run, (sign * (10.0 * bound + 10.0)).astype(space.dtype))
+        except EnvironmentCheckError:
+            raise
+        except REFUSALS:
+            pass
+    run.same_worlds(
+        run.events[0],
+        subject.reset(seed=subject.seed),
+        "bad actions",
+        "a reset after actions beyond the bounds",
+        "clip actions to the bounds, or refuse them by a ValueError",
+    )
+
+
+def wrong_shape(run: Reference) -> str | None:
+    """Actions of another shape are refused before anything moves."""
+    subject = run.subject
+    _not_async(run)
+    action = subject.actions[_quiet_step(run)]
+    items = [subject.action_of(action, world) for world in range(subject.num_envs)]
+    shapes = {f"{subject.num_envs + 1} worlds": (items[0], *items)}
+    if isinstance(action, np.ndarray):
+        shapes = {f"{subject.num_envs + 1} worlds": np.concatenate([action[:1], action])}
+        if action.ndim > 1 and not subject.composed:
+            shapes["one number more"] = np.concatenate([action, action[..., :1]], axis=-1)
+        if not subject.composed and action.ndim > 1:
+            shapes["no axis of worlds"] = action[0]
+    for name, bad in shapes.items():
+        subject.run(_quiet_step(run))
+        try:
+            _quietly(run, bad)
+        except EnvironmentCheckError:
+            raise
+        except Exception as error:
+            _refused(run, error, _quiet_step(run), f"an action of {name}")
+        else:
+            raise EnvironmentCheckError(
+                f"an action of {name} is accepted",
+                rule="bad actions",
+                hint="compare the action's shape with action_space.shape and raise a ValueError that names both",
+            )
+    return "the shape of a single world's action is left to the single environments" if subject.composed else None
+
+
+def _for_floats(run: Reference) -> None:
+    """Skip where actions are no floats."""
+    _not_async(run)
+    if not is_continuous(run.subject.env.action_space):
+        raise Skip("actions are not floating-point numbers")
+
+
+def _not_async(run: Reference) -> None:
+    """Skip where an error ends the worker process."""
+    if isinstance(run.subject.env.unwrapped, AsyncVectorEnv):
+        raise Skip("an error in a worker closes an AsyncVectorEnv")
+
+
+def _quiet_step(run: Reference) -> int:
+    """Return the index of an early step in which no episode ends."""
+    return next((i for i in (2, 1, 0) if i < len(run.steps) and _no_end(run, i)), 0)
+
+
+def _no_end(run: Reference, index: int) -> bool:
+    """Whether no episode ended up to a step."""
+    return not any(event.done.any() for event in run.steps[: index + 1])
+
+
+def _quietly(run: Reference, action: Any, lenient: int | None = None) -> Event:
+    """Step without the warnings that bad numbers cause."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return run.subject.step(action, lenient=lenient)
+
+
+def _refused(run: Reference, error: Exception, at: int, what: str) -> None:
+    """Check that an error is a refusal and that nothing moved."""
+    subject = run.subject
+    if not isinstance(error, REFUSALS):
+        raise EnvironmentCheckError(
+            f"{what} raises {type(error).__name__}: {error}",
+            rule="bad actions",
+            hint="check actions first and raise a ValueError or TypeError that says what was expected",
+        ) from error
+    if subject.composed:
+        return  # single environments are stepped in turn, so those before the bad one have moved
+    run.same_worlds(
+        run.steps[at],
+        subject.step(subject.actions[at]),
+        "bad actions",
+        f"{what}, refused,",
+        "check actions before any world moves",
+        same=True,
+    )
