@@ -9,8 +9,8 @@ UV     := $(BIN)/uv
 ARGS   ?=
 
 # Tests train with stable-baselines3, rsl_rl and skrl, which need torch; a CPU wheel (200 MB) is enough, and the three and
-# what they bring are 32 MB more. Where pip's own settings find no CPU wheel, the default one for Linux brings gigabytes of CUDA libraries: point PIP_EXTRA_INDEX_URL at PyTorch's index
-# of CPU wheels to avoid that.
+# what they bring are 32 MB more. Where pip's own settings find no CPU wheel, the default one for Linux brings gigabytes of
+# CUDA libraries: point PIP_EXTRA_INDEX_URL at PyTorch's index of CPU wheels to avoid that.
 TORCH ?= torch==2.13.0
 
 # Compiled kernels and built bodies stay inside the checkout.

@@ -156,6 +156,8 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             seed: Seed s, for s + i in world i; or one per world, None among them to go on; or None.
             options: ``reset_mask`` (num_envs,) bool, and parameters of the task, one value or one per world.
         """
+        if options is not None and not isinstance(options, Mapping):
+            raise ConfigError(f"options is a {type(options).__name__}", hint="give a dict")
         given = dict(options or {})
         mask = self._checked_mask(given.pop("reset_mask", None))
         chosen = check_options(self._worlds[0].parameters, given, self.num_envs)
@@ -174,8 +176,11 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             actions: Actions in [-1, 1], shape (num_envs, action_size).
 
         Raises:
-            ConfigError: If the actions have another shape, or hold NaN (numpy output only); nothing has moved then.
+            ConfigError: If the actions have another shape, or hold NaN (numpy output only), or no episode has begun;
+                nothing has moved then.
         """
+        if self._random is None:
+            raise ConfigError("step comes before the first reset", hint="call reset() first")
         numbers = self._tensors_assigned(actions) if self.output == "torch" else self._checked_actions(actions)
         with self._stream():
             for worlds, part in zip(self._worlds, self._slices, strict=True):
@@ -245,7 +250,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         elif isinstance(seed, (int, np.integer)):
             given = [int(seed) + i for i in range(self.num_envs)]
         else:
-            given = list(seed)
+            given = list(seed) if isinstance(seed, (Sequence, np.ndarray)) and not isinstance(seed, str) else []
         if len(given) != self.num_envs or not all(
             s is None or (isinstance(s, (int, np.integer)) and s >= 0) for s in given
         ):
@@ -320,6 +325,13 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             observation = rows
         infos["final_obs"], infos["_final_obs"] = observation, _copy(ended)
         infos["final_info"], infos["_final_info"] = self._masked(final["info"], ended), _copy(ended)
+        # What stays are the infos of the new episodes, which have earned nothing yet.
+        terms = [value for name, value in infos["reward_terms"].items() if not name.startswith("_")]
+        for values in (*terms, infos["end_reason"]):
+            if numpy:
+                values[ended] = 0
+            else:
+                values.masked_fill_(ended, 0)
 
     def _everywhere(self) -> Any:
         """Return a mask of all worlds."""

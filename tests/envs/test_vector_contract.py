@@ -188,7 +188,7 @@ def first(tree: Any) -> Any:
 
 @pytest.mark.parametrize("task", [TASKS[0], *(pytest.param(task, marks=pytest.mark.slow) for task in TASKS[1:])])
 def test_the_end_is_the_same_in_both_autoreset_modes(task: str) -> None:
-    """What NEXT_STEP returns at the end of an episode is SAME_STEP's final_obs and final_info, and so goes the next."""
+    """What NEXT_STEP returns at the end of an episode is SAME_STEP's final_obs and final_info, and so it goes on."""
     same, then = (
         gym.make_vec(task, num_envs=2, autoreset_mode=mode, max_episode_steps=LIMIT)
         for mode in (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
@@ -204,6 +204,8 @@ def test_the_end_is_the_same_in_both_autoreset_modes(task: str) -> None:
     assert ours[3].all()
     np.testing.assert_array_equal(np.stack(ours[4]["final_obs"]), theirs[0])
     assert equal(ours[4]["final_info"], theirs[4])
+    fresh = [ours[4]["end_reason"], *(ours[4]["reward_terms"][name] for name in first(theirs[4]["reward_terms"]))]
+    assert not np.any(fresh)  # beside final_info are the infos of the new episodes
     np.testing.assert_array_equal(ours[0], then.step(action)[0])
     action = same.action_space.sample()
     np.testing.assert_array_equal(same.step(action)[0], then.step(action)[0])

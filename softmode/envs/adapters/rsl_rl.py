@@ -113,8 +113,11 @@ class RslRlVecEnv(VecEnv):
 
     def _log(self, infos: dict[str, Any], done: torch.Tensor) -> dict[str, torch.Tensor]:
         """Average reward terms and the ends of episodes; nothing is read back to the host."""
+        ended = infos["final_info"]["reward_terms"]
         log = {
-            f"/reward/{name}": value.mean() for name, value in infos["reward_terms"].items() if not name.startswith("_")
+            f"/reward/{name}": torch.where(done, ended[name], value).mean()
+            for name, value in infos["reward_terms"].items()
+            if not name.startswith("_")
         }
         self._ended = torch.maximum(self._ended, done.float())
         for name, value in infos["final_info"].items():

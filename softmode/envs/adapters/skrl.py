@@ -84,9 +84,11 @@ class SkrlWrapper(Wrapper):
         actions = unflatten_tensorized_space(self.action_space, actions)
         observation, reward, terminated, truncated, self._infos = self._env.step(actions)
         self._observations = flatten_tensorized_space(_floats(observation))
-        terms = self._infos.get("reward_terms", {})
+        now, ended = self._infos["reward_terms"], self._infos["final_info"]["reward_terms"]
         self._infos["episode"] = {
-            f"Reward / {name}": value.mean() for name, value in terms.items() if not name.startswith("_")
+            f"Reward / {name}": torch.where(terminated | truncated, ended[name], value).mean()
+            for name, value in now.items()
+            if not name.startswith("_")
         }
         return (
             self._observations,
