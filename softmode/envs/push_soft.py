@@ -125,10 +125,10 @@ class PushSoft(Task):
         low_yaw, high_yaw = config.goal_yaw
         return (
             *super().parameters(),
-            Parameter(name="goal", low=tuple(low), high=tuple(high), least=(0.0, -2.0 * np.pi), most=(0.5, 2.0 * np.pi)),
             Parameter(
-                name="goal_yaw", low=(low_yaw,), high=(high_yaw,), least=(-2.0 * np.pi,), most=(2.0 * np.pi,)
+                name="goal", low=tuple(low), high=tuple(high), least=(0.0, -2.0 * np.pi), most=(0.5, 2.0 * np.pi)
             ),
+            Parameter(name="goal_yaw", low=(low_yaw,), high=(high_yaw,), least=(-2.0 * np.pi,), most=(2.0 * np.pi,)),
         )
 
     def goal_segments(self) -> tuple[Segment, ...]:

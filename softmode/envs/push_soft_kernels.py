@@ -69,9 +69,7 @@ def observe(
     observation[w, object_column + 6] = push_height - tool[2]
     metrics[w, 0] = distance
     metrics[w, 1] = wp.abs(wp.atan2(across, along))
-    marker_place[w] = wp.transform(
-        wp.vec3(goal[0], goal[1], 0.0), wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw)
-    )
+    marker_place[w] = wp.transform(wp.vec3(goal[0], goal[1], 0.0), wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw))
 
 
 @wp.kernel
