@@ -15,9 +15,10 @@ __version__ = "0.1.0"
 
 ENVIRONMENTS = {
     "softmode/LiftSoft-v0": "Pick a soft object from a table and hold it at a goal.",
+    "softmode/PushSoft-v0": "Push a soft object over the table to a goal.",
 }
 """Ids of the registered environments and what their task is."""
-_EPISODE_STEPS = {"LiftSoft": 150}
+_EPISODE_STEPS = {"LiftSoft": 150, "PushSoft": 120}
 """Control steps of an episode."""
 
 

@@ -11,6 +11,29 @@ from softmode.envs.lift_soft import LiftSoft
 from softmode.errors import ConfigError
 
 
+def scripted_policy(env: Any) -> Any:
+    """Return the scripted policy of an environment: called with an observation it returns an action.
+
+    Args:
+        env: An environment of one world, wrapped or not.
+
+    Raises:
+        ConfigError: If its task has none, or it takes other actions than tool steps.
+    """
+    from softmode.envs.push_soft import PushSoft
+    from softmode.envs.scripted_push import ScriptedPush
+
+    policies = {LiftSoft: ScriptedLift, PushSoft: ScriptedPush}
+    task = getattr(env.unwrapped, "task", None)
+    for kind, policy in policies.items():
+        if isinstance(task, kind):
+            return policy(env)
+    raise ConfigError(
+        f"there is no scripted policy for {env}",
+        hint=f"there is one for {', '.join(kind.__name__ for kind in policies)}",
+    )
+
+
 class ScriptedLift:
     """Lift the object: align above it, go down, close until it is held, lift to the goal, try again if it slips.
 

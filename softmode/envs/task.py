@@ -245,9 +245,9 @@ class Task:
             Segment("object_points", 3 * self.point_count, -reach, reach),
         )
         self.segments: dict[str, tuple[slice, Segment]] = {}
-        """Columns of each segment: proprioception, goal, object."""
+        """Columns of each segment: proprioception, goal, object, and what a task adds about it."""
         column = 0
-        for segment in (*PROPRIOCEPTION, *self.goal_segments(), *body):
+        for segment in (*PROPRIOCEPTION, *self.goal_segments(), *body, *self.object_segments()):
             self.segments[segment.name] = (slice(column, column + segment.size), segment)
             column += segment.size
         chosen = [segment for _, segment in self.segments.values()]
@@ -326,6 +326,10 @@ class Task:
 
     def goal_segments(self) -> tuple[Segment, ...]:
         """Return the segments of the observation that say what to reach."""
+        return ()
+
+    def object_segments(self) -> tuple[Segment, ...]:
+        """Return more segments that see the object; the last ones of the observation."""
         return ()
 
     def place(self) -> None:
