@@ -59,6 +59,27 @@ def test_mistakes_name_the_remedy(arguments, named, capsys, tmp_path, monkeypatc
     assert not list(tmp_path.iterdir())
 
 
+def test_pixels_of_a_softmode_environment(tmp_path: Path, capsys):
+    """The camera's picture size comes from JSON, the critic reads the state, and the policy makes its environment."""
+    folder = tmp_path / "run"
+    arguments = ["train", "softmode/LiftSoft-v0", "--run-dir", str(folder), "--obs-type", "pixels_agent_pos"]
+    arguments += ["--env-options", '{"config": {"image_size": 36}, "max_episode_steps": 6}', "--num-envs", "2"]
+    arguments += ["--set", "rollout_steps=4", "features=8", "hidden=[8]", "epochs=1", "--total-steps", "32"]
+    assert cli.main([*arguments, "--eval-episodes", "2"]) == 0
+    assert "reach" in capsys.readouterr().out
+    from softmode.learning.policy import load_policy
+
+    policy = load_policy(folder / "latest.npz")
+    assert policy.interface.pictures == {"pixels": (36, 36, 3)} and policy.checkpoint.privileged > 8
+    env = policy.make()
+    try:
+        policy.check(env)
+        observation, _ = env.reset(seed=0)
+        assert env.action_space.contains(policy(observation))
+    finally:
+        env.close()
+
+
 def test_values_are_parsed():
     """JSON where it is, words where it is not; dicts become configurations down to the leaves."""
     assert parse_overrides(("discount=0.9", "hidden=[8,8]", "schedule=linear", "clip-value=null")) == {

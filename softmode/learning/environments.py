@@ -27,13 +27,12 @@ def make_vector_env(env: str, num_envs: int, device: torch.device, options: dict
     """
     given = dict(options)
     try:
-        spec = gym.spec(env)
+        gym.spec(env)
         if env not in ENVIRONMENTS:
             return gym.make_vec(env, num_envs=num_envs, vectorization_mode="sync", **given)
     except (gym.error.UnregisteredEnv, gym.error.NameNotFound, gym.error.NamespaceNotFound) as error:
         raise ConfigError(f"unknown environment {env!r}", hint=f"use one of {', '.join(ENVIRONMENTS)}") from error
-    if isinstance(given.get("config"), dict):
-        given["config"] = config_of(env_class(spec).task_class.config_class, given["config"])
+    given = with_config(env, given)
     try:
         return gym.make_vec(env, num_envs=num_envs, **{"device": str(device), "output": "torch", **given})
     except TypeError as error:
@@ -44,7 +43,14 @@ def make_vector_env(env: str, num_envs: int, device: torch.device, options: dict
         ) from error
 
 
-def env_class(spec: Any) -> Any:
-    """Return the class of a registered vector environment."""
-    module, _, name = str(spec.vector_entry_point).partition(":")
-    return getattr(importlib.import_module(module), name)
+def with_config(env: str, options: dict[str, Any]) -> dict[str, Any]:
+    """Return keyword arguments of a softmode environment, a ``config`` that is a dict as the configuration it means.
+
+    Raises:
+        ConfigError: If a field is unknown or outside its range.
+    """
+    if env not in ENVIRONMENTS or not isinstance(options.get("config"), dict):
+        return options
+    module, _, name = str(gym.spec(env).vector_entry_point).partition(":")
+    cls = getattr(importlib.import_module(module), name)
+    return {**options, "config": config_of(cls.task_class.config_class, options["config"])}

@@ -139,7 +139,7 @@ def preset(num_envs: int, *, pixels: bool = False) -> Hyperparameters:
     if not _is_count(num_envs):
         raise ConfigError(f"num_envs must be a whole number >= 1, got {num_envs!r}", hint="give a count like 16")
     if num_envs >= 512:
-        base = Hyperparameters(minibatches=8)
+        base = Hyperparameters(rollout_steps=16, epochs=4, minibatches=8)
     else:
         # Rollouts of about 2,048 steps in minibatches of about 256.
         steps = min(max(2048 // num_envs, 32), 512)

@@ -15,6 +15,7 @@ import torch
 from softmode.errors import CheckpointError, ConfigError
 from softmode.learning.checkpoints import Checkpoint, check_env, read_checkpoint
 from softmode.learning.distributed import local_device
+from softmode.learning.environments import with_config
 from softmode.learning.networks import Actor, Observation
 from softmode.learning.spaces import Interface
 from softmode.learning.vector_tensors import TensorVectorEnv
@@ -48,6 +49,10 @@ class Policy:
         low = torch.tensor(self.interface.action_low, device=device)
         high = torch.tensor(self.interface.action_high, device=device)
         self._center, self._half = (high + low) / 2.0, (high - low) / 2.0
+
+    def make(self, **options: Any) -> gym.Env:
+        """Return the environment of the policy, with the options it was trained with and further ones."""
+        return gym.make(self.env, **with_config(self.env, {**self.env_options, **options}))
 
     def check(self, env: Any) -> None:
         """Refuse an environment other than the policy's.
