@@ -32,7 +32,7 @@ class Hyperparameters:
     """Learning rate of Adam at the start."""
     schedule: Literal["adaptive", "linear", "constant"] = "adaptive"
     """adaptive follows the divergence of the policy, linear falls to a twentieth at the end of the run."""
-    desired_kl: float = 0.01
+    desired_kl: float = 0.02
     """Divergence from the old policy that the adaptive schedule aims at [nat]."""
     max_learning_rate: float = 5e-3
     """Bound of the adaptive schedule."""
