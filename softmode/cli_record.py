@@ -78,9 +78,11 @@ def record(options: Record) -> int:
 
     check_recording(options.episodes, options.seed, options.noise)
     trained = trained_policy(options.policy, options.env)
-    given: dict[str, Any] = (
-        {"obs_type": "pixels_agent_pos"} if trained is None else _trained_options(options.env, trained)
-    )
+    given: dict[str, Any] = {"obs_type": "pixels_agent_pos"}
+    if trained is not None:
+        from softmode.learning.environments import with_config
+
+        given = with_config(options.env, trained.env_options)
     if options.obs_type is not None:
         given["obs_type"] = options.obs_type
     with quiet_warp():
@@ -126,19 +128,6 @@ def record(options: Record) -> int:
         f"{out} holds {total} episodes"
     )
     return 0
-
-
-def _trained_options(env: str, trained: Any) -> dict[str, Any]:
-    """Return the options of the environment that a policy was trained in."""
-    import gymnasium as gym
-
-    from softmode.learning.config_values import config_of
-    from softmode.learning.environments import env_class
-
-    given = dict(trained.env_options)
-    if isinstance(given.get("config"), dict):
-        given["config"] = config_of(env_class(gym.spec(env)).task_class.config_class, given["config"])
-    return given
 
 
 def _tell_interrupted(writer: DatasetWriter, missing: int, seed: int) -> None:
