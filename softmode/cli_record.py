@@ -82,7 +82,7 @@ def record(options: Record) -> int:
     if trained is not None:
         from softmode.learning.environments import with_config
 
-        given = with_config(options.env, trained.env_options)
+        given = dict(with_config(options.env, trained.env_options))
     if options.obs_type is not None:
         given["obs_type"] = options.obs_type
     with quiet_warp():
