@@ -24,8 +24,7 @@ from softmode.demonstrations.recording import environment_features, record_episo
 from softmode.policies import policy_factory
 
 KEYS = ("observation.state", "observation.environment_state", "action")
-CHUNK, PLAYED, NOISE = 8, 4, 0.3
-"""Actions predicted at once, those of them played, pushes while recording."""
+CHUNK, PLAYED, NOISE = 8, 4, 0.3  # actions predicted at once, those of them played, pushes while recording
 
 
 class Clone(nn.Module):
@@ -37,13 +36,12 @@ class Clone(nn.Module):
         parts = [data.statistics[key] for key in KEYS[:-1]]
         self.mean = torch.tensor(np.concatenate([part["mean"] for part in parts]), dtype=torch.float32)
         self.scale = torch.tensor(np.concatenate([part["std"] for part in parts]), dtype=torch.float32).clamp(min=1e-3)
-        self.actions = data.columns["action"].shape[1]
-        first, last = nn.Linear(len(self.mean), 512), nn.Linear(512, CHUNK * self.actions)
+        first, last = nn.Linear(len(self.mean), 512), nn.Linear(512, CHUNK * data.columns["action"].shape[1])
         self.net = nn.Sequential(first, nn.GELU(), nn.Linear(512, 512), nn.GELU(), last)
 
     def forward(self, state: torch.Tensor) -> torch.Tensor:
         """Return actions of shape (batch, CHUNK, D) for states of shape (batch, D)."""
-        return self.net(((state - self.mean) / self.scale).clamp(-5.0, 5.0)).reshape(-1, CHUNK, self.actions)
+        return self.net(((state - self.mean) / self.scale).clamp(-5.0, 5.0)).unflatten(1, (CHUNK, -1))
 
     def start(self, seed: int) -> Callable[[Any], Any]:
         """Return the policy for an episode: it plays the beginning of a chunk, then asks for the next."""
@@ -61,11 +59,11 @@ class Clone(nn.Module):
 def train(data: Dataset, steps: int, seed: int = 0) -> Clone:
     """Fit a clone to the demonstrations; the absolute error keeps the script's abrupt actions sharp."""
     torch.manual_seed(seed)
-    clone = Clone(data)
     states = torch.from_numpy(np.concatenate([data.columns[key] for key in KEYS[:-1]], axis=1))
     last = np.repeat(data.episode_stop, data.episode_stop - data.episode_start) - 1
     frames = np.minimum(np.arange(len(last))[:, None] + np.arange(CHUNK), last[:, None])  # the last action is repeated
     actions = torch.from_numpy(data.columns["action"][frames])
+    clone = Clone(data)
     optimizer = torch.optim.AdamW(clone.parameters(), lr=1e-3, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 1e-3, total_steps=steps)
     for _ in range(steps):
@@ -85,8 +83,8 @@ def successes(env: gym.Env, policy: Callable[[int], Callable[[Any], Any]], episo
     for episode in range(seed, seed + episodes):
         (state, info), act, done = env.reset(seed=episode), policy(episode), False
         while not done:
-            state, _, terminated, truncated, info = env.step(act(state))
-            done = terminated or truncated
+            state, _, *ended, info = env.step(act(state))
+            done = any(ended)
         count += bool(info["is_success"])
     return count
 
@@ -101,20 +99,19 @@ def main() -> None:
     """Record, learn, evaluate."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env", default="softmode/LiftSoft-v0", choices=softmode.ENVIRONMENTS)
-    parser.add_argument("--demonstrations", type=int, default=100)
-    parser.add_argument("--episodes", type=int, default=50, help="to evaluate with")
+    for name, count in (("--demonstrations", 100), ("--episodes", 50)):
+        parser.add_argument(name, type=int, default=count)
     parser.add_argument("--short", action="store_true", help="two demonstrations, one episode")
     args = parser.parse_args()
-    demonstrations, episodes, steps = (2, 1, 50) if args.short else (args.demonstrations, args.episodes, 10_000)
+    demonstrations, episodes, steps = (2, 1, 50) if args.short else (args.demonstrations, args.episodes, 4000)
     env, out = gym.make(args.env), Path("out", "behaviour_cloning", args.env.replace("/", "_"))
     script, task = policy_factory("scripted", env), softmode.ENVIRONMENTS[args.env]
     with DatasetWriter(out, environment_features(env), fps=env.metadata["render_fps"], append=True) as writer:
-        have = writer.episode_count  # of an interrupted run
-        if have < demonstrations:
+        if (have := writer.episode_count) < demonstrations:  # an interrupted run left some
             record_episodes(env, script, writer, episodes=demonstrations - have, task=task, seed=have, noise=NOISE)
     data = read_dataset(out)
-    players = {"script": script, "clone": train(data, steps).start}
-    count = {name: successes(env, policy, episodes, seed=1_000_000) for name, policy in players.items()}
+    policies = (("script", script), ("clone", train(data, steps).start))
+    count = {name: successes(env, policy, episodes, seed=1_000_000) for name, policy in policies}
     print(f"{args.env}, {data.episode_count} demonstrations, successes in {episodes} unseen episodes: {count}")
     test_final(data, count["script"], count["clone"], args.short)
 

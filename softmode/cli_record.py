@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from softmode import ENVIRONMENTS
 from softmode.cli_common import bar_interval, quiet_warp, warp_device
 from softmode.errors import ConfigError
-from softmode.policies import check_policy, policy_factory
+from softmode.policies import check_policy, policy_factory, trained_policy
 
 if TYPE_CHECKING:
     from softmode.demonstrations import DatasetWriter
@@ -36,13 +36,14 @@ class Record:
     out: Annotated[Path | None, _short("-o")] = None
     """Folder of the dataset, out/NAME if omitted; must not exist, unless --append is given."""
     policy: str = "scripted"
-    """scripted, random, zero, or the file of a trained policy."""
+    """scripted, random, zero, or the checkpoint of a run."""
     episodes: int = 10
     """Episodes to record."""
     seed: int = 0
     """Seed of the first episode; the next ones count up."""
-    obs_type: Literal["pixels_agent_pos", "state", "pixels"] = "pixels_agent_pos"
-    """What is observed: pictures and the robot's own state, the full state, or pictures alone."""
+    obs_type: Literal["pixels_agent_pos", "state", "pixels"] | None = None
+    """What is observed: pictures and the robot's own state, the full state, or pictures alone; the first if omitted, or
+    what a trained policy observes."""
     pictures: Literal["video", "png"] = "video"
     """Store pictures as H.264 films, small, or as PNG, exact."""
     only_successes: bool = False
@@ -76,10 +77,18 @@ def record(options: Record) -> int:
     from softmode.demonstrations.recording import check_recording, environment_features, record_episodes
 
     check_recording(options.episodes, options.seed, options.noise)
+    trained = trained_policy(options.policy, options.env)
+    given: dict[str, Any] = {"obs_type": "pixels_agent_pos"}
+    if trained is not None:
+        from softmode.learning.environments import with_config
+
+        given = dict(with_config(options.env, trained.env_options))
+    if options.obs_type is not None:
+        given["obs_type"] = options.obs_type
     with quiet_warp():
-        env = gym.make(options.env, obs_type=options.obs_type, device=warp_device(options.device))
+        env = gym.make(options.env, **given, device=warp_device(options.device))
     try:
-        policy = policy_factory(options.policy, env)
+        policy = policy_factory(options.policy, env, trained)
         features = environment_features(env, pictures=options.pictures)
         fps = int(env.metadata["render_fps"])
         with (

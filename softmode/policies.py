@@ -20,6 +20,22 @@ def check_policy(name: str) -> None:
         )
 
 
+def trained_policy(name: str, env: str) -> Any:
+    """Return the policy in a checkpoint, or None for a policy that needs no file.
+
+    Args:
+        name: What :func:`check_policy` let pass.
+        env: Id of the environment that it is to play.
+
+    Raises:
+        CheckpointError: If the file is missing, damaged, foreign, or of another environment.
+        MissingExtraError: If torch is not installed.
+    """
+    from softmode.cli_train import policy_file
+
+    return None if name in POLICIES else policy_file(name, env)
+
+
 def policy_factory(name: str, env: Any, trained: Any = None) -> Callable[[int], Callable[[Any], Any]]:
     """Return what makes a policy for each episode.
 
@@ -37,10 +53,10 @@ def policy_factory(name: str, env: Any, trained: Any = None) -> Callable[[int], 
     """
     check_policy(name)
     if name == "scripted":
-        from softmode.envs.scripted import ScriptedLift
+        from softmode.envs.scripted import scripted_policy
 
-        ScriptedLift(env)  # refuses other environments
-        return lambda seed: ScriptedLift(env)
+        scripted_policy(env)  # refuses environments without one
+        return lambda seed: scripted_policy(env)
     if name == "random":
 
         def random(seed: int) -> Callable[[Any], Any]:
