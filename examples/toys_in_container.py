@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from softmode.deformables.body import BuildOptions
 from softmode.deformables.materials import Material
+from softmode.deformables.solver_reduced import SolverReducedOptions
 from softmode.envs.objects import ObjectConfig, load_object
 from softmode.envs.splat_scene import PlacedObject, Record, SplatScene
 from softmode.film import Film
@@ -69,7 +70,8 @@ def make_scene(splat: str | None, seed: int, size: int, device: str | None) -> S
     eye, target = (0.38, -0.28, 0.46), (0.0, 0.0, 0.085)
     camera = PinholeCamera.look_at("film", position=eye, target=target, width=size, height=size, fov_y=0.72)
     light = CameraOptions(mesh_samples=4, splat_shadow=ShadowOptions(cells=160))
-    return SplatScene(world, placed, cameras=[camera], camera_options=light, device=device)
+    many = SolverReducedOptions(contact_max=512)
+    return SplatScene(world, placed, cameras=[camera], options=many, camera_options=light, device=device)
 
 
 def depth_in_walls(scene: SplatScene) -> float:

@@ -171,7 +171,8 @@ class SplatScene:
 
     def _draw(self, camera: SplatCamera) -> None:
         """Deform the splats of every object and draw."""
-        q, start, splats = self.state.softmode.q, self.model.softmode.function_start, self.splats
+        start: Any = self.model.softmode.function_start
+        q, splats = self.state.softmode.q, self.splats
         for i, skin in enumerate(self._skins):
             skin.launch(
                 q,

@@ -1,0 +1,94 @@
+"""What the preset objects cost, and how far a rope bends with which handles.
+
+The first table has one line per preset of `softmode.envs.presets`: sizes, processor time of the build without a cache,
+time of a step at rest on the ground. The second one holds a rope in its middle and compares the drop of its ends with
+the heavy elastica's.
+
+Run: ``python -m benchmarks.objects [--load 2.5]``
+"""
+
+import argparse
+import os
+import tempfile
+import time
+from dataclasses import replace
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from softmode.deformables.body import BuildOptions
+from softmode.deformables.solver_reduced import SolverReduced, add_reduced_body
+from softmode.envs import presets
+from softmode.envs.objects import load_object
+from tests.envs.test_primitives import hang, heavy_elastica
+from tests.scenes import GRAVITY
+
+DT = 1.0 / 240.0
+ROPES = (
+    BuildOptions(mode_count=6),
+    BuildOptions(mode_count=16),
+    BuildOptions(mode_count=16, rank_tolerance=1e-9),
+    BuildOptions(mode_count=6, handles="quadratic"),
+    BuildOptions(mode_count=3, handles="quadratic", rank_tolerance=1e-9),
+    BuildOptions(mode_count=4, handles="quadratic", rank_tolerance=1e-9),
+    BuildOptions(mode_count=6, handles="quadratic", rank_tolerance=1e-9),
+)
+
+
+def step_time(name: str) -> str:
+    """Return the table row of a preset."""
+    clock = time.process_time()
+    thing, material = load_object(getattr(presets, name), False), getattr(presets, f"{name}_MATERIAL")
+    seconds = time.process_time() - clock
+    world = newton.ModelBuilder()
+    add_reduced_body(world, thing.body, material=material, position=(0.0, 0.0, thing.height))
+    world.add_ground_plane()
+    model: Any = world.finalize(device="cpu")
+    solver, first, second = SolverReduced(model, [thing.body]), model.state(), model.state()
+    for _ in range(60):
+        solver.step(first, second, None, None, DT)
+        solver.step(second, first, None, None, DT)
+    with wp.ScopedCapture(device="cpu") as capture:
+        solver.step(first, second, None, None, DT)
+        solver.step(second, first, None, None, DT)
+    graph: Any = capture.graph
+    times = []
+    for _ in range(60):
+        clock = time.perf_counter()
+        wp.capture_launch(graph)
+        times.append(0.5e3 * (time.perf_counter() - clock))
+    body = thing.body
+    sizes = f"{body.function_count} | {body.point_count} | {body.surface_count} | {thing.splats.count}"
+    return f"| {name} | {sizes} | {seconds:.2f} | {min(times):.2f} |"
+
+
+def main() -> None:
+    """Print both tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--load", type=float, default=2.5, help="w (L/2)^3 / (E I) of the rope")
+    load = parser.parse_args().load
+    wp.config.log_level = wp.LOG_WARNING
+    print("| preset | functions | points | samples | splats | build [s] | ms per step |\n|---|---|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["SOFTMODE_CACHE"] = folder
+        load_object(presets.CUBE, False)  # imports what builds need
+        for name in ("BEAM", "CUBE", "PAD", "ROPE"):
+            os.environ["SOFTMODE_CACHE"] = os.path.join(folder, name)
+            print(step_time(name), flush=True)
+        half, radius = 0.5 * presets.ROPE.extents[0], 0.5 * presets.ROPE.extents[1]  # type: ignore[index]
+        modulus = 1000.0 * GRAVITY * 4.0 * half**3 / (load * radius**2)
+        material = replace(presets.ROPE_MATERIAL, youngs_modulus=modulus, density=1000.0)
+        exact = half * heavy_elastica(load)[0]
+        print(f"\nelastica: {exact / half:.3f} of half the length")
+        print("| handles | modes | rank tolerance | functions | drop over the elastica's |\n|---|---|---|---|---|")
+        for build in ROPES:
+            thing = load_object(replace(presets.ROPE, build=build), False)
+            drop = float(np.asarray(hang(thing, material, half))[0])
+            row = f"{build.handles} | {build.mode_count} | {build.rank_tolerance:g} | {thing.body.function_count}"
+            print(f"| {row} | {drop / exact:.3f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
