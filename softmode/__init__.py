@@ -16,9 +16,10 @@ __version__ = "0.1.0"
 ENVIRONMENTS = {
     "softmode/LiftSoft-v0": "Pick a soft object from a table and hold it at a goal.",
     "softmode/PushSoft-v0": "Push a soft object over the table to a goal.",
+    "softmode/PressSoft-v0": "Press on a soft pad of unknown stiffness and hold a contact force.",
 }
 """Ids of the registered environments and what their task is."""
-_EPISODE_STEPS = {"LiftSoft": 150, "PushSoft": 120}
+_EPISODE_STEPS = {"LiftSoft": 150, "PushSoft": 120, "PressSoft": 120}
 """Control steps of an episode."""
 
 

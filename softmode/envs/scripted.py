@@ -20,10 +20,12 @@ def scripted_policy(env: Any) -> Any:
     Raises:
         ConfigError: If its task has none, or it takes other actions than tool steps.
     """
+    from softmode.envs.press_soft import PressSoft
     from softmode.envs.push_soft import PushSoft
+    from softmode.envs.scripted_press import ScriptedPress
     from softmode.envs.scripted_push import ScriptedPush
 
-    policies = {LiftSoft: ScriptedLift, PushSoft: ScriptedPush}
+    policies = {LiftSoft: ScriptedLift, PushSoft: ScriptedPush, PressSoft: ScriptedPress}
     task = getattr(env.unwrapped, "task", None)
     for kind, policy in policies.items():
         if isinstance(task, kind):
