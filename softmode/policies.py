@@ -37,10 +37,10 @@ def policy_factory(name: str, env: Any, trained: Any = None) -> Callable[[int], 
     """
     check_policy(name)
     if name == "scripted":
-        from softmode.envs.scripted import ScriptedLift
+        from softmode.envs.scripted import scripted_policy
 
-        ScriptedLift(env)  # refuses other environments
-        return lambda seed: ScriptedLift(env)
+        scripted_policy(env)  # refuses environments that have none
+        return lambda seed: scripted_policy(env)
     if name == "random":
 
         def random(seed: int) -> Callable[[Any], Any]:
