@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -90,6 +91,10 @@ def test_values_are_parsed():
 
     config = config_of(LiftSoftConfig, {"image_size": 64, "scene": {"object": {"size": 0.07}}, "goal_range": [0, 0, 0]})
     assert config.image_size == 64 and config.scene.object.size == 0.07 and config.goal_range == (0, 0, 0)
+    from softmode.envs.push_soft import PushSoftConfig
+
+    config = config_of(PushSoftConfig, {"scene": {"substeps": 8}})
+    assert config.scene == dataclasses.replace(PushSoftConfig().scene, substeps=8)
     with pytest.raises(ConfigError, match="colour"):
         config_of(LiftSoftConfig, {"scene": {"object": {"colour": 1}}})
 
