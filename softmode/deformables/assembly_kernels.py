@@ -59,8 +59,8 @@ def block_task(task: int, block_count: int):
     return wp.where(diagonal == 0, 0, wp.where(diagonal == 1, 3, 5)), rows, rows + lanes
 
 
-@wp.kernel
-def assemble_stiffness(
+@wp.func
+def stiffness_block(
     instances: Instances,
     basis: Basis,
     points: Points,
@@ -69,9 +69,11 @@ def assemble_stiffness(
     chunk_count: int,
     # Out:
     stiffness_out: wp.array4d[vec8],  # (instance_count, chunk_count, 3 stride, 3 block_count), upper triangle
+    i: int,
+    chunk: int,
+    task: int,
 ):
     """Assemble 8x8 blocks of sum_p grad b^T C grad b over one chunk of the points."""
-    i, chunk, task = wp.tid()
     if active[instances.world[i]] == 0 or renew[instances.world[i]] == 0:
         return
     block_count = basis.row.shape[1]
@@ -137,6 +139,22 @@ def assemble_stiffness(
 
 
 @wp.kernel
+def assemble_stiffness(
+    instances: Instances,
+    basis: Basis,
+    points: Points,
+    active: wp.array[int],
+    renew: wp.array[int],
+    chunk_count: int,
+    # Out:
+    stiffness_out: wp.array4d[vec8],  # (instance_count, chunk_count, 3 stride, 3 block_count), upper triangle
+):
+    """Launch :func:`stiffness_block`."""
+    i, chunk, task = wp.tid()
+    stiffness_block(instances, basis, points, active, renew, chunk_count, stiffness_out, i, chunk, task)
+
+
+@wp.kernel
 def assemble_pins(
     instances: Instances,
     basis: Basis,
@@ -179,8 +197,8 @@ def assemble_pins(
     pins_out[i, row + 7, lanes] = a7
 
 
-@wp.kernel
-def assemble_matrix(
+@wp.func
+def matrix_row(
     instances: Instances,
     basis: Basis,
     motion: Motion,
@@ -191,9 +209,11 @@ def assemble_matrix(
     team: int,
     # Out:
     matrix_out: wp.array3d[vec8],  # (system_count, N, ...), upper triangle
+    i: int,
+    row: int,
+    member: int,
 ):
     """Add inertia and pins to the stiffness; driven unknowns stay put."""
-    i, row, member = wp.tid()
     if active[instances.world[i]] == 0:
         return
     block_count = basis.row.shape[1]
@@ -222,16 +242,35 @@ def assemble_matrix(
 
 
 @wp.kernel
-def add_contacts(
+def assemble_matrix(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    active: wp.array[int],
+    stiffness: wp.array4d[vec8],
+    pins: wp.array3d[vec8],
+    dt: wp.float64,
+    team: int,
+    # Out:
+    matrix_out: wp.array3d[vec8],  # (system_count, N, ...), upper triangle
+):
+    """Launch :func:`matrix_row`."""
+    i, row, member = wp.tid()
+    matrix_row(instances, basis, motion, active, stiffness, pins, dt, team, matrix_out, i, row, member)
+
+
+@wp.func
+def contact_block(
     instances: Instances,
     basis: Basis,
     entries: Entries,
     active: wp.array[int],
     # In and out:
     matrix: wp.array3d[vec8],  # (system_count, N, ...), upper triangle
+    i: int,
+    task: int,
 ):
     """Add the contacts, sum_e b^T H b, to 8x8 blocks; driven unknowns stay put."""
-    i, task = wp.tid()
     if active[instances.world[i]] == 0 or not has_contacts(instances, entries, i):
         return
     block_count = basis.row.shape[1]
@@ -273,7 +312,21 @@ def add_contacts(
 
 
 @wp.kernel
-def assemble_columns(
+def add_contacts(
+    instances: Instances,
+    basis: Basis,
+    entries: Entries,
+    active: wp.array[int],
+    # In and out:
+    matrix: wp.array3d[vec8],  # (system_count, N, ...), upper triangle
+):
+    """Launch :func:`contact_block`."""
+    i, task = wp.tid()
+    contact_block(instances, basis, entries, active, matrix, i, task)
+
+
+@wp.func
+def column_block(
     instances: Instances,
     basis: Basis,
     entries: Entries,
@@ -284,9 +337,11 @@ def assemble_columns(
     size: int,  # N
     # Out:
     matrix_out: wp.array3d[float],  # (system_count, N, N + ...)
+    i: int,
+    rows: int,
+    j: int,
 ):
     """Fill the columns right of K: d2E/dq dr = -sum_e b_k H_e J_e, and -g in column rigid_count."""
-    i, rows, j = wp.tid()
     if active[instances.world[i]] == 0:
         return
     block_count = basis.row.shape[1]
@@ -307,15 +362,35 @@ def assemble_columns(
 
 
 @wp.kernel
-def assemble_rigid(
+def assemble_columns(
+    instances: Instances,
+    basis: Basis,
+    entries: Entries,
+    active: wp.array[int],
+    gradient: wp.array2d[vec8d],
+    rigid: Rigid,
+    rigid_count: int,
+    size: int,  # N
+    # Out:
+    matrix_out: wp.array3d[float],  # (system_count, N, N + ...)
+):
+    """Launch :func:`column_block`."""
+    i, rows, j = wp.tid()
+    column_block(instances, basis, entries, active, gradient, rigid, rigid_count, size, matrix_out, i, rows, j)
+
+
+@wp.func
+def rigid_entry(
     instances: Instances,
     entries: Entries,
     progress: Progress,
     # In and out:
     rigid: Rigid,
+    w: int,
+    j: int,
+    l: int,
 ):
     """Compute gradient and Hessian of the rigid dofs: M_eff/dt^2 (r - r_predicted) + sum_e J_e^T f_e, and the rows."""
-    w, j, l = wp.tid()
     if progress.active[w] == 0 or j >= rigid.count[w] or l > j:
         return
     first = progress.instance_start[w]
@@ -343,16 +418,31 @@ def assemble_rigid(
 
 
 @wp.kernel
-def condense(
+def assemble_rigid(
+    instances: Instances,
+    entries: Entries,
+    progress: Progress,
+    # In and out:
+    rigid: Rigid,
+):
+    """Launch :func:`rigid_entry`."""
+    w, j, l = wp.tid()
+    rigid_entry(instances, entries, progress, rigid, w, j, l)
+
+
+@wp.func
+def condensed_entry(
     progress: Progress,
     system_start: wp.array[int],  # (world_count + 1,)
     rigid_max: int,
     factored: wp.array3d[vec8],  # [U | Y | y], Y = U^-T C, y = U^-T (-g)
     # In and out:
     rigid: Rigid,
+    w: int,
+    j: int,
+    l: int,
 ):
     """Subtract the bodies: S = R - sum_i Y_i^T Y_i and s = -g_r - sum_i Y_i^T y_i."""
-    w, j, l = wp.tid()
     # column l = rigid_count is the right-hand side; of the matrix only the lower triangle is read
     if progress.active[w] == 0 or j >= rigid.count[w] or l > rigid.count[w] or (l > j and l < rigid.count[w]):
         return
@@ -374,6 +464,20 @@ def condense(
     if l == j:
         rigid.pivot_min[w, j] = wp.max(rigid.pivot_floor[w, j], CONDENSED_ROUNDING * rigid.matrix[w, j, j])
     rigid.matrix[w, j, l] = value
+
+
+@wp.kernel
+def condense(
+    progress: Progress,
+    system_start: wp.array[int],  # (world_count + 1,)
+    rigid_max: int,
+    factored: wp.array3d[vec8],  # [U | Y | y], Y = U^-T C, y = U^-T (-g)
+    # In and out:
+    rigid: Rigid,
+):
+    """Launch :func:`condensed_entry`."""
+    w, j, l = wp.tid()
+    condensed_entry(progress, system_start, rigid_max, factored, rigid, w, j, l)
 
 
 @wp.func
@@ -431,15 +535,16 @@ def bound_pivots(
         rigid.pivot_floor[w, a] = rigid.matrix[w, a, a] * rigid.matrix[w, a, a]
 
 
-@wp.kernel
-def solve_rigid(
+@wp.func
+def solve_rigid_team(
     active: wp.array[int],
     team: int,
     # In and out: ``matrix`` and ``direction`` are overwritten by the factor and the solution
     rigid: Rigid,
+    w: int,
+    lane: int,
 ):
     """Solve S x = s by Cholesky. Pivots that rounding put below those of the inertia are raised to them."""
-    w, lane = wp.tid()
     if active[w] == 0:
         return
     n = rigid.count[w]
@@ -457,6 +562,18 @@ def solve_rigid(
         for s in range(a + 1, n):
             value -= rigid.matrix[w, s, a] * rigid.direction[w, s]
         rigid.direction[w, a] = value / rigid.matrix[w, a, a]
+
+
+@wp.kernel
+def solve_rigid(
+    active: wp.array[int],
+    team: int,
+    # In and out: ``matrix`` and ``direction`` are overwritten by the factor and the solution
+    rigid: Rigid,
+):
+    """Launch :func:`solve_rigid_team`."""
+    w, lane = wp.tid()
+    solve_rigid_team(active, team, rigid, w, lane)
 
 
 @wp.kernel

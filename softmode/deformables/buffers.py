@@ -82,6 +82,5 @@ def make_progress(instance_start: np.ndarray, team: int, device: Any) -> Any:
         setattr(progress, name, wp.zeros(world_count, dtype=int, device=device))
     for name in ("potential", "slope", "step_length", "reached"):
         setattr(progress, name, wp.zeros(world_count, dtype=wp.float64, device=device))
-    progress.partial = wp.zeros((world_count, team), dtype=wp.float64, device=device)
     progress.any_active, progress.any_searching = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
     return progress

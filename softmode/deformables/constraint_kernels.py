@@ -277,17 +277,18 @@ def evaluate_cone(rigid: Rigid, w: int, head: int, r: wp.array2d[wp.float64], dt
             rigid.row_coupling[w, k, j] = value / (dt * dt)
 
 
-@wp.kernel
-def evaluate_rows(
+@wp.func
+def evaluate_row(
     selected: wp.array[int],
     r: wp.array2d[wp.float64],
     dt: wp.float64,
     derivatives: int,
     # In and out:
     rigid: Rigid,
+    w: int,
+    k: int,
 ):
     """Evaluate the rows at r: energy, force and s'' J."""
-    w, k = wp.tid()
     if selected[w] == 0 or k >= rigid.row_count[w]:
         return
     kind = rigid.row_kind[w, k]
@@ -305,3 +306,17 @@ def evaluate_rows(
         if derivatives != 0:
             for j in range(rigid.count[w]):
                 rigid.row_coupling[w, k, j] = curvature / (dt * dt) * wp.float64(rigid.row_jacobian[w, k, j])
+
+
+@wp.kernel
+def evaluate_rows(
+    selected: wp.array[int],
+    r: wp.array2d[wp.float64],
+    dt: wp.float64,
+    derivatives: int,
+    # In and out:
+    rigid: Rigid,
+):
+    """Launch :func:`evaluate_row`."""
+    w, k = wp.tid()
+    evaluate_row(selected, r, dt, derivatives, rigid, w, k)

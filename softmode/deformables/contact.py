@@ -138,8 +138,8 @@ def stiffness_per_area(instances: Instances, i: int, partner_mass: float, partne
     return wp.max(wp.max(BULK_FACTOR * wave / instances.size[i], INERTIA_FACTOR * inertia), STIFFNESS_FLOOR)
 
 
-@wp.kernel
-def evaluate_entries(
+@wp.func
+def evaluate_entry(
     instances: Instances,
     basis: Basis,
     motion: Motion,
@@ -153,12 +153,13 @@ def evaluate_entries(
     derivatives: int,
     # In and out:
     entries: Entries,
+    i: int,
+    e: int,
 ):
     """Evaluate pins and contacts at displacement d = sum_k b_k (q_k - q_nk) - J r, less that of a soft partner.
 
     A contact of two soft bodies is an entry of each, which has one half of its energy and all of its force.
     """
-    i, e = wp.tid()
     w = instances.world[i]
     if selected[w] == 0 or e >= entries.count[i]:
         return
@@ -216,6 +217,27 @@ def evaluate_entries(
         entries.hessian[i, e] = wp.mat33(H)
         for k in range(entries.dof_begin[i, e], entries.dof_end[i, e]):
             entries.coupling[i, e, k] = wp.mat33(H) * entries.jacobian[i, e, k]
+
+
+@wp.kernel
+def evaluate_entries(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    progress: Progress,
+    rigid: Rigid,
+    stick_range: wp.float64,  # eps of the friction potential for this step [m]
+    # State in:
+    selected: wp.array[int],
+    q: wp.array2d[vec8d],
+    r: wp.array2d[wp.float64],
+    derivatives: int,
+    # In and out:
+    entries: Entries,
+):
+    """Launch :func:`evaluate_entry`."""
+    i, e = wp.tid()
+    evaluate_entry(instances, basis, motion, progress, rigid, stick_range, selected, q, r, derivatives, entries, i, e)
 
 
 @wp.kernel

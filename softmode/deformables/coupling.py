@@ -21,9 +21,11 @@ What step 3 neglects of MuJoCo's answer to the forces: the implicit integrator d
 dofs that are both damped and constrained; and contacts that MuJoCo will only detect in the next step.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import contextmanager
 from typing import Any
 
+import mujoco_warp
 import newton
 import numpy as np
 import warp as wp
@@ -39,6 +41,10 @@ from softmode.deformables.rigid_dofs import RigidDofs
 from softmode.deformables.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.deformables.step_checks import check_step
 from softmode.errors import ConfigError
+
+_INTEGRATORS = mujoco_warp.IntegratorType
+SPLIT_INTEGRATORS = (_INTEGRATORS.EULER, _INTEGRATORS.IMPLICIT, _INTEGRATORS.IMPLICITFAST)
+"""MuJoCo's integrators whose step is its two halves one after the other."""
 
 
 class SolverCoupledReduced(SolverBase):
@@ -266,8 +272,27 @@ class SolverCoupledReduced(SolverBase):
         wp.copy(self.rigid.mjw_data.act, self.activation)
         wp.copy(self.body_f, state_in.body_f)
         self._launch(kernels.add_wrench, self.model.body_count, [self.body_wrench, state_in.body_f])
-        self.rigid.step(state_in, state_out, control, contacts, dt, observables=observables)
+        with self._from_forces_on():
+            self.rigid.step(state_in, state_out, control, contacts, dt, observables=observables)
         wp.copy(state_in.body_f, self.body_f)
+
+    @contextmanager
+    def _from_forces_on(self) -> Generator[None]:
+        """Let MuJoCo step from its forces on: positions, inertia and constraint rows are those of the prediction.
+
+        MuJoCo's own split of a step; the whole one where that is another step.
+        """
+        rigid: Any = self.rigid
+        model = rigid.mjw_model
+        sleeps = bool(model.opt.enableflags & mujoco_warp.EnableBit.SLEEP)
+        whole = sleeps or model.opt.integrator not in SPLIT_INTEGRATORS or rigid._use_speculative_contacts
+        if not whole:
+            rigid._mujoco_warp_step = lambda: mujoco_warp.step2(model, rigid.mjw_data)
+        try:
+            yield
+        finally:
+            if not whole:
+                del rigid._mujoco_warp_step
 
     def _keep_prediction(self, state: Any) -> None:
         """Take the prediction in the worlds where no soft body pushes a rigid one."""

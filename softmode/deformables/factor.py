@@ -33,8 +33,8 @@ def related(pattern: wp.array3d[int], i: int, part: int, other: int):
     return part == other or other >= pattern.shape[1] or pattern[i, part, other] != 0
 
 
-@wp.kernel
-def _factor(
+@wp.func
+def factor_system(
     # Selection:
     system_world: wp.array[int],  # (system_count,)
     active: wp.array[int],  # (world_count,)
@@ -49,9 +49,10 @@ def _factor(
     # Out:
     diagonal_out: wp.array2d[vec8],  # (system_count, N): diagonal blocks of U with inverse pivots
     indefinite_out: wp.array[int],  # (system_count,), 1 where a pivot had to be raised
+    i: int,
+    lane: int,
 ):
     """Factor row block by row block: subtract what is above (left-looking), then solve with the diagonal block."""
-    i, lane = wp.tid()
     if active[system_world[i]] == 0:
         return
     total = unit.shape[2]
@@ -149,6 +150,28 @@ def _factor(
         indefinite_out[i] = indefinite
 
 
+@wp.kernel
+def _factor(
+    # Selection:
+    system_world: wp.array[int],  # (system_count,)
+    active: wp.array[int],  # (world_count,)
+    block_count: int,
+    part_blocks: int,  # blocks of rows per part
+    pattern: wp.array3d[int],  # (system_count, part_count, part_count), upper triangle
+    team: int,
+    width: int,
+    # In and out, the same memory in blocks of eight columns, and in units of ``width`` = 8 (vec8) or 1 (float) columns:
+    matrix: wp.array3d[vec8],  # (system_count, N, (N + M) / 8)
+    unit: wp.array3d[Any],  # (system_count, N, (N + M) / width)
+    # Out:
+    diagonal_out: wp.array2d[vec8],  # (system_count, N): diagonal blocks of U with inverse pivots
+    indefinite_out: wp.array[int],  # (system_count,), 1 where a pivot had to be raised
+):
+    """Launch :func:`factor_system`."""
+    i, lane = wp.tid()
+    factor_system(system_world, active, block_count, part_blocks, pattern, team, width, matrix, unit, diagonal_out, indefinite_out, i, lane)
+
+
 @wp.func
 def back_substitute(
     matrix: wp.array3d[vec8],
@@ -183,6 +206,41 @@ def back_substitute(
         barrier()
 
 
+@wp.func
+def solve_system(
+    # Selection:
+    system_world: wp.array[int],
+    active: wp.array[int],
+    block_count: int,
+    column: int,
+    team: int,
+    # Factor:
+    matrix: wp.array3d[vec8],  # (system_count, N, (N + M) / 8)
+    diagonal: wp.array2d[vec8],  # (system_count, N)
+    pattern: wp.array3d[int],
+    # Schur correction:
+    tail: wp.array2d[wp.float64],  # (world_count, tail_count): unknowns already known
+    tail_count: int,
+    # Scratch:
+    right: wp.array2d[float],  # (system_count, N)
+    # Out:
+    solution_out: wp.array2d[vec8],  # (system_count, N / 8)
+    i: int,
+    lane: int,
+):
+    """Solve U x = y - Y t from the last row up; y is right-hand column ``column``, Y the ``tail_count`` first ones."""
+    world = system_world[i]
+    if active[world] == 0:
+        return
+    for row in range(lane, LANES * block_count, team):
+        value = matrix[i, row, block_count + column / 8][column % 8]
+        for j in range(tail_count):
+            value -= matrix[i, row, block_count + j / 8][j % 8] * float(tail[world, j])
+        right[i, row] = value
+    barrier()
+    back_substitute(matrix, diagonal, pattern, right, solution_out, i, lane, team)
+
+
 @wp.kernel
 def _solve(
     # Selection:
@@ -203,18 +261,9 @@ def _solve(
     # Out:
     solution_out: wp.array2d[vec8],  # (system_count, N / 8)
 ):
-    """Solve U x = y - Y t from the last row up; y is right-hand column ``column``, Y the ``tail_count`` first ones."""
+    """Launch :func:`solve_system`."""
     i, lane = wp.tid()
-    world = system_world[i]
-    if active[world] == 0:
-        return
-    for row in range(lane, LANES * block_count, team):
-        value = matrix[i, row, block_count + column / 8][column % 8]
-        for j in range(tail_count):
-            value -= matrix[i, row, block_count + j / 8][j % 8] * float(tail[world, j])
-        right[i, row] = value
-    barrier()
-    back_substitute(matrix, diagonal, pattern, right, solution_out, i, lane, team)
+    solve_system(system_world, active, block_count, column, team, matrix, diagonal, pattern, tail, tail_count, right, solution_out, i, lane)
 
 
 @wp.kernel
@@ -287,10 +336,10 @@ class BlockCholesky:
         shape = (self.system_count, size, LANES * total)
         self.scalars = wp.array(ptr=self.matrix.ptr, dtype=float, shape=shape, device=device, copy=False)
         """The same memory as ``matrix``, number by number."""
-        self.team, self.width, self._unit = 1, LANES, self.matrix
+        self.team, self.width, self.unit = 1, LANES, self.matrix
         if wp.get_device(device).is_cuda:
-            self.team, self.width, self._unit = min(-(-LANES * total // TEAM) * TEAM, 8 * TEAM), 1, self.scalars
-        self._factor = wp.overload(_factor, {"unit": self._unit})
+            self.team, self.width, self.unit = min(-(-LANES * total // TEAM) * TEAM, 8 * TEAM), 1, self.scalars
+        self._factor = wp.overload(_factor, {"unit": self.unit})
         self.indefinite = wp.zeros(self.system_count, dtype=int, device=device)
         self.diagonal = wp.zeros((self.system_count, size), dtype=vec8, device=device)
         self.right = wp.zeros((self.system_count, size), dtype=float, device=device)
@@ -308,7 +357,7 @@ class BlockCholesky:
         """
         parts = [self.block_count // self.pattern.shape[1], self.pattern]
         selection = [self.system_world, active, self.block_count, *parts, self.team, self.width]
-        self._launch(self._factor, [*selection, self.matrix, self._unit], [self.diagonal, self.indefinite])
+        self._launch(self._factor, [*selection, self.matrix, self.unit], [self.diagonal, self.indefinite])
 
     def solve(self, active: wp.array, column: int, tail: wp.array, tail_count: int) -> wp.array:
         """Return x of U x = y - Y tail, shape (system_count, N / 8) of 8-vectors."""

@@ -274,8 +274,8 @@ def material_of(instances: Instances, basis: Basis, i: int, point: int):
     return parameters
 
 
-@wp.kernel
-def evaluate_points(
+@wp.func
+def evaluate_point(
     instances: Instances,
     basis: Basis,
     motion: Motion,
@@ -287,12 +287,13 @@ def evaluate_points(
     progress: Progress,
     # Out:
     points: Points,
+    i: int,
+    p: int,
 ):
     """Evaluate V_p Psi(F_p) and, where asked, its derivatives by F_p at every cubature point.
 
     A body of scale s has V_p s^3 and the elastic F_p / s: each derivative takes one s off.
     """
-    i, p = wp.tid()
     if selected[instances.world[i]] == 0 or p >= instances.point_count[i]:
         return
     point = instances.point_start[i] + p
@@ -318,7 +319,26 @@ def evaluate_points(
 
 
 @wp.kernel
-def sum_forces(
+def evaluate_points(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    # State in:
+    selected: wp.array[int],  # (world_count,)
+    q: wp.array2d[vec8d],
+    dt: wp.float64,
+    derivatives: int,
+    progress: Progress,
+    # Out:
+    points: Points,
+):
+    """Launch :func:`evaluate_point`."""
+    i, p = wp.tid()
+    evaluate_point(instances, basis, motion, selected, q, dt, derivatives, progress, points, i, p)
+
+
+@wp.func
+def sum_force_block(
     instances: Instances,
     basis: Basis,
     points: Points,
@@ -327,9 +347,11 @@ def sum_forces(
     chunk_count: int,
     # Out:
     chunk_out: wp.array3d[vec8d],  # (instance_count, chunk_count, 3 block_count) [N]
+    i: int,
+    chunk: int,
+    b: int,
 ):
     """Sum V P grad b_k over one chunk of the points, less b_k f over one chunk of the entries."""
-    i, chunk, b = wp.tid()
     if active[instances.world[i]] == 0 or LANES * b >= instances.function_count[i]:
         return
     stride = basis.row.shape[1]
@@ -365,7 +387,23 @@ def sum_forces(
 
 
 @wp.kernel
-def sum_gradient(
+def sum_forces(
+    instances: Instances,
+    basis: Basis,
+    points: Points,
+    entries: Entries,
+    active: wp.array[int],
+    chunk_count: int,
+    # Out:
+    chunk_out: wp.array3d[vec8d],  # (instance_count, chunk_count, 3 block_count) [N]
+):
+    """Launch :func:`sum_force_block`."""
+    i, chunk, b = wp.tid()
+    sum_force_block(instances, basis, points, entries, active, chunk_count, chunk_out, i, chunk, b)
+
+
+@wp.func
+def gradient_block(
     instances: Instances,
     basis: Basis,
     motion: Motion,
@@ -376,9 +414,10 @@ def sum_gradient(
     # Out:
     gradient_out: wp.array2d[vec8d],  # [N]; zero for driven functions
     reaction_out: wp.array2d[vec8d],  # [N]; what holds the driven functions, zero for the others
+    i: int,
+    e: int,
 ):
     """Compute g = m c^2/dt^2 (q - q_inertial) + m alpha c/dt (q - q_rate) - f + sum_p V P grad b - sum_e b f_e."""
-    i, e = wp.tid()
     stride = basis.row.shape[1]
     b = e % stride
     if active[instances.world[i]] == 0 or LANES * b >= instances.function_count[i]:
@@ -397,6 +436,24 @@ def sum_gradient(
             g[lane] = wp.float64(0.0)
     gradient_out[i, e] = g
     reaction_out[i, e] = reaction
+
+
+@wp.kernel
+def sum_gradient(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    active: wp.array[int],
+    chunk: wp.array3d[vec8d],
+    q: wp.array2d[vec8d],
+    dt: wp.float64,
+    # Out:
+    gradient_out: wp.array2d[vec8d],  # [N]; zero for driven functions
+    reaction_out: wp.array2d[vec8d],  # [N]; what holds the driven functions, zero for the others
+):
+    """Launch :func:`gradient_block`."""
+    i, e = wp.tid()
+    gradient_block(instances, basis, motion, active, chunk, q, dt, gradient_out, reaction_out, i, e)
 
 
 @wp.kernel
@@ -476,8 +533,8 @@ def check_state(
         for p in range(lane, instances.point_count[i], team):
             if points.volume_ratio[i, p] < COLLAPSED_RATIO:
                 flat += share
-        collapsed = wp.max(collapsed, float(team_sum(progress.partial, w, lane, team, wp.float64(flat))))
-    total = team_sum(progress.partial, w, lane, team, total)
+        collapsed = wp.max(collapsed, float(team_sum(wp.float64(flat))))
+    total = team_sum(total)
     if lane == 0:
         if not wp.isfinite(total):
             progress.status[w] = progress.status[w] | WORLD_NOT_FINITE

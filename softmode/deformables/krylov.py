@@ -34,7 +34,6 @@ class Gmres:
         k.factored, k.diagonal = solver.system.matrix, solver.system.diagonal
         k.pattern = solver.system.pattern
         k.work, k.rows = self._zeros(solver.functions, vec8), self._zeros((count, 3 * solver.stride), float)
-        k.partial = self._zeros((count, solver.team), wp.float64)
         self._krylov = k
 
     @property

@@ -37,7 +37,6 @@ class Krylov:
     pattern: wp.array3d[int]  # (instance_count, 1, 1), see ``factor``
     work: wp.array2d[vec8]  # (instance_count, N / 8)
     rows: wp.array2d[float]  # (instance_count, N)
-    partial: wp.array2d[wp.float64]  # (instance_count, team)
 
 
 @wp.func
@@ -101,7 +100,7 @@ def begin_cycle(
             r = r - k.product[i, e]
         k.basis[0, i, e] = r
         rho += wp.dot(r, r)
-    rho = wp.sqrt(team_sum(k.partial, i, lane, team, rho))
+    rho = wp.sqrt(team_sum(rho))
     if first_cycle != 0 and lane == 0:
         k.target[i] = tolerance * rho
         k.count[i] = 0
@@ -149,7 +148,7 @@ def extend_cycle(
         h = wp.float64(0.0)
         for e in range(lane, total, team):
             h += wp.dot(k.basis[j + 1, i, e], k.basis[l, i, e])
-        h = team_sum(k.partial, i, lane, team, h)
+        h = team_sum(h)
         for e in range(lane, total, team):
             k.basis[j + 1, i, e] = k.basis[j + 1, i, e] - h * k.basis[l, i, e]
         if lane == 0:
@@ -157,7 +156,7 @@ def extend_cycle(
     size = wp.float64(0.0)
     for e in range(lane, total, team):
         size += wp.dot(k.basis[j + 1, i, e], k.basis[j + 1, i, e])
-    size = wp.sqrt(team_sum(k.partial, i, lane, team, size))
+    size = wp.sqrt(team_sum(size))
     if lane == 0:
         for l in range(j):
             g = k.rotation[i, l]
@@ -203,7 +202,7 @@ def extend_cycle(
             combined = combined + k.tail[i, l] * k.basis[l, i, e]
         k.basis[0, i, e] = combined
         size += wp.dot(combined, combined)
-    size = wp.sqrt(team_sum(k.partial, i, lane, team, size))
+    size = wp.sqrt(team_sum(size))
     precondition(k, i, lane, team, size, k.basis[0])
     for e in range(lane, total, team):
         solution[i, e] = solution[i, e] + k.search[i, e]

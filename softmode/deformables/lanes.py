@@ -71,16 +71,25 @@ def free_part(block: Any, driven: int):
     return out
 
 
-@wp.func
-def team_sum(partial: wp.array2d[wp.float64], i: int, lane: int, team: int, value: wp.float64):
-    """Return the sum of the threads' values, in order, to every thread; every thread of the team must call it."""
-    partial[i, lane] = value
-    barrier()
-    total = wp.float64(0.0)
-    for k in range(team):
-        total += partial[i, k]
-    barrier()
-    return total
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    __shared__ double partial[32];
+    for (int offset = 16; offset > 0; offset >>= 1) value += __shfl_xor_sync(0xffffffff, value, offset);
+    if (threadIdx.x % 32 == 0) partial[threadIdx.x / 32] = value;
+    __syncthreads();
+    double total = partial[0];
+    for (int k = 1; k < blockDim.x / 32; ++k) total += partial[k];
+    __syncthreads();
+    return total;
+#else
+    return value;
+#endif
+"""
+)
+def team_sum(value: wp.float64) -> wp.float64:  # pyright: ignore[reportReturnType]
+    """Return the sum of the threads' values, in a fixed order, to every thread; every thread must call it."""
+    ...
 
 
 def to_blocks(q: np.ndarray, block_count: int) -> np.ndarray:

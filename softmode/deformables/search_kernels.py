@@ -69,6 +69,66 @@ def potential_share(
     return total
 
 
+@wp.func
+def judge_world(
+    instances: Instances,
+    motion: Motion,
+    points: Points,
+    entries: Entries,
+    rigid: Rigid,
+    team: int,
+    iteration_max: int,
+    force_tolerance: wp.float64,
+    # State in:
+    gradient: wp.array2d[vec8d],
+    q: wp.array2d[vec8d],
+    dt: wp.float64,
+    # In and out:
+    progress: Progress,
+    w: int,
+    lane: int,
+):
+    """Sum the potential; stop a world whose last step was small and whose residual is small near its contacts.
+
+    The second condition matters in contact: within a step's tolerance friction goes from one side of its cone to the
+    other, and a residual is momentum that the other body receives and this one does not.
+    """
+    if progress.active[w] == 0:
+        return
+    share = potential_share(progress, instances, motion, points, entries, rigid, q, rigid.r, dt, w, lane, team)
+    potential = team_sum(share)
+    done = progress.last[w]
+    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
+        if done == 1 and progress.iteration[w] > 0 and pushes(instances, entries, i):
+            residual = wp.float64(0.0)
+            external = wp.float64(0.0)
+            scale = wp.float64(0.0)
+            for e in range(lane, q.shape[1], team):
+                residual += wp.dot(gradient[i, e], gradient[i, e])
+                external += wp.dot(motion.force[i, e], motion.force[i, e])
+            for e in range(lane, entries.count[i], team):
+                scale += wp.length(entries.force[i, e])
+            residual = team_sum(residual)
+            scale = wp.sqrt(team_sum(external)) + team_sum(scale)
+            floor = wp.float64(1.0e-5) * instances.mass[i] * wp.float64(instances.tolerance[i]) / (dt * dt)
+            if not (wp.sqrt(residual) <= force_tolerance * scale + floor):
+                done = 0
+    if lane != 0:
+        return
+    progress.potential[w] = potential
+    if wp.isnan(potential):
+        progress.active[w] = 0
+        progress.status[w] = progress.status[w] | WORLD_NOT_FINITE
+        return
+    if progress.iteration[w] == 0:
+        return
+    if done == 1:
+        progress.active[w] = 0
+    elif progress.iteration[w] >= iteration_max:
+        progress.active[w] = 0
+        progress.status[w] = progress.status[w] | WORLD_ITERATION_LIMIT
+
+
 @wp.kernel
 def judge_iterate(
     instances: Instances,
@@ -86,59 +146,27 @@ def judge_iterate(
     # In and out:
     progress: Progress,
 ):
-    """Sum the potential; stop a world whose last step was small and whose residual is small near its contacts.
-
-    The second condition matters in contact: within a step's tolerance friction goes from one side of its cone to the
-    other, and a residual is momentum that the other body receives and this one does not.
-    """
+    """Launch :func:`judge_world`."""
     w, lane = wp.tid()
-    if progress.active[w] == 0:
-        return
-    share = potential_share(progress, instances, motion, points, entries, rigid, q, rigid.r, dt, w, lane, team)
-    potential = team_sum(progress.partial, w, lane, team, share)
-    if lane != 0:
-        return
-    progress.potential[w] = potential
-    if wp.isnan(potential):
-        progress.active[w] = 0
-        progress.status[w] = progress.status[w] | WORLD_NOT_FINITE
-        return
-    if progress.iteration[w] == 0:
-        return
-    done = progress.last[w]
-    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
-        if done == 1 and pushes(instances, entries, i):
-            residual = wp.float64(0.0)
-            external = wp.float64(0.0)
-            for e in range(q.shape[1]):
-                residual += wp.dot(gradient[i, e], gradient[i, e])
-                external += wp.dot(motion.force[i, e], motion.force[i, e])
-            scale = wp.sqrt(external)
-            for e in range(entries.count[i]):
-                scale += wp.length(entries.force[i, e])
-            floor = wp.float64(1.0e-5) * instances.mass[i] * wp.float64(instances.tolerance[i]) / (dt * dt)
-            if not (wp.sqrt(residual) <= force_tolerance * scale + floor):
-                done = 0
-    if done == 1:
-        progress.active[w] = 0
-    elif progress.iteration[w] >= iteration_max:
-        progress.active[w] = 0
-        progress.status[w] = progress.status[w] | WORLD_ITERATION_LIMIT
+    judge_world(instances, motion, points, entries, rigid, team, iteration_max, force_tolerance, gradient, q, dt, progress, w, lane)
 
 
-@wp.kernel
-def begin_search(
+@wp.func
+def begin_world_search(
     instances: Instances,
     entries: Entries,
     rigid: Rigid,
     rigid_tolerance: wp.array[float],  # (world_count,) [m or rad]
     stick_range: wp.float64,  # [m]
+    team: int,
     # State in:
     gradient: wp.array2d[vec8d],
     direction: wp.array2d[vec8],
     indefinite: wp.array[int],  # (system_count,)
     # In and out:
     progress: Progress,
+    w: int,
+    lane: int,
 ):
     """Compute the slope g . d of each active world and start its line search at alpha = 1.
 
@@ -147,9 +175,9 @@ def begin_search(
     A step below the tolerance (in contact, far below the stick range too) is taken in full: there the change of the
     potential drowns in rounding.
     """
-    w = wp.tid()
-    progress.searching[w] = 0
     if progress.active[w] == 0:
+        if lane == 0:
+            progress.searching[w] = 0
         return
     slope = wp.float64(0.0)
     last = int(1)
@@ -158,15 +186,20 @@ def begin_search(
         if progress.project[w] == 0 and indefinite[instances.system[i]] != 0:
             unsound = 1
         moved = wp.float64(0.0)
-        for e in range(gradient.shape[1]):
+        for e in range(lane, gradient.shape[1], team):
             d = vec8d(direction[i, e])
             slope += wp.dot(gradient[i, e], d)
             moved += wp.dot(d, d)
+        moved = team_sum(moved)
         limit = wp.float64(instances.tolerance[i])
         if has_contacts(instances, entries, i):
             limit = wp.min(limit, wp.float64(0.1) * stick_range)
         if not (wp.sqrt(moved) <= limit):
             last = 0
+    slope = team_sum(slope)
+    if lane != 0:
+        return
+    progress.searching[w] = 0
     for j in range(rigid.count[w]):
         slope += rigid.gradient[w, j] * rigid.direction[w, j]
         # dofs that take part are in contact: a light body moves where the soft one stays
@@ -186,6 +219,26 @@ def begin_search(
     elif last == 0:
         progress.searching[w] = 1
         wp.atomic_max(progress.any_searching, 0, 1)
+
+
+@wp.kernel
+def begin_search(
+    instances: Instances,
+    entries: Entries,
+    rigid: Rigid,
+    rigid_tolerance: wp.array[float],  # (world_count,) [m or rad]
+    stick_range: wp.float64,  # [m]
+    team: int,
+    # State in:
+    gradient: wp.array2d[vec8d],
+    direction: wp.array2d[vec8],
+    indefinite: wp.array[int],  # (system_count,)
+    # In and out:
+    progress: Progress,
+):
+    """Launch :func:`begin_world_search`."""
+    w, lane = wp.tid()
+    begin_world_search(instances, entries, rigid, rigid_tolerance, stick_range, team, gradient, direction, indefinite, progress, w, lane)
 
 
 @wp.kernel
@@ -218,8 +271,8 @@ def trial_rigid(
     rigid.trial[w, j] = rigid.r[w, j] + progress.step_length[w] * rigid.direction[w, j]
 
 
-@wp.kernel
-def judge_trial(
+@wp.func
+def judge_world_trial(
     instances: Instances,
     motion: Motion,
     points: Points,
@@ -232,16 +285,17 @@ def judge_trial(
     dt: wp.float64,
     # In and out:
     progress: Progress,
+    w: int,
+    lane: int,
 ):
     """Accept a trial that lowers the potential enough (Armijo, up to rounding) or halve the step; give up if short.
 
     Where a full step has lowered it by more than a quadratic would have, take the better of that and twice the step.
     """
-    w, lane = wp.tid()
     if progress.searching[w] == 0:
         return
     share = potential_share(progress, instances, motion, points, entries, rigid, q, rigid.trial, dt, w, lane, team)
-    trial = team_sum(progress.partial, w, lane, team, share)
+    trial = team_sum(share)
     if lane != 0:
         return
     potential = progress.potential[w]
@@ -270,7 +324,27 @@ def judge_trial(
 
 
 @wp.kernel
-def finish_iteration(
+def judge_trial(
+    instances: Instances,
+    motion: Motion,
+    points: Points,
+    entries: Entries,
+    rigid: Rigid,
+    team: int,
+    step_length_min: wp.float64,
+    # State in:
+    q: wp.array2d[vec8d],
+    dt: wp.float64,
+    # In and out:
+    progress: Progress,
+):
+    """Launch :func:`judge_world_trial`."""
+    w, lane = wp.tid()
+    judge_world_trial(instances, motion, points, entries, rigid, team, step_length_min, q, dt, progress, w, lane)
+
+
+@wp.func
+def finish_world(
     instances: Instances,
     rigid: Rigid,
     team: int,
@@ -282,12 +356,13 @@ def finish_iteration(
     # In and out:
     q: wp.array2d[vec8d],
     progress: Progress,
+    w: int,
+    lane: int,
 ):
     """Take the accepted step; say whether the stiffness is to be renewed and how friction is to be linearised.
 
     A world that touches nothing is done with a step below the tolerance; near contacts the residual decides.
     """
-    w, lane = wp.tid()
     if progress.active[w] == 0:
         return
     alpha = progress.step_length[w]
@@ -295,11 +370,12 @@ def finish_iteration(
     away = int(0)
     for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
         moved = wp.float64(0.0)
-        for e in range(q.shape[1]):
+        for e in range(lane, q.shape[1], team):
             d = vec8d(direction[i, e])
             moved += wp.dot(d, d)
-            if e % team == lane and alpha > wp.float64(0.0):
+            if alpha > wp.float64(0.0):
                 q[i, e] = q[i, e] + alpha * d
+        moved = team_sum(moved)
         inertia = instances.inertia[i] / (dt * dt * instances.youngs_modulus[i])
         limit = wp.min(renewal_distance, INERTIA_SHARE * inertia) * instances.size[i]
         if alpha * wp.sqrt(moved) > wp.float64(limit):
@@ -333,3 +409,22 @@ def finish_iteration(
         progress.active[w] = 0
     else:
         wp.atomic_max(progress.any_active, 0, 1)
+
+
+@wp.kernel
+def finish_iteration(
+    instances: Instances,
+    rigid: Rigid,
+    team: int,
+    renewal: int,
+    renewal_distance: float,  # in sizes
+    dt: float,
+    # State in:
+    direction: wp.array2d[vec8],
+    # In and out:
+    q: wp.array2d[vec8d],
+    progress: Progress,
+):
+    """Launch :func:`finish_world`."""
+    w, lane = wp.tid()
+    finish_world(instances, rigid, team, renewal, renewal_distance, dt, direction, q, progress, w, lane)

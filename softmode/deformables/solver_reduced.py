@@ -10,7 +10,7 @@ import warp as wp
 from newton.solvers import SolverBase
 
 from softmode.deformables import assembly_kernels as assembly
-from softmode.deformables import attachment_kernels, contact, detection, kernels, stick_kernels
+from softmode.deformables import attachment_kernels, contact, detection, kernels, newton_kernels, stick_kernels
 from softmode.deformables import constraint_kernels as constraints
 from softmode.deformables import search_kernels as search
 from softmode.deformables.attachments import Attachment
@@ -47,6 +47,8 @@ Integrator = Literal["euler", "bdf2"]
 
 CUDA_THREADS = 2**16
 """Threads that keep a GPU busy: sums over points are split until there are about so many."""
+ONE_LAUNCH_BLOCKS = 5
+"""Blocks of eight functions up to which a body is small enough for a team of threads on CUDA."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,10 +182,14 @@ class SolverReduced(SolverBase):
         self.reaction = wp.zeros(functions, dtype=vec8d, device=device)
         """Generalised forces that held the driven functions at the last iterate but one [N], in blocks: their error is
         Newton's tolerance times the stiffness, so tighten it where forces of 1 % matter."""
-        self.gradient_chunk = wp.zeros(
-            (functions[0], self._chunks(functions[0] * layout.block_count), functions[1]), dtype=vec8d, device=device
-        )
-        chunks = self._chunks(functions[0] * 3 * layout.block_count**2)
+        self.one_launch = device.is_cuda and self.part_count == 1 and layout.block_count <= ONE_LAUNCH_BLOCKS
+        """Whether a team of threads takes a world through all of its Newton iterations in one launch."""
+        self.newton_team = newton_kernels.TEAM if device.is_cuda else 1
+        self.newton_options: Any = newton_kernels.NewtonOptions()
+        blocks = layout.block_count
+        chunks = self._chunks(functions[0] * blocks, blocks)
+        self.gradient_chunk = wp.zeros((functions[0], chunks, functions[1]), dtype=vec8d, device=device)
+        chunks = self._chunks(functions[0] * 3 * blocks**2, 3 * blocks**2 + 3 * (blocks**2 + blocks) // 2)
         self.stiffness = wp.zeros((functions[0], chunks, 3 * self.stride, functions[1]), dtype=vec8, device=device)
         shape = (functions[0], self.stride, layout.block_count) if layout.pin_max else (1, 1, 1)
         self.pins = wp.zeros(shape, dtype=vec8, device=device)
@@ -197,8 +203,13 @@ class SolverReduced(SolverBase):
         self._check_materials()
         self.refresh()
 
-    def _chunks(self, threads: int) -> int:
-        """Return into how many parts sums over points are split where a kernel has so many threads."""
+    def _chunks(self, threads: int, tasks: int) -> int:
+        """Return into how many parts sums over points are split where a kernel has so many threads.
+
+        ``tasks`` is how many of them belong to one body.
+        """
+        if self.one_launch:
+            return int(np.clip(self.newton_team // tasks, 1, 16))
         return int(np.clip(CUDA_THREADS // threads, 1, 16)) if self.model.device.is_cuda else 1
 
     def _shapes(self) -> Any:
@@ -223,6 +234,8 @@ class SolverReduced(SolverBase):
         columns = rigid.count_max + 1
         self.system_start, self.system = join_systems(self.layout, self.part_count, columns, device)
         self.direction = self.system.solution
+        unit = self.system.unit
+        self._minimise_worlds: Any = wp.overload(newton_kernels.minimise_worlds, {"unit": unit})
         if self.part_count > 1:
             self.direction = wp.zeros(self.functions, dtype=vec8, device=device)
 
@@ -428,7 +441,36 @@ class SolverReduced(SolverBase):
         self._launch(kernels.begin_newton, self.world_count, [self.progress, self.instances, self.entries])
         tables = [self.instances, self.motion, self.entries]
         self._launch(kernels.extrapolate, self.functions, [*tables, wp.float64(dt)], [self.q])
-        wp.capture_while(self.progress.any_active, self._newton_iteration, dt=dt)
+        if self.one_launch:
+            self._minimise_at_once(dt)
+        else:
+            wp.capture_while(self.progress.any_active, self._newton_iteration, dt=dt)
+
+    def _minimise_at_once(self, dt: float) -> None:
+        """Take every world through its iterations in one launch, a team of threads per world."""
+        options, system, given = self.options, self.system, self.newton_options
+        given.iteration_max, given.force_tolerance = options.iteration_max, wp.float64(options.force_tolerance)
+        given.stick_range = wp.float64(options.stick_velocity * dt)
+        given.step_length_min = wp.float64(options.step_length_min)
+        given.renewal, given.renewal_distance = options.stiffness_renewal, options.renewal_distance
+        given.rigid_max, given.dt = self.rigid.count_max, wp.float64(dt)
+        given.gradient_chunks, given.stiffness_chunks = self.gradient_chunk.shape[1], self.stiffness.shape[1]
+        given.factor_width = system.width
+        arrays = newton_kernels.NewtonArrays()
+        arrays.q, arrays.q_trial, arrays.gradient, arrays.reaction = self.q, self.q_trial, self.gradient, self.reaction
+        arrays.gradient_chunk, arrays.stiffness, arrays.pins = self.gradient_chunk, self.stiffness, self.pins
+        arrays.rigid_tolerance, arrays.system_start = self.rigid_tolerance, self.system_start
+        arrays.system_world, arrays.matrix, arrays.scalars = system.system_world, system.matrix, system.scalars
+        arrays.pattern, arrays.diagonal, arrays.indefinite = system.pattern, system.diagonal, system.indefinite
+        arrays.right, arrays.direction = system.right, self.direction
+        tables = [self.instances, self.basis, self.motion, self.points, self.entries, self.rigid.table, self.progress]
+        wp.launch(
+            self._minimise_worlds,
+            dim=(self.world_count, self.newton_team),
+            inputs=[*tables, given, arrays, system.unit, self.newton_team],
+            block_dim=self.newton_team,
+            device=self.model.device,
+        )
 
     def _newton_iteration(self, dt: float) -> None:
         """Take one Newton step in every world that is not done."""
@@ -556,9 +598,9 @@ class SolverReduced(SolverBase):
     def _begin_search(self, dt: float) -> None:
         """Start the line search of every active world."""
         self.progress.any_searching.zero_()
-        limits = [self.rigid_tolerance, wp.float64(self.options.stick_velocity * dt)]
+        limits = [self.rigid_tolerance, wp.float64(self.options.stick_velocity * dt), self.team]
         linear = [self.gradient, self.direction, self.system.indefinite]
-        self._launch(
+        self._launch_team(
             search.begin_search,
             self.world_count,
             [self.instances, self.entries, self.rigid.table, *limits, *linear],

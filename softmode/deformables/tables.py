@@ -181,7 +181,6 @@ class Progress:
     slope: wp.array[wp.float64]  # [J]
     step_length: wp.array[wp.float64]
     reached: wp.array[wp.float64]  # potential after a full step, while a longer one is tried [J]
-    partial: wp.array2d[wp.float64]  # (world_count, team), scratch of sums
     any_active: wp.array[int]  # (1,)
     any_searching: wp.array[int]  # (1,)
 
