@@ -99,10 +99,7 @@ class SolverCoupledReduced(SolverBase):
         self.reduced.attach_rigid(self._rigid_dofs())
         self.predicted_state = model.state()
         device, worlds = model.device, self.reduced.world_count
-        articulations, dofs = model.articulation_count, model.max_dofs_per_articulation
-        self.mass_matrix = wp.zeros((articulations, dofs, dofs), dtype=float, device=device)
         self.joint_S = wp.zeros(model.joint_dof_count, dtype=vector, device=device)
-        self.body_I = wp.zeros(model.body_count, dtype=wp.spatial_matrix, device=device)
         self.body_f = wp.zeros(model.body_count, dtype=vector, device=device)
         self.damping = wp.zeros(model.joint_dof_count, dtype=float, device=device)
         self.any_coupled = wp.zeros(1, dtype=int, device=device)
@@ -156,6 +153,24 @@ class SolverCoupledReduced(SolverBase):
 
     def _bind(self) -> None:
         """Point to the arrays of the model and of MuJoCo that the kernels read."""
+        model, dofs = self.model, self.reduced.rigid
+        self.inertia: Any = kernels.Inertia()
+        for name, source in (
+            ("dof_start", dofs.dof_start),
+            ("dof_articulation", self.dof_articulation),
+            ("articulation_dof_start", dofs.articulation_dof_start),
+            ("joint_start", model.articulation_start),
+            ("joint_end", model.articulation_end),
+            ("joint_child", model.joint_child),
+            ("dof_body", self.dof_body),
+            ("body_flags", model.body_flags),
+            ("body_mass", model.body_mass),
+            ("body_inertia", model.body_inertia),
+            ("armature", model.joint_armature),
+            ("damping", self.damping),
+            ("jacobian", dofs.jacobian),
+        ):
+            setattr(self.inertia, name, source)
         model, turned, data, mujoco = self.model, self.turned, self.rigid.mjw_data, constraints.MujocoRows()
         turned.qd_start, turned.q_start, turned.child = model.joint_qd_start, model.joint_q_start, model.joint_child
         turned.parent_frame, turned.child_frame, turned.body_com = model.joint_X_p, model.joint_X_c, model.body_com
@@ -321,27 +336,12 @@ class SolverCoupledReduced(SolverBase):
         """Evaluate Jacobians and the effective inertia at the start of the step."""
         model, dofs = self.model, self.reduced.rigid
         newton.eval_jacobian(model, state, dofs.jacobian, joint_S_s=self.joint_S)
-        newton.eval_mass_matrix(
-            model, state, self.mass_matrix, J=dofs.jacobian, body_I_s=self.body_I, joint_S_s=self.joint_S
-        )
         drives = [model.joint_target_mode, model.joint_target_kd, model.joint_damping]
         self._launch(kernels.drive_damping, model.joint_dof_count, drives, [self.damping])
         self._launch(
             kernels.effective_inertia,
-            (self.reduced.world_count, dofs.count_max),
-            [
-                dofs.count,
-                dofs.dof_start,
-                self.dof_articulation,
-                dofs.articulation_dof_start,
-                self.damping,
-                self.mass_matrix,
-                state.joint_qd,
-                self.predicted_state.joint_qd,
-                self.dof_body,
-                model.body_flags,
-                wp.float64(dt),
-            ],
+            (self.reduced.world_count, dofs.count_max, dofs.count_max),
+            [dofs.count, self.inertia, state.body_q, state.joint_qd, self.predicted_state.joint_qd, wp.float64(dt)],
             [dofs.inertia, dofs.predicted, dofs.r],
         )
         rows = [self.mujoco, self.turned, state.joint_q]

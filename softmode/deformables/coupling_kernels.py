@@ -80,20 +80,52 @@ def keep_prediction(
         corrected[width * e + c] = predicted[width * e + c]
 
 
+@wp.struct
+class Inertia:
+    """What the mass matrix of the articulations is made of."""
+
+    dof_start: wp.array[int]  # (world_count,), first joint dof of a world
+    dof_articulation: wp.array[int]  # (joint_dof_count,), -1 for a joint that closes a loop
+    articulation_dof_start: wp.array[int]
+    joint_start: wp.array[int]  # (articulation_count,)
+    joint_end: wp.array[int]
+    joint_child: wp.array[int]
+    dof_body: wp.array[int]  # (joint_dof_count,), the body that a dof moves
+    body_flags: wp.array[int]
+    body_mass: wp.array[float]  # [kg]
+    body_inertia: wp.array[wp.mat33]  # about the centre of mass, in the body's frame [kg m^2]
+    armature: wp.array[float]  # (joint_dof_count,)
+    damping: wp.array[float]  # (joint_dof_count,), D + K_d
+    jacobian: wp.array3d[float]  # (articulation_count, 6 link_max, dof_max), twists of centres of mass, world frame
+
+
+@wp.func
+def mass_entry(inertia: Inertia, body_q: wp.array[wp.transform], a: int, j: int, l: int):
+    """Return entry (j, l) of the mass matrix of an articulation, sum over its links of v_j m v_l + w_j I w_l."""
+    J = inertia.jacobian
+    total = float(0.0)
+    for joint in range(inertia.joint_start[a], inertia.joint_end[a]):
+        row = 6 * (joint - inertia.joint_start[a])
+        body = inertia.joint_child[joint]
+        v = wp.vec3(J[a, row, j], J[a, row + 1, j], J[a, row + 2, j])
+        turn = wp.vec3(J[a, row + 3, j], J[a, row + 4, j], J[a, row + 5, j])
+        v_other = wp.vec3(J[a, row, l], J[a, row + 1, l], J[a, row + 2, l])
+        turn_other = wp.vec3(J[a, row + 3, l], J[a, row + 4, l], J[a, row + 5, l])
+        frame = wp.transform_get_rotation(body_q[body])
+        turn = wp.quat_rotate_inv(frame, turn)
+        turn_other = wp.quat_rotate_inv(frame, turn_other)
+        total += inertia.body_mass[body] * wp.dot(v, v_other)
+        total += wp.dot(turn, inertia.body_inertia[body] * turn_other)
+    return total
+
+
 @wp.kernel
 def effective_inertia(
-    # Worlds:
-    count: wp.array[int],
-    dof_start: wp.array[int],
-    # Joint dofs:
-    dof_articulation: wp.array[int],  # (joint_dof_count,), -1 for a joint that closes a loop
-    articulation_dof_start: wp.array[int],
-    damping: wp.array[float],  # (joint_dof_count,), D + K_d
-    mass_matrix: wp.array3d[float],  # (articulation_count, dof_max, dof_max)
+    count: wp.array[int],  # (world_count,)
+    inertia: Inertia,
+    body_q: wp.array[wp.transform],
     joint_qd_start: wp.array[float],
     joint_qd_predicted: wp.array[float],
-    dof_body: wp.array[int],  # (joint_dof_count,), the body that a dof moves
-    body_flags: wp.array[int],
     dt: wp.float64,
     # Out:
     inertia_out: wp.array3d[wp.float64],  # (world_count, rigid_max, rigid_max), M_eff / dt^2
@@ -101,28 +133,26 @@ def effective_inertia(
     r_out: wp.array2d[wp.float64],
 ):
     """Lay the mass matrices of the articulations of a world on the diagonal, with implicit damping."""
-    w, j = wp.tid()
-    if j >= count[w]:
+    w, j, l = wp.tid()
+    if j >= count[w] or l > j:
         return
-    dof = dof_start[w] + j
-    a = dof_articulation[dof]
-    first = int(0)
-    if a >= 0:
-        first = articulation_dof_start[a]
-    for l in range(count[w]):
-        other = dof_start[w] + l
-        value = wp.float64(0.0)
-        if a >= 0 and dof_articulation[other] == a:
-            value = wp.float64(mass_matrix[a, dof - first, other - first])
-        if l == j:
-            value += dt * wp.float64(damping[dof])
-            if a < 0 or body_flags[dof_body[dof]] & wp.static(int(newton.BodyFlags.KINEMATIC)) != 0:
-                value += IMMOVABLE
-        inertia_out[w, j, l] = value / (dt * dt)
-    predicted_out[w, j] = dt * wp.float64(joint_qd_predicted[dof])
-    # Newton starts from the motion that goes on, as it does for q: in a grasp the contact-free prediction would press
-    # the fingers far into the object
-    r_out[w, j] = dt * wp.float64(joint_qd_start[dof])
+    dof = inertia.dof_start[w] + j
+    other = inertia.dof_start[w] + l
+    a = inertia.dof_articulation[dof]
+    value = wp.float64(0.0)
+    if a >= 0 and inertia.dof_articulation[other] == a:
+        first = inertia.articulation_dof_start[a]
+        value = wp.float64(mass_entry(inertia, body_q, a, dof - first, other - first))
+    if l == j:
+        value += wp.float64(inertia.armature[dof]) + dt * wp.float64(inertia.damping[dof])
+        if a < 0 or inertia.body_flags[inertia.dof_body[dof]] & wp.static(int(newton.BodyFlags.KINEMATIC)) != 0:
+            value += IMMOVABLE
+        predicted_out[w, j] = dt * wp.float64(joint_qd_predicted[dof])
+        # Newton starts from the motion that goes on, as it does for q: in a grasp the contact-free prediction would
+        # press the fingers far into the object
+        r_out[w, j] = dt * wp.float64(joint_qd_start[dof])
+    inertia_out[w, j, l] = value / (dt * dt)
+    inertia_out[w, l, j] = value / (dt * dt)
 
 
 @wp.kernel
