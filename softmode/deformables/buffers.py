@@ -7,7 +7,7 @@ import warp as wp
 
 from softmode.deformables.detection import Samples
 from softmode.deformables.lanes import vec8d
-from softmode.deformables.tables import SLOTS, Entries, Motion, Points, Progress
+from softmode.deformables.tables import SLOTS, Entries, Motion, Points, Progress, vec5
 
 
 def make_motion(functions: tuple[int, int], device: Any) -> Any:
@@ -63,7 +63,7 @@ def make_entries(instance_count: int, entry_max: int, rigid_max: int, device: An
     return entries
 
 
-def make_progress(instance_start: np.ndarray, team: int, device: Any) -> Any:
+def make_progress(instance_start: np.ndarray, functions: tuple[int, int], device: Any) -> Any:
     """Return the state of Newton's iteration."""
     progress, world_count = Progress(), len(instance_start) - 1
     progress.instance_start = wp.array(instance_start, dtype=int, device=device)
@@ -76,11 +76,14 @@ def make_progress(instance_start: np.ndarray, team: int, device: Any) -> Any:
         "project",
         "failures",
         "exact",
+        "kept",
         "iteration",
         "status",
     ):
         setattr(progress, name, wp.zeros(world_count, dtype=int, device=device))
     for name in ("potential", "slope", "step_length", "reached"):
         setattr(progress, name, wp.zeros(world_count, dtype=wp.float64, device=device))
+    progress.kept_q = wp.zeros(functions, dtype=vec8d, device=device)
+    progress.kept_for = wp.zeros(functions[0], dtype=vec5, device=device)
     progress.any_active, progress.any_searching = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
     return progress

@@ -649,6 +649,7 @@ def reset_worlds(
     body_wrench_out: wp.array[wp.spatial_vector],
     entry_count_out: wp.array[int],
     pair_count_out: wp.array[int],
+    kept_out: wp.array[int],
 ):
     """Clear what the masked worlds report: status, entries, contact force on bodies, wrench on rigid bodies."""
     i = wp.tid()
@@ -657,5 +658,6 @@ def reset_worlds(
         instance_force_out[i] = wp.vec3d()
         entry_count_out[i] = 0
         pair_count_out[i] = 0
+        kept_out[instances.world[i]] = 0
     if i < body_world.shape[0] and in_mask(body_world[i], world_mask):
         body_wrench_out[i] = wp.spatial_vector()

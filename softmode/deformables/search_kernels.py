@@ -4,7 +4,18 @@ import warp as wp
 
 from softmode.deformables.lanes import barrier, team_sum, vec8, vec8d
 from softmode.deformables.status import WORLD_ITERATION_LIMIT, WORLD_NO_DESCENT, WORLD_NOT_FINITE
-from softmode.deformables.tables import Entries, Instances, Motion, Points, Progress, Rigid, has_contacts, pushes
+from softmode.deformables.tables import (
+    Basis,
+    Entries,
+    Instances,
+    Motion,
+    Points,
+    Progress,
+    Rigid,
+    has_contacts,
+    hessian_recipe,
+    pushes,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -344,6 +355,49 @@ def judge_trial(
 
 
 @wp.func
+def renewal_limit(instances: Instances, i: int, renewal_distance: float, dt: float):
+    """Return how far a body may move, in strain and rotation, before its elastic Hessian is renewed [m], rms."""
+    inertia = instances.inertia[i] / (dt * dt * instances.youngs_modulus[i])
+    return wp.float64(wp.min(renewal_distance, INERTIA_SHARE * inertia) * instances.size[i])
+
+
+@wp.kernel
+def keep_hessians(
+    instances: Instances,
+    basis: Basis,
+    renewal_distance: float,  # in sizes
+    dt: float,
+    team: int,
+    q: wp.array2d[vec8d],
+    # In and out:
+    progress: Progress,
+):
+    """Start with the elastic Hessian of the step before where no body has bent or turned since.
+
+    The distance leaves out the translation: the basis is mass-orthonormal, so that its coordinates are the basis' mean.
+    """
+    w, lane = wp.tid()
+    keep = progress.kept[w]
+    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
+        stride = q.shape[1] / 3
+        moved = wp.float64(0.0)
+        mean = wp.vec3d()
+        for e in range(lane, q.shape[1], team):
+            d = q[i, e] - progress.kept_q[i, e]
+            moved += wp.dot(d, d)
+            mean[e / stride] = mean[e / stride] + wp.dot(d, basis.mean[instances.asset[i], e % stride])
+        for axis in range(3):
+            part = team_sum(mean[axis])
+            mean[axis] = part
+        moved = team_sum(moved) - wp.length_sq(mean)
+        limit = renewal_limit(instances, i, renewal_distance, dt)
+        if not (moved <= limit * limit) or not (progress.kept_for[i] == hessian_recipe(instances, i, dt)):
+            keep = 0
+    if lane == 0:
+        progress.renew[w] = 1 - keep
+
+
+@wp.func
 def finish_world(
     instances: Instances,
     rigid: Rigid,
@@ -366,6 +420,7 @@ def finish_world(
     if progress.active[w] == 0:
         return
     alpha = progress.step_length[w]
+    renewed = progress.renew[w]
     far = int(0)
     away = int(0)
     for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
@@ -373,13 +428,15 @@ def finish_world(
         for e in range(lane, q.shape[1], team):
             d = vec8d(direction[i, e])
             moved += wp.dot(d, d)
+            if renewed != 0:
+                progress.kept_q[i, e] = q[i, e]
             if alpha > wp.float64(0.0):
                 q[i, e] = q[i, e] + alpha * d
         moved = team_sum(moved)
-        inertia = instances.inertia[i] / (dt * dt * instances.youngs_modulus[i])
-        limit = wp.min(renewal_distance, INERTIA_SHARE * inertia) * instances.size[i]
-        if alpha * wp.sqrt(moved) > wp.float64(limit):
+        if alpha * wp.sqrt(moved) > renewal_limit(instances, i, renewal_distance, dt):
             far = 1
+        if renewed != 0 and lane == 0:
+            progress.kept_for[i] = hessian_recipe(instances, i, dt)
         if alpha * wp.sqrt(moved) > wp.float64(PROJECTED_DISTANCE * instances.size[i]):
             away = 1
     for j in range(lane, rigid.count[w], team):
@@ -389,6 +446,8 @@ def finish_world(
     if lane != 0:
         return
     progress.iteration[w] = progress.iteration[w] + 1
+    if renewed != 0:
+        progress.kept[w] = 1 - progress.project[w]
     stale = progress.renew[w] == 0 or progress.project[w] == 0
     progress.renew[w] = far
     slow = progress.iteration[w] >= 2 * renewal

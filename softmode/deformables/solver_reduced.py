@@ -67,6 +67,10 @@ class SolverReducedOptions:
     """The elastic Hessian is assembled every so many iterations at least (contact always is), and"""
     renewal_distance: float = 1.0e-3
     """after an iteration that moved a body by more than this fraction of its size (rms). 0 is Newton's own method."""
+    carry_stiffness: bool = False
+    """Whether a step may start with the elastic Hessian of the step before, where no body has bent or turned by more
+    than that since: half of the time of a body at rest. It changes results within the tolerances; what a step starts
+    with is then no longer in its state alone, so that a replayed step agrees within the tolerances, not to the bit."""
     tolerance: float = 1.0e-5
     """Newton stops when every body moved less than this fraction of its size (rms) in an iteration, and"""
     force_tolerance: float = 1.0e-5
@@ -176,7 +180,7 @@ class SolverReduced(SolverBase):
         if options.soft_contact and crowded:
             self.pairs = SoftPairs(model, layout, options.contact_max // 2, options.stick_ratio, self.sizes.spacing)
         """Contact between soft bodies, None where there is never any."""
-        self.progress = make_progress(layout.instance_start, self.team, device)
+        self.progress = make_progress(layout.instance_start, functions, device)
         self.q, self.q_trial = (wp.zeros(functions, dtype=vec8d, device=device) for _ in range(2))
         self.gradient = wp.zeros(functions, dtype=vec8d, device=device)
         self.reaction = wp.zeros(functions, dtype=vec8d, device=device)
@@ -441,6 +445,9 @@ class SolverReduced(SolverBase):
         self._launch(kernels.begin_newton, self.world_count, [self.progress, self.instances, self.entries])
         tables = [self.instances, self.motion, self.entries]
         self._launch(kernels.extrapolate, self.functions, [*tables, wp.float64(dt)], [self.q])
+        if self.options.carry_stiffness:
+            given = [self.instances, self.basis, self.options.renewal_distance, float(dt), self.team, self.q]
+            self._launch_team(search.keep_hessians, self.world_count, given, [self.progress])
         if self.one_launch:
             self._minimise_at_once(dt)
         else:
@@ -726,7 +733,7 @@ class SolverReduced(SolverBase):
             kernels.reset_worlds,
             max(self.instance_count, self.model.body_count),
             [self.instances, initial.instance_world, self.model.body_world, mask],
-            [self.status, self.instance_force, self.body_wrench, self.entries.count, self.entries.pair_count],
+            [self.status, self.instance_force, self.body_wrench, self.entries.count, self.entries.pair_count, self.progress.kept],
         )
         if self.layout.pin_max:
             dim = (self.instance_count, self.layout.pin_max)

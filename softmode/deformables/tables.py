@@ -16,6 +16,7 @@ OVERLAP = wp.constant(0.05)
 wrongly, is pushed out by that much a step instead of being thrown out."""
 SLOTS = 2
 """What a surface sample may touch at a time: the deepest two shapes, and the nearest two other soft bodies."""
+vec5 = wp.types.vector(length=5, dtype=float)
 mat23d: Any = wp.types.matrix(shape=(SLOTS, 3), dtype=wp.float64)
 
 
@@ -181,6 +182,9 @@ class Progress:
     slope: wp.array[wp.float64]  # [J]
     step_length: wp.array[wp.float64]
     reached: wp.array[wp.float64]  # potential after a full step, while a longer one is tried [J]
+    kept: wp.array[int]  # whether the elastic Hessian in memory is Newton's own, of some iterate
+    kept_q: wp.array2d[vec8d]  # (instance_count, 3 block_count), that iterate [m], and
+    kept_for: wp.array[vec5]  # (instance_count,), what else it is made of: see ``hessian_recipe``
     any_active: wp.array[int]  # (1,)
     any_searching: wp.array[int]  # (1,)
 
@@ -201,6 +205,18 @@ def pushes(instances: Instances, entries: Entries, i: int):
 def first_coupled(instances: Instances, i: int):
     """Return the first entry of an instance that may push a rigid body: a pin only where some pin follows a body."""
     return wp.where(instances.link_pin_count[i] > 0, 0, instances.pin_count[i])
+
+
+@wp.func
+def hessian_recipe(instances: Instances, i: int, dt: float):
+    """Return what the elastic Hessian of an instance depends on besides its coordinates."""
+    return vec5(
+        float(instances.material_model[i]),
+        instances.youngs_modulus[i],
+        instances.poissons_ratio[i],
+        instances.viscosity[i],
+        dt,
+    )
 
 
 @wp.func
