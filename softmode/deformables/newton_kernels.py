@@ -24,11 +24,12 @@ from softmode.deformables.factor import factor_system, solve_system
 from softmode.deformables.kernels import evaluate_point, gradient_block, sum_force_block
 from softmode.deformables.lanes import LANES, barrier, vec8, vec8d
 from softmode.deformables.search_kernels import begin_world_search, finish_world, judge_world, judge_world_trial
+from softmode.deformables.shared_factor import shared_system, sum_forces_of
 from softmode.deformables.tables import Basis, Entries, Instances, Motion, Points, Progress, Rigid
 
 wp.set_module_options({"enable_backward": False})
 
-TEAM = 128
+TEAM = 96
 """Threads that share a world on CUDA."""
 
 
@@ -45,6 +46,7 @@ class NewtonOptions:
     rigid_max: int  # joint dofs that there is room for
     gradient_chunks: int
     stiffness_chunks: int
+    shared: int  # 1 where every world has one system, which fits in shared memory
     factor_width: int  # columns that a thread of the factorisation takes at a time
     dt: wp.float64
 
@@ -72,7 +74,7 @@ class NewtonArrays:
     direction: wp.array2d[vec8]
 
 
-@wp.kernel(launch_bounds=(TEAM, 3))
+@wp.kernel(launch_bounds=(TEAM, 4))
 def minimise_worlds(
     instances: Instances,
     basis: Basis,
@@ -130,19 +132,35 @@ def minimise_worlds(
         barrier()
         if trial == 0:
             for i in range(begin, end):
-                for t in range(lane, options.gradient_chunks * blocks, team):
-                    sum_force_block(
-                        instances,
-                        basis,
-                        points,
-                        entries,
-                        progress.active,
-                        options.gradient_chunks,
+                if options.shared != 0:
+                    sum_forces_of(
+                        points.stress,
+                        basis.gradient_across,
+                        entries.row,
+                        entries.force,
+                        entries.count[i],
+                        basis.row,
+                        instances.point_start[i],
+                        instances.point_count[i],
                         arrays.gradient_chunk,
                         i,
-                        t / blocks,
-                        t % blocks,
+                        lane,
+                        team,
                     )
+                else:
+                    for t in range(lane, options.gradient_chunks * blocks, team):
+                        sum_force_block(
+                            instances,
+                            basis,
+                            points,
+                            entries,
+                            progress.active,
+                            options.gradient_chunks,
+                            arrays.gradient_chunk,
+                            i,
+                            t / blocks,
+                            t % blocks,
+                        )
                 barrier()
                 for e in range(lane, 3 * blocks, team):
                     gradient_block(
@@ -193,25 +211,26 @@ def minimise_worlds(
                                 t % tasks,
                             )
                         barrier()
-                    columns = 3 * blocks
-                    for t in range(lane, 3 * LANES * blocks * columns, team):
-                        matrix_row(
-                            instances,
-                            basis,
-                            motion,
-                            progress.active,
-                            arrays.stiffness,
-                            arrays.pins,
-                            dt,
-                            columns,
-                            arrays.matrix,
-                            i,
-                            t / columns,
-                            t % columns,
-                        )
-                    barrier()
-                    for t in range(lane, tasks, team):
-                        contact_block(instances, basis, entries, progress.active, arrays.matrix, i, t)
+                    if options.shared == 0:
+                        columns = 3 * blocks
+                        for t in range(lane, 3 * LANES * blocks * columns, team):
+                            matrix_row(
+                                instances,
+                                basis,
+                                motion,
+                                progress.active,
+                                arrays.stiffness,
+                                arrays.pins,
+                                dt,
+                                columns,
+                                arrays.matrix,
+                                i,
+                                t / columns,
+                                t % columns,
+                            )
+                        barrier()
+                        for t in range(lane, tasks, team):
+                            contact_block(instances, basis, entries, progress.active, arrays.matrix, i, t)
                     for t in range(lane, 3 * blocks * (options.rigid_max + 1), team):
                         column_block(
                             instances,
@@ -230,7 +249,35 @@ def minimise_worlds(
                 for t in range(lane, n * n, team):
                     rigid_entry(instances, entries, progress, rigid, w, t / n, t % n)
                 barrier()
-                for s in range(arrays.system_start[w], arrays.system_start[w + 1]):
+                inertia = float(0.0)
+                if options.shared != 0:
+                    # the padding behind the functions carries inertia alone
+                    rate = motion.rate[begin] / dt
+                    inertia = float(
+                        instances.mass[begin] * rate * (rate + wp.float64(instances.mass_damping[begin]))
+                    )
+                    shared_system(
+                        0,
+                        arrays.stiffness,
+                        inertia,
+                        entries.row,
+                        entries.hessian,
+                        entries.count[begin],
+                        basis.row,
+                        arrays.scalars,
+                        LANES * arrays.direction.shape[1],
+                        arrays.scalars.shape[2],
+                        arrays.indefinite,
+                        options.rigid_max,
+                        rigid.direction,
+                        n,
+                        arrays.direction,
+                        arrays.system_start[w],
+                        w,
+                        lane,
+                        team,
+                    )
+                for s in range(arrays.system_start[w], arrays.system_start[w + 1 - options.shared]):
                     factor_system(
                         arrays.system_world,
                         progress.active,
@@ -262,7 +309,29 @@ def minimise_worlds(
                     barrier()
                     solve_rigid_team(progress.active, team, rigid, w, lane)
                     barrier()
-                for s in range(arrays.system_start[w], arrays.system_start[w + 1]):
+                if options.shared != 0:
+                    shared_system(
+                        1,
+                        arrays.stiffness,
+                        inertia,
+                        entries.row,
+                        entries.hessian,
+                        entries.count[begin],
+                        basis.row,
+                        arrays.scalars,
+                        LANES * arrays.direction.shape[1],
+                        arrays.scalars.shape[2],
+                        arrays.indefinite,
+                        options.rigid_max,
+                        rigid.direction,
+                        n,
+                        arrays.direction,
+                        arrays.system_start[w],
+                        w,
+                        lane,
+                        team,
+                    )
+                for s in range(arrays.system_start[w], arrays.system_start[w + 1 - options.shared]):
                     solve_system(
                         arrays.system_world,
                         progress.active,

@@ -30,6 +30,7 @@ from softmode.deformables.observables import REDUCED_KINDS, ReducedObservableKin
 from softmode.deformables.pairs import SoftPairs
 from softmode.deformables.rigid_dofs import RigidDofs
 from softmode.deformables.shape_tables import heightfields, mesh_sources, solid_shapes
+from softmode.deformables.shared_factor import SHARED_SIZE, SHARED_WIDTH
 from softmode.deformables.sizes import Sizes
 from softmode.deformables.step_checks import check_step
 from softmode.errors import ConfigError
@@ -189,9 +190,13 @@ class SolverReduced(SolverBase):
         self.one_launch = device.is_cuda and self.part_count == 1 and layout.block_count <= ONE_LAUNCH_BLOCKS
         """Whether a team of threads takes a world through all of its Newton iterations in one launch."""
         self.newton_team = newton_kernels.TEAM if device.is_cuda else 1
+        one_each = self.instance_count == self.world_count and layout.pin_max == 0
+        driven = bool(self.instances.driven_count.numpy().any())
+        self.shared = self.one_launch and one_each and not driven and 3 * self.stride <= SHARED_SIZE
+        """Whether the systems of that launch are assembled and solved in shared memory."""
         self.newton_options: Any = newton_kernels.NewtonOptions()
         blocks = layout.block_count
-        chunks = self._chunks(functions[0] * blocks, blocks)
+        chunks = 1 if self.shared else self._chunks(functions[0] * blocks, blocks)
         self.gradient_chunk = wp.zeros((functions[0], chunks, functions[1]), dtype=vec8d, device=device)
         chunks = self._chunks(functions[0] * 3 * blocks**2, 3 * blocks**2 + 3 * (blocks**2 + blocks) // 2)
         self.stiffness = wp.zeros((functions[0], chunks, 3 * self.stride, functions[1]), dtype=vec8, device=device)
@@ -239,6 +244,7 @@ class SolverReduced(SolverBase):
         self.system_start, self.system = join_systems(self.layout, self.part_count, columns, device)
         self.direction = self.system.solution
         unit = self.system.unit
+        self.shared = self.shared and self.system.scalars.shape[2] <= SHARED_WIDTH
         self._minimise_worlds: Any = wp.overload(newton_kernels.minimise_worlds, {"unit": unit})
         if self.part_count > 1:
             self.direction = wp.zeros(self.functions, dtype=vec8, device=device)
@@ -463,6 +469,7 @@ class SolverReduced(SolverBase):
         given.rigid_max, given.dt = self.rigid.count_max, wp.float64(dt)
         given.gradient_chunks, given.stiffness_chunks = self.gradient_chunk.shape[1], self.stiffness.shape[1]
         given.factor_width = system.width
+        given.shared = int(self.shared)
         arrays = newton_kernels.NewtonArrays()
         arrays.q, arrays.q_trial, arrays.gradient, arrays.reaction = self.q, self.q_trial, self.gradient, self.reaction
         arrays.gradient_chunk, arrays.stiffness, arrays.pins = self.gradient_chunk, self.stiffness, self.pins
