@@ -45,10 +45,6 @@ sinks in 1.4 to 2.4 mm instead of 7 to 8. Ten times the stiffness throughout cos
 HARDENING_DEPTH = wp.constant(wp.float64(2.0))
 """Penetration beyond which it does, in ranges of the onset."""
 
-LAG_ITERATIONS = wp.constant(8)
-"""Newton iterations during which the normal force of friction follows the contact; then it is frozen, and what is left
-is the minimisation of one potential."""
-
 
 @wp.func
 def penalty(penetration: wp.float64, eps: wp.float64):
@@ -187,7 +183,7 @@ def evaluate_entry(
         n = entries.normal[i, e]
         total = entries.offset[i, e] + d
         psi, slope, curvature = normal_potential(-wp.dot(n, total), wp.float64(smoothing))
-        if derivatives != 0 and progress.iteration[w] <= LAG_ITERATIONS:
+        if derivatives != 0 and progress.iteration[w] <= progress.friction_lag:
             held = slope
             if progress.iteration[w] == 0:
                 # in an impact the first guess lies far too deep: friction of such a force would be too stiff to solve

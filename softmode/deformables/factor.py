@@ -169,7 +169,21 @@ def _factor(
 ):
     """Launch :func:`factor_system`."""
     i, lane = wp.tid()
-    factor_system(system_world, active, block_count, part_blocks, pattern, team, width, matrix, unit, diagonal_out, indefinite_out, i, lane)
+    factor_system(
+        system_world,
+        active,
+        block_count,
+        part_blocks,
+        pattern,
+        team,
+        width,
+        matrix,
+        unit,
+        diagonal_out,
+        indefinite_out,
+        i,
+        lane,
+    )
 
 
 @wp.func
@@ -263,7 +277,22 @@ def _solve(
 ):
     """Launch :func:`solve_system`."""
     i, lane = wp.tid()
-    solve_system(system_world, active, block_count, column, team, matrix, diagonal, pattern, tail, tail_count, right, solution_out, i, lane)
+    solve_system(
+        system_world,
+        active,
+        block_count,
+        column,
+        team,
+        matrix,
+        diagonal,
+        pattern,
+        tail,
+        tail_count,
+        right,
+        solution_out,
+        i,
+        lane,
+    )
 
 
 @wp.kernel

@@ -253,9 +253,7 @@ def minimise_worlds(
                 if options.shared != 0:
                     # the padding behind the functions carries inertia alone
                     rate = motion.rate[begin] / dt
-                    inertia = float(
-                        instances.mass[begin] * rate * (rate + wp.float64(instances.mass_damping[begin]))
-                    )
+                    inertia = float(instances.mass[begin] * rate * (rate + wp.float64(instances.mass_damping[begin])))
                     shared_system(
                         0,
                         arrays.stiffness,

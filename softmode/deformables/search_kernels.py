@@ -159,7 +159,22 @@ def judge_iterate(
 ):
     """Launch :func:`judge_world`."""
     w, lane = wp.tid()
-    judge_world(instances, motion, points, entries, rigid, team, iteration_max, force_tolerance, gradient, q, dt, progress, w, lane)
+    judge_world(
+        instances,
+        motion,
+        points,
+        entries,
+        rigid,
+        team,
+        iteration_max,
+        force_tolerance,
+        gradient,
+        q,
+        dt,
+        progress,
+        w,
+        lane,
+    )
 
 
 @wp.func
@@ -249,7 +264,20 @@ def begin_search(
 ):
     """Launch :func:`begin_world_search`."""
     w, lane = wp.tid()
-    begin_world_search(instances, entries, rigid, rigid_tolerance, stick_range, team, gradient, direction, indefinite, progress, w, lane)
+    begin_world_search(
+        instances,
+        entries,
+        rigid,
+        rigid_tolerance,
+        stick_range,
+        team,
+        gradient,
+        direction,
+        indefinite,
+        progress,
+        w,
+        lane,
+    )
 
 
 @wp.kernel

@@ -208,7 +208,7 @@ def shared_system(
     lane: int,
     team: int,
 ) -> None:
-    """Assemble and factor system ``i`` (mode 0), later solve it (mode 1). CUDA only, one body without pins per world."""
+    """Assemble and factor system ``i`` (mode 0), later solve it (mode 1). CUDA only, one body per world, no pins."""
     ...
 
 

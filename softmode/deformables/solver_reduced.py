@@ -76,6 +76,10 @@ class SolverReducedOptions:
     """Newton stops when every body moved less than this fraction of its size (rms) in an iteration, and"""
     force_tolerance: float = 1.0e-5
     """when the residual force on every body near a contact is below this fraction of the forces on it."""
+    friction_lag: int = 8
+    """Iterations during which the normal force that limits friction follows the contact; then it is frozen, and what is
+    left is the minimisation of one potential. Newton converges linearly until then where bodies slide: fewer make a
+    step cheaper, and friction of the last iterate but a few."""
     step_length_min: float = 2.0**-16
     """Shortest step the line search tries."""
     contact_max: int = 256
@@ -96,7 +100,7 @@ class SolverReducedOptions:
         """Check every range."""
         if self.integrator not in ("euler", "bdf2"):
             raise ConfigError(f"integrator must be 'euler' or 'bdf2', got {self.integrator!r}")
-        for name, low in (("iteration_max", 1), ("stiffness_renewal", 1), ("contact_max", 1)):
+        for name, low in (("iteration_max", 1), ("stiffness_renewal", 1), ("contact_max", 1), ("friction_lag", 0)):
             if getattr(self, name) < low:
                 raise ConfigError(f"{name} must be at least {low}, got {getattr(self, name)}")
         for name in ("renewal_distance", "stick_ratio"):
@@ -182,6 +186,7 @@ class SolverReduced(SolverBase):
             self.pairs = SoftPairs(model, layout, options.contact_max // 2, options.stick_ratio, self.sizes.spacing)
         """Contact between soft bodies, None where there is never any."""
         self.progress = make_progress(layout.instance_start, functions, device)
+        self.progress.friction_lag = options.friction_lag
         self.q, self.q_trial = (wp.zeros(functions, dtype=vec8d, device=device) for _ in range(2))
         self.gradient = wp.zeros(functions, dtype=vec8d, device=device)
         self.reaction = wp.zeros(functions, dtype=vec8d, device=device)
@@ -740,7 +745,14 @@ class SolverReduced(SolverBase):
             kernels.reset_worlds,
             max(self.instance_count, self.model.body_count),
             [self.instances, initial.instance_world, self.model.body_world, mask],
-            [self.status, self.instance_force, self.body_wrench, self.entries.count, self.entries.pair_count, self.progress.kept],
+            [
+                self.status,
+                self.instance_force,
+                self.body_wrench,
+                self.entries.count,
+                self.entries.pair_count,
+                self.progress.kept,
+            ],
         )
         if self.layout.pin_max:
             dim = (self.instance_count, self.layout.pin_max)

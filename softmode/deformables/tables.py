@@ -185,6 +185,7 @@ class Progress:
     kept: wp.array[int]  # whether the elastic Hessian in memory is Newton's own, of some iterate
     kept_q: wp.array2d[vec8d]  # (instance_count, 3 block_count), that iterate [m], and
     kept_for: wp.array[vec5]  # (instance_count,), what else it is made of: see ``hessian_recipe``
+    friction_lag: int  # iterations during which the normal force of friction follows the contact
     any_active: wp.array[int]  # (1,)
     any_searching: wp.array[int]  # (1,)
 

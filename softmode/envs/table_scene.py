@@ -350,6 +350,7 @@ class TableScene:
         with wp.ScopedCapture(device=self.device) as capture:
             self.control_step()
         self.state.assign(saved)
+        self.solver.reduced.progress.kept.zero_()
         self.controller.reset(self.state)
         return capture.graph
 

@@ -1,0 +1,25 @@
+"""The table scene as reinforcement learning wants it: coarser, steps of 1/120 s, the same physics within a few percent.
+
+What it costs in accuracy stands in docs/performance.md ("A preset for reinforcement learning").
+"""
+
+from dataclasses import replace
+
+from softmode.deformables.build_options import BuildOptions
+from softmode.deformables.solver_reduced import SolverReducedOptions
+from softmode.envs.table_scene import TableSceneConfig
+
+RL_SOLVER = SolverReducedOptions(
+    carry_stiffness=True, tolerance=1.0e-4, force_tolerance=1.0e-3, iteration_max=12, friction_lag=4
+)
+"""Steps end when the residual force is below a thousandth of the forces on a body and it moves by less than 1e-4 of its
+size; a body at rest keeps its stiffness from step to step."""
+RL_BUILD = BuildOptions(mode_count=5, cubature_count=96)
+"""At most 24 functions, a system of 72 unknowns, which on CUDA fits in shared memory."""
+
+
+def rl_scene(config: TableSceneConfig | None = None, *, dt: float = 1.0 / 120.0) -> TableSceneConfig:
+    """Return a scene with the coarse body and solver, in steps of about ``dt`` [s], an even number per control step."""
+    config = config or TableSceneConfig()
+    substeps = 2 * max(1, round(0.5 / (config.control_hz * dt)))
+    return replace(config, object=replace(config.object, build=RL_BUILD), solver=RL_SOLVER, substeps=substeps)

@@ -1,0 +1,95 @@
+"""Newton's iteration in one launch does what the launches per phase do; a carried stiffness only saves time."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from softmode.deformables.solver_reduced import SolverReducedOptions
+from softmode.envs.rl_scene import RL_BUILD, RL_SOLVER, rl_scene
+from softmode.envs.table_scene import TableScene, TableSceneConfig
+
+CLOSE = np.array([0.0, 0.0, -1.0, 0.0, 1.0], np.float32)
+
+
+def grasp(device: str, *, one_launch: bool, shared: bool = False, worlds: int = 2) -> dict[str, np.ndarray]:
+    """Lower the open gripper over the object, close it until both fingers press, and return where everything is."""
+    scene = TableScene(rl_scene(), world_count=worlds, device=device)
+    reduced = scene.solver.reduced
+    reduced.one_launch, reduced.shared = one_launch, shared
+    for step in range(32):
+        height = scene.controller.target_position.numpy()[0, 2]
+        down = np.clip((scene.soft.height - height) / 0.015, -1.0, 1.0)
+        grip = 1.0 if step < 16 else max(1.0 - 0.08 * (step - 15), -0.3)
+        scene.step(np.tile(np.array([0.0, 0.0, down, 0.0, grip], np.float32), (worlds, 1)))
+    assert (np.linalg.norm(scene.finger_force.numpy(), axis=2) > 0.5).all()
+    assert not scene.status.any()
+    arrays = {"q": scene.state.softmode.q, "joint_q": scene.state.joint_q, "force": scene.finger_force}
+    return {name: array.numpy() for name, array in arrays.items()}
+
+
+def test_one_launch_equals_launches_per_phase() -> None:
+    """On CPU a team is one thread and every sum has one order: equal to the bit, in a grasp."""
+    apart, at_once = (grasp("cpu", one_launch=flag) for flag in (False, True))
+    for name, value in apart.items():
+        np.testing.assert_array_equal(at_once[name], value)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a GPU")
+@pytest.mark.parametrize("shared", [False, True])
+def test_one_launch_on_cuda(shared: bool) -> None:
+    """Sums have another order: coordinates agree within the solve's tolerance, 1e-4 of 0.1 m, forces within 1e-3."""
+    apart = grasp("cuda:0", one_launch=False)
+    at_once = grasp("cuda:0", one_launch=True, shared=shared)
+    for name in ("q", "joint_q"):
+        np.testing.assert_allclose(at_once[name], apart[name], atol=1.0e-5)
+    np.testing.assert_allclose(at_once["force"], apart["force"], atol=1.0e-3 * np.abs(apart["force"]).max())
+
+
+def test_carried_stiffness_agrees_within_tolerance() -> None:
+    """The Hessian of an earlier step changes how Newton gets to the minimum, not where that is: |dx| < 1e-4 size."""
+    places = []
+    for carry in (False, True):
+        options = SolverReducedOptions(carry_stiffness=carry)
+        scene = TableScene(TableSceneConfig(substeps=4, solver=options))
+        for step in range(12):
+            scene.step(CLOSE if step < 9 else -CLOSE)
+        assert not scene.status.any()
+        places.append(scene.state.particle_q.numpy())
+    assert np.abs(places[1] - places[0]).max() < 1.0e-4 * 0.08
+
+
+def test_carried_stiffness_follows_the_material() -> None:
+    """A body at rest that becomes ten times softer sags at once: its kept Hessian does not serve another material."""
+    scene = TableScene(rl_scene())
+    still = np.zeros(5, np.float32)
+    for _ in range(4):
+        scene.step(still)
+    before = scene.object_position.numpy()[0, 2]
+    modulus = scene.model.softmode.youngs_modulus
+    modulus.assign(0.02 * modulus.numpy())
+    for _ in range(6):
+        scene.step(still)
+    assert before - scene.object_position.numpy()[0, 2] > 2.0e-4
+    assert not scene.status.any()
+
+
+def test_reset_forgets_the_stiffness() -> None:
+    """After a reset a world is as new: the same actions give the same bits."""
+    scene = TableScene(rl_scene())
+    runs = []
+    for _ in range(2):
+        scene.reset()
+        for step in range(4):
+            scene.step(CLOSE if step % 2 else -CLOSE)
+        runs.append(scene.state.softmode.q.numpy())
+    np.testing.assert_array_equal(runs[1], runs[0])
+
+
+def test_rl_scene_keeps_the_rest() -> None:
+    """Only body, solver and substeps change; 1/120 s at 30 control steps per second are four."""
+    config = TableSceneConfig(table_friction=0.3, control_hz=30.0)
+    scene = rl_scene(config)
+    assert (scene.substeps, scene.solver, scene.object.build) == (4, RL_SOLVER, RL_BUILD)
+    assert scene.table_friction == 0.3
+    assert rl_scene(TableSceneConfig(control_hz=60.0)).substeps == 2
