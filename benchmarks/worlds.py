@@ -1,9 +1,12 @@
 """Time the control step of LiftSoft's scene against the number of worlds.
 
 Run: ``python benchmarks/worlds.py --device cuda:0 --worlds 1 64 1024``. Every world plays the same downward motion with
-the gripper closing on the object, so that contact is active in all of them. Prints milliseconds per control step, world
-steps per second, the union of the solver's status bits and, on CUDA, the memory taken; with ``--pixels 64`` also the
-time of a picture of that edge in every world, meshes, shadows and splats, and what it takes without the splats.
+the gripper closing on the object, so that contact is active in all of them; with ``--random`` every world plays random
+actions of its own instead. ``--preset rl`` takes the scene of ``softmode.envs.rl_scene``.
+
+Prints milliseconds per control step, world steps per second, the union of the solver's status bits and, on CUDA, the
+memory taken; with ``--pixels 64`` also the time of a picture of that edge in every world, meshes, shadows and splats,
+and what it takes without the splats.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from softmode.envs.rl_scene import rl_scene
 from softmode.envs.table_scene import TableScene, TableSceneConfig
 from softmode.splats.camera import PinholeCamera, SplatCamera
 
@@ -26,7 +30,11 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, nargs="+", default=[1, 4, 16])
     parser.add_argument("--steps", type=int, default=30)
     parser.add_argument("--pixels", type=int, default=0, help="edge of the pictures [px]; 0 for none")
+    parser.add_argument("--random", action="store_true", help="random actions instead of a grasp")
+    parser.add_argument("--warm-up", type=int, default=26, help="control steps before the clock starts")
+    parser.add_argument("--preset", choices=["fine", "rl"], default="fine")
     options = parser.parse_args()
+    config = rl_scene() if options.preset == "rl" else TableSceneConfig()
     wp.config.log_level = wp.LOG_WARNING
     for count in options.worlds:
         camera = PinholeCamera.look_at(
@@ -38,14 +46,20 @@ def main() -> None:
             fov_y=0.6,
         )
         cameras = [camera] if options.pixels else []
-        scene = TableScene(TableSceneConfig(), world_count=count, cameras=cameras, device=options.device)
-        for step in range(26):
-            scene.step(grasp_action(scene, step))
+        scene = TableScene(config, world_count=count, cameras=cameras, device=options.device)
+        rng = np.random.default_rng(0)
+        noise = rng.uniform(-1.0, 1.0, (64, count, 5)).astype(np.float32)
+
+        def action(step: int, scene: TableScene = scene, noise: np.ndarray = noise) -> np.ndarray:
+            return noise[step % len(noise)] if options.random else grasp_action(scene, step)
+
+        for step in range(options.warm_up):
+            scene.step(action(step))
         wp.synchronize_device(scene.device)
         clock = time.perf_counter()
         flags = 0
-        for step in range(26, 26 + options.steps):
-            scene.step(grasp_action(scene, step))
+        for step in range(options.warm_up, options.warm_up + options.steps):
+            scene.step(action(step))
             flags |= int(np.bitwise_or.reduce(scene.status))
         wp.synchronize_device(scene.device)
         milliseconds = 1e3 * (time.perf_counter() - clock) / options.steps

@@ -25,7 +25,6 @@ from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-import mujoco_warp
 import newton
 import numpy as np
 import warp as wp
@@ -41,10 +40,6 @@ from softmode.deformables.rigid_dofs import RigidDofs
 from softmode.deformables.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.deformables.step_checks import check_step
 from softmode.errors import ConfigError
-
-_INTEGRATORS = mujoco_warp.IntegratorType
-SPLIT_INTEGRATORS = (_INTEGRATORS.EULER, _INTEGRATORS.IMPLICIT, _INTEGRATORS.IMPLICITFAST)
-"""MuJoCo's integrators whose step is its two halves one after the other."""
 
 
 class SolverCoupledReduced(SolverBase):
@@ -297,10 +292,13 @@ class SolverCoupledReduced(SolverBase):
 
         MuJoCo's own split of a step; the whole one where that is another step.
         """
+        import mujoco_warp
+
         rigid: Any = self.rigid
-        model = rigid.mjw_model
+        model, known = rigid.mjw_model, mujoco_warp.IntegratorType
         sleeps = bool(model.opt.enableflags & mujoco_warp.EnableBit.SLEEP)
-        whole = sleeps or model.opt.integrator not in SPLIT_INTEGRATORS or rigid._use_speculative_contacts
+        in_halves = model.opt.integrator in (known.EULER, known.IMPLICIT, known.IMPLICITFAST)
+        whole = sleeps or not in_halves or rigid._use_speculative_contacts
         if not whole:
             rigid._mujoco_warp_step = lambda: mujoco_warp.step2(model, rigid.mjw_data)
         try:

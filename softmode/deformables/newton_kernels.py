@@ -24,7 +24,7 @@ from softmode.deformables.factor import factor_system, solve_system
 from softmode.deformables.kernels import evaluate_point, gradient_block, sum_force_block
 from softmode.deformables.lanes import LANES, barrier, vec8, vec8d
 from softmode.deformables.search_kernels import begin_world_search, finish_world, judge_world, judge_world_trial
-from softmode.deformables.shared_factor import shared_system, sum_forces_of
+from softmode.deformables.shared_system_kernels import shared_system, sum_forces_of
 from softmode.deformables.tables import Basis, Entries, Instances, Motion, Points, Progress, Rigid
 
 wp.set_module_options({"enable_backward": False})

@@ -30,7 +30,7 @@ from softmode.deformables.observables import REDUCED_KINDS, ReducedObservableKin
 from softmode.deformables.pairs import SoftPairs
 from softmode.deformables.rigid_dofs import RigidDofs
 from softmode.deformables.shape_tables import heightfields, mesh_sources, solid_shapes
-from softmode.deformables.shared_factor import SHARED_SIZE, SHARED_WIDTH
+from softmode.deformables.shared_system_kernels import SHARED_SIZE, SHARED_WIDTH
 from softmode.deformables.sizes import Sizes
 from softmode.deformables.step_checks import check_step
 from softmode.errors import ConfigError

@@ -90,7 +90,9 @@ SHARED_WIDTH = 88
             #pragma unroll
             for (int a = 0; a < 4; ++a) {
                 #pragma unroll
-                for (int b = 0; b < 8; ++b) A[(c * 8 * blocks + 4 * k + a) * stride + d * 8 * blocks + 8 * m + b] += sum[a][b];
+                for (int b = 0; b < 8; ++b) {
+                    A[(c * 8 * blocks + 4 * k + a) * stride + d * 8 * blocks + 8 * m + b] += sum[a][b];
+                }
             }
         }
         __syncthreads();
