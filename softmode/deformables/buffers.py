@@ -7,7 +7,7 @@ import warp as wp
 
 from softmode.deformables.detection import Samples
 from softmode.deformables.lanes import vec8d
-from softmode.deformables.tables import SLOTS, Entries, Motion, Points, Progress, vec5
+from softmode.deformables.tables import SLOTS, Entries, Motion, Points, Progress, vec6
 
 
 def make_motion(functions: tuple[int, int], device: Any) -> Any:
@@ -84,6 +84,6 @@ def make_progress(instance_start: np.ndarray, functions: tuple[int, int], device
     for name in ("potential", "slope", "step_length", "reached"):
         setattr(progress, name, wp.zeros(world_count, dtype=wp.float64, device=device))
     progress.kept_q = wp.zeros(functions, dtype=vec8d, device=device)
-    progress.kept_for = wp.zeros(functions[0], dtype=vec5, device=device)
+    progress.kept_for = wp.zeros(functions[0], dtype=vec6, device=device)
     progress.any_active, progress.any_searching = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
     return progress

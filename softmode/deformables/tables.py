@@ -16,7 +16,7 @@ OVERLAP = wp.constant(0.05)
 wrongly, is pushed out by that much a step instead of being thrown out."""
 SLOTS = 2
 """What a surface sample may touch at a time: the deepest two shapes, and the nearest two other soft bodies."""
-vec5 = wp.types.vector(length=5, dtype=float)
+vec6 = wp.types.vector(length=6, dtype=float)
 mat23d: Any = wp.types.matrix(shape=(SLOTS, 3), dtype=wp.float64)
 
 
@@ -184,7 +184,7 @@ class Progress:
     reached: wp.array[wp.float64]  # potential after a full step, while a longer one is tried [J]
     kept: wp.array[int]  # whether the elastic Hessian in memory is Newton's own, of some iterate
     kept_q: wp.array2d[vec8d]  # (instance_count, 3 block_count), that iterate [m], and
-    kept_for: wp.array[vec5]  # (instance_count,), what else it is made of: see ``hessian_recipe``
+    kept_for: wp.array[vec6]  # (instance_count,), what else it is made of: see ``hessian_recipe``
     friction_lag: int  # iterations during which the normal force of friction follows the contact
     any_active: wp.array[int]  # (1,)
     any_searching: wp.array[int]  # (1,)
@@ -211,11 +211,12 @@ def first_coupled(instances: Instances, i: int):
 @wp.func
 def hessian_recipe(instances: Instances, i: int, dt: float):
     """Return what the elastic Hessian of an instance depends on besides its coordinates."""
-    return vec5(
+    return vec6(
         float(instances.material_model[i]),
         instances.youngs_modulus[i],
         instances.poissons_ratio[i],
         instances.viscosity[i],
+        instances.scale[i],
         dt,
     )
 
