@@ -12,17 +12,13 @@ import argparse
 import os
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from typing import Any
 
-import gymnasium as gym
 import warp as wp
-from gymnasium.envs.registration import load_env_creator
 
-import softmode  # noqa: F401  (registers the environments)
-from softmode.envs.soft_vector_env import SoftVectorEnv, checked_device
-from softmode.envs.throughput import measure_throughput, stage_times
+from softmode.envs.catalogue import config_class
+from softmode.envs.throughput import report_throughput
 
 
 def main() -> None:
@@ -41,51 +37,36 @@ def main() -> None:
     parser.add_argument("--peer", default=None, help="script to run on the same device")
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
-    device = checked_device(options.device)
     for count in options.worlds:
-        free = device.free_memory if device.is_cuda else 0
-        clock = time.perf_counter()
-        env = make(options, count)
-        made = time.perf_counter() - clock
-        result = measure_throughput(
-            env, steps=options.steps, warmup=options.warmup, actions=options.actions, free_before=free
+        given = environment_options(options)
+        report_throughput(
+            options.env,
+            count,
+            given,
+            steps=options.steps,
+            warmup=options.warmup,
+            actions=options.actions,
+            stages=options.stages,
         )
-        print(
-            f"{count} worlds, {options.actions}: {result.rate:,.0f} env-steps/s, "
-            f"{1e3 * result.seconds / result.steps:.2f} ms per step, touching {100 * result.touching:.0f} %, "
-            f"{result.failures} failures, {result.megabytes:.0f} MB, made in {made:.1f} s",
-            flush=True,
-        )
-        if options.stages and options.processes == 1:
-            parts = ", ".join(f"{name} {spent:.2f} ms" for name, spent in stage_times(env.task).items())
-            print(f"   {parts}", flush=True)
-        env.close()
-        del env
     if options.peer:
         counts = ",".join(str(count) for count in options.worlds)
         given = {**os.environ, "STEPS": str(min(options.steps, 100)), "WARMUP": "20", "SHARE": "0"}
         subprocess.run([sys.executable, options.peer, options.device, counts], check=False, env=given)
 
 
-def make(options: argparse.Namespace, count: int) -> SoftVectorEnv:
-    """Return the vector environment with 4 steps of 1/120 s per control step."""
-    env_class: Any = load_env_creator(str(gym.spec(options.env).vector_entry_point))
-    config_class = env_class.task_class.config_class
-    config = config_class() if options.preset is None else config_class.preset(options.preset)
-    scene = replace(config.scene, control_hz=30.0, substeps=4)
+def environment_options(options: argparse.Namespace) -> dict[str, Any]:
+    """Return keyword arguments of the environment, with 4 steps of 1/120 s per control step."""
+    known = config_class(options.env)
+    config = known() if options.preset is None else known.preset(options.preset)
     if options.pixels:
         config = replace(config, image_size=options.pixels)
-    env = gym.make_vec(
-        options.env,
-        num_envs=count,
-        config=replace(config, scene=scene),
-        obs_type="pixels" if options.pixels else "state",
-        device=options.device,
-        output="torch" if options.device.startswith("cuda") else "numpy",
-        processes=options.processes,
-    )
-    assert isinstance(env, SoftVectorEnv)
-    return env
+    return {
+        "config": replace(config, scene=replace(config.scene, control_hz=30.0, substeps=4)),
+        "obs_type": "pixels" if options.pixels else "state",
+        "device": options.device,
+        "output": "torch" if options.device.startswith("cuda") else "numpy",
+        "processes": options.processes,
+    }
 
 
 if __name__ == "__main__":

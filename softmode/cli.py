@@ -1,4 +1,4 @@
-"""The command line: ``softmode play``, ``train``, ``evaluate``, ``record``, ``list-envs``, ``robots``, ``splat``."""
+"""The command line: play, train, evaluate, record, bench, list-envs, robots and splat."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from softmode import ENVIRONMENTS
+from softmode.cli_bench import Bench
 from softmode.cli_common import bar_interval, quiet_warp, warp_device
 from softmode.cli_record import Record
 from softmode.cli_splat import SplatConvert, SplatFromMesh, SplatInfo
@@ -36,15 +37,15 @@ class Play:
     splat: Path | None = None
     """Splat file of the object (INRIA .ply, or a SOG v2 folder, meta.json or .sog); the built-in plush if omitted."""
     size: float | None = None
-    """Longest edge of the object [m], 0.08 if omitted; the gripper opens 0.09 m."""
-    up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] = "-y"
-    """Axis of the splat file that points up."""
+    """Longest edge of the object [m], as the task has it if omitted; the gripper opens 0.09 m."""
+    up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
+    """Axis of the splat file that points up, -y if omitted."""
     crop: tuple[float, float, float, float, float, float] | None = None
     """Box x0 y0 z0 x1 y1 z1 of the splat file, once turned up, outside which splats are dropped."""
-    part: Literal["thickest", "tallest", "largest", "all"] = "thickest"
-    """Which of the separate parts of the splat file is the object."""
-    pose: Literal["stable", "captured"] = "stable"
-    """Lay an object that cannot stand on its stable side, or let it topple."""
+    part: Literal["thickest", "tallest", "largest", "all"] | None = None
+    """Which of the separate parts of the splat file is the object; the thickest if omitted."""
+    pose: Literal["stable", "captured"] | None = None
+    """Lay an object that cannot stand on its stable side (as if omitted), or let it topple."""
     youngs_modulus: float | None = None
     """Young's modulus of the object [Pa]; random if omitted."""
     device: str | None = None
@@ -108,6 +109,7 @@ def main(arguments: list[str] | None = None) -> int:
             Annotated[Play, tyro.conf.subcommand("play")]
             | Annotated[Train, tyro.conf.subcommand("train")]
             | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+            | Annotated[Bench, tyro.conf.subcommand("bench")]
             | Annotated[Record, tyro.conf.subcommand("record")]
             | Annotated[ListEnvs, tyro.conf.subcommand("list-envs")]
             | Annotated[Robots, tyro.conf.subcommand("robots")]
@@ -232,13 +234,17 @@ def _task_config(options: Play, trained: dict[str, Any]) -> Any:
 
     base = config_of(config_class(options.env), trained)
     scene = base.scene
-    if options.splat is not None or options.size is not None:
-        size = scene.object.size if options.size is None else options.size
-        thing = dataclasses.replace(scene.object, size=size)
+    names = ("splat", "size", "up", "crop", "part", "pose")
+    given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    if given:
+        thing = scene.object
         if options.splat is not None:
-            thing = ObjectConfig(
-                splat=options.splat, size=size, up=options.up, crop=options.crop, part=options.part, pose=options.pose
+            thing = ObjectConfig(surface_count=thing.surface_count, build=thing.build)
+        if thing.extents is not None:
+            raise ConfigError(
+                f"{', '.join(given)} given for a {thing.shape} of {thing.extents} m", hint="give a --splat file too"
             )
+        thing = dataclasses.replace(thing, **given)
         scene = dataclasses.replace(scene, object=thing)
     return dataclasses.replace(base, scene=scene, mesh_samples=4 if options.video else base.mesh_samples)
 

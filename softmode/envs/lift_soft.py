@@ -2,27 +2,43 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import warp as wp
 
 from softmode.envs import lift_soft_kernels as kernels
 from softmode.envs.markers import sphere_marker
+from softmode.envs.objects import ObjectConfig
 from softmode.envs.parameters import Parameter
 from softmode.envs.presets import BEAM, BEAM_MATERIAL
+from softmode.envs.rl_scene import rl_scene
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.table_scene import TableSceneConfig
 from softmode.envs.task import Segment, Task, TaskConfig
 from softmode.errors import ConfigError
+from softmode.robots import ArmDescription
 from softmode.splats import Splats
+
+
+def lift_scene() -> TableSceneConfig:
+    """Return the scene: a plush under the open gripper, coarse enough for training (`rl_scene`)."""
+    return rl_scene(
+        TableSceneConfig(
+            object=ObjectConfig(surface_count=200),
+            constraint_max=96,
+            arm=ArmDescription(home_position=(0.45, 0.0, 0.17)),
+        )
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class LiftSoftConfig(TaskConfig):
     """Goal and success of LiftSoft."""
 
+    scene: TableSceneConfig = field(default_factory=lift_scene)
+    """Objects, robot and physics."""
     goal_height: float = 0.15
     """Middle of the goal's range of heights: how far the object's centre of mass is to rise [m]."""
     goal_range: tuple[float, float, float] = (0.04, 0.08, 0.05)
@@ -49,7 +65,7 @@ class LiftSoftConfig(TaskConfig):
     @classmethod
     def presets(cls) -> dict[str, LiftSoftConfig]:
         """Return "beam": object and goals of Isaac Lab's `Isaac-Lift-Soft-Franka`, as high as this arm reaches."""
-        scene = TableSceneConfig(object=BEAM, material=BEAM_MATERIAL, substeps=4)
+        scene = replace(lift_scene(), object=BEAM, material=BEAM_MATERIAL)
         return {"beam": cls(scene=scene, yaw_range=0.5, goal_height=0.2, goal_range=(0.08, 0.15, 0.08))}
 
 

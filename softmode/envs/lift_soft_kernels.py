@@ -67,7 +67,7 @@ def evaluate(
         steps = held[w] + 1
     held[w] = steps
     lifted = wp.clamp(rise / wp.max(parameters[w, goal_parameter + 2], 1.0e-3), 0.0, 1.0)
-    terms[w, 0] = 1.0 - wp.tanh(10.0 * wp.length(offset))
+    terms[w, 0] = 1.0 - wp.tanh(6.0 * wp.length(offset))
     terms[w, 1] = 0.5 * grasp
     terms[w, 2] = 1.0 * lifted * grasp
     terms[w, 3] = 2.0 * lifted * grasp * (1.0 - wp.tanh(10.0 * distance))

@@ -13,6 +13,7 @@ from softmode.envs import press_soft_kernels as kernels
 from softmode.envs.markers import sphere_marker
 from softmode.envs.objects import ObjectConfig
 from softmode.envs.parameters import Parameter
+from softmode.envs.rl_scene import RL_SOLVER
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.table_scene import TableSceneConfig
@@ -67,6 +68,7 @@ def press_scene() -> TableSceneConfig:
             workspace_lower=(0.35, -0.10, 0.5 * THICKNESS - tip),
             workspace_upper=(0.55, 0.10, 0.20),
         ),
+        solver=RL_SOLVER,
         substeps=4,
     )
 

@@ -14,6 +14,7 @@ from softmode.envs import push_soft_kernels as kernels
 from softmode.envs.markers import dots
 from softmode.envs.objects import ObjectConfig, load_object
 from softmode.envs.parameters import Parameter
+from softmode.envs.rl_scene import RL_SOLVER
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.table_scene import TableSceneConfig
@@ -39,6 +40,7 @@ def push_scene() -> TableSceneConfig:
         object=PUCK,
         material=PUCK_MATERIAL,
         table_friction=0.4,
+        solver=RL_SOLVER,
         substeps=4,
         object_position=(0.42, 0.0),
         arm=ArmDescription(home_position=(0.31, 0.0, 0.03), home_opening=0.045),

@@ -6,10 +6,11 @@ import time
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import gymnasium as gym
 import numpy as np
 import warp as wp
 
-from softmode.envs.soft_vector_env import SoftVectorEnv
+from softmode.envs.soft_vector_env import SoftVectorEnv, checked_device
 from softmode.envs.task import Task
 
 Actions = Literal["random", "grasp"]
@@ -85,6 +86,47 @@ def measure_throughput(
         failures=int(failures),
         megabytes=max(taken, 0.0),
     )
+
+
+def report_throughput(
+    name: str,
+    num_envs: int,
+    options: dict[str, Any],
+    *,
+    steps: int = 500,
+    warmup: int = 100,
+    actions: Actions = "random",
+    stages: bool = False,
+) -> Throughput:
+    """Make the vector environment of an id, measure it, print a line, close it.
+
+    Args:
+        name: Id of the environment.
+        num_envs: Number of worlds.
+        options: Keyword arguments of the environment.
+        steps: Measured control steps.
+        warmup: Steps before them.
+        actions: See :func:`measure_throughput`.
+        stages: Whether to print the time of the parts of a step.
+    """
+    device = checked_device(options.get("device"))
+    free = device.free_memory if device.is_cuda else 0
+    clock = time.perf_counter()
+    env = gym.make_vec(name, num_envs=num_envs, **options)
+    assert isinstance(env, SoftVectorEnv)
+    made = time.perf_counter() - clock
+    result = measure_throughput(env, steps=steps, warmup=warmup, actions=actions, free_before=free)
+    memory = f", {result.megabytes:,.0f} MB" if device.is_cuda else ""
+    print(
+        f"{num_envs} worlds, {actions} actions: {result.rate:,.0f} env-steps/s, "
+        f"{1e3 * result.seconds / result.steps:.2f} ms per step, a finger touches in {100 * result.touching:.0f} %, "
+        f"{result.failures} failures{memory}, made in {made:.1f} s",
+        flush=True,
+    )
+    if stages and options.get("processes", 1) == 1:
+        print("  " + ", ".join(f"{part} {spent:.2f} ms" for part, spent in stage_times(env.task).items()), flush=True)
+    env.close()
+    return result
 
 
 class _Source:

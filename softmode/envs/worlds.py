@@ -154,18 +154,31 @@ def _serve(pipe: Any, task_class: type[Task], arguments: dict[str, Any]) -> None
         with wp.ScopedDevice("cpu"):
             worlds = LocalWorlds(task_class, arguments)
         pipe.send((True, (worlds.parameters, worlds.segments, worlds.action_space, worlds.observation_space)))
+    except (EOFError, KeyboardInterrupt, ConnectionError):
+        return
+    except Exception as error:  # the parent reports what went wrong here
+        pipe.send((False, _portable(error)))
+        return
+    try:
         while True:
             name, given = pipe.recv()
             if name == "close":
                 return
-            value = getattr(worlds, name)(*given)
-            pipe.send((True, _to_numpy(worlds.result() if name in ("reset", "step") else value)))
+            try:
+                value = getattr(worlds, name)(*given)
+                answer = (True, _to_numpy(worlds.result() if name in ("reset", "step") else value))
+            except Exception as error:
+                answer = (False, _portable(error))
+            pipe.send(answer)
     except (EOFError, KeyboardInterrupt, ConnectionError):
         return
-    except SoftmodeError as error:
-        pipe.send((False, error))
-    except Exception as error:  # the parent reports what went wrong here
-        pipe.send((False, RuntimeError(f"{type(error).__name__} in a process that holds worlds: {error}")))
+
+
+def _portable(error: Exception) -> Exception:
+    """Return an error that can travel to another process."""
+    if isinstance(error, SoftmodeError):
+        return error
+    return RuntimeError(f"{type(error).__name__} in a process that holds worlds: {error}")
 
 
 def _to_numpy(tree: Any) -> Any:
