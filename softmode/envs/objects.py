@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, KDTree, QhullError
 
-from softmode.deformables.body import BuildOptions, ReducedBody, build_body, cached_body
+from softmode.deformables.body import BuildOptions, ReducedBody, Region, build_body, cached_body
 from softmode.deformables.quadrature import Quadrature, quadrature_from_mesh, quadrature_from_splats
 from softmode.deformables.skinning import average_basis
 from softmode.envs.primitives import (
@@ -76,6 +76,9 @@ class ObjectConfig:
     pose: Pose = "stable"
     """"stable" lays an object from a file that cannot stand as it is there (on a pointed foot, say) on the side that
     needs the least turn; "captured" lets it topple."""
+    clamped_height: float = 0.0
+    """Height of the foot that is fixed to the table [m], 0 for an object that stands free. A clamped object keeps its
+    scale."""
     build: BuildOptions = field(default_factory=BuildOptions)
     """How the body is reduced."""
 
@@ -83,6 +86,8 @@ class ObjectConfig:
         """Check the ranges."""
         if not 0.005 <= self.size <= 1.0:
             raise ConfigError(f"size must lie in 0.005..1 m, got {self.size!r}", hint="give the longest edge in metres")
+        if not 0.0 <= self.clamped_height < np.inf:
+            raise ConfigError(f"clamped_height must be a finite length >= 0 [m], got {self.clamped_height!r}")
         if self.crop is not None and not all(a < b for a, b in zip(self.crop[:3], self.crop[3:], strict=True)):
             raise ConfigError(f"crop {self.crop} is empty", hint="give x0 y0 z0 x1 y1 z1 with every 0 below its 1")
         for name, known in (("shape", Shape), ("up", UpAxis), ("part", Part), ("pose", Pose)):
@@ -163,11 +168,17 @@ def load_object(config: ObjectConfig, progress: Callable[[str, float], None] | b
             turn = stable_rotation(quadrature.surface_points - centre)
         if turn is not None:
             quadrature = turned(quadrature, turn)
-        body = build_body(quadrature, config.build, name=name, progress=progress)
+        regions = ()
+        if config.clamped_height > 0.0:
+            wide = float("inf")
+            top = float(quadrature.bounds[0, 2]) + config.clamped_height
+            regions = (Region(name="foot", box=((-wide,) * 3, (wide, wide, top))),)
+        body = build_body(quadrature, config.build, name=name, regions=regions, progress=progress)
         rows = np.eye(3).tolist() if turn is None else turn.tolist()
         return replace(body, provenance={**body.provenance, "turn": json.dumps(rows)})
 
-    body = cached_body((RECIPE, *key, turns, config.surface_count, config.build), build)
+    clamp = (config.clamped_height,) if config.clamped_height > 0.0 else ()
+    body = cached_body((RECIPE, *key, turns, config.surface_count, config.build, *clamp), build)
     turn = np.array(json.loads(str(body.provenance["turn"])))
     if not np.array_equal(turn, np.eye(3)):
         splats = splats.transformed(rotation=turn)

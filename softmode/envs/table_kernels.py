@@ -21,8 +21,9 @@ def place_objects(
     # Out:
     q_out: wp.array[wp.vec3d],
     qd_out: wp.array[wp.vec3d],
+    q_driven_out: wp.array[wp.vec3d],
 ):
-    """Set q of one object of each world to the placement x = scale R(yaw) X + position, at rest."""
+    """Set q of one object of each world to the placement x = scale R(yaw) X + position, at rest; clamps hold it there."""
     w, k = wp.tid()
     if not world_mask[w]:
         return
@@ -33,7 +34,9 @@ def place_objects(
     x = linear_coordinates[k, 0]
     y = linear_coordinates[k, 1]
     z = (size - wp.float64(1.0)) * linear_coordinates[k, 2]
-    q_out[function_start[i] + k] = wp.vec3d(c * x - s * y, s * x + c * y, z) + linear_coordinates[k, 3] * position[i]
+    q = wp.vec3d(c * x - s * y, s * x + c * y, z) + linear_coordinates[k, 3] * position[i]
+    q_out[function_start[i] + k] = q
+    q_driven_out[function_start[i] + k] = q
     qd_out[function_start[i] + k] = wp.vec3d()
 
 
@@ -77,7 +80,7 @@ def observe_fingers(
 
 @wp.kernel
 def place_marker(
-    rest: wp.array[wp.vec3],
+    points: wp.array2d[wp.vec3],  # (1 or world_count, splats)
     place: wp.array[wp.transform],
     first: int,
     # Out:
@@ -85,4 +88,4 @@ def place_marker(
 ):
     """Move the centres of the marker's splats to its place."""
     w, i = wp.tid()
-    means[w, first + i] = wp.transform_point(place[w], rest[i])
+    means[w, first + i] = wp.transform_point(place[w], points[w % points.shape[0], i])

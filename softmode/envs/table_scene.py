@@ -246,7 +246,9 @@ class TableScene:
         drawn = [thing.splats for thing in self.objects]
         if self._marker is not None:
             self._marker_first = first
-            self._marker_means = wp.array(self._marker.means, dtype=wp.vec3, device=self.device)
+            self.marker_points = wp.array(self._marker.means[None], dtype=wp.vec3, device=self.device)
+            """Centres of the marker's splats from `marker_place` [m], shape (1 or world_count, splats); a task may put
+            an array of its own here before the first picture, to change the marker's shape."""
             drawn.append(self._marker)
         self.splat_arrays = SplatArrays.from_splats(drawn, world_count=self.world_count, device=self.device)
         for size in sorted({(camera.width, camera.height) for camera in cameras}):
@@ -298,6 +300,7 @@ class TableScene:
     def reset_worlds(self) -> None:
         """Put arm and objects of the worlds in `world_mask` back, objects where `place_position` says; capturable."""
         worlds, data, state = self.world_count, self.model.softmode, self.state
+        control: Any = self.control
         wp.copy(self._solver_mask, self.world_mask, count=worlds)
         self.solver.reset(state, self._solver_mask)
         for o, linear in enumerate(self._linear):
@@ -314,7 +317,7 @@ class TableScene:
                     self.place_yaw,
                     data.scale,
                 ],
-                outputs=[state.softmode.q, state.softmode.qd],
+                outputs=[state.softmode.q, state.softmode.qd, control.softmode.q_driven],
                 device=self.device,
             )
         self.solver.reduced.update_particles(state)
@@ -419,7 +422,7 @@ class TableScene:
             wp.launch(
                 kernels.place_marker,
                 dim=(self.world_count, self._marker.count),
-                inputs=[self._marker_means, self.marker_place, self._marker_first],
+                inputs=[self.marker_points, self.marker_place, self._marker_first],
                 outputs=[arrays.means],
                 device=self.device,
             )
