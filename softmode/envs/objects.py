@@ -76,6 +76,9 @@ class ObjectConfig:
     pose: Pose = "stable"
     """"stable" lays an object from a file that cannot stand as it is there (on a pointed foot, say) on the side that
     needs the least turn; "captured" lets it topple."""
+    contact_radius: float = 0.0
+    """How far the surface that touches stands out from the body's [m]. Samples are points: one or two millimetres keep
+    an edge that presses between them from catching on them."""
     clamped_height: float = 0.0
     """Height of the foot that is fixed to the table [m], 0 for an object that stands free. A clamped object keeps its
     scale."""
@@ -86,8 +89,9 @@ class ObjectConfig:
         """Check the ranges."""
         if not 0.005 <= self.size <= 1.0:
             raise ConfigError(f"size must lie in 0.005..1 m, got {self.size!r}", hint="give the longest edge in metres")
-        if not 0.0 <= self.clamped_height < np.inf:
-            raise ConfigError(f"clamped_height must be a finite length >= 0 [m], got {self.clamped_height!r}")
+        for name in ("contact_radius", "clamped_height"):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise ConfigError(f"{name} must be a finite length >= 0 [m], got {getattr(self, name)!r}")
         if self.crop is not None and not all(a < b for a, b in zip(self.crop[:3], self.crop[3:], strict=True)):
             raise ConfigError(f"crop {self.crop} is empty", hint="give x0 y0 z0 x1 y1 z1 with every 0 below its 1")
         for name, known in (("shape", Shape), ("up", UpAxis), ("part", Part), ("pose", Pose)):
@@ -141,7 +145,8 @@ class SoftObject:
     grad_basis: NDArray[np.float64]
     """Their gradients, averaged likewise [1/m], shape (N, n, 3)."""
     height: float
-    """Height of the body frame's origin over the lowest surface sample [m]."""
+    """Height of the body frame's origin over the table at rest [m]: over the lowest surface sample, and the contact
+    radius of an object that is not clamped."""
 
 
 def load_object(config: ObjectConfig, progress: Callable[[str, float], None] | bool | None = None) -> SoftObject:
@@ -184,7 +189,8 @@ def load_object(config: ObjectConfig, progress: Callable[[str, float], None] | b
         splats = splats.transformed(rotation=turn)
     shown = splats.subset(_drawn(splats, body)).transformed(translation=-body.offset)
     basis, grad_basis = average_basis(lambda x: body.evaluate(x)[0], shown.means, shown.covariances())
-    return SoftObject(body, shown, basis, grad_basis, float(-body.surface_points[:, 2].min()))
+    height = float(-body.surface_points[:, 2].min()) + (0.0 if clamp else config.contact_radius)
+    return SoftObject(body, shown, basis, grad_basis, height)
 
 
 def choose_part(splats: Splats, rule: Part) -> Splats:

@@ -29,7 +29,8 @@ RewardType = Literal["dense", "sparse"]
 POST = ObjectConfig(
     shape="cylinder",
     extents=(0.03, 0.03, 0.12),
-    surface_count=120,
+    surface_count=240,
+    contact_radius=0.0015,
     clamped_height=0.012,
     build=BuildOptions(mode_count=2, response_derivatives=0, cubature_count=96),
 )
@@ -64,7 +65,7 @@ class ShapeSoftConfig(TaskConfig):
     goal_direction: tuple[float, float] = (-np.pi, np.pi)
     """Range of the direction in which it is bent, about z from the x axis [rad]."""
     reward: RewardType = "dense"
-    """"dense": 1 - tanh(error / `reward_length`), and 1 more at the target; "sparse": 0 at the target and -1 elsewhere."""
+    """"dense": 1 - tanh(error / `reward_length`), and 1 more at the target; "sparse": 0 there and -1 elsewhere."""
     reward_length: float = 0.02
     """Error of the shape that matters to the dense reward [m]."""
     goal_tolerance: float = 0.005
@@ -83,7 +84,9 @@ class ShapeSoftConfig(TaskConfig):
                 hint="give a cylinder with two equal horizontal extents and clamped_height > 0",
             )
         if self.scale_range is not None:
-            raise ConfigError(f"scale_range is {self.scale_range}", hint="a clamped object keeps its scale; leave it out")
+            raise ConfigError(
+                f"scale_range is {self.scale_range}", hint="a clamped object keeps its scale; leave it out"
+            )
         near, far = self.goal_displacement
         if not 0.0 <= near <= far <= 0.6 * thing.extents[2]:  # type: ignore[index]
             raise ConfigError(
@@ -104,14 +107,14 @@ class ShapeSoftConfig(TaskConfig):
 class ShapeSoft(Task):
     """Bend the post so that its surface points lie where those of the target shape do, and hold it there.
 
-    The targets are shapes that the arm has made: at construction it presses the post aside once, its surface is recorded
-    over the displacement of the free end, and a target is that press turned about the vertical. Quasi-static shapes under
-    a given displacement depend on stiffness only as far as weight matters, so that one press serves all stiffnesses.
+    The targets are shapes that the arm has made: at construction it presses the post aside once, its surface is
+    recorded over the displacement of the free end, and a target is that press turned about the vertical. Static shapes
+    under a given displacement depend on stiffness only as far as weight matters, so that one press serves all.
 
     A state observation is a dict of ``observation``, ``achieved_goal`` and ``desired_goal``, the latter two the points
     [m] relative to the middle of the foot, on the table. The reward is a function of both goals, see
-    `GoalMethods.compute_reward`. Terms: ``shape`` (0..1) and ``there`` (0 or 1), or ``there`` (-1 or 0) alone where it is
-    sparse. Success: within the tolerance for ``hold_steps`` steps in a row.
+    `GoalMethods.compute_reward`. Terms: ``shape`` (0..1) and ``there`` (0 or 1), or ``there`` (-1 or 0) alone where it
+    is sparse. Success: within the tolerance for ``hold_steps`` steps in a row.
     """
 
     config: ShapeSoftConfig
@@ -260,12 +263,16 @@ class GoalMethods:
         leading = tuple(achieved_goal.shape[:-1])
         tensors = hasattr(achieved_goal, "detach")
         if tensors:
-            goals = [wp.from_torch(goal.detach().float().reshape(-1, size).contiguous(), dtype=wp.float32)
-                     for goal in (achieved_goal, desired_goal)]
+            goals = [
+                wp.from_torch(goal.detach().float().reshape(-1, size).contiguous(), dtype=wp.float32)
+                for goal in (achieved_goal, desired_goal)
+            ]
         else:
             device = getattr(self, "task_device", "cpu")
-            goals = [wp.array(np.asarray(goal, np.float32).reshape(-1, size), dtype=float, device=device)
-                     for goal in (achieved_goal, desired_goal)]
+            goals = [
+                wp.array(np.asarray(goal, np.float32).reshape(-1, size), dtype=float, device=device)
+                for goal in (achieved_goal, desired_goal)
+            ]
         reward = wp.zeros(len(goals[0]), dtype=float, device=goals[0].device)
         wp.launch(
             kernels.compute_reward,
@@ -282,7 +289,9 @@ class GoalMethods:
         """Return whether the episode ended by a failure, which `info` knows; goals end none."""
         if isinstance(info, Mapping):
             return info.get("end_reason", EndReason.RUNNING) > EndReason.TIME_LIMIT
-        ends = [one.get("end_reason", EndReason.RUNNING) > EndReason.TIME_LIMIT for one in (() if info is None else info)]
+        ends = [
+            one.get("end_reason", EndReason.RUNNING) > EndReason.TIME_LIMIT for one in (() if info is None else info)
+        ]
         return np.array(ends) if ends else np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
 
     def compute_truncated(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> Any:

@@ -136,9 +136,7 @@ def shape_marker(
 ):
     """Bend the marker into the target shape."""
     w, i = wp.tid()
-    marker_points[w, i] = target_point(
-        parameters, yaw_parameter, goal_parameter, press, displacement_max, w, first + i
-    )
+    marker_points[w, i] = target_point(parameters, yaw_parameter, goal_parameter, press, displacement_max, w, first + i)
     if i == 0:
         foot = wp.vec3(parameters[w, position_parameter], parameters[w, position_parameter + 1], 0.0)
         marker_place[w] = wp.transform(foot, wp.quat_identity())

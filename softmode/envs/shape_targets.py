@@ -102,7 +102,9 @@ class ShapeTargets:
         levels = np.linspace(0.0, displacement_max, LEVELS)
         table = np.empty((DIRECTIONS, LEVELS, len(rest), 3), np.float32)
         # reduced coordinates between two records: the shape between two shapes
-        between = np.clip(np.searchsorted(press.displacements, levels, side="right") - 1, 0, len(press.displacements) - 2)
+        between = np.clip(
+            np.searchsorted(press.displacements, levels, side="right") - 1, 0, len(press.displacements) - 2
+        )
         low, high = press.displacements[between], press.displacements[between + 1]
         share = ((levels - low) / (high - low))[:, None, None]
         q = (1.0 - share) * press.coordinates[between] + share * press.coordinates[between + 1]

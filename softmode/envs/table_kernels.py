@@ -23,7 +23,7 @@ def place_objects(
     qd_out: wp.array[wp.vec3d],
     q_driven_out: wp.array[wp.vec3d],
 ):
-    """Set q of one object of each world to the placement x = scale R(yaw) X + position, at rest; clamps hold it there."""
+    """Set q of one object of each world to the placement x = scale R(yaw) X + position, at rest; clamps hold it so."""
     w, k = wp.tid()
     if not world_mask[w]:
         return

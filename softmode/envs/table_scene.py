@@ -179,9 +179,13 @@ class TableScene:
         )
         for fixture in config.fixtures:
             _add_fixture(world, fixture)
-        for thing in self.objects:
+        for thing, kind in zip(self.objects, (config.object, *config.others), strict=True):
             add_reduced_body(
-                world, thing.body, material=config.material, position=(*config.object_position, thing.height)
+                world,
+                thing.body,
+                material=config.material,
+                position=(*config.object_position, thing.height),
+                contact_radius=kind.contact_radius,
             )
         builder = newton.ModelBuilder()
         register_custom_attributes(builder)
