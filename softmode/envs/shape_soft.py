@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
@@ -15,11 +14,13 @@ from softmode.envs import shape_soft_kernels as kernels
 from softmode.envs.markers import dots
 from softmode.envs.objects import ObjectConfig, load_object
 from softmode.envs.parameters import Parameter
+from softmode.envs.rl_scene import RL_SOLVER
+from softmode.envs.shape_goals import POINTS, GoalMethods, reward_arguments
 from softmode.envs.shape_targets import ShapeTargets, record_press
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.table_scene import TableSceneConfig
-from softmode.envs.task import PROPRIOCEPTION, EndReason, Segment, Task, TaskConfig
+from softmode.envs.task import PROPRIOCEPTION, Segment, Task, TaskConfig
 from softmode.errors import ConfigError
 from softmode.robots import ArmControlOptions, ArmDescription
 from softmode.splats import Splats
@@ -44,6 +45,7 @@ def shape_scene() -> TableSceneConfig:
     return TableSceneConfig(
         object=POST,
         material=POST_MATERIAL,
+        solver=RL_SOLVER,
         substeps=4,
         arm=ArmDescription(home_position=(0.45, 0.0, 0.09), home_opening=0.08),
         control=ArmControlOptions(workspace_lower=(0.33, -0.12, 0.08), workspace_upper=(0.57, 0.12, 0.20)),
@@ -121,7 +123,7 @@ class ShapeSoft(Task):
     config_class = ShapeSoftConfig
     term_names = ("shape", "there")
     metric_names = ("shape_error",)
-    point_count = 12
+    point_count = POINTS
 
     def build(self) -> None:
         """Record the targets and allocate the count of steps at the target."""
@@ -219,7 +221,7 @@ class ShapeSoft(Task):
                 self.column("achieved_goal"),
                 self.column("desired_goal"),
                 self.point_count,
-                *_reward_arguments(config),
+                *reward_arguments(config),
                 config.hold_steps,
             ],
             [self.held, self.terms, self.success],
@@ -228,75 +230,6 @@ class ShapeSoft(Task):
     def marker(self) -> Splats:
         """Return the surface of the post; `observe` bends it."""
         return dots(load_object(self.config.scene.object).body.surface_points, 0.004, opacity=0.35)
-
-
-def _reward_arguments(config: ShapeSoftConfig) -> list[Any]:
-    """Return what the reward depends on."""
-    return [int(config.reward == "sparse"), config.reward_length, config.goal_tolerance]
-
-
-class GoalMethods:
-    """What goal-conditioned learners, such as hindsight experience replay, ask of an environment."""
-
-    config: ShapeSoftConfig
-
-    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> Any:
-        """Return the reward of a step that led to `achieved_goal`, bit for bit that of the step on the same device.
-
-        Args:
-            achieved_goal: Points of the shape [m], shape (..., 36), a numpy array or a tensor.
-            desired_goal: Those of the target.
-            info: Not used.
-
-        Returns:
-            Rewards, float32, shape (...): a number, an array, or a tensor on the device of the goals.
-
-        Raises:
-            ConfigError: If the shapes do not fit.
-        """
-        size = 3 * ShapeSoft.point_count
-        if tuple(achieved_goal.shape) != tuple(desired_goal.shape) or tuple(achieved_goal.shape[-1:]) != (size,):
-            raise ConfigError(
-                f"goals have shapes {tuple(achieved_goal.shape)} and {tuple(desired_goal.shape)}",
-                hint=f"give both the same shape (..., {size})",
-            )
-        leading = tuple(achieved_goal.shape[:-1])
-        tensors = hasattr(achieved_goal, "detach")
-        if tensors:
-            goals = [
-                wp.from_torch(goal.detach().float().reshape(-1, size).contiguous(), dtype=wp.float32)
-                for goal in (achieved_goal, desired_goal)
-            ]
-        else:
-            device = getattr(self, "task_device", "cpu")
-            goals = [
-                wp.array(np.asarray(goal, np.float32).reshape(-1, size), dtype=float, device=device)
-                for goal in (achieved_goal, desired_goal)
-            ]
-        reward = wp.zeros(len(goals[0]), dtype=float, device=goals[0].device)
-        wp.launch(
-            kernels.compute_reward,
-            dim=len(reward),
-            inputs=[*goals, ShapeSoft.point_count, *_reward_arguments(self.config)],
-            outputs=[reward],
-            device=reward.device,
-        )
-        if tensors:
-            return wp.to_torch(reward).reshape(leading)
-        return reward.numpy().reshape(leading)[()]
-
-    def compute_terminated(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> Any:
-        """Return whether the episode ended by a failure, which `info` knows; goals end none."""
-        if isinstance(info, Mapping):
-            return info.get("end_reason", EndReason.RUNNING) > EndReason.TIME_LIMIT
-        ends = [
-            one.get("end_reason", EndReason.RUNNING) > EndReason.TIME_LIMIT for one in (() if info is None else info)
-        ]
-        return np.array(ends) if ends else np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
-
-    def compute_truncated(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> Any:
-        """Return False: the time limit is not the task's."""
-        return np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
 
 
 class ShapeSoftEnv(GoalMethods, SoftEnv):

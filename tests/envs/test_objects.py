@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from softmode.deformables.body import BuildOptions
 from softmode.envs import objects
 from softmode.envs.objects import ObjectConfig, choose_part, load_object, stable_rotation
 from softmode.errors import AssetError, ConfigError
@@ -124,6 +125,22 @@ def test_plush_stands_on_the_table_at_its_size() -> None:
     assert thing.grad_basis.shape == (*thing.basis.shape, 3)
 
 
+def test_a_contact_radius_lifts_what_stands_free() -> None:
+    """The touching surface stands out by the radius, so the object rests so much higher, unless it is clamped."""
+    box = ObjectConfig(
+        shape="box", extents=(0.04, 0.04, 0.06), surface_count=40, build=BuildOptions(mode_count=1, cubature_count=24)
+    )
+    thing = load_object(box)
+    assert thing.body.driven_count == 0
+    assert load_object(replace(box, contact_radius=0.002)).height == pytest.approx(thing.height + 0.002)
+    post = load_object(replace(box, contact_radius=0.002, clamped_height=0.01))
+    assert post.height == pytest.approx(-post.body.surface_points[:, 2].min())
+    low = post.body.surface_points[:, 2] < post.body.surface_points[:, 2].min() + 0.009
+    free = post.body.evaluate(post.body.surface_points)[0][:, post.body.driven_count :]
+    assert post.body.driven_count > 0 and low.sum() >= 4
+    assert np.abs(free[low]).max() < 1e-6 < np.abs(free[~low]).max()
+
+
 def test_affine_motion_of_body_moves_the_splats_along() -> None:
     """x(X) = X + sum b_k q_k with q = affine(A, t) is A X + t at every splat."""
     thing = load_object(ObjectConfig())
@@ -224,6 +241,8 @@ def test_empty_crop_says_where_the_splats_are(tmp_path: Path) -> None:
         {"part": "best"},
         {"up": "z"},
         {"pose": "flat"},
+        {"contact_radius": -0.001},
+        {"clamped_height": float("inf")},
     ],
 )
 def test_options_out_of_range_are_refused(given: dict) -> None:

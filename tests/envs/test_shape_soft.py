@@ -145,7 +145,9 @@ def test_reward_is_computed_again_for_any_goals(shape: ShapeSoftEnv) -> None:
     assert (
         not shape.compute_terminated(achieved, desired).any() and not shape.compute_truncated(achieved, desired).any()
     )
-    assert shape.compute_terminated(achieved[0, 0], desired[0, 0], {"end_reason": 2})
+    assert shape.compute_terminated(achieved[0, 0], desired[0, 0], {"end_reason": 2}) is True
+    ends = shape.compute_terminated(achieved[0, :2], desired[0, :2], [{"end_reason": 1}, {"end_reason": 3}])
+    assert ends.tolist() == [False, True]
     with pytest.raises(ConfigError, match="shape"):
         shape.compute_reward(achieved[..., :30], desired[..., :30])
     torch = pytest.importorskip("torch")
