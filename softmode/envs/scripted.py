@@ -22,10 +22,12 @@ def scripted_policy(env: Any) -> Any:
     """
     from softmode.envs.press_soft import PressSoft
     from softmode.envs.push_soft import PushSoft
+    from softmode.envs.rope_route import RopeRoute
     from softmode.envs.scripted_press import ScriptedPress
     from softmode.envs.scripted_push import ScriptedPush
+    from softmode.envs.scripted_rope import ScriptedRope
 
-    policies = {LiftSoft: ScriptedLift, PushSoft: ScriptedPush, PressSoft: ScriptedPress}
+    policies = {LiftSoft: ScriptedLift, PushSoft: ScriptedPush, PressSoft: ScriptedPress, RopeRoute: ScriptedRope}
     task = getattr(env.unwrapped, "task", None)
     for kind, policy in policies.items():
         if isinstance(task, kind):
