@@ -22,6 +22,7 @@ from softmode.errors import ConfigError
 from softmode.robots import ArmDescription
 from softmode.robots.control import ArmControlOptions
 from softmode.splats import Splats
+from softmode.splats.camera import PinholeCamera
 
 THICKNESS = 0.04
 """Thickness of the default pad [m]."""
@@ -213,7 +214,24 @@ class PressSoft(Task):
 
     def marker(self) -> Splats:
         """Return a small ball; it hangs beside the pad, over its top by `GAUGE` per newton that is missing."""
-        return sphere_marker(0.008)
+        return sphere_marker(0.006)
+
+    def observation_camera(self) -> PinholeCamera:
+        """Return a camera close to the pad, or the one on the hand."""
+        if self.config.camera != "front":
+            return super().observation_camera()
+        return pad_camera("pixels", self.config.image_size)
+
+    def render_cameras(self) -> list[PinholeCamera]:
+        """Return that camera and the overview."""
+        return [pad_camera("front", self.config.render_size), *super().render_cameras()[1:]]
+
+
+def pad_camera(name: str, edge: int) -> PinholeCamera:
+    """Return a camera that sees pad, finger tips and marker."""
+    return PinholeCamera.look_at(
+        name, position=(0.80, -0.24, 0.21), target=(0.465, 0.015, 0.065), width=edge, height=edge, fov_y=0.42
+    )
 
 
 class PressSoftEnv(SoftEnv):

@@ -22,12 +22,20 @@ def scripted_policy(env: Any) -> Any:
     """
     from softmode.envs.press_soft import PressSoft
     from softmode.envs.push_soft import PushSoft
+    from softmode.envs.rope_route import RopeRoute
     from softmode.envs.scripted_press import ScriptedPress
     from softmode.envs.scripted_push import ScriptedPush
+    from softmode.envs.scripted_rope import ScriptedRope
     from softmode.envs.scripted_shape import ScriptedShape
     from softmode.envs.shape_soft import ShapeSoft
 
-    policies = {LiftSoft: ScriptedLift, PushSoft: ScriptedPush, PressSoft: ScriptedPress, ShapeSoft: ScriptedShape}
+    policies = {
+        LiftSoft: ScriptedLift,
+        PushSoft: ScriptedPush,
+        PressSoft: ScriptedPress,
+        RopeRoute: ScriptedRope,
+        ShapeSoft: ScriptedShape,
+    }
     task = getattr(env.unwrapped, "task", None)
     for kind, policy in policies.items():
         if isinstance(task, kind):
