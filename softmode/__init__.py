@@ -17,9 +17,10 @@ ENVIRONMENTS = {
     "softmode/LiftSoft-v0": "Pick a soft object from a table and hold it at a goal.",
     "softmode/PushSoft-v0": "Push a soft object over the table to a goal.",
     "softmode/PressSoft-v0": "Press on a soft pad of unknown stiffness and hold a contact force.",
+    "softmode/PlaceInBin-v0": "Put a soft toy into a bin with other soft objects in it.",
 }
 """Ids of the registered environments and what their task is."""
-_EPISODE_STEPS = {"LiftSoft": 150, "PushSoft": 120, "PressSoft": 120}
+_EPISODE_STEPS = {"LiftSoft": 150, "PushSoft": 120, "PressSoft": 120, "PlaceInBin": 180}
 """Control steps of an episode."""
 
 
