@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 import warp as wp
@@ -30,7 +31,11 @@ TOY = ObjectConfig(
 )
 """A soft die."""
 BALL = ObjectConfig(
-    shape="sphere", extents=(0.045,) * 3, surface_count=80, colors=((0.25, 0.45, 0.80), (0.85, 0.88, 0.95)), build=_BUILD
+    shape="sphere",
+    extents=(0.045, 0.045, 0.045),
+    surface_count=80,
+    colors=((0.25, 0.45, 0.80), (0.85, 0.88, 0.95)),
+    build=_BUILD,
 )
 """A soft ball."""
 DISC = ObjectConfig(
@@ -98,7 +103,7 @@ def bin_scene() -> TableSceneConfig:
         solver=SolverReducedOptions(contact_max=256),
         substeps=4,
         object_position=(0.43, -0.13),
-        constraint_max=256,
+        constraint_max=160,
         rigid_contact_max=64,
     )
 
@@ -116,7 +121,7 @@ class PlaceInBinConfig(TaskConfig):
     other_range: tuple[float, float] = (0.045, 0.012)
     """Half-width of the random positions of the other objects in x and y [m], about places side by side along y."""
     rim_allowance: float = 0.02
-    """Height over the rim below which the centre of what lies in the bin, maybe upon other objects, counts as in [m]."""
+    """Height over the rim below which the centre of an object in the bin, maybe upon others, counts as in [m]."""
     rest_speed: float = 0.03
     """Speed of the toy under which it counts as at rest [m/s]."""
     hold_steps: int = 10
@@ -186,11 +191,10 @@ class PlaceInBin(Task):
         config, (a, b) = self.config, self.half
         (toy, *others), (dx, dy) = radii, config.other_range
         width = 2.0 * b / max(len(others), 1)
-        fits = all(dx + r <= a and dy + r <= 0.5 * width for r in others)
-        fits = fits or (
+        fits = (
             all(dx + r <= a for r in others)
-            and all(2.0 * dy + r + s <= width for r, s in zip(others, others[1:], strict=False))
             and all(dy + r <= 0.5 * width for r in (*others[:1], *others[-1:]))
+            and all(2.0 * dy + r + s <= width for r, s in pairwise(others))
         )
         if not fits:
             raise ConfigError(

@@ -98,8 +98,8 @@ class ScriptedPlace:
         """Return the next move of the held toy: up, across once it clears the rim, down over its place."""
         task, scene = self._task, self._task.scene
         points = self._surfaces()
-        tips = float(scene.controller.target_position.numpy()[0, 2]) - 0.5 * self.env.config.scene.arm.gripper.pad_size[2]
-        lowest = min(float(points[0][:, 2].min()), tips)
+        tool, pad = scene.controller.target_position.numpy()[0], self.env.config.scene.arm.gripper.pad_size
+        lowest = min(float(points[0][:, 2].min()), float(tool[2]) - 0.5 * pad[2])
         if self._place is None:
             self._place = self._roomiest()
         aside = self._place - centre[:2]
