@@ -17,11 +17,19 @@ ENVIRONMENTS = {
     "softmode/LiftSoft-v0": "Pick a soft object from a table and hold it at a goal.",
     "softmode/PushSoft-v0": "Push a soft object over the table to a goal.",
     "softmode/PressSoft-v0": "Press on a soft pad of unknown stiffness and hold a contact force.",
+    "softmode/PlaceInBin-v0": "Put a soft toy into a bin with other soft objects in it.",
     "softmode/RopeRoute-v0": "Lead a soft rope around pegs, each on its side, to a goal.",
     "softmode/ShapeSoft-v0": "Bend a soft post into a given shape and hold it there.",
 }
 """Ids of the registered environments and what their task is."""
-_EPISODE_STEPS = {"LiftSoft": 150, "PushSoft": 120, "PressSoft": 120, "RopeRoute": 160, "ShapeSoft": 100}
+_EPISODE_STEPS = {
+    "LiftSoft": 150,
+    "PushSoft": 120,
+    "PressSoft": 120,
+    "PlaceInBin": 180,
+    "RopeRoute": 160,
+    "ShapeSoft": 100,
+}
 """Control steps of an episode."""
 
 

@@ -43,6 +43,8 @@ class EndReason(IntEnum):
     """A number of the world's state was not finite."""
     DROPPED = 3
     """The object fell off the table."""
+    SPILLED = 4
+    """Another object left the container that it belongs in."""
 
 
 @dataclass(frozen=True)
@@ -208,7 +210,7 @@ class Task:
         if render:
             cameras += self.render_cameras()
         self.scene = TableScene(
-            config.scene,
+            self.scene_config(),
             world_count=world_count,
             cameras=cameras,
             camera_options=CameraOptions(
@@ -297,6 +299,10 @@ class Task:
 
     # -- what a task adds ---------------------------------------------------------------------------------------------
 
+    def scene_config(self) -> TableSceneConfig:
+        """Return what the scene is built from: the configured one, and what a task adds to it."""
+        return self.config.scene
+
     def build(self) -> None:
         """Allocate what the subclass needs; called once, when the scene stands."""
 
@@ -366,8 +372,8 @@ class Task:
         dim = self.world_count if dim is None else dim
         wp.launch(kernel, dim=dim, inputs=list(inputs), outputs=list(outputs), device=self.device)
 
-    def place_object(self, index: int, position: str, yaw: str) -> None:
-        """Put an object where two parameters say, standing on the table."""
+    def place_object(self, index: int, position: str, yaw: str, ground: float = 0.0) -> None:
+        """Put an object where two parameters say, standing on the table or on `ground` [m] above it."""
         scene, table = self.scene, self.table
         self.launch(
             kernels.place_object,
@@ -378,7 +384,7 @@ class Task:
                 table.column(yaw),
                 table.column("scale"),
                 scene.objects[index].height,
-                GAP,
+                GAP + ground,
                 len(scene.objects),
                 index,
             ],
