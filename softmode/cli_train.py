@@ -43,6 +43,8 @@ class Train:
     """Go on with the run in --run-dir after it was ended or killed."""
     init: Path | None = None
     """Checkpoint of the same environment whose networks training starts from."""
+    teacher: Path | None = None
+    """Checkpoint of a policy on the state of the same environment, whose actions one from pixels is drawn to."""
     nan_guard: bool = False
     """Check every observation and reward; dump the last steps of worlds that are not finite, and stop."""
     eval_episodes: int = 200
@@ -69,6 +71,7 @@ class Train:
             name=self.name,
             resume=self.resume,
             init=self.init,
+            teacher=self.teacher,
             nan_guard=self.nan_guard,
             eval_episodes=self.eval_episodes,
             checkpoint_seconds=self.checkpoint_seconds,

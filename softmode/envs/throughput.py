@@ -183,22 +183,17 @@ def stage_times(task: Task, repeats: int = 20) -> dict[str, float]:
     parts: dict[str, Any] = {"physics": physics, "observe and judge": judging, "masked reset": reset}
     if task.images:
         parts["camera"] = task._draw_pictures
-    times = {"whole step": _median(task.graph, task.device, repeats)}
+    graphs: dict[str, Any] = {"whole step": task.graph}
     for name, part in parts.items():
         with wp.ScopedCapture(device=task.device) as capture:
             part()
-        graph: Any = capture.graph
-        times[name] = _median(graph, task.device, repeats)
-    return times
-
-
-def _median(graph: Any, device: Any, repeats: int) -> float:
-    """Return the median time of a graph's replay [ms]."""
-    spent = []
-    for _ in range(repeats + 2):
-        wp.synchronize_device(device)
-        clock = time.perf_counter()
-        wp.capture_launch(graph)
-        wp.synchronize_device(device)
-        spent.append(1e3 * (time.perf_counter() - clock))
-    return float(np.median(spent[2:]))
+        graphs[name] = capture.graph
+    spent: dict[str, list[float]] = {name: [] for name in graphs}
+    for _ in range(repeats + 2):  # in turn, so that all see the same states
+        for name, graph in graphs.items():
+            wp.synchronize_device(task.device)
+            clock = time.perf_counter()
+            wp.capture_launch(graph)
+            wp.synchronize_device(task.device)
+            spent[name].append(1e3 * (time.perf_counter() - clock))
+    return {name: float(np.median(times[2:])) for name, times in spent.items()}

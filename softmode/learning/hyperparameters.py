@@ -72,6 +72,8 @@ class Hyperparameters:
     """Let the critic read the full state where the environment offers it beside the observation."""
     state_prediction_coefficient: float = 0.1
     """Weight of predicting the full state from the features of pixels, where the environment offers it."""
+    teacher_coefficient: float = 2.0
+    """Weight, at the start of the run, of staying near a teacher's actions; it falls linearly to 0 at the end."""
     critic_warmup: int = 0
     """Updates at the start that train the critic alone, for actors that begin with what they learnt elsewhere."""
     mixed_precision: bool = True
@@ -89,7 +91,7 @@ class Hyperparameters:
         positive = ("learning_rate", "desired_kl", "max_learning_rate", "clip", "max_gradient_norm", "initial_std")
         for name in (*positive, "min_std", "max_std"):
             _require(name, getattr(self, name), _number(getattr(self, name)) and getattr(self, name) > 0, "> 0")
-        coefficients = ("value", "entropy", "bound", "state_prediction")
+        coefficients = ("value", "entropy", "bound", "state_prediction", "teacher")
         for name in (f"{word}_coefficient" for word in coefficients):
             _require(name, getattr(self, name), _number(getattr(self, name)) and getattr(self, name) >= 0, ">= 0")
         ok = self.clip_value is None or (_number(self.clip_value) and self.clip_value > 0)

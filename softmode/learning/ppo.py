@@ -9,11 +9,13 @@ import torch
 from softmode.learning.distributed import Ranks
 from softmode.learning.hyperparameters import Hyperparameters
 from softmode.learning.moments import RunningMoments
-from softmode.learning.networks import PRIVILEGED, ActorCritic
+from softmode.learning.networks import PRIVILEGED, Actor, ActorCritic
 from softmode.learning.optimizer import FlatAdam
 from softmode.learning.rollout import Rollout, generalized_advantage
 
 MIN_LEARNING_RATE = 1e-5
+STATE = "state"
+"""Key of the observation of a policy on the state."""
 
 
 class PPO:
@@ -23,13 +25,18 @@ class PPO:
         model: Actor and critic.
         options: Hyperparameters.
         ranks: The processes that train together.
+        teacher: An actor that sees the full state, whose actions attract those of the actor: imitation on the states
+            that the learner itself visits (Ross et al. 2011), beside the policy gradient.
     """
 
     LOSSES = ("policy_loss", "value_loss", "entropy", "divergence", "gradient_norm", "clip_fraction", "prediction_loss")
     """What :meth:`update` returns the means of."""
 
-    def __init__(self, model: ActorCritic, options: Hyperparameters, ranks: Ranks) -> None:
+    def __init__(
+        self, model: ActorCritic, options: Hyperparameters, ranks: Ranks, teacher: Actor | None = None
+    ) -> None:
         """Make the optimizer."""
+        self.teacher = teacher
         self.model, self.options, self.ranks = model, options, ranks
         self.optimizer = FlatAdam(model.parameters(), options.learning_rate, options.max_gradient_norm)
         device = self.optimizer.value.device
@@ -84,7 +91,7 @@ class PPO:
             for index in order.chunk(options.minibatches):
                 parts = [column[index] for column in columns]
                 optimizer.zero()
-                losses = self._losses(rollout, index, parts, entropy_weight, train_actor)
+                losses = self._losses(rollout, index, parts, entropy_weight, train_actor, 1.0 - progress)
                 divergence = optimizer.average(losses[3], self.ranks)
                 if options.schedule == "adaptive" and train_actor:
                     optimizer.adapt(divergence, options.desired_kl, (MIN_LEARNING_RATE, options.max_learning_rate))
@@ -100,6 +107,7 @@ class PPO:
         parts: list[torch.Tensor],
         entropy_weight: float,
         train_actor: bool,
+        remaining: float,
     ) -> torch.Tensor:
         """Add the gradients of a minibatch; return its losses."""
         options, model = self.options, self.model
@@ -124,6 +132,11 @@ class PPO:
             if options.bound == "clamp" and options.bound_coefficient:
                 outside = (mean.abs() - 1.0).clamp(min=0.0).square().sum(-1)
                 loss = loss + options.bound_coefficient * (weight * outside).mean()
+        if self.teacher is not None and train_actor:
+            with torch.no_grad():
+                shown = self.teacher.mean(self.teacher.encoder({STATE: observation[PRIVILEGED]})).clamp(-1.0, 1.0)
+            apart = (mean - shown).square().sum(-1)
+            loss = loss + options.teacher_coefficient * remaining * (weight * apart).mean()
         prediction_loss = torch.zeros_like(loss)
         if model.predict is not None:
             state = model.critic.encoder.moments[PRIVILEGED](observation[PRIVILEGED])

@@ -52,6 +52,8 @@ class TrainOptions:
     """Go on with the run in run_dir: its worlds, seed and hyperparameters are taken from there."""
     init: Path | None = None
     """Checkpoint of the same environment whose networks training starts from."""
+    teacher: Path | None = None
+    """Checkpoint of a policy on the state of the same environment, whose actions one from pixels is drawn to."""
     nan_guard: bool = False
     """Check every observation and reward, and dump the last steps of worlds that are not finite."""
     eval_episodes: int = 200

@@ -21,9 +21,9 @@ from softmode.learning.checkpoints import Checkpoint, check_env, read_checkpoint
 from softmode.learning.distributed import Ranks, local_device
 from softmode.learning.environments import make_vector_env
 from softmode.learning.nan_guard import NanGuard
-from softmode.learning.networks import ActorCritic
-from softmode.learning.policy import EVALUATION_SEED, Policy, evaluate
-from softmode.learning.ppo import PPO
+from softmode.learning.networks import Actor, ActorCritic
+from softmode.learning.policy import EVALUATION_SEED, Policy, actor_of, evaluate
+from softmode.learning.ppo import PPO, STATE
 from softmode.learning.rollout import Collector, Rollout
 from softmode.learning.run_folder import BEST, LATEST, RunFolder
 from softmode.learning.train_options import DEFAULT_STEPS, TrainOptions, TrainResult
@@ -91,6 +91,7 @@ def _starting_point(options: TrainOptions) -> tuple[TrainOptions, Checkpoint | N
             num_envs=int(config["num_envs"]),
             seed=int(config["seed"]),
             env_options=start.env_options,
+            teacher=options.teacher or (Path(config["teacher"]) if config.get("teacher") else None),
             hyperparameters=start.hyperparameters,
         ), start
     except (KeyError, TypeError, ValueError) as error:
@@ -129,7 +130,7 @@ class _Run:
         first = env.reset(first_seed)
         self.privileged = self._privileged_size()
         self.model = ActorCritic(env.interface, self.privileged, self.hyperparameters).to(self.device)
-        self.ppo = PPO(self.model, self.hyperparameters, ranks)
+        self.ppo = PPO(self.model, self.hyperparameters, ranks, self._teacher())
         if start is not None:
             self._load(start)
         options_ = self.hyperparameters
@@ -153,6 +154,22 @@ class _Run:
                 hint="make the environment with AutoresetMode.NEXT_STEP, or set asymmetric_critic=false",
             )
         return int(state.shape[1])
+
+    def _teacher(self) -> Actor | None:
+        """Return the actor to learn from, if one is given."""
+        path = self.options.teacher
+        if path is None:
+            return None
+        checkpoint = read_checkpoint(path)
+        if checkpoint.env != self.options.env:
+            raise CheckpointError(f"teacher {path} plays {checkpoint.env}", hint=f"give one of {self.options.env}")
+        seen = checkpoint.interface
+        if dict(seen.vectors) != {STATE: self.privileged} or seen.action_size != self.env.interface.action_size:
+            raise CheckpointError(
+                f"teacher {path} sees {dict(seen.vectors)}, and this run offers a state of {self.privileged} numbers",
+                hint="train the teacher with obs_type state, and from pixels with an asymmetric critic",
+            )
+        return actor_of(checkpoint, self.device, path)
 
     def _stagger_iterations(self, fresh: bool) -> int:
         """Return how many rollouts pass before the first update.
@@ -232,6 +249,7 @@ class _Run:
             "total_steps": options.total_steps,
             "time_limit": options.time_limit,
             "init": None if options.init is None else str(options.init),
+            "teacher": None if options.teacher is None else str(options.teacher),
             "interface": self.env.interface.to_json(),
             "privileged": self.privileged,
             "hyperparameters": self.hyperparameters.to_json(),
