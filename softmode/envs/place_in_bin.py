@@ -10,15 +10,16 @@ import warp as wp
 
 from softmode.deformables.body import BuildOptions
 from softmode.deformables.materials import Material
-from softmode.deformables.solver_reduced import SolverReducedOptions
 from softmode.envs import place_in_bin_kernels as kernels
 from softmode.envs.objects import ObjectConfig
 from softmode.envs.parameters import Parameter
+from softmode.envs.rl_scene import RL_SOLVER
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.table_scene import Fixture, TableSceneConfig
 from softmode.envs.task import Segment, Task, TaskConfig
 from softmode.errors import ConfigError
+from softmode.robots import ArmDescription
 from softmode.robots.control import ArmControlOptions
 from softmode.splats.camera import PinholeCamera
 
@@ -99,8 +100,9 @@ def bin_scene() -> TableSceneConfig:
         object=TOY,
         others=(BALL, DISC),
         material=Material(youngs_modulus=1.0e5, poissons_ratio=0.3, density=300.0, friction=0.8),
+        arm=ArmDescription(home_position=(0.43, 0.0, 0.18)),
         control=ArmControlOptions(workspace_lower=(0.25, -0.35, 0.022), workspace_upper=(0.65, 0.35, 0.40)),
-        solver=SolverReducedOptions(contact_max=256),
+        solver=RL_SOLVER,
         substeps=4,
         object_position=(0.43, -0.13),
         constraint_max=160,

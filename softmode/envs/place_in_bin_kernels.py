@@ -95,7 +95,7 @@ def evaluate(
         lift = 1.0
         lowered = wp.clamp((carried - x[2]) / (carried - low - floor), 0.0, 1.0)
     near = 1.0 - wp.tanh(6.0 * aside)
-    reach = 1.0 - wp.tanh(10.0 * distance)
+    reach = 1.0 - wp.tanh(5.0 * distance)
     if inside:
         reach = 1.0
         lift = 1.0
