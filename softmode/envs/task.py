@@ -620,13 +620,13 @@ def wrist_camera(name: str, edge: int) -> PinholeCamera:
     """Return the camera on the hand that looks between the fingers."""
     return PinholeCamera.look_at(
         name,
-        position=(0.09, 0.0, -0.02),
-        target=(0.0, 0.0, 0.13),
+        position=(0.12, 0.0, 0.02),
+        target=(0.0, 0.0, 0.14),
         up=(-1.0, 0.0, 0.0),
         width=edge,
         height=edge,
         fov_y=1.1,
-        body="hand",
+        body="link7",
     )
 
 
