@@ -1,4 +1,4 @@
-"""The command line: play, train, evaluate, record, bench, list-envs, robots and splat."""
+"""The command line: play, train, evaluate, export, record, bench, list-envs, robots and splat."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from softmode.cli_bench import Bench
 from softmode.cli_common import bar_interval, quiet_warp, warp_device
 from softmode.cli_record import Record
 from softmode.cli_splat import SplatConvert, SplatFromMesh, SplatInfo
-from softmode.cli_train import Evaluate, Train, policy_file
+from softmode.cli_train import Evaluate, Export, Train, policy_file
 from softmode.errors import ConfigError, MaterialError, MissingExtraError, SoftmodeError
 from softmode.film import Film
 from softmode.policies import POLICIES, check_policy, policy_factory
@@ -109,6 +109,7 @@ def main(arguments: list[str] | None = None) -> int:
             Annotated[Play, tyro.conf.subcommand("play")]
             | Annotated[Train, tyro.conf.subcommand("train")]
             | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+            | Annotated[Export, tyro.conf.subcommand("export")]
             | Annotated[Bench, tyro.conf.subcommand("bench")]
             | Annotated[Record, tyro.conf.subcommand("record")]
             | Annotated[ListEnvs, tyro.conf.subcommand("list-envs")]

@@ -1,4 +1,4 @@
-"""The commands ``softmode train`` and ``softmode evaluate``."""
+"""The commands ``softmode train``, ``softmode evaluate`` and ``softmode export``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from softmode.cli_common import quiet_warp
-from softmode.errors import ConfigError, MissingExtraError
+from softmode.errors import ConfigError, MissingExtraError, StorageError
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -130,6 +130,35 @@ class Evaluate:
                 print(evaluate(env, policy, self.episodes, seed=self.seed, device=device))
             finally:
                 env.close()
+        return 0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write the policy of a run's checkpoint to a file of its own, without optimizer and critic."""
+
+    checkpoint: Path
+    """Checkpoint of a run, for example best.npz."""
+    out: Path
+    """File to write (.npz), not there yet; play, evaluate, --init and --teacher read it."""
+
+    def run(self) -> int:
+        """Write the file; return the exit code."""
+        require_torch()
+        from softmode.learning.checkpoints import policy_only, read_checkpoint, write_checkpoint
+        from softmode.learning.policy import load_policy
+
+        if self.out.exists():
+            raise ConfigError(f"{self.out} exists", hint="remove it, or write another file")
+        load_policy(self.checkpoint)  # refuses a file whose actor does not fit its header
+        try:
+            self.out.parent.mkdir(parents=True, exist_ok=True)
+            write_checkpoint(policy_only(read_checkpoint(self.checkpoint)), self.out)
+        except OSError as error:
+            raise StorageError(
+                f"{self.out} cannot be written ({error.strerror or error})", hint="choose another folder"
+            ) from error
+        print(f"{self.out}: {self.out.stat().st_size / 1e3:.0f} kB")
         return 0
 
 

@@ -36,6 +36,27 @@ def test_train_and_evaluate(tmp_path: Path, capsys):
     assert "Pendulum-v1" in capsys.readouterr().err
 
 
+def test_export(tmp_path: Path, capsys):
+    """An exported policy is smaller, plays and evaluates as its checkpoint, starts a run; no file is replaced."""
+    folder, policy = tmp_path / "run", tmp_path / "new" / "policy.npz"
+    assert cli.main(["train", "Pendulum-v1", "--run-dir", str(folder), *QUICK, "0"]) == 0
+    assert cli.main(["export", str(folder / "latest.npz"), str(policy)]) == 0
+    assert policy.stat().st_size < 0.5 * (folder / "latest.npz").stat().st_size
+    results = []
+    for file in (folder / "latest.npz", policy):
+        capsys.readouterr()
+        assert cli.main(["evaluate", "Pendulum-v1", str(file), "--episodes", "2", "--num-envs", "2"]) == 0
+        results.append(capsys.readouterr().out)
+    assert results[0] == results[1]
+    again = ["--run-dir", str(tmp_path / "again"), "--init", str(policy), *QUICK, "0"]
+    assert cli.main(["train", "Pendulum-v1", *again]) == 0
+    before = policy.read_bytes()
+    assert cli.main(["export", str(folder / "latest.npz"), str(policy)]) == 2
+    assert "exists" in capsys.readouterr().err and policy.read_bytes() == before
+    assert cli.main(["export", str(folder / "config.json"), str(tmp_path / "other.npz")]) == 2
+    assert "config.json" in capsys.readouterr().err and not (tmp_path / "other.npz").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [

@@ -76,6 +76,12 @@ def write_checkpoint(checkpoint: Checkpoint, path: str | os.PathLike[str]) -> No
         file.write(buffer.getbuffer())
 
 
+def policy_only(checkpoint: Checkpoint) -> Checkpoint:
+    """Return the policy of a checkpoint without what only training needs: optimizer, critic and scale of rewards."""
+    arrays = {name: array for name, array in checkpoint.arrays.items() if name.startswith("actor.")}
+    return dataclasses.replace(checkpoint, arrays=arrays)
+
+
 def read_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
     """Read a file that :func:`write_checkpoint` wrote. No code in it is ever run.
 

@@ -1,0 +1,55 @@
+"""The policies of the repository load, and succeed in the present environments as often as their results say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("torch")
+
+from softmode.learning.environments import make_vector_env
+from softmode.learning.policy import evaluate, load_policy
+
+FOLDER = Path(__file__).parents[2] / "policies"
+LEAST = {"lift_soft": (18, 20), "press_soft": (18, 20), "push_soft": (15, 20), "lift_soft_pixels": (8, 10)}
+"""Fewest successes in as many episodes."""
+
+
+def test_all_are_tested():
+    """The folder holds these policies, small ones."""
+    assert {path.stem for path in FOLDER.glob("*.npz")} == LEAST.keys()
+    assert all(path.stat().st_size < 2.5e6 for path in FOLDER.glob("*.npz"))
+
+
+@pytest.mark.parametrize("name", LEAST)
+def test_loads(name: str):
+    """Each holds a policy and nothing that only training needs."""
+    policy = load_policy(FOLDER / f"{name}.npz")
+    assert policy.env.startswith("softmode/") and all(key.startswith("actor.") for key in policy.checkpoint.arrays)
+
+
+def test_lifts():
+    """An episode of LiftSoft."""
+    policy = load_policy(FOLDER / "lift_soft.npz")
+    env = policy.make()
+    try:
+        policy.check(env)
+        assert evaluate(env, policy, 1, seed=0).success_rate == 1.0
+    finally:
+        env.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LEAST)
+def test_success(name: str):
+    """Episodes with random stiffness and pose end in success."""
+    least, episodes = LEAST[name]
+    policy = load_policy(FOLDER / f"{name}.npz")
+    env = make_vector_env(policy.env, 2, "cpu", policy.env_options)
+    try:
+        policy.check(env)
+        found = evaluate(env, policy, episodes, seed=0)
+        assert found.success_rate is not None and round(found.success_rate * episodes) >= least, str(found)
+    finally:
+        env.close()
