@@ -44,7 +44,7 @@ def main() -> None:
             axis.plot([float(row[column]) / scale for row in rows], success, line, color=color, label=label, lw=1.5)
             axis.plot(float(end[column]) / scale, reached, "o", color=color, mfc="none" if line == "--" else color)
     axes[0].set(xlabel="environment steps [million]", ylabel="successful episodes [%]", ylim=(0.0, 103.0))
-    axes[1].set(xlabel="wall time of training [s]", xscale="log", xlim=(2.0, 2000.0))
+    axes[1].set(xlabel="wall time of training [s]", xscale="log", xlim=(2.0, 2500.0))
     for axis in axes:
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=8, loc="lower right")
