@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any, Literal
 
 from softmode.cli_common import quiet_warp
+from softmode.errors import ConfigError
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -40,9 +41,13 @@ class Bench:
     def run(self) -> int:
         """Measure; return the exit code."""
         from softmode.envs.catalogue import config_class
-        from softmode.envs.soft_vector_env import checked_device
+        from softmode.envs.soft_env import checked_device
         from softmode.envs.throughput import report_throughput
 
+        if not self.num_envs:
+            raise ConfigError("num-envs names no number of worlds", hint="give some, like --num-envs 1 16")
+        if self.stages and self.processes > 1:
+            raise ConfigError("--stages looks into this process only", hint="leave --processes at 1")
         with quiet_warp():
             device = checked_device(self.device)
             known = config_class(self.env)

@@ -52,6 +52,10 @@ class SolverDiverged(SoftmodeError, RuntimeError):
     """A step produced no finite state."""
 
 
+class WorkerError(SoftmodeError, RuntimeError):
+    """A process that holds worlds of a vector environment has died, was closed, or failed at something unexpected."""
+
+
 class CheckpointError(SoftmodeError, ValueError):
     """A policy or checkpoint file is missing, damaged, foreign, or belongs to another environment or version."""
 

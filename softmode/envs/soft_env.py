@@ -9,6 +9,7 @@ from typing import Any, ClassVar, get_args
 
 import gymnasium as gym
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 from softmode.deformables.status import status_reasons
@@ -58,7 +59,7 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         progress: Reports the build of the object: a callable (stage, fraction), or True or False for a bar or none.
 
     Raises:
-        ConfigError: If an option is unknown or out of range.
+        ConfigError: If an option is unknown or out of range, or there is no such device.
         AssetError: If the splat file cannot be used.
     """
 
@@ -96,7 +97,11 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         self.obs_type, self.render_mode = obs_type, render_mode
         self.metadata = {**self.metadata, "render_fps": round(self.config.scene.control_hz)}
         self.task = self.task_class(
-            self.config, obs_type=obs_type, render=render_mode is not None, device=device, progress=progress
+            self.config,
+            obs_type=obs_type,
+            render=render_mode is not None,
+            device=checked_device(device),
+            progress=progress,
         )
         self.scene = self.task.scene
         self.action_space = self.task.action_space
@@ -104,6 +109,8 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
 
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode."""
+        if options is not None and not isinstance(options, Mapping):
+            raise ConfigError(f"options is a {type(options).__name__}", hint="give a dict")
         given = self.task.table.check(options)
         fresh = seed is not None or self._np_random is None
         super().reset(seed=seed)
@@ -190,6 +197,21 @@ def checked_config(
     return replace(chosen, scene=scene)
 
 
+def checked_device(device: Any) -> Any:
+    """Return a Warp device.
+
+    Raises:
+        ConfigError: If there is no such device.
+    """
+    if isinstance(device, str) and device == "cuda":
+        device = "cuda:0"
+    try:
+        return wp.get_device(device)
+    except (ValueError, RuntimeError) as error:
+        known = ", ".join(str(found) for found in wp.get_devices())
+        raise ConfigError(f"there is no device {device!r}", hint=f"use one of {known}") from error
+
+
 def checked_actions(actions: Any, space: gym.Space) -> NDArray[np.float32]:
     """Return actions as an array.
 
@@ -241,7 +263,7 @@ def info_arrays(task: Task, *, final: bool = False) -> dict[str, Any]:
     }
     vector: Any = task.final_observation if final else task.observation
     info["finger_force"] = vector[:, task.segments["finger_force"][0]]
-    info["solver_status"] = task.scene.solver.reduced.status
+    info["solver_status"] = task.final_status if final else task.scene.solver.reduced.status
     info["end_reason"] = task.end
     return info
 

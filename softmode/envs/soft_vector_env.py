@@ -16,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from softmode.envs.parameters import check_options
-from softmode.envs.soft_env import checked_actions, checked_config, world_seed
+from softmode.envs.soft_env import checked_actions, checked_config, checked_device, world_seed
 from softmode.envs.task import ObservationType, Task, TaskConfig
 from softmode.envs.worlds import LocalWorlds, RemoteWorlds
 from softmode.errors import ConfigError, MissingExtraError
@@ -81,9 +81,11 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         """Build the scene, capture the step and make the spaces."""
         if isinstance(num_envs, bool) or not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
             raise ConfigError(f"num_envs is {num_envs!r}", hint="give a whole number of at least 1")
-        if max_episode_steps is not None and not max_episode_steps >= 1:
+        whole = isinstance(max_episode_steps, (int, np.integer)) and not isinstance(max_episode_steps, bool)
+        if max_episode_steps is not None and not (whole and max_episode_steps >= 1):
             raise ConfigError(
-                f"max_episode_steps is {max_episode_steps!r}", hint="give at least 1, or None for no limit"
+                f"max_episode_steps is {max_episode_steps!r}",
+                hint="give a whole number of at least 1, or None for no limit",
             )
         if output not in ("numpy", "torch"):
             raise ConfigError(f"output is {output!r}", hint="use 'numpy' or 'torch'")
@@ -117,7 +119,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
                 "config": config,
                 "obs_type": obs_type,
                 "world_count": part.stop - part.start,
-                "limit": max_episode_steps or 0,
+                "limit": int(max_episode_steps or 0),
                 "autoreset_mode": mode,
                 "render": render_mode is not None,
                 "device": str(self.device),
@@ -178,6 +180,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         Raises:
             ConfigError: If the actions have another shape, or hold NaN (numpy output only), or no episode has begun;
                 nothing has moved then.
+            WorkerError: If a child process has died or the environment is closed.
         """
         if self._random is None:
             raise ConfigError("step comes before the first reset", hint="call reset() first")
@@ -196,7 +199,8 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         """Return a frame per world."""
         if self.render_mode is None:
             return None
-        return tuple(frame for worlds in self._worlds for frame in worlds.render())
+        with self._stream():
+            return tuple(frame for worlds in self._worlds for frame in worlds.render())
 
     def close_extras(self, **kwargs: Any) -> None:
         """Stop the child processes."""
@@ -216,7 +220,13 @@ class SoftVectorEnv(gym.vector.VectorEnv):
 
     @property
     def state_observation(self) -> Any:
-        """The full observation vector of every world whatever `obs_type`, shape (num_envs, D): for a critic."""
+        """The full observation vector of every world whatever `obs_type`, shape (num_envs, D): for a critic.
+
+        Raises:
+            ConfigError: If no episode has begun.
+        """
+        if not self._results:
+            raise ConfigError("there is no state before the first reset", hint="call reset() first")
         with self._stream():
             return self._gather("state")
 
@@ -364,21 +374,6 @@ def checked_processes(processes: Any, num_envs: int, device: Any, output: str) -
             hint="several processes serve CPU and numpy only; leave processes at 1",
         )
     return min(int(processes), num_envs)
-
-
-def checked_device(device: Any) -> Any:
-    """Return a Warp device.
-
-    Raises:
-        ConfigError: If there is no such device.
-    """
-    if isinstance(device, str) and device == "cuda":
-        device = "cuda:0"
-    try:
-        return wp.get_device(device)
-    except (ValueError, RuntimeError) as error:
-        known = ", ".join(str(found) for found in wp.get_devices())
-        raise ConfigError(f"there is no device {device!r}", hint=f"use one of {known}") from error
 
 
 def _row(tree: Any, index: int) -> Any:

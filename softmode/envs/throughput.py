@@ -10,8 +10,10 @@ import gymnasium as gym
 import numpy as np
 import warp as wp
 
-from softmode.envs.soft_vector_env import SoftVectorEnv, checked_device
+from softmode.envs.soft_env import checked_device
+from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.task import Task
+from softmode.errors import ConfigError
 
 Actions = Literal["random", "grasp"]
 TOUCH = 0.02
@@ -60,7 +62,11 @@ def measure_throughput(
             most of the time, so that contact is active.
         seed: Seed of episodes and actions.
         free_before: Free device memory before the environment was made [bytes].
+
+    Raises:
+        ConfigError: If there is no step to measure.
     """
+    check_steps(steps, warmup)
     tensors = env.output == "torch"
     env.reset(seed=seed)
     source = _Source(env, actions, seed)
@@ -109,6 +115,7 @@ def report_throughput(
         actions: See :func:`measure_throughput`.
         stages: Whether to print the time of the parts of a step.
     """
+    check_steps(steps, warmup)
     device = checked_device(options.get("device"))
     free = device.free_memory if device.is_cuda else 0
     clock = time.perf_counter()
@@ -127,6 +134,12 @@ def report_throughput(
         print("  " + ", ".join(f"{part} {spent:.2f} ms" for part, spent in stage_times(env.task).items()), flush=True)
     env.close()
     return result
+
+
+def check_steps(steps: int, warmup: int) -> None:
+    """Raise ConfigError if there is no step to measure."""
+    if steps < 1 or warmup < 0:
+        raise ConfigError(f"steps is {steps}, warmup {warmup}", hint="measure at least one step, after 0 or more")
 
 
 class _Source:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from softmode.envs.soft_env import info_arrays, observation_arrays, render_worlds
 from softmode.envs.task import Task
-from softmode.errors import SoftmodeError
+from softmode.errors import SoftmodeError, WorkerError
 
 
 class LocalWorlds:
@@ -80,7 +80,7 @@ class RemoteWorlds:
 
     Raises:
         SoftmodeError: What the task raised, here or in any call.
-        RuntimeError: If the child died.
+        WorkerError: If the child has died or is closed.
     """
 
     def __init__(self, task_class: type[Task], arguments: dict[str, Any]) -> None:
@@ -92,6 +92,7 @@ class RemoteWorlds:
         )
         self._process.start()
         theirs.close()
+        self._pending = True  # whether an answer is due
         self._result: dict[str, Any] = {}
 
     def connect(self) -> None:
@@ -123,29 +124,50 @@ class RemoteWorlds:
 
     def close(self) -> None:
         """Stop the child."""
+        if self._pipe.closed:
+            return
         with contextlib.suppress(OSError):
-            self._send("close")
+            self._pipe.send(("close", ()))
+        if self._pending:  # a large answer that nobody waits for must not hold the child up
+            with contextlib.suppress(EOFError, OSError):
+                if self._pipe.poll(5.0):
+                    self._pipe.recv()
         self._process.join(timeout=5.0)
         if self._process.is_alive():
             self._process.terminate()
         self._pipe.close()
 
     def _send(self, name: str, *arguments: Any) -> None:
+        """Send a call; the answer to an earlier one that an error or an interruption left there is thrown away."""
+        if self._pending:
+            with contextlib.suppress(SoftmodeError):
+                self._receive()
         try:
             self._pipe.send((name, arguments))
-        except (BrokenPipeError, ConnectionError) as error:
-            raise RuntimeError("a process that holds worlds has died; make the environment again") from error
+        except OSError as error:
+            raise self._lost() from error
+        self._pending = True
 
     def _receive(self) -> Any:
+        """Return the answer to the last call, or raise the error that it is."""
         try:
             fine, value = self._pipe.recv()
-        except (EOFError, ConnectionError) as error:
-            raise RuntimeError(
-                f"a process that holds worlds has died (exit code {self._process.exitcode}); make the environment again"
-            ) from error
+        except (EOFError, OSError) as error:
+            raise self._lost() from error
+        self._pending = False
         if not fine:
             raise value
         return value
+
+    def _lost(self) -> WorkerError:
+        """Return the error of a child that no longer answers."""
+        if self._pipe.closed:
+            return WorkerError("the environment is closed", hint="make it again")
+        self._process.join(timeout=1.0)
+        return WorkerError(
+            f"a process that holds worlds has died (exit code {self._process.exitcode})",
+            hint="make the environment again",
+        )
 
 
 def _serve(pipe: Any, task_class: type[Task], arguments: dict[str, Any]) -> None:
@@ -178,7 +200,10 @@ def _portable(error: Exception) -> Exception:
     """Return an error that can travel to another process."""
     if isinstance(error, SoftmodeError):
         return error
-    return RuntimeError(f"{type(error).__name__} in a process that holds worlds: {error}")
+    return WorkerError(
+        f"{type(error).__name__} in a process that holds worlds: {error}",
+        hint="try processes=1 for the whole traceback",
+    )
 
 
 def _to_numpy(tree: Any) -> Any:
