@@ -13,6 +13,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softmode.deformables.status import status_reasons
+from softmode.envs.objects import ObjectConfig
 from softmode.envs.task import EndReason, ObservationType, Task, TaskConfig
 from softmode.errors import ConfigError
 
@@ -193,7 +194,15 @@ def checked_config(
         scene = replace(scene, control=replace(scene.control, mode=control_mode))  # type: ignore[arg-type]
     if splat is not None or size is not None:
         given = {name: value for name, value in (("splat", splat), ("size", size)) if value is not None}
-        scene = replace(scene, object=replace(scene.object, **given))
+        thing = scene.object
+        if splat is not None and (thing.extents is not None or thing.mesh is not None):
+            thing = ObjectConfig(surface_count=thing.surface_count, build=thing.build)
+        if thing.extents is not None:
+            raise ConfigError(
+                f"size given for a {thing.shape} of {thing.extents} m",
+                hint="set the extents of config.scene.object, or give a splat file too",
+            )
+        scene = replace(scene, object=replace(thing, **given))
     return replace(chosen, scene=scene)
 
 

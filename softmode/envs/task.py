@@ -35,7 +35,10 @@ MATERIAL = ("youngs_modulus", "poissons_ratio", "density", "friction", "scale")
 
 
 class EndReason(IntEnum):
-    """Why an episode ended, ``info["end_reason"]``; what comes after TIME_LIMIT is a failure and terminates."""
+    """Why an episode ended, ``info["end_reason"]``; what comes after TIME_LIMIT is a failure and terminates.
+
+    The limit of a single environment is that of Gymnasium's ``TimeLimit`` around it, which info does not tell.
+    """
 
     RUNNING = 0
     TIME_LIMIT = 1
