@@ -92,7 +92,7 @@ class ShapeSoftConfig(TaskConfig):
         near, far = self.goal_displacement
         if not (0.0 <= near <= far <= 0.6 * thing.extents[2] and far > 0.0):  # type: ignore[index]
             raise ConfigError(
-                f"goal_displacement must satisfy 0 <= low <= high <= 0.6 of the height, high > 0, got {self.goal_displacement}"
+                f"goal_displacement must satisfy 0 <= low <= high, 0 < high <= 0.6 height: {self.goal_displacement}"
             )
         least, most = self.goal_direction
         if not -np.pi <= least <= most <= np.pi:
