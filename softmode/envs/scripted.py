@@ -56,12 +56,13 @@ class ScriptedLift:
     Args:
         env: A LiftSoft environment, wrapped or not.
         squeeze: Force of each finger as a multiple of the least that friction needs to carry the weight.
+        least_force: But at least this force [N]; stiff objects touch the fingers with few samples and turn out of less.
 
     Raises:
         ConfigError: If the environment is another one, or its actions are not tool steps.
     """
 
-    def __init__(self, env: Any, *, squeeze: float = 5.0) -> None:
+    def __init__(self, env: Any, *, squeeze: float = 5.0, least_force: float = 6.0) -> None:
         """Remember the environment and plan nothing yet."""
         base = env.unwrapped
         if not isinstance(getattr(base, "task", None), LiftSoft) or base.config.scene.control.mode != "pose_delta":
@@ -70,7 +71,7 @@ class ScriptedLift:
                 hint="make the environment with control_mode='pose_delta'",
             )
         self._task: LiftSoft = base.task
-        self._grasp = ScriptedGrasp(base, self._way, squeeze=squeeze)
+        self._grasp = ScriptedGrasp(base, self._way, squeeze=squeeze, least_force=least_force)
 
     def reset(self) -> None:
         """Forget the episode; call after ``env.reset``."""

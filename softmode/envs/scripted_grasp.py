@@ -20,6 +20,7 @@ class ScriptedGrasp:
         env: A bare environment of one world in pose_delta mode.
         way: From the centre of the held object [m] to its next move [m], both of shape (3,).
         squeeze: Force of each finger as a multiple of the least that friction needs to carry the weight.
+        least_force: But at least this force [N].
     """
 
     PALM_GAP = 0.004
@@ -34,10 +35,15 @@ class ScriptedGrasp:
     """Control steps after which closing without a grip is given up."""
 
     def __init__(
-        self, env: Any, way: Callable[[NDArray[np.float64]], NDArray[np.float64]], *, squeeze: float = 5.0
+        self,
+        env: Any,
+        way: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+        *,
+        squeeze: float = 5.0,
+        least_force: float = 1.5,
     ) -> None:
         """Remember the environment and plan nothing yet."""
-        self.env, self._way, self._squeeze = env, way, squeeze
+        self.env, self._way, self._squeeze, self._least_force = env, way, squeeze, least_force
         self.reset()
 
     def reset(self) -> None:
@@ -134,7 +140,7 @@ class ScriptedGrasp:
         scene = self.env.config.scene
         weight = scene.material.density * self.env.scene.soft.body.volume * 9.81
         friction = np.sqrt(scene.material.friction * scene.arm.gripper.friction)
-        return max(self._squeeze * 0.5 * weight / friction, 1.5)
+        return max(self._squeeze * 0.5 * weight / friction, self._least_force)
 
     def _regulated(self, force: NDArray[np.floating]) -> float:
         """Close while the weaker finger feels too little, open while it feels too much."""
