@@ -94,6 +94,7 @@ def test_pictures(tmp_path: Path, short: Callable[[int], None], pictures: str):
 def test_append_and_interruption(tmp_path: Path, short: Callable[[int], None], capfd: pytest.CaptureFixture[str]):
     """Interrupted, it says what is there and how to go on; going on adds episodes."""
     short(4)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 
     def interrupt() -> None:
         while not (tmp_path / "d").exists():
@@ -105,6 +106,7 @@ def test_append_and_interruption(tmp_path: Path, short: Callable[[int], None], c
     thread.start()
     assert record(tmp_path / "d", *arguments, "--episodes", "10000") == 130
     thread.join()
+    signal.signal(signal.SIGINT, before)
     count = read_dataset(tmp_path / "d").episode_count
     assert 1 <= count < 10_000
     _, err = capfd.readouterr()
