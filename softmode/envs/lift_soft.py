@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import warp as wp
 
 from softmode.envs import lift_soft_kernels as kernels
 from softmode.envs.markers import sphere_marker
@@ -82,10 +81,6 @@ class LiftSoft(Task):
     term_names = ("reach", "grasp", "lift", "goal", "hold")
     metric_names = ("object_height", "goal_distance")
 
-    def build(self) -> None:
-        """Allocate the count of steps at the goal."""
-        self.held = wp.zeros(self.world_count, dtype=int, device=self.device)
-
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the goal: x, y [m] and how far to rise [m]."""
         config = self.config
@@ -106,10 +101,6 @@ class LiftSoft(Task):
     def goal_segments(self) -> tuple[Segment, ...]:
         """The goal's position [m]."""
         return (Segment("goal", 3, -2.0, 2.0),)
-
-    def clear(self) -> None:
-        """Start counting anew."""
-        self.launch(kernels.clear, [self.scene.world_mask], [self.held])
 
     def observe(self) -> None:
         """Write goal, rise and distance."""

@@ -73,15 +73,3 @@ def evaluate(
     terms[w, 3] = 2.0 * lifted * grasp * (1.0 - wp.tanh(10.0 * distance))
     terms[w, 4] = wp.where(there, 2.0, 0.0)
     success[w] = steps >= hold_steps
-
-
-@wp.kernel
-def clear(
-    world_mask: wp.array[wp.bool],
-    # Out:
-    held: wp.array[int],
-):
-    """Forget how long the object was held."""
-    w = wp.tid()
-    if world_mask[w]:
-        held[w] = 0

@@ -173,8 +173,7 @@ class PlaceInBin(Task):
         return replace(scene, fixtures=(*scene.fixtures, *self.config.bin.fixtures()))
 
     def build(self) -> None:
-        """Allocate the count of steps at rest, and check that everything starts where it has room."""
-        self.held = wp.zeros(self.world_count, dtype=int, device=self.device)
+        """Check that everything starts where it has room."""
         given = self.config.bin
         self.rim = (*given.position, given.height)
         """Centre of the bin's opening [m]."""
@@ -249,10 +248,6 @@ class PlaceInBin(Task):
         super().place()
         for k in range(1, len(self.scene.objects)):
             self.place_object(k, f"other_position_{k}", f"other_yaw_{k}", self.config.bin.floor)
-
-    def clear(self) -> None:
-        """Start counting anew."""
-        self.launch(kernels.clear, [self.scene.world_mask], [self.held])
 
     def observe(self) -> None:
         """Write ways and distances."""

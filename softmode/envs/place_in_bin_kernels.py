@@ -118,15 +118,3 @@ def evaluate(
     for o in range(1, object_position.shape[1]):
         if not (beyond(object_position[w, o], rim, half + wp.vec2(wall, wall)) == 0.0):
             failure[w] = SPILLED
-
-
-@wp.kernel
-def clear(
-    world_mask: wp.array[wp.bool],
-    # Out:
-    held: wp.array[int],
-):
-    """Forget how long the object rested in the bin."""
-    w = wp.tid()
-    if world_mask[w]:
-        held[w] = 0

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import warp as wp
 
 from softmode.deformables.body import BuildOptions
 from softmode.deformables.materials import Material
@@ -126,10 +125,6 @@ class PressSoft(Task):
     term_names = ("reach", "force", "hold", "overshoot")
     metric_names = ("contact_force", "force_error", "indentation", "centre_distance")
 
-    def build(self) -> None:
-        """Allocate the count of steps with the right force."""
-        self.held = wp.zeros(self.world_count, dtype=int, device=self.device)
-
     @property
     def top(self) -> float:
         """Height of the unscaled pad [m]."""
@@ -170,10 +165,6 @@ class PressSoft(Task):
             Segment("contact_force", 1, -200.0, 200.0),
             Segment("missing_force", 1, -200.0, 200.0),
         )
-
-    def clear(self) -> None:
-        """Start counting anew."""
-        self.launch(kernels.clear, [self.scene.world_mask], [self.held])
 
     def observe(self) -> None:
         """Write the forces, the indentation and the distance from the middle."""

@@ -83,15 +83,3 @@ def evaluate(
     terms[w, 2] = wp.where(there, 2.0, 0.0)
     terms[w, 3] = -wp.clamp((force - 1.3 * goal) / goal, 0.0, 1.0)
     success[w] = steps >= hold_steps
-
-
-@wp.kernel
-def clear(
-    world_mask: wp.array[wp.bool],
-    # Out:
-    held: wp.array[int],
-):
-    """Forget how long the force was right."""
-    w = wp.tid()
-    if world_mask[w]:
-        held[w] = 0

@@ -109,7 +109,6 @@ class PushSoft(Task):
 
     def build(self) -> None:
         """Allocate what the reward remembers."""
-        self.held = wp.zeros(self.world_count, dtype=int, device=self.device)
         self.before = wp.zeros(self.world_count, dtype=float, device=self.device)
         body = self.scene.soft.body
         rest = body.surface_points[self.points]
@@ -150,8 +149,9 @@ class PushSoft(Task):
         )
 
     def clear(self) -> None:
-        """Start counting anew."""
-        self.launch(kernels.clear, [self.scene.world_mask], [self.held, self.before])
+        """Forget how long the object rested and where it was."""
+        super().clear()
+        self.launch(kernels.forget_distance, [self.scene.world_mask], [self.before])
 
     def observe(self) -> None:
         """Write goal, ways and errors."""

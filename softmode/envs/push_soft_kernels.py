@@ -120,14 +120,12 @@ def evaluate(
 
 
 @wp.kernel
-def clear(
+def forget_distance(
     world_mask: wp.array[wp.bool],
     # Out:
-    held: wp.array[int],
     before: wp.array[float],
 ):
-    """Forget how long the object rested and where it was."""
+    """Forget where the object was."""
     w = wp.tid()
     if world_mask[w]:
-        held[w] = 0
         before[w] = -1.0

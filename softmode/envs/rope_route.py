@@ -140,7 +140,7 @@ class RopeRoute(Task):
     metric_names = ("goal_distance", "least_winding", "highest_point", "grasp_distance")
 
     def build(self) -> None:
-        """Sample the axis and allocate the count of steps."""
+        """Sample the axis."""
         body, device = self.scene.soft.body, self.device
         low, high = body.bounds
         self.half_length = float(0.5 * (high[0] - low[0]))
@@ -155,7 +155,6 @@ class RopeRoute(Task):
         self.peg_height = min(peg.position[2] + peg.size[1] for peg in self.config.pegs)
         """Height of the lowest peg's top [m]."""
         self._pegs = wp.array([peg.position[:2] for peg in self.config.pegs], dtype=wp.vec2, device=device)
-        self.held = wp.zeros(self.world_count, dtype=int, device=device)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the side of the first peg, and the goal: aside of the last peg, and beyond it [m]."""
@@ -193,10 +192,6 @@ class RopeRoute(Task):
             [scene.world_mask, table.values, *columns, self.half_length, scene.soft.height, GAP],
             [scene.place_position, scene.place_yaw],
         )
-
-    def clear(self) -> None:
-        """Start counting anew."""
-        self.launch(kernels.clear, [self.scene.world_mask], [self.held])
 
     def observe(self) -> None:
         """Trace the axis and write goal, end and winding."""

@@ -164,15 +164,3 @@ def evaluate(
     terms[w, 3] = (1.0 + wp.max(passed, 0.0)) * (1.0 - wp.tanh(5.0 * metrics[w, 0]))
     terms[w, 4] = wp.where(there, 2.0, 0.0)
     success[w] = steps >= hold_steps
-
-
-@wp.kernel
-def clear(
-    world_mask: wp.array[wp.bool],
-    # Out:
-    held: wp.array[int],
-):
-    """Forget how long the rope lay right."""
-    w = wp.tid()
-    if world_mask[w]:
-        held[w] = 0

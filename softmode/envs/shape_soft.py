@@ -126,8 +126,7 @@ class ShapeSoft(Task):
     point_count = POINTS
 
     def build(self) -> None:
-        """Record the targets and allocate the count of steps at the target."""
-        self.held = wp.zeros(self.world_count, dtype=int, device=self.device)
+        """Record the targets."""
         scene, body = self.scene, self.scene.soft.body
         press = record_press(scene, self.config.goal_displacement[1])
         rest = body.surface_points[self.points]
@@ -166,10 +165,6 @@ class ShapeSoft(Task):
         """Return the columns of observation and goals."""
         goals = {name: self.segments[name][0] for name in ("achieved_goal", "desired_goal")}
         return {"observation": slice(self.column("object_position"), self.column("achieved_goal")), **goals}
-
-    def clear(self) -> None:
-        """Start counting anew."""
-        self.launch(kernels.clear, [self.scene.world_mask], [self.held])
 
     def observe(self) -> None:
         """Write both goals and the error."""

@@ -186,15 +186,3 @@ def compute_reward(
     n = wp.tid()
     pair = reward_terms(shape_error(achieved, 0, desired, 0, point_count, n), sparse, length, tolerance)
     reward[n] = pair[0] + pair[1]
-
-
-@wp.kernel
-def clear(
-    world_mask: wp.array[wp.bool],
-    # Out:
-    held: wp.array[int],
-):
-    """Forget how long the target was held."""
-    w = wp.tid()
-    if world_mask[w]:
-        held[w] = 0

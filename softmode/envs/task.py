@@ -274,6 +274,8 @@ class Task:
             return wp.zeros((worlds, *shape), dtype=dtype, device=device)
 
         self.seed, self.episode, self.elapsed, self.end, self.failure = (zeros(dtype=int) for _ in range(5))
+        self.held = zeros(dtype=int)
+        """Control steps in a row in which the goal was met, counted by `evaluate`."""
         self.terminated, self.truncated, self.success, self.done, self.finite = (zeros(dtype=wp.bool) for _ in range(5))
         self.final_success = zeros(dtype=wp.bool)
         self.observation, self.final_observation = zeros(len(self.low)), zeros(len(self.low))
@@ -347,7 +349,8 @@ class Task:
         self.place_object(0, "position", "yaw")
 
     def clear(self) -> None:
-        """Reset counters of the subclass in the worlds of `scene.world_mask`."""
+        """Reset `held`, and counters of the subclass, in the worlds of `scene.world_mask`."""
+        self.launch(kernels.forget_held, [self.scene.world_mask], [self.held])
 
     def observe(self) -> None:
         """Write the goal segments of `observation` and the `metrics`, functions of the state alone."""

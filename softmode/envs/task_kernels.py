@@ -186,6 +186,18 @@ def clear_worlds(
 
 
 @wp.kernel
+def forget_held(
+    world_mask: wp.array[wp.bool],
+    # Out:
+    held: wp.array[int],
+):
+    """Forget for how many steps the goal was met."""
+    w = wp.tid()
+    if world_mask[w]:
+        held[w] = 0
+
+
+@wp.kernel
 def finish_step(
     fresh: wp.array[wp.bool],  # worlds whose step was a reset
     limit: int,  # steps per episode, 0 for none

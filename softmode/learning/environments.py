@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import Any
 
 import gymnasium as gym
 import torch
 
 from softmode import ENVIRONMENTS
+from softmode.envs.catalogue import config_class
 from softmode.errors import ConfigError
 from softmode.learning.config_values import config_of
 
@@ -51,6 +51,4 @@ def with_config(env: str, options: dict[str, Any]) -> dict[str, Any]:
     """
     if env not in ENVIRONMENTS or not isinstance(options.get("config"), dict):
         return options
-    module, _, name = str(gym.spec(env).vector_entry_point).partition(":")
-    cls = getattr(importlib.import_module(module), name)
-    return {**options, "config": config_of(cls.task_class.config_class, options["config"])}
+    return {**options, "config": config_of(config_class(env), options["config"])}
