@@ -191,7 +191,8 @@ def _creased(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> Any:
     a, b, c = vertices[faces].transpose(1, 0, 2)
     area = np.cross(b - a, c - a)
     size = np.linalg.norm(area, axis=1, keepdims=True)
-    unit = area / np.where(size > 0.0, size, 1.0)
+    real = size[:, 0] > 1e-12 * size.max(initial=0.0)  # triangles without area face nowhere and show nothing
+    faces, area, unit = faces[real], area[real], area[real] / size[real]
     _, place = np.unique(vertices, axis=0, return_inverse=True)
     at = place.reshape(-1)[faces.reshape(-1)]
     order = np.argsort(at, kind="stable")
