@@ -71,7 +71,8 @@ class PendingFile:
 
     def discard(self) -> None:
         """Remove what was not published."""
-        self.temporary.unlink(missing_ok=True)
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            self.temporary.unlink()
         for folder in self._made:
             with contextlib.suppress(OSError):
                 folder.rmdir()

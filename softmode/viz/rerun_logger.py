@@ -16,6 +16,7 @@ from softmode.atomic import PendingFile
 from softmode.deformables.energies import SoftEnergies
 from softmode.deformables.sensing import ContactSensor
 from softmode.errors import ConfigError, MissingExtraError, StorageError
+from softmode.splats import Splats
 from softmode.splats.camera import SplatCamera
 from softmode.viz.deformed_splats import DeformedSplats, SplatFrame
 from softmode.viz.rerun_blueprint import make_blueprint
@@ -38,7 +39,7 @@ class RerunOptions:
     """Splats of the soft bodies, with their colours from all around (degree 0)."""
     covariance_tolerance: float = 0.05
     """Scales and orientations of an object's splats are written anew once the covariance of one of them has changed by
-    more than this, relative to itself (Frobenius norm); 0 writes them in every frame. Centres are in every frame."""
+    more than this, relative to itself (Frobenius norm); 0 writes every change. Centres are in every frame."""
     surface: bool = True
     """Surface samples as points; hidden in the saved layout."""
     contacts: bool = True
@@ -53,7 +54,7 @@ class RerunOptions:
     """Distance of the worlds of a recording of several [m]."""
     plane_extent: float = PLANE_EXTENT
     """Edge of the quad that stands for an infinite plane [m]."""
-    eye: tuple[tuple[float, float, float], tuple[float, float, float]] = ((1.25, -0.85, 0.75), (0.3, 0.0, 0.2))
+    eye: tuple[tuple[float, float, float], tuple[float, float, float]] = ((1.0, -0.65, 0.5), (0.36, 0.02, 0.18))
     """Where the saved layout looks from and at [m]."""
 
     def __post_init__(self) -> None:
@@ -73,6 +74,7 @@ class RerunLogger:
 
     Entities, of several worlds each under ``world_3/``: ``scene/bodies`` (meshes of links, their poses per frame),
     ``scene/fixed``, ``scene/soft/NAME`` (splats) and its ``surface``, ``scene/contacts`` (forces on rigid bodies),
+    ``scene/marker`` (the goal),
     ``scene/camera/NAME/rgb`` and ``depth``, ``energy/NAME``, ``reward``, ``success``, ``metrics``, ``action``,
     ``solver``, ``log``. Timelines: ``step`` and ``sim_time``.
 
@@ -106,6 +108,7 @@ class RerunLogger:
         self._prefix = {w: "" if self.worlds == (0,) and count == 1 else f"world_{w}/" for w in self.worlds}
         self._file = None if live else PendingFile(target, "recording")
         self._written: dict[tuple[int, int], NDArray[np.float32]] = {}
+        self._marks: dict[int, NDArray[np.float32]] = {}
         self._lenses: dict[str, NDArray[np.float32]] = {}
         self._cameras: tuple[str, ...] | None = None
         self.frame_count = 0
@@ -269,6 +272,7 @@ class RerunLogger:
                     self._log(f"{prefix}energy/{name}/{kind}", rr.Scalars(float(values[self._starts[w] + o])))
             for path, value in source.scalars(w).items():
                 self._log(f"{prefix}{path}", rr.Scalars(value))
+            self._log_marker(source.marker(w), w)
             for level, text in source.remarks(w):
                 self._log(f"{prefix}log", rr.TextLog(text, level=level))
             for drawn in cameras:
@@ -298,20 +302,28 @@ class RerunLogger:
                 fields["scales"], fields["quaternions"] = self._splats.axes(frame)  # type: ignore[union-attr]
             if self.frame_count == 0:
                 thing: Any = self._objects[o]
-                rgba = np.concatenate([thing.splats.colors(), thing.splats.opacities[:, None]], axis=1)
-                fields["colors"] = np.round(255.0 * np.clip(rgba, 0.0, 1.0)).astype(np.uint8)
-                fields["spherical_harmonics_degree"] = 0
+                fields |= _colors(thing.splats)
             self._log(path, rr.GaussianSplats3D.from_fields(**fields))
         if not self.options.surface:
             return
         positions: Any = moment.state.particle_q
-        points = positions.numpy()
+        points = positions.numpy().copy()  # rerun keeps what it is given, and on CPU this is the state's own memory
         for (w, o), (first, count) in self._samples.items():
             path = f"{self._prefix[w]}scene/soft/{self._soft[o]}/surface"
             fields: dict[str, Any] = {"positions": points[first : first + count]}
             if self.frame_count == 0:
                 fields |= {"radii": [0.0012], "colors": [(250, 190, 60)]}
             self._log(path, rr.Points3D.from_fields(**fields))
+
+    def _log_marker(self, marker: Splats | None, w: int) -> None:
+        """Write the splats that mark the goal, when they change."""
+        if marker is None or (w in self._marks and np.array_equal(self._marks[w], marker.means)):
+            return
+        fields: dict[str, Any] = {"centers": marker.means}
+        if w not in self._marks:
+            fields |= {"scales": marker.scales, "quaternions": marker.quats, **_colors(marker)}
+        self._marks[w] = marker.means
+        self._log(f"{self._prefix[w]}scene/marker", self._rr.GaussianSplats3D.from_fields(**fields))
 
     def _changed(self, key: tuple[int, int], frame: SplatFrame) -> bool:
         """Return whether scales and orientations of an object are to be written, and note that they are."""
@@ -361,10 +373,10 @@ class RerunLogger:
                     rr.Pinhole(
                         image_from_camera=[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]],
                         resolution=(camera.width, camera.height),
-                        image_plane_distance=0.12,
+                        image_plane_distance=0.07,
                     ),
                 )
-            pixels = camera.images(view.name).numpy()[w]
+            pixels = camera.images(view.name).numpy()[w].copy()
             self._log(f"{path}/rgb", self._encoded(pixels))
             self._log(f"{path}/depth", self._encoded_depth(camera.images(view.name, "depth").numpy()[w]))
 
@@ -389,6 +401,12 @@ class RerunLogger:
     def _log(self, path: str, what: Any, *, static: bool = False) -> None:
         """Write one thing."""
         self._stream.log(path, what, static=static)
+
+
+def _colors(splats: Splats) -> dict[str, Any]:
+    """Return the fields of colour and opacity; higher degrees would have to turn with every splat."""
+    rgba = np.concatenate([splats.colors(), splats.opacities[:, None]], axis=1)
+    return {"colors": np.round(255.0 * np.clip(rgba, 0.0, 1.0)).astype(np.uint8), "spherical_harmonics_degree": 0}
 
 
 def check_target(target: str | Path) -> bool:

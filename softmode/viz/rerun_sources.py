@@ -15,6 +15,7 @@ from softmode.envs.soft_env import info_arrays
 from softmode.envs.splat_scene import SplatScene
 from softmode.envs.task import EndReason, Task
 from softmode.errors import ConfigError
+from softmode.splats import Splats
 from softmode.splats.camera import SplatCamera
 
 
@@ -64,6 +65,10 @@ class Source(Protocol):
         """Return the cameras, with pictures of the present moment."""
         ...
 
+    def marker(self, world: int) -> Splats | None:
+        """Return the splats that mark a goal."""
+        ...
+
     def scalars(self, world: int) -> Mapping[str, float | Sequence[float]]:
         """Return numbers by path."""
         ...
@@ -94,6 +99,9 @@ class SceneSource:
         """Return the cameras as they are."""
         return self._cameras
 
+    def marker(self, world: int) -> Splats | None:
+        """Return nothing."""
+
     def scalars(self, world: int) -> Mapping[str, float | Sequence[float]]:
         """Return the solver's iterations and status."""
         return solver_scalars(self.solver, world)
@@ -112,6 +120,7 @@ class TaskSource:
         self.name, self.model, self.solver = name, scene.model, scene.solver
         self.objects: Sequence[SoftObject | None] = scene.objects
         self.task, self._world, self._step, self._elapsed = task, world, -1, 0
+        self._drawn = False
 
     def moment(self, state: Any, time: float | None) -> Moment:
         """Return the present state of the task's scene."""
@@ -126,7 +135,16 @@ class TaskSource:
     def cameras(self) -> Sequence[SplatCamera]:
         """Draw and return the cameras."""
         scene = self.task.scene
+        self._drawn = bool(scene.cameras)
         return [scene.render(size) for size in scene.cameras]
+
+    def marker(self, world: int) -> Splats | None:
+        """Return the task's marker where the last picture has it."""
+        scene = self.task.scene
+        if not self._drawn or scene.marker is None:
+            return None
+        means: Any = scene.splat_arrays.means
+        return replace(scene.marker, means=means.numpy()[world, -scene.marker.count :].copy())
 
     def scalars(self, world: int) -> Mapping[str, float | Sequence[float]]:
         """Return reward, its terms, metrics, action, success and solver's figures; no reward before the first step."""
