@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import sys
 import time
@@ -34,6 +35,9 @@ class Play:
     """Seed of the first episode; the next ones count up."""
     video: Path | None = None
     """Film to write (.mp4): the camera's view beside an overview. A contact sheet (.png) is written beside it."""
+    rerun: str | None = None
+    """Recording to write for the rerun viewer (.rrd); or the address of a running one, like
+    rerun+http://127.0.0.1:9876/proxy; or spawn, which opens one."""
     splat: Path | None = None
     """Splat file of the object (INRIA .ply, or a SOG v2 folder, meta.json or .sog); the built-in plush if omitted."""
     size: float | None = None
@@ -144,6 +148,10 @@ def play(options: Play) -> int:
         raise MaterialError(
             f"youngs-modulus must be a finite number > 0, got {options.youngs_modulus}", hint="give it in Pa, like 2e5"
         )
+    if options.rerun is not None:
+        from softmode.viz.rerun_logger import check_target
+
+        check_target(options.rerun)
     film = None
     try:
         if options.video is not None:
@@ -168,7 +176,7 @@ def _play(options: Play, film: Film | None) -> int:
         with _BuildBar() as progress:
             env = gym.make(
                 options.env,
-                render_mode="rgb_array" if film else None,
+                render_mode="rgb_array" if film or options.rerun else None,
                 config=_task_config(options, given.pop("config", {})),
                 **given,
                 device=warp_device(options.device),
@@ -185,19 +193,31 @@ def _play(options: Play, film: Film | None) -> int:
             fps = env.metadata["render_fps"]
             policy = policy_factory(options.policy, env, trained)
             seeds = range(options.seed, options.seed + options.episodes)
-            successes = sum(_play_episode(env, options, policy, seed, film, fps) for seed in seeds)
+            with _rerun_logger(options.rerun, env) as log:
+                successes = sum(_play_episode(env, options, policy, seed, film, log, fps) for seed in seeds)
         finally:
             env.close()
     if film:
         film.publish()
         print(f"wrote {film.path} and {film.sheet_path}")
+    if options.rerun and options.rerun.endswith(".rrd"):
+        print(f"wrote {options.rerun}; open it with: rerun {options.rerun}")
     if options.episodes > 1:
         print(f"{successes} of {options.episodes} episodes succeeded")
     return 0
 
 
+def _rerun_logger(target: str | None, env: Any) -> contextlib.AbstractContextManager[Any]:
+    """Return the logger, or a context of None."""
+    if target is None:
+        return contextlib.nullcontext()
+    from softmode.viz.rerun_logger import RerunLogger
+
+    return RerunLogger(target, env)
+
+
 def _play_episode(
-    env: Any, options: Play, factory: Callable[[int], Any], seed: int, film: Film | None, fps: int
+    env: Any, options: Play, factory: Callable[[int], Any], seed: int, film: Film | None, log: Any, fps: int
 ) -> bool:
     """Play one episode, print its outcome, return whether it succeeded."""
     import gymnasium as gym
@@ -206,6 +226,8 @@ def _play_episode(
     given = {} if options.youngs_modulus is None else {"youngs_modulus": options.youngs_modulus}
     observation, info = env.reset(seed=seed, options=given)
     policy = factory(seed)
+    if log:
+        log.record()
     total, steps, seconds = 0.0, 0, 0.0
     limit = gym.spec(options.env).max_episode_steps
     with tqdm(total=limit, desc=f"seed {seed}", unit="step", mininterval=bar_interval()) as bar:
@@ -218,6 +240,8 @@ def _play_episode(
             total, steps, done = total + float(reward), steps + 1, terminated or truncated
             if film:
                 film.add(env.render(), fps)
+            if log:
+                log.record()
             bar.update()
     modulus = info["parameters"]["youngs_modulus"]
     print(
