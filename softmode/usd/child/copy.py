@@ -145,6 +145,10 @@ def _convert(stage: Any, meters: float, kilograms: float) -> None:
         prismatic = prim.GetTypeName() == "PhysicsPrismaticJoint"
         for attribute in prim.GetAuthoredAttributes():
             _convert_attribute(attribute, prismatic, meters, kilograms)
+        for side in ("0", "1"):  # the frame of a joint on a body scales with that; on the world nothing does it
+            body, frame = prim.GetRelationship(f"physics:body{side}"), prim.GetAttribute(f"physics:localPos{side}")
+            if frame and frame.HasAuthoredValue() and not (body and body.GetTargets()):
+                frame.Set(frame.Get() * meters)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
 
