@@ -246,7 +246,7 @@ def build_deformable(
     """Build the body of a deformable, or recall it from the cache.
 
     A closed Mesh, and the boundary of a TetMesh, are integrated as they are; a mesh that is not closed stands for what
-    it encloses; Points are taken for the outer layers of a solid and stand out by their radius; splats are filled.
+    it encloses; Points with widths fill a body, those without lie on its surface; splats are filled.
 
     Args:
         deformable: From `read_usd_scene`.
@@ -267,7 +267,7 @@ def build_deformable(
     if deformable.surface is not None:
         shape = (deformable.surface.vertices, deformable.surface.faces)
     elif deformable.kind == "Points":
-        shape = (deformable.points, deformable.point_radius)
+        shape = (deformable.points, deformable.point_radii)
     elif splats is not None:
         shape = (splats.means, splats.scales, splats.quats, splats.opacities)
     else:
@@ -296,7 +296,15 @@ def _integrate(deformable: UsdDeformable, surface_count: int) -> Quadrature:
         return quadrature_from_splats(
             splats.means, splats.scales, splats.quats, splats.opacities, surface_count=surface_count
         )
-    return quadrature_from_points(deformable.points, radius=deformable.point_radius, surface_count=surface_count)
+    points, radii = deformable.points, deformable.point_radii
+    if not radii.any():
+        return quadrature_from_points(points, surface_count=surface_count)
+    # Particles that fill a body: round splats as wide as their radius. Half opaque at 1.18 of it, they close the gaps
+    # between particles that touch, and the volume of a lattice of them comes out to 2 %.
+    quats = np.tile([0.0, 0.0, 0.0, 1.0], (len(points), 1))
+    return quadrature_from_splats(
+        points, np.tile(radii[:, None], (1, 3)), quats, np.ones(len(points)), surface_count=surface_count
+    )
 
 
 def _mesh_splats(deformable: UsdDeformable, count: int) -> Splats | None:

@@ -19,6 +19,7 @@ from softmode.usd.geometry import SurfaceMesh, mesh_surface, split_transform, te
 
 Kind = Literal["Mesh", "TetMesh", "Points", "ParticleField3DGaussianSplat"]
 Array = NDArray[np.float64]
+_WIDTHS = "Give one width, or one for each point"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,8 +34,8 @@ class UsdDeformable:
     """Surface of a Mesh or TetMesh, asset frame [m]."""
     points: Array = field(default_factory=lambda: np.zeros((0, 3)))
     """Positions of Points, asset frame [m], shape (N, 3)."""
-    point_radius: float = 0.0
-    """Radius of Points [m]: half the median width."""
+    point_radii: Array = field(default_factory=lambda: np.zeros(0))
+    """Radii of Points [m], half their widths, shape (N,); zero where the stage gives none."""
     splats: Splats | None = None
     """Its picture, asset frame [m]; None where the stage has none."""
     meshes: tuple[SurfaceMesh, ...] = ()
@@ -233,7 +234,7 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame,
     shape = body["shape"]
     notes = list(body["notes"])
     kind = body["kind"]
-    surface, points, radius = None, np.zeros((0, 3)), 0.0
+    surface, points, radii = None, np.zeros((0, 3)), np.zeros(0)
     if kind == "Mesh":
         surface = mesh_surface(_parts(shape, arrays, frame), stretch, where)
         if body["surface"]:
@@ -243,8 +244,13 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame,
     elif kind == "Points":
         parts = _parts(shape, arrays, frame)
         points = parts["points"] @ stretch.T
-        if "widths" in parts:
-            radius = 0.5 * float(np.median(parts["widths"])) * abs(float(np.linalg.det(stretch))) ** (1.0 / 3.0)
+        if not np.isfinite(points).all():
+            raise AssetError(f"{where}: its points are NaN or infinite", hint="Export it again")
+        widths = np.asarray(parts.get("widths", 0.0), dtype=np.float64)
+        if not (widths.size in (1, len(points)) and np.isfinite(widths).all() and (widths >= 0.0).all()):
+            raise AssetError(f"{where}: {widths.size} widths for {len(points)} points, or negative ones", hint=_WIDTHS)
+        size = abs(float(np.linalg.det(stretch))) ** (1.0 / 3.0)
+        radii = np.broadcast_to(0.5 * size * widths.reshape(-1), (len(points),)).copy()
     pictures = []
     for prim in body["splats"]:
         part = splats_from_prim(prim, arrays, f"{name}: {prim['path']}")
@@ -269,7 +275,7 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame,
         kind=kind,
         surface=surface,
         points=points,
-        point_radius=radius,
+        point_radii=radii,
         splats=joined(pictures, f"{name}: {body['path']}") if pictures else None,
         meshes=tuple(meshes),
         rotation=rotation,
