@@ -80,7 +80,7 @@ def mesh_surface(parts: dict[str, Any], linear: Array, where: str, offset: Array
     Raises:
         AssetError: If it has no faces, indices point nowhere, or positions are not finite.
     """
-    points = _finite_points(parts, where)
+    points = finite_points(parts, where)
     counts, indices = (np.asarray(parts.get(name, ()), dtype=np.int64) for name in ("counts", "indices"))
     if not len(counts) or counts.min() < 0 or counts.sum() != len(indices):
         raise AssetError(
@@ -111,7 +111,7 @@ def tet_surface(parts: dict[str, Any], linear: Array, where: str) -> SurfaceMesh
     Raises:
         AssetError: If it has no tetrahedra, indices point nowhere, or positions are not finite.
     """
-    points = _finite_points(parts, where) @ linear.T
+    points = finite_points(parts, where) @ linear.T
     tets = np.asarray(parts.get("tets", np.zeros((0, 4))), dtype=np.int64).reshape(-1, 4)
     if not len(tets) or tets.min() < 0 or tets.max() >= len(points):
         raise AssetError(f"{where}: tetVertexIndices do not fit {len(points)} points", hint="Export the mesh again")
@@ -127,8 +127,8 @@ def tet_surface(parts: dict[str, Any], linear: Array, where: str) -> SurfaceMesh
     return SurfaceMesh(points[kept], renumbered.reshape(-1, 3).astype(np.int64), colors[kept])
 
 
-def _finite_points(parts: dict[str, Any], where: str) -> Array:
-    """Return the positions, all finite."""
+def finite_points(parts: dict[str, Any], where: str) -> Array:
+    """Return the positions (V, 3) of a geometry, all finite; raise AssetError otherwise."""
     points = parts["points"]
     if not len(points):
         raise AssetError(f"{where}: has no points", hint="Export it with its points")

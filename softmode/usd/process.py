@@ -151,7 +151,7 @@ def refusal(code: int, report: str, name: str) -> AssetError:
     reason, hint = "OpenUSD exceeds its memory or time, or crashes, with it", REEXPORT
     if code == 3:  # an error of OpenUSD: where in its sources : 'what'
         said = json.loads(report.rpartition("\nanswer: ")[2])
-        reason = (re.findall(r" : '(.+?)'(?: Error in|$)", said["reason"]) or [said["reason"]])[0].strip()
+        reason = (re.findall(r" : '(.+?)(?:' Error in|'?$)", said["reason"]) or [said["reason"]])[0].strip()
         hint = said["hint"] or hint
         if said["hint"]:
             return AssetError(f"{name}: {reason[:400]}", hint=hint)

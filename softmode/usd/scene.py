@@ -15,7 +15,7 @@ from softmode.errors import AssetError, MaterialError
 from softmode.splats.formats.usd import UP_AXES, joined, placed, splats_from_prim
 from softmode.splats.splats import MAX_SPLATS, Splats, up_rotation
 from softmode.usd import process, tokens
-from softmode.usd.geometry import SurfaceMesh, mesh_surface, split_transform, tet_surface
+from softmode.usd.geometry import SurfaceMesh, finite_points, mesh_surface, split_transform, tet_surface
 
 Kind = Literal["Mesh", "TetMesh", "Points", "ParticleField3DGaussianSplat"]
 Array = NDArray[np.float64]
@@ -212,7 +212,8 @@ class _Frame:
 
     def points(self, points: NDArray[Any]) -> Array:
         """Return positions in metres with Z up, shape (N, 3)."""
-        return (self.meters * points.astype(np.float64)) @ self.up.T
+        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is refused where it is used, by name
+            return (self.meters * points.astype(np.float64)) @ self.up.T
 
 
 def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame, name: str) -> UsdDeformable:
@@ -243,9 +244,7 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame,
         surface = tet_surface(_parts(shape, arrays, frame), stretch, where)
     elif kind == "Points":
         parts = _parts(shape, arrays, frame)
-        points = parts["points"] @ stretch.T
-        if not np.isfinite(points).all():
-            raise AssetError(f"{where}: its points are NaN or infinite", hint="Export it again")
+        points = finite_points(parts, where) @ stretch.T
         widths = np.asarray(parts.get("widths", 0.0), dtype=np.float64)
         if not (widths.size in (1, len(points)) and np.isfinite(widths).all() and (widths >= 0.0).all()):
             raise AssetError(f"{where}: {widths.size} widths for {len(points)} points, or negative ones", hint=_WIDTHS)

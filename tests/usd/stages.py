@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from softmode.splats.splats import Splats, up_rotation
 
-Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdVol, Vt = (
+Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils, UsdVol, Vt = (
     importlib.import_module(f"pxr.{name}")
-    for name in ("Gf", "Sdf", "Usd", "UsdGeom", "UsdPhysics", "UsdShade", "UsdVol", "Vt")
+    for name in ("Gf", "Sdf", "Usd", "UsdGeom", "UsdPhysics", "UsdShade", "UsdUtils", "UsdVol", "Vt")
 )
 
 KINDS = ("Mesh", "TetMesh", "Points", "ParticleField3DGaussianSplat")

@@ -58,10 +58,11 @@ def answer(request: dict[str, Any]) -> int:
             for array in arrays.values:
                 out.write(memoryview(array).cast("B"))
     except Exception as error:  # every failure of OpenUSD is an answer about the file
-        reason = {
-            "reason": " ".join(str(error).split())[:600] or type(error).__name__,
-            "hint": getattr(error, "hint", ""),
-        }
+        try:
+            said = " ".join(str(error).split())
+        except UnicodeDecodeError:  # OpenUSD quotes what it read
+            said = ""
+        reason = {"reason": said[:600] or type(error).__name__, "hint": getattr(error, "hint", "")}
         sys.stderr.write(f"\nanswer: {json.dumps(reason)}\n")
         sys.stderr.flush()
         return 3
