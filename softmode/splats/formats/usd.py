@@ -10,13 +10,9 @@ Reference:
 
 from __future__ import annotations
 
-import importlib.util
-import json
+import importlib
 import os
-import re
 import shutil
-import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,21 +24,14 @@ from numpy.typing import NDArray
 from softmode.errors import AssetError, ConfigError, MissingExtraError
 from softmode.splats.formats.common import REEXPORT, atomic_splat_file, typed_errors
 from softmode.splats.splats import MAX_SPLATS, Splats, UpAxis, rotate_sh, up_rotation
+from softmode.usd import process
 
-_CHILD = Path(__file__).with_name("usd_child.py")
-_DTYPES = {"f": np.dtype("<f4"), "e": np.dtype("<f2"), "d": np.dtype("<f8")}
+_LIMITS = process.Limits(memory=128 * 2.0**20, memory_per_byte=16.0, seconds=1.0)
+"""Splats alone need little: 16 bytes for each of the file is generous."""
 _SH = "radiance:sphericalHarmonicsCoefficients"
 _WIDTHS = {"positions": 3, "orientations": 4, "scales": 3, "opacities": 1, _SH: 3}
-_UP: dict[str, UpAxis] = {"X": "+x", "Y": "+y", "Z": "+z"}
+UP_AXES: dict[str, UpAxis] = {"X": "+x", "Y": "+y", "Z": "+z"}
 _MIRROR = np.diag([-1.0, 1.0, 1.0])
-
-
-def _pxr_folder() -> str:
-    """Return the folder that holds `pxr` without importing it."""
-    spec = importlib.util.find_spec("pxr")
-    if spec is None or not spec.submodule_search_locations:
-        raise MissingExtraError("OpenUSD splats need usd-core", hint="install it with: pip install 'softmode[usd]'")
-    return str(Path(next(iter(spec.submodule_search_locations))).parent)
 
 
 def read_usd(path: str | os.PathLike[str], *, time_code: float | None = None) -> Splats:
@@ -50,7 +39,7 @@ def read_usd(path: str | os.PathLike[str], *, time_code: float | None = None) ->
 
     Transforms, shear and mirroring included, the stage's up axis and its unit are applied: the result is in metres with
     z up. Prims of lower degree get zero coefficients above it. The file is opened in a process of its own with limited
-    memory and time, since OpenUSD itself does not withstand damaged files.
+    memory and time, since OpenUSD itself does not withstand damaged files; what it refers to must lie in its folder.
 
     Args:
         path: A `.usd`, `.usda`, `.usdc` or `.usdz` file.
@@ -67,25 +56,11 @@ def read_usd(path: str | os.PathLike[str], *, time_code: float | None = None) ->
 
 def _read_stage(file: Path, time_code: float | None) -> Splats:
     """Open the stage in a process of its own and join what that sends back."""
-    folder = _pxr_folder()
-    size = file.stat().st_size
-    command = [sys.executable, "-I", str(_CHILD), folder, str(file.absolute())]
-    command += ["" if time_code is None else repr(float(time_code)), str(MAX_SPLATS)]
-    try:
-        child = subprocess.run(command, capture_output=True, timeout=120.0 + size / 1e6, check=False)
-    except subprocess.TimeoutExpired as error:
-        raise AssetError(f"splat file {file}: OpenUSD does not come to an end with it", hint=REEXPORT) from error
-    if child.returncode:
-        reason = "OpenUSD exceeds its memory or time with it"
-        if child.returncode == 3:  # an error of OpenUSD: where in its sources : 'what'
-            report = child.stderr.decode("utf-8", "replace").rpartition("\nreason: ")[2]
-            reason = (re.findall(r" : '(.+?)'(?: Error in|$)", report) or [report])[0].strip()
-        elif child.returncode == 1:  # an error of Python, before OpenUSD saw the file
-            reason = (child.stderr.decode("utf-8", "replace").strip().splitlines() or ["no message"])[-1]
-        raise AssetError(f"splat file {file}: cannot be read ({reason[:300]})", hint=REEXPORT)
-    body = memoryview(child.stdout)
-    end = child.stdout.index(b"\n")
-    stage, body = json.loads(body[:end].tobytes()), body[end + 1 :]
+    with tempfile.TemporaryDirectory() as folder:
+        request = process.make_request("splats", file, f"{folder}/answer", asset_root=None, limits=_LIMITS)
+        request |= {"time": None if time_code is None else float(time_code), "most": MAX_SPLATS}
+        answer = process.ask(request, name=f"splat file {file}")
+    stage = answer.described
     if not stage["prims"]:
         raise AssetError(
             f"splat file {file}: holds no visible ParticleField3DGaussianSplat prim",
@@ -93,34 +68,32 @@ def _read_stage(file: Path, time_code: float | None) -> Splats:
         )
     parts: list[Splats] = []
     for prim in stage["prims"]:
-        name = f"splat file {file}: {prim['path']}"
-        arrays, body = _take_arrays(prim["arrays"], body, name)
-        parts.append(_placed(_from_arrays(prim, arrays, name), np.array(prim["matrix"]).reshape(4, 4).T))
-    if stage["up"] not in _UP:
+        splats = splats_from_prim(prim, answer.arrays, f"splat file {file}: {prim['path']}")
+        parts.append(placed(splats, np.array(prim["matrix"]).reshape(4, 4).T))
+    if stage["up"] not in UP_AXES:
         raise AssetError(f"splat file {file}: upAxis is {stage['up'][:20]!r}", hint="Set it to X, Y or Z")
-    up = up_rotation(_UP[stage["up"]])
+    up = up_rotation(UP_AXES[stage["up"]])
     meters = float(stage["meters"])
     if not (np.isfinite(meters) and meters > 0.0):
         raise AssetError(f"splat file {file}: metersPerUnit is {meters}", hint="Set it to the length of the unit in m")
-    return _joined(parts, f"splat file {file}").transformed(rotation=up, scale=meters)
+    return joined(parts, f"splat file {file}").transformed(rotation=up, scale=meters)
 
 
-def _take_arrays(
-    described: dict[str, Any], body: memoryview, name: str
-) -> tuple[dict[str, NDArray[np.float32]], memoryview]:
-    """Return the arrays of one prim, each of shape (rows, width), and the bytes behind them."""
+def splats_from_prim(prim: dict[str, Any], sent: list[NDArray[Any]], name: str) -> Splats:
+    """Build the splats of one prim in its own frame from what the process of its own sent.
+
+    Raises:
+        AssetError: If arrays are missing, contradict each other, or the radiance is linear.
+    """
     arrays: dict[str, NDArray[np.float32]] = {}
-    for key, (kind, shape) in described.items():
-        dtype, width = _DTYPES.get(kind), _WIDTHS[key]
-        rows = int(shape[0])
-        if dtype is None or list(shape[1:]) not in ([], [width]):
-            raise AssetError(f"{name}: {key} is of type {kind!r} and shape {shape}", hint=REEXPORT)
-        count = int(np.prod(shape))
-        arrays[key] = np.frombuffer(body, dtype=dtype, count=count).astype(np.float32).reshape(rows, -1)
-        body = body[count * dtype.itemsize :]
+    for key, number in prim["splats"].items():
+        value, width = sent[number], _WIDTHS[key]
+        if value.dtype.kind != "f" or list(value.shape[1:]) not in ([], [width]):
+            raise AssetError(f"{name}: {key} is of type {value.dtype} and shape {value.shape}", hint=REEXPORT)
+        arrays[key] = value.astype(np.float32).reshape(len(value), -1)
         if arrays[key].shape[1] != width:
             raise AssetError(f"{name}: {key} has rows of {arrays[key].shape[1]} numbers, not {width}", hint=REEXPORT)
-    return arrays, body
+    return _from_arrays(prim, arrays, name)
 
 
 def _from_arrays(prim: dict[str, Any], arrays: dict[str, NDArray[np.float32]], name: str) -> Splats:
@@ -154,7 +127,7 @@ def _from_arrays(prim: dict[str, Any], arrays: dict[str, NDArray[np.float32]], n
     )
 
 
-def _placed(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
+def placed(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
     """Return the splats under the affine map of a prim (column vectors, shape (4, 4))."""
     linear, offset = matrix[:3, :3], matrix[:3, 3]
     determinant = np.linalg.det(linear)
@@ -176,7 +149,7 @@ def _placed(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
     return splats.deformed(splats.means.astype(np.float64) @ linear.T + offset, linear)
 
 
-def _joined(parts: list[Splats], name: str) -> Splats:
+def joined(parts: list[Splats], name: str) -> Splats:
     """Return several sets of splats as one of the highest degree among them."""
     if len(parts) == 1:
         return parts[0]
@@ -220,7 +193,7 @@ def write_usd(path: str | os.PathLike[str], splats: Splats | Sequence[Splats], *
     suffix = Path(path).suffix.lower()
     if suffix not in (".usd", ".usda", ".usdc"):
         raise AssetError(f"splat file {path}: cannot write {suffix!r}", hint="Name a .usdc, .usda or .usd file")
-    _pxr_folder()
+    process.pxr_folder()
     with atomic_splat_file(path) as file, tempfile.TemporaryDirectory() as folder:
         scratch = os.path.join(folder, "splats" + suffix)
         if not _build_layer(frames, fps).Export(scratch):

@@ -1,0 +1,165 @@
+"""Which prims of a stage are deformable bodies, and which prims belong to each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from .. import tokens
+from .limits import Refused
+
+_GEOMETRY = (tokens.TET_MESH, tokens.MESH, tokens.POINTS, tokens.SPLATS)
+_FOREIGN = ("PhysicsRigidBodyAPI", "PhysicsArticulationRootAPI")
+_BETWEEN = (
+    "PhysicsAttachment",
+    "PhysicsElementCollisionFilter",
+    "OmniPhysicsVtxXformAttachment",
+    "PhysxPhysicsAttachment",
+)
+
+
+@dataclass
+class Body:
+    """A deformable body of a stage."""
+
+    prim: Any
+    """What carries the body's schema."""
+    geometry: Any
+    """Its simulation geometry; of one that is only splats the first of them."""
+    splats: list[Any] = field(default_factory=list)
+    """Its visible splat prims."""
+    meshes: list[Any] = field(default_factory=list)
+    """Its other visible meshes."""
+    notes: list[str] = field(default_factory=list)
+    """What was read in another way than it was meant."""
+
+
+def applied(prim: Any) -> list[str]:
+    """Return the applied schemas, those that are not registered included."""
+    return list(prim.GetPrimTypeInfo().GetAppliedAPISchemas())
+
+
+def _is_body(prim: Any) -> bool:
+    """Return whether a prim is an enabled deformable body."""
+    if not any(name in tokens.BODY_APIS for name in applied(prim)):
+        return False
+    for namespace in ("physics:bodyEnabled", "omniphysics:deformableBodyEnabled", "omniphysics:bodyEnabled"):
+        attribute = prim.GetAttribute(namespace)
+        if attribute and attribute.Get() is False:
+            return False
+    return True
+
+
+def uninstance(stage: Any) -> None:
+    """Make the instances that hold deformables ordinary prims, in the session: their parts must be told apart."""
+    from .answer import prims_of
+
+    for _ in range(64):
+        found = set()
+        for prim in prims_of(stage):
+            if prim.IsInstanceProxy() and (_is_body(prim) or any(a in tokens.SIM_APIS for a in applied(prim))):
+                owner = prim
+                while owner.IsInstanceProxy():
+                    owner = owner.GetParent()
+                found.add(str(owner.GetPath()))
+        if not found:
+            return
+        stage.SetEditTarget(stage.GetSessionLayer())
+        for path in found:
+            stage.GetPrimAtPath(path).SetInstanceable(False)
+    raise Refused("nests instances of deformables too deeply", "Flatten the stage")
+
+
+def find_bodies(prims: list[Any]) -> tuple[list[Body], list[tuple[str, str]]]:
+    """Return the deformable bodies, and the path and type of what ties them to others, which is not read.
+
+    Args:
+        prims: All prims, parents first.
+    """
+    roots = [prim for prim in prims if _is_body(prim)]
+    paths = {prim.GetPath() for prim in roots}
+    disabled = [
+        prim.GetPath()
+        for prim in prims
+        if prim.GetPath() not in paths and any(a in tokens.BODY_APIS for a in applied(prim))
+    ]
+    for prim in prims:  # a simulation geometry that no body governs stands for itself
+        path = prim.GetPath()
+        if any(a in tokens.SIM_APIS for a in applied(prim)) and not any(path.HasPrefix(p) for p in (*paths, *disabled)):
+            roots.append(prim)
+            paths.add(path)
+    bodies = [_body(root, paths) for root in roots]
+    by_path = {body.prim.GetPath(): body for body in bodies}
+    for prim in prims:  # pictures that lie elsewhere say whose they are
+        if prim.GetTypeName() == tokens.SPLATS and prim.GetRelationship(tokens.SPLAT_BODY):
+            for target in prim.GetRelationship(tokens.SPLAT_BODY).GetTargets():
+                body = by_path.get(target)
+                if body is not None and prim.GetPath() not in {p.GetPath() for p in body.splats} and _visible(prim):
+                    body.splats.append(prim)
+    between = [(str(p.GetPath()), str(p.GetTypeName())) for p in prims if p.GetTypeName() in _BETWEEN]
+    return bodies, between
+
+
+def _body(root: Any, roots: set[Any]) -> Body:
+    """Return what belongs to a body: the geometries beneath it up to other bodies, rigid or soft."""
+    owned: list[Any] = []
+    _collect(root, root, roots, owned)
+    of_type = {kind: [p for p in owned if p.GetTypeName() == kind] for kind in _GEOMETRY}
+    marked = [p for p in owned if any(a in tokens.SIM_APIS for a in applied(p))]
+    cooked = root.GetRelationship(tokens.COOKING_SOURCE)
+    targets = [root.GetStage().GetPrimAtPath(t) for t in cooked.GetTargets()] if cooked else []
+    candidates = marked or [p for p in targets if p] or ([root] if root.GetTypeName() in _GEOMETRY else [])
+    if not candidates:
+        candidates = next((of_type[kind] for kind in _GEOMETRY if of_type[kind]), [])
+        if candidates and candidates[0].GetTypeName() == tokens.SPLATS:
+            candidates = candidates[:1]
+    where = f"{root.GetPath()}:"
+    if not candidates:
+        raise Refused(f"{where} a deformable body without geometry", f"Give it a child of type {', '.join(_GEOMETRY)}")
+    if len(candidates) > 1:
+        names = ", ".join(str(p.GetPath()) for p in candidates[:4])
+        raise Refused(
+            f"{where} a deformable body with {len(candidates)} simulation geometries ({names})",
+            f"Apply {tokens.VOLUME_SIM_API} to one of them",
+        )
+    geometry = candidates[0]
+    if geometry.GetTypeName() not in _GEOMETRY:
+        raise Refused(
+            f"{geometry.GetPath()}: a deformable of type {geometry.GetTypeName() or 'none'}",
+            f"Make its simulation geometry a {', '.join(_GEOMETRY)}",
+        )
+    body = Body(root, geometry)
+    body.splats = [p for p in of_type[tokens.SPLATS] if _visible(p) or p == geometry]
+    body.meshes = [p for p in of_type[tokens.MESH] if p != geometry and _visible(p)]
+    for namespace in ("physics", "omniphysics"):
+        kinematic = root.GetAttribute(f"{namespace}:kinematicEnabled")
+        if kinematic and kinematic.Get() is True:
+            body.notes.append("is kinematic in the stage; softmode simulates it")
+        rest = geometry.GetAttribute(f"{namespace}:restShapePoints")
+        if rest and rest.HasAuthoredValue():
+            body.notes.append("starts undeformed, in its rest shape")
+    return body
+
+
+def _collect(prim: Any, root: Any, roots: set[Any], owned: list[Any]) -> None:
+    """Gather a prim and what lies beneath it, up to other bodies."""
+    if prim != root and (prim.GetPath() in roots or any(name in _FOREIGN for name in applied(prim))):
+        return
+    owned.append(prim)
+    for child in prim.GetFilteredChildren(_everything()):
+        _collect(child, root, roots, owned)
+
+
+def _everything() -> Any:
+    """Return the predicate of all prims that count, instances entered."""
+    import importlib
+
+    return importlib.import_module("pxr.Usd").TraverseInstanceProxies()
+
+
+def _visible(prim: Any) -> bool:
+    """Return whether a prim is visible."""
+    import importlib
+
+    UsdGeom = importlib.import_module("pxr.UsdGeom")
+    return UsdGeom.Imageable(prim).ComputeVisibility() != UsdGeom.Tokens.invisible

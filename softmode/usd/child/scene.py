@@ -1,0 +1,163 @@
+"""Read everything about deformables of a stage, and write what is left of it as one crate for Newton's importer."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from .. import tokens
+from .answer import prims_of
+from .deformables import applied, find_bodies, uninstance
+from .limits import Refused
+from .splats import flat, read_prim
+
+
+def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
+    """Return what the stage says and each of its deformables.
+
+    Args:
+        stage: The stage.
+        request: `most`, the largest number of splats, and `copy`: where the rest of the stage goes, None for nowhere.
+        arrays: Takes the arrays.
+    """
+    Usd, UsdGeom, UsdPhysics = (importlib.import_module(f"pxr.{name}") for name in ("Usd", "UsdGeom", "UsdPhysics"))
+    uninstance(stage)
+    prims = list(prims_of(stage))
+    time = Usd.TimeCode.EarliestTime()
+    transforms = UsdGeom.XformCache(time)
+    bodies, ignored = find_bodies(prims)
+    described = []
+    used: list[str] = []
+    for body in bodies:
+        geometry = body.geometry
+        most = request["most"]
+        pictures = []
+        for prim in body.splats:
+            found, count = read_prim(prim, time, arrays, most)
+            most -= count
+            pictures.append({**found, "matrix": flat(transforms.GetLocalToWorldTransform(prim))})
+        described.append(
+            {
+                "path": str(body.prim.GetPath()),
+                "geometry": str(geometry.GetPath()),
+                "kind": str(geometry.GetTypeName()),
+                "surface": any(name in tokens.SURFACE_SIM_APIS for name in applied(geometry)),
+                "matrix": flat(transforms.GetLocalToWorldTransform(geometry)),
+                "body_matrix": flat(transforms.GetLocalToWorldTransform(body.prim)),
+                "shape": _geometry(geometry, time, arrays),
+                "meshes": [
+                    {
+                        "matrix": flat(transforms.GetLocalToWorldTransform(mesh)),
+                        **_geometry(mesh, time, arrays),
+                    }
+                    for mesh in body.meshes
+                ],
+                "splats": pictures,
+                "mass": _scalar(body.prim, geometry, "mass"),
+                "density": _scalar(body.prim, geometry, "density"),
+                "material": _material(geometry, body.prim),
+                "bundle": _bundle(body.prim, arrays),
+                "notes": body.notes,
+            }
+        )
+        used += [str(prim.GetPath()) for prim in (geometry, *body.splats, *body.meshes)]
+    if request["copy"] is not None:
+        copy = importlib.import_module(".copy", __package__)
+        copy.write_rest(stage, prims, request["copy"], used, [str(body.prim.GetPath()) for body in bodies], ignored)
+    return {
+        "up": str(UsdGeom.GetStageUpAxis(stage)),
+        "meters": UsdGeom.GetStageMetersPerUnit(stage),
+        "kilograms": UsdPhysics.GetStageKilogramsPerUnit(stage),
+        "bodies": described,
+        "notes": [f"{path}: {kind} between deformables is not read" for path, kind in ignored],
+    }
+
+
+def _geometry(prim: Any, time: Any, arrays: Any) -> dict[str, Any]:
+    """Return the numbers of the arrays of a Mesh, TetMesh or Points prim, by attribute."""
+    found: dict[str, Any] = {"path": str(prim.GetPath())}
+    names = {
+        "points": ("physics:restShapePoints", "omniphysics:restShapePoints", "points"),
+        "counts": ("faceVertexCounts",),
+        "indices": ("faceVertexIndices",),
+        "tets": ("tetVertexIndices",),
+        "widths": ("widths",),
+        "masses": (tokens.MASSES, "omniphysics:masses"),
+        "colors": ("primvars:displayColor",),
+    }
+    for name, candidates in names.items():
+        for candidate in candidates:
+            attribute = prim.GetAttribute(candidate)
+            value = attribute.Get(time) if attribute else None
+            if value is not None and len(value):
+                found[name] = arrays.add(value)
+                break
+    orientation = prim.GetAttribute("orientation")
+    found["left_handed"] = bool(orientation) and orientation.Get(time) == "leftHanded"
+    return found
+
+
+def _scalar(prim: Any, other: Any, name: str) -> float | None:
+    """Return an authored number of a body or its geometry that is not zero, the value that says "not given"."""
+    for owner in (prim, other):
+        value, _ = _authored(owner, name)
+        if value:
+            return value
+    return None
+
+
+def _authored(prim: Any, name: str) -> tuple[float | None, str]:
+    """Return the value of `<namespace>:<name>` under the first namespace that has one, and the attribute's name."""
+    for namespace in tokens.NAMESPACES:
+        attribute = prim.GetAttribute(f"{namespace}:{name}")
+        value = attribute.Get() if attribute and attribute.HasAuthoredValue() else None
+        if value is not None:
+            return float(value), f"{namespace}:{name}"
+    return None, ""
+
+
+def _material(geometry: Any, body: Any) -> dict[str, Any] | None:
+    """Return what the material says that is bound to the geometry, else to the body: for physics, else for all."""
+    UsdShade = importlib.import_module("pxr.UsdShade")
+    for prim in (geometry, body):
+        for purpose in (tokens.MATERIAL_PURPOSE, UsdShade.Tokens.allPurpose):
+            material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)
+            if not material:
+                continue
+            found: dict[str, Any] = {"path": str(material.GetPath())}
+            for key, names in {
+                "youngs_modulus": ("youngsModulus",),
+                "poissons_ratio": ("poissonsRatio",),
+                "density": ("density",),
+                "friction": ("dynamicFriction", "staticFriction"),
+            }.items():
+                for name in names:
+                    value, source = _authored(material.GetPrim(), name)
+                    if value is not None:
+                        found[key] = value
+                        found[f"{key}_from"] = source
+                        break
+            if len(found) > 1:  # a material that is only for rendering says nothing
+                return found
+    return None
+
+
+def _bundle(prim: Any, arrays: Any) -> dict[str, Any] | None:
+    """Return softmode's own attributes of a body: strings, numbers, and the numbers of arrays."""
+    marker = prim.GetAttribute(tokens.FORMAT)
+    if not marker or not marker.HasAuthoredValue():
+        return None
+    found: dict[str, Any] = {"values": {}, "arrays": {}}
+    for attribute in prim.GetAuthoredAttributes():
+        name = attribute.GetName()
+        if not name.startswith(tokens.PREFIX) or name == tokens.HANDLES:
+            continue
+        value = attribute.Get()
+        if value is None or isinstance(value, str | bool | int | float):
+            found["values"][name] = value
+        else:
+            try:
+                found["arrays"][name] = arrays.add(value)
+            except TypeError as error:
+                raise Refused(f"{prim.GetPath()}: {name} is no array of numbers", "Export the body again") from error
+    return found

@@ -1,0 +1,146 @@
+"""Shapes of deformables as triangle meshes, and transforms split into a stretch and a place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softmode.errors import AssetError
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+_SIMILAR = 1.0e-9
+"""Relative deviation up to which a transform is a rotation with one scale: what rounding makes of one."""
+_MIRROR = np.diag([-1.0, 1.0, 1.0])
+_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+"""Faces of a tetrahedron of positive volume, counter-clockwise seen from outside."""
+_GREY = (0.6, 0.6, 0.6)
+
+
+@dataclass(frozen=True)
+class SurfaceMesh:
+    """A triangle mesh."""
+
+    vertices: Array
+    """Positions [m], shape (V, 3)."""
+    faces: Indices
+    """Vertex indices, counter-clockwise seen from outside, shape (T, 3)."""
+    colors: Array
+    """Display colours 0..1 (linear, as `primvars:displayColor` is) of the vertices, shape (V, 3)."""
+
+
+def split_transform(matrix: ArrayLike, where: str) -> tuple[Array, Array]:
+    """Split the linear part L = R S of a transform into a rotation R (3, 3) and what is baked into the shape, S (3, 3).
+
+    S is symmetric (polar decomposition), s I to the bit where L is a rotation with one scale, and mirrors x first where
+    L mirrors.
+
+    Args:
+        matrix: Transform, column vectors, shape (4, 4).
+        where: Named by errors.
+
+    Raises:
+        AssetError: If the transform is singular or not finite.
+    """
+    transform = np.asarray(matrix, dtype=np.float64)
+    linear = transform[:3, :3]
+    if not (np.isfinite(transform).all() and np.abs(transform[3] - [0, 0, 0, 1]).max() == 0.0):
+        raise AssetError(f"{where}: its transform is not finite and affine", hint="Mend its xformOps")
+    left, size, right = np.linalg.svd(linear)
+    if not size[2] > 1e-9 * size[0]:
+        raise AssetError(f"{where}: its transform is singular", hint="Give the prim scales other than zero")
+    mirrored = np.linalg.det(linear) < 0.0
+    if mirrored:
+        left, size, right = np.linalg.svd(linear @ _MIRROR)
+    rotation = left @ right
+    if size[0] - size[2] <= _SIMILAR * size[0]:
+        scale = float(np.round(size.mean(), 12))
+        stretch = (scale if scale > 0.0 else float(size.mean())) * np.eye(3)
+    else:
+        stretch = right.T @ np.diag(size) @ right
+    whole = np.round(rotation)
+    if np.abs(rotation - whole).max() < 1e-14:  # a turn onto axes has no rounding
+        rotation = whole
+    return rotation, stretch @ _MIRROR if mirrored else stretch
+
+
+def mesh_surface(parts: dict[str, Any], linear: Array, where: str, offset: ArrayLike = (0.0, 0.0, 0.0)) -> SurfaceMesh:
+    """Return the triangles of a polygon mesh under an affine map; faces that mirror keep facing outwards.
+
+    Args:
+        parts: Its `points` (V, 3), `counts`, `indices`, `left_handed`, and `colors`, as authored.
+        linear: Matrix of the map, shape (3, 3).
+        where: Named by errors.
+        offset: Translation of the map [m].
+
+    Raises:
+        AssetError: If it has no faces, indices point nowhere, or positions are not finite.
+    """
+    points = finite_points(parts, where)
+    counts, indices = (np.asarray(parts.get(name, ()), dtype=np.int64) for name in ("counts", "indices"))
+    if not len(counts) or counts.min() < 0 or counts.sum() != len(indices):
+        raise AssetError(
+            f"{where}: {len(counts)} face counts for {len(indices)} indices", hint="Export the mesh with its faces"
+        )
+    if indices.min() < 0 or indices.max() >= len(points):
+        raise AssetError(
+            f"{where}: indices {indices.min()}..{indices.max()} for {len(points)} points", hint="Export the mesh again"
+        )
+    start = np.cumsum(counts) - counts
+    fans = np.maximum(counts - 2, 0)
+    face = np.repeat(np.arange(len(counts)), fans)
+    corner = np.arange(len(face)) - np.repeat(np.cumsum(fans) - fans, fans) + 1
+    triangles = indices[np.stack([start[face], start[face] + corner, start[face] + corner + 1], axis=1)]
+    if parts["left_handed"] != (np.linalg.det(linear) < 0.0):
+        triangles = triangles[:, ::-1]
+    return SurfaceMesh(points @ linear.T + offset, triangles, _vertex_colors(parts, len(points)))
+
+
+def tet_surface(parts: dict[str, Any], linear: Array, where: str) -> SurfaceMesh:
+    """Return the boundary of a tetrahedral mesh under a linear map: the faces that one tetrahedron alone has.
+
+    Args:
+        parts: Its `points` (V, 3), `tets` (T, 4), `left_handed` and `colors`, as authored.
+        linear: Matrix of the map, shape (3, 3).
+        where: Named by errors.
+
+    Raises:
+        AssetError: If it has no tetrahedra, indices point nowhere, or positions are not finite.
+    """
+    points = finite_points(parts, where) @ linear.T
+    tets = np.asarray(parts.get("tets", np.zeros((0, 4))), dtype=np.int64).reshape(-1, 4)
+    if not len(tets) or tets.min() < 0 or tets.max() >= len(points):
+        raise AssetError(f"{where}: tetVertexIndices do not fit {len(points)} points", hint="Export the mesh again")
+    corner = points[tets]
+    edges = corner[:, 1:] - corner[:, :1]
+    volume = np.einsum("ti,ti->t", np.cross(edges[:, 0], edges[:, 1]), edges[:, 2])
+    tets = np.where((volume < 0.0)[:, None], tets[:, [0, 2, 1, 3]], tets)
+    faces = tets[:, _FACES].reshape(-1, 3)
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    boundary = faces[np.sort(first[count == 1])]
+    kept, renumbered = np.unique(boundary, return_inverse=True)
+    colors = _vertex_colors(parts, len(points))
+    return SurfaceMesh(points[kept], renumbered.reshape(-1, 3).astype(np.int64), colors[kept])
+
+
+def finite_points(parts: dict[str, Any], where: str) -> Array:
+    """Return the positions (V, 3) of a geometry, all finite; raise AssetError otherwise."""
+    points = parts["points"]
+    if not len(points):
+        raise AssetError(f"{where}: has no points", hint="Export it with its points")
+    lost = int((~np.isfinite(points).all(axis=1)).sum())
+    if lost:
+        raise AssetError(f"{where}: {lost} of {len(points)} points are NaN or infinite", hint="Export it again")
+    return points
+
+
+def _vertex_colors(parts: dict[str, Any], count: int) -> Array:
+    """Return display colours per vertex: authored ones per vertex, else their mean, else grey."""
+    colors = np.asarray(parts.get("colors", [_GREY]), dtype=np.float64)
+    if colors.ndim != 2 or colors.shape[1] != 3 or not np.isfinite(colors).all():
+        colors = np.array([_GREY])
+    return np.clip(colors if len(colors) == count else np.tile(colors.mean(axis=0), (count, 1)), 0.0, 1.0)

@@ -1,0 +1,221 @@
+"""`add_usd`: a stage with robot, prop and soft bodies becomes a model that steps; nothing twice, nothing lost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pxr", reason="needs the extra [usd]")
+
+import newton
+import warp as wp
+
+from softmode.deformables.body import BuildOptions, build_body
+from softmode.deformables.coupling import SolverCoupledReduced
+from softmode.deformables.materials import Material
+from softmode.deformables.quadrature import quadrature_from_mesh, quadrature_from_splats
+from softmode.deformables.skinning import SkinSplats
+from softmode.deformables.status import status_reasons
+from softmode.errors import AssetError, ConfigError, MissingExtraError
+from softmode.usd import add_usd, process, read_usd_scene
+from tests.usd.stages import KINDS, Author, UsdGeom, UsdVol, box, shell, transform
+
+EPSILON = float(np.finfo(np.float32).eps)
+SMALL = BuildOptions(mode_count=3, kernel_count=120, cubature_count=128)
+
+
+def everything(path: Path, up: str = "Z", meters: float = 1.0, kilograms: float = 1.0) -> Path:
+    """Author a robot, a prop, a soft box with splats above the ground and a soft TetMesh beside it."""
+    author = Author.create(path, up, meters, kilograms)
+    author.robot("/World/Robot", (0.6, 0.1, 0.0))
+    author.prop("/World/Prop", (0.3, 0.0, 0.051))
+    author.body("/World/Toy", "Mesh", matrix=transform((0.0, 0.0, 0.035)))
+    author.splats(UsdVol.ParticleField3DGaussianSplat.Define(author.stage, "/World/Toy/Splats"), shell(300))
+    author.body("/World/Brick", "TetMesh", "omni", matrix=transform((0.0, 0.3, 0.035), turn=0.4))
+    author.save()
+    return path
+
+
+def arrays(builder: newton.ModelBuilder) -> dict[str, np.ndarray]:
+    """Return what a model says of its rigid and soft bodies."""
+    model: Any = builder.finalize()
+    state = model.state()
+    newton.eval_fk(model, model.joint_q, model.joint_qd, state)
+    names = (
+        *("body_mass", "body_inertia", "shape_scale", "joint_type", "joint_limit_lower", "joint_limit_upper"),
+        *("joint_target_ke", "joint_target_kd", "joint_effort_limit", "particle_q", "particle_mass", "gravity"),
+    )
+    soft = ("youngs_modulus", "poissons_ratio", "density", "friction")
+    found = {name: getattr(model, name).numpy() for name in names}
+    found |= {name: getattr(model.softmode, name).numpy() for name in soft}
+    return found | {"body": state.body_q.numpy()[:, :3]}
+
+
+def test_everything_in_a_stage(tmp_path: Path) -> None:
+    """Robot and prop come through Newton, the soft bodies as reduced bodies; each once."""
+    builder = newton.ModelBuilder()
+    found = add_usd(builder, everything(tmp_path / "a.usda"), build_options=SMALL, surface_count=100)
+    assert list(found.bodies) == ["/World/Toy", "/World/Brick"]
+    assert [body.instance for body in found.bodies.values()] == [0, 1]
+    assert set(found.newton["path_body_map"]) == {
+        "/World/Prop",
+        *(f"/World/Robot/{n}" for n in ("base", "link", "finger")),
+    }
+    assert builder.body_count == 4 and builder.joint_count == 4
+    assert builder.shape_count == 4, "no soft geometry among the shapes"
+    assert builder.particle_count == 200 and not builder.tet_count and not builder.tri_count
+    toy = found.bodies["/World/Toy"]
+    assert toy.splats is not None and toy.splats.count == shell(300).count
+    placed = toy.placed_splats()
+    assert placed is not None
+    np.testing.assert_allclose(placed.means, shell(300).means + np.array([0.0, 0.0, 0.035]), atol=8 * EPSILON)
+    brick = found.bodies["/World/Brick"]
+    np.testing.assert_allclose(brick.position, (0.0, 0.3, 0.035), atol=1e-8)
+    assert brick.splats is not None and brick.splats.count == 2000, "samples of its surface"
+    assert len(found.reduced_bodies) == 2
+
+
+@pytest.mark.parametrize(("up", "meters", "kilograms"), [("Y", 0.01, 1.0), ("Z", 0.001, 0.001)])
+def test_units_of_everything(tmp_path: Path, up: str, meters: float, kilograms: float) -> None:
+    """A stage in other units with another axis up gives the same model as one in metres and kilograms with z up."""
+    models = []
+    for name, units in (("si", ("Z", 1.0, 1.0)), ("other", (up, meters, kilograms))):
+        builder = newton.ModelBuilder()
+        add_usd(builder, everything(tmp_path / f"{name}.usda", *units), build_options=SMALL, surface_count=100)
+        models.append(arrays(builder))
+    for name, value in models[0].items():
+        scale = np.abs(value[np.isfinite(value)]).max(initial=1e-12)
+        np.testing.assert_allclose(models[1][name], value, atol=1e-5 * scale, err_msg=name)
+
+
+def test_it_rests_on_the_ground(tmp_path: Path) -> None:
+    """Two worlds of robot, prop and two soft bodies step with the coupled solver: the soft ones come to rest."""
+    world = newton.ModelBuilder()
+    found = add_usd(world, everything(tmp_path / "a.usda"), build_options=SMALL, surface_count=100)
+    world.add_ground_plane()
+    builder = newton.ModelBuilder()
+    builder.replicate(world, 2)
+    model: Any = builder.finalize()
+    solver = SolverCoupledReduced(model, found.reduced_bodies)
+    state, after, control = model.state(), model.state(), model.control()
+    newton.eval_fk(model, model.joint_q, model.joint_qd, state)
+    for _ in range(240):
+        solver.step(state, after, control, None, 1.0 / 240.0)
+        state, after = after, state
+    assert not any(status_reasons(int(bits)) for bits in solver.status.numpy())
+    x = state.particle_q.numpy().reshape(2, 2, 100, 3)
+    np.testing.assert_array_equal(x[0], x[1])
+    assert -0.002 < x[..., 2].min() < 0.002, "on the ground"
+    assert np.abs(x[0, 0, :, 2].max() - 0.06) < 0.006, "as high as it is"
+    assert np.abs(state.softmode.qd.numpy()).max() < 0.01, "at rest"
+    assert np.isfinite(state.body_q.numpy()).all()
+    toy = found.bodies["/World/Toy"]
+    assert toy.splats is not None
+    skin = SkinSplats(toy.splats.means, toy.splats.covariances(), *toy.average_basis())
+    means = wp.zeros((2, toy.splats.count), dtype=wp.vec3)
+    covariances = wp.zeros((2, toy.splats.count), dtype=wp.mat33)
+    starts = wp.array(model.softmode.function_start.numpy()[toy.instance :: len(found.bodies)], dtype=wp.int32)
+    skin.launch(state.softmode.q, starts, means, covariances)
+    assert np.abs(means.numpy()[0, :, 2].min()) < 0.003
+
+
+def test_the_body_is_the_one_built_by_hand(tmp_path: Path) -> None:
+    """The same arrays, options and name give the same fingerprint, for a mesh and for splats alone."""
+    author = Author.create(tmp_path / "a.usda")
+    author.body("/World/Toy", "Mesh", matrix=transform((0.3, 0.2, 0.1), turn=1.0))
+    author.body("/World/Plush", "ParticleField3DGaussianSplat")
+    author.save()
+    found = add_usd(newton.ModelBuilder(), tmp_path / "a.usda", build_options=SMALL)
+    mesh = box()
+    quadrature = quadrature_from_mesh(mesh.vertices.astype(np.float32), mesh.faces)
+    assert found.bodies["/World/Toy"].body.fingerprint == build_body(quadrature, SMALL, name="Toy").fingerprint
+    splats = shell()
+    quadrature = quadrature_from_splats(splats.means, splats.scales, splats.quats, splats.opacities)
+    assert found.bodies["/World/Plush"].body.fingerprint == build_body(quadrature, SMALL, name="Plush").fingerprint
+
+
+def test_what_the_stage_does_not_say(tmp_path: Path) -> None:
+    """Missing properties come from the argument, and a mesh that is not closed stands for what it encloses."""
+    author = Author.create(tmp_path / "a.usda")
+    author.body("/World/Toy", bound=False)
+    prim = author.stage.GetPrimAtPath("/World/Toy/Geometry")
+    prim.GetAttribute("faceVertexCounts").Set([3] * 11)
+    prim.GetAttribute("faceVertexIndices").Set(box().faces.ravel()[:33].tolist())
+    author.save()
+    given = Material(youngs_modulus=3e4, density=150.0)
+    found = add_usd(newton.ModelBuilder(), tmp_path / "a.usda", build_options=SMALL, material=given)
+    toy = found.bodies["/World/Toy"]
+    assert toy.material == given
+    assert toy.body.volume == pytest.approx(0.1 * 0.08 * 0.06, rel=0.05)
+    assert any("surface deformable" in note for note in toy.notes)
+
+
+def test_picture_from_a_visible_mesh(tmp_path: Path) -> None:
+    """A body without splats is shown by samples of its visible meshes in their display colour."""
+    author = Author.create(tmp_path / "a.usda")
+    author.body("/World/Toy", "TetMesh", matrix=transform((0.0, 0.0, 0.2), turn=0.3))
+    mesh = author.geometry("/World/Toy/Look", "Mesh")
+    UsdGeom.Mesh(mesh).CreateDisplayColorAttr([(0.2, 0.4, 0.8)])
+    author.save()
+    toy = add_usd(newton.ModelBuilder(), tmp_path / "a.usda", build_options=SMALL, splat_count=500).bodies["/World/Toy"]
+    assert toy.splats is not None and toy.splats.count == 500
+    gamma = 1.055 * np.array([0.2, 0.4, 0.8]) ** (1 / 2.4) - 0.055
+    np.testing.assert_allclose(toy.splats.colors(), np.tile(gamma, (500, 1)), atol=1e-5)
+    on_face = np.abs(np.abs(toy.splats.means) / (0.5 * np.array([0.1, 0.08, 0.06])) - 1.0).min(axis=1)
+    assert on_face.max() < 1e-4
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_two_of_a_kind_share_a_body(tmp_path: Path, kind: str) -> None:
+    """Instances of one asset are built once, whatever their places; a mirrored one is another shape."""
+    author = Author.create(tmp_path / "toy.usda")
+    author.body("/World/Toy", kind)
+    author.save()
+    author = Author.create(tmp_path / "a.usda")
+    for name, matrix in (("A", transform()), ("B", transform((0.5, 0.1, 0.2), turn=0.8))):
+        prim = UsdGeom.Xform.Define(author.stage, f"/World/{name}").GetPrim()
+        prim.GetReferences().AddReference("./toy.usda")
+        author.place(prim, matrix)
+    author.save()
+    builder = newton.ModelBuilder()
+    found = add_usd(builder, tmp_path / "a.usda", build_options=SMALL)
+    assert len(found.bodies) == 2 and len(found.reduced_bodies) == 1
+    np.testing.assert_allclose(found.bodies["/World/B/Toy"].rotation, transform(turn=0.8)[:3, :3], atol=1e-12)
+
+
+def test_refusals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Options that this function decides, builders with another axis up, absent bodies, and a missing extra."""
+    path = everything(tmp_path / "a.usda")
+    with pytest.raises(ConfigError, match="source"):
+        add_usd(newton.ModelBuilder(), path, newton_options={"source": "b.usda"})
+    with pytest.raises(ConfigError, match="up axis"):
+        add_usd(newton.ModelBuilder(up_axis=newton.Axis.Y), path)
+    with pytest.raises(ConfigError, match="no_such_option"):
+        add_usd(newton.ModelBuilder(), path, build_options=SMALL, newton_options={"no_such_option": 1})
+    author = Author.create(tmp_path / "flat.usda")
+    author.body("/World/Toy")
+    points = author.stage.GetPrimAtPath("/World/Toy/Geometry").GetAttribute("points")
+    points.Set(np.array(points.Get()) * np.array([1.0, 1.0, 0.0], np.float32))
+    author.save()
+    builder = newton.ModelBuilder()
+    with pytest.raises(AssetError, match="/World/Toy"):
+        add_usd(builder, tmp_path / "flat.usda")
+    assert not builder.particle_count
+    monkeypatch.setattr(process.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(MissingExtraError, match=r"softmode\[usd\]"):
+        read_usd_scene(path)
+
+
+def test_options_reach_newton(tmp_path: Path) -> None:
+    """`newton_options` are those of `newton.ModelBuilder.add_usd`."""
+    author = Author.create(tmp_path / "a.usda")
+    author.prop("/World/Prop", (0.0, 0.0, 0.1))
+    author.save()
+    builder = newton.ModelBuilder()
+    found = add_usd(
+        builder, tmp_path / "a.usda", newton_options={"xform": wp.transform((1.0, 0.0, 0.0), wp.quat_identity())}
+    )
+    assert not found.bodies and builder.body_q[0][0] == pytest.approx(1.0)
