@@ -25,17 +25,23 @@ def write_body(body: ReducedBody, path: str | os.PathLike[str]) -> None:
     """Write a body; the file appears complete or not at all."""
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
+    header, arrays = body_fields(body)
+    stored = {**arrays, "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}
+    with atomic_write(target) as file:
+        np.savez(file, **stored)  # type: ignore[arg-type]
+
+
+def body_fields(body: ReducedBody) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return what is no array, with the format and its version, ready for JSON, and the arrays by name."""
     header: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION}
-    arrays: dict[str, Any] = {}
+    arrays: dict[str, np.ndarray] = {}
     for f in dataclasses.fields(body):
         value = getattr(body, f.name)
         if isinstance(value, np.ndarray):
             arrays[f.name] = value
         else:
             header[f.name] = value
-    arrays["header"] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-    with atomic_write(target) as file:
-        np.savez(file, **arrays)
+    return header, arrays
 
 
 def read_body(cls: type[ReducedBody], path: str | os.PathLike[str]) -> ReducedBody:
@@ -58,21 +64,38 @@ def read_body(cls: type[ReducedBody], path: str | os.PathLike[str]) -> ReducedBo
         header = json.loads(stored.pop("header").tobytes().decode())
     except (KeyError, ValueError) as error:
         raise AssetError(f"body file {path}: not a softmode body", hint=hint) from error
-    if not isinstance(header, dict) or header.pop("format", None) != FORMAT:
-        raise AssetError(f"body file {path}: not a softmode body", hint=hint)
-    version = header.pop("version", None)
+    return body_from_fields(cls, header, stored, f"body file {path}", hint=hint)
+
+
+def body_from_fields(
+    cls: type[ReducedBody], header: Any, arrays: dict[str, np.ndarray], source: str, *, hint: str = "Build it again."
+) -> ReducedBody:
+    """Return the body of what `body_fields` returned, checked.
+
+    Args:
+        cls: ReducedBody.
+        header: What is no array.
+        arrays: The arrays by name.
+        source: Where they come from, for messages.
+        hint: The remedy.
+
+    Raises:
+        AssetError: If they are foreign, of another version, or not those of a body.
+    """
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise AssetError(f"{source}: not a softmode body", hint=hint)
+    fields = {name: value for name, value in header.items() if name not in ("format", "version")}
+    version = header.get("version")
     if version != FORMAT_VERSION:
-        raise AssetError(f"body file {path}: format version {version}, this softmode reads {FORMAT_VERSION}", hint=hint)
+        raise AssetError(f"{source}: format version {version}, this softmode reads {FORMAT_VERSION}", hint=hint)
     names = {f.name for f in dataclasses.fields(cls)}
-    if set(header) | set(stored) != names:
-        raise AssetError(
-            f"body file {path}: fields {sorted(names ^ (set(header) | set(stored)))} do not match", hint=hint
-        )
+    if set(fields) | set(arrays) != names or set(fields) & set(arrays):
+        raise AssetError(f"{source}: fields {sorted(names ^ (set(fields) | set(arrays)))} do not match", hint=hint)
     try:
-        body = cls(**{**header, "region_names": tuple(header["region_names"])}, **stored)
+        body = cls(**{**fields, "region_names": tuple(fields["region_names"])}, **arrays)
         body.check()
     except BasisError as error:
-        raise AssetError(f"body file {path}: {error.message}", hint=hint) from error
+        raise AssetError(f"{source}: {error.message}", hint=hint) from error
     except (TypeError, IndexError, AttributeError, KeyError, ValueError) as error:
-        raise AssetError(f"body file {path}: a field has another type or shape ({error})", hint=hint) from error
+        raise AssetError(f"{source}: a field has another type or shape ({error})", hint=hint) from error
     return body
