@@ -1,4 +1,7 @@
-"""Files of reduced bodies: one .npz without pickle, arrays by name and everything else in a JSON header."""
+"""Files of reduced bodies: one .npz without pickle, arrays by name and everything else in a JSON header.
+
+A file may carry arrays of others beside the body, under names with a dot (`splats.means`), which readers of bodies skip.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import dataclasses
 import json
 import os
 import zipfile
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,12 +25,21 @@ FORMAT = "softmode.ReducedBody"
 FORMAT_VERSION = 2
 
 
-def write_body(body: ReducedBody, path: str | os.PathLike[str]) -> None:
-    """Write a body; the file appears complete or not at all."""
+def write_body(
+    body: ReducedBody, path: str | os.PathLike[str], *, beside: Mapping[str, np.ndarray] | None = None
+) -> None:
+    """Write a body; the file appears complete or not at all.
+
+    Args:
+        body: The body.
+        path: The file; its folder is made if it is missing.
+        beside: Arrays to store beside the body, by names with a dot.
+    """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     header, arrays = body_fields(body)
     stored = {**arrays, "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}
+    stored |= dict(beside or {})
     with atomic_write(target) as file:
         np.savez(file, **stored)  # type: ignore[arg-type]
 
@@ -51,20 +64,34 @@ def read_body(cls: type[ReducedBody], path: str | os.PathLike[str]) -> ReducedBo
         AssetError: If the file is missing, damaged, foreign, or of another version.
     """
     hint = "Build the body again."
+    stored = _read_arrays(path, lambda name: "." not in name, hint)
+    try:
+        header = json.loads(stored.pop("header").tobytes().decode())
+    except (KeyError, ValueError) as error:
+        raise AssetError(f"body file {path}: not a softmode body", hint=hint) from error
+    return body_from_fields(cls, header, stored, f"body file {path}", hint=hint)
+
+
+def read_beside(path: str | os.PathLike[str], prefix: str) -> dict[str, np.ndarray]:
+    """Return the arrays that a body's file carries under names that begin with `prefix`, which has a dot.
+
+    Raises:
+        AssetError: If the file is missing or damaged.
+    """
+    return _read_arrays(path, lambda name: name.startswith(prefix), "Build the body again.")
+
+
+def _read_arrays(path: str | os.PathLike[str], wanted: Callable[[str], bool], hint: str) -> dict[str, np.ndarray]:
+    """Return arrays of an .npz by name."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            stored = {key: file[key] for key in file.files}
+            return {key: file[key] for key in file.files if wanted(key)}
     except FileNotFoundError as error:
         raise AssetError(f"body file {path}: does not exist", hint=hint) from error
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError, MemoryError) as error:
         raise AssetError(f"body file {path}: damaged or not an .npz ({error})", hint=hint) from error
     except Exception as error:  # zlib and struct errors of a damaged archive have no common base.
         raise AssetError(f"body file {path}: damaged ({type(error).__name__}: {error})", hint=hint) from error
-    try:
-        header = json.loads(stored.pop("header").tobytes().decode())
-    except (KeyError, ValueError) as error:
-        raise AssetError(f"body file {path}: not a softmode body", hint=hint) from error
-    return body_from_fields(cls, header, stored, f"body file {path}", hint=hint)
 
 
 def body_from_fields(

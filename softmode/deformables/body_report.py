@@ -185,8 +185,8 @@ def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
         notes.find(
             "warning",
             "thin",
-            f"the body is {1e3 * thickness * size:.2g} mm thick on average, 1/{1.0 / thickness:.0f} of its size: too thin"
-            " to be integrated and touched as a solid",
+            f"the body is {1e3 * thickness * size:.2g} mm thick on average, 1/{1.0 / thickness:.0f} of its size: too"
+            " thin to be integrated and touched as a solid",
             "thicken the asset to a hundredth of its size",
         )
     degrees = body.handle_degrees
@@ -224,8 +224,8 @@ def _check_tables(body: ReducedBody, notes: _Notes) -> None:
         notes.find(
             "broken",
             "tables",
-            f"stored functions are not those of the kernels: affine motion errs by {affine:.1e}, tables by {stored:.1e},"
-            f" the centre of mass by {off:.1e} (rounding: 1e-6)",
+            f"stored functions are not those of the kernels: affine motion errs by {affine:.1e}, tables by"
+            f" {stored:.1e}, the centre of mass by {off:.1e} (rounding: 1e-6)",
             "build the body again; the file was changed or mixed up",
         )
     notes.measure("cubature volume over volume", float(body.weights.sum() / body.volume))
@@ -242,8 +242,8 @@ def _check_parts(body: ReducedBody, interior: Interior, notes: _Notes) -> None:
         notes.find(
             "warning",
             "separate parts",
-            f"the body falls into {len(share)} parts that do not touch; all but the largest hold {rest} % of its volume."
-            " Kernels that reach across the gap glue them together",
+            f"the body falls into {len(share)} parts that do not touch; all but the largest hold {rest} % of its"
+            " volume. Kernels that reach across the gap glue them together",
             "keep one part (--crop, or for splats --part), or build one body for each",
         )
     first = float(body.eigenvalues[1]) * body.length**2
@@ -359,7 +359,7 @@ def _check_build(body: ReducedBody, notes: _Notes) -> None:
             notes.find(
                 "warning",
                 "cubature",
-                f"elastic forces at the {body.point_count} cubature points err by {100.0 * force:.1f} % (held-out poses)",
+                f"elastic forces at the {body.point_count} cubature points err by {100.0 * force:.1f} %",
                 "take more cubature points (--points)",
             )
     if body.function_count >= FULL_FUNCTIONS and body.point_count < min(
@@ -370,6 +370,27 @@ def _check_build(body: ReducedBody, notes: _Notes) -> None:
             "cubature",
             f"{body.point_count} cubature points for {body.function_count} functions",
             f"take six for each, --points {6 * body.function_count}",
+        )
+    _check_asset(body, told, notes)
+
+
+def _check_asset(body: ReducedBody, told: dict[str, float], notes: _Notes) -> None:
+    """Read what became of the asset: holes that were closed, parts that were left out."""
+    if body.provenance.get("asset_kind") == "mesh" and body.provenance.get("quadrature_source") == "splats":
+        notes.find(
+            "warning",
+            "open mesh",
+            "the mesh is not closed: the body is what its surface encloses when the holes are covered smoothly",
+            "close the holes (trimesh.repair.fill_holes, or a modelling tool), and build again",
+        )
+    given, left_out = told.get("asset_splats", 0.0), told.get("asset_left_out", 0.0)
+    if left_out > 0.0:
+        notes.measure("splats of the file left out", left_out)
+        notes.find(
+            "warning" if left_out > 0.002 * given else "note",
+            "left out",
+            f"{left_out:.0f} of {given:.0f} splats are floaters or separate parts and were left out",
+            "look at the picture (softmode body show); crop the capture (--crop), or choose --part",
         )
     if told.get("quadrature_overlapping"):
         notes.find(
