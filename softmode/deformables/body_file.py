@@ -1,6 +1,6 @@
 """Files of reduced bodies: one .npz without pickle, arrays by name and everything else in a JSON header.
 
-A file may carry arrays of others beside the body, under names with a dot (`splats.means`), which readers of bodies skip.
+A file may carry arrays of others beside the body, under names with a dot (`splats.means`); readers of bodies skip them.
 """
 
 from __future__ import annotations

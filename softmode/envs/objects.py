@@ -45,7 +45,7 @@ STABLE_TILT = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectConfig:
-    """Which soft object, how large, how finely reduced: the built-in plush, a shape, a file, or a body already built."""
+    """Which soft object, how large, how finely reduced: the built-in plush, a shape, a file, or a body as it is."""
 
     shape: Shape = "plush"
     """What it is where neither `splat` nor `mesh` is given: "plush", or a "box", "cylinder", "capsule" or "sphere" of
@@ -110,7 +110,8 @@ class ObjectConfig:
         files = (self.splat, self.mesh, self.body)
         if sum(file is not None for file in files) + (self.shape != "plush") > 1:
             raise ConfigError(
-                f"shape {self.shape!r}, splat {self.splat!r}, mesh {self.mesh!r} and body {self.body!r} exclude each other",
+                f"shape {self.shape!r}, splat {self.splat!r}, mesh {self.mesh!r} and body {self.body!r} exclude each"
+                " other",
                 hint="give one of them",
             )
         if self.body is not None and self.clamped_height > 0.0:

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 COLUMNS = 7
 """Pictures in a row: the body at rest and six modes; the constant weight's place and six weights."""
 PIXELS = 380
-"""Edge of each rendered picture [px]."""
+"""Width of each rendered picture [px]."""
 AMPLITUDE = 0.16
 """Largest displacement in a mode's picture, over the body's size."""
 TOWARDS = np.array([0.80, -0.48, 0.36])
@@ -51,7 +51,7 @@ def soft_modes(body: ReducedBody, count: int) -> tuple[Array, Array]:
     value, mode = elastic_modes(reduced_stiffness(gradient, body.weights * body.stiffness_scale, POISSON_RATIO))
     count = min(count, len(value))
     q = np.zeros((count, body.function_count, 3))
-    q[:, free] = mode[:, :count].T.reshape(count, 3, -1).transpose(0, 2, 1)
+    q[:, free] = mode[:, :count].T.reshape(count, 3, body.function_count - body.driven_count).transpose(0, 2, 1)
     return value, q
 
 
@@ -104,20 +104,29 @@ def write_body_picture(
         raise ConfigError(f"picture {target} is no .png file", hint="name it like toy.png")
     modes = soft_modes(body, COLUMNS - 1)[1]
     names, weights = _weights(body, splats)
-    asset = [splats, *(_moved(body, splats, q) for q in modes)]
+    asset = [splats, *_moved(body, splats, modes)]
     pictures = _render(body, [*asset, *(_painted(body, splats, color) for color in weights)])
     frequency = mode_frequencies(body, youngs_modulus=youngs_modulus, density=density)
 
-    figure = Figure(figsize=(14.0, 9.0), dpi=100, facecolor="white")
+    strip = 13.5 / COLUMNS * pictures[0].shape[0] / pictures[0].shape[1]  # height of a row of pictures [in]
+    height = 2.0 * strip + 4.8
+    figure = Figure(figsize=(14.0, height), dpi=100, facecolor="white")
     FigureCanvasAgg(figure)
     rows = figure.add_gridspec(
-        3, 1, height_ratios=(1.0, 1.0, 1.5), left=0.02, right=0.985, top=0.915, bottom=0.065, hspace=0.2
+        3,
+        1,
+        height_ratios=(strip, strip, 3.0),
+        left=0.02,
+        right=0.985,
+        top=1.0 - 0.8 / height,
+        bottom=0.5 / height,
+        hspace=0.5 / ((2.0 * strip + 3.0) / 3.0),
     )
     x, y, z = 1e2 * np.ptp(body.bounds, axis=0)
-    figure.text(0.02, 0.967, f"{body.name}", fontsize=15, weight="bold")
+    figure.text(0.02, 1.0 - 0.35 / height, body.name, fontsize=15, weight="bold")
     figure.text(
         0.985,
-        0.967,
+        1.0 - 0.35 / height,
         f"{x:.3g} x {y:.3g} x {z:.3g} cm, {1e6 * body.volume:.4g} cm$^3$ · {body.function_count} functions · "
         f"{body.mode_count} eigenmodes · {body.point_count} cubature points · {len(body.centres)} kernels",
         fontsize=10,
@@ -127,7 +136,7 @@ def write_body_picture(
     titles = ["at rest", *(f"soft mode {k + 1}: {frequency[k]:.3g} Hz" for k in range(len(modes)))]
     _strip(figure, rows[0], titles, pictures[: len(titles)])
     _strip(figure, rows[1], names, pictures[len(titles) :])
-    lower = rows[2].subgridspec(1, 4, width_ratios=(1.0, 1.0, 1.0, 1.75), wspace=0.2)
+    lower = rows[2].subgridspec(1, 4, width_ratios=(1.0, 1.0, 0.9, 1.9), wspace=0.14)
     _draw_points(figure.add_subplot(lower[0]), body)
     _draw_kernels(figure.add_subplot(lower[1]), body)
     spectra = lower[2].subgridspec(2, 1, hspace=0.75)
@@ -143,17 +152,19 @@ def write_body_picture(
 # -- what the splats show ---------------------------------------------------------------------------------------------
 
 
-def _moved(body: ReducedBody, splats: Splats, q: Array) -> Splats:
-    """Return the splats displaced by a mode so far that the largest displacement is a fixed part of the size."""
+def _moved(body: ReducedBody, splats: Splats, modes: Array) -> list[Splats]:
+    """Return the splats displaced by each mode, so far that the largest displacement is a fixed part of the size."""
     from softmode.deformables.skinning import average_basis
 
     value, gradient = average_basis(lambda x: body.evaluate(x)[0], splats.means, splats.covariances())
-    motion = value @ q
-    # The sign is free: most of the motion goes towards the camera's right, so that the picture does not depend on it.
-    scale = AMPLITUDE * float(np.linalg.norm(np.ptp(body.bounds, axis=0))) / np.linalg.norm(motion, axis=1).max()
-    scale *= 1.0 if (motion**3).sum() >= 0.0 else -1.0
-    slope = np.eye(3) + scale * np.einsum("nkd,kc->ncd", gradient, q)
-    return splats.deformed(splats.means + scale * motion, slope)
+    size, found = float(np.linalg.norm(np.ptp(body.bounds, axis=0))), []
+    for q in modes:
+        motion = value @ q
+        # A mode has no sign: the one drawn has most of its motion along +x +y +z.
+        scale = AMPLITUDE * size / np.linalg.norm(motion, axis=1).max() * (1.0 if (motion**3).sum() >= 0.0 else -1.0)
+        slope = np.eye(3) + scale * np.einsum("nkd,kc->ncd", gradient, q)
+        found.append(splats.deformed(splats.means + scale * motion, slope))
+    return found
 
 
 def _weights(body: ReducedBody, splats: Splats) -> tuple[list[str], list[Array]]:
@@ -213,24 +224,29 @@ def _render(body: ReducedBody, shown: list[Splats]) -> list[NDArray[np.uint8]]:
     from softmode.splats.pinhole import PinholeCamera
     from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
 
-    centre = body.bounds.mean(axis=0)
     right, up = _camera_axes()
-    reach = np.concatenate([s.means for s in shown]) - centre
-    half = 1.06 * float(max(np.abs(reach @ right).max(), np.abs(reach @ up).max()))
-    distance, fov = 8.0 * half, 2.0 * float(np.arctan(1.0 / 8.0))
-    position = centre + distance * TOWARDS / np.linalg.norm(TOWARDS)
+    seen = np.concatenate([s.means for s in shown]) @ np.column_stack([right, up])
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    margin = 0.06 * float((high - low).max())
+    width, tall = (high - low + 2.0 * margin).tolist()
+    # As far away as eight heights, so that near and far parts have nearly one scale, and what was measured fits.
+    toward = TOWARDS / np.linalg.norm(TOWARDS)
+    middle, distance = 0.5 * (low + high), 8.0 * max(width, tall)
+    centre = middle[0] * right + middle[1] * up + (body.bounds.mean(axis=0) @ toward) * toward
+    position = centre + distance * toward
+    rows = round(PIXELS * min(max(tall / width, 0.35), 1.3))
     camera = PinholeCamera.look_at(
         "body",
         position=(float(position[0]), float(position[1]), float(position[2])),
         target=(float(centre[0]), float(centre[1]), float(centre[2])),
         width=PIXELS,
-        height=PIXELS,
-        fov_y=fov,
+        height=rows,
+        fov_y=2.0 * float(np.arctan(0.5 * max(tall, width * rows / PIXELS) / distance)),
     )
     views = ViewArrays.from_cameras([camera], background=(1.0, 1.0, 1.0))
     pictures = []
     for splats in shown:
-        rasterizer = SplatRasterizer(splats.count, 1, PIXELS, PIXELS)
+        rasterizer = SplatRasterizer(splats.count, 1, PIXELS, rows)
         rasterizer.render(SplatArrays.from_splats([splats]), views)
         pictures.append((255.0 * np.clip(rasterizer.rgb.numpy()[0], 0.0, 1.0)).round().astype(np.uint8))
     return pictures
@@ -304,7 +320,9 @@ def _draw_kernels(axes: Any, body: ReducedBody) -> None:
 
 def _draw_spectrum(axes: Any, values: Array, title: str, label: str) -> None:
     """Draw a spectrum as bars, on a logarithmic scale if it is wide."""
-    axes.bar(np.arange(1, len(values) + 1), values, color="#2f6f9f", width=0.8)
+    axes.bar(np.arange(1, len(values) + 1), values, color="#2f6f9f", width=0.8 if len(values) < 40 else 1.0)
+    axes.set_xlim(0.4, len(values) + 0.6)
+    axes.xaxis.get_major_locator().set_params(integer=True)
     if len(values) and values.max() > 30.0 * values.min() > 0.0:
         axes.set_yscale("log")
     axes.set_title(title, fontsize=9, pad=3)
@@ -316,19 +334,19 @@ def _draw_spectrum(axes: Any, values: Array, title: str, label: str) -> None:
 def _write_report(axes: Any, body: ReducedBody, report: BodyReport) -> None:
     """Write the measures in two columns and the findings under them."""
     axes.set_axis_off()
-    lines = [f"{m.name}: {m.value:.4g} {m.unit}".rstrip() for m in report.measures]
+    told = ("extent", "mass at", "functions", "cubature points", "splats")  # the title has these, or the findings
+    lines = [f"{m.name}: {m.value:.3g} {m.unit}".rstrip() for m in report.measures if not m.name.startswith(told)]
     lines.append(f"build: {body.build_seconds:.2f} s")
-    step = 0.062
-    half = -(-len(lines) // 2)
+    half, y, step = -(-len(lines) // 2), 1.0, 0.06
     for column, part in enumerate((lines[:half], lines[half:])):
         for row, line in enumerate(part):
-            axes.text(0.53 * column, 1.02 - step * row, line, fontsize=7.6, transform=axes.transAxes, va="top")
-    y = 1.0 - step * (half + 0.6)
+            axes.text(0.5 * column, y - step * row, line, fontsize=7.5, transform=axes.transAxes, va="top")
+    y -= step * (half + 0.7)
     if not report.findings:
         axes.text(0.0, y, "no findings", fontsize=9, color="#1b7f3b", weight="bold", transform=axes.transAxes, va="top")
     for finding in report.findings:
-        for line in textwrap.wrap(f"{finding.severity}, {finding.name}: {finding.what}", 88):
-            if y < -0.06:
+        for line in textwrap.wrap(f"{finding.severity}, {finding.name}: {finding.what}", 84):
+            if y < -0.1:
                 return
-            axes.text(0.0, y, line, fontsize=7.6, color=_COLORS[finding.severity], transform=axes.transAxes, va="top")
+            axes.text(0.0, y, line, fontsize=7.5, color=_COLORS[finding.severity], transform=axes.transAxes, va="top")
             y -= step
