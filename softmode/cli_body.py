@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from softmode.deformables.body_report import BodyReport
     from softmode.deformables.quadrature import Quadrature
     from softmode.deformables.reduced_body import ReducedBody
+    from softmode.deformables.regions import Region
+    from softmode.envs.object_build import StifferBox
     from softmode.splats import Splats
 
 
@@ -60,7 +62,7 @@ class _Asset:
     """NAME=x0,y0,z0,x1,y1,z1: a part that scenes hold, move or grasp [m]; a seventh number makes it soft, stiffness / E
     [1/m^2]. Coordinates: z up, bounding box centred over the origin, standing on z = 0; inf is allowed."""
     stiffness: tuple[str, ...] = ()
-    """x0,y0,z0,x1,y1,z1,FACTOR: a part that is FACTOR times as stiff, in the same coordinates."""
+    """NAME=x0,y0,z0,x1,y1,z1,FACTOR: a part that is FACTOR times as stiff as the rest, in the same coordinates."""
     seed: int = 0
     """Seed of every random choice of the build."""
 
@@ -206,33 +208,34 @@ def _print_report(report: BodyReport, *, measures: bool) -> None:
         print(f"{finding.severity}: {finding.name}: {finding.what}. {remedy}.")
 
 
-def _numbers(text: str, what: str, counts: tuple[int, ...]) -> list[float]:
-    """Return numbers separated by commas."""
+def _named_numbers(option: str, text: str, counts: tuple[int, ...]) -> tuple[str, list[float]]:
+    """Return the name and the numbers of NAME=number,number,..."""
+    name, _, values = text.partition("=")
     try:
-        found = [float(word) for word in text.split(",")]
+        found = [float(word) for word in values.split(",")]
     except ValueError:
         found = []
-    if len(found) not in counts:
-        raise ConfigError(f"{what} {text!r}: expected {' or '.join(map(str, counts))} numbers separated by commas")
-    return found
+    if not name or len(found) not in counts:
+        raise ConfigError(
+            f"{option} {text!r}: expected NAME= and {' or '.join(map(str, counts))} numbers separated by commas",
+            hint=f"give it like --{option} root=-inf,-inf,-inf,inf,inf,0.01" + (",10" if 6 not in counts else ""),
+        )
+    return name, found
 
 
-def _region(text: str) -> Any:
+def _region(text: str) -> Region:
     """Return the region NAME=x0,y0,z0,x1,y1,z1[,stiffness]."""
     from softmode.deformables.regions import Region
 
-    name, _, box = text.partition("=")
-    if not name or not box:
-        raise ConfigError(f"region {text!r}: no name", hint="give it like root=-inf,-inf,-inf,inf,inf,0.01")
-    values = _numbers(box, f"region {name}", (6, 7))
+    name, values = _named_numbers("region", text, (6, 7))
     return Region(name=name, box=(values[:3], values[3:6]), stiffness=values[6] if len(values) == 7 else None)
 
 
-def _stiffer(text: str) -> Any:
-    """Return the part x0,y0,z0,x1,y1,z1,factor."""
+def _stiffer(text: str) -> StifferBox:
+    """Return the part NAME=x0,y0,z0,x1,y1,z1,factor."""
     from softmode.envs.object_build import StifferBox
 
-    x0, y0, z0, x1, y1, z1, factor = _numbers(text, "stiffness", (7,))
+    _, (x0, y0, z0, x1, y1, z1, factor) = _named_numbers("stiffness", text, (7,))
     return StifferBox(box=(x0, y0, z0, x1, y1, z1), factor=factor)
 
 

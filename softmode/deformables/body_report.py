@@ -35,6 +35,8 @@ CONDITION_WARNING = 1e6
 """Condition number of a moment matrix from which on gradients lose more digits than float32 has to spare."""
 SLENDER = 0.3
 """Ratio of the least to the largest extent under which affine handles lock a body in bending."""
+BARE = 3.0
+"""Surface farther than so many spacings of splats from the nearest one is not shown."""
 EMPTY = 1e-10
 """Elastic eigenvalues under this fraction of the largest cost no energy; a rope of 25:1 has 4e-7."""
 FULL_FUNCTIONS = 100
@@ -443,8 +445,10 @@ def _check_splats(body: ReducedBody, splats: Array, notes: _Notes) -> None:
             " body's size away from it and move along as if glued on",
             "crop them off (--crop), or keep another part (--part)",
         )
-    spacing = float(np.median(KDTree(splats).query(splats, k=min(7, len(splats)))[0][:, -1]))
-    bare = KDTree(splats).query(body.surface_points)[0] > max(2.0 * pitch, 2.0 * spacing)
+    # The sixth neighbour of a splat is one and a half spacings away.
+    tree = KDTree(splats)
+    spacing = float(np.median(tree.query(splats, k=min(7, len(splats)))[0][:, -1])) / 1.5
+    bare = tree.query(body.surface_points)[0] > BARE * spacing
     share = notes.measure("surface without splats", float(body.surface_areas[bare].sum() / body.surface_areas.sum()))
     if share > 0.05:
         notes.find(

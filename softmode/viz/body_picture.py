@@ -28,6 +28,8 @@ PIXELS = 380
 """Width of each rendered picture [px]."""
 AMPLITUDE = 0.16
 """Largest displacement in a mode's picture, over the body's size."""
+STEEPNESS = 0.8
+"""Largest gradient of the displacement there: a linear mode turned further swells instead."""
 TOWARDS = np.array([0.80, -0.48, 0.36])
 """Direction from the body to the camera."""
 _LIGHT = np.array([0.55, -0.35, 0.76])
@@ -161,9 +163,11 @@ def _moved(body: ReducedBody, splats: Splats, modes: Array) -> list[Splats]:
     for q in modes:
         motion = value @ q
         # A mode has no sign: the one drawn has most of its motion along +x +y +z.
-        scale = AMPLITUDE * size / np.linalg.norm(motion, axis=1).max() * (1.0 if (motion**3).sum() >= 0.0 else -1.0)
-        slope = np.eye(3) + scale * np.einsum("nkd,kc->ncd", gradient, q)
-        found.append(splats.deformed(splats.means + scale * motion, slope))
+        slope = np.einsum("nkd,kc->ncd", gradient, q)
+        steepest = float(np.quantile(np.linalg.norm(slope, axis=(1, 2)), 0.95))
+        scale = min(AMPLITUDE * size / np.linalg.norm(motion, axis=1).max(), STEEPNESS / max(steepest, 1e-300))
+        scale *= 1.0 if (motion**3).sum() >= 0.0 else -1.0
+        found.append(splats.deformed(splats.means + scale * motion, np.eye(3) + scale * slope))
     return found
 
 
