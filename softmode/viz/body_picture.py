@@ -28,7 +28,7 @@ PIXELS = 380
 """Width of each rendered picture [px]."""
 AMPLITUDE = 0.16
 """Largest displacement in a mode's picture, over the body's size."""
-STEEPNESS = 0.8
+STEEPNESS = 1.2
 """Largest gradient of the displacement there: a linear mode turned further swells instead."""
 TOWARDS = np.array([0.80, -0.48, 0.36])
 """Direction from the body to the camera."""
@@ -99,6 +99,8 @@ def write_body_picture(
         raise MissingExtraError(
             "the picture of a body needs matplotlib", hint="install it with: pip install 'softmode[viz]'"
         ) from error
+    from PIL import Image
+
     from softmode.atomic import atomic_write
 
     target = Path(path)
@@ -113,7 +115,7 @@ def write_body_picture(
     strip = 13.5 / COLUMNS * pictures[0].shape[0] / pictures[0].shape[1]  # height of a row of pictures [in]
     height = 2.0 * strip + 4.8
     figure = Figure(figsize=(14.0, height), dpi=100, facecolor="white")
-    FigureCanvasAgg(figure)
+    canvas = FigureCanvasAgg(figure)
     rows = figure.add_gridspec(
         3,
         1,
@@ -146,9 +148,13 @@ def write_body_picture(
     title = f"frequencies [Hz], E = {youngs_modulus:.3g} Pa, {density:.3g} kg/m$^3$"
     _draw_spectrum(figure.add_subplot(spectra[1]), frequency, title, "elastic mode")
     _write_report(figure.add_subplot(lower[3]), body, report)
+    canvas.draw()
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3])
     target.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(target) as file:
-        figure.savefig(file, format="png")
+        # 256 colours, dithered, are enough here and make half the size.
+        few = picture.quantize(palette=picture.quantize(256), dither=Image.Dither.FLOYDSTEINBERG)
+        few.save(file, format="png", optimize=True)
 
 
 # -- what the splats show ---------------------------------------------------------------------------------------------
@@ -349,7 +355,7 @@ def _write_report(axes: Any, body: ReducedBody, report: BodyReport) -> None:
     if not report.findings:
         axes.text(0.0, y, "no findings", fontsize=9, color="#1b7f3b", weight="bold", transform=axes.transAxes, va="top")
     for finding in report.findings:
-        for line in textwrap.wrap(f"{finding.severity}, {finding.name}: {finding.what}", 84):
+        for line in textwrap.wrap(f"{finding.severity}, {finding.name}: {finding.what}", 98):
             if y < -0.1:
                 return
             axes.text(0.0, y, line, fontsize=7.5, color=_COLORS[finding.severity], transform=axes.transAxes, va="top")
