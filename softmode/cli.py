@@ -257,10 +257,9 @@ def _task_config(options: Play, trained: dict[str, Any]) -> Any:
         thing = scene.object
         if options.splat is not None:
             thing = ObjectConfig(surface_count=thing.surface_count, build=thing.build)
-        if thing.extents is not None:
-            raise ConfigError(
-                f"{', '.join(given)} given for a {thing.shape} of {thing.extents} m", hint="give a --splat file too"
-            )
+        if thing.extents is not None or thing.body is not None:
+            what = f"a {thing.shape} of {thing.extents} m" if thing.body is None else f"the body {thing.body}"
+            raise ConfigError(f"{', '.join(given)} given for {what}", hint="give a --splat file too")
         thing = dataclasses.replace(thing, **given)
         scene = dataclasses.replace(scene, object=thing)
     return dataclasses.replace(base, scene=scene, mesh_samples=4 if options.video else base.mesh_samples)
