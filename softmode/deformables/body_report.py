@@ -166,7 +166,7 @@ def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
     enclosed = notes.measure("volume by surface samples over volume", flux / volume)
     closure = float(np.linalg.norm(body.surface_areas @ body.surface_normals)) / area
     notes.measure("mean normal of the surface", closure)
-    # Samples lie inside the corners of their hull, so a box fills a little more than it: 1.08 with 100 samples.
+    # Samples lie inside the corners of their hull, so a box fills a little more than it: 1.08 with 80 samples.
     if volume > 1.05 * box or (hull > 0.0 and volume > 1.5 * hull):
         notes.find(
             "broken",
