@@ -1,4 +1,4 @@
-"""The command line: play, train, evaluate, export, record, bench, list-envs, robots and splat."""
+"""The command line: play, train, evaluate, export, record, bench, list-envs, robots, splat and body."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 
 from softmode import ENVIRONMENTS
 from softmode.cli_bench import Bench
+from softmode.cli_body import BodyBuild, BodyCheck, BodyShow
 from softmode.cli_common import bar_interval, quiet_warp, warp_device
 from softmode.cli_record import Record
 from softmode.cli_splat import SplatConvert, SplatFromMesh, SplatInfo
@@ -40,6 +41,8 @@ class Play:
     rerun+http://127.0.0.1:9876/proxy; or spawn, which opens one."""
     splat: Path | None = None
     """Splat file of the object (INRIA .ply, or a SOG v2 folder, meta.json or .sog); the built-in plush if omitted."""
+    object: Path | None = None
+    """Body file of the object, from `softmode body build`; instead of a splat file."""
     size: float | None = None
     """Longest edge of the object [m], as the task has it if omitted; the gripper opens 0.09 m."""
     up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
@@ -109,6 +112,12 @@ def main(arguments: list[str] | None = None) -> int:
             | Annotated[SplatConvert, tyro.conf.subcommand("convert")],
             tyro.conf.subcommand("splat", description="Make, inspect and convert splat files."),
         ]
+        body = Annotated[
+            Annotated[BodyBuild, tyro.conf.subcommand("build")]
+            | Annotated[BodyShow, tyro.conf.subcommand("show")]
+            | Annotated[BodyCheck, tyro.conf.subcommand("check")],
+            tyro.conf.subcommand("body", description="Build, draw and check the bodies of soft objects."),
+        ]
         command = tyro.cli(
             Annotated[Play, tyro.conf.subcommand("play")]
             | Annotated[Train, tyro.conf.subcommand("train")]
@@ -118,7 +127,8 @@ def main(arguments: list[str] | None = None) -> int:
             | Annotated[Record, tyro.conf.subcommand("record")]
             | Annotated[ListEnvs, tyro.conf.subcommand("list-envs")]
             | Annotated[Robots, tyro.conf.subcommand("robots")]
-            | splat,  # type: ignore[arg-type]
+            | splat  # type: ignore[arg-type]
+            | body,  # type: ignore[arg-type]
             prog="softmode",
             args=arguments,
             config=(tyro.conf.PositionalRequiredArgs,),
@@ -261,14 +271,19 @@ def _task_config(options: Play, trained: dict[str, Any]) -> Any:
     scene = base.scene
     names = ("splat", "size", "up", "crop", "part", "pose")
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    if given:
+    if options.object is not None:
+        if given:
+            raise ConfigError(
+                f"{', '.join(given)} given for the body {options.object}", hint="give them to softmode body build"
+            )
+        scene = dataclasses.replace(scene, object=ObjectConfig(body=options.object))
+    elif given:
         thing = scene.object
         if options.splat is not None:
             thing = ObjectConfig(surface_count=thing.surface_count, build=thing.build)
-        if thing.extents is not None:
-            raise ConfigError(
-                f"{', '.join(given)} given for a {thing.shape} of {thing.extents} m", hint="give a --splat file too"
-            )
+        if thing.extents is not None or thing.body is not None:
+            what = f"a {thing.shape} of {thing.extents} m" if thing.body is None else f"the body {thing.body}"
+            raise ConfigError(f"{', '.join(given)} given for {what}", hint="give a --splat file too")
         thing = dataclasses.replace(thing, **given)
         scene = dataclasses.replace(scene, object=thing)
     return dataclasses.replace(base, scene=scene, mesh_samples=4 if options.video else base.mesh_samples)
