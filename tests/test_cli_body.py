@@ -264,7 +264,7 @@ def scramble(path: Path) -> None:
     path.write_bytes(data)
 
 
-def rewritten(change: Callable[[dict[str, np.ndarray]], None]) -> Callable[[Path], None]:
+def rewritten(change: Callable[[dict[str, np.ndarray]], object]) -> Callable[[Path], None]:
     """Return what changes the arrays of a file."""
 
     def apply(path: Path) -> None:
@@ -282,11 +282,11 @@ def other_version(arrays: dict[str, np.ndarray]) -> None:
     arrays["header"] = np.frombuffer(json.dumps({**header, "version": 99}).encode(), dtype=np.uint8)
 
 
-DAMAGE: dict[str, Callable[[Path], None]] = {
+DAMAGE: dict[str, Callable[[Path], object]] = {
     "cut": cut,
     "scrambled": scramble,
     "empty": lambda path: path.write_bytes(b""),
-    "text": lambda path: path.write_text("hello") and None,
+    "text": lambda path: path.write_text("hello"),
     "version": rewritten(other_version),
     "no points": rewritten(lambda arrays: arrays.pop("points") is None),
     "nan": rewritten(lambda arrays: arrays.update(weights=np.full_like(arrays["weights"], np.nan))),

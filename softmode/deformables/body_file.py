@@ -119,7 +119,8 @@ def body_from_fields(
     if set(fields) | set(arrays) != names or set(fields) & set(arrays):
         raise AssetError(f"{source}: fields {sorted(names ^ (set(fields) | set(arrays)))} do not match", hint=hint)
     try:
-        body = cls(**{**fields, "region_names": tuple(fields["region_names"])}, **arrays)
+        values: dict[str, Any] = {**fields, **arrays, "region_names": tuple(fields["region_names"])}
+        body = cls(**values)
         body.check()
     except BasisError as error:
         raise AssetError(f"{source}: {error.message}", hint=hint) from error
