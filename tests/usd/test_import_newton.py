@@ -20,6 +20,7 @@ from softmode.deformables.quadrature import quadrature_from_mesh, quadrature_fro
 from softmode.deformables.skinning import SkinSplats
 from softmode.deformables.status import status_reasons
 from softmode.errors import AssetError, ConfigError, MissingExtraError
+from softmode.splats.rasterizer import SplatArrays
 from softmode.usd import add_usd, process, read_usd_scene
 from tests.usd.stages import KINDS, Author, UsdGeom, UsdVol, box, shell, transform
 
@@ -115,11 +116,11 @@ def test_it_rests_on_the_ground(tmp_path: Path) -> None:
     toy = found.bodies["/World/Toy"]
     assert toy.splats is not None
     skin = SkinSplats(toy.splats.means, toy.splats.covariances(), *toy.average_basis())
-    means = wp.zeros((2, toy.splats.count), dtype=wp.vec3)
-    covariances = wp.zeros((2, toy.splats.count), dtype=wp.mat33)
+    drawn = SplatArrays.from_splats([toy.splats], world_count=2)
     starts = wp.array(model.softmode.function_start.numpy()[toy.instance :: len(found.bodies)], dtype=wp.int32)
-    skin.launch(state.softmode.q, starts, means, covariances)
-    assert np.abs(means.numpy()[0, :, 2].min()) < 0.003
+    skin.launch(state.softmode.q, starts, drawn.means, drawn.covariances)
+    means = drawn.means.numpy()[0, : toy.splats.count]
+    assert abs(means[:, 2].min()) < 0.003 and abs(means[:, 2].max() - 0.06) < 0.006, "they went with the body"
 
 
 def test_the_body_is_the_one_built_by_hand(tmp_path: Path) -> None:
