@@ -19,7 +19,9 @@ from softmode.errors import AssetError
 
 DTYPES = {"<f8": "double[]", "<f4": "float[]", "<i8": "int64[]"}
 """What fields may be made of, and the OpenUSD types of their attributes."""
-_HINT = "Write the file again with softmode.usd.write_usd, or delete its softmode: attributes to have the body built anew"
+_HINT = (
+    "Write the file again with softmode.usd.write_usd, or delete its softmode: attributes to have the body built anew"
+)
 
 
 def content_digest(header: str, arrays: Mapping[str, NDArray]) -> str:
