@@ -1,7 +1,7 @@
 """A `ReducedBody` as attributes of a prim: one flat array for each array field, and a header in JSON for the rest.
 
 Nothing is rounded and nothing is pickled: arrays keep their dtype, and JSON gives floats back to the bit. A sha256 over
-all of it goes along, so that a body of which a part was edited, or lost in a conversion, is told from one that is whole.
+all of it goes along, so that a body of which a part was edited or lost in a conversion is told from a whole one.
 """
 
 from __future__ import annotations

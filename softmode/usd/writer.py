@@ -33,21 +33,26 @@ from softmode.usd.placed import PlacedBody
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class UsdExportOptions:
-    """What a stage holds beside what is needed to read it back exactly.
+    """What a stage holds, beside what is needed to read it back exactly.
 
     Raises:
-        ConfigError: If `weights` is none of its values.
+        ConfigError: If a value is none of those that there are.
     """
 
     weights: Literal["float", "half", "none"] = "float"
     """Skinning weights of the splats as a primvar, for other tools: float, half precision, or none."""
     kaolin: bool = True
     """Kaolin's attributes, on bodies without quadratic handles."""
+    splats: Literal["float", "half"] = "float"
+    """Precision of the splats: float, equal to the bit when read back; or half, half as large, off by 2^-11 at most of
+    each number (positions count from the body's centre: of its size)."""
 
     def __post_init__(self) -> None:
         """Check the names."""
         if self.weights not in ("float", "half", "none"):
             raise ConfigError(f"weights is {self.weights!r}", hint="use 'float', 'half' or 'none'")
+        if self.splats not in ("float", "half"):
+            raise ConfigError(f"splats is {self.splats!r}", hint="use 'float' or 'half'")
 
 
 def write_usd(
@@ -154,7 +159,7 @@ def author_body(stage: Any, path: str, placed: PlacedBody, options: UsdExportOpt
     if placed.splats is not None:
         splats = define_splats(stage, f"{path}/Splats", placed.splats.sh_degree)
         for name, values in splat_columns(placed.splats).items():
-            set_splat_column(splats, name, values)
+            set_splat_column(splats, name, values, half=options.splats == "half")
         carrier = splats.GetPrim()
         weights = handle_weights(body, placed.splats.means)[0].astype(np.float32)
         if options.weights != "none":
