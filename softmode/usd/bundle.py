@@ -6,7 +6,6 @@ all of it goes along, so that a body of which a part was edited or lost in a con
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 from collections.abc import Mapping
@@ -16,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.deformables.body_file import body_fields, body_from_fields
-from softmode.deformables.materials import Material, MaterialModel
 from softmode.deformables.reduced_body import ReducedBody
-from softmode.errors import AssetError, MaterialError
+from softmode.errors import AssetError
 from softmode.usd import tokens
 
 DTYPES = {"<f8": "double[]", "<f4": "float[]", "<i8": "int64[]"}
@@ -103,37 +101,3 @@ def body_of(attributes: Mapping[str, Any], source: str) -> ReducedBody:
         if name.startswith(tokens.BODY_PREFIX) and isinstance(value, np.ndarray)
     }
     return decode_body(str(texts[0]), arrays, str(texts[1]), source)
-
-
-def material_of(attributes: Mapping[str, Any], standard: Mapping[str, float], source: str) -> Material:
-    """Return the material of a body that softmode wrote.
-
-    softmode's own attributes are in double precision. They count where the standard ones, which are float, agree with
-    them or are not there; a standard one that was edited counts itself.
-
-    Args:
-        attributes: All attributes whose names begin with `softmode:`.
-        standard: What the bound material says, in SI units, by the names of Material's fields.
-        source: File and prim, for messages.
-
-    Raises:
-        AssetError: If a value is no number, or no material has it.
-    """
-    values: dict[str, Any] = {}
-    try:
-        for field in dataclasses.fields(Material):
-            exact = attributes.get(tokens.MATERIAL_PREFIX + field.name)
-            if field.name == "model":
-                values["model"] = MaterialModel[exact] if exact is not None else field.default
-                continue
-            given = standard.get(field.name)
-            if exact is not None and (given is None or abs(given - exact) <= 1.0e-6 * abs(exact)):
-                given = exact
-            if given is not None:
-                values[field.name] = float(given)
-        return Material(**values)
-    except (KeyError, TypeError, ValueError) as error:
-        message = error.message if isinstance(error, MaterialError) else f"{type(error).__name__}: {error}"
-        raise AssetError(
-            f"{source}: its material cannot be used ({message})", hint="Mend it, or write it again"
-        ) from error
