@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-import functools
-
 import numpy as np
 import pytest
 
-from softmode.deformables.body import BuildOptions, ReducedBody, Region, build_body
-from softmode.deformables.quadrature import quadrature_from_box
 from softmode.errors import AssetError
 from softmode.usd.bundle import decode_body, encode_body
 from softmode.usd.handles import (
@@ -20,36 +15,7 @@ from softmode.usd.handles import (
     rigid_motion,
     world_coordinates,
 )
-
-KINDS = ("affine", "quadratic", "regions")
-
-
-@functools.cache
-def small_body(kind: str) -> ReducedBody:
-    """Return a small bar with one kind of handles: affine, quadratic, or with a region and static responses."""
-    sizes = {"mode_count": 4, "kernel_count": 60, "cubature_count": 48}
-    handles = "quadratic" if kind == "quadratic" else "affine"
-    regions = [Region(name="root", box=((-1.0,) * 3, (-0.03, 1.0, 1.0)))] if kind == "regions" else []
-    quadrature = quadrature_from_box((0.1, 0.04, 0.03), surface_count=80)
-    return build_body(quadrature, BuildOptions(handles=handles, **sizes), regions=regions, name=f"bar {kind}")
-
-
-def assert_same(one: ReducedBody, other: ReducedBody) -> None:
-    """Assert that two bodies are equal field by field, to the bit."""
-    for field in dataclasses.fields(ReducedBody):
-        a, b = getattr(one, field.name), getattr(other, field.name)
-        if isinstance(a, np.ndarray):
-            assert a.dtype == b.dtype and a.shape == b.shape, field.name
-            assert a.tobytes() == b.tobytes(), field.name
-        else:
-            assert a == b and type(a) is type(b), field.name
-
-
-def some_state(body: ReducedBody) -> np.ndarray:
-    """Return coordinates of a bent and turned body."""
-    rng = np.random.default_rng(7)
-    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    return body.affine(turn, (0.3, -0.2, 0.5)) + 0.004 * rng.normal(size=(body.function_count, 3))
+from tests.usd.export_scenes import KINDS, assert_same, small_body, some_state
 
 
 @pytest.mark.parametrize("kind", KINDS)
