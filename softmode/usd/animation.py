@@ -7,6 +7,7 @@ nothing of handles sees rigid objects move; whoever knows them, or a baked stage
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +22,7 @@ from softmode.errors import ConfigError, SolverDiverged
 from softmode.splats.formats.usd import set_splat_column, splat_columns
 from softmode.usd import tokens
 from softmode.usd.handles import handles_from_coordinates, local_coordinates, rigid_motion
-from softmode.usd.openusd import checked_target, openusd, whole_stage
+from softmode.usd.openusd import check_folder, checked_target, openusd, whole_stage
 from softmode.usd.placed import PlacedBody
 from softmode.usd.rigid import RigidMeshes
 from softmode.usd.skinned import SkinnedSplats
@@ -88,6 +89,7 @@ class UsdAnimation:
 
     Raises:
         ConfigError: If the file or the world cannot be, or the bodies are not those of the world.
+        StorageError: If the file cannot be written where it is named.
         MissingExtraError: If the extra `[usd]` is not installed.
     """
 
@@ -103,6 +105,7 @@ class UsdAnimation:
         """Find the bodies in the model."""
         openusd("Usd")
         self.path = checked_target(path)
+        check_folder(self.path)
         self.options = options or UsdAnimationOptions()
         self.model, self.world = model, world
         worlds = max(int(model.world_count), 1)
@@ -200,7 +203,8 @@ class UsdAnimation:
         if not self._times:
             raise ConfigError("no frame was recorded", hint="call record at least once")
         codes = [time * self.options.fps for time in self._times]
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(OSError):  # what is in the way will be told by the next line
+            self.path.parent.mkdir(parents=True, exist_ok=True)
         with whole_stage(self.path) as file:
             layer = new_layer(str(file))
             stage = new_stage(layer)

@@ -45,6 +45,22 @@ def checked_target(path: str | os.PathLike[str]) -> Path:
     return target
 
 
+def check_folder(target: Path) -> None:
+    """Check that a stage can be written where its name says, before anything is worth writing.
+
+    Raises:
+        StorageError: If the folder, or the nearest one above that exists, cannot be written to.
+    """
+    folder = target.absolute().parent
+    while not folder.exists():
+        folder = folder.parent
+    if not (folder.is_dir() and os.access(folder, os.W_OK)):
+        raise StorageError(
+            f"stage {target}: cannot be written ({folder} is no folder that may be written to)",
+            hint="choose another folder",
+        )
+
+
 @contextlib.contextmanager
 def whole_stage(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield the name of a file beside `path` that takes its place when the block ends without an error.
