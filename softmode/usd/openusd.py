@@ -86,4 +86,5 @@ def whole_stage(path: str | os.PathLike[str]) -> Iterator[Path]:
                 hint="check the folder, its permissions and the free space",
             ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
