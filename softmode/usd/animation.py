@@ -22,7 +22,7 @@ from softmode.errors import ConfigError, SolverDiverged
 from softmode.splats.formats.usd import set_splat_column, splat_columns
 from softmode.usd import tokens
 from softmode.usd.handles import handles_from_coordinates, local_coordinates, rigid_motion
-from softmode.usd.openusd import check_folder, checked_target, openusd, whole_stage
+from softmode.usd.openusd import check_stage, openusd, whole_stage
 from softmode.usd.placed import PlacedBody
 from softmode.usd.rigid import RigidMeshes
 from softmode.usd.skinned import SkinnedSplats
@@ -103,9 +103,7 @@ class UsdAnimation:
         options: UsdAnimationOptions | None = None,
     ) -> None:
         """Find the bodies in the model."""
-        openusd("Usd")
-        self.path = checked_target(path)
-        check_folder(self.path)
+        self.path = check_stage(path)
         self.options = options or UsdAnimationOptions()
         self.model, self.world = model, world
         worlds = max(int(model.world_count), 1)
@@ -123,8 +121,38 @@ class UsdAnimation:
         self._bodies = tuple(bodies)
         self._placed: tuple[PlacedBody, ...] = ()
         self._meshes = RigidMeshes(model, world) if self.options.rigid_meshes else None
+        self._live: Any = None
         self._times: list[float] = []
         self._states: list[list[NDArray[np.float64]]] = []
+
+    @classmethod
+    def of_env(
+        cls, path: str | Path, env: Any, *, world: int = 0, options: UsdAnimationOptions | None = None
+    ) -> UsdAnimation:
+        """Return an animation of an environment; `record()` then takes its present state.
+
+        Args:
+            path: As above.
+            env: A `SoftEnv` or a `SoftVectorEnv` whose worlds live in this process, wrapped or not.
+            world: Which world.
+            options: How it is written; by default with the environment's control rate as `fps`.
+
+        Raises:
+            ConfigError: As above, or if `env` is no such environment.
+        """
+        task = getattr(getattr(env, "unwrapped", env), "task", None)
+        scene = getattr(task, "scene", None)
+        if scene is None:
+            raise ConfigError(f"env is a {type(env).__name__}", hint="pass a softmode environment, made by gym.make")
+        made = cls(
+            path,
+            scene.model,
+            [PlacedBody(body=thing.body, splats=thing.splats) for thing in scene.objects],
+            world=world,
+            options=options or UsdAnimationOptions(fps=scene.config.control_hz),
+        )
+        made._live = scene.state
+        return made
 
     def __enter__(self) -> UsdAnimation:
         """Return the animation."""
@@ -140,17 +168,20 @@ class UsdAnimation:
         """Number of frames recorded."""
         return len(self._times)
 
-    def record(self, state: Any, time: float | None = None) -> None:
+    def record(self, state: Any = None, time: float | None = None) -> None:
         """Append a frame.
 
         Args:
-            state: A state of the model.
+            state: A state of the model; None for the present one of the environment (`of_env`).
             time: When it is [s], later than the frame before; None for one frame after it.
 
         Raises:
-            ConfigError: If the time is not finite or not later than that of the frame before.
+            ConfigError: If there is no state, or the time is not finite or not later than that of the frame before.
             SolverDiverged: If the state is not finite.
         """
+        state = self._live if state is None else state
+        if state is None:
+            raise ConfigError("state is None", hint="pass a state of the model, or make the animation by of_env")
         when = (self._times[-1] + 1.0 / self.options.fps if self._times else 0.0) if time is None else float(time)
         if not (np.isfinite(when) and (not self._times or when > self._times[-1])):
             before = f" after one at {self._times[-1]} s" if self._times else ""

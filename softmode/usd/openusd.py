@@ -45,12 +45,16 @@ def checked_target(path: str | os.PathLike[str]) -> Path:
     return target
 
 
-def check_folder(target: Path) -> None:
-    """Check that a stage can be written where its name says, before anything is worth writing.
+def check_stage(path: str | os.PathLike[str]) -> Path:
+    """Return the path of a stage that can be written where its name says, before anything is worth writing.
 
     Raises:
+        ConfigError: As by `checked_target`.
+        MissingExtraError: If the extra `[usd]` is not installed.
         StorageError: If the folder, or the nearest one above that exists, cannot be written to.
     """
+    openusd("Usd")
+    target = checked_target(path)
     folder = target.absolute().parent
     while not folder.exists():
         folder = folder.parent
@@ -59,6 +63,7 @@ def check_folder(target: Path) -> None:
             f"stage {target}: cannot be written ({folder} is no folder that may be written to)",
             hint="choose another folder",
         )
+    return target
 
 
 @contextlib.contextmanager
