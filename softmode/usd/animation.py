@@ -140,10 +140,10 @@ class UsdAnimation:
         Raises:
             ConfigError: As above, or if `env` is no such environment.
         """
-        task = getattr(getattr(env, "unwrapped", env), "task", None)
-        scene = getattr(task, "scene", None)
+        inner = getattr(env, "unwrapped", env)
+        scene = getattr(getattr(inner, "task", None), "scene", None)
         if scene is None:
-            raise ConfigError(f"env is a {type(env).__name__}", hint="pass a softmode environment, made by gym.make")
+            raise ConfigError(f"env is a {type(inner).__name__}", hint="pass a softmode environment, made by gym.make")
         made = cls(
             path,
             scene.model,

@@ -73,6 +73,9 @@ def _author_mesh(stage: Any, path: str, mesh: SceneMesh) -> None:
     prim.CreateNormalsAttr(vectors(mesh.normals))
     prim.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     prim.CreateExtentAttr(vectors(np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)])))
-    prim.CreateDisplayColorAttr(vectors(np.array([mesh.color])))
+    # Display colours are linear in OpenUSD.
+    color = np.array([mesh.color], dtype=np.float64)
+    linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+    prim.CreateDisplayColorAttr(vectors(linear))
     if mesh.opacity < 1.0:
         prim.CreateDisplayOpacityAttr(Vt.FloatArray([mesh.opacity]))

@@ -122,7 +122,7 @@ def test_baked_is_what_handles_play(tmp_path: Path, kind: str, coefficients: int
     (same,) = read_animation(tmp_path / "baked.usdc").bodies
     np.testing.assert_array_equal(played.coordinates, same.coordinates)
     reach = float(np.abs(played.splats_at(0).means).max())
-    for frame in range(FRAMES):
+    for frame in (0, FRAMES - 1):
         expected = played.splats_at(frame)
         seen = read_usd(tmp_path / "baked.usdc", time_code=frame * 3.0)
         np.testing.assert_allclose(seen.means, expected.means, atol=4 * EPSILON * reach)
@@ -160,6 +160,9 @@ def test_rigid_bodies_are_in_place(tmp_path: Path) -> None:
     mesh = UsdGeom.Mesh(boxes[0])
     assert not mesh.GetPointsAttr().GetNumTimeSamples()
     assert len(np.unique(np.array(mesh.GetPointsAttr().Get()), axis=0)) == 8
+    color = scene.model.shape_color.numpy()[1]
+    shown = np.array(mesh.GetDisplayColorAttr().Get())[0]  # linear, where the model has sRGB
+    np.testing.assert_allclose(1.055 * shown ** (1 / 2.4) - 0.055, color, atol=1e-6)
     for frame in range(FRAMES):
         matrix = np.array(UsdGeom.XformCache(3.0 * frame).GetLocalToWorldTransform(boxes[0]))
         angle = 0.6 * frame
