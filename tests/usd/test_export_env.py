@@ -15,6 +15,7 @@ from softmode.cli import main
 from softmode.errors import ConfigError
 from softmode.splats.formats import read_usd
 from softmode.usd import UsdAnimation, read_animation
+from softmode.usd.openusd import openusd
 
 pytest.importorskip("pxr", reason="needs the extra [usd]")
 PLAY = ["play", "softmode/LiftSoft-v0", "--policy", "random"]
@@ -66,8 +67,7 @@ def test_worlds_of_a_vector_environment(tmp_path: Path) -> None:
     count = toy.body.function_count
     np.testing.assert_allclose(toy.coordinates[-1], q[count:], atol=1e-12)
     assert np.abs(toy.coordinates[-1] - q[:count]).max() > 1e-3
-    from pxr import Usd, UsdGeom
-
+    Usd, UsdGeom = openusd("Usd", "UsdGeom")
     stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
     links = stage.GetPrimAtPath("/World/Rigid").GetChildren()
     assert stage.GetPrimAtPath("/World/Rigid/world/table") and len(links) > 5
