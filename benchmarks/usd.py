@@ -98,7 +98,7 @@ def main() -> None:
         kept = model.state()
         kept.assign(state)
         states.append(kept)
-    print("| what | size [MB] | write [s] | read [s] | frame on the spot [ms] |\n|---|---|---|---|---|")
+    print("| what | size [MB] | write [s] | read [s] | record a frame [ms] |\n|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "toy.usdc"
         for name, export in (("toy", FULL), ("toy, weights and Kaolin left out", BARE), ("toy, half", HALF)):

@@ -143,11 +143,12 @@ def prim_name(label: str, seen: set[str]) -> str:
 
 def author_body(stage: Any, path: str, placed: PlacedBody, options: UsdExportOptions) -> str:
     """Author one body with all that belongs to it; return its path."""
-    Usd, UsdGeom = openusd("Usd", "UsdGeom")
+    Usd, UsdGeom, UsdSemantics = openusd("Usd", "UsdGeom", "UsdSemantics")
     body = placed.body
     root = UsdGeom.Xform.Define(stage, path)
     prim = root.GetPrim()
     Usd.ModelAPI(prim).SetKind("component")
+    UsdSemantics.LabelsAPI.Apply(prim, "class").CreateLabelsAttr([placed.name or body.name])
     prim.AddAppliedSchema(tokens.BODY_API)
     attribute(prim, tokens.MASS, "Float", placed.mass)
     set_place(root, placed.position, placed.rotation, placed.scale)

@@ -93,6 +93,7 @@ def test_stage_says_what_it_holds(tmp_path: Path) -> None:
     assert stage.GetDefaultPrim().GetPath() == "/World" and not stage.HasAuthoredTimeCodeRange()
     prim = stage.GetPrimAtPath("/World/toy")
     assert newton.usd.has_applied_api_schema(prim, "PhysicsDeformableBodyAPI")
+    assert list(prim.GetAttribute("semantics:labels:class").Get()) == ["toy"]
     mass = MATERIAL.density * toy.body.volume * toy.scale**3
     assert prim.GetAttribute("physics:mass").Get() == np.float32(mass)
     material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")
