@@ -1,16 +1,18 @@
-"""The command line: play, train, evaluate, export, record, bench, list-envs, robots and splat."""
+"""The command line: play, train, evaluate, export, record, bench, list-envs, robots, splat and body."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from softmode import ENVIRONMENTS
 from softmode.cli_bench import Bench
+from softmode.cli_body import BodyBuild, BodyCheck, BodyShow
 from softmode.cli_common import bar_interval, quiet_warp, warp_device
 from softmode.cli_record import Record
 from softmode.cli_splat import SplatConvert, SplatFromMesh, SplatInfo
@@ -34,8 +36,17 @@ class Play:
     """Seed of the first episode; the next ones count up."""
     video: Path | None = None
     """Film to write (.mp4): the camera's view beside an overview. A contact sheet (.png) is written beside it."""
+    rerun: str | None = None
+    """Recording to write for the rerun viewer (.rrd); or the address of a running one, like
+    rerun+http://127.0.0.1:9876/proxy; or spawn, which opens one."""
+    usd: Path | None = None
+    """OpenUSD stage to write (.usdc, .usd or .usda)."""
+    usd_mode: Literal["handles", "baked"] = "handles"
+    """What the stage samples: handle matrices only, or also every splat."""
     splat: Path | None = None
     """Splat file of the object (INRIA .ply, or a SOG v2 folder, meta.json or .sog); the built-in plush if omitted."""
+    object: Path | None = None
+    """Body file of the object, from `softmode body build`; instead of a splat file."""
     size: float | None = None
     """Longest edge of the object [m], as the task has it if omitted; the gripper opens 0.09 m."""
     up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
@@ -105,6 +116,12 @@ def main(arguments: list[str] | None = None) -> int:
             | Annotated[SplatConvert, tyro.conf.subcommand("convert")],
             tyro.conf.subcommand("splat", description="Make, inspect and convert splat files."),
         ]
+        body = Annotated[
+            Annotated[BodyBuild, tyro.conf.subcommand("build")]
+            | Annotated[BodyShow, tyro.conf.subcommand("show")]
+            | Annotated[BodyCheck, tyro.conf.subcommand("check")],
+            tyro.conf.subcommand("body", description="Build, draw and check the bodies of soft objects."),
+        ]
         command = tyro.cli(
             Annotated[Play, tyro.conf.subcommand("play")]
             | Annotated[Train, tyro.conf.subcommand("train")]
@@ -114,7 +131,8 @@ def main(arguments: list[str] | None = None) -> int:
             | Annotated[Record, tyro.conf.subcommand("record")]
             | Annotated[ListEnvs, tyro.conf.subcommand("list-envs")]
             | Annotated[Robots, tyro.conf.subcommand("robots")]
-            | splat,  # type: ignore[arg-type]
+            | splat  # type: ignore[arg-type]
+            | body,  # type: ignore[arg-type]
             prog="softmode",
             args=arguments,
             config=(tyro.conf.PositionalRequiredArgs,),
@@ -144,6 +162,14 @@ def play(options: Play) -> int:
         raise MaterialError(
             f"youngs-modulus must be a finite number > 0, got {options.youngs_modulus}", hint="give it in Pa, like 2e5"
         )
+    if options.rerun is not None:
+        from softmode.viz.rerun_logger import check_target
+
+        check_target(options.rerun)
+    if options.usd is not None:
+        from softmode.usd.openusd import check_stage
+
+        check_stage(options.usd)
     film = None
     try:
         if options.video is not None:
@@ -168,7 +194,7 @@ def _play(options: Play, film: Film | None) -> int:
         with _BuildBar() as progress:
             env = gym.make(
                 options.env,
-                render_mode="rgb_array" if film else None,
+                render_mode="rgb_array" if film or options.rerun else None,
                 config=_task_config(options, given.pop("config", {})),
                 **given,
                 device=warp_device(options.device),
@@ -185,19 +211,41 @@ def _play(options: Play, film: Film | None) -> int:
             fps = env.metadata["render_fps"]
             policy = policy_factory(options.policy, env, trained)
             seeds = range(options.seed, options.seed + options.episodes)
-            successes = sum(_play_episode(env, options, policy, seed, film, fps) for seed in seeds)
+            with _recorders(options, env) as logs:
+                successes = sum(_play_episode(env, options, policy, seed, film, logs, fps) for seed in seeds)
         finally:
             env.close()
     if film:
         film.publish()
         print(f"wrote {film.path} and {film.sheet_path}")
+    if options.rerun and options.rerun.endswith(".rrd"):
+        print(f"wrote {options.rerun}; open it with: rerun {options.rerun}")
+    if options.usd:
+        print(f"wrote {options.usd}; read it with softmode.usd.read_animation, or open it in any viewer of OpenUSD")
     if options.episodes > 1:
         print(f"{successes} of {options.episodes} episodes succeeded")
     return 0
 
 
+@contextlib.contextmanager
+def _recorders(options: Play, env: Any) -> Iterator[list[Any]]:
+    """Yield what records the state of the environment after every step, each publishing its file at the end."""
+    with contextlib.ExitStack() as stack:
+        logs: list[Any] = []
+        if options.rerun is not None:
+            from softmode.viz.rerun_logger import RerunLogger
+
+            logs.append(stack.enter_context(RerunLogger(options.rerun, env)))
+        if options.usd is not None:
+            from softmode.usd.animation import UsdAnimation, UsdAnimationOptions
+
+            usd = UsdAnimationOptions(mode=options.usd_mode, fps=env.metadata["render_fps"])
+            logs.append(stack.enter_context(UsdAnimation.of_env(options.usd, env, options=usd)))
+        yield logs
+
+
 def _play_episode(
-    env: Any, options: Play, factory: Callable[[int], Any], seed: int, film: Film | None, fps: int
+    env: Any, options: Play, factory: Callable[[int], Any], seed: int, film: Film | None, logs: list[Any], fps: int
 ) -> bool:
     """Play one episode, print its outcome, return whether it succeeded."""
     import gymnasium as gym
@@ -206,6 +254,8 @@ def _play_episode(
     given = {} if options.youngs_modulus is None else {"youngs_modulus": options.youngs_modulus}
     observation, info = env.reset(seed=seed, options=given)
     policy = factory(seed)
+    for log in logs:
+        log.record()
     total, steps, seconds = 0.0, 0, 0.0
     limit = gym.spec(options.env).max_episode_steps
     with tqdm(total=limit, desc=f"seed {seed}", unit="step", mininterval=bar_interval()) as bar:
@@ -218,6 +268,8 @@ def _play_episode(
             total, steps, done = total + float(reward), steps + 1, terminated or truncated
             if film:
                 film.add(env.render(), fps)
+            for log in logs:
+                log.record()
             bar.update()
     modulus = info["parameters"]["youngs_modulus"]
     print(
@@ -237,14 +289,19 @@ def _task_config(options: Play, trained: dict[str, Any]) -> Any:
     scene = base.scene
     names = ("splat", "size", "up", "crop", "part", "pose")
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    if given:
+    if options.object is not None:
+        if given:
+            raise ConfigError(
+                f"{', '.join(given)} given for the body {options.object}", hint="give them to softmode body build"
+            )
+        scene = dataclasses.replace(scene, object=ObjectConfig(body=options.object))
+    elif given:
         thing = scene.object
         if options.splat is not None:
             thing = ObjectConfig(surface_count=thing.surface_count, build=thing.build)
-        if thing.extents is not None:
-            raise ConfigError(
-                f"{', '.join(given)} given for a {thing.shape} of {thing.extents} m", hint="give a --splat file too"
-            )
+        if thing.extents is not None or thing.body is not None:
+            what = f"a {thing.shape} of {thing.extents} m" if thing.body is None else f"the body {thing.body}"
+            raise ConfigError(f"{', '.join(given)} given for {what}", hint="give a --splat file too")
         thing = dataclasses.replace(thing, **given)
         scene = dataclasses.replace(scene, object=thing)
     return dataclasses.replace(base, scene=scene, mesh_samples=4 if options.video else base.mesh_samples)

@@ -173,23 +173,14 @@ class ReducedBody:
         Raises:
             BasisError: If points are not finite, or out of reach with outside="raise".
         """
-        x = np.asarray(points, dtype=np.float64)
-        if x.ndim != 2 or x.shape[1] != 3 or not np.isfinite(x).all():
-            raise BasisError(f"points: expected finite positions of shape (N, 3), got shape {x.shape}")
+        x, inner, far = self._within_reach(points)
         if outside not in ("clamp", "raise"):
             raise ConfigError(f"outside: expected 'clamp' or 'raise', got {outside!r}")
-        basis, tree = self._kernels
-        distance, nearest = tree.query(x)
-        ratio = distance / (REACH * basis.support[nearest])
-        far = ratio > 1.0
         if far.any() and outside == "raise":
             raise BasisError(
                 f"points: {int(far.sum())} of {len(x)} lie outside the body (first: row {int(far.argmax())})",
                 hint="Drop them, or pass outside='clamp'.",
             )
-        inner = np.where(
-            far[:, None], self.centres[nearest] + (x - self.centres[nearest]) / np.maximum(ratio, 1.0)[:, None], x
-        )
         value = np.empty((len(x), self.function_count))
         gradient = np.empty((len(x), self.function_count, 3))
         for i in range(0, len(x), _CHUNK):
@@ -201,11 +192,54 @@ class ReducedBody:
             gradient[far] = content[:3].T
         return value, gradient
 
+    def skinning_weights(self, points: ArrayLike) -> tuple[Array, Array]:
+        """Evaluate the skinning weights W_j and their gradients at rest points of the body frame.
+
+        With T_j the map that handle j applies, x(X) = X + sum_j W_j(X) T_j(X) for points within the kernels' reach;
+        beyond it the weights are those of the nearest point within.
+
+        Args:
+            points: Rest positions [m], shape (N, 3).
+
+        Returns:
+            Weights (N, J), the constant handle's first, and gradients [1/m] (N, J, 3).
+
+        Raises:
+            BasisError: If points are not finite.
+        """
+        inner = self._within_reach(points)[1]
+        weight = np.empty((len(inner), len(self.handle_degrees)))
+        gradient = np.empty((*weight.shape, 3))
+        for i in range(0, len(inner), _CHUNK):
+            weight[i : i + _CHUNK], gradient[i : i + _CHUNK] = self._weights_inside(inner[i : i + _CHUNK])
+        return weight, gradient
+
+    def _within_reach(self, points: ArrayLike) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Return the points, the nearest ones to them within the kernels' reach, and which differ."""
+        x = np.asarray(points, dtype=np.float64)
+        if x.ndim != 2 or x.shape[1] != 3 or not np.isfinite(x).all():
+            raise BasisError(f"points: expected finite positions of shape (N, 3), got shape {x.shape}")
+        basis, tree = self._kernels
+        distance, nearest = tree.query(x)
+        ratio = distance / (REACH * basis.support[nearest])
+        far = ratio > 1.0
+        inner = np.where(
+            far[:, None], self.centres[nearest] + (x - self.centres[nearest]) / np.maximum(ratio, 1.0)[:, None], x
+        )
+        return x, inner, far
+
+    @cached_property
+    def _skin(self) -> SkinningWeights:
+        return SkinningWeights(coefficients=self.handles, degrees=self.handle_degrees, blends=self.handle_regions)
+
+    def _weights_inside(self, x: Array) -> tuple[Array, Array]:
+        """Evaluate weights (N, J) and gradients (N, J, 3) at points within reach."""
+        return self._skin.evaluate(*enveloped(self._kernels[0].evaluate(x), self._envelope))
+
     def _evaluate_inside(self, x: Array) -> tuple[Array, Array]:
         """Evaluate functions (N, n) and gradients (N, n, 3) at points within reach."""
-        skin = SkinningWeights(coefficients=self.handles, degrees=self.handle_degrees, blends=self.handle_regions)
-        weight, slope = skin.evaluate(*enveloped(self._kernels[0].evaluate(x), self._envelope))
-        raw, raw_gradient = skin.products(weight, slope, x, self.length)
+        weight, slope = self._weights_inside(x)
+        raw, raw_gradient = self._skin.products(weight, slope, x, self.length)
         gradient = np.stack([raw_gradient[:, :, d] @ self.transform for d in range(3)], axis=2)
         return raw @ self.transform, gradient
 

@@ -144,13 +144,37 @@ class BasisRKPM:
             matrix(value), (matrix(gradient[:, 0]), matrix(gradient[:, 1]), matrix(gradient[:, 2])), x
         )
 
-    def _evaluate_chunk(self, x: Array, first: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
-        """Return kernels per point (N,), column of each pair, value (pairs,) and gradient (pairs, 3)."""
+    def conditions(self, points: ArrayLike) -> Array:
+        """Return the 1-norm condition numbers of the moment matrices at points (N, 3) [m], shape (N,).
+
+        Infinite where fewer than four kernels reach a point; `evaluate` refuses those over `CONDITION_LIMIT`.
+        """
+        x = np.asarray(points, dtype=np.float64)
+        found = np.full(len(x), np.inf)
+        step = max(1, _PAIRS_PER_CHUNK // self.kernel_count)
+        for i in range(0, len(x), step):
+            row, column, count = self._pairs(x[i : i + step])
+            offset = x[i : i + step][row] - self.centres[column]
+            poly = np.column_stack([np.ones(len(row)), offset / float(self.support.mean())])
+            entry = (poly[:, :, None] * poly[:, None]).reshape(-1, 16) * self._bell(offset, column)[0][:, None]
+            moment = np.stack([np.bincount(row, e, minlength=len(count)) for e in entry.T], axis=1).reshape(-1, 4, 4)
+            good = np.flatnonzero((count >= 4) & (moment[:, 0, 0] > 1e-14))
+            scaled = moment[good] / moment[good, :1, :1]
+            value = np.linalg.cond(scaled, 1)
+            found[i + good] = np.where(np.isfinite(value), value, np.inf)
+        return found
+
+    def _pairs(self, x: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+        """Return the row and kernel of every pair within reach, by rows, and kernels per point (N,)."""
         origin = self.centres.mean(axis=0)
         a, b = x - origin, self.centres - origin
         distance_sq = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2.0 * (a @ b.T)
         row, column = np.nonzero(distance_sq < self.support**2 * (1.0 + 1e-9))
-        count = np.bincount(row, minlength=len(x))
+        return row, column, np.bincount(row, minlength=len(x))
+
+    def _evaluate_chunk(self, x: Array, first: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
+        """Return kernels per point (N,), column of each pair, value (pairs,) and gradient (pairs, 3)."""
+        row, column, count = self._pairs(x)
         if count.min() < 4:
             self._raise_uncovered(np.flatnonzero(count < 4) + first, x[count < 4])
         h = float(self.support.mean())

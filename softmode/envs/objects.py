@@ -15,6 +15,7 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 from softmode.deformables.body import BuildOptions, ReducedBody, Region, build_body, cached_body
 from softmode.deformables.quadrature import Quadrature, quadrature_from_mesh, quadrature_from_splats
 from softmode.deformables.skinning import average_basis
+from softmode.envs.object_file import read_object, surface_cover
 from softmode.envs.primitives import (
     Color,
     Extents,
@@ -27,6 +28,7 @@ from softmode.envs.primitives import (
 from softmode.errors import AssetError, ConfigError
 from softmode.splats import Splats, make_plush, read_splats, split_components
 from softmode.splats.colored_mesh import ColoredMesh, read_mesh
+from softmode.splats.point_cloud import is_point_cloud, read_points
 from softmode.splats.splats import UpAxis, up_rotation
 
 Shape = Literal["plush", "box", "cylinder", "capsule", "sphere"]
@@ -43,7 +45,7 @@ STABLE_TILT = 0.1
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectConfig:
-    """Which soft object, how large, how finely reduced: the built-in plush, a shape, a mesh file or a splat file."""
+    """Which soft object, how large, how finely reduced: the built-in plush, a shape, a file, or a body as it is."""
 
     shape: Shape = "plush"
     """What it is where neither `splat` nor `mesh` is given: "plush", or a "box", "cylinder", "capsule" or "sphere" of
@@ -52,9 +54,12 @@ class ObjectConfig:
     """Edges of a shape's bounding box along x, y and z [m]. A round shape needs two that are equal, a sphere three; a
     capsule lies along the third, its longest, a cylinder along the third, its length or the thickness of a disc."""
     splat: str | Path | None = None
-    """Splat file (INRIA .ply, SOG v2)."""
+    """Splat file (.ply, SOG v2, .spz, .splat, OpenUSD), or a point cloud (.npz, see `read_points`, or .ply)."""
     mesh: str | Path | None = None
     """Mesh file (.obj, .glb, .stl, ... whatever trimesh reads). One that is not closed stands for what it encloses."""
+    body: str | Path | None = None
+    """File of a body (`softmode body build`, or `ReducedBody.save`): taken as it is, with its own size, pose, surface
+    samples, regions and splats."""
     size: float = 0.08
     """Longest edge of the bounding box of plush, splat file or mesh, upright [m]; the gripper opens 0.09 m."""
     colors: tuple[Color, Color] | None = None
@@ -65,7 +70,7 @@ class ObjectConfig:
     """Number of surface samples, the points that feel contact."""
     up: UpAxis | None = None
     """Axis of the file that points up; None for "-y" (splat files: trained captures mostly have y down), "+y" (glTF) or
-    "+z" (other meshes)."""
+    "+z" (OpenUSD, which is read with z up, point clouds, and other meshes)."""
     crop: tuple[float, float, float, float, float, float] | None = None
     """Box (x0, y0, z0, x1, y1, z1) of the splat file, after turning it up, outside which splats are dropped; cuts an
     object off what it touched when it was captured."""
@@ -102,10 +107,17 @@ class ObjectConfig:
         for name, low in (("splat_count", 100), ("surface_count", 16)):
             if getattr(self, name) < low:
                 raise ConfigError(f"{name} must be at least {low}, got {getattr(self, name)!r}")
-        if (self.splat is not None) + (self.mesh is not None) + (self.shape != "plush") > 1:
+        files = (self.splat, self.mesh, self.body)
+        if sum(file is not None for file in files) + (self.shape != "plush") > 1:
             raise ConfigError(
-                f"shape {self.shape!r}, splat {self.splat!r} and mesh {self.mesh!r} exclude each other",
+                f"shape {self.shape!r}, splat {self.splat!r}, mesh {self.mesh!r} and body {self.body!r} exclude each"
+                " other",
                 hint="give one of them",
+            )
+        if self.body is not None and self.clamped_height > 0.0:
+            raise ConfigError(
+                f"clamped_height is {self.clamped_height} m for a body that is built",
+                hint="build it with a region for its foot: softmode body build FILE --region foot=...",
             )
         self._check_extents()
         if self.colors is not None:
@@ -159,38 +171,68 @@ def load_object(config: ObjectConfig, progress: Callable[[str, float], None] | b
     Raises:
         AssetError: If the file cannot be read or encloses no volume.
     """
-    splats, solid, name, key = _source(config)
+    if config.body is not None:
+        body, shown = read_object(config.body)
+        return _tie(
+            body, surface_cover(body) if shown is None else shown, 0.0 if body.driven_count else config.contact_radius
+        )
+    splats, solid, name, key = object_source(config)
     turns = config.pose == "stable" and (config.splat is not None or config.mesh is not None)
 
     def build() -> ReducedBody:
-        try:
-            quadrature = solid()
-        except AssetError as error:
-            raise AssetError(f"{splats.name}: {error.message}", hint=error.hint) from error
-        turn = None
-        if turns:
-            centre = quadrature.weights @ quadrature.points / quadrature.volume
-            turn = stable_rotation(quadrature.surface_points - centre)
-        if turn is not None:
-            quadrature = turned(quadrature, turn)
+        quadrature, turn = standing_quadrature(config, solid, splats.name)
         regions = ()
         if config.clamped_height > 0.0:
             wide = float("inf")
             top = float(quadrature.bounds[0, 2]) + config.clamped_height
             regions = (Region(name="foot", box=((-wide,) * 3, (wide, wide, top))),)
         body = build_body(quadrature, config.build, name=name, regions=regions, progress=progress)
-        rows = np.eye(3).tolist() if turn is None else turn.tolist()
-        return replace(body, provenance={**body.provenance, "turn": json.dumps(rows)})
+        return replace(body, provenance={**body.provenance, "turn": json.dumps(turn.tolist())})
 
     clamp = (config.clamped_height,) if config.clamped_height > 0.0 else ()
     body = cached_body((RECIPE, *key, turns, config.surface_count, config.build, *clamp), build)
     turn = np.array(json.loads(str(body.provenance["turn"])))
+    return _tie(body, shown_splats(splats, body, turn), 0.0 if clamp else config.contact_radius)
+
+
+def standing_quadrature(
+    config: ObjectConfig, solid: Callable[[], Quadrature], name: str
+) -> tuple[Quadrature, NDArray[np.float64]]:
+    """Integrate an object and lay it on a stable side if its pose is to be stable.
+
+    Args:
+        config: Which object.
+        solid: Integrates it; see `object_source`.
+        name: What messages call it.
+
+    Returns:
+        The quadrature, and the rotation that was applied, shape (3, 3).
+
+    Raises:
+        AssetError: If it encloses no volume.
+    """
+    try:
+        quadrature = solid()
+    except AssetError as error:
+        raise AssetError(f"{name}: {error.message}", hint=error.hint) from error
+    turn = None
+    if config.pose == "stable" and (config.splat is not None or config.mesh is not None):
+        centre = quadrature.weights @ quadrature.points / quadrature.volume
+        turn = stable_rotation(quadrature.surface_points - centre)
+    return (quadrature, np.eye(3)) if turn is None else (turned(quadrature, turn), turn)
+
+
+def shown_splats(splats: Splats, body: ReducedBody, turn: NDArray[np.float64]) -> Splats:
+    """Return the splats that show a body, turned (3, 3) as it was, in its frame, without floaters far from it."""
     if not np.array_equal(turn, np.eye(3)):
         splats = splats.transformed(rotation=turn)
-    shown = splats.subset(_drawn(splats, body)).transformed(translation=-body.offset)
+    return splats.subset(_drawn(splats, body)).transformed(translation=-body.offset)
+
+
+def _tie(body: ReducedBody, shown: Splats, contact_radius: float) -> SoftObject:
+    """Tie splats to the functions that move them."""
     basis, grad_basis = average_basis(lambda x: body.evaluate(x)[0], shown.means, shown.covariances())
-    height = float(-body.surface_points[:, 2].min()) + (0.0 if clamp else config.contact_radius)
-    return SoftObject(body, shown, basis, grad_basis, height)
+    return SoftObject(body, shown, basis, grad_basis, float(-body.surface_points[:, 2].min()) + contact_radius)
 
 
 def choose_part(splats: Splats, rule: Part) -> Splats:
@@ -250,8 +292,12 @@ _Source = tuple[Splats, Callable[[], Quadrature], str, tuple[Any, ...]]
 """Splats, how their solid is integrated, its name, and what it depends on beside the configuration."""
 
 
-def _source(config: ObjectConfig) -> _Source:
-    """Return what an object is made of, before it is turned to a stable pose."""
+def object_source(config: ObjectConfig) -> _Source:
+    """Return what an object is made of, before it is turned to a stable pose.
+
+    Raises:
+        AssetError: If a file cannot be read.
+    """
     count = config.surface_count
     if config.mesh is not None:
         mesh = _read_mesh(config)
@@ -295,20 +341,7 @@ def _mesh_solid(mesh: ColoredMesh, surface_count: int) -> Quadrature:
 
 def _read_splats(config: ObjectConfig) -> Splats:
     """Return the splats upright, standing on z = 0 around the origin, scaled to the wanted size."""
-    if config.splat is None:
-        splats = make_plush()
-    else:
-        splats = read_splats(config.splat).oriented(config.up or "-y")
-        if config.crop is not None:
-            inside = (splats.means >= config.crop[:3]).all(axis=1) & (splats.means <= config.crop[3:]).all(axis=1)
-            if not inside.any():
-                low, high = np.round(splats.bounds(), 3).tolist()
-                raise AssetError(
-                    f"{splats.name}: no splat lies inside crop {config.crop}",
-                    hint=f"the splats fill {low} to {high} once turned up",
-                )
-            splats = splats.subset(inside)
-        splats = choose_part(splats, config.part)
+    splats = make_plush() if config.splat is None else choose_part(read_cropped(config), config.part)
     low, high = splats.bounds(quantile=0.0 if config.splat is None else 0.002)
     extent = float((high - low).max())
     if not extent > 0.0:
@@ -316,6 +349,30 @@ def _read_splats(config: ObjectConfig) -> Splats:
     scale = config.size / extent
     centre = np.array([*(0.5 * (low + high))[:2], low[2]])
     return splats.transformed(translation=-scale * centre, scale=scale)
+
+
+def read_cropped(config: ObjectConfig) -> Splats:
+    """Read the splat file or point cloud of a configuration, turn it upright and crop it.
+
+    Raises:
+        AssetError: If it cannot be read, or the crop leaves nothing.
+    """
+    file = Path(str(config.splat))
+    if is_point_cloud(file):
+        splats, up = read_points(file), "+z"
+    else:
+        splats, up = read_splats(file), "+z" if file.suffix.lower().startswith(".usd") else "-y"
+    splats = splats.oriented(config.up or up)
+    if config.crop is None:
+        return splats
+    inside = (splats.means >= config.crop[:3]).all(axis=1) & (splats.means <= config.crop[3:]).all(axis=1)
+    if not inside.any():
+        low, high = np.round(splats.bounds(), 3).tolist()
+        raise AssetError(
+            f"{splats.name}: no splat lies inside crop {config.crop}",
+            hint=f"the splats fill {low} to {high} once turned up",
+        )
+    return splats.subset(inside)
 
 
 def _drawn(splats: Splats, body: ReducedBody) -> NDArray[np.bool_]:

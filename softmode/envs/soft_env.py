@@ -195,11 +195,12 @@ def checked_config(
     if splat is not None or size is not None:
         given = {name: value for name, value in (("splat", splat), ("size", size)) if value is not None}
         thing = scene.object
-        if splat is not None and (thing.extents is not None or thing.mesh is not None):
+        if splat is not None and (thing.extents is not None or thing.mesh is not None or thing.body is not None):
             thing = ObjectConfig(surface_count=thing.surface_count, build=thing.build)
-        if thing.extents is not None:
+        if thing.extents is not None or thing.body is not None:
+            what = f"a {thing.shape} of {thing.extents} m" if thing.body is None else f"the body {thing.body}"
             raise ConfigError(
-                f"size given for a {thing.shape} of {thing.extents} m",
+                f"size given for {what}",
                 hint="set the extents of config.scene.object, or give a splat file too",
             )
         scene = replace(scene, object=replace(thing, **given))

@@ -159,6 +159,11 @@ class TableScene:
         """The first soft object."""
         return self.objects[0]
 
+    @property
+    def marker(self) -> Splats | None:
+        """Splats that mark a place in pictures, as they were given; the last ones of `splat_arrays`."""
+        return self._marker
+
     # -- construction -------------------------------------------------------------------------------------------------
 
     def _build_model(self) -> None:

@@ -27,7 +27,7 @@ from softmode.errors import AssetError, BasisError, ConfigError, SoftmodeError
 from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.mesh_samples import sample_mesh
 from softmode.splats.splats import Splats, quat_from_rotation
-from softmode.usd import tokens
+from softmode.usd.bundle import body_of
 from softmode.usd.geometry import SurfaceMesh
 from softmode.usd.scene import UsdDeformable, UsdScene, open_scene
 
@@ -216,7 +216,7 @@ def _build(
 ) -> UsdBody:
     """Build or recall the body of a deformable, with its material, place and splats; its instance is yet to come."""
     if deformable.bundle is not None:
-        body = _stored_body(deformable)
+        body = body_of(deformable.bundle, deformable.path)
         offset = np.zeros(3)  # the prim's frame is the body frame
     else:
         body = build_deformable(deformable, options, surface_count=surface_count, progress=progress)
@@ -237,25 +237,6 @@ def _build(
         splats=splats,
         notes=deformable.notes,
     )
-
-
-def _stored_body(deformable: UsdDeformable) -> ReducedBody:
-    """Return the body that softmode wrote, checked against its digest."""
-    from softmode.usd.bundle import decode_body
-
-    bundle = deformable.bundle or {}
-    header, digest = bundle.get(tokens.BODY_HEADER), bundle.get(tokens.BODY_SHA256)
-    if bundle.get(tokens.FORMAT) != tokens.BUNDLE_FORMAT or not isinstance(header, str) or not isinstance(digest, str):
-        raise AssetError(
-            f"{deformable.path}: its softmode attributes are of format {bundle.get(tokens.FORMAT)!r}, or incomplete",
-            hint=f"This softmode reads {tokens.BUNDLE_FORMAT!r}; write the file again",
-        )
-    arrays = {
-        name.removeprefix(tokens.BODY_PREFIX): value
-        for name, value in bundle.items()
-        if name.startswith(tokens.BODY_PREFIX) and isinstance(value, np.ndarray)
-    }
-    return decode_body(header, arrays, digest, deformable.path)
 
 
 def build_deformable(

@@ -58,6 +58,7 @@ class PointVectorEnv(gym.vector.VectorEnv):
         self.episode = torch.zeros(num_envs, device=self.device)
         self.seeds = torch.arange(num_envs, device=self.device)
         self.done = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
+        self.frequencies = torch.tensor([1.0, 1.7, 2.3, 3.1], dtype=torch.float64, device=self.device)
         self.clock = 0
 
     @property
@@ -68,7 +69,7 @@ class PointVectorEnv(gym.vector.VectorEnv):
     def _start(self, mask: torch.Tensor) -> None:
         """Begin the next episode of the worlds of a mask."""
         phase = ((self.seeds % 10007).double() * 12.9898 + self.episode.double() * 78.233)[:, None]
-        phase = phase * torch.tensor([1.0, 1.7, 2.3, 3.1], dtype=torch.float64, device=self.device)
+        phase = phase * self.frequencies
         draw = (2.0 * torch.remainder(torch.sin(phase) * 43758.5, 1.0) - 1.0).float()
         self.place = torch.where(mask[:, None], draw[:, :2], self.place)
         self.goal = torch.where(mask[:, None], draw[:, 2:], self.goal)

@@ -1,0 +1,148 @@
+"""Point clouds as splats: one flat disc per point, so that a sampled surface is shown and filled like a capture."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
+
+from softmode.errors import AssetError
+from softmode.splats.formats.common import sh_from_colors
+from softmode.splats.splats import MAX_SPLATS, Splats, quats_from_rotations
+
+GREY = 0.62
+"""Colour of points that have none."""
+_HINT = "Give an .npz with points (N, 3), and normals and colors (N, 3) if there are any"
+
+
+def is_point_cloud(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file is a point cloud: an .npz, or a .ply without faces and without splats."""
+    file = Path(path)
+    if file.suffix.lower() == ".npz":
+        return True
+    return file.suffix.lower() == ".ply" and ply_kind(file) == "points"
+
+
+def ply_kind(path: str | os.PathLike[str]) -> str:
+    """Return what a .ply holds by its header: "splats", "mesh" or "points".
+
+    Raises:
+        AssetError: If the file is missing or cannot be read.
+    """
+    try:
+        with open(path, "rb") as file:
+            head = file.read(64 * 1024).split(b"end_header")[0]
+    except OSError as error:
+        raise AssetError(f"file {path}: cannot be read ({error.strerror or error})", hint="Check the path") from error
+    words = [line.split() for line in head.splitlines()]
+    names = {line[-1] for line in words if line[:1] == [b"property"]}
+    if b"f_dc_0" in names or b"packed_position" in names:
+        return "splats"
+    faces = [line for line in words if line[:2] == [b"element", b"face"] and len(line) == 3]
+    return "mesh" if any(line[2] != b"0" for line in faces) else "points"
+
+
+def read_points(path: str | os.PathLike[str]) -> Splats:
+    """Read a point cloud: an .npz with `points` and, if there are any, `normals` and `colors`, or a .ply.
+
+    Args:
+        path: The file; positions keep its frame and unit. Colours are 0..1, or integers 0..255.
+
+    Raises:
+        AssetError: If the file is missing, damaged, or holds no points.
+    """
+    file = Path(path)
+    name = f"point cloud {file}"
+    if not file.is_file():
+        raise AssetError(f"{name}: no such file", hint="Check the path")
+    if file.suffix.lower() == ".npz":
+        try:
+            with np.load(file, allow_pickle=False) as stored:
+                arrays = {key: stored[key] for key in ("points", "normals", "colors") if key in stored.files}
+        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError, MemoryError) as error:
+            raise AssetError(f"{name}: damaged or not an .npz ({error})", hint=_HINT) from error
+        except Exception as error:  # zlib and struct errors of a damaged archive have no common base.
+            raise AssetError(f"{name}: damaged ({type(error).__name__}: {error})", hint=_HINT) from error
+        if "points" not in arrays:
+            raise AssetError(f"{name}: holds no points", hint=_HINT)
+        return splats_from_points(arrays["points"], arrays.get("normals"), arrays.get("colors"), name=name)
+    import trimesh
+
+    try:
+        cloud = trimesh.load(file)
+        points = np.asarray(cloud.vertices)  # type: ignore[attr-defined]
+        colors = np.asarray(getattr(cloud, "colors", np.zeros((0, 4))))
+    except Exception as error:  # its readers raise whatever a damaged file leads them to
+        raise AssetError(f"{name}: cannot be read ({type(error).__name__}: {error})", hint=_HINT) from error
+    return splats_from_points(points, None, colors[:, :3] if len(colors) == len(points) else None, name=name)
+
+
+def splats_from_points(
+    points: ArrayLike, normals: ArrayLike | None = None, colors: ArrayLike | None = None, *, name: str = "points"
+) -> Splats:
+    """Return one flat, opaque splat for each point, as wide as the points are apart.
+
+    Args:
+        points: Positions on a surface [m], shape (N, 3), N >= 4.
+        normals: Normals, of either sign and any length, shape (N, 3); from the twelve nearest points if None.
+        colors: Colours 0..1, or integers 0..255, shape (N, 3); grey if None.
+        name: Where they come from; used in messages.
+
+    Raises:
+        AssetError: If an array has another shape, is not finite, or all points lie at one place.
+    """
+    x = _array(f"{name}: points", points, None)
+    if not 4 <= len(x) <= MAX_SPLATS:
+        raise AssetError(f"{name}: {len(x)} points, expected 4 to {MAX_SPLATS}", hint=_HINT)
+    tree = KDTree(x)
+    pitch = tree.query(x, k=min(7, len(x)))[0][:, -1] / 1.5  # the sixth neighbour is one and a half spacings away
+    typical = float(np.median(pitch))
+    if not typical > 0.0:
+        raise AssetError(f"{name}: most points coincide", hint="Remove repeated points")
+    pitch = np.clip(pitch, 0.5 * typical, 2.0 * typical)
+    if normals is None:
+        near = x[tree.query(x, k=min(12, len(x)))[1]]
+        near = near - near.mean(axis=1, keepdims=True)
+        frame = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, ::-1]
+    else:
+        frame = _frames(_array(f"{name}: normals", normals, len(x)))
+    frame = frame * np.sign(np.linalg.det(frame))[:, None, None]
+    shade = np.full((len(x), 3), GREY)
+    if colors is not None:
+        shade = _array(f"{name}: colors", colors, len(x))
+        if np.issubdtype(np.asarray(colors).dtype, np.integer):
+            shade = shade / 255.0
+    return Splats(
+        means=x,
+        quats=quats_from_rotations(frame),
+        scales=pitch[:, None] * np.array([0.6, 0.6, 0.05]),
+        opacities=np.full(len(x), 0.95),
+        sh=sh_from_colors(np.clip(shade, 0.0, 1.0)),
+        name=name,
+    )
+
+
+def _frames(normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return orthogonal frames (N, 3, 3) whose last column is the normal."""
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normal = np.where(length > 1e-12, normals / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
+    side = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    return np.stack([side, np.cross(normal, side), normal], axis=2)
+
+
+def _array(name: str, value: ArrayLike, count: int | None) -> NDArray[np.float64]:
+    """Return a finite array (N, 3)."""
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise AssetError(f"{name}: no array of numbers", hint=_HINT) from error
+    if array.ndim != 2 or array.shape[1] != 3 or (count is not None and len(array) != count):
+        raise AssetError(f"{name}: expected shape ({count or 'N'}, 3), got {array.shape}", hint=_HINT)
+    if not np.isfinite(array).all():
+        raise AssetError(f"{name}: not all finite", hint="Remove the points that hold NaN or infinity")
+    return array

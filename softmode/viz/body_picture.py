@@ -1,0 +1,362 @@
+"""One picture of a body: rest, soft modes, skinning weights, cubature, kernels, spectrum, and what its report says."""
+
+from __future__ import annotations
+
+import os
+import textwrap
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from softmode.deformables.body_report import BodyReport
+from softmode.deformables.cubature import POISSON_RATIO
+from softmode.deformables.reduced_body import ReducedBody
+from softmode.deformables.reduced_stiffness import elastic_modes, reduced_stiffness
+from softmode.errors import ConfigError, MissingExtraError
+from softmode.splats import Splats
+from softmode.splats.splats import SH_DC
+
+Array = NDArray[np.float64]
+
+COLUMNS = 7
+"""Pictures in a row: the body at rest and six modes; the constant weight's place and six weights."""
+PIXELS = 380
+"""Width of each rendered picture [px]."""
+AMPLITUDE = 0.16
+"""Largest displacement in a mode's picture, over the body's size."""
+STEEPNESS = 1.2
+"""Largest gradient of the displacement there: a linear mode turned further swells instead."""
+TOWARDS = np.array([0.80, -0.48, 0.36])
+"""Direction from the body to the camera."""
+_LIGHT = np.array([0.55, -0.35, 0.76])
+_COLORS = {"broken": "#b3261e", "warning": "#9a5b00", "note": "#44546a"}
+_REGION = np.array([0.85, 0.15, 0.45])
+
+
+def soft_modes(body: ReducedBody, count: int) -> tuple[Array, Array]:
+    """Return elastic modes at rest, by the body's own cubature.
+
+    Args:
+        body: The body.
+        count: How many modes, at most.
+
+    Returns:
+        All eigenvalues lambda > 0 for E = 1 and nu = `cubature.POISSON_RATIO` [m], ascending, with omega^2 = E lambda /
+        (rho V); and the lowest modes as coordinates q, shape (count, n, 3).
+    """
+    free = slice(body.driven_count, None)
+    gradient = body.grad_basis.astype(np.float64)[:, free].transpose(1, 2, 0)
+    value, mode = elastic_modes(reduced_stiffness(gradient, body.weights * body.stiffness_scale, POISSON_RATIO))
+    count = min(count, len(value))
+    q = np.zeros((count, body.function_count, 3))
+    q[:, free] = mode[:, :count].T.reshape(count, 3, body.function_count - body.driven_count).transpose(0, 2, 1)
+    return value, q
+
+
+def mode_frequencies(body: ReducedBody, *, youngs_modulus: float, density: float) -> Array:
+    """Return the natural frequencies of the undamped body [Hz], ascending, without rigid motions.
+
+    Args:
+        body: The body; free, or held by its exact regions.
+        youngs_modulus: Young's modulus [Pa]; Poisson's ratio is `cubature.POISSON_RATIO`.
+        density: Density [kg/m^3].
+    """
+    value = soft_modes(body, 0)[0]
+    return np.sqrt(youngs_modulus * value / (density * body.volume)) / (2.0 * np.pi)
+
+
+def write_body_picture(
+    path: str | os.PathLike[str],
+    body: ReducedBody,
+    splats: Splats,
+    report: BodyReport,
+    *,
+    youngs_modulus: float = 1.0e5,
+    density: float = 300.0,
+) -> None:
+    """Draw a body and write the picture; the file appears complete or not at all.
+
+    Args:
+        path: The .png to write.
+        body: The body.
+        splats: Splats that show it, in the body frame.
+        report: Its report.
+        youngs_modulus: Young's modulus for the frequencies [Pa].
+        density: Density for the frequencies [kg/m^3].
+
+    Raises:
+        MissingExtraError: If matplotlib is not installed.
+        ConfigError: If the name is not that of a .png.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtraError(
+            "the picture of a body needs matplotlib", hint="install it with: pip install 'softmode[viz]'"
+        ) from error
+    from PIL import Image
+
+    from softmode.atomic import atomic_write
+
+    target = Path(path)
+    if target.suffix.lower() != ".png":
+        raise ConfigError(f"picture {target} is no .png file", hint="name it like toy.png")
+    modes = soft_modes(body, COLUMNS - 1)[1]
+    names, weights = _weights(body, splats)
+    asset = [splats, *_moved(body, splats, modes)]
+    pictures = _render(body, [*asset, *(_painted(body, splats, color) for color in weights)])
+    frequency = mode_frequencies(body, youngs_modulus=youngs_modulus, density=density)
+
+    strip = 13.5 / COLUMNS * pictures[0].shape[0] / pictures[0].shape[1]  # height of a row of pictures [in]
+    height = 2.0 * strip + 4.8
+    figure = Figure(figsize=(14.0, height), dpi=100, facecolor="white")
+    canvas = FigureCanvasAgg(figure)
+    rows = figure.add_gridspec(
+        3,
+        1,
+        height_ratios=(strip, strip, 3.0),
+        left=0.02,
+        right=0.985,
+        top=1.0 - 0.8 / height,
+        bottom=0.5 / height,
+        hspace=0.5 / ((2.0 * strip + 3.0) / 3.0),
+    )
+    x, y, z = 1e2 * np.ptp(body.bounds, axis=0)
+    figure.text(0.02, 1.0 - 0.35 / height, body.name, fontsize=15, weight="bold")
+    figure.text(
+        0.985,
+        1.0 - 0.35 / height,
+        f"{x:.3g} x {y:.3g} x {z:.3g} cm, {1e6 * body.volume:.4g} cm$^3$ · {body.function_count} functions · "
+        f"{body.mode_count} eigenmodes · {body.point_count} cubature points · {len(body.centres)} kernels",
+        fontsize=10,
+        ha="right",
+        color="0.3",
+    )
+    titles = ["at rest", *(f"soft mode {k + 1}: {frequency[k]:.3g} Hz" for k in range(len(modes)))]
+    _strip(figure, rows[0], titles, pictures[: len(titles)])
+    _strip(figure, rows[1], names, pictures[len(titles) :])
+    lower = rows[2].subgridspec(1, 4, width_ratios=(1.0, 1.0, 0.9, 1.9), wspace=0.14)
+    _draw_points(figure.add_subplot(lower[0]), body)
+    _draw_kernels(figure.add_subplot(lower[1]), body)
+    spectra = lower[2].subgridspec(2, 1, hspace=0.75)
+    _draw_spectrum(figure.add_subplot(spectra[0]), body.eigenvalues[1:], "skinning eigenvalues [1/m$^2$]", "eigenmode")
+    title = f"frequencies [Hz], E = {youngs_modulus:.3g} Pa, {density:.3g} kg/m$^3$"
+    _draw_spectrum(figure.add_subplot(spectra[1]), frequency, title, "elastic mode")
+    _write_report(figure.add_subplot(lower[3]), body, report)
+    canvas.draw()
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3])
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(target) as file:
+        # 256 colours, dithered, are enough here and make half the size.
+        few = picture.quantize(palette=picture.quantize(256), dither=Image.Dither.FLOYDSTEINBERG)
+        few.save(file, format="png", optimize=True)
+
+
+# -- what the splats show ---------------------------------------------------------------------------------------------
+
+
+def _moved(body: ReducedBody, splats: Splats, modes: Array) -> list[Splats]:
+    """Return the splats displaced by each mode, so far that the largest displacement is a fixed part of the size."""
+    from softmode.deformables.skinning import average_basis
+
+    value, gradient = average_basis(lambda x: body.evaluate(x)[0], splats.means, splats.covariances())
+    size, found = float(np.linalg.norm(np.ptp(body.bounds, axis=0))), []
+    for q in modes:
+        motion = value @ q
+        # A mode has no sign: the one drawn has most of its motion along +x +y +z.
+        slope = np.einsum("nkd,kc->ncd", gradient, q)
+        steepest = float(np.quantile(np.linalg.norm(slope, axis=(1, 2)), 0.95))
+        scale = min(AMPLITUDE * size / np.linalg.norm(motion, axis=1).max(), STEEPNESS / max(steepest, 1e-300))
+        scale *= 1.0 if (motion**3).sum() >= 0.0 else -1.0
+        found.append(splats.deformed(splats.means + scale * motion, np.eye(3) + scale * slope))
+    return found
+
+
+def _weights(body: ReducedBody, splats: Splats) -> tuple[list[str], list[Array]]:
+    """Return titles and colours (N, 3) per splat: the stiffness or regions, then skinning weights."""
+    from matplotlib import colormaps
+
+    x = splats.means.astype(np.float64)
+    weight = body.skinning_weights(x)[0]
+    names, colors = [_first_title(body)], [_first_colors(body, x)]
+    ranks = _weight_names(body)
+    for j in range(1, min(len(body.handle_degrees), COLUMNS)):
+        one = weight[:, j] / max(float(np.abs(weight[:, j]).max()), 1e-300)
+        names.append(ranks[j])
+        colors.append(np.asarray(colormaps["RdBu_r"](0.5 + 0.5 * one))[:, :3])
+    return names, colors
+
+
+def _weight_names(body: ReducedBody) -> list[str]:
+    """Return what each skinning weight is: constant, of regions, eigenmodes, then static responses."""
+    responses = int((body.handle_degrees == 0).sum())
+    regions = len(body.handle_degrees) - responses - len(body.eigenvalues)
+    order = [name for name, k in zip(body.region_names, body.region_stiffness, strict=True) if k == 0.0]
+    order += [name for name, k in zip(body.region_names, body.region_stiffness, strict=True) if k > 0.0]
+    modes = [f"weight {k}: {value:.3g} / m$^2$" for k, value in enumerate(body.eigenvalues[1:], start=1)]
+    return ["constant", *(f"region {name}" for name in order[:regions]), *modes, *["static response"] * responses]
+
+
+def _first_title(body: ReducedBody) -> str:
+    if body.stiffness_scale.max() > 1.0001 * body.stiffness_scale.min():
+        return f"stiffness x {body.stiffness_scale.min():.2g} to {body.stiffness_scale.max():.2g}"
+    return "regions: " + ", ".join(body.region_names) if body.region_names else "surface"
+
+
+def _first_colors(body: ReducedBody, x: Array) -> Array:
+    """Return colours (N, 3) that show where a body is stiffer, or its regions."""
+    from matplotlib import colormaps
+
+    scale = body.stiffness_scale
+    if scale.max() > 1.0001 * scale.min():
+        level = np.log(scale[KDTree(body.points).query(x)[1]] / scale.min()) / np.log(scale.max() / scale.min())
+        return np.asarray(colormaps["viridis"](level))[:, :3]
+    found = np.full((len(x), 3), 0.86)
+    for region in body.regions:
+        found[region.distance(x)[0] <= 0.0] = _REGION
+    return found
+
+
+def _painted(body: ReducedBody, splats: Splats, colors: Array) -> Splats:
+    """Return the splats in other colours, shaded by the surface's normal so that the shape can be seen."""
+    normal = body.surface_normals[KDTree(body.surface_points).query(splats.means)[1]]
+    light = 0.62 + 0.38 * np.clip(normal @ (_LIGHT / np.linalg.norm(_LIGHT)), 0.0, 1.0)
+    return replace(splats, sh=((colors * light[:, None] - 0.5) / SH_DC)[:, None])
+
+
+def _render(body: ReducedBody, shown: list[Splats]) -> list[NDArray[np.uint8]]:
+    """Draw every set of splats from the same side."""
+    from softmode.splats.pinhole import PinholeCamera
+    from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
+
+    right, up = _camera_axes()
+    seen = np.concatenate([s.means for s in shown]) @ np.column_stack([right, up])
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    margin = 0.06 * float((high - low).max())
+    width, tall = (high - low + 2.0 * margin).tolist()
+    # As far away as eight heights, so that near and far parts have nearly one scale, and what was measured fits.
+    toward = TOWARDS / np.linalg.norm(TOWARDS)
+    middle, distance = 0.5 * (low + high), 8.0 * max(width, tall)
+    centre = middle[0] * right + middle[1] * up + (body.bounds.mean(axis=0) @ toward) * toward
+    position = centre + distance * toward
+    rows = round(PIXELS * min(max(tall / width, 0.35), 1.3))
+    camera = PinholeCamera.look_at(
+        "body",
+        position=(float(position[0]), float(position[1]), float(position[2])),
+        target=(float(centre[0]), float(centre[1]), float(centre[2])),
+        width=PIXELS,
+        height=rows,
+        fov_y=2.0 * float(np.arctan(0.5 * max(tall, width * rows / PIXELS) / distance)),
+    )
+    views = ViewArrays.from_cameras([camera], background=(1.0, 1.0, 1.0))
+    pictures = []
+    for splats in shown:
+        rasterizer = SplatRasterizer(splats.count, 1, PIXELS, rows)
+        rasterizer.render(SplatArrays.from_splats([splats]), views)
+        pictures.append((255.0 * np.clip(rasterizer.rgb.numpy()[0], 0.0, 1.0)).round().astype(np.uint8))
+    return pictures
+
+
+def _camera_axes() -> tuple[Array, Array]:
+    """Return the directions to the right and up in the picture."""
+    forward = -TOWARDS / np.linalg.norm(TOWARDS)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return right, np.cross(right, forward)
+
+
+# -- panels -----------------------------------------------------------------------------------------------------------
+
+
+def _strip(figure: Any, row: Any, titles: list[str], pictures: list[NDArray[np.uint8]]) -> None:
+    """Put pictures side by side into a row of the figure's grid."""
+    places = row.subgridspec(1, COLUMNS, wspace=0.03)
+    for column, (title, picture) in enumerate(zip(titles, pictures, strict=True)):
+        axes = figure.add_subplot(places[column])
+        axes.imshow(picture)
+        axes.set_axis_off()
+        axes.set_title(title, fontsize=9, pad=3)
+
+
+def _plane(axes: Any, body: ReducedBody, title: str) -> tuple[Array, Array]:
+    """Prepare a panel that looks at the body from the camera's side; return the directions in the picture."""
+    right, up = _camera_axes()
+    axes.scatter(body.surface_points @ right, body.surface_points @ up, s=3, color="0.82", linewidths=0)
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+    axes.set_title(title, fontsize=9, pad=3)
+    return right, up
+
+
+def _draw_points(axes: Any, body: ReducedBody) -> None:
+    """Draw the cubature points, as large as their volume, near ones darker."""
+    right, up = _plane(axes, body, "cubature points, area by volume")
+    order = np.argsort(body.points @ TOWARDS)
+    depth = body.points[order] @ TOWARDS
+    shade = (depth - depth[0]) / max(float(np.ptp(depth)), 1e-300)
+    size = 5000.0 * body.weights[order] / body.volume
+    axes.scatter(
+        body.points[order] @ right,
+        body.points[order] @ up,
+        s=size,
+        c=0.25 + 0.65 * shade,
+        cmap="Blues",
+        vmin=0.0,
+        vmax=1.0,
+        linewidths=0.3,
+        edgecolors="white",
+    )
+
+
+def _draw_kernels(axes: Any, body: ReducedBody) -> None:
+    """Draw the kernel centres, and the nominal radius of a few."""
+    from matplotlib.patches import Circle
+
+    right, up = _plane(axes, body, "kernel centres, radii of every tenth")
+    x, y = body.centres @ right, body.centres @ up
+    axes.scatter(x, y, s=5, color="#7a3e9d", linewidths=0)
+    for k in range(0, len(x), 10):
+        circle = Circle(
+            (float(x[k]), float(y[k])), float(body.radii[k]), fill=False, color="#7a3e9d", alpha=0.35, lw=0.7
+        )
+        axes.add_patch(circle)
+    axes.autoscale_view()
+
+
+def _draw_spectrum(axes: Any, values: Array, title: str, label: str) -> None:
+    """Draw a spectrum as bars, on a logarithmic scale if it is wide."""
+    axes.bar(np.arange(1, len(values) + 1), values, color="#2f6f9f", width=0.8 if len(values) < 40 else 1.0)
+    axes.set_xlim(0.4, len(values) + 0.6)
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    if len(values) and values.max() > 30.0 * values.min() > 0.0:
+        axes.set_yscale("log")
+    axes.set_title(title, fontsize=9, pad=3)
+    axes.set_xlabel(label, fontsize=8, labelpad=1)
+    axes.tick_params(labelsize=7)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _write_report(axes: Any, body: ReducedBody, report: BodyReport) -> None:
+    """Write the measures in two columns and the findings under them."""
+    axes.set_axis_off()
+    told = ("extent", "mass at", "functions", "cubature points", "splats")  # the title has these, or the findings
+    lines = [f"{m.name}: {m.value:.3g} {m.unit}".rstrip() for m in report.measures if not m.name.startswith(told)]
+    lines.append(f"build: {body.build_seconds:.2f} s")
+    half, y, step = -(-len(lines) // 2), 1.0, 0.06
+    for column, part in enumerate((lines[:half], lines[half:])):
+        for row, line in enumerate(part):
+            axes.text(0.5 * column, y - step * row, line, fontsize=7.5, transform=axes.transAxes, va="top")
+    y -= step * (half + 0.7)
+    if not report.findings:
+        axes.text(0.0, y, "no findings", fontsize=9, color="#1b7f3b", weight="bold", transform=axes.transAxes, va="top")
+    for finding in report.findings:
+        for line in textwrap.wrap(f"{finding.severity}, {finding.name}: {finding.what}", 98):
+            if y < -0.1:
+                return
+            axes.text(0.0, y, line, fontsize=7.5, color=_COLORS[finding.severity], transform=axes.transAxes, va="top")
+            y -= step

@@ -1,0 +1,452 @@
+"""`RerunLogger`: a scene or an environment as a recording for the rerun viewer."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softmode.atomic import PendingFile
+from softmode.deformables.energies import SoftEnergies
+from softmode.deformables.sensing import ContactSensor
+from softmode.errors import ConfigError, MissingExtraError, StorageError
+from softmode.splats import Splats
+from softmode.splats.camera import SplatCamera
+from softmode.viz.deformed_splats import DeformedSplats, SplatFrame
+from softmode.viz.rerun_blueprint import make_blueprint
+from softmode.viz.rerun_sources import Moment, RerunScene, source_of
+from softmode.viz.scene_meshes import PLANE_EXTENT, scene_meshes, scene_poses
+
+__all__ = ["RerunLogger", "RerunOptions", "RerunScene"]
+
+LIVE = "rerun+http"
+"""How the address of a running viewer begins."""
+FLUSH = 1.0
+"""Seconds for which rows of a file are gathered into chunks."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RerunOptions:
+    """What a recording holds."""
+
+    splats: bool = True
+    """Splats of the soft bodies, with their colours from all around (degree 0)."""
+    covariance_tolerance: float = 0.05
+    """Scales and orientations of an object's splats are written anew once the covariance of one of them has changed by
+    more than this, relative to itself (Frobenius norm); 0 writes every change. Centres are in every frame."""
+    surface: bool = True
+    """Surface samples as points; hidden in the saved layout."""
+    contacts: bool = True
+    """Forces of the soft bodies on rigid bodies and the world as arrows."""
+    force_scale: float = 0.02
+    """Length of an arrow per force [m/N]."""
+    images: bool = True
+    """Colour and depth of the cameras; draws those of an environment."""
+    jpeg_quality: int | None = 90
+    """Quality of colour pictures, 1..95; None writes them exactly."""
+    world_spacing: float = 1.5
+    """Distance of the worlds of a recording of several [m]."""
+    plane_extent: float = PLANE_EXTENT
+    """Edge of the quad that stands for an infinite plane [m]."""
+    eye: tuple[tuple[float, float, float], tuple[float, float, float]] = ((1.0, -0.65, 0.5), (0.36, 0.02, 0.18))
+    """Where the saved layout looks from and at [m]."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name in ("covariance_tolerance", "force_scale", "world_spacing"):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise ConfigError(f"{name} must be finite and >= 0, got {getattr(self, name)}")
+        if self.jpeg_quality is not None and not 1 <= self.jpeg_quality <= 95:
+            raise ConfigError(f"jpeg_quality must lie in 1..95, got {self.jpeg_quality}", hint="None writes exactly")
+
+
+class RerunLogger:
+    """Writes what happens in a scene to a file for the rerun viewer, or shows it in one live.
+
+    A file appears complete when the ``with`` block ends, or by :meth:`publish`; an error or an interruption leaves
+    none. Everything is read from the device after the step; the recording is one of its own, whatever else uses rerun.
+
+    Entities, of several worlds each under ``world_3/``: ``scene/bodies`` (meshes of links, their poses per frame),
+    ``scene/fixed``, ``scene/soft/NAME`` (splats) and its ``surface``, ``scene/contacts`` (forces on rigid bodies),
+    ``scene/marker`` (the goal),
+    ``scene/camera/NAME/rgb`` and ``depth``, ``energy/NAME``, ``reward``, ``success``, ``metrics``, ``action``,
+    ``solver``, ``log``. Timelines: ``step`` and ``sim_time``.
+
+    Args:
+        target: File to write (.rrd); or address of a running viewer, like "rerun+http://127.0.0.1:9876/proxy"; or
+            "spawn", which opens one.
+        scene: An environment of softmode (its task in this process), a :class:`softmode.envs.splat_scene.SplatScene`,
+            or a :class:`RerunScene`.
+        worlds: Which worlds.
+        options: What the recording holds.
+
+    Raises:
+        ConfigError: If the file cannot be written there, the scene is none of these, or a world does not exist.
+        MissingExtraError: If rerun is not installed.
+    """
+
+    def __init__(
+        self, target: str | Path, scene: Any, *, worlds: Sequence[int] = (0,), options: RerunOptions | None = None
+    ) -> None:
+        """Open the recording and write what does not change."""
+        live = check_target(target)
+        import rerun as rr
+
+        self.options = options if options is not None else RerunOptions()
+        self.worlds = tuple(int(w) for w in worlds)
+        self._source = source_of(scene, self.worlds or (0,))
+        model = self._source.model
+        count = max(int(model.world_count), 1)
+        if not self.worlds or len(set(self.worlds)) < len(self.worlds) or not set(self.worlds) <= set(range(count)):
+            raise ConfigError(f"worlds must name different ones of 0..{count - 1}, got {list(worlds)}")
+        self._prefix = {w: "" if self.worlds == (0,) and count == 1 else f"world_{w}/" for w in self.worlds}
+        self._file = None if live else PendingFile(target, "recording")
+        self._written: dict[tuple[int, int], NDArray[np.float32]] = {}
+        self._marks: dict[int, NDArray[np.float32]] = {}
+        self._lenses: dict[str, NDArray[np.float32]] = {}
+        self._cameras: tuple[str, ...] | None = None
+        self.frame_count = 0
+        """Frames recorded."""
+        self._rr: Any = rr
+        # A file gains from large chunks, a viewer from prompt ones.
+        batches = rr.ChunkBatcherConfig.DEFAULT() if live else rr.ChunkBatcherConfig(flush_tick=FLUSH)
+        self._stream: Any = rr.RecordingStream("softmode", batcher_config=batches)
+        try:
+            self._stream.set_log_time_enabled(False)
+            self._stream.set_log_tick_enabled(False)
+            if self._file is not None:
+                self._stream.save(self._file.temporary)
+            elif str(target) == "spawn":
+                self._stream.spawn()
+            else:
+                self._stream.connect_grpc(str(target))
+            self._stream.send_recording_name(self._source.name)
+            self._prepare()
+        except BaseException:
+            self.discard()
+            raise
+
+    # -- the file -----------------------------------------------------------------------------------------------------
+
+    def __enter__(self) -> Self:
+        """Return the logger."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Publish the file, or discard it after an error."""
+        if kind is None:
+            self.publish()
+        else:
+            self.discard()
+
+    def publish(self) -> None:
+        """End the recording and put the file in place; does nothing the second time.
+
+        Raises:
+            StorageError: If what was written cannot be read back, as on a full disk.
+        """
+        if self._stream is None:
+            return
+        self._end()
+        if self._file is None:
+            return
+        try:
+            from rerun.chunk import RrdReader
+
+            RrdReader(self._file.temporary).store()  # reads the list of all chunks, which is written last
+        except Exception as error:
+            self._file.discard()
+            raise StorageError(f"recording {self._file.path} is not complete", hint="check the free space") from error
+        self._file.publish()
+
+    def discard(self) -> None:
+        """End the recording and remove the file unless it was published."""
+        if self._stream is not None:
+            self._end()
+        if self._file is not None:
+            self._file.discard()
+
+    def _end(self) -> None:
+        """Write out what is still in memory and close."""
+        stream, self._stream = self._stream, None
+        stream.flush()
+        stream.disconnect()
+
+    # -- what does not change -----------------------------------------------------------------------------------------
+
+    def _prepare(self) -> None:
+        """Write meshes, places of the worlds and the layout; allocate what reads the device."""
+        source, rr, options = self._source, self._rr, self.options
+        model, reduced = source.model, getattr(source.solver, "reduced", source.solver)
+        self._log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self._meshes, self._paths = {}, {}
+        for place, w in enumerate(self.worlds):
+            if len(self.worlds) > 1:
+                shift = (0.0, options.world_spacing * place, 0.0)
+                self._log(f"{self._prefix[w]}scene", rr.Transform3D(translation=shift), static=True)
+            self._meshes[w] = scene_meshes(model, world=w, plane_extent=options.plane_extent)
+            self._write_meshes(w)
+        layout = reduced.layout
+        instances = range(int(layout.instance_start[0]), int(layout.instance_start[1]))
+        self._starts = {w: int(layout.instance_start[w]) for w in self.worlds}
+        self._soft = _unlike([layout.bodies[layout.asset[i]].name for i in instances])
+        objects = source.objects or (None,) * len(self._soft)
+        self._splats = DeformedSplats(model, objects, self.worlds) if options.splats else None
+        self._objects = objects
+        self._energies = SoftEnergies(source.solver)
+        self._samples = {
+            (w, o): (int(reduced.instances.particle_start.numpy()[i]), int(reduced.instances.sample_count.numpy()[i]))
+            for w in self.worlds
+            for o, i in enumerate(range(self._starts[w], self._starts[w] + len(self._soft)))
+        }
+        self._contacts = None
+        if options.contacts:
+            self._contacts = ContactSensor(source.solver, list(range(-1, _bodies_per_world(model))))
+
+    def _write_meshes(self, w: int) -> None:
+        """Write the meshes of a world, each body's under its own entity."""
+        rr, model = self._rr, self._source.model
+        bodies = sorted({mesh.body for mesh in self._meshes[w]})
+        names = _unlike(["fixed" if b < 0 else str(model.body_label[b]) for b in bodies])
+        root = f"{self._prefix[w]}scene"
+        folder = {b: f"{root}/{n}" if b < 0 else f"{root}/bodies/{n}" for b, n in zip(bodies, names, strict=True)}
+        self._paths[w] = {b: path for b, path in folder.items() if b >= 0}
+        for mesh in self._meshes[w]:
+            carrier = "world" if mesh.body < 0 else str(model.body_label[mesh.body])
+            color = [round(255 * c) for c in (*mesh.color, mesh.opacity)]
+            self._log(
+                f"{folder[mesh.body]}/{_part(mesh.label.removeprefix(f'{carrier}/'))}",
+                rr.Mesh3D(
+                    vertex_positions=mesh.vertices,
+                    triangle_indices=mesh.faces,
+                    vertex_normals=mesh.normals,
+                    albedo_factor=color,
+                ),
+                static=True,
+            )
+
+    # -- a frame ------------------------------------------------------------------------------------------------------
+
+    def record(
+        self, state: Any = None, *, time: float | None = None, scalars: Mapping[str, float] | None = None
+    ) -> None:
+        """Write a frame: after ``reset`` and every ``step`` of an environment, or with state and time of a scene.
+
+        Args:
+            state: State of a scene of one's own; nothing for an environment.
+            time: Its time [s].
+            scalars: More numbers, by path.
+
+        Raises:
+            ConfigError: If the recording has ended, or what a scene needs is missing.
+        """
+        if self._stream is None:
+            raise ConfigError("the recording has ended", hint="record before publish, inside the with block")
+        source, rr, stream = self._source, self._rr, self._stream
+        moment = source.moment(state, time)
+        stream.set_time("step", sequence=moment.step)
+        stream.set_time("sim_time", duration=moment.time)
+        self._energies.update(moment.state)
+        energies = {n: getattr(self._energies, n).numpy() for n in ("kinetic", "elastic", "gravitational")}
+        cameras = list(source.cameras()) if self.options.images else []
+        if self._cameras is None:
+            self._cameras = tuple(_part(camera.name) for drawn in cameras for camera in drawn.cameras)
+            task = hasattr(source, "task")
+            layout = make_blueprint(list(self._prefix.values()), self._soft, self._cameras, task, self.options.eye)
+            stream.send_blueprint(layout)
+        self._log_poses(moment)
+        self._log_soft(moment)
+        self._log_contacts()
+        for w in self.worlds:
+            prefix = self._prefix[w]
+            for o, name in enumerate(self._soft):
+                for kind, values in energies.items():
+                    self._log(f"{prefix}energy/{name}/{kind}", rr.Scalars(float(values[self._starts[w] + o])))
+            for path, value in source.scalars(w).items():
+                self._log(f"{prefix}{path}", rr.Scalars(value))
+            self._log_marker(source.marker(w), w)
+            for level, text in source.remarks(w):
+                self._log(f"{prefix}log", rr.TextLog(text, level=level))
+            for drawn in cameras:
+                self._log_images(drawn, w)
+        for path, value in (scalars or {}).items():
+            self._log(path, rr.Scalars(float(value)))
+        self.frame_count += 1
+
+    def _log_poses(self, moment: Moment) -> None:
+        """Write where the links are."""
+        for w in self.worlds:
+            poses = scene_poses(self._meshes[w], moment.state)
+            where = {mesh.body: pose for mesh, pose in zip(self._meshes[w], poses, strict=True)}
+            for body, path in self._paths[w].items():
+                pose = where[body]
+                self._log(path, self._rr.Transform3D(translation=pose[:3], quaternion=pose[3:]))
+
+    def _log_soft(self, moment: Moment) -> None:
+        """Write splats and surface samples."""
+        rr = self._rr
+        frames = {} if self._splats is None else self._splats.frames(moment.state)
+        for (place, o), frame in frames.items():
+            w = self.worlds[place]
+            path = f"{self._prefix[w]}scene/soft/{self._soft[o]}"
+            fields: dict[str, Any] = {"centers": frame.means}
+            if self._changed((w, o), frame):
+                fields["scales"], fields["quaternions"] = self._splats.axes(frame)  # type: ignore[union-attr]
+            if self.frame_count == 0:
+                thing: Any = self._objects[o]
+                fields |= _colors(thing.splats)
+            self._log(path, rr.GaussianSplats3D.from_fields(**fields))
+        if not self.options.surface:
+            return
+        positions: Any = moment.state.particle_q
+        points = positions.numpy().copy()  # rerun keeps what it is given, and on CPU this is the state's own memory
+        for (w, o), (first, count) in self._samples.items():
+            path = f"{self._prefix[w]}scene/soft/{self._soft[o]}/surface"
+            fields: dict[str, Any] = {"positions": points[first : first + count]}
+            if self.frame_count == 0:
+                fields |= {"radii": [0.0012], "colors": [(250, 190, 60)]}
+            self._log(path, rr.Points3D.from_fields(**fields))
+
+    def _log_marker(self, marker: Splats | None, w: int) -> None:
+        """Write the splats that mark the goal, when they change."""
+        if marker is None or (w in self._marks and np.array_equal(self._marks[w], marker.means)):
+            return
+        fields: dict[str, Any] = {"centers": marker.means}
+        if w not in self._marks:
+            fields |= {"scales": marker.scales, "quaternions": marker.quats, **_colors(marker)}
+        self._marks[w] = marker.means
+        self._log(f"{self._prefix[w]}scene/marker", self._rr.GaussianSplats3D.from_fields(**fields))
+
+    def _changed(self, key: tuple[int, int], frame: SplatFrame) -> bool:
+        """Return whether scales and orientations of an object are to be written, and note that they are."""
+        before, now = self._written.get(key), frame.covariances
+        if before is not None:
+            twice = np.array([1, 2, 2, 1, 2, 1], np.float32)  # the entries beside the diagonal stand for two
+            change, size = (((a**2) * twice).sum(axis=1) for a in (now - before, before))
+            if (change <= self.options.covariance_tolerance**2 * size).all():
+                return False
+        self._written[key] = now
+        return True
+
+    def _log_contacts(self) -> None:
+        """Write the forces of the soft bodies on the rigid ones at their centres of pressure."""
+        if self._contacts is None:
+            return
+        sensor, scale = self._contacts, self.options.force_scale
+        sensor.update()
+        force, place = sensor.force_matrix.numpy(), sensor.position_matrix.numpy()
+        for w in self.worlds:
+            pressed = np.linalg.norm(force[w], axis=-1) > 1e-3
+            vectors, origins = force[w][pressed], place[w][pressed]
+            arrows = self._rr.Arrows3D(
+                vectors=scale * vectors,
+                origins=origins,
+                colors=[(230, 60, 60)],
+                radii=[0.0025],
+                labels=[f"{np.linalg.norm(v):.2f} N" for v in vectors],
+                show_labels=False,
+            )
+            self._log(f"{self._prefix[w]}scene/contacts", arrows)
+
+    def _log_images(self, camera: SplatCamera, w: int) -> None:
+        """Write the last pictures of the cameras of one size."""
+        rr = self._rr
+        for view in camera.cameras:
+            path = f"{self._prefix[w]}scene/camera/{_part(view.name)}"
+            matrix = camera.extrinsics(view.name).numpy()[w]
+            lens = np.append(matrix.ravel(), camera.intrinsics(view.name).numpy()[w])
+            if path not in self._lenses or not np.array_equal(self._lenses[path], lens):
+                self._lenses[path] = lens
+                fx, fy, cx, cy = lens[16:].tolist()
+                turn = matrix[:3, :3].T
+                self._log(path, rr.Transform3D(translation=-turn @ matrix[:3, 3], mat3x3=turn))
+                self._log(
+                    path,
+                    rr.Pinhole(
+                        image_from_camera=[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]],
+                        resolution=(camera.width, camera.height),
+                        image_plane_distance=0.07,
+                    ),
+                )
+            pixels = camera.images(view.name).numpy()[w].copy()
+            self._log(f"{path}/rgb", self._encoded(pixels))
+            self._log(f"{path}/depth", self._encoded_depth(camera.images(view.name, "depth").numpy()[w]))
+
+    def _encoded(self, pixels: NDArray[np.uint8]) -> Any:
+        """Return a picture for rerun, compressed unless it shall be exact."""
+        if self.options.jpeg_quality is None:
+            return self._rr.Image(pixels)
+        from PIL import Image
+
+        buffer = io.BytesIO()
+        Image.fromarray(pixels).save(buffer, "JPEG", quality=self.options.jpeg_quality)
+        return self._rr.EncodedImage(contents=buffer.getvalue(), media_type="image/jpeg")
+
+    def _encoded_depth(self, depth: NDArray[np.float32]) -> Any:
+        """Return a depth picture for rerun: 16 bit PNG in steps of 0.1 mm, which reach 6.5 m."""
+        from PIL import Image
+
+        buffer, steps = io.BytesIO(), np.round(np.clip(1e4 * depth, 0.0, 65535.0)).astype(np.uint16)
+        Image.fromarray(steps).save(buffer, "PNG", compress_level=1)
+        return self._rr.EncodedDepthImage(blob=buffer.getvalue(), media_type="image/png", meter=1e4)
+
+    def _log(self, path: str, what: Any, *, static: bool = False) -> None:
+        """Write one thing."""
+        self._stream.log(path, what, static=static)
+
+
+def _colors(splats: Splats) -> dict[str, Any]:
+    """Return the fields of colour and opacity; higher degrees would have to turn with every splat."""
+    rgba = np.concatenate([splats.colors(), splats.opacities[:, None]], axis=1)
+    return {"colors": np.round(255.0 * np.clip(rgba, 0.0, 1.0)).astype(np.uint8), "spherical_harmonics_degree": 0}
+
+
+def check_target(target: str | Path) -> bool:
+    """Return whether a recording is shown live instead of written.
+
+    Raises:
+        ConfigError: If it is neither a .rrd file, nor the address of a viewer, nor "spawn".
+        MissingExtraError: If rerun is not installed.
+    """
+    try:
+        import rerun  # noqa: F401
+    except ImportError as error:
+        raise MissingExtraError(
+            "recording for rerun needs rerun-sdk", hint="install it with: pip install 'softmode[viz]'"
+        ) from error
+    live = str(target) == "spawn" or str(target).startswith(LIVE)
+    if not live and Path(target).suffix.lower() != ".rrd":
+        raise ConfigError(f"recording {target} is no .rrd file", hint="name it like out/lift.rrd")
+    return live
+
+
+def _bodies_per_world(model: Any) -> int:
+    """Return how many rigid bodies every world has."""
+    worlds = max(int(model.world_count), 1)
+    if worlds == 1 or model.body_count == 0:
+        return int(model.body_count)
+    return int(np.diff(model.body_world_start.numpy()[: worlds + 1]).min())
+
+
+def _part(label: str) -> str:
+    """Return a label as one part of an entity path."""
+    return "".join(c if c.isalnum() or c in "_-." else "_" for c in label) or "_"
+
+
+def _unlike(labels: Sequence[str]) -> list[str]:
+    """Return labels as parts of entity paths, no two alike."""
+    found: list[str] = []
+    for label in map(_part, labels):
+        chosen, number = label, 2
+        while chosen in found:
+            chosen, number = f"{label}_{number}", number + 1
+        found.append(chosen)
+    return found
