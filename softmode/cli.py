@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -39,6 +39,10 @@ class Play:
     rerun: str | None = None
     """Recording to write for the rerun viewer (.rrd); or the address of a running one, like
     rerun+http://127.0.0.1:9876/proxy; or spawn, which opens one."""
+    usd: Path | None = None
+    """OpenUSD stage to write (.usdc, .usd or .usda)."""
+    usd_mode: Literal["handles", "baked"] = "handles"
+    """What the stage samples: handle matrices only, or also every splat."""
     splat: Path | None = None
     """Splat file of the object (INRIA .ply, or a SOG v2 folder, meta.json or .sog); the built-in plush if omitted."""
     object: Path | None = None
@@ -162,6 +166,10 @@ def play(options: Play) -> int:
         from softmode.viz.rerun_logger import check_target
 
         check_target(options.rerun)
+    if options.usd is not None:
+        from softmode.usd.openusd import check_stage
+
+        check_stage(options.usd)
     film = None
     try:
         if options.video is not None:
@@ -203,8 +211,8 @@ def _play(options: Play, film: Film | None) -> int:
             fps = env.metadata["render_fps"]
             policy = policy_factory(options.policy, env, trained)
             seeds = range(options.seed, options.seed + options.episodes)
-            with _rerun_logger(options.rerun, env) as log:
-                successes = sum(_play_episode(env, options, policy, seed, film, log, fps) for seed in seeds)
+            with _recorders(options, env) as logs:
+                successes = sum(_play_episode(env, options, policy, seed, film, logs, fps) for seed in seeds)
         finally:
             env.close()
     if film:
@@ -212,22 +220,32 @@ def _play(options: Play, film: Film | None) -> int:
         print(f"wrote {film.path} and {film.sheet_path}")
     if options.rerun and options.rerun.endswith(".rrd"):
         print(f"wrote {options.rerun}; open it with: rerun {options.rerun}")
+    if options.usd:
+        print(f"wrote {options.usd}; read it with softmode.usd.read_animation, or open it in any viewer of OpenUSD")
     if options.episodes > 1:
         print(f"{successes} of {options.episodes} episodes succeeded")
     return 0
 
 
-def _rerun_logger(target: str | None, env: Any) -> contextlib.AbstractContextManager[Any]:
-    """Return the logger, or a context of None."""
-    if target is None:
-        return contextlib.nullcontext()
-    from softmode.viz.rerun_logger import RerunLogger
+@contextlib.contextmanager
+def _recorders(options: Play, env: Any) -> Iterator[list[Any]]:
+    """Yield what records the state of the environment after every step, each publishing its file at the end."""
+    with contextlib.ExitStack() as stack:
+        logs: list[Any] = []
+        if options.rerun is not None:
+            from softmode.viz.rerun_logger import RerunLogger
 
-    return RerunLogger(target, env)
+            logs.append(stack.enter_context(RerunLogger(options.rerun, env)))
+        if options.usd is not None:
+            from softmode.usd.animation import UsdAnimation, UsdAnimationOptions
+
+            usd = UsdAnimationOptions(mode=options.usd_mode, fps=env.metadata["render_fps"])
+            logs.append(stack.enter_context(UsdAnimation.of_env(options.usd, env, options=usd)))
+        yield logs
 
 
 def _play_episode(
-    env: Any, options: Play, factory: Callable[[int], Any], seed: int, film: Film | None, log: Any, fps: int
+    env: Any, options: Play, factory: Callable[[int], Any], seed: int, film: Film | None, logs: list[Any], fps: int
 ) -> bool:
     """Play one episode, print its outcome, return whether it succeeded."""
     import gymnasium as gym
@@ -236,7 +254,7 @@ def _play_episode(
     given = {} if options.youngs_modulus is None else {"youngs_modulus": options.youngs_modulus}
     observation, info = env.reset(seed=seed, options=given)
     policy = factory(seed)
-    if log:
+    for log in logs:
         log.record()
     total, steps, seconds = 0.0, 0, 0.0
     limit = gym.spec(options.env).max_episode_steps
@@ -250,7 +268,7 @@ def _play_episode(
             total, steps, done = total + float(reward), steps + 1, terminated or truncated
             if film:
                 film.add(env.render(), fps)
-            if log:
+            for log in logs:
                 log.record()
             bar.update()
     modulus = info["parameters"]["youngs_modulus"]

@@ -74,7 +74,8 @@ class Splats:
         self._require(np.asarray(norm[:, 0] > 1e-8), "quats", "a rotation quaternion of length zero")
         self._require(np.asarray((scales > 0.0).all(axis=1)), "scales", "a scale that is not positive")
         self._require((opacities >= 0.0) & (opacities <= 1.0), "opacities", "an opacity outside 0..1")
-        quats = (quats / norm).astype(np.float32)
+        # What is a unit quaternion to float32 rounding stays as it is, so that files and copies are equal to the bit.
+        quats = (quats / np.where(np.abs(norm - 1.0) < 1.0e-7, 1.0, norm)).astype(np.float32)
         arrays = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
         for field, value in arrays.items():
             value.setflags(write=False)

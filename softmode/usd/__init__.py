@@ -10,19 +10,46 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from softmode.usd.animation import UsdAnimation, UsdAnimationOptions
     from softmode.usd.importer import UsdBody, UsdImport, add_usd
+    from softmode.usd.placed import PlacedBody
+    from softmode.usd.playback import PlayedBody, UsdPlayback, read_animation
     from softmode.usd.scene import UsdDeformable, UsdScene, read_usd_scene
+    from softmode.usd.writer import UsdExportOptions, write_usd
 
 _HOME = {
+    "PlacedBody": "placed",
+    "PlayedBody": "playback",
+    "UsdAnimation": "animation",
+    "UsdAnimationOptions": "animation",
     "UsdBody": "importer",
-    "UsdImport": "importer",
-    "add_usd": "importer",
     "UsdDeformable": "scene",
+    "UsdExportOptions": "writer",
+    "UsdImport": "importer",
+    "UsdPlayback": "playback",
     "UsdScene": "scene",
+    "add_usd": "importer",
+    "read_animation": "playback",
     "read_usd_scene": "scene",
+    "write_usd": "writer",
 }
 
-__all__ = ["UsdBody", "UsdDeformable", "UsdImport", "UsdScene", "add_usd", "read_usd_scene"]
+__all__ = [
+    "PlacedBody",
+    "PlayedBody",
+    "UsdAnimation",
+    "UsdAnimationOptions",
+    "UsdBody",
+    "UsdDeformable",
+    "UsdExportOptions",
+    "UsdImport",
+    "UsdPlayback",
+    "UsdScene",
+    "add_usd",
+    "read_animation",
+    "read_usd_scene",
+    "write_usd",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -56,7 +56,7 @@ def split_transform(matrix: ArrayLike, where: str) -> tuple[Array, Array]:
     mirrored = np.linalg.det(linear) < 0.0
     if mirrored:
         left, size, right = np.linalg.svd(linear @ _MIRROR)
-    rotation = left @ right
+    rotation: Array = np.asarray(left @ right, dtype=np.float64)
     if size[0] - size[2] <= _SIMILAR * size[0]:
         scale = float(np.round(size.mean(), 12))
         stretch = (scale if scale > 0.0 else float(size.mean())) * np.eye(3)
@@ -64,7 +64,7 @@ def split_transform(matrix: ArrayLike, where: str) -> tuple[Array, Array]:
         stretch = right.T @ np.diag(size) @ right
     whole = np.round(rotation)
     if np.abs(rotation - whole).max() < 1e-14:  # a turn onto axes has no rounding
-        rotation = whole
+        rotation = np.asarray(whole, dtype=np.float64)
     return rotation, stretch @ _MIRROR if mirrored else stretch
 
 
@@ -97,7 +97,8 @@ def mesh_surface(parts: dict[str, Any], linear: Array, where: str, offset: Array
     triangles = indices[np.stack([start[face], start[face] + corner, start[face] + corner + 1], axis=1)]
     if parts["left_handed"] != (np.linalg.det(linear) < 0.0):
         triangles = triangles[:, ::-1]
-    return SurfaceMesh(points @ linear.T + offset, triangles, _vertex_colors(parts, len(points)))
+    moved = points @ linear.T + np.asarray(offset, dtype=np.float64)
+    return SurfaceMesh(moved, triangles, _vertex_colors(parts, len(points)))
 
 
 def tet_surface(parts: dict[str, Any], linear: Array, where: str) -> SurfaceMesh:

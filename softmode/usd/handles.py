@@ -1,9 +1,9 @@
 """Handles: the state of a body as one matrix per skinning weight, in Kaolin's order, and back to coordinates.
 
-x(X) = X + sum_j W_j(X) T_j [X; 1]: a handle adds to the rest position, so that at rest every matrix is zero. Matrices are
-4 x 4 for row vectors as everywhere in OpenUSD, [X, 1] M_j = (T_j [X; 1], 0): the linear part transposed in the upper left,
-the translation in the last row, zeros in the last column. The constant handle, W = 1, comes last, as Kaolin has it;
-softmode's own order has it first. A quadratic handle adds six rows more, the factors of xx, yy, zz, xy, yz and zx.
+x(X) = X + sum_j W_j(X) T_j [X; 1]: a handle adds to the rest position, so that at rest every matrix is zero. Matrices
+are 4 x 4 for row vectors as everywhere in OpenUSD, [X, 1] M_j = (T_j [X; 1], 0): linear part transposed in the upper
+left, the translation in the last row, zeros in the last column. The constant handle, W = 1, comes last, as Kaolin has
+it; softmode's own order has it first. A quadratic handle adds six rows more, the factors of xx, yy, zz, xy, yz and zx.
 """
 
 from __future__ import annotations

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import newton
 import numpy as np
-from numpy.typing import NDArray
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.authoring import add_reduced_body
 from softmode.deformables.body import BuildOptions, ReducedBody, build_body, cached_body
@@ -25,8 +26,8 @@ from softmode.deformables.skinning import average_basis
 from softmode.errors import AssetError, BasisError, ConfigError, SoftmodeError
 from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.mesh_samples import sample_mesh
-from softmode.splats.splats import Splats
-from softmode.usd import tokens
+from softmode.splats.splats import Splats, quat_from_rotation
+from softmode.usd.bundle import body_of
 from softmode.usd.geometry import SurfaceMesh
 from softmode.usd.scene import UsdDeformable, UsdScene, open_scene
 
@@ -101,6 +102,8 @@ def add_usd(
     path: str | os.PathLike[str],
     *,
     asset_root: str | os.PathLike[str] | None = None,
+    position: Sequence[float] = (0.0, 0.0, 0.0),
+    rotation: ArrayLike | None = None,
     build_options: BuildOptions | None = None,
     material: Material | None = None,
     surface_count: int = 400,
@@ -119,6 +122,8 @@ def add_usd(
         builder: Builder of the world, Z up; it may be replicated afterwards.
         path: A `.usd`, `.usda`, `.usdc` or `.usdz` file.
         asset_root: Folder that holds whatever the stage may read; None for the file's own.
+        position: Where the origin of the stage comes to lie [m].
+        rotation: How the stage is turned, shape (3, 3); not at all when None.
         build_options: How bodies are reduced; defaults when None.
         material: Properties that the stage does not give; ``Material()`` when None.
         surface_count: Number of surface samples of each body.
@@ -137,9 +142,13 @@ def add_usd(
         MissingExtraError: If the extra `[usd]` is not installed.
     """
     options = dict(newton_options or {})
-    decided = sorted(set(options) & {"source", "apply_up_axis_from_stage"})
+    decided = sorted(set(options) & {"source", "xform", "root_path", "apply_up_axis_from_stage"})
     if decided:
-        raise ConfigError(f"newton_options: {', '.join(decided)} cannot be given", hint="leave them out")
+        raise ConfigError(
+            f"newton_options: {', '.join(decided)} cannot be given",
+            hint="leave them out; a stage has one place for all",
+        )
+    turn, shift = _place(position, rotation)
     if builder.up_axis != newton.Axis.Z:
         raise ConfigError(
             f"builder: its up axis is {builder.up_axis}", hint="use newton.ModelBuilder(), which has Z up"
@@ -151,9 +160,11 @@ def add_usd(
             _build(deformable, build_options or BuildOptions(), material, surface_count, splat_count, progress)
             for deformable in scene.deformables
         ]
+        options["xform"] = wp.transform(wp.vec3(*shift), wp.quat(*quat_from_rotation(turn)))
         rest = _add_rest(builder, os.path.join(folder, "rest.usdc"), str(path), options)
     bodies = {}
-    for body in ready:
+    for made in ready:
+        body = replace(made, position=turn @ made.position + shift, rotation=turn @ made.rotation)
         instance = add_reduced_body(
             builder,
             body.body,
@@ -165,6 +176,17 @@ def add_usd(
         )
         bodies[body.path] = replace(body, instance=instance)
     return UsdImport(bodies=bodies, scene=scene, newton=rest)
+
+
+def _place(position: Sequence[float], rotation: ArrayLike | None) -> tuple[Array, Array]:
+    """Return the rotation (3, 3) and translation (3,) of a stage, checked."""
+    turn = np.eye(3) if rotation is None else np.asarray(rotation, dtype=np.float64)
+    shift = np.asarray(position, dtype=np.float64)
+    if shift.shape != (3,) or not np.isfinite(shift).all():
+        raise ConfigError(f"position must be three finite numbers, got {position!r}", hint="give metres")
+    if turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-5) or np.linalg.det(turn) < 0.0:
+        raise ConfigError("rotation must be a rotation matrix of shape (3, 3)", hint="orthonormalise it")
+    return turn, shift
 
 
 def _add_rest(builder: newton.ModelBuilder, crate: str, name: str, options: dict[str, Any]) -> dict[str, Any]:
@@ -194,7 +216,7 @@ def _build(
 ) -> UsdBody:
     """Build or recall the body of a deformable, with its material, place and splats; its instance is yet to come."""
     if deformable.bundle is not None:
-        body = _stored_body(deformable)
+        body = body_of(deformable.bundle, deformable.path)
         offset = np.zeros(3)  # the prim's frame is the body frame
     else:
         body = build_deformable(deformable, options, surface_count=surface_count, progress=progress)
@@ -215,25 +237,6 @@ def _build(
         splats=splats,
         notes=deformable.notes,
     )
-
-
-def _stored_body(deformable: UsdDeformable) -> ReducedBody:
-    """Return the body that softmode wrote, checked against its digest."""
-    from softmode.usd.bundle import decode_body
-
-    bundle = deformable.bundle or {}
-    header, digest = bundle.get(tokens.BODY_HEADER), bundle.get(tokens.BODY_SHA256)
-    if bundle.get(tokens.FORMAT) != tokens.BUNDLE_FORMAT or not isinstance(header, str) or not isinstance(digest, str):
-        raise AssetError(
-            f"{deformable.path}: its softmode attributes are of format {bundle.get(tokens.FORMAT)!r}, or incomplete",
-            hint=f"This softmode reads {tokens.BUNDLE_FORMAT!r}; write the file again",
-        )
-    arrays = {
-        name.removeprefix(tokens.BODY_PREFIX): value
-        for name, value in bundle.items()
-        if name.startswith(tokens.BODY_PREFIX) and isinstance(value, np.ndarray)
-    }
-    return decode_body(header, arrays, digest, deformable.path)
 
 
 def build_deformable(

@@ -116,6 +116,8 @@ class UsdScene:
     """Mass of the stage's unit [kg]."""
     up_axis: str
     """Axis of the stage that points up: X, Y or Z."""
+    scenery: Splats | None = None
+    """Visible splats that belong to no deformable, in the world [m]; None where there are none."""
     notes: tuple[str, ...] = ()
     """What was not read."""
 
@@ -180,6 +182,7 @@ def scene_from_answer(answer: process.Answer, name: str) -> UsdScene:
     frame = _Frame(up_rotation(UP_AXES[stage["up"]]), meters, kilograms)
     try:
         bodies = tuple(_deformable(body, answer.arrays, frame, name) for body in stage["bodies"])
+        scenery = [_splats(prim, answer.arrays, frame, np.eye(4), name) for prim in stage["scenery"]]
     except (TypeError, IndexError, KeyError, ValueError, OverflowError) as error:
         if isinstance(error, AssetError):
             raise
@@ -190,6 +193,7 @@ def scene_from_answer(answer: process.Answer, name: str) -> UsdScene:
         meters_per_unit=meters,
         kilograms_per_unit=kilograms,
         up_axis=stage["up"],
+        scenery=joined(scenery, name) if scenery else None,
         notes=tuple(stage["notes"]),
     )
 
@@ -250,13 +254,7 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame,
             raise AssetError(f"{where}: {widths.size} widths for {len(points)} points, or negative ones", hint=_WIDTHS)
         size = abs(float(np.linalg.det(stretch))) ** (1.0 / 3.0)
         radii = np.broadcast_to(0.5 * size * widths.reshape(-1), (len(points),)).copy()
-    pictures = []
-    for prim in body["splats"]:
-        part = splats_from_prim(prim, arrays, f"{name}: {prim['path']}")
-        if frame.meters != 1.0 or not np.array_equal(frame.up, np.eye(3)):
-            part = part.transformed(rotation=frame.up, scale=frame.meters)
-        relative = _snapped(to_asset @ frame.matrix(prim["matrix"]))
-        pictures.append(part if np.array_equal(relative, np.eye(4)) else placed(part, relative))
+    pictures = [_splats(prim, arrays, frame, to_asset, name) for prim in body["splats"]]
     meshes = []
     for mesh in body["meshes"]:
         relative = _snapped(to_asset @ frame.matrix(mesh["matrix"]))
@@ -286,6 +284,15 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame,
         bundle=_bundle(body["bundle"], arrays),
         notes=tuple(notes),
     )
+
+
+def _splats(prim: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame, into: Array, name: str) -> Splats:
+    """Return the splats of a prim in another frame than the world, given the map there; untouched if it is theirs."""
+    part = splats_from_prim(prim, arrays, f"{name}: {prim['path']}")
+    if frame.meters != 1.0 or not np.array_equal(frame.up, np.eye(3)):
+        part = part.transformed(rotation=frame.up, scale=frame.meters)
+    relative = _snapped(into @ frame.matrix(prim["matrix"]))
+    return part if np.array_equal(relative, np.eye(4)) else placed(part, relative)
 
 
 def _snapped(matrix: Array) -> Array:

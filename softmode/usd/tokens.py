@@ -72,9 +72,12 @@ counts as long as it agrees with the standard attribute to float32: whoever edit
 SPLAT_BODY = "softmode:splats:body"
 """Relationship from a splat prim to the prim of the body whose picture it is, where it does not lie beneath it."""
 WEIGHTS = "primvars:softmode:weights"
-"""Skinning weights W_j of splats: float[], elementSize = number of handles, interpolation vertex."""
+"""Skinning weights W_j of splats, the constant one last: float[] or half[], elementSize = number of handles,
+interpolation vertex."""
 HANDLES = "softmode:handles"
-"""Time samples of the handles' transforms, on the body's prim."""
+"""Time samples of the handles' transforms, on the body's prim: matrix4d[], see `usd.handles`."""
+HANDLES_QUADRATIC = "softmode:handles:quadratic"
+"""Time samples of what quadratic handles have beside: double3[], six rows for each."""
 
 # Kaolin's exchange format, a schema applied several times: `kaolin_skinned_physics:<instance>:<name>`.
 KAOLIN_SKINNED_API = "KaolinSkinnedPhysicsAPI"

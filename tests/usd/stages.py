@@ -247,7 +247,8 @@ def grid_points(count: int = 12) -> tuple[NDArray[np.float64], float]:
     width = EDGES[2] / count
     numbers = [round(edge / width) for edge in EDGES]
     axes = [(np.arange(n) + 0.5) * width - 0.5 * n * width for n in numbers]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3), width
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return np.asarray(points, dtype=np.float64), width
 
 
 def shell(count: int = 3000, color: float = 0.3) -> Splats:

@@ -148,22 +148,37 @@ def test_the_real_process_survives_too(tmp_path: Path) -> None:
 
 
 HUGE = {
-    "declared points": 'def Mesh "M" { point3f[] points = [' + "(0, 0, 0)," * 200_000 + "] }",
-    "repeated references": 'def "A" { def "B" (references = [</A>, </A>]) {} }',
-    "wide": "\n".join(f'def "p{i}" {{}}' for i in range(60_000)),
-    "nested variants": 'def "A" (variantSets = "v") { variantSet "v" = {' * 90,
+    "points": ('def Mesh "M" {\n point3f[] points = [' + ", ".join(["(0, 0, 0)"] * 200_000) + "]\n}\n", True),
+    "prims": ("\n".join(f'def "p{i}" {{\n}}' for i in range(20_000)), True),
+    "references to itself": ('def "A" {\n def "B" (\n references = [</A>, </A>]\n) {\n}\n}\n', False),
+    "doubling": (
+        'def "p0" {\n}\n'
+        + "".join(
+            f'def "p{i + 1}" {{\n def "a" (\n references = </p{i}>\n) {{\n}}\n def "b" (\n references = </p{i}>\n)'
+            " {\n}\n}\n"
+            for i in range(40)
+        ),
+        False,
+    ),
+    "nested variants": ('def "A" (\n variantSets = "v"\n) {\n variantSet "v" = {\n "a" {\n' * 90, False),
 }
+"""Text of a stage, and whether it is sound: 40 lines of doubling stand for 10^12 prims."""
 
 
 @pytest.mark.parametrize("name", HUGE)
-def test_huge_declarations(tmp_path: Path, name: str) -> None:
-    """What is large or refers to itself ends in time, whichever way."""
+def test_huge_declarations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """What is large loads; what refers to itself or multiplies beyond measure ends in a typed error."""
+    less = process.Limits(seconds=3.0)  # of the usual ten
+    monkeypatch.setattr(process, "Limits", lambda: less)
     path = tmp_path / "a.usda"
-    path.write_text("#usda 1.0\n" + HUGE[name])
-    try:
+    text, sound = HUGE[name]
+    path.write_text("#usda 1.0\n" + text)
+    if sound:
         assert read_usd_scene(path).deformables == ()
-    except AssetError as error:
-        assert error.hint
+    else:
+        with pytest.raises(AssetError) as caught:
+            read_usd_scene(path)
+        assert caught.value.hint
 
 
 def test_crates_that_declare_huge_arrays(tmp_path: Path) -> None:
@@ -223,3 +238,19 @@ def test_indices_that_point_nowhere(tmp_path: Path) -> None:
     with pytest.raises(AssetError, match="vertices that are not there"):
         add_usd(builder, tmp_path / "a.usda")
     assert not builder.shape_count
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [process.Limits(memory=2**20, memory_per_byte=0.0), process.Limits(seconds=0.05, seconds_per_byte=0.0)],
+    ids=["memory", "time"],
+)
+def test_limits_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limits: process.Limits) -> None:
+    """A sound file that needs more memory or processor time than it may have is refused; the caller goes on."""
+    path = tmp_path / "a.usda"
+    path.write_text("#usda 1.0\n" + HUGE["points"][0])
+    read_usd_scene(path)
+    monkeypatch.setattr(process, "Limits", lambda: limits)  # what the reader of scenes asks for
+    with pytest.raises(AssetError) as caught:
+        read_usd_scene(path)
+    assert caught.value.hint

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from softmode.deformables.quadrature import quadrature_from_mesh, quadrature_fro
 from softmode.deformables.skinning import SkinSplats
 from softmode.deformables.status import status_reasons
 from softmode.errors import AssetError, ConfigError, MissingExtraError
+from softmode.splats.rasterizer import SplatArrays
 from softmode.usd import add_usd, process, read_usd_scene
 from tests.usd.stages import KINDS, Author, UsdGeom, UsdVol, box, shell, transform
 
@@ -115,11 +118,11 @@ def test_it_rests_on_the_ground(tmp_path: Path) -> None:
     toy = found.bodies["/World/Toy"]
     assert toy.splats is not None
     skin = SkinSplats(toy.splats.means, toy.splats.covariances(), *toy.average_basis())
-    means = wp.zeros((2, toy.splats.count), dtype=wp.vec3)
-    covariances = wp.zeros((2, toy.splats.count), dtype=wp.mat33)
+    drawn = SplatArrays.from_splats([toy.splats], world_count=2)
     starts = wp.array(model.softmode.function_start.numpy()[toy.instance :: len(found.bodies)], dtype=wp.int32)
-    skin.launch(state.softmode.q, starts, means, covariances)
-    assert np.abs(means.numpy()[0, :, 2].min()) < 0.003
+    skin.launch(state.softmode.q, starts, drawn.means, drawn.covariances)
+    means = drawn.means.numpy()[0, : toy.splats.count]
+    assert abs(means[:, 2].min()) < 0.003 and abs(means[:, 2].max() - 0.06) < 0.006, "they went with the body"
 
 
 def test_the_body_is_the_one_built_by_hand(tmp_path: Path) -> None:
@@ -210,12 +213,37 @@ def test_refusals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_options_reach_newton(tmp_path: Path) -> None:
-    """`newton_options` are those of `newton.ModelBuilder.add_usd`."""
+    """`newton_options` are those of `newton.ModelBuilder.add_usd`: without a free joint the prop is fixed."""
     author = Author.create(tmp_path / "a.usda")
     author.prop("/World/Prop", (0.0, 0.0, 0.1))
     author.save()
+    for options, count in (({}, 6), ({"floating": False}, 0)):
+        builder = newton.ModelBuilder()
+        assert not add_usd(builder, tmp_path / "a.usda", newton_options=options).bodies
+        assert builder.joint_dof_count == count
+
+
+@pytest.mark.parametrize("up", ["Y", "Z"])
+def test_place_of_a_stage(tmp_path: Path, up: str) -> None:
+    """Rigid and soft things of a stage move together: x' = R x + t."""
+    author = Author.create(tmp_path / "a.usda", up)
+    author.prop("/World/Prop", (0.3, 0.0, 0.1))
+    author.body("/World/Toy", "Mesh", matrix=transform((0.0, 0.2, 0.1)))
+    author.save()
+    place = transform((1.0, 2.0, 0.5), turn=0.5)
     builder = newton.ModelBuilder()
     found = add_usd(
-        builder, tmp_path / "a.usda", newton_options={"xform": wp.transform((1.0, 0.0, 0.0), wp.quat_identity())}
+        builder, tmp_path / "a.usda", position=place[:3, 3].tolist(), rotation=place[:3, :3], build_options=SMALL
     )
-    assert not found.bodies and builder.body_q[0][0] == pytest.approx(1.0)
+    body = found.bodies["/World/Toy"]
+    expected = [place[:3, :3] @ np.array(x) + place[:3, 3] for x in ((0.3, 0.0, 0.1), (0.0, 0.2, 0.1))]
+    np.testing.assert_allclose(builder.body_q[0][:3], expected[0], atol=1e-6)
+    np.testing.assert_allclose(body.position, expected[1], atol=1e-6)
+    middle = np.mean([list(q) for q in builder.particle_q], axis=0)
+    np.testing.assert_allclose(middle, expected[1], atol=0.01)
+
+
+def test_importing_names_loads_no_openusd() -> None:
+    """The reader of scenes itself leaves OpenUSD to another process; `newton`, which `add_usd` needs, brings it."""
+    code = "import sys; from softmode.usd import read_usd_scene; sys.exit('pxr' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -14,7 +14,7 @@ from softmode.errors import AssetError
 from softmode.splats import read_splats
 from softmode.usd import read_usd_scene
 from softmode.usd.child.layers import MAX_LAYERS
-from tests.usd.stages import Author, Sdf, UsdVol, shell
+from tests.usd.stages import Author, Sdf, UsdUtils, UsdVol, shell
 
 
 @pytest.fixture
@@ -107,8 +107,6 @@ def test_inside_the_root_all_arcs_load(tree: Path) -> None:
 
 def test_packages(tree: Path) -> None:
     """A .usdz package holds all of its stage."""
-    from pxr import UsdUtils  # type: ignore[import-untyped]
-
     package = tree / "toy.usdz"
     assert UsdUtils.CreateNewUsdzPackage(str(tree / "parts" / "toy.usda"), str(package))
     assert [body.path for body in read_usd_scene(package).deformables] == ["/World/Toy"]

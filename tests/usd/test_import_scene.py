@@ -182,8 +182,11 @@ def test_splats_of_a_body_are_its_picture(tmp_path: Path) -> None:
             prim.GetPrim().CreateRelationship("softmode:splats:body").SetTargets(["/World/Other"])
     UsdGeom.Imageable(author.stage.GetPrimAtPath("/World/Toy/Hidden")).MakeInvisible()
     author.save()
-    toy, other = read_usd_scene(tmp_path / "a.usda").deformables
+    scene = read_usd_scene(tmp_path / "a.usda")
+    toy, other = scene.deformables
     expected = shell(200)
+    assert scene.scenery is not None and (scene.scenery.sh == np.float32(0.4)).all()
+    np.testing.assert_array_equal(scene.scenery.means, expected.means)
     for body, color in ((toy, 0.1), (other, 0.3)):
         assert body.splats.count == expected.count
         assert (body.splats.sh == np.float32(color)).all()

@@ -205,49 +205,85 @@ def write_usd(path: str | os.PathLike[str], splats: Splats | Sequence[Splats], *
 def _build_layer(frames: list[Splats], fps: float) -> Any:
     """Return an anonymous layer with the prim `/Splats`."""
     # By name: usd-core has no type stubs, a type checker takes its modules for empty.
-    pxr: list[Any] = [importlib.import_module(f"pxr.{name}") for name in ("Sdf", "Usd", "UsdGeom", "UsdVol", "Vt")]
-    Sdf, Usd, UsdGeom, UsdVol, Vt = pxr
-    if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
-        raise MissingExtraError(
-            "the installed usd-core has no ParticleField3DGaussianSplat",
-            hint="install it with: pip install 'softmode[usd]'",
-        )
+    pxr: list[Any] = [importlib.import_module(f"pxr.{name}") for name in ("Sdf", "Usd", "UsdGeom")]
+    Sdf, Usd, UsdGeom = pxr
     layer = Sdf.Layer.CreateAnonymous(".usdc")
     stage = Usd.Stage.Open(layer)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    prim = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/Splats")
+    prim = define_splats(stage, "/Splats", frames[0].sh_degree)
     stage.SetDefaultPrim(prim.GetPrim())
-    prim.CreateRadianceSphericalHarmonicsDegreeAttr(frames[0].sh_degree)
     if len(frames) > 1:
         stage.SetTimeCodesPerSecond(fps)
         stage.SetFramesPerSecond(fps)
         stage.SetStartTimeCode(0.0)
         stage.SetEndTimeCode(len(frames) - 1.0)
-    quats = [frames[0].quats]
-    for frame in frames[1:]:  # q and -q are one rotation: the nearer of the two keeps interpolation on the short way
-        sign = np.where((frame.quats * quats[-1]).sum(axis=1, keepdims=True) < 0.0, np.float32(-1), np.float32(1))
-        quats.append(frame.quats * sign)
-    vectors, numbers, rotations = Vt.Vec3fArray.FromNumpy, Vt.FloatArray.FromNumpy, Vt.QuatfArray.FromNumpy
-    columns = [
-        (prim.CreatePositionsAttr(), vectors, [frame.means for frame in frames]),
-        (prim.CreateOrientationsAttr(), rotations, quats),
-        (prim.CreateScalesAttr(), vectors, [frame.scales for frame in frames]),
-        (prim.CreateOpacitiesAttr(), numbers, [frame.opacities for frame in frames]),
-        (
-            prim.CreateRadianceSphericalHarmonicsCoefficientsAttr(),
-            vectors,
-            [frame.sh.reshape(-1, 3) for frame in frames],
-        ),
-        (prim.CreateExtentAttr(), vectors, [_extent(frame) for frame in frames]),
-    ]
-    for attribute, convert, values in columns:
-        if all(np.array_equal(value, values[0]) for value in values[1:]):
-            attribute.Set(convert(values[0]))
+    rows: list[dict[str, NDArray[Any]]] = []
+    for frame in frames:
+        rows.append(splat_columns(frame, near=rows[-1]["orientations"] if rows else None))
+    for name, first in rows[0].items():
+        if all(np.array_equal(row[name], first) for row in rows[1:]):
+            set_splat_column(prim, name, first)
             continue
-        for code, value in enumerate(values):
-            attribute.Set(convert(value), float(code))
+        for code, row in enumerate(rows):
+            set_splat_column(prim, name, row[name], float(code))
     return layer
+
+
+def define_splats(stage: Any, path: str, sh_degree: int) -> Any:
+    """Define a `ParticleField3DGaussianSplat` without values on a stage and return it."""
+    UsdVol: Any = importlib.import_module("pxr.UsdVol")
+    if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
+        raise MissingExtraError(
+            "the installed usd-core has no ParticleField3DGaussianSplat",
+            hint="install it with: pip install 'softmode[usd]'",
+        )
+    prim = UsdVol.ParticleField3DGaussianSplat.Define(stage, path)
+    prim.CreateRadianceSphericalHarmonicsDegreeAttr(sh_degree)
+    return prim
+
+
+def splat_columns(splats: Splats, *, near: NDArray[Any] | None = None) -> dict[str, NDArray[Any]]:
+    """Return what a splat prim is made of, by attribute.
+
+    Args:
+        splats: The splats.
+        near: Orientations of the frame before, shape (N, 4); q and -q are one rotation, and the nearer of the two keeps
+            interpolation on the short way.
+    """
+    quats = splats.quats
+    if near is not None:
+        quats = quats * np.where((quats * near).sum(axis=1, keepdims=True) < 0.0, np.float32(-1), np.float32(1))
+    return {
+        "positions": splats.means,
+        "orientations": quats,
+        "scales": splats.scales,
+        "opacities": splats.opacities,
+        _SH: splats.sh.reshape(-1, 3),
+        "extent": _extent(splats),
+    }
+
+
+def set_splat_column(
+    prim: Any, name: str, values: NDArray[Any], time_code: float | None = None, *, half: bool = False
+) -> None:
+    """Author one attribute of a splat prim, as a time sample or for all times.
+
+    Args:
+        prim: From `define_splats`.
+        name: Attribute, as in `splat_columns`.
+        values: Its value.
+        time_code: When; None for always.
+        half: Author the variant of half precision, `positionsh` beside `positions`; an extent has none.
+    """
+    Usd: Any = importlib.import_module("pxr.Usd")
+    Vt: Any = importlib.import_module("pxr.Vt")
+    half = half and name != "extent"
+    kind = {"orientations": "Quat{}Array", "opacities": "{}Array"}.get(name, "Vec3{}Array")
+    number = ("Half" if half else "Float") if name == "opacities" else ("h" if half else "f")
+    array = getattr(Vt, kind.format(number)).FromNumpy(np.ascontiguousarray(values, np.float16 if half else np.float32))
+    when = Usd.TimeCode.Default() if time_code is None else Usd.TimeCode(time_code)
+    prim.GetPrim().GetAttribute(name + ("h" if half else "")).Set(array, when)
 
 
 def _extent(splats: Splats) -> NDArray[np.float32]:

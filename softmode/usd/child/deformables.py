@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -94,7 +95,7 @@ def find_bodies(prims: list[Any]) -> tuple[list[Body], list[tuple[str, str]]]:
         if prim.GetTypeName() == tokens.SPLATS and prim.GetRelationship(tokens.SPLAT_BODY):
             for target in prim.GetRelationship(tokens.SPLAT_BODY).GetTargets():
                 body = by_path.get(target)
-                if body is not None and prim.GetPath() not in {p.GetPath() for p in body.splats} and _visible(prim):
+                if body is not None and prim.GetPath() not in {p.GetPath() for p in body.splats} and visible(prim):
                     body.splats.append(prim)
     between = [(str(p.GetPath()), str(p.GetTypeName())) for p in prims if p.GetTypeName() in _BETWEEN]
     return bodies, between
@@ -129,8 +130,8 @@ def _body(root: Any, roots: set[Any]) -> Body:
             f"Make its simulation geometry a {', '.join(_GEOMETRY)}",
         )
     body = Body(root, geometry)
-    body.splats = [p for p in of_type[tokens.SPLATS] if _visible(p) or p == geometry]
-    body.meshes = [p for p in of_type[tokens.MESH] if p != geometry and _visible(p)]
+    body.splats = [p for p in of_type[tokens.SPLATS] if visible(p) or p == geometry]
+    body.meshes = [p for p in of_type[tokens.MESH] if p != geometry and visible(p)]
     for namespace in ("physics", "omniphysics"):
         kinematic = root.GetAttribute(f"{namespace}:kinematicEnabled")
         if kinematic and kinematic.Get() is True:
@@ -152,14 +153,10 @@ def _collect(prim: Any, root: Any, roots: set[Any], owned: list[Any]) -> None:
 
 def _everything() -> Any:
     """Return the predicate of all prims that count, instances entered."""
-    import importlib
-
     return importlib.import_module("pxr.Usd").TraverseInstanceProxies()
 
 
-def _visible(prim: Any) -> bool:
+def visible(prim: Any) -> bool:
     """Return whether a prim is visible."""
-    import importlib
-
     UsdGeom = importlib.import_module("pxr.UsdGeom")
     return UsdGeom.Imageable(prim).ComputeVisibility() != UsdGeom.Tokens.invisible

@@ -71,7 +71,7 @@ class Budget:
             memory = int(min(self._memory + self._memory_per_byte * self._size, _MEMORY_CAP))
             # Writable memory, not address space: mapped libraries do not count. Files that it writes likewise.
             limits.setrlimit(limits.RLIMIT_DATA, (memory, _MEMORY_CAP))
-            limits.setrlimit(limits.RLIMIT_FSIZE, (2 * memory, _MEMORY_CAP))
+            limits.setrlimit(limits.RLIMIT_FSIZE, (min(2 * memory, _MEMORY_CAP), _MEMORY_CAP))
             limits.setrlimit(limits.RLIMIT_CORE, (0, 0))
         if hasattr(signal, "setitimer"):
             left = self._seconds + self._seconds_per_byte * self._size - (time.process_time() - self._begun)

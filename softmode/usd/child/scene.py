@@ -7,7 +7,7 @@ from typing import Any
 
 from .. import tokens
 from .answer import prims_of
-from .deformables import applied, find_bodies, uninstance
+from .deformables import applied, find_bodies, uninstance, visible
 from .limits import Refused
 from .splats import flat, read_prim
 
@@ -28,14 +28,16 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
     bodies, ignored = find_bodies(prims)
     described = []
     used: list[str] = []
+    most = request["most"]
+
+    def read_splats(prim: Any) -> dict[str, Any]:
+        nonlocal most
+        found, count = read_prim(prim, time, arrays, most)
+        most -= count
+        return {**found, "matrix": flat(transforms.GetLocalToWorldTransform(prim))}
+
     for body in bodies:
         geometry = body.geometry
-        most = request["most"]
-        pictures = []
-        for prim in body.splats:
-            found, count = read_prim(prim, time, arrays, most)
-            most -= count
-            pictures.append({**found, "matrix": flat(transforms.GetLocalToWorldTransform(prim))})
         described.append(
             {
                 "path": str(body.prim.GetPath()),
@@ -52,7 +54,7 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
                     }
                     for mesh in body.meshes
                 ],
-                "splats": pictures,
+                "splats": [read_splats(prim) for prim in body.splats],
                 "mass": _scalar(body.prim, geometry, "mass"),
                 "density": _scalar(body.prim, geometry, "density"),
                 "material": _material(geometry, body.prim),
@@ -69,6 +71,11 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
         "meters": UsdGeom.GetStageMetersPerUnit(stage),
         "kilograms": UsdPhysics.GetStageKilogramsPerUnit(stage),
         "bodies": described,
+        "scenery": [
+            read_splats(prim)
+            for prim in prims
+            if prim.GetTypeName() == tokens.SPLATS and str(prim.GetPath()) not in used and visible(prim)
+        ],
         "notes": [f"{path}: {kind} between deformables is not read" for path, kind in ignored],
     }
 

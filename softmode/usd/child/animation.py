@@ -1,0 +1,60 @@
+"""Read the bodies that softmode wrote, with their splats at rest and the time samples of their handles."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from .. import tokens
+from .answer import prims_of
+from .limits import Refused
+from .scene import _bundle
+from .splats import read_prim
+
+MAX_FRAMES = 1_000_000
+"""Most time samples that a body may have."""
+
+
+def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
+    """Return each body with its samples.
+
+    Args:
+        stage: The stage.
+        request: `most`, the largest number of splats.
+        arrays: Takes the arrays.
+    """
+    Usd, UsdGeom, Vt = (importlib.import_module(f"pxr.{name}") for name in ("Usd", "UsdGeom", "Vt"))
+    most = request["most"]
+    bodies = []
+    for prim in prims_of(stage):
+        found = _bundle(prim, arrays)
+        handles = prim.GetAttribute(tokens.HANDLES)
+        if found is None or not handles or not handles.GetNumTimeSamples():
+            continue
+        codes = handles.GetTimeSamples()
+        if len(codes) > MAX_FRAMES:
+            raise Refused(f"{prim.GetPath()}: has more than {MAX_FRAMES} time samples", "Record a shorter animation")
+        more = prim.GetAttribute(tokens.HANDLES_QUADRATIC)
+        transforms = [UsdGeom.XformCache(Usd.TimeCode(code)).GetLocalToWorldTransform(prim) for code in codes]
+        splats = None
+        for child in prim.GetChildren():
+            if child.GetTypeName() == tokens.SPLATS and splats is None:
+                splats, count = read_prim(child, Usd.TimeCode.Default(), arrays, most)
+                most -= count
+        bodies.append(
+            {
+                "path": str(prim.GetPath()),
+                "bundle": found,
+                "splats": splats,
+                "codes": arrays.add(Vt.DoubleArray(codes)),
+                "places": arrays.add(Vt.Matrix4dArray(transforms)),
+                "handles": [arrays.add(handles.Get(code)) for code in codes],
+                "quadratic": [arrays.add(more.Get(code)) for code in codes] if more else [],
+            }
+        )
+    return {
+        "up": str(UsdGeom.GetStageUpAxis(stage)),
+        "meters": UsdGeom.GetStageMetersPerUnit(stage),
+        "rate": stage.GetTimeCodesPerSecond(),
+        "bodies": bodies,
+    }

@@ -1,0 +1,95 @@
+"""OpenUSD's own modules, loaded when needed, and files of it that appear whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from softmode.errors import ConfigError, MissingExtraError, StorageError
+
+SUFFIXES = (".usdc", ".usd", ".usda")
+"""What can be written: binary, binary, text."""
+
+
+def openusd(*names: str) -> list[Any]:
+    """Return modules of OpenUSD, such as "Usd" and "Gf".
+
+    Raises:
+        MissingExtraError: If usd-core is not installed, or too old for splats.
+    """
+    # By name: usd-core has no type stubs, a type checker takes its modules for empty.
+    try:
+        return [importlib.import_module(f"pxr.{name}") for name in names]
+    except ImportError as error:
+        raise MissingExtraError(
+            "OpenUSD stages need usd-core", hint="install it with: pip install 'softmode[usd]'"
+        ) from error
+
+
+def checked_target(path: str | os.PathLike[str]) -> Path:
+    """Return the path of a stage to write.
+
+    Raises:
+        ConfigError: If the name has another suffix, or is that of a folder.
+    """
+    target = Path(path)
+    if target.suffix.lower() not in SUFFIXES:
+        raise ConfigError(f"stage {target}: cannot write {target.suffix!r}", hint="name it .usdc, .usd or .usda")
+    if target.is_dir():
+        raise ConfigError(f"stage {target} is a folder", hint="name a file in it, like scene.usdc")
+    return target
+
+
+def check_stage(path: str | os.PathLike[str]) -> Path:
+    """Return the path of a stage that can be written where its name says, before anything is worth writing.
+
+    Raises:
+        ConfigError: As by `checked_target`.
+        MissingExtraError: If the extra `[usd]` is not installed.
+        StorageError: If the folder, or the nearest one above that exists, cannot be written to.
+    """
+    openusd("Usd")
+    target = checked_target(path)
+    folder = target.absolute().parent
+    while not folder.exists():
+        folder = folder.parent
+    if not (folder.is_dir() and os.access(folder, os.W_OK)):
+        raise StorageError(
+            f"stage {target}: cannot be written ({folder} is no folder that may be written to)",
+            hint="choose another folder",
+        )
+    return target
+
+
+@contextlib.contextmanager
+def whole_stage(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield the name of a file beside `path` that takes its place when the block ends without an error.
+
+    OpenUSD opens files by name, and what a name says is how it writes: the yielded one has the suffix of `path`.
+
+    Raises:
+        ConfigError: If the suffix is none of OpenUSD's.
+        StorageError: If the file cannot be written; nothing is left behind.
+    """
+    target = checked_target(path)
+    temporary = target.with_name(f".{target.stem}-{secrets.token_hex(6)}{target.suffix}")
+    try:
+        try:
+            temporary.open("xb").close()  # with the permissions that the umask asks for, and errors of the place itself
+            yield temporary
+            with temporary.open("rb+") as file:
+                os.fsync(file.fileno())
+            os.replace(temporary, target)
+        except OSError as error:
+            raise StorageError(
+                f"stage {target}: cannot be written ({error.strerror or error})",
+                hint="check the folder, its permissions and the free space",
+            ) from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()

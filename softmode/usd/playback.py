@@ -1,0 +1,136 @@
+"""`read_animation`: what `UsdAnimation` recorded, as states of the bodies and splats in any frame."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softmode.deformables.reduced_body import ReducedBody
+from softmode.errors import AssetError, ConfigError
+from softmode.splats.formats.usd import splats_from_prim
+from softmode.splats.splats import MAX_SPLATS, Splats
+from softmode.usd import process
+from softmode.usd.bundle import body_of
+from softmode.usd.handles import coordinates_from_handles, world_coordinates
+from softmode.usd.skinned import SkinnedSplats
+
+Array = NDArray[np.float64]
+_LIMITS = process.Limits()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlayedBody:
+    """A soft body over the frames of an animation."""
+
+    path: str
+    """Path of its prim."""
+    body: ReducedBody
+    """The body."""
+    splats: Splats | None
+    """Its splats in the body frame [m]."""
+    times: Array
+    """When the frames are [s], shape (F,)."""
+    coordinates: Array
+    """Reduced coordinates in the world, as in `state.softmode.q` [m], shape (F, n, 3)."""
+
+    @cached_property
+    def _skinned(self) -> SkinnedSplats:
+        if self.splats is None:
+            raise ConfigError(f"{self.path} has no splats", hint="record it with a PlacedBody that has")
+        return SkinnedSplats(self.body, self.splats)
+
+    def splats_at(self, frame: int) -> Splats:
+        """Return its splats in the world in one frame.
+
+        Raises:
+            ConfigError: If there is no such frame, or the body has no splats.
+        """
+        if not -len(self.times) <= frame < len(self.times):
+            raise ConfigError(f"frame is {frame}, there are {len(self.times)}")
+        return next(self._skinned.frames(self.coordinates[frame][None]))
+
+    def points_at(self, frame: int) -> Array:
+        """Return its surface samples in the world in one frame [m], shape (S, 3)."""
+        return self.body.surface_points + self.body.surface_basis.astype(np.float64) @ self.coordinates[frame]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class UsdPlayback:
+    """An animation that was read back."""
+
+    fps: float
+    """Time codes per second [1/s]."""
+    bodies: tuple[PlayedBody, ...]
+    """The soft bodies, in the order of the stage."""
+
+
+def read_animation(path: str | os.PathLike[str]) -> UsdPlayback:
+    """Read an animation that `UsdAnimation` wrote, in metres with z up.
+
+    The stage is opened in a process of its own with limited memory and time.
+
+    Args:
+        path: The file.
+
+    Raises:
+        AssetError: If the file is damaged, or holds no body with handles.
+        MissingExtraError: If the extra `[usd]` is not installed.
+    """
+    name = f"OpenUSD file {path}"
+    with tempfile.TemporaryDirectory() as folder:
+        request = process.make_request("animation", path, f"{folder}/answer", asset_root=None, limits=_LIMITS)
+        answer = process.ask({**request, "most": MAX_SPLATS}, name=name)
+    stage = answer.described
+    if stage["up"] != "Z" or stage["meters"] != 1.0:
+        raise AssetError(
+            f"{name}: upAxis {stage['up'][:20]!r}, metersPerUnit {stage['meters']}",
+            hint="Read the file that softmode wrote, which has z up and metres",
+        )
+    if not stage["bodies"]:
+        raise AssetError(
+            f"{name}: holds no animated body of softmode",
+            hint="Write it with softmode.usd.UsdAnimation; splats that other tools animate are read by read_splats",
+        )
+    rate = float(stage["rate"])
+    try:
+        bodies = tuple(_played(sent, answer.arrays, rate, name) for sent in stage["bodies"])
+    except (TypeError, IndexError, KeyError, ValueError) as error:
+        if isinstance(error, AssetError):
+            raise
+        raise AssetError(f"{name}: holds invalid data ({error})", hint=process.REEXPORT) from error
+    return UsdPlayback(fps=rate, bodies=bodies)
+
+
+def _played(sent: dict[str, Any], arrays: list[NDArray[Any]], rate: float, name: str) -> PlayedBody:
+    """Return one body from what the process sent."""
+    source = f"{name}: {sent['path']}"
+    bundle = {**sent["bundle"]["values"], **{key: arrays[k] for key, k in sent["bundle"]["arrays"].items()}}
+    body = body_of(bundle, source)
+    codes, places = arrays[sent["codes"]], arrays[sent["places"]].reshape(-1, 4, 4)
+    curved = int((body.handle_degrees == 2).sum())
+    matrices = np.array([arrays[k] for k in sent["handles"]]).reshape(len(codes), len(body.handle_degrees), 4, 4)
+    quadratic = np.array([arrays[k] for k in sent["quadratic"]]).reshape(len(codes), curved, 6, 3)
+    if not all(np.isfinite(values).all() for values in (codes, places, matrices, quadratic)):
+        raise AssetError(f"{source}: its time samples are not all finite", hint=process.REEXPORT)
+    local = coordinates_from_handles(body, matrices, quadratic)
+    linear = places[:, :3, :3].transpose(0, 2, 1)
+    scale = np.cbrt(np.linalg.det(linear))
+    if not (scale > 0.0).all():
+        raise AssetError(f"{source}: its place is mirrored or flat", hint=process.REEXPORT)
+    world = [
+        world_coordinates(body, q, matrix / s, place[3, :3], float(s))
+        for q, matrix, s, place in zip(local, linear, scale, places, strict=True)
+    ]
+    return PlayedBody(
+        path=sent["path"],
+        body=body,
+        splats=None if sent["splats"] is None else splats_from_prim(sent["splats"], arrays, source),
+        times=codes / rate,
+        coordinates=np.array(world),
+    )

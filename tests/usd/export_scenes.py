@@ -1,0 +1,68 @@
+"""Bodies, splats and states that the tests of the export share."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+
+from softmode.deformables.body import BuildOptions, ReducedBody, Region, build_body
+from softmode.deformables.materials import Material, MaterialModel
+from softmode.deformables.quadrature import quadrature_from_box
+from softmode.splats import Splats
+from tests.splats.test_splats import random_splats
+
+KINDS = ("affine", "quadratic", "regions")
+MATERIAL = Material(
+    youngs_modulus=34567.8,
+    poissons_ratio=0.41,
+    density=271.3,
+    viscosity=0.0037,
+    mass_damping=0.1,
+    friction=0.55,
+    model=MaterialModel.COROTATED,
+)
+"""A material of which no number but the first is a float32."""
+TURN = np.array([[0.0, -0.6, 0.8], [1.0, 0.0, 0.0], [0.0, 0.8, 0.6]])
+
+
+@functools.cache
+def small_body(kind: str) -> ReducedBody:
+    """Return a small bar with one kind of handles: affine, quadratic, or with a region and static responses."""
+    sizes = {"mode_count": 4, "kernel_count": 60, "cubature_count": 48}
+    handles = "quadratic" if kind == "quadratic" else "affine"
+    regions = [Region(name="root", box=((-1.0,) * 3, (-0.03, 1.0, 1.0)))] if kind == "regions" else []
+    quadrature = quadrature_from_box((0.1, 0.04, 0.03), surface_count=80)
+    return build_body(quadrature, BuildOptions(handles=handles, **sizes), regions=regions, name=f"bar {kind}")
+
+
+def small_splats(coefficients: int = 1) -> Splats:
+    """Return splats in the bar."""
+    splats = random_splats(count=50, coefficients=coefficients)
+    low, high = splats.bounds()
+    inside = (splats.means - low) / (high - low) - 0.5
+    return dataclasses.replace(splats, means=inside * (0.1, 0.04, 0.03), scales=np.full((50, 3), (3e-3, 2e-3, 1e-3)))
+
+
+def some_state(body: ReducedBody, seed: int = 7, scale: float = 1.0) -> np.ndarray:
+    """Return coordinates of a bent and turned body."""
+    rng = np.random.default_rng(seed)
+    return body.affine(scale * TURN, (0.3, -0.2, 0.5)) + 0.003 * rng.normal(size=(body.function_count, 3))
+
+
+def assert_same(one: ReducedBody, other: ReducedBody) -> None:
+    """Assert that two bodies are equal field by field, to the bit."""
+    for field in dataclasses.fields(ReducedBody):
+        a, b = getattr(one, field.name), getattr(other, field.name)
+        if isinstance(a, np.ndarray):
+            assert a.dtype == b.dtype and a.shape == b.shape, field.name
+            assert a.tobytes() == b.tobytes(), field.name
+        else:
+            assert a == b and type(a) is type(b), field.name
+
+
+def assert_same_splats(one: Splats, other: Splats) -> None:
+    """Assert that two sets of splats are equal to the bit."""
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
