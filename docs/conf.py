@@ -1,39 +1,93 @@
-"""The documentation as a site: `make docs` writes out/docs/index.html, offline."""
+"""The documentation as a site: `make docs` writes out/docs/index.html, without a network."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+from pathlib import Path
+from typing import Any
+
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
 
 project = "softmode"
 author = "the softmode authors"
 copyright = "the softmode authors, Apache-2.0"
 release = importlib.metadata.version("softmode")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax", "sphinx.ext.viewcode"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["_build"]
-suppress_warnings = []
 
-myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence"]
+myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3
-myst_links_external_new_tab = False
 
-autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True, "show-inheritance": True}
-autodoc_typehints = "signature"
-autodoc_typehints_format = "short"
+autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
-# The site builds without the extras; what is installed is read as it is.
-autodoc_mock_imports = [
-    name
-    for name in ("torch", "stable_baselines3", "rsl_rl", "skrl", "tensordict", "pyarrow", "rerun", "viser", "matplotlib")
-    if importlib.util.find_spec(name) is None
-]
+autodoc_typehints_format = "short"
+# The site builds without the extras: what is not installed is mocked, and only that.
+_EXTRAS = (
+    "matplotlib",
+    "pyarrow",
+    "pxr",
+    "rerun",
+    "rsl_rl",
+    "skrl",
+    "stable_baselines3",
+    "tensordict",
+    "torch",
+    "viser",
+)
+autodoc_mock_imports = [name for name in _EXTRAS if importlib.util.find_spec(name) is None]
 napoleon_numpy_docstring = False
 napoleon_use_rtype = False
 
 html_theme = "furo"
 html_title = "softmode"
-html_show_sphinx = False
 html_copy_source = False
+html_show_sphinx = False
 html_theme_options = {"navigation_with_keys": True}
+html_math_renderer = "mathml"  # set in the page itself: a reader needs no network either
+
+_DESCRIPTIONS: dict[str, list[str]] = {}
+
+
+def _keep(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Make plain docstrings fit for reStructuredText: |x| is a norm, not a substitution."""
+    lines[:] = [line.replace("|", "\N{DIVIDES}") for line in lines]
+    if what in ("attribute", "data", "property"):
+        _DESCRIPTIONS[name] = list(lines)
+
+
+def _restore(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Undo what napoleon makes of a field's description: it takes the words before the first colon for a type."""
+    if what in ("attribute", "data", "property"):
+        lines[:] = _DESCRIPTIONS.pop(name)
+
+
+def _skip_absent(app: Any, page: str, source: list[str]) -> None:
+    """Drop the patterns of the index that stand for pages not there, which Sphinx cannot be told not to mention."""
+    if page == "index":
+        folder = Path(app.srcdir)
+        lines = source[0].splitlines()
+        source[0] = "\n".join(line for line in lines if not line.endswith("*") or list(folder.glob(f"{line}.md")))
+
+
+def _inline_math(writer: Any, node: Any) -> None:
+    """Write a formula of a line as MathML."""
+    writer.body.append(tex2mathml(node.astext()))
+    raise nodes.SkipNode
+
+
+def _block_math(writer: Any, node: Any) -> None:
+    """Write a formula of its own as MathML."""
+    writer.body.append(f'<div class="math">{tex2mathml(node.astext(), as_block=True)}</div>')
+    raise nodes.SkipNode
+
+
+def setup(app: Any) -> None:
+    """Put the two hooks on docstrings around napoleon, whose priority is 500."""
+    app.connect("autodoc-process-docstring", _keep, priority=400)
+    app.connect("autodoc-process-docstring", _restore, priority=600)
+    app.connect("source-read", _skip_absent)
+    app.add_html_math_renderer("mathml", inline_renderers=(_inline_math, None), block_renderers=(_block_math, None))
