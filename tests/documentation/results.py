@@ -120,3 +120,63 @@ def _demonstrations(names: dict[str, Any], folder: Path) -> None:
     """What is read back is what was written."""
     assert names["data"].columns["action"].shape == (10, 1)
     assert (names["data"].columns["action"] == np.float32(0.5)).all()
+
+
+@_result("docs/getting_started.md")
+def _getting_started(names: dict[str, Any], folder: Path) -> None:
+    """The bear is on its way down or on the ground, and in the picture."""
+    from PIL import Image
+
+    assert -1e-3 < names["scene"].state.particle_q.numpy()[:, 2].min() < 0.05
+    picture = np.asarray(Image.open(folder / "bear.png")).astype(int)
+    assert (picture[..., 0] - picture[..., 2] > 60).sum() > 1000  # brown
+
+
+@_result("docs/howto/own_splat.md")
+def _own_splat(names: dict[str, Any], folder: Path) -> None:
+    """The capture of 30 cm became a toy of 8 cm that is in the environment."""
+    toy = names["toy"]
+    assert np.ptp(toy.splats.means, axis=0).max() == abs(np.diff(toy.splats.bounds(), axis=0)).max()
+    np.testing.assert_allclose(np.ptp(toy.splats.means, axis=0).max(), 0.08, rtol=0.05)
+    assert toy.body.provenance["quadrature_parts"] == 1 and toy.body.provenance["cubature_force_error"] < 0.01
+    assert names["env"].unwrapped.scene.soft.body.name == toy.body.name
+
+
+@_result("docs/howto/own_robot.md")
+def _own_robot(names: dict[str, Any], folder: Path) -> None:
+    """Both fingers are pushed outwards, equally."""
+    y = names["press"][:, 1]
+    assert np.abs(y).min() > 0.5 and abs(y.sum()) < 0.1 * np.abs(y).max()
+
+
+@_result("docs/howto/own_env.md")
+def _own_env(names: dict[str, Any], folder: Path) -> None:
+    """The reward is the sum of its terms; the vector environment keeps its contract."""
+    terms = names["info"]["reward_terms"]
+    assert set(terms) == {"reach", "moved"}
+    np.testing.assert_allclose(sum(terms.values()), names["reward"], rtol=1e-6)
+    assert {"autoreset", "same seed", "isolation of actions"} <= set(names["report"].checked)
+
+
+@_result("docs/howto/tune_a_material.md")
+def _tune_a_material(names: dict[str, Any], folder: Path) -> None:
+    """A block sinks by rho g h^2 / (2 E), but for the contact's own 0.03 mm."""
+    for modulus, sink in names["sinks"].items():
+        expected = names["density"] * 9.81 * names["edge"] ** 2 / 2.0 / modulus
+        np.testing.assert_allclose(sink, expected, rtol=0.02, atol=5e-5)
+
+
+@_result("docs/howto/read_forces.md")
+def _read_forces(names: dict[str, Any], folder: Path) -> None:
+    """The ground carries the weight; the patch is the bottom of the cube."""
+    force = names["ground"].total_force.numpy()[0, 0]
+    weight = names["density"] * names["edge"] ** 3 * 9.81
+    np.testing.assert_allclose(force, [0.0, 0.0, -weight], atol=1e-3 * weight)
+    np.testing.assert_allclose(names["surface"].total_area.numpy()[0], names["edge"] ** 2, rtol=0.05)
+
+
+@_result("docs/howto/train.md")
+def _train(names: dict[str, Any], folder: Path) -> None:
+    """The policy acts within the bounds of the environment."""
+    action = names["policy"](names["observation"])
+    assert names["env"].action_space.contains(np.asarray(action, np.float32))

@@ -9,15 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-SETUPS: dict[str, Callable[[Path], dict[str, Any]]] = {}
+SetUp = Callable[[Path], dict[str, Any]]
+
+SETUPS: dict[str, SetUp] = {}
 """By the page's path below the checkout: a function of the folder in which the page runs, which returns names."""
 
 
-def _setup(page: str) -> Callable[[Callable[[Path], dict[str, Any]]], None]:
+def _setup(page: str) -> Callable[[SetUp], SetUp]:
     """Register a function for a page."""
 
-    def register(function: Callable[[Path], dict[str, Any]]) -> None:
+    def register(function: SetUp) -> SetUp:
         SETUPS[page] = function
+        return function
 
     return register
 
@@ -120,6 +123,16 @@ def _training(folder: Path) -> dict[str, Any]:
     return {}
 
 
+@_setup("docs/howto/train.md")
+def _howto_train(folder: Path) -> dict[str, Any]:
+    """The checkout's policies."""
+    from tests.documentation.pages import ROOT
+
+    pytest.importorskip("torch")
+    (folder / "policies").symlink_to(ROOT / "policies")
+    return {}
+
+
 @_setup("docs/vector_envs.md")
 def _vector_envs(folder: Path) -> dict[str, Any]:
     """The libraries of reinforcement learning."""
@@ -129,6 +142,7 @@ def _vector_envs(folder: Path) -> dict[str, Any]:
 
 
 @_setup("docs/robots.md")
+@_setup("docs/howto/own_robot.md")
 def _robots(folder: Path) -> dict[str, Any]:
     """A robot that needs no download."""
     from softmode import robots

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -36,7 +38,10 @@ def test_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     """Its snippets run one after the other, and what the text says of them holds."""
     monkeypatch.chdir(tmp_path)
     setup, result = SETUPS.get(_name(page)), RESULTS.get(_name(page))
-    names: dict[str, Any] = {"__name__": "page", **(setup(tmp_path) if setup else {})}
+    module = ModuleType("page")  # a module that can be found, as dataclasses and kernels expect of theirs
+    monkeypatch.setitem(sys.modules, "page", module)
+    names: dict[str, Any] = module.__dict__
+    names.update(setup(tmp_path) if setup else {})
     run_python(page, names)
     if result:
         result(names, tmp_path)
