@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from docutils import nodes
+from docutils.utils.math import MathError
 from docutils.utils.math.latex2mathml import tex2mathml
+from sphinx.util.logging import getLogger
 
 project = "softmode"
 author = "the softmode authors"
@@ -73,15 +75,24 @@ def _skip_absent(app: Any, page: str, source: list[str]) -> None:
         source[0] = "\n".join(line for line in lines if not line.endswith("*") or list(folder.glob(f"{line}.md")))
 
 
+def _mathml(node: Any, *, as_block: bool) -> str:
+    """Return a formula as MathML, or as it was written with a warning."""
+    try:
+        return tex2mathml(node.astext(), as_block=as_block)
+    except MathError as error:
+        getLogger(__name__).warning("formula %r: %s", node.astext(), error, location=node)
+        return node.astext()
+
+
 def _inline_math(writer: Any, node: Any) -> None:
-    """Write a formula of a line as MathML."""
-    writer.body.append(tex2mathml(node.astext()))
+    """Write a formula within a line."""
+    writer.body.append(_mathml(node, as_block=False))
     raise nodes.SkipNode
 
 
 def _block_math(writer: Any, node: Any) -> None:
-    """Write a formula of its own as MathML."""
-    writer.body.append(f'<div class="math">{tex2mathml(node.astext(), as_block=True)}</div>')
+    """Write a formula that stands by itself."""
+    writer.body.append(f'<div class="math">{_mathml(node, as_block=True)}</div>')
     raise nodes.SkipNode
 
 
