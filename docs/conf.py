@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+import re
 from pathlib import Path
 from typing import Any
 
+import numpy.typing
 from docutils import nodes
 from docutils.utils.math import MathError
 from docutils.utils.math.latex2mathml import tex2mathml
@@ -23,7 +25,7 @@ exclude_patterns = ["_build"]
 myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3
 
-autodoc_default_options = {"members": True, "show-inheritance": True}
+autodoc_default_options = {"members": True}
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 autodoc_typehints_format = "short"
@@ -67,12 +69,34 @@ def _restore(app: Any, what: str, name: str, obj: Any, options: Any, lines: list
         lines[:] = _DESCRIPTIONS.pop(name)
 
 
-def _skip_absent(app: Any, page: str, source: list[str]) -> None:
-    """Drop the patterns of the index that stand for pages not there, which Sphinx cannot be told not to mention."""
+def _read(app: Any, page: str, source: list[str]) -> None:
+    """Adapt a page to the site: links called after their files, as is right elsewhere, get the titles of their pages.
+
+    Patterns of the index that stand for pages not there, which Sphinx cannot be told not to mention, are dropped.
+    """
     if page == "index":
         folder = Path(app.srcdir)
         lines = source[0].splitlines()
         source[0] = "\n".join(line for line in lines if not line.endswith("*") or list(folder.glob(f"{line}.md")))
+    source[0] = re.sub(r"\[[\w/]+\.md\]\(([^)]+\.md)\)", r"[](\1)", source[0])
+
+
+def _shorten(app: Any, what: str, name: str, obj: Any, options: Any, signature: str, result: str) -> Any:
+    """Write defaults that a factory makes as dots: the signature is then Python, and is set as such."""
+    return (signature or "").replace("<factory>", "...") or None, result
+
+
+class _Named(type):
+    """Types that are called as they are written."""
+
+    def __getitem__(cls, item: Any) -> Any:
+        name = getattr(item, "__name__", "Any")
+        return _Named(f"{cls.__name__}[{name}]", (), {"__module__": "builtins"})
+
+
+# numpy.typing's aliases expand to what no reader wants to see. This stands before the first import of softmode.
+for _alias in ("NDArray", "ArrayLike"):
+    setattr(numpy.typing, _alias, _Named(_alias, (), {"__module__": "builtins"}))
 
 
 def _mathml(node: Any, *, as_block: bool) -> str:
@@ -100,5 +124,6 @@ def setup(app: Any) -> None:
     """Put the two hooks on docstrings around napoleon, whose priority is 500."""
     app.connect("autodoc-process-docstring", _keep, priority=400)
     app.connect("autodoc-process-docstring", _restore, priority=600)
-    app.connect("source-read", _skip_absent)
+    app.connect("autodoc-process-signature", _shorten)
+    app.connect("source-read", _read)
     app.add_html_math_renderer("mathml", inline_renderers=(_inline_math, None), block_renderers=(_block_math, None))
