@@ -48,14 +48,17 @@ def run_python(page: Path, names: dict[str, Any]) -> None:
             exec(compile("\n" * fence.line + fence.text, str(page), "exec"), names)
 
 
-def commands(page: Path) -> list[str]:
-    """Return the command lines of a page: those of bash blocks, and code spans that begin like one."""
-    lines: list[str] = []
+def command_lines(page: Path) -> list[str]:
+    """Return the command lines of the bash blocks of a page."""
+    lines = []
     for fence in fences(page, "bash"):
         for line in fence.text.replace("\\\n", " ").splitlines():
             line = re.sub(r"(^|\s)#.*", "", line).strip()
-            if line:
+            if line and fence.mark != "not run":
                 lines.append(line)
-    prose = FENCE.sub("", page.read_text())
-    spans = re.findall(r"`((?:softmode|python|torchrun|make) [^`]+)`", prose)
-    return lines + [span.replace("\n", " ") for span in spans]
+    return lines
+
+
+def prose(page: Path) -> str:
+    """Return a page without its blocks."""
+    return FENCE.sub("", page.read_text())

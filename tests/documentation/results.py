@@ -180,3 +180,10 @@ def _train(names: dict[str, Any], folder: Path) -> None:
     """The policy acts within the bounds of the environment."""
     action = names["policy"](names["observation"])
     assert names["env"].action_space.contains(np.asarray(action, np.float32))
+
+
+@_result("docs/body_tool.md")
+def _body_tool(names: dict[str, Any], folder: Path) -> None:
+    """What the page makes is well."""
+    assert names["report"].severity == 0
+    np.testing.assert_array_equal(names["thing"].splats.means, names["splats"].means)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import itertools
 import re
 import shlex
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from tests.documentation.pages import FENCE, PAGES, ROOT, commands
+from tests.documentation.pages import PAGES, ROOT, command_lines, prose
 
 pytest.importorskip("tyro", reason="needs the extra [demo]")
 
@@ -59,13 +60,10 @@ def _check(words: list[str], parse: Any) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_command_lines(page: Path, parse: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    """Every command line parses, and what it runs exists. A lone `softmode train` in prose only names the command."""
-    for line in commands(page):
-        words = shlex.split(line)
-        if words[0] == "softmode" and len(words) == 2 and words[1] != "list-envs":
-            words.append("--help")
+    """Every command line of a block parses, and what it runs exists."""
+    for line in command_lines(page):
         try:
-            _check(words, parse)
+            _check(shlex.split(line), parse)
         except SystemExit as end:
             assert end.code == 0, f"{line}\n{capsys.readouterr().err}"
         except AssertionError as error:
@@ -73,14 +71,36 @@ def test_command_lines(page: Path, parse: Any, capsys: pytest.CaptureFixture[str
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_commands_in_prose(page: Path, parse: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    """A command that the text mentions, in part or in full, is one, and has the options that are mentioned with it."""
+    for span in re.findall(r"`((?:softmode|python|make) [^`]+)`", prose(page)):
+        words = shlex.split(span.replace("[", "").replace("]", ""))
+        if words[0] != "softmode":
+            _check(words, parse)
+            continue
+        names = list(itertools.takewhile(re.compile(r"[a-z-]+").fullmatch, words[1:]))
+        names = [name for name in names if not name.startswith("-")]
+        text = None
+        while names and text is None:
+            try:
+                parse([*names, "--help"])
+            except SystemExit as end:
+                text = capsys.readouterr().out if end.code == 0 else None
+                names.pop()
+        assert text is not None, f"{span}: no such command"
+        for option in (word.partition("=")[0] for word in words if word.startswith("--")):
+            assert re.search(rf"(?<![\w-]){option}(?![\w-])", text), f"{span}: no option {option}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_files_and_names(page: Path) -> None:
     """Paths and dotted names in code spans lead somewhere, and so do relative links."""
-    prose = FENCE.sub("", page.read_text())
-    for path in re.findall(r"`((?:softmode|tests|examples|benchmarks|docs|policies)/[\w./]+\.\w+)`", prose):
+    text = prose(page)
+    for path in re.findall(r"`((?:softmode|tests|examples|benchmarks|docs|policies)/[\w./]+\.\w+)`", text):
         assert (ROOT / path).exists(), f"{page.name} mentions {path}, which does not exist"
-    for name in re.findall(r"`(softmode(?:\.\w+)+)(?:\(\))?`", prose):
+    for name in re.findall(r"`(softmode(?:\.\w+)+)(?:\(\))?`", text):
         assert _resolves(name), f"{page.name} mentions {name}, which does not exist"
-    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", prose):
+    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
         assert (page.parent / target).exists(), f"{page.name} links to {target}, which does not exist"
 
 
