@@ -21,7 +21,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 unexport VIRTUAL_ENV
 
 .DEFAULT_GOAL := help
-.PHONY: help lock demo test test-slow lint bench accuracy baselines clean coupling
+.PHONY: help lock demo test test-slow lint bench accuracy baselines clean coupling docs
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -86,6 +86,9 @@ baselines: $(VENV)/.bench  ## the table and the picture of docs/baselines.md
 coupling: $(VENV)/.dev  ## the tables of docs/coupling.md and docs/contact.md
 	$(BIN)/python -m benchmarks.coupling $(ARGS)
 	$(BIN)/python -m benchmarks.contact
+
+docs: $(VENV)/.dev  ## build the documentation: out/docs/index.html, no network needed
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going -b html docs out/docs $(ARGS)
 
 clean:  ## remove what the targets made, the virtual environment included
 	rm -rf $(VENV) .cache out build dist .pytest_cache .ruff_cache .hypothesis

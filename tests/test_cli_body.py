@@ -6,7 +6,6 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -371,16 +370,3 @@ def test_play_lifts_a_body(assets: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert main(["play", "softmode/LiftSoft-v0", "--object", str(out), "--youngs-modulus", "1e5"]) == 0
     said = capsys.readouterr().out
     assert "body 'box.obj'" in said and "success: True" in said
-
-
-def test_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """docs/body_tool.md runs, and what it makes is well."""
-    monkeypatch.chdir(tmp_path)
-    page = Path(__file__).resolve().parents[1] / "docs" / "body_tool.md"
-    names: dict[str, Any] = {}
-    snippets = [part.split("```")[0] for part in page.read_text().split("```python")[1:]]
-    assert len(snippets) == 2
-    for snippet in snippets:
-        exec(snippet, names)
-    assert names["report"].severity == 0
-    np.testing.assert_array_equal(names["thing"].splats.means, names["splats"].means)

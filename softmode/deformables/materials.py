@@ -11,14 +11,14 @@ model                  energy density                                           
 STABLE_NEO_HOOKEAN_LOG m/2 (I_C - 3) + l/2 [(J - a)^2 - (1 - a)^2] - m/2 ln((I_C + 1)/4), m = 4/3 mu,  all F
                        l = lambda + 5/6 mu, a = 1 + m/l - m/(4 l). Smith, de Goes, Kim 2018,
                        doi:10.1145/3180491, eq. (14)
-STABLE_NEO_HOOKEAN     mu/2 (I_C - 3) + (lambda+mu)/2 [(J - g)^2 - (1 - g)^2], g = 1 + mu/(lambda+mu).  all F, but stays
+STABLE_NEO_HOOKEAN     mu/2 (I_C - 3) + (lambda+mu)/2 [(J - g)^2 - (1 - g)^2], g = 1 + mu/(lambda+mu). all F, but stays
                        FreeForm's eq. (16) with the factor 1/2 on mu that its eq. (26) needs           at a point
 ARAP                   mu |F - R|^2                                                                    all F
 COROTATED              mu |F - R|^2 + lambda/2 (J - 1)^2. Stomakhin et al. 2012,                       all F
                        doi:10.2312/SCA/SCA12/025-032
 STVK                   mu E : E + lambda/2 tr(E)^2                                                     all F, soft below
                                                                                                        0.58 of length
-NEO_HOOKEAN            mu/2 (I_C - 3) - mu ln J + lambda/2 ln(J)^2. Bonet and Wood 2008, eq. (6.28)     J > 0
+NEO_HOOKEAN            mu/2 (I_C - 3) - mu ln J + lambda/2 ln(J)^2. Bonet and Wood 2008, eq. (6.28)    J > 0
 ====================== =============================================================================== ================
 
 When to use which:

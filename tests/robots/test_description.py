@@ -269,13 +269,6 @@ def test_closed_loop_stays_closed(tmp_path):
     assert (coupler, rocker) == pytest.approx((-crank, crank), abs=0.01)
 
 
-@needs_aloha
-def test_the_page_runs():
-    """The first snippet of docs/robots.md."""
-    page = (Path(__file__).resolve().parents[2] / "docs" / "robots.md").read_text()
-    exec(page.split("```python")[1].split("```")[0], {})
-
-
 # -- what a caller may get wrong ---------------------------------------------------------------------------------------
 
 

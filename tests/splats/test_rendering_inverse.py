@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -129,14 +126,3 @@ def test_bend_is_found_from_pictures() -> None:
     found = 0.01 * descend(loss, np.zeros(18)).reshape(6, 3)
     moved, wrong = basis @ bent, basis @ (found - bent)
     assert np.linalg.norm(wrong, axis=1).max() < 0.01 * np.linalg.norm(moved, axis=1).max()
-
-
-def test_the_snippets_of_the_docs_run() -> None:
-    """docs/rendering_gradients.md: moving the body along v and the camera against it are the same."""
-    page = Path(__file__).parents[2] / "docs" / "rendering_gradients.md"
-    names: dict[str, Any] = {}
-    exec("\n".join(re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)), names)
-    by_translation, by_twist = names["loss_q"].numpy()[3], names["gradients"].twist.numpy()[0]
-    turn = names["views"].world_to_camera.numpy()[0, :3, :3]
-    assert np.abs(by_twist).max() > 1.0
-    np.testing.assert_allclose(turn @ by_translation, by_twist[:3], atol=1e-4 * np.abs(by_twist).max())

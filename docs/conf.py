@@ -1,0 +1,129 @@
+"""The documentation as a site: `make docs` writes out/docs/index.html, without a network."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy.typing
+from docutils import nodes
+from docutils.utils.math import MathError
+from docutils.utils.math.latex2mathml import tex2mathml
+from sphinx.util.logging import getLogger
+
+project = "softmode"
+author = "the softmode authors"
+copyright = "the softmode authors, Apache-2.0"
+release = importlib.metadata.version("softmode")
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+exclude_patterns = ["_build"]
+
+myst_enable_extensions = ["dollarmath", "amsmath"]
+myst_heading_anchors = 3
+
+autodoc_default_options = {"members": True}
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+autodoc_typehints_format = "short"
+# The site builds without the extras: what is not installed is mocked, and only that.
+_EXTRAS = (
+    "matplotlib",
+    "pyarrow",
+    "pxr",
+    "rerun",
+    "rsl_rl",
+    "skrl",
+    "stable_baselines3",
+    "tensordict",
+    "torch",
+    "viser",
+)
+autodoc_mock_imports = [name for name in _EXTRAS if importlib.util.find_spec(name) is None]
+napoleon_numpy_docstring = False
+napoleon_use_rtype = False
+
+html_theme = "furo"
+html_title = "softmode"
+html_copy_source = False
+html_show_sphinx = False
+html_theme_options = {"navigation_with_keys": True}
+html_math_renderer = "mathml"  # set in the page itself: a reader needs no network either
+
+_DESCRIPTIONS: dict[str, list[str]] = {}
+
+
+def _keep(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Make plain docstrings fit for reStructuredText: |x| is a norm, not a substitution."""
+    lines[:] = [line.replace("|", "\N{DIVIDES}") for line in lines]
+    if what in ("attribute", "data", "property"):
+        _DESCRIPTIONS[name] = list(lines)
+
+
+def _restore(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Undo what napoleon makes of a field's description: it takes the words before the first colon for a type."""
+    if what in ("attribute", "data", "property"):
+        lines[:] = _DESCRIPTIONS.pop(name)
+
+
+def _read(app: Any, page: str, source: list[str]) -> None:
+    """Adapt a page to the site: links called after their files, as is right elsewhere, get the titles of their pages.
+
+    Patterns of the index that stand for pages not there, which Sphinx cannot be told not to mention, are dropped.
+    """
+    if page == "index":
+        folder = Path(app.srcdir)
+        lines = source[0].splitlines()
+        source[0] = "\n".join(line for line in lines if not line.endswith("*") or list(folder.glob(f"{line}.md")))
+    source[0] = re.sub(r"\[[\w/]+\.md\]\(([^)]+\.md)\)", r"[](\1)", source[0])
+
+
+def _shorten(app: Any, what: str, name: str, obj: Any, options: Any, signature: str, result: str) -> Any:
+    """Write defaults that a factory makes as dots: the signature is then Python, and is set as such."""
+    return (signature or "").replace("<factory>", "...") or None, result
+
+
+class _Named(type):
+    """Types that are called as they are written."""
+
+    def __getitem__(cls, item: Any) -> Any:
+        name = getattr(item, "__name__", "Any")
+        return _Named(f"{cls.__name__}[{name}]", (), {"__module__": "builtins"})
+
+
+# numpy.typing's aliases expand to what no reader wants to see. This stands before the first import of softmode.
+for _alias in ("NDArray", "ArrayLike"):
+    setattr(numpy.typing, _alias, _Named(_alias, (), {"__module__": "builtins"}))
+
+
+def _mathml(node: Any, *, as_block: bool) -> str:
+    """Return a formula as MathML, or as it was written with a warning."""
+    try:
+        return tex2mathml(node.astext(), as_block=as_block)
+    except MathError as error:
+        getLogger(__name__).warning("formula %r: %s", node.astext(), error, location=node)
+        return node.astext()
+
+
+def _inline_math(writer: Any, node: Any) -> None:
+    """Write a formula within a line."""
+    writer.body.append(_mathml(node, as_block=False))
+    raise nodes.SkipNode
+
+
+def _block_math(writer: Any, node: Any) -> None:
+    """Write a formula that stands by itself."""
+    writer.body.append(f'<div class="math">{_mathml(node, as_block=True)}</div>')
+    raise nodes.SkipNode
+
+
+def setup(app: Any) -> None:
+    """Put the two hooks on docstrings around napoleon, whose priority is 500."""
+    app.connect("autodoc-process-docstring", _keep, priority=400)
+    app.connect("autodoc-process-docstring", _restore, priority=600)
+    app.connect("autodoc-process-signature", _shorten)
+    app.connect("source-read", _read)
+    app.add_html_math_renderer("mathml", inline_renderers=(_inline_math, None), block_renderers=(_block_math, None))

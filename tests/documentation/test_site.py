@@ -1,0 +1,72 @@
+"""The site builds offline without a warning, and shows what it should."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.documentation.pages import ROOT
+
+
+def referenced() -> set[str]:
+    """Return the modules that the pages of the reference show."""
+    text = "".join(page.read_text() for page in sorted((ROOT / "docs" / "api").glob("*.md")))
+    return set(re.findall(r"automodule:: (softmode[\w.]*)", text))
+
+
+def test_the_reference_names_modules_that_are_there() -> None:
+    """Every module of the reference exists, and each of the packages has a page."""
+    files = (path.relative_to(ROOT).with_suffix("") for path in (ROOT / "softmode").rglob("*.py"))
+    found = {".".join(file.parts).removesuffix(".__init__") for file in files}
+    assert referenced() <= found
+    for package in ("deformables", "splats", "envs", "robots", "learning", "demonstrations"):
+        assert any(name.startswith(f"softmode.{package}.") for name in referenced())
+
+
+def test_nothing_is_fetched() -> None:
+    """No page and no option of the site refers to another machine for scripts, styles, fonts or inventories."""
+    configuration = (ROOT / "docs" / "conf.py").read_text()
+    assert "intersphinx" not in configuration and "http" not in configuration
+
+
+def test_formulas_are_understood() -> None:
+    """Every formula of the method is one that docutils can write as MathML."""
+    latex = pytest.importorskip("docutils.utils.math.latex2mathml", reason="needs the extra [docs]")
+    text = (ROOT / "docs" / "method.md").read_text()
+    blocks = re.findall(r"^\$\$\n(.*?)^\$\$$", text, re.M | re.S)
+    lines = re.findall(r"(?<!\$)\$(?!\$)([^$\n]+)\$", re.sub(r"^\$\$\n.*?^\$\$$", "", text, flags=re.M | re.S))
+    assert len(blocks) >= 8 and len(lines) >= 20
+    for formula in (*blocks, *lines):
+        assert latex.tex2mathml(formula, as_block=formula in blocks).startswith("<math"), formula
+
+
+@pytest.mark.slow
+def test_the_site_builds(tmp_path: Path) -> None:
+    """`make docs`: no warning, a page per source, formulas as MathML, and no script or style from elsewhere."""
+    for module in ("sphinx", "furo", "myst_parser"):
+        pytest.importorskip(module, reason="needs the extra [docs]")
+    command = [sys.executable, "-m", "sphinx", "--fail-on-warning", "--keep-going", "-q", "-b", "html"]
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(ROOT),
+        "http_proxy": "http://127.0.0.1:9",
+        "https_proxy": "http://127.0.0.1:9",
+    }
+    done = subprocess.run(
+        [*command, str(ROOT / "docs"), str(tmp_path)], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    for page in (ROOT / "docs").rglob("*.md"):
+        assert (tmp_path / page.relative_to(ROOT / "docs").with_suffix(".html")).is_file()
+    method = (tmp_path / "method.html").read_text()
+    assert method.count("<math") > 10 and "ERROR" not in method
+    reference = (tmp_path / "api" / "deformables.html").read_text()
+    for name in ("softmode.deformables.body.build_body", "softmode.deformables.solver_reduced.SolverReduced.step"):
+        assert f'id="{name}"' in reference
+    for html in tmp_path.rglob("*.html"):
+        assert not re.search(r"<(?:script|link)[^>]+(?:src|href)=\"https?:", html.read_text()), html
