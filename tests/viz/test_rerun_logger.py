@@ -123,7 +123,7 @@ def test_episode_is_what_the_environment_did(env: Any, tmp_path: Path) -> None:
             }
         )
 
-    observation, info = env.reset(seed=0)
+    observation, info = env.reset(seed=0, options={"youngs_modulus": 3.0e4})
     policy = policy_factory("scripted", env, None)(0)
     with RerunLogger(path, env) as log:
         log.record()
