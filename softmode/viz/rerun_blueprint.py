@@ -21,7 +21,9 @@ def make_blueprint(worlds: Sequence[str], objects: Sequence[str], cameras: Seque
     import rerun.blueprint as rrb
 
     def curves(name: str, *patterns: str) -> Any:
-        return rrb.TimeSeriesView(name=name, origin="/", contents=[f"+ /{w}{p}" for w in worlds for p in patterns])
+        contents = [f"+ /{w}{p}" for w in worlds for p in patterns]
+        legend = rrb.PlotLegend(rrb.Corner2D.LeftTop)  # what rises towards the end stays in view
+        return rrb.TimeSeriesView(name=name, origin="/", contents=contents, plot_legend=legend)
 
     position, target = eye
     scene = rrb.Spatial3DView(

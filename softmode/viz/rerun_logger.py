@@ -54,7 +54,7 @@ class RerunOptions:
     """Distance of the worlds of a recording of several [m]."""
     plane_extent: float = PLANE_EXTENT
     """Edge of the quad that stands for an infinite plane [m]."""
-    eye: tuple[tuple[float, float, float], tuple[float, float, float]] = ((1.0, -0.65, 0.5), (0.36, 0.02, 0.18))
+    eye: tuple[tuple[float, float, float], tuple[float, float, float]] = ((1.05, -0.4, 0.42), (0.34, -0.02, 0.19))
     """Where the saved layout looks from and at [m]."""
 
     def __post_init__(self) -> None:
