@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import io
 import os
+import signal
+import socket
+import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -300,6 +304,37 @@ def test_whole_or_not_at_all(falling: Any, tmp_path: Path) -> None:
         pass
     assert Recording(tmp_path / "empty.rrd").times == {}
     assert sorted(p.name for p in tmp_path.iterdir()) == ["empty.rrd", "old.rrd"]
+
+
+def test_live_viewer(falling: Any, tmp_path: Path) -> None:
+    """What is sent to the address of a viewer arrives there, here at one that saves it."""
+    scene, thing = falling
+    scene.restart()
+    source, path = RerunScene(model=scene.model, solver=scene.solver, objects=[thing]), tmp_path / "seen.rrd"
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = int(probe.getsockname()[1])
+    command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", str(port), "--save", str(path)]
+    viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    try:
+        for _ in range(300):
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", port)) == 0:
+                    break
+            time.sleep(0.1)
+        with RerunLogger(f"rerun+http://127.0.0.1:{port}/proxy", source) as log:
+            for k in range(3):
+                log.record(scene.state, time=k * scene.dt)
+        for _ in range(300):
+            if path.exists() and path.stat().st_size > 3 * 12 * thing.splats.count:
+                break
+            time.sleep(0.1)
+    finally:
+        os.killpg(viewer.pid, signal.SIGINT)
+        viewer.wait(timeout=30)
+    file = Recording(path)
+    assert sorted(file.times) == [0, 1, 2] and file.blueprints == 1
+    assert len(file.of("world_0/scene/soft/plush", "GaussianSplats3D:centers")) == 3
 
 
 def test_bad_input_is_refused(falling: Any, env: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
