@@ -32,7 +32,10 @@ def _scene(material: Material = MATERIAL, scale: float = 1.0, **given) -> Scene:
 def _energies(scene: Scene) -> tuple[float, float, float]:
     energies = SoftEnergies(scene.solver)
     energies.update(scene.state)
-    return tuple(float(e.numpy()[0]) for e in (energies.kinetic, energies.elastic, energies.gravitational))
+    kinetic, elastic, gravitational = (
+        float(e.numpy()[0]) for e in (energies.kinetic, energies.elastic, energies.gravitational)
+    )
+    return kinetic, elastic, gravitational
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.5])
