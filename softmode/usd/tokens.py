@@ -43,6 +43,8 @@ SIM_APIS = (
     "OmniPhysicsVolumeDeformableSimAPI",
     "OmniPhysicsSurfaceDeformableSimAPI",
 )
+CURVES_SIM_APIS = ("PhysicsCurvesDeformableSimAPI", "OmniPhysicsCurvesDeformableSimAPI")
+"""Cables, which Newton has bodies of its own for."""
 SURFACE_SIM_APIS = (SURFACE_SIM_API, "OmniPhysicsSurfaceDeformableSimAPI")
 NAMESPACES = ("physics", "omniphysics", "physxDeformableBody", "physxDeformableBodyMaterial")
 """Namespaces of the attributes above, such as `omniphysics:youngsModulus`."""

@@ -71,7 +71,8 @@ class Author:
     def points(self, points: ArrayLike) -> NDArray[np.float64]:
         """Return positions as the stage has them."""
         turn = up_rotation({"X": "+x", "Y": "+y", "Z": "+z"}[self.up])  # type: ignore[arg-type]
-        return np.asarray(points, dtype=np.float64) @ turn / self.meters
+        with np.errstate(invalid="ignore"):  # infinity is authored on purpose
+            return np.asarray(points, dtype=np.float64) @ turn / self.meters
 
     def vector(self, value: ArrayLike) -> tuple[float, float, float]:
         """Return one position as the stage has it."""

@@ -171,6 +171,22 @@ def test_picture_from_a_visible_mesh(tmp_path: Path) -> None:
     assert on_face.max() < 1e-4
 
 
+def test_cables_are_left_to_newton(tmp_path: Path) -> None:
+    """A deformable of curves becomes Newton's cable; it is no reduced body."""
+    author = Author.create(tmp_path / "a.usda")
+    curves = UsdGeom.BasisCurves.Define(author.stage, "/World/Cable")
+    curves.CreateTypeAttr("linear")
+    curves.CreatePointsAttr([(0.1 * i, 0.0, 0.5) for i in range(5)])
+    curves.CreateCurveVertexCountsAttr([5])
+    curves.CreateWidthsAttr([0.01] * 5)
+    for schema in ("PhysicsDeformableBodyAPI", "PhysicsCurvesDeformableSimAPI"):
+        curves.GetPrim().AddAppliedSchema(schema)
+    author.save()
+    builder = newton.ModelBuilder()
+    assert not add_usd(builder, tmp_path / "a.usda").bodies
+    assert builder.body_count == 4, "one for each segment"
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_two_of_a_kind_share_a_body(tmp_path: Path, kind: str) -> None:
     """Instances of one asset are built once, whatever their places; a mirrored one is another shape."""

@@ -55,6 +55,7 @@ TARGETS = {
     "file:///etc/toy.usda": "address",
     "https://example.com/toy.usda": "address",
     "`'${X}.usda'`": "expression",
+    "./parts/toy.usda:SDF_FORMAT_ARGS:a=b": "arguments",
 }
 
 

@@ -89,7 +89,7 @@ def find_bodies(prims: list[Any]) -> tuple[list[Body], list[tuple[str, str]]]:
         if any(a in tokens.SIM_APIS for a in applied(prim)) and not any(path.HasPrefix(p) for p in (*paths, *disabled)):
             roots.append(prim)
             paths.add(path)
-    bodies = [_body(root, paths) for root in roots]
+    bodies = [body for body in (_body(root, paths) for root in roots) if body is not None]
     by_path = {body.prim.GetPath(): body for body in bodies}
     for prim in prims:  # pictures that lie elsewhere say whose they are
         if prim.GetTypeName() == tokens.SPLATS and prim.GetRelationship(tokens.SPLAT_BODY):
@@ -101,12 +101,14 @@ def find_bodies(prims: list[Any]) -> tuple[list[Body], list[tuple[str, str]]]:
     return bodies, between
 
 
-def _body(root: Any, roots: set[Any]) -> Body:
-    """Return what belongs to a body: the geometries beneath it up to other bodies, rigid or soft."""
+def _body(root: Any, roots: set[Any]) -> Body | None:
+    """Return what belongs to a body: the geometries beneath it up to other bodies; None for cables, left to Newton."""
     owned: list[Any] = []
     _collect(root, root, roots, owned)
     of_type = {kind: [p for p in owned if p.GetTypeName() == kind] for kind in _GEOMETRY}
     marked = [p for p in owned if any(a in tokens.SIM_APIS for a in applied(p))]
+    if not marked and any(a in tokens.CURVES_SIM_APIS for prim in owned for a in applied(prim)):
+        return None
     cooked = root.GetRelationship(tokens.COOKING_SOURCE)
     targets = [root.GetStage().GetPrimAtPath(t) for t in cooked.GetTargets()] if cooked else []
     candidates = marked or [p for p in targets if p] or ([root] if root.GetTypeName() in _GEOMETRY else [])

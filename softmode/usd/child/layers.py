@@ -12,7 +12,6 @@ from .limits import Budget, Refused, check_nesting
 MAX_LAYERS = 1024
 """Most files that a stage may consist of."""
 _HINT = "Keep everything that the stage needs inside its folder, or pass the folder that holds it as asset_root"
-_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 
 
 def inside(path: str, root: str) -> bool:
@@ -54,7 +53,8 @@ def open_layers(path: str, root: str, budget: Budget) -> Any:
         first = first or layer
         for asset, is_layer in _assets(layer):
             target = _resolved(asset, layer.identifier, root)
-            if is_layer and asset.lower().rstrip("]").endswith(_SUFFIXES) and target not in seen:
+            known = is_layer and Sdf.FileFormat.FindByExtension(asset.rstrip("]")) is not None
+            if known and target not in seen:
                 seen.add(target)
                 queue.append(target)
         if len(seen) > MAX_LAYERS:
@@ -93,6 +93,8 @@ def _resolved(asset: str, anchor: str, root: str) -> str:
         return ""
     if asset.startswith("`"):
         raise Refused(f"refers to the expression {shown}", "Write the path out")
+    if ":SDF_FORMAT_ARGS:" in asset:
+        raise Refused(f"refers to {shown}, with arguments", "Name the file alone")
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:", asset):
         raise Refused(f"refers to the address {shown}", _HINT)
     outer, bracket, inner = asset.partition("[")
