@@ -57,7 +57,7 @@ _DESCRIPTIONS: dict[str, list[str]] = {}
 
 
 def _keep(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Make plain docstrings fit for reStructuredText: |x| is a norm, and formulas set in by themselves stay as they are."""
+    """Make plain docstrings fit for reStructuredText: |x| is a norm, and formulas set in stay as they are."""
     plain = [line.replace("|", "\N{DIVIDES}") for line in lines]
     lines.clear()
     before = ""  # the last line that is not empty
