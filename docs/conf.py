@@ -57,8 +57,16 @@ _DESCRIPTIONS: dict[str, list[str]] = {}
 
 
 def _keep(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Make plain docstrings fit for reStructuredText: |x| is a norm, not a substitution."""
-    lines[:] = [line.replace("|", "\N{DIVIDES}") for line in lines]
+    """Make plain docstrings fit for reStructuredText: |x| is a norm, and formulas set in stay as they are."""
+    plain = [line.replace("|", "\N{DIVIDES}") for line in lines]
+    lines.clear()
+    before = ""  # the last line that is not empty
+    for k, line in enumerate(plain):
+        if line.startswith("    ") and k and not plain[k - 1] and re.match(r"[^\s\-.=]", before):
+            if not before.endswith("::"):
+                lines += ["::", ""]
+        lines.append(line)
+        before = line or before
     if what in ("attribute", "data", "property"):
         _DESCRIPTIONS[name] = list(lines)
 

@@ -141,6 +141,14 @@ def _vector_envs(folder: Path) -> dict[str, Any]:
     return {}
 
 
+@_setup("docs/splat_files.md")
+@_setup("docs/usd.md")
+def _usd(folder: Path) -> dict[str, Any]:
+    """OpenUSD."""
+    pytest.importorskip("pxr", reason="needs the extra [usd]")
+    return {}
+
+
 @_setup("docs/robots.md")
 @_setup("docs/howto/own_robot.md")
 def _robots(folder: Path) -> dict[str, Any]:
