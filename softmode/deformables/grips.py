@@ -39,7 +39,7 @@ class GripOptions:
     """but stiff enough to carry the weight at this fraction of the size. Its damping is critical for the mass."""
     pull_force: float = 0.3
     """Largest force of a pull, over E times the size squared; the weight over `pull_sag` comes on top."""
-    hold_stiffness: float = 20.0
+    hold_stiffness: float = 60.0
     """Stiffness of a grip that holds, over E times the body's size,"""
     hold_sag: float = 1.0e-4
     """but stiff enough to carry the weight at this fraction of the size."""
