@@ -37,7 +37,7 @@ class GripOptions:
     """It is no stiffer than the mass times the square of this [1/s],"""
     pull_sag: float = 0.05
     """but stiff enough to carry the weight at this fraction of the size. Its damping is critical for the mass."""
-    pull_force: float = 0.3
+    pull_force: float = 0.1
     """Largest force of a pull, over E times the size squared; the weight over `pull_sag` comes on top."""
     hold_stiffness: float = 60.0
     """Stiffness of a grip that holds, over E times the body's size,"""
