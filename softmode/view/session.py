@@ -1,0 +1,594 @@
+"""`LiveSession`: a soft body, or an environment with its robot, that runs in real time and is pulled, pinned and tuned.
+
+All calls must come from one thread.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softmode.deformables.body import ReducedBody
+from softmode.deformables.energies import SoftEnergies
+from softmode.deformables.materials import Material
+from softmode.deformables.status import status_reasons
+from softmode.envs.objects import ObjectConfig, SoftObject
+from softmode.errors import ConfigError
+from softmode.view import live_parameters
+from softmode.view.hands import Hands
+from softmode.view.live_recording import (
+    RECORD_HZ,
+    CoordinateRecorder,
+    FilmRecorder,
+    LiveRecording,
+    Recorder,
+    live_camera,
+)
+from softmode.view.live_scenes import EnvScene, LiveScene, ObjectScene
+from softmode.view.live_types import (
+    DragView,
+    Energies,
+    Hit,
+    HoldName,
+    LiveOptions,
+    LiveParameters,
+    LiveStatus,
+    PinView,
+    SceneName,
+    SplatPicture,
+    vector3,
+)
+from softmode.view.picture import LivePicture
+from softmode.view.sources import load_source, with_handles
+
+RATE_WINDOW = 1.0
+"""Time over which the real-time factor is taken [s]."""
+
+
+class LiveSession:
+    """Soft objects that run in real time while they are pulled, pinned and tuned.
+
+    Made by `from_object` or `from_env`. Nothing here draws or serves: `advance` moves time, `splats`, `meshes` and
+    `poses` are what to show, the rest is what a person does. All calls must come from one thread.
+    """
+
+    def __init__(
+        self, make: Callable[[ObjectConfig | None], LiveScene], source: ObjectConfig | None, options: LiveOptions
+    ) -> None:
+        """Make the scene; use `from_object` or `from_env`."""
+        self.options = options
+        self._make, self._source = make, source
+        self._scene = make(source)
+        self._given: dict[str, float] = {}
+        self._playing = True
+        self._recorder: Recorder | None = None
+        self._hands = Hands(options)
+        self._clock, self._record_from = 0.0, 0.0
+        self._bind()
+
+    def _bind(self) -> None:
+        """Take up a scene that has just been made."""
+        scene = self._scene
+        self._picture = LivePicture(scene.objects, scene.model, scene.marker)
+        self._energies = SoftEnergies(scene.solver)
+        self._reduced = getattr(scene.solver, "reduced", scene.solver)
+        self._meshes: tuple[Any, ...] | None = None
+        self._block_seconds = 0.0
+        self._begin()
+
+    def _begin(self) -> None:
+        """Forget what belongs to the time before a reset."""
+        self._time, self._debt, self._bits, self._stale = 0.0, 0.0, 0, True
+        self._passed: deque[tuple[float, float]] = deque()
+        self._hands.take_up(self._scene)
+        self._reduced.status.zero_()
+
+    @classmethod
+    def from_object(
+        cls,
+        source: ObjectConfig | SoftObject | str | Path | None = None,
+        *,
+        scene: SceneName = "hang",
+        hold: HoldName = "top",
+        size: float | None = None,
+        material: Material | None = None,
+        options: LiveOptions | None = None,
+        device: Any = None,
+        progress: Any = None,
+    ) -> LiveSession:
+        """Make a session with one object.
+
+        Args:
+            source: What it is: a configuration, an object, the file of a splat, a mesh, a point cloud, a body or an
+                OpenUSD stage (its first deformable body, or its splats), None for the built-in plush.
+            scene: "hang": held by one end, nothing around it. "drop": above a table.
+            hold: Which end a hanging object is held by.
+            size: Longest edge of the object [m]; None for the configuration's.
+            material: What it is made of; None for what the file says, else 1e5 Pa and 250 kg/m^3.
+            options: How the session runs.
+            device: Warp device.
+            progress: Reports the build of the object.
+
+        Raises:
+            ConfigError: If an option is unknown or out of range.
+            AssetError: If the file cannot be used.
+        """
+        chosen = options or LiveOptions()
+
+        def make(origin: ObjectConfig | None) -> LiveScene:
+            found = load_source(origin or source, None if origin else size, progress)
+            made = material or found.material or Material(youngs_modulus=1.0e5, density=250.0)
+            return ObjectScene(found, scene, hold, made, chosen, device)
+
+        return cls(make, None, chosen)
+
+    @classmethod
+    def from_env(
+        cls,
+        name: str = "softmode/LiftSoft-v0",
+        *,
+        policy: str = "scripted",
+        config: Any = None,
+        seed: int = 0,
+        options: LiveOptions | None = None,
+        device: Any = None,
+        progress: Any = None,
+    ) -> LiveSession:
+        """Make a session with an environment, whose policy goes on while a person pulls the object.
+
+        An episode that ends is followed by the next one; while something is dragged or pinned its time limit waits.
+
+        Args:
+            name: Id of the environment.
+            policy: "scripted", "random", "zero", or the file of a trained policy.
+            config: The task's configuration; None for the default.
+            seed: Seed of the first episode.
+            options: How the session runs.
+            device: Warp device.
+            progress: Reports the build of the object.
+
+        Raises:
+            ConfigError: If the environment or the policy is unknown, or an option out of range.
+        """
+        chosen = options or LiveOptions()
+
+        def make(origin: ObjectConfig | None) -> LiveScene:
+            return EnvScene(name, policy, config, seed, chosen, device, progress, origin)
+
+        return cls(make, None, chosen)
+
+    # -- time ---------------------------------------------------------------------------------------------------------
+
+    def advance(self, frame_dt: float) -> float:
+        """Let up to `frame_dt` [s] of simulated time pass, if the session plays; call it once per frame.
+
+        Takes whole blocks of physics steps (1/120 s, a control step with an environment), carries the rest over to the
+        next call, and takes no more than fit in `LiveOptions.budget` of the frame.
+
+        Returns:
+            The simulated time that passed [s].
+
+        Raises:
+            ConfigError: If `frame_dt` is not a finite number >= 0.
+        """
+        if not (isinstance(frame_dt, int | float) and math.isfinite(frame_dt) and frame_dt >= 0.0):
+            raise ConfigError(f"frame_dt must be a finite number >= 0 [s], got {frame_dt!r}")
+        now = time.perf_counter()
+        if not self._playing:
+            return 0.0
+        block = self._scene.block_dt
+        self._debt += frame_dt
+        count = int(self._debt / block + 1e-6)
+        if self._block_seconds > 0.0:
+            count = min(count, max(int(self.options.budget * frame_dt / self._block_seconds), 1))
+        passed = self._run(count)
+        self._debt = min(self._debt - passed, block)  # what did not fit is lost
+        self._passed.append((now, passed))
+        while self._passed[-1][0] - self._passed[0][0] > RATE_WINDOW and len(self._passed) > 2:
+            self._passed.popleft()
+        return passed
+
+    def play(self) -> None:
+        """Let time run; a session starts playing."""
+        self._playing = True
+        self._debt = 0.0
+        self._passed.clear()
+
+    def pause(self) -> None:
+        """Stop time; drags and pins may still be moved, and take effect when it runs again."""
+        self._playing = False
+        self._passed.clear()
+
+    def step(self) -> float:
+        """Take one block of physics steps, paused or not, and return the simulated time that passed [s]."""
+        return self._run(1)
+
+    def reset(self) -> None:
+        """Start over: drags and pins are let go, a hanging object is held again, an environment begins an episode.
+
+        Parameters stay as they are.
+        """
+        self._hands.let_go()
+        self._scene.reset()
+        live_parameters.apply(self._scene, self._given)
+        self._begin()
+
+    def close(self) -> None:
+        """Discard a recording that is being made and let go of the environment; may be called twice."""
+        if self._recorder is not None:
+            self._recorder.discard()
+            self._recorder = None
+        self._scene.close()
+
+    # -- what to show -------------------------------------------------------------------------------------------------
+
+    @property
+    def size(self) -> float:
+        """Diagonal of the first object's bounding box at rest [m]."""
+        return float(self._reduced.instances.size.numpy()[0])
+
+    def bounds(self) -> NDArray[np.float64]:
+        """Return the corners of a box around what is worth seeing at the start [m], shape (2, 3)."""
+        corners = self.splats().means
+        if isinstance(self._scene, EnvScene):
+            corners = np.concatenate([corners, [[-0.1, -0.35, 0.0], [0.75, 0.35, 0.6]]])
+        return np.stack([corners.min(axis=0), corners.max(axis=0)]).astype(np.float64)
+
+    def splats(self) -> SplatPicture:
+        """Return the splats of all objects as they are now, in arrays of their own."""
+        self._show()
+        return self._picture.read()
+
+    def meshes(self) -> tuple[Any, ...]:
+        """Return the meshes of the rigid shapes, `softmode.viz.scene_meshes.SceneMesh`; they do not change."""
+        if self._meshes is None:
+            from softmode.viz.scene_meshes import scene_meshes
+
+            self._meshes = scene_meshes(self._scene.model)
+        return self._meshes
+
+    def poses(self) -> NDArray[np.float32]:
+        """Return the poses of the rigid bodies: position [m] and quaternion (x, y, z, w), shape (B, 7)."""
+        poses = self._scene.state.body_q
+        return np.zeros((0, 7), np.float32) if poses is None else poses.numpy().copy()
+
+    def surface(self, object_index: int = 0) -> NDArray[np.float64]:
+        """Return the surface samples of an object as they are now [m], shape (S, 3)."""
+        thing, model = self._object(object_index), self._scene.model
+        start = int(model.softmode.particle_start.numpy()[object_index])
+        x: Any = self._scene.state.particle_q[start : start + thing.body.surface_count]
+        return x.numpy().astype(np.float64)
+
+    def centre(self, object_index: int = 0) -> NDArray[np.float64]:
+        """Return the centre of mass of an object [m], shape (3,)."""
+        return self._object(object_index).body.mean_basis @ self._coordinates("q", object_index)
+
+    def status(self) -> LiveStatus:
+        """Return times, flags and the rewards of the environment."""
+        rate = 0.0
+        if len(self._passed) > 1:
+            rate = sum(dt for _, dt in list(self._passed)[1:]) / (self._passed[-1][0] - self._passed[0][0])
+        scene = self._scene
+        return LiveStatus(
+            time=self._time,
+            playing=self._playing,
+            realtime_factor=rate,
+            step_milliseconds=1e3 * self._block_seconds / scene.block_steps,
+            solver=status_reasons(self._bits),
+            recording=self._recorder is not None,
+            reward_terms=dict(scene.terms),
+            success=scene.success,
+            episode=scene.episode,
+        )
+
+    def energies(self) -> Energies:
+        """Return the energies of all objects."""
+        self._energies.update(self._scene.state)
+        return Energies(
+            kinetic=float(self._energies.kinetic.numpy().sum()),
+            elastic=float(self._energies.elastic.numpy().sum()),
+            gravitational=float(self._energies.gravitational.numpy().sum()),
+        )
+
+    # -- pulling and pinning ------------------------------------------------------------------------------------------
+
+    def pick(self, origin: ArrayLike, direction: ArrayLike) -> Hit | None:
+        """Return where a ray meets the splats, or None: where half of the light behind is gone.
+
+        Args:
+            origin: Where the ray starts [m], shape (3,).
+            direction: Its direction, of any length but zero, shape (3,).
+
+        Raises:
+            ConfigError: If they are not finite, or the direction is zero.
+        """
+        start, way = vector3("origin", origin), vector3("direction", direction)
+        length = float(np.linalg.norm(way))
+        if length < 1e-12:
+            raise ConfigError("direction is zero", hint="give the direction of the ray")
+        self._show()
+        return self._picture.pick(start, way / length, self._scene.state)
+
+    def begin_drag(self, hit: Hit) -> None:
+        """Put a damped spring between a point of an object and the cursor, which is at that point.
+
+        Another drag ends.
+        """
+        self._hands.begin_drag(hit)
+
+    def drag_to(self, point: ArrayLike) -> None:
+        """Move the cursor to a point [m]; the spring's end gets there in the course of the next frame.
+
+        Raises:
+            ConfigError: If nothing is dragged, or the point is not finite.
+        """
+        self._hands.drag_to(point)
+
+    def end_drag(self) -> None:
+        """Let go; does nothing if nothing is dragged."""
+        self._hands.end_drag()
+
+    def drag(self) -> DragView | None:
+        """Return the drag, or None."""
+        return self._hands.drag()
+
+    def pin(self, hit: Hit, radius: float | None = None) -> int:
+        """Hold the region around a point of an object where it is, in its present shape.
+
+        Args:
+            hit: The point.
+            radius: How far the region reaches from it at rest [m]; None for a tenth of the size.
+
+        Returns:
+            Number of the pin, for `move_pin` and `unpin`.
+
+        Raises:
+            ConfigError: If the radius is not a finite number > 0, or there are `LiveOptions.pin_max` pins already.
+        """
+        return self._hands.pin(hit, radius)
+
+    def move_pin(self, pin: int, position: ArrayLike, wxyz: ArrayLike | None = None) -> None:
+        """Move the centre of a pinned region to a point [m], and turn the region, in the course of the next frame.
+
+        Args:
+            pin: What `pin` returned.
+            position: Where its centre shall be, shape (3,).
+            wxyz: Turn since it was pinned, a quaternion; None keeps the present one.
+
+        Raises:
+            ConfigError: If there is no such pin, or a number is not finite.
+        """
+        self._hands.move_pin(pin, position, wxyz)
+
+    def unpin(self, pin: int) -> None:
+        """Let a pinned region go.
+
+        Raises:
+            ConfigError: If there is no such pin.
+        """
+        self._hands.unpin(pin)
+
+    def pins(self) -> dict[int, PinView]:
+        """Return the pins by number; the one that a hanging object is held by is among them."""
+        return self._hands.pins()
+
+    # -- parameters ---------------------------------------------------------------------------------------------------
+
+    @property
+    def parameters(self) -> LiveParameters:
+        """The present values, of the first object."""
+        return live_parameters.present(self._scene)
+
+    def set_parameters(
+        self,
+        *,
+        youngs_modulus: float | None = None,
+        poissons_ratio: float | None = None,
+        density: float | None = None,
+        viscosity: float | None = None,
+        mass_damping: float | None = None,
+        friction: float | None = None,
+        gravity: float | ArrayLike | None = None,
+    ) -> None:
+        """Change parameters of all objects, at once and while time runs; None leaves one.
+
+        Args:
+            youngs_modulus: E [Pa].
+            poissons_ratio: nu.
+            density: rho [kg/m^3].
+            viscosity: beta of Rayleigh's damping [s].
+            mass_damping: alpha of Rayleigh's damping [1/s].
+            friction: Coulomb coefficient of the objects.
+            gravity: A vector [m/s^2], shape (3,), or its magnitude downwards.
+
+        Raises:
+            ConfigError: If a value lies outside its range; nothing is changed then.
+        """
+        self._given |= live_parameters.checked(
+            gravity,
+            {
+                "youngs_modulus": youngs_modulus,
+                "poissons_ratio": poissons_ratio,
+                "density": density,
+                "viscosity": viscosity,
+                "mass_damping": mass_damping,
+                "friction": friction,
+            },
+        )
+        live_parameters.apply(self._scene, self._given)
+
+    def set_handles(self, count: int) -> None:
+        """Give the object another number of skinning eigenmodes: builds it anew, or takes it from the cache.
+
+        Position, deformation and velocity are carried over by least squares, pins are kept, a drag ends. With an
+        environment a new episode begins.
+
+        Raises:
+            ConfigError: If the count lies outside 0..64, or the object came as a saved body, which cannot be rebuilt.
+        """
+        if self._recorder is not None:
+            raise ConfigError("a recording is being made", hint="stop it before the handles change")
+        old, scene = self._object(0).body, self._scene
+        source = with_handles(self._source or scene.source, count)
+        if count == old.mode_count:
+            return
+        self.end_drag()
+        q, qd = self._coordinates("q"), self._coordinates("qd")
+        kept = self._hands.kept()
+        elapsed, clock = self._time, self._clock
+        made = self._make(source)  # a build that fails leaves all as it was
+        scene.close()
+        self._scene, self._source = made, source
+        if not isinstance(made, EnvScene):
+            made.grips[0].let_go_all()
+            for grip, position, rotation in kept:
+                made.grips[0].restore(grip, position, rotation.tolist())
+        self._bind()
+        self._clock = clock
+        if not isinstance(made, EnvScene):
+            self._carry_over(old, q, qd)
+            self._time = elapsed
+        live_parameters.apply(self._scene, self._given)
+
+    # -- recording ----------------------------------------------------------------------------------------------------
+
+    def start_recording(
+        self, path: str | Path, *, position: ArrayLike | None = None, target: ArrayLike | None = None, edge: int = 480
+    ) -> None:
+        """Record from now on, 30 frames per simulated second: ".mp4" draws pictures, ".npz" keeps coordinates.
+
+        Args:
+            path: The file; it appears when the recording is stopped, complete or not at all.
+            position: Where the camera stands [m]; None for a view of all.
+            target: Where it looks [m].
+            edge: Width and height of the pictures [px].
+
+        Raises:
+            ConfigError: If a recording is being made, or the path has another suffix or cannot be written.
+            MissingExtraError: If what encodes videos is not installed.
+        """
+        if self._recorder is not None:
+            raise ConfigError(f"{self._recorder.path} is being recorded", hint="stop that recording first")
+        file, suffix = Path(path), Path(path).suffix.lower()
+        if suffix == ".npz":
+            self._recorder = CoordinateRecorder(file, [thing.body for thing in self._scene.objects])
+        elif suffix == ".mp4":
+            camera = live_camera(self._scene.cameras, self.bounds(), position, target, edge)
+            self._recorder = FilmRecorder(file, self._scene.model, self._picture, camera)
+        else:
+            raise ConfigError(f"recording {file} is no .mp4 or .npz file", hint="name it like out/poke.mp4")
+        self._record_from = self._clock
+        self._record()
+
+    def show_frame(self, recording: LiveRecording, index: int) -> None:
+        """Pause, and put everything where a frame of a recording has it, at rest; a reset makes it live again.
+
+        Args:
+            recording: A recording of the same objects.
+            index: Which frame.
+
+        Raises:
+            ConfigError: If the recording is of other objects, or has no such frame.
+        """
+        scene = self._scene
+        own = tuple(thing.body.fingerprint for thing in scene.objects)
+        if recording.fingerprints != own or recording.q.shape[1] != scene.state.softmode.q.shape[0]:
+            raise ConfigError("the recording is of other objects", hint="open the objects that were recorded")
+        if not 0 <= index < len(recording.times):
+            raise ConfigError(f"index must lie in 0..{len(recording.times) - 1}, got {index}")
+        self.pause()
+        state = scene.state
+        state.softmode.q.assign(recording.q[index])
+        state.softmode.qd.zero_()
+        state.softmode.dt_before.zero_()
+        if state.body_q is not None and recording.body_q.shape[1] == state.body_q.shape[0]:
+            state.body_q.assign(recording.body_q[index])
+        self._reduced.update_particles(state)
+        self._stale = True
+
+    def stop_recording(self) -> Path:
+        """Write the recording and return its path.
+
+        Raises:
+            ConfigError: If none is being made, or it has no frame.
+        """
+        if self._recorder is None:
+            raise ConfigError("nothing is being recorded", hint="call start_recording first")
+        recorder, self._recorder = self._recorder, None
+        try:
+            recorder.finish()
+        finally:
+            recorder.discard()
+        return recorder.path
+
+    # -- inside -------------------------------------------------------------------------------------------------------
+
+    def _run(self, count: int) -> float:
+        """Take blocks and return the simulated time that passed [s]."""
+        scene = self._scene
+        if count < 1:
+            return 0.0
+        for grips in scene.grips:
+            grips.begin_frame(count * scene.block_steps)
+        self._bits, taken = 0, 0
+        self._reduced.status.zero_()
+        for _ in range(count):
+            if scene.over(busy=self._hands.busy):
+                self.reset()
+                continue
+            clock = time.perf_counter()
+            scene.run()
+            self._bits |= int(self._reduced.status.numpy()[0])  # waits for the device
+            spent = time.perf_counter() - clock
+            self._block_seconds = spent if self._block_seconds == 0.0 else 0.8 * self._block_seconds + 0.2 * spent
+            taken += 1
+            self._time += scene.block_dt
+            self._clock += scene.block_dt
+            self._stale = self._hands.moved = True
+            self._record()
+        return taken * scene.block_dt
+
+    def _show(self) -> None:
+        """Deform the splats if anything has moved since."""
+        if self._stale:
+            self._picture.update(self._scene.state, *self._scene.marker_place())
+            self._stale = False
+
+    def _record(self) -> None:
+        """Give the recorder a frame if one is due."""
+        recorder = self._recorder
+        if recorder is not None and self._clock - self._record_from >= recorder.count / RECORD_HZ - 1e-9:
+            self._show()
+            recorder.add(self._clock - self._record_from, self._scene.state)
+
+    def _carry_over(self, old: ReducedBody, q: NDArray[np.float64], qd: NDArray[np.float64]) -> None:
+        """Give the object the positions and velocities that it had with another basis, by least squares."""
+        body, state = self._object(0).body, self._scene.state
+        X = np.concatenate([old.surface_points, old.points])
+        before, shift = old.evaluate(X)[0], old.offset - body.offset
+        rows = body.evaluate(X + shift)[0]
+        found = np.linalg.lstsq(rows, np.hstack([before @ q - shift, before @ qd]), rcond=1e-10)[0]
+        state.softmode.q.assign(found[:, :3])
+        state.softmode.qd.assign(found[:, 3:])
+        state.softmode.dt_before.zero_()
+        self._reduced.update_particles(state)
+
+    def _coordinates(self, name: str, object_index: int = 0) -> NDArray[np.float64]:
+        """Return coordinates "q" or velocities "qd" of an object, shape (n, 3)."""
+        body = self._object(object_index).body
+        start = int(self._scene.model.softmode.function_start.numpy()[object_index])
+        values: Any = getattr(self._scene.state.softmode, name)[start : start + body.function_count]
+        return values.numpy().astype(np.float64)
+
+    def _object(self, index: int) -> SoftObject:
+        objects = self._scene.objects
+        if not 0 <= index < len(objects):
+            raise ConfigError(f"object_index must lie in 0..{len(objects) - 1}, got {index}")
+        return objects[index]
