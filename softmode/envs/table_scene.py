@@ -10,6 +10,7 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from softmode.deformables.coupling import SolverCoupledReduced
+from softmode.deformables.grips import Grips, add_grip_slots
 from softmode.deformables.materials import Material
 from softmode.deformables.skinning import SkinSplats
 from softmode.deformables.solver_reduced import (
@@ -95,6 +96,8 @@ class TableSceneConfig:
     """Contacts between rigid shapes per world."""
     object_position: tuple[float, float] = (0.45, 0.0)
     """Where the object stands by default [m]."""
+    grip_slots: int = 0
+    """Points of each soft object that may be gripped while the scene runs; see :class:`TableScene.grips`."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -104,6 +107,8 @@ class TableSceneConfig:
             raise ConfigError(f"control_hz must lie in 1..1000, got {self.control_hz}")
         if not self.table_friction >= 0.0:
             raise ConfigError(f"table_friction must be >= 0, got {self.table_friction}")
+        if not 0 <= self.grip_slots <= 4096:
+            raise ConfigError(f"grip_slots must lie in 0..4096, got {self.grip_slots}")
 
 
 class TableScene:
@@ -185,13 +190,15 @@ class TableScene:
         for fixture in config.fixtures:
             _add_fixture(world, fixture)
         for thing, kind in zip(self.objects, (config.object, *config.others), strict=True):
-            add_reduced_body(
+            instance = add_reduced_body(
                 world,
                 thing.body,
                 material=config.material,
                 position=(*config.object_position, thing.height),
                 contact_radius=kind.contact_radius,
             )
+            if config.grip_slots:
+                add_grip_slots(world, instance, config.grip_slots)
         builder = newton.ModelBuilder()
         register_custom_attributes(builder)
         SolverMuJoCo.register_custom_attributes(builder)
@@ -210,6 +217,9 @@ class TableScene:
         for state in (self.state, self._scratch):
             newton.eval_fk(model, model.joint_q, model.joint_qd, state)
         self.controller = ArmController(model, self.arm, config.control)
+        slots, instances = config.grip_slots, worlds * len(self.objects)
+        self.grips = tuple(Grips(self.solver, i, slot_count=slots) for i in range(instances if slots else 0))
+        """Grips of each instance, world by world, that pull and hold it while the scene runs; none without slots."""
         device = self.device
         self.actions = wp.zeros((worlds, config.control.action_size), dtype=float, device=device)
         self.object_position = wp.zeros((worlds, len(self.objects)), dtype=wp.vec3, device=device)
@@ -374,6 +384,8 @@ class TableScene:
         for substep in range(config.substeps):
             self.controller.write_targets(self.control, (substep + 1) / config.substeps)
             first, second = (self.state, self._scratch) if substep % 2 == 0 else (self._scratch, self.state)
+            for grips in self.grips:
+                grips.apply(first, self.control, self.dt)
             self.solver.step(first, second, self.control, None, self.dt)
         self.observe()
 
