@@ -104,7 +104,7 @@ class Grips:
         instance: int,
         *,
         slot_count: int,
-        grip_max: int = 16,
+        grip_max: int = 66,
         options: GripOptions | None = None,
     ) -> None:
         """Find the slots and take them out of use."""

@@ -10,7 +10,7 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from softmode.deformables.coupling import SolverCoupledReduced
-from softmode.deformables.grips import Grips, add_grip_slots
+from softmode.deformables.grips import GripOptions, Grips, add_grip_slots
 from softmode.deformables.materials import Material
 from softmode.deformables.skinning import SkinSplats
 from softmode.deformables.solver_reduced import (
@@ -97,7 +97,9 @@ class TableSceneConfig:
     object_position: tuple[float, float] = (0.45, 0.0)
     """Where the object stands by default [m]."""
     grip_slots: int = 0
-    """Points of each soft object that may be gripped while the scene runs; see :class:`TableScene.grips`."""
+    """Points of each soft object that may be gripped while the scene runs; see :attr:`TableScene.grips`."""
+    grip_options: GripOptions = field(default_factory=GripOptions)
+    """How stiff such grips are."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -218,7 +220,10 @@ class TableScene:
             newton.eval_fk(model, model.joint_q, model.joint_qd, state)
         self.controller = ArmController(model, self.arm, config.control)
         slots, instances = config.grip_slots, worlds * len(self.objects)
-        self.grips = tuple(Grips(self.solver, i, slot_count=slots) for i in range(instances if slots else 0))
+        self.grips = tuple(
+            Grips(self.solver, i, slot_count=slots, options=config.grip_options)
+            for i in range(instances if slots else 0)
+        )
         """Grips of each instance, world by world, that pull and hold it while the scene runs; none without slots."""
         device = self.device
         self.actions = wp.zeros((worlds, config.control.action_size), dtype=float, device=device)
@@ -236,7 +241,6 @@ class TableScene:
         self.world_mask = wp.ones(worlds, dtype=wp.bool, device=device)
         """Which worlds `reset_worlds` resets, shape (world_count,)."""
         self._solver_mask = wp.zeros(worlds + 1, dtype=wp.bool, device=device)
-        instances = worlds * len(self.objects)
         self.place_position = wp.zeros(instances, dtype=wp.vec3d, device=device)
         """Where `reset_worlds` puts the centre of mass of each object [m], shape (world_count * objects,)."""
         self.place_yaw = wp.zeros(instances, dtype=wp.float64, device=device)

@@ -1,0 +1,137 @@
+"""Recordings of a live session: pictures as a video, or coordinates to be shown again."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softmode.atomic import atomic_write
+from softmode.errors import AssetError, ConfigError
+from softmode.film import Film
+from softmode.splats.camera import CameraOptions, PinholeCamera, SplatCamera
+from softmode.view.picture import LivePicture
+
+RECORD_HZ = 30
+"""Frames per simulated second."""
+_FORMAT = "softmode live recording 1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveRecording:
+    """Coordinates of a session over time."""
+
+    times: NDArray[np.float64]
+    """Simulated time of each frame [s], shape (T,)."""
+    q: NDArray[np.float64]
+    """Reduced coordinates of all objects, one after another [m], shape (T, functions, 3)."""
+    body_q: NDArray[np.float32]
+    """Poses of the rigid bodies, position [m] and quaternion xyzw, shape (T, B, 7)."""
+    fingerprints: tuple[str, ...]
+    """Fingerprints of the bodies."""
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> LiveRecording:
+        """Read a file that a session recorded.
+
+        Raises:
+            AssetError: If the file is missing, damaged or foreign.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                data = {name: file[name] for name in ("format", "times", "q", "body_q", "fingerprints")}
+        except Exception as error:  # a damaged archive raises whatever its parser stumbled on
+            raise AssetError(f"recording {path} cannot be read: {error}", hint="record it again") from error
+        times, q, body_q = data["times"], data["q"], data["body_q"]
+        good = str(data["format"]) == _FORMAT and times.ndim == 1 and q.ndim == 3 and body_q.ndim == 3
+        good = good and len(times) == len(q) == len(body_q) and q.shape[2] == 3 and body_q.shape[2] == 7
+        if not good or not all(np.isfinite(x).all() for x in (times, q, body_q)):
+            raise AssetError(f"recording {path} is not one of a live session", hint="record it again")
+        prints = tuple(str(x) for x in data["fingerprints"])
+        return cls(times=times, q=q, body_q=body_q.astype(np.float32), fingerprints=prints)
+
+
+class Recorder(Protocol):
+    """What takes frames until it is finished or discarded."""
+
+    path: Path
+    count: int
+
+    def add(self, time: float, state: Any) -> None:
+        """Take a frame; the picture has been updated."""
+        ...
+
+    def finish(self) -> None:
+        """Put the file in place."""
+        ...
+
+    def discard(self) -> None:
+        """Leave nothing behind."""
+        ...
+
+
+class CoordinateRecorder:
+    """Keeps coordinates and poses in memory and writes them at the end."""
+
+    def __init__(self, path: Path, bodies: list[Any]) -> None:
+        """Check that the file can be written."""
+        if path.is_dir() or not path.absolute().parent.is_dir():
+            raise ConfigError(f"recording {path} cannot be written", hint="name a file in a folder that exists")
+        self.path, self.count = path, 0
+        self._prints = [body.fingerprint for body in bodies]
+        self._frames: list[tuple[float, Any, Any]] = []
+
+    def add(self, time: float, state: Any) -> None:
+        """Take a frame."""
+        poses = np.zeros((0, 7), np.float32) if state.body_q is None else state.body_q.numpy().copy()
+        self._frames.append((time, state.softmode.q.numpy().copy(), poses))
+        self.count += 1
+
+    def finish(self) -> None:
+        """Write the file."""
+        times, q, poses = (np.array(column) for column in zip(*self._frames, strict=True))
+        with atomic_write(self.path) as file:
+            np.savez_compressed(
+                file,
+                format=np.array(_FORMAT),
+                times=times.astype(np.float64),
+                q=q.astype(np.float64),
+                body_q=poses.astype(np.float32).reshape(len(times), -1, 7),
+                fingerprints=np.array(self._prints),
+            )
+
+    def discard(self) -> None:
+        """Forget the frames."""
+        self._frames.clear()
+
+
+class FilmRecorder:
+    """Draws every frame with a camera and encodes it."""
+
+    def __init__(self, path: Path, model: Any, picture: LivePicture, camera: PinholeCamera) -> None:
+        """Claim the file and make the camera."""
+        self._film = Film(path)
+        self.path, self.count = path, 0
+        try:
+            self._camera = SplatCamera(model, picture.arrays, [camera], options=CameraOptions(mesh_samples=4))
+        except BaseException:
+            self._film.discard()
+            raise
+
+    def add(self, time: float, state: Any) -> None:
+        """Draw a frame."""
+        self._camera.render(state)
+        self._film.add(self._camera.images(self._camera.cameras[0].name).numpy()[0].copy(), RECORD_HZ)
+        self.count += 1
+
+    def finish(self) -> None:
+        """Publish video and contact sheet."""
+        self._film.publish()
+
+    def discard(self) -> None:
+        """Remove what was written."""
+        self._film.discard()

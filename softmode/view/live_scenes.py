@@ -1,0 +1,268 @@
+"""What a live session runs: one object that hangs or falls, or an environment; both take blocks of captured steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Protocol, get_args
+
+import newton
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from softmode.deformables.grips import GripOptions, Grips, add_grip_slots
+from softmode.deformables.materials import Material
+from softmode.deformables.solver_reduced import SolverReduced, add_reduced_body
+from softmode.envs.objects import SoftObject
+from softmode.envs.task import Task
+from softmode.errors import ConfigError
+from softmode.policies import POLICIES, check_policy, policy_factory, trained_policy
+from softmode.splats import Splats
+from softmode.splats.pinhole import PinholeCamera
+from softmode.view.live_types import HoldName, LiveOptions, SceneName
+
+BLOCK_STEPS = 2
+"""Physics steps of a block of an object without an environment; even, there and back between two states."""
+HELD_PART = 0.12
+"""Part of its height by which a hanging object is held."""
+TABLE_FRICTION = 0.8
+"""Coulomb coefficient of the table."""
+
+
+class LiveScene(Protocol):
+    """A model with its state, its solver and the grips of its objects."""
+
+    objects: tuple[SoftObject, ...]
+    """Soft objects, instance by instance."""
+    model: Any
+    solver: Any
+    control: Any
+    state: Any
+    grips: tuple[Grips, ...]
+    """Of each object."""
+    block_dt: float
+    """Simulated time of a block [s]."""
+    block_steps: int
+    """Physics steps of a block."""
+    marker: Splats | None
+    """Splats that mark a goal, to be put where `marker_place` says."""
+    cameras: list[PinholeCamera]
+    """Cameras that show the scene well, if any are known."""
+    terms: dict[str, float]
+    """Terms of the reward in the last block."""
+    success: bool
+    """Whether the task counts as solved."""
+    episode: int
+    """Episodes begun."""
+
+    def run(self, *, busy: bool) -> bool:
+        """Take a block; return whether a new episode began. `busy`: a person holds something, so it should not."""
+        ...
+
+    def reset(self) -> None:
+        """Start over; grips have been let go."""
+        ...
+
+    def marker_place(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the marker's centres before they are placed [m] (M, 3), and its pose: position, quaternion xyzw."""
+        ...
+
+    def close(self) -> None:
+        """Let go of what is held open."""
+        ...
+
+
+def grip_slots(options: LiveOptions) -> int:
+    """Return the points of an object that pins and the drag may need at a time; what it hangs by is a pin more."""
+    return (options.pin_max + 1) * options.pin_points + 1
+
+
+def strength_of(options: LiveOptions) -> GripOptions:
+    """Return how stiff the grips of a session are."""
+    return GripOptions(pull_stiffness=options.drag_stiffness, pull_rate=options.drag_rate)
+
+
+class ObjectScene:
+    """One object, held by a part of it or above a table.
+
+    Args:
+        thing: The object.
+        scene: "hang" or "drop".
+        hold: Which end a hanging object is held by.
+        material: What it is made of.
+        options: How the session runs.
+        device: Warp device.
+
+    Raises:
+        ConfigError: If scene or hold are unknown.
+    """
+
+    marker = None
+    cameras: list[PinholeCamera] = []  # noqa: RUF012
+    success = False
+    episode = 1
+
+    def __init__(
+        self,
+        thing: SoftObject,
+        scene: SceneName,
+        hold: HoldName,
+        material: Material,
+        options: LiveOptions,
+        device: Any,
+    ) -> None:
+        """Build model and solver, capture a block."""
+        for name, value, known in (("scene", scene, SceneName), ("hold", hold, HoldName)):
+            if value not in get_args(known):
+                raise ConfigError(f"{name} is {value!r}", hint=f"use one of {', '.join(map(repr, get_args(known)))}")
+        self.objects, self._hold = (thing,), hold if scene == "hang" else None
+        self.terms: dict[str, float] = {}
+        self.dt, self.block_steps = options.substep, BLOCK_STEPS
+        self.block_dt = self.dt * self.block_steps
+        builder, height = newton.ModelBuilder(), float(thing.body.bounds[1, 2] - thing.body.bounds[0, 2])
+        if scene == "drop":
+            table = newton.ModelBuilder.ShapeConfig(mu=TABLE_FRICTION, has_shape_collision=True)
+            half = 3.0 * float(np.ptp(thing.body.bounds, axis=0).max())
+            place = wp.transform((0.0, 0.0, -0.1 * half), wp.quat_identity())
+            color = (0.42, 0.48, 0.54)
+            builder.add_shape_box(
+                -1, xform=place, hx=half, hy=half, hz=0.1 * half, cfg=table, color=color, label="table"
+            )
+        position = (0.0, 0.0, thing.height + 0.6 * height)
+        instance = add_reduced_body(builder, thing.body, material=material, position=position)
+        add_grip_slots(builder, instance, grip_slots(options))
+        self.model: Any = builder.finalize(device=device)
+        self.solver: Any = SolverReduced(self.model, [thing.body])
+        self.control: Any = self.model.control()
+        count = grip_slots(options)
+        self.grips = (Grips(self.solver, 0, slot_count=count, options=strength_of(options)),)
+        self.state, self._scratch = self.model.state(), self.model.state()
+        self._two_steps()  # compiles
+        with wp.ScopedCapture(device=self.model.device) as capture:
+            self._two_steps()
+        self._graph: Any = capture.graph
+        self.reset()
+
+    def _two_steps(self) -> None:
+        """Step there and back between the two states."""
+        for first, second in ((self.state, self._scratch), (self._scratch, self.state)):
+            self.grips[0].apply(first, self.control, self.dt)
+            self.solver.step(first, second, self.control, None, self.dt)
+
+    def run(self, *, busy: bool) -> bool:
+        """Take a block."""
+        wp.capture_launch(self._graph)
+        return False
+
+    def reset(self) -> None:
+        """Put the object back, and hold it again if it hangs."""
+        self.solver.reset(self.state)
+        if self._hold is not None:
+            self.grips[0].take(held_points(self.objects[0], self._hold), self.state)
+
+    def marker_place(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return no centres: there is no marker."""
+        return np.zeros((0, 3)), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+def held_points(thing: SoftObject, hold: HoldName, count: int = 16) -> NDArray[np.float64]:
+    """Return the surface samples by which a hanging object is held, spread over its top or base, shape (n, 3)."""
+    from softmode.deformables.rkpm import sample_farthest
+
+    sign = 1.0 if hold == "top" else -1.0
+    X = thing.body.surface_points
+    z = sign * X[:, 2]
+    order = np.argsort(-z)
+    chosen = order[: max(int((z > z.max() - HELD_PART * np.ptp(z)).sum()), 4)]
+    return X[chosen[sample_farthest(X[chosen], count, first=0)]]
+
+
+class EnvScene:
+    """An environment that its policy plays.
+
+    Args:
+        name: Id of the environment.
+        policy: Who plays; see :data:`softmode.policies.POLICIES`.
+        config: The task's configuration; None for the default.
+        seed: Seed of the first episode.
+        options: How the session runs.
+        device: Warp device.
+        progress: Reports the build of the object.
+
+    Raises:
+        ConfigError: If environment or policy are unknown, or the configuration is another task's.
+    """
+
+    def __init__(
+        self, name: str, policy: str, config: Any, seed: int, options: LiveOptions, device: Any, progress: Any
+    ) -> None:
+        """Make the environment with slots for grips and begin an episode."""
+        import gymnasium as gym
+
+        from softmode.envs.catalogue import config_class
+
+        kind = config_class(name)
+        if config is not None and not isinstance(config, kind):
+            raise ConfigError(f"config is a {type(config).__name__}", hint=f"{name} takes a {kind.__name__}")
+        if not 0 <= seed < 2**31:
+            raise ConfigError(f"seed must lie in 0..2147483647, got {seed!r}")
+        check_policy(policy)
+        trained = None if policy in POLICIES else trained_policy(policy, name)
+        given = dict(trained.env_options) if trained else {}
+        base = config or kind()
+        if isinstance(given.get("config"), dict):
+            base = replace(base, **given.pop("config")) if config is None else base
+        given_scene = replace(base.scene, grip_slots=grip_slots(options), grip_options=strength_of(options))
+        base = replace(base, scene=given_scene)
+        # with cameras, so that the goal's marker is kept up to date
+        given |= {"config": base, "device": device, "progress": progress, "render_mode": "rgb_array"}
+        self._env: Any = gym.make(name, **given, disable_env_checker=True)
+        task: Task = self._env.unwrapped.task
+        scene: Any = task.scene
+        self._scene, self.objects, self.model, self.solver = scene, scene.objects, scene.model, scene.solver
+        self.control, self.grips = scene.control, scene.grips
+        self.block_steps = scene.config.substeps
+        self.block_dt = 1.0 / scene.config.control_hz
+        self.marker, self.cameras = task.marker(), task.render_cameras()
+        self.config = base
+        self._factory: Callable[[int], Callable[[Any], Any]] = policy_factory(policy, self._env, trained)
+        self.seed, self.episode = seed, 0
+        self.reset()
+
+    @property
+    def state(self) -> Any:
+        """The present state."""
+        return self._scene.state
+
+    def run(self, *, busy: bool) -> bool:
+        """Take a control step; begin the next episode when this one has ended."""
+        if self._done and not (busy and not self._failed):
+            self.reset()
+            return True
+        self._observation, _, terminated, truncated, info = self._env.step(self._policy(self._observation))
+        self._done, self._failed = terminated or truncated, terminated
+        self.terms = dict(info["reward_terms"])
+        self.success = bool(info["is_success"])
+        return False
+
+    def reset(self) -> None:
+        """Begin the next episode."""
+        self._observation, info = self._env.reset(seed=self.seed if self.episode == 0 else None)
+        self._policy = self._factory(self.seed + self.episode)
+        self.episode += 1
+        self._done = self._failed = False
+        self.terms = {name: 0.0 for name in info["reward_terms"]}
+        self.success = bool(info["is_success"])
+
+    def marker_place(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the centres of the goal's marker and its pose."""
+        points, place = self._scene.marker_points, self._scene.marker_place
+        return points.numpy()[0].astype(np.float64), place.numpy()[0].astype(np.float64)
+
+    def close(self) -> None:
+        """Close the environment."""
+        self._env.close()
