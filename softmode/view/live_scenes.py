@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from softmode.deformables.grips import GripOptions, Grips, add_grip_slots
 from softmode.deformables.materials import Material
+from softmode.deformables.rkpm import sample_farthest
 from softmode.deformables.solver_reduced import SolverReduced, add_reduced_body
 from softmode.envs.objects import SoftObject
 from softmode.envs.task import Task
@@ -21,6 +22,7 @@ from softmode.policies import POLICIES, check_policy, policy_factory, trained_po
 from softmode.splats import Splats
 from softmode.splats.pinhole import PinholeCamera
 from softmode.view.live_types import HoldName, LiveOptions, SceneName
+from softmode.view.sources import ObjectSource
 
 BLOCK_STEPS = 2
 """Physics steps of a block of an object without an environment; even, there and back between two states."""
@@ -56,8 +58,17 @@ class LiveScene(Protocol):
     episode: int
     """Episodes begun."""
 
-    def run(self, *, busy: bool) -> bool:
-        """Take a block; return whether a new episode began. `busy`: a person holds something, so it should not."""
+    @property
+    def source(self) -> ObjectSource:
+        """Where the first object comes from."""
+        ...
+
+    def over(self, *, busy: bool) -> bool:
+        """Return whether the next episode is to begin; while a person is busy only a failure ends one."""
+        ...
+
+    def run(self) -> None:
+        """Take a block."""
         ...
 
     def reset(self) -> None:
@@ -87,6 +98,7 @@ class ObjectScene:
     """One object, held by a part of it or above a table.
 
     Args:
+        source: Where the object comes from.
         thing: The object.
         scene: "hang" or "drop".
         hold: Which end a hanging object is held by.
@@ -98,13 +110,9 @@ class ObjectScene:
         ConfigError: If scene or hold are unknown.
     """
 
-    marker = None
-    cameras: list[PinholeCamera] = []  # noqa: RUF012
-    success = False
-    episode = 1
-
     def __init__(
         self,
+        source: ObjectSource,
         thing: SoftObject,
         scene: SceneName,
         hold: HoldName,
@@ -116,8 +124,13 @@ class ObjectScene:
         for name, value, known in (("scene", scene, SceneName), ("hold", hold, HoldName)):
             if value not in get_args(known):
                 raise ConfigError(f"{name} is {value!r}", hint=f"use one of {', '.join(map(repr, get_args(known)))}")
-        self.objects, self._hold = (thing,), hold if scene == "hang" else None
+        self.source, self._pin_points = source, options.pin_points
+        self.objects: tuple[SoftObject, ...] = (thing,)
+        self._hold: HoldName | None = hold if scene == "hang" else None
+        self.marker: Splats | None = None
+        self.cameras: list[PinholeCamera] = []
         self.terms: dict[str, float] = {}
+        self.success, self.episode = False, 1
         self.dt, self.block_steps = options.substep, BLOCK_STEPS
         self.block_dt = self.dt * self.block_steps
         builder, height = newton.ModelBuilder(), float(thing.body.bounds[1, 2] - thing.body.bounds[0, 2])
@@ -150,16 +163,19 @@ class ObjectScene:
             self.grips[0].apply(first, self.control, self.dt)
             self.solver.step(first, second, self.control, None, self.dt)
 
-    def run(self, *, busy: bool) -> bool:
+    def over(self, *, busy: bool) -> bool:
+        """An object has no episodes."""
+        return False
+
+    def run(self) -> None:
         """Take a block."""
         wp.capture_launch(self._graph)
-        return False
 
     def reset(self) -> None:
         """Put the object back, and hold it again if it hangs."""
         self.solver.reset(self.state)
         if self._hold is not None:
-            self.grips[0].take(held_points(self.objects[0], self._hold), self.state)
+            self.grips[0].take(held_points(self.objects[0], self._hold, self._pin_points), self.state)
 
     def marker_place(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return no centres: there is no marker."""
@@ -169,10 +185,8 @@ class ObjectScene:
         """Nothing is held open."""
 
 
-def held_points(thing: SoftObject, hold: HoldName, count: int = 16) -> NDArray[np.float64]:
+def held_points(thing: SoftObject, hold: HoldName, count: int) -> NDArray[np.float64]:
     """Return the surface samples by which a hanging object is held, spread over its top or base, shape (n, 3)."""
-    from softmode.deformables.rkpm import sample_farthest
-
     sign = 1.0 if hold == "top" else -1.0
     X = thing.body.surface_points
     z = sign * X[:, 2]
@@ -192,13 +206,22 @@ class EnvScene:
         options: How the session runs.
         device: Warp device.
         progress: Reports the build of the object.
+        source: Another first object than the configuration's.
 
     Raises:
         ConfigError: If environment or policy are unknown, or the configuration is another task's.
     """
 
     def __init__(
-        self, name: str, policy: str, config: Any, seed: int, options: LiveOptions, device: Any, progress: Any
+        self,
+        name: str,
+        policy: str,
+        config: Any,
+        seed: int,
+        options: LiveOptions,
+        device: Any,
+        progress: Any,
+        source: ObjectSource | None = None,
     ) -> None:
         """Make the environment with slots for grips and begin an episode."""
         import gymnasium as gym
@@ -217,6 +240,8 @@ class EnvScene:
         if isinstance(given.get("config"), dict):
             base = replace(base, **given.pop("config")) if config is None else base
         given_scene = replace(base.scene, grip_slots=grip_slots(options), grip_options=strength_of(options))
+        if source is not None and source.config is not None:
+            given_scene = replace(given_scene, object=source.config)
         base = replace(base, scene=given_scene)
         # with cameras, so that the goal's marker is kept up to date
         given |= {"config": base, "device": device, "progress": progress, "render_mode": "rgb_array"}
@@ -238,16 +263,21 @@ class EnvScene:
         """The present state."""
         return self._scene.state
 
-    def run(self, *, busy: bool) -> bool:
-        """Take a control step; begin the next episode when this one has ended."""
-        if self._done and not (busy and not self._failed):
-            self.reset()
-            return True
+    @property
+    def source(self) -> ObjectSource:
+        """Where the first object comes from."""
+        return ObjectSource(config=self.config.scene.object)
+
+    def over(self, *, busy: bool) -> bool:
+        """Return whether the episode has ended; its time limit waits while a person is busy, a failure does not."""
+        return self._failed or (self._done and not busy)
+
+    def run(self) -> None:
+        """Take a control step."""
         self._observation, _, terminated, truncated, info = self._env.step(self._policy(self._observation))
         self._done, self._failed = terminated or truncated, terminated
         self.terms = dict(info["reward_terms"])
         self.success = bool(info["is_success"])
-        return False
 
     def reset(self) -> None:
         """Begin the next episode."""

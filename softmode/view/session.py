@@ -5,14 +5,31 @@ All calls must come from one thread.
 
 from __future__ import annotations
 
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import newton
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from softmode.deformables.body import ReducedBody
+from softmode.deformables.energies import SoftEnergies
+from softmode.deformables.grips import Grips
 from softmode.deformables.materials import Material
-from softmode.envs.objects import ObjectConfig
+from softmode.deformables.parameters import PARAMETER_LIMITS, set_parameters
+from softmode.deformables.rkpm import sample_farthest
+from softmode.deformables.status import status_reasons
+from softmode.envs.objects import ObjectConfig, SoftObject
+from softmode.errors import ConfigError
+from softmode.splats.pinhole import PinholeCamera
+from softmode.view.live_recording import RECORD_HZ, CoordinateRecorder, FilmRecorder, LiveRecording, Recorder
+from softmode.view.live_scenes import EnvScene, LiveScene, ObjectScene
 from softmode.view.live_types import (
     DragView,
     Energies,
@@ -24,15 +41,62 @@ from softmode.view.live_types import (
     PinView,
     SceneName,
     SplatPicture,
+    vector3,
 )
+from softmode.view.picture import LivePicture
+from softmode.view.sources import ObjectSource
+
+RATE_WINDOW = 1.0
+"""Time over which the real-time factor is taken [s]."""
+_LIMITS = PARAMETER_LIMITS | {"viscosity": (0.0, 10.0), "mass_damping": (0.0, 1.0e4)}
+_MATERIAL = ("youngs_modulus", "poissons_ratio", "density", "friction")
+"""Parameters that other quantities follow."""
+GRAVITY_MAX = 1000.0
+"""Largest gravity [m/s^2]."""
 
 
 class LiveSession:
-    """Soft objects that run in real time while they are pulled, pinned and tuned; make one by `from_object`, `from_env`.
+    """Soft objects that run in real time while they are pulled, pinned and tuned.
 
-    Nothing here draws or serves: `advance` moves time, `splats`, `meshes` and `poses` are what to show, the rest is what
-    a person does. All calls must come from one thread.
+    Made by `from_object` or `from_env`. Nothing here draws or serves: `advance` moves time, `splats`, `meshes` and
+    `poses` are what to show, the rest is what a person does. All calls must come from one thread.
     """
+
+    def __init__(
+        self, make: Callable[[ObjectSource | None], LiveScene], source: ObjectSource | None, options: LiveOptions
+    ) -> None:
+        """Make the scene; use `from_object` or `from_env`."""
+        self.options = options
+        self._make, self._source = make, source
+        self._scene = make(source)
+        self._given: dict[str, float] = {}
+        self._playing = True
+        self._recorder: Recorder | None = None
+        self._drag: tuple[int, int, NDArray[np.float64]] | None = None
+        self._next_pin, self._clock, self._record_from = 1, 0.0, 0.0
+        self._bind()
+
+    def _bind(self) -> None:
+        """Take up a scene that has just been made."""
+        scene = self._scene
+        self._picture = LivePicture(scene.objects, scene.model, scene.marker)
+        self._energies = SoftEnergies(scene.solver)
+        self._reduced = getattr(scene.solver, "reduced", scene.solver)
+        self._meshes: tuple[Any, ...] | None = None
+        self._block_seconds = 0.0
+        self._begin()
+
+    def _begin(self) -> None:
+        """Forget what belongs to the time before a reset; find the pins that the scene itself holds."""
+        self._time, self._debt, self._bits, self._stale, self._moved = 0.0, 0.0, 0, True, False
+        self._passed: deque[tuple[float, float]] = deque()
+        self._drag = None
+        self._pins: dict[int, tuple[int, int]] = {}
+        for index, grips in enumerate(self._scene.grips):
+            for grip in grips.held:
+                self._add_pin(index, grip)
+        self._held_at_start = len(self._pins)
+        self._reduced.status.zero_()
 
     @classmethod
     def from_object(
@@ -64,7 +128,14 @@ class LiveSession:
             ConfigError: If an option is unknown or out of range.
             AssetError: If the file cannot be used.
         """
-        raise NotImplementedError
+        chosen = options or LiveOptions()
+        made = material or Material(youngs_modulus=1.0e5, density=250.0)
+
+        def make(origin: ObjectSource | None) -> LiveScene:
+            named = origin or ObjectSource.of(source, size)
+            return ObjectScene(named, named.load(progress), scene, hold, made, chosen, device)
+
+        return cls(make, None, chosen)
 
     @classmethod
     def from_env(
@@ -94,7 +165,12 @@ class LiveSession:
         Raises:
             ConfigError: If the environment or the policy is unknown, or an option out of range.
         """
-        raise NotImplementedError
+        chosen = options or LiveOptions()
+
+        def make(origin: ObjectSource | None) -> LiveScene:
+            return EnvScene(name, policy, config, seed, chosen, device, progress, origin)
+
+        return cls(make, None, chosen)
 
     # -- time ---------------------------------------------------------------------------------------------------------
 
@@ -110,69 +186,124 @@ class LiveSession:
         Raises:
             ConfigError: If `frame_dt` is not a finite number >= 0.
         """
-        raise NotImplementedError
+        if not (isinstance(frame_dt, int | float) and math.isfinite(frame_dt) and frame_dt >= 0.0):
+            raise ConfigError(f"frame_dt must be a finite number >= 0 [s], got {frame_dt!r}")
+        now = time.perf_counter()
+        if not self._playing:
+            return 0.0
+        block = self._scene.block_dt
+        self._debt += frame_dt
+        count = int(self._debt / block + 1e-6)
+        if self._block_seconds > 0.0:
+            count = min(count, max(int(self.options.budget * frame_dt / self._block_seconds), 1))
+        passed = self._run(count)
+        self._debt = min(self._debt - passed, block)  # what did not fit is lost
+        self._passed.append((now, passed))
+        while self._passed[-1][0] - self._passed[0][0] > RATE_WINDOW and len(self._passed) > 2:
+            self._passed.popleft()
+        return passed
 
     def play(self) -> None:
         """Let time run; a session starts playing."""
-        raise NotImplementedError
+        self._playing = True
+        self._debt = 0.0
+        self._passed.clear()
 
     def pause(self) -> None:
         """Stop time; drags and pins may still be moved, and take effect when it runs again."""
-        raise NotImplementedError
+        self._playing = False
+        self._passed.clear()
 
     def step(self) -> float:
         """Take one block of physics steps, paused or not, and return the simulated time that passed [s]."""
-        raise NotImplementedError
+        return self._run(1)
 
     def reset(self) -> None:
         """Start over: drags and pins are let go, a hanging object is held again, an environment begins an episode.
 
         Parameters stay as they are.
         """
-        raise NotImplementedError
+        self._let_go()
+        self._scene.reset()
+        self._apply_parameters()
+        self._begin()
 
     def close(self) -> None:
         """Discard a recording that is being made and let go of the environment; may be called twice."""
-        raise NotImplementedError
+        if self._recorder is not None:
+            self._recorder.discard()
+            self._recorder = None
+        self._scene.close()
 
     # -- what to show -------------------------------------------------------------------------------------------------
 
     @property
     def size(self) -> float:
         """Diagonal of the first object's bounding box at rest [m]."""
-        raise NotImplementedError
+        return float(self._reduced.instances.size.numpy()[0])
 
     def bounds(self) -> NDArray[np.float64]:
         """Return the corners of a box around what is worth seeing at the start [m], shape (2, 3)."""
-        raise NotImplementedError
+        corners = self.splats().means
+        if isinstance(self._scene, EnvScene):
+            corners = np.concatenate([corners, [[-0.1, -0.35, 0.0], [0.75, 0.35, 0.6]]])
+        return np.stack([corners.min(axis=0), corners.max(axis=0)]).astype(np.float64)
 
     def splats(self) -> SplatPicture:
         """Return the splats of all objects as they are now, in arrays of their own."""
-        raise NotImplementedError
+        self._show()
+        return self._picture.read()
 
     def meshes(self) -> tuple[Any, ...]:
         """Return the meshes of the rigid shapes, `softmode.viz.scene_meshes.SceneMesh`; they do not change."""
-        raise NotImplementedError
+        if self._meshes is None:
+            from softmode.viz.scene_meshes import scene_meshes
+
+            self._meshes = scene_meshes(self._scene.model)
+        return self._meshes
 
     def poses(self) -> NDArray[np.float32]:
         """Return the poses of the rigid bodies: position [m] and quaternion (x, y, z, w), shape (B, 7)."""
-        raise NotImplementedError
+        poses = self._scene.state.body_q
+        return np.zeros((0, 7), np.float32) if poses is None else poses.numpy().copy()
 
     def surface(self, object_index: int = 0) -> NDArray[np.float64]:
         """Return the surface samples of an object as they are now [m], shape (S, 3)."""
-        raise NotImplementedError
+        thing, model = self._object(object_index), self._scene.model
+        start = int(model.softmode.particle_start.numpy()[object_index])
+        x: Any = self._scene.state.particle_q[start : start + thing.body.surface_count]
+        return x.numpy().astype(np.float64)
 
     def centre(self, object_index: int = 0) -> NDArray[np.float64]:
         """Return the centre of mass of an object [m], shape (3,)."""
-        raise NotImplementedError
+        return self._object(object_index).body.mean_basis @ self._coordinates("q", object_index)
 
     def status(self) -> LiveStatus:
         """Return times, flags and the rewards of the environment."""
-        raise NotImplementedError
+        rate = 0.0
+        if len(self._passed) > 1:
+            rate = sum(dt for _, dt in list(self._passed)[1:]) / (self._passed[-1][0] - self._passed[0][0])
+        scene = self._scene
+        return LiveStatus(
+            time=self._time,
+            playing=self._playing,
+            realtime_factor=rate,
+            step_milliseconds=1e3 * self._block_seconds / scene.block_steps,
+            solver=status_reasons(self._bits),
+            recording=self._recorder is not None,
+            reward_terms=dict(scene.terms),
+            success=scene.success,
+            episode=scene.episode,
+        )
 
     def energies(self) -> Energies:
         """Return the energies of all objects."""
-        raise NotImplementedError
+        self._energies.update(self._scene.state)
+        return Energies(
+            kinetic=float(self._energies.kinetic.numpy().sum()),
+            elastic=float(self._energies.elastic.numpy().sum()),
+            gravitational=float(self._energies.gravitational.numpy().sum()),
+        )
 
     # -- pulling and pinning ------------------------------------------------------------------------------------------
 
@@ -186,11 +317,23 @@ class LiveSession:
         Raises:
             ConfigError: If they are not finite, or the direction is zero.
         """
-        raise NotImplementedError
+        start, way = vector3("origin", origin), vector3("direction", direction)
+        length = float(np.linalg.norm(way))
+        if length < 1e-12:
+            raise ConfigError("direction is zero", hint="give the direction of the ray")
+        self._show()
+        return self._picture.pick(start, way / length, self._scene.state)
 
     def begin_drag(self, hit: Hit) -> None:
-        """Put a damped spring between a point of an object and the cursor, which is at that point; ends another drag."""
-        raise NotImplementedError
+        """Put a damped spring between a point of an object and the cursor, which is at that point.
+
+        Another drag ends.
+        """
+        self.end_drag()
+        grips = self._grips(hit.object_index)
+        grip = grips.take(hit.rest_point[None], self._scene.state, pulls=True)
+        self._drag = (hit.object_index, grip, hit.point - grips.pose(grip)[0])
+        self._moved = False
 
     def drag_to(self, point: ArrayLike) -> None:
         """Move the cursor to a point [m]; the spring's end gets there in the course of the next frame.
@@ -198,15 +341,28 @@ class LiveSession:
         Raises:
             ConfigError: If nothing is dragged, or the point is not finite.
         """
-        raise NotImplementedError
+        if self._drag is None:
+            raise ConfigError("nothing is dragged", hint="call begin_drag with a hit of pick")
+        index, grip, offset = self._drag
+        self._grips(index).aim(grip, vector3("point", point) - offset)
 
     def end_drag(self) -> None:
         """Let go; does nothing if nothing is dragged."""
-        raise NotImplementedError
+        if self._drag is not None:
+            self._grips(self._drag[0]).let_go(self._drag[1])
+            self._drag = None
 
     def drag(self) -> DragView | None:
         """Return the drag, or None."""
-        raise NotImplementedError
+        if self._drag is None:
+            return None
+        index, grip, offset = self._drag
+        grips = self._grips(index)
+        return DragView(
+            point=grips.points(grip, self._scene.state)[0] + offset,
+            target=grips.pose(grip, goal=True)[0] + offset,
+            force=grips.force(grip) if self._moved else np.zeros(3),
+        )
 
     def pin(self, hit: Hit, radius: float | None = None) -> int:
         """Hold the region around a point of an object where it is, in its present shape.
@@ -221,7 +377,19 @@ class LiveSession:
         Raises:
             ConfigError: If the radius is not a finite number > 0, or there are `LiveOptions.pin_max` pins already.
         """
-        raise NotImplementedError
+        thing = self._object(hit.object_index)
+        reach = 0.1 * float(np.linalg.norm(np.ptp(thing.body.bounds, axis=0))) if radius is None else radius
+        if not (isinstance(reach, int | float) and math.isfinite(reach) and reach > 0.0):
+            raise ConfigError(f"radius must be a finite length > 0 [m], got {radius!r}")
+        if len(self._pins) >= self.options.pin_max + self._held_at_start:
+            raise ConfigError(f"there are {len(self._pins)} pins already", hint="let go of one first")
+        X = np.concatenate([thing.body.surface_points, thing.body.points])
+        distance = np.linalg.norm(X - hit.rest_point, axis=1)
+        order = np.argsort(distance)
+        chosen = order[: max(int((distance <= reach).sum()), 4)]
+        chosen = chosen[sample_farthest(X[chosen], self.options.pin_points, first=0)]
+        grip = self._grips(hit.object_index).take(X[chosen], self._scene.state)
+        return self._add_pin(hit.object_index, grip)
 
     def move_pin(self, pin: int, position: ArrayLike, wxyz: ArrayLike | None = None) -> None:
         """Move the centre of a pinned region to a point [m], and turn the region, in the course of the next frame.
@@ -234,7 +402,12 @@ class LiveSession:
         Raises:
             ConfigError: If there is no such pin, or a number is not finite.
         """
-        raise NotImplementedError
+        index, grip = self._pin(pin)
+        turn = None
+        if wxyz is not None:
+            w, x, y, z = unit_quaternion(wxyz)
+            turn = (x, y, z, w)
+        self._grips(index).aim(grip, vector3("position", position), turn)
 
     def unpin(self, pin: int) -> None:
         """Let a pinned region go.
@@ -242,18 +415,32 @@ class LiveSession:
         Raises:
             ConfigError: If there is no such pin.
         """
-        raise NotImplementedError
+        index, grip = self._pin(pin)
+        self._grips(index).let_go(grip)
+        del self._pins[pin]
 
     def pins(self) -> dict[int, PinView]:
         """Return the pins by number; the one that a hanging object is held by is among them."""
-        raise NotImplementedError
+        found = {}
+        for number, (index, grip) in self._pins.items():
+            grips = self._grips(index)
+            position, (x, y, z, w) = grips.pose(grip)
+            points = grips.points(grip, self._scene.state)
+            error = float(np.linalg.norm(points - grips.targets(grip), axis=1).max())
+            found[number] = PinView(
+                position=position, wxyz=np.array([w, x, y, z]), points=points, error=error, object_index=index
+            )
+        return found
 
     # -- parameters ---------------------------------------------------------------------------------------------------
 
     @property
     def parameters(self) -> LiveParameters:
         """The present values, of the first object."""
-        raise NotImplementedError
+        data = self._scene.model.softmode
+        values = {name: float(getattr(data, name).numpy()[0]) for name in _LIMITS if name != "scale"}
+        x, y, z = self._scene.model.gravity.numpy()[0].tolist()
+        return LiveParameters(**values, gravity=(x, y, z), handles=self._object(0).body.mode_count)
 
     def set_parameters(
         self,
@@ -280,7 +467,29 @@ class LiveSession:
         Raises:
             ConfigError: If a value lies outside its range; nothing is changed then.
         """
-        raise NotImplementedError
+        given = {
+            "youngs_modulus": youngs_modulus,
+            "poissons_ratio": poissons_ratio,
+            "density": density,
+            "viscosity": viscosity,
+            "mass_damping": mass_damping,
+            "friction": friction,
+        }
+        chosen: dict[str, Any] = {}
+        for name, value in given.items():
+            if value is None:
+                continue
+            low, high = _LIMITS[name]
+            if not (isinstance(value, int | float | np.number) and low <= float(value) <= high):
+                raise ConfigError(f"{name} must lie in {low:g}..{high:g}, got {value!r}")
+            chosen[name] = float(value)
+        if gravity is not None:
+            numbers = vector3("gravity", (0.0, 0.0, -gravity) if np.ndim(gravity) == 0 else gravity)  # type: ignore[operator]
+            if np.linalg.norm(numbers) > GRAVITY_MAX:
+                raise ConfigError(f"gravity must be at most {GRAVITY_MAX:g} m/s^2, got {gravity!r}")
+            chosen["gravity"] = tuple(numbers.tolist())
+        self._given |= chosen
+        self._apply_parameters()
 
     def set_handles(self, count: int) -> None:
         """Give the object another number of skinning eigenmodes: builds it anew, or takes it from the cache.
@@ -291,14 +500,36 @@ class LiveSession:
         Raises:
             ConfigError: If the count lies outside 0..64, or the object came as a saved body, which cannot be rebuilt.
         """
-        raise NotImplementedError
+        if self._recorder is not None:
+            raise ConfigError("a recording is being made", hint="stop it before the handles change")
+        old, scene = self._object(0).body, self._scene
+        source = (self._source or scene.source).with_handles(count)
+        if count == old.mode_count:
+            return
+        self.end_drag()
+        q, qd = self._coordinates("q"), self._coordinates("qd")
+        kept = [(scene.grips[0].held[grip], *scene.grips[0].pose(grip)) for _, grip in self._pins.values()]
+        elapsed, clock = self._time, self._clock
+        made = self._make(source)  # a build that fails leaves all as it was
+        scene.close()
+        self._scene, self._source = made, source
+        if not isinstance(made, EnvScene):
+            made.grips[0].let_go_all()
+            for grip, position, rotation in kept:
+                made.grips[0].restore(grip, position, rotation.tolist())
+        self._bind()
+        self._clock = clock
+        if not isinstance(made, EnvScene):
+            self._carry_over(old, q, qd)
+            self._time = elapsed
+        self._apply_parameters()
 
     # -- recording ----------------------------------------------------------------------------------------------------
 
     def start_recording(
         self, path: str | Path, *, position: ArrayLike | None = None, target: ArrayLike | None = None, edge: int = 480
     ) -> None:
-        """Record from now on: ".mp4" draws pictures, ".npz" keeps coordinates and poses, 30 frames per simulated second.
+        """Record from now on, 30 frames per simulated second: ".mp4" draws pictures, ".npz" keeps coordinates.
 
         Args:
             path: The file; it appears when the recording is stopped, complete or not at all.
@@ -310,7 +541,43 @@ class LiveSession:
             ConfigError: If a recording is being made, or the path has another suffix or cannot be written.
             MissingExtraError: If what encodes videos is not installed.
         """
-        raise NotImplementedError
+        if self._recorder is not None:
+            raise ConfigError(f"{self._recorder.path} is being recorded", hint="stop that recording first")
+        file, suffix = Path(path), Path(path).suffix.lower()
+        if suffix == ".npz":
+            self._recorder = CoordinateRecorder(file, [thing.body for thing in self._scene.objects])
+        elif suffix == ".mp4":
+            self._recorder = FilmRecorder(file, self._scene.model, self._picture, self._camera(position, target, edge))
+        else:
+            raise ConfigError(f"recording {file} is no .mp4 or .npz file", hint="name it like out/poke.mp4")
+        self._record_from = self._clock
+        self._record()
+
+    def show_frame(self, recording: LiveRecording, index: int) -> None:
+        """Pause, and put everything where a frame of a recording has it, at rest; a reset makes it live again.
+
+        Args:
+            recording: A recording of the same objects.
+            index: Which frame.
+
+        Raises:
+            ConfigError: If the recording is of other objects, or has no such frame.
+        """
+        scene = self._scene
+        own = tuple(thing.body.fingerprint for thing in scene.objects)
+        if recording.fingerprints != own or recording.q.shape[1] != scene.state.softmode.q.shape[0]:
+            raise ConfigError("the recording is of other objects", hint="open the objects that were recorded")
+        if not 0 <= index < len(recording.times):
+            raise ConfigError(f"index must lie in 0..{len(recording.times) - 1}, got {index}")
+        self.pause()
+        state = scene.state
+        state.softmode.q.assign(recording.q[index])
+        state.softmode.qd.zero_()
+        state.softmode.dt_before.zero_()
+        if state.body_q is not None and recording.body_q.shape[1] == state.body_q.shape[0]:
+            state.body_q.assign(recording.body_q[index])
+        self._reduced.update_particles(state)
+        self._stale = True
 
     def stop_recording(self) -> Path:
         """Write the recording and return its path.
@@ -318,4 +585,152 @@ class LiveSession:
         Raises:
             ConfigError: If none is being made, or it has no frame.
         """
-        raise NotImplementedError
+        if self._recorder is None:
+            raise ConfigError("nothing is being recorded", hint="call start_recording first")
+        recorder, self._recorder = self._recorder, None
+        try:
+            recorder.finish()
+        finally:
+            recorder.discard()
+        return recorder.path
+
+    # -- inside -------------------------------------------------------------------------------------------------------
+
+    def _run(self, count: int) -> float:
+        """Take blocks and return the simulated time that passed [s]."""
+        scene = self._scene
+        if count < 1:
+            return 0.0
+        for grips in scene.grips:
+            grips.begin_frame(count * scene.block_steps)
+        self._bits, taken = 0, 0
+        self._reduced.status.zero_()
+        for _ in range(count):
+            if scene.over(busy=self._drag is not None or bool(self._pins)):
+                self.reset()
+                continue
+            clock = time.perf_counter()
+            scene.run()
+            self._bits |= int(self._reduced.status.numpy()[0])  # waits for the device
+            spent = time.perf_counter() - clock
+            self._block_seconds = spent if self._block_seconds == 0.0 else 0.8 * self._block_seconds + 0.2 * spent
+            taken += 1
+            self._time += scene.block_dt
+            self._clock += scene.block_dt
+            self._stale = self._moved = True
+            self._record()
+        return taken * scene.block_dt
+
+    def _show(self) -> None:
+        """Deform the splats if anything has moved since."""
+        if self._stale:
+            self._picture.update(self._scene.state, *self._scene.marker_place())
+            self._stale = False
+
+    def _record(self) -> None:
+        """Give the recorder a frame if one is due."""
+        recorder = self._recorder
+        if recorder is not None and self._clock - self._record_from >= recorder.count / RECORD_HZ - 1e-9:
+            self._show()
+            recorder.add(self._clock - self._record_from, self._scene.state)
+
+    def _camera(self, position: ArrayLike | None, target: ArrayLike | None, edge: int) -> PinholeCamera:
+        """Return a camera, by default one that sees all."""
+        if not isinstance(edge, int | np.integer) or not 64 <= edge <= 1024:
+            raise ConfigError(f"edge must be a whole number in 64..1024 px, got {edge!r}")
+        edge -= edge % 8  # what encoders like
+        known = self._scene.cameras
+        if known and position is None and target is None:
+            shown = known[-1]
+            x, y = edge / shown.width, edge / shown.height
+            lens = {"fx": x * shown.fx, "fy": y * shown.fy, "cx": x * shown.cx, "cy": y * shown.cy}
+            return replace(shown, name="live", width=edge, height=edge, **lens)
+        low, high = self.bounds()
+        middle, reach = 0.5 * (low + high), float(np.linalg.norm(high - low))
+        eye = middle + reach * np.array([0.9, -1.3, 0.5]) if position is None else vector3("position", position)
+        at = middle if target is None else vector3("target", target)
+        x, y, z = eye.tolist()
+        u, v, w = at.tolist()
+        return PinholeCamera.look_at("live", position=(x, y, z), target=(u, v, w), width=edge, height=edge, fov_y=0.7)
+
+    def _apply_parameters(self) -> None:
+        """Write what was given into the model."""
+        scene, given = self._scene, self._given
+        data = scene.model.softmode
+        arrays = {
+            name: wp.full(data.friction.shape, given[name], dtype=float, device=scene.model.device)
+            for name in _MATERIAL
+            if name in given
+        }
+        if arrays:
+            set_parameters(scene.solver, **arrays)
+        for name in ("viscosity", "mass_damping"):
+            if name in given:
+                getattr(data, name).fill_(given[name])
+        if "gravity" in given:
+            scene.model.set_gravity(given["gravity"])
+            if scene.solver is not self._reduced:
+                scene.solver.rigid.notify_model_changed(newton.ModelFlags.MODEL_PROPERTIES)
+
+    def _carry_over(self, old: ReducedBody, q: NDArray[np.float64], qd: NDArray[np.float64]) -> None:
+        """Give the object the positions and velocities that it had with another basis, by least squares."""
+        body, state = self._object(0).body, self._scene.state
+        X = np.concatenate([old.surface_points, old.points])
+        before, shift = old.evaluate(X)[0], old.offset - body.offset
+        rows = body.evaluate(X + shift)[0]
+        found = np.linalg.lstsq(rows, np.hstack([before @ q - shift, before @ qd]), rcond=1e-10)[0]
+        state.softmode.q.assign(found[:, :3])
+        state.softmode.qd.assign(found[:, 3:])
+        state.softmode.dt_before.zero_()
+        self._reduced.update_particles(state)
+
+    def _coordinates(self, name: str, object_index: int = 0) -> NDArray[np.float64]:
+        """Return coordinates "q" or velocities "qd" of an object, shape (n, 3)."""
+        body = self._object(object_index).body
+        start = int(self._scene.model.softmode.function_start.numpy()[object_index])
+        values: Any = getattr(self._scene.state.softmode, name)[start : start + body.function_count]
+        return values.numpy().astype(np.float64)
+
+    def _object(self, index: int) -> SoftObject:
+        objects = self._scene.objects
+        if not 0 <= index < len(objects):
+            raise ConfigError(f"object_index must lie in 0..{len(objects) - 1}, got {index}")
+        return objects[index]
+
+    def _grips(self, index: int) -> Grips:
+        self._object(index)
+        return self._scene.grips[index]
+
+    def _pin(self, pin: int) -> tuple[int, int]:
+        if pin not in self._pins:
+            raise ConfigError(f"there is no pin {pin}", hint=f"there are {sorted(self._pins)}")
+        return self._pins[pin]
+
+    def _add_pin(self, index: int, grip: int) -> int:
+        number = self._next_pin
+        self._next_pin += 1
+        self._pins[number] = (index, grip)
+        return number
+
+    def _let_go(self) -> None:
+        """Let go of everything."""
+        for grips in self._scene.grips:
+            grips.let_go_all()
+        self._pins.clear()
+        self._drag = None
+
+
+def unit_quaternion(wxyz: ArrayLike) -> list[float]:
+    """Return a quaternion of length one.
+
+    Raises:
+        ConfigError: If it is not four finite numbers, or all are zero.
+    """
+    try:
+        numbers = np.array(wxyz, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    length = float(np.linalg.norm(numbers)) if numbers.shape == (4,) else 0.0
+    if not (np.isfinite(length) and length > 1e-9):
+        raise ConfigError(f"wxyz must be four finite numbers, not all zero, got {wxyz!r}")
+    return (numbers / length).tolist()
