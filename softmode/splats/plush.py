@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
@@ -40,6 +42,7 @@ def plush_signed_distance(points: ArrayLike, height: float = 0.08) -> NDArray[np
     return scale * _unit_distance(np.asarray(points, dtype=np.float64) / scale)
 
 
+@functools.lru_cache(maxsize=4)
 def make_plush(count: int = 4000, seed: int = 0, *, height: float = 0.08) -> Splats:
     """Make the plush bear as a closed shell of flat splats.
 

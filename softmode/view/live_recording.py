@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from softmode.atomic import atomic_write
 from softmode.errors import AssetError, ConfigError
 from softmode.film import Film
 from softmode.splats.camera import CameraOptions, PinholeCamera, SplatCamera
+from softmode.view.live_types import vector3
 from softmode.view.picture import LivePicture
 
 RECORD_HZ = 30
@@ -135,3 +137,37 @@ class FilmRecorder:
     def discard(self) -> None:
         """Remove what was written."""
         self._film.discard()
+
+
+def live_camera(
+    known: Sequence[PinholeCamera],
+    bounds: NDArray[np.float64],
+    position: ArrayLike | None,
+    target: ArrayLike | None,
+    edge: int,
+) -> PinholeCamera:
+    """Return the camera of a video, square.
+
+    Args:
+        known: Cameras that show the scene well; the last one is taken if nothing is asked for.
+        bounds: Box to be seen otherwise [m], shape (2, 3).
+        position: Where the camera stands [m].
+        target: Where it looks [m].
+        edge: Width and height [px]; cut to a multiple of 8, which encoders like.
+
+    Raises:
+        ConfigError: If a number is not finite or out of range.
+    """
+    if not isinstance(edge, int | np.integer) or not 64 <= edge <= 1024:
+        raise ConfigError(f"edge must be a whole number in 64..1024 px, got {edge!r}")
+    edge = int(edge) - int(edge) % 8
+    if known and position is None and target is None:
+        shown = known[-1]
+        x, y = edge / shown.width, edge / shown.height
+        lens = {"fx": x * shown.fx, "fy": y * shown.fy, "cx": x * shown.cx, "cy": y * shown.cy}
+        return replace(shown, name="live", width=edge, height=edge, **lens)
+    middle, reach = bounds.mean(axis=0), float(np.linalg.norm(bounds[1] - bounds[0]))
+    eye = middle + reach * np.array([0.9, -1.3, 0.5]) if position is None else vector3("position", position)
+    at = middle if target is None else vector3("target", target)
+    (x, y, z), (u, v, w) = eye.tolist(), at.tolist()
+    return PinholeCamera.look_at("live", position=(x, y, z), target=(u, v, w), width=edge, height=edge, fov_y=0.7)

@@ -9,26 +9,28 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import newton
 import numpy as np
-import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.body import ReducedBody
 from softmode.deformables.energies import SoftEnergies
-from softmode.deformables.grips import Grips
 from softmode.deformables.materials import Material
-from softmode.deformables.parameters import PARAMETER_LIMITS, set_parameters
-from softmode.deformables.rkpm import sample_farthest
 from softmode.deformables.status import status_reasons
 from softmode.envs.objects import ObjectConfig, SoftObject
 from softmode.errors import ConfigError
-from softmode.splats.pinhole import PinholeCamera
-from softmode.view.live_recording import RECORD_HZ, CoordinateRecorder, FilmRecorder, LiveRecording, Recorder
+from softmode.view import live_parameters
+from softmode.view.hands import Hands
+from softmode.view.live_recording import (
+    RECORD_HZ,
+    CoordinateRecorder,
+    FilmRecorder,
+    LiveRecording,
+    Recorder,
+    live_camera,
+)
 from softmode.view.live_scenes import EnvScene, LiveScene, ObjectScene
 from softmode.view.live_types import (
     DragView,
@@ -48,11 +50,6 @@ from softmode.view.sources import ObjectSource
 
 RATE_WINDOW = 1.0
 """Time over which the real-time factor is taken [s]."""
-_LIMITS = PARAMETER_LIMITS | {"viscosity": (0.0, 10.0), "mass_damping": (0.0, 1.0e4)}
-_MATERIAL = ("youngs_modulus", "poissons_ratio", "density", "friction")
-"""Parameters that other quantities follow."""
-GRAVITY_MAX = 1000.0
-"""Largest gravity [m/s^2]."""
 
 
 class LiveSession:
@@ -72,8 +69,8 @@ class LiveSession:
         self._given: dict[str, float] = {}
         self._playing = True
         self._recorder: Recorder | None = None
-        self._drag: tuple[int, int, NDArray[np.float64]] | None = None
-        self._next_pin, self._clock, self._record_from = 1, 0.0, 0.0
+        self._hands = Hands(options)
+        self._clock, self._record_from = 0.0, 0.0
         self._bind()
 
     def _bind(self) -> None:
@@ -87,15 +84,10 @@ class LiveSession:
         self._begin()
 
     def _begin(self) -> None:
-        """Forget what belongs to the time before a reset; find the pins that the scene itself holds."""
-        self._time, self._debt, self._bits, self._stale, self._moved = 0.0, 0.0, 0, True, False
+        """Forget what belongs to the time before a reset."""
+        self._time, self._debt, self._bits, self._stale = 0.0, 0.0, 0, True
         self._passed: deque[tuple[float, float]] = deque()
-        self._drag = None
-        self._pins: dict[int, tuple[int, int]] = {}
-        for index, grips in enumerate(self._scene.grips):
-            for grip in grips.held:
-                self._add_pin(index, grip)
-        self._held_at_start = len(self._pins)
+        self._hands.take_up(self._scene)
         self._reduced.status.zero_()
 
     @classmethod
@@ -223,9 +215,9 @@ class LiveSession:
 
         Parameters stay as they are.
         """
-        self._let_go()
+        self._hands.let_go()
         self._scene.reset()
-        self._apply_parameters()
+        live_parameters.apply(self._scene, self._given)
         self._begin()
 
     def close(self) -> None:
@@ -329,11 +321,7 @@ class LiveSession:
 
         Another drag ends.
         """
-        self.end_drag()
-        grips = self._grips(hit.object_index)
-        grip = grips.take(hit.rest_point[None], self._scene.state, pulls=True)
-        self._drag = (hit.object_index, grip, hit.point - grips.pose(grip)[0])
-        self._moved = False
+        self._hands.begin_drag(hit)
 
     def drag_to(self, point: ArrayLike) -> None:
         """Move the cursor to a point [m]; the spring's end gets there in the course of the next frame.
@@ -341,28 +329,15 @@ class LiveSession:
         Raises:
             ConfigError: If nothing is dragged, or the point is not finite.
         """
-        if self._drag is None:
-            raise ConfigError("nothing is dragged", hint="call begin_drag with a hit of pick")
-        index, grip, offset = self._drag
-        self._grips(index).aim(grip, vector3("point", point) - offset)
+        self._hands.drag_to(point)
 
     def end_drag(self) -> None:
         """Let go; does nothing if nothing is dragged."""
-        if self._drag is not None:
-            self._grips(self._drag[0]).let_go(self._drag[1])
-            self._drag = None
+        self._hands.end_drag()
 
     def drag(self) -> DragView | None:
         """Return the drag, or None."""
-        if self._drag is None:
-            return None
-        index, grip, offset = self._drag
-        grips = self._grips(index)
-        return DragView(
-            point=grips.points(grip, self._scene.state)[0] + offset,
-            target=grips.pose(grip, goal=True)[0] + offset,
-            force=grips.force(grip) if self._moved else np.zeros(3),
-        )
+        return self._hands.drag()
 
     def pin(self, hit: Hit, radius: float | None = None) -> int:
         """Hold the region around a point of an object where it is, in its present shape.
@@ -377,19 +352,7 @@ class LiveSession:
         Raises:
             ConfigError: If the radius is not a finite number > 0, or there are `LiveOptions.pin_max` pins already.
         """
-        thing = self._object(hit.object_index)
-        reach = 0.1 * float(np.linalg.norm(np.ptp(thing.body.bounds, axis=0))) if radius is None else radius
-        if not (isinstance(reach, int | float) and math.isfinite(reach) and reach > 0.0):
-            raise ConfigError(f"radius must be a finite length > 0 [m], got {radius!r}")
-        if len(self._pins) >= self.options.pin_max + self._held_at_start:
-            raise ConfigError(f"there are {len(self._pins)} pins already", hint="let go of one first")
-        X = np.concatenate([thing.body.surface_points, thing.body.points])
-        distance = np.linalg.norm(X - hit.rest_point, axis=1)
-        order = np.argsort(distance)
-        chosen = order[: max(int((distance <= reach).sum()), 4)]
-        chosen = chosen[sample_farthest(X[chosen], self.options.pin_points, first=0)]
-        grip = self._grips(hit.object_index).take(X[chosen], self._scene.state)
-        return self._add_pin(hit.object_index, grip)
+        return self._hands.pin(hit, radius)
 
     def move_pin(self, pin: int, position: ArrayLike, wxyz: ArrayLike | None = None) -> None:
         """Move the centre of a pinned region to a point [m], and turn the region, in the course of the next frame.
@@ -402,12 +365,7 @@ class LiveSession:
         Raises:
             ConfigError: If there is no such pin, or a number is not finite.
         """
-        index, grip = self._pin(pin)
-        turn = None
-        if wxyz is not None:
-            w, x, y, z = unit_quaternion(wxyz)
-            turn = (x, y, z, w)
-        self._grips(index).aim(grip, vector3("position", position), turn)
+        self._hands.move_pin(pin, position, wxyz)
 
     def unpin(self, pin: int) -> None:
         """Let a pinned region go.
@@ -415,32 +373,18 @@ class LiveSession:
         Raises:
             ConfigError: If there is no such pin.
         """
-        index, grip = self._pin(pin)
-        self._grips(index).let_go(grip)
-        del self._pins[pin]
+        self._hands.unpin(pin)
 
     def pins(self) -> dict[int, PinView]:
         """Return the pins by number; the one that a hanging object is held by is among them."""
-        found = {}
-        for number, (index, grip) in self._pins.items():
-            grips = self._grips(index)
-            position, (x, y, z, w) = grips.pose(grip)
-            points = grips.points(grip, self._scene.state)
-            error = float(np.linalg.norm(points - grips.targets(grip), axis=1).max())
-            found[number] = PinView(
-                position=position, wxyz=np.array([w, x, y, z]), points=points, error=error, object_index=index
-            )
-        return found
+        return self._hands.pins()
 
     # -- parameters ---------------------------------------------------------------------------------------------------
 
     @property
     def parameters(self) -> LiveParameters:
         """The present values, of the first object."""
-        data = self._scene.model.softmode
-        values = {name: float(getattr(data, name).numpy()[0]) for name in _LIMITS if name != "scale"}
-        x, y, z = self._scene.model.gravity.numpy()[0].tolist()
-        return LiveParameters(**values, gravity=(x, y, z), handles=self._object(0).body.mode_count)
+        return live_parameters.present(self._scene)
 
     def set_parameters(
         self,
@@ -467,29 +411,18 @@ class LiveSession:
         Raises:
             ConfigError: If a value lies outside its range; nothing is changed then.
         """
-        given = {
-            "youngs_modulus": youngs_modulus,
-            "poissons_ratio": poissons_ratio,
-            "density": density,
-            "viscosity": viscosity,
-            "mass_damping": mass_damping,
-            "friction": friction,
-        }
-        chosen: dict[str, Any] = {}
-        for name, value in given.items():
-            if value is None:
-                continue
-            low, high = _LIMITS[name]
-            if not (isinstance(value, int | float | np.number) and low <= float(value) <= high):
-                raise ConfigError(f"{name} must lie in {low:g}..{high:g}, got {value!r}")
-            chosen[name] = float(value)
-        if gravity is not None:
-            numbers = vector3("gravity", (0.0, 0.0, -gravity) if np.ndim(gravity) == 0 else gravity)  # type: ignore[operator]
-            if np.linalg.norm(numbers) > GRAVITY_MAX:
-                raise ConfigError(f"gravity must be at most {GRAVITY_MAX:g} m/s^2, got {gravity!r}")
-            chosen["gravity"] = tuple(numbers.tolist())
-        self._given |= chosen
-        self._apply_parameters()
+        self._given |= live_parameters.checked(
+            gravity,
+            {
+                "youngs_modulus": youngs_modulus,
+                "poissons_ratio": poissons_ratio,
+                "density": density,
+                "viscosity": viscosity,
+                "mass_damping": mass_damping,
+                "friction": friction,
+            },
+        )
+        live_parameters.apply(self._scene, self._given)
 
     def set_handles(self, count: int) -> None:
         """Give the object another number of skinning eigenmodes: builds it anew, or takes it from the cache.
@@ -508,7 +441,7 @@ class LiveSession:
             return
         self.end_drag()
         q, qd = self._coordinates("q"), self._coordinates("qd")
-        kept = [(scene.grips[0].held[grip], *scene.grips[0].pose(grip)) for _, grip in self._pins.values()]
+        kept = self._hands.kept()
         elapsed, clock = self._time, self._clock
         made = self._make(source)  # a build that fails leaves all as it was
         scene.close()
@@ -522,7 +455,7 @@ class LiveSession:
         if not isinstance(made, EnvScene):
             self._carry_over(old, q, qd)
             self._time = elapsed
-        self._apply_parameters()
+        live_parameters.apply(self._scene, self._given)
 
     # -- recording ----------------------------------------------------------------------------------------------------
 
@@ -547,7 +480,8 @@ class LiveSession:
         if suffix == ".npz":
             self._recorder = CoordinateRecorder(file, [thing.body for thing in self._scene.objects])
         elif suffix == ".mp4":
-            self._recorder = FilmRecorder(file, self._scene.model, self._picture, self._camera(position, target, edge))
+            camera = live_camera(self._scene.cameras, self.bounds(), position, target, edge)
+            self._recorder = FilmRecorder(file, self._scene.model, self._picture, camera)
         else:
             raise ConfigError(f"recording {file} is no .mp4 or .npz file", hint="name it like out/poke.mp4")
         self._record_from = self._clock
@@ -606,7 +540,7 @@ class LiveSession:
         self._bits, taken = 0, 0
         self._reduced.status.zero_()
         for _ in range(count):
-            if scene.over(busy=self._drag is not None or bool(self._pins)):
+            if scene.over(busy=self._hands.busy):
                 self.reset()
                 continue
             clock = time.perf_counter()
@@ -617,7 +551,7 @@ class LiveSession:
             taken += 1
             self._time += scene.block_dt
             self._clock += scene.block_dt
-            self._stale = self._moved = True
+            self._stale = self._hands.moved = True
             self._record()
         return taken * scene.block_dt
 
@@ -633,44 +567,6 @@ class LiveSession:
         if recorder is not None and self._clock - self._record_from >= recorder.count / RECORD_HZ - 1e-9:
             self._show()
             recorder.add(self._clock - self._record_from, self._scene.state)
-
-    def _camera(self, position: ArrayLike | None, target: ArrayLike | None, edge: int) -> PinholeCamera:
-        """Return a camera, by default one that sees all."""
-        if not isinstance(edge, int | np.integer) or not 64 <= edge <= 1024:
-            raise ConfigError(f"edge must be a whole number in 64..1024 px, got {edge!r}")
-        edge -= edge % 8  # what encoders like
-        known = self._scene.cameras
-        if known and position is None and target is None:
-            shown = known[-1]
-            x, y = edge / shown.width, edge / shown.height
-            lens = {"fx": x * shown.fx, "fy": y * shown.fy, "cx": x * shown.cx, "cy": y * shown.cy}
-            return replace(shown, name="live", width=edge, height=edge, **lens)
-        low, high = self.bounds()
-        middle, reach = 0.5 * (low + high), float(np.linalg.norm(high - low))
-        eye = middle + reach * np.array([0.9, -1.3, 0.5]) if position is None else vector3("position", position)
-        at = middle if target is None else vector3("target", target)
-        x, y, z = eye.tolist()
-        u, v, w = at.tolist()
-        return PinholeCamera.look_at("live", position=(x, y, z), target=(u, v, w), width=edge, height=edge, fov_y=0.7)
-
-    def _apply_parameters(self) -> None:
-        """Write what was given into the model."""
-        scene, given = self._scene, self._given
-        data = scene.model.softmode
-        arrays = {
-            name: wp.full(data.friction.shape, given[name], dtype=float, device=scene.model.device)
-            for name in _MATERIAL
-            if name in given
-        }
-        if arrays:
-            set_parameters(scene.solver, **arrays)
-        for name in ("viscosity", "mass_damping"):
-            if name in given:
-                getattr(data, name).fill_(given[name])
-        if "gravity" in given:
-            scene.model.set_gravity(given["gravity"])
-            if scene.solver is not self._reduced:
-                scene.solver.rigid.notify_model_changed(newton.ModelFlags.MODEL_PROPERTIES)
 
     def _carry_over(self, old: ReducedBody, q: NDArray[np.float64], qd: NDArray[np.float64]) -> None:
         """Give the object the positions and velocities that it had with another basis, by least squares."""
@@ -696,41 +592,3 @@ class LiveSession:
         if not 0 <= index < len(objects):
             raise ConfigError(f"object_index must lie in 0..{len(objects) - 1}, got {index}")
         return objects[index]
-
-    def _grips(self, index: int) -> Grips:
-        self._object(index)
-        return self._scene.grips[index]
-
-    def _pin(self, pin: int) -> tuple[int, int]:
-        if pin not in self._pins:
-            raise ConfigError(f"there is no pin {pin}", hint=f"there are {sorted(self._pins)}")
-        return self._pins[pin]
-
-    def _add_pin(self, index: int, grip: int) -> int:
-        number = self._next_pin
-        self._next_pin += 1
-        self._pins[number] = (index, grip)
-        return number
-
-    def _let_go(self) -> None:
-        """Let go of everything."""
-        for grips in self._scene.grips:
-            grips.let_go_all()
-        self._pins.clear()
-        self._drag = None
-
-
-def unit_quaternion(wxyz: ArrayLike) -> list[float]:
-    """Return a quaternion of length one.
-
-    Raises:
-        ConfigError: If it is not four finite numbers, or all are zero.
-    """
-    try:
-        numbers = np.array(wxyz, dtype=np.float64)
-    except (TypeError, ValueError):
-        numbers = np.zeros(0)
-    length = float(np.linalg.norm(numbers)) if numbers.shape == (4,) else 0.0
-    if not (np.isfinite(length) and length > 1e-9):
-        raise ConfigError(f"wxyz must be four finite numbers, not all zero, got {wxyz!r}")
-    return (numbers / length).tolist()

@@ -1,0 +1,175 @@
+"""What a person holds in a live session: the drag and the pins."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from softmode.deformables.grips import Grip, Grips
+from softmode.deformables.rkpm import sample_farthest
+from softmode.errors import ConfigError
+from softmode.view.live_scenes import LiveScene
+from softmode.view.live_types import DragView, Hit, LiveOptions, PinView, vector3
+
+PIN_RADIUS = 0.1
+"""How far a pinned region reaches if nothing is said, as a fraction of the object's size."""
+
+
+class Hands:
+    """The drag and the pins, as grips of the objects of a scene; see `LiveSession` for what the methods do.
+
+    Args:
+        options: How the session runs.
+    """
+
+    def __init__(self, options: LiveOptions) -> None:
+        """Hold nothing."""
+        self._options, self._next = options, 1
+        self._pins: dict[int, tuple[int, int]] = {}
+        self._drag: tuple[int, int, NDArray[np.float64]] | None = None
+        self.moved = False
+        """Whether a step has been taken since the drag began."""
+
+    def take_up(self, scene: LiveScene) -> None:
+        """Start over with a scene; what it holds by itself is a pin."""
+        self._scene, self._drag = scene, None
+        self._pins.clear()
+        for index, grips in enumerate(scene.grips):
+            for grip in grips.held:
+                self._add(index, grip)
+        self._held_at_start = len(self._pins)
+
+    @property
+    def busy(self) -> bool:
+        """Whether anything is held."""
+        return self._drag is not None or bool(self._pins)
+
+    def let_go(self) -> None:
+        """Let go of everything."""
+        for grips in self._scene.grips:
+            grips.let_go_all()
+        self._pins.clear()
+        self._drag = None
+
+    def kept(self) -> list[tuple[Grip, Any, Any]]:
+        """Return the pins of the first object with position and rotation, to be held on another build of it."""
+        grips = self._scene.grips[0]
+        return [(grips.held[grip], *grips.pose(grip)) for index, grip in self._pins.values() if index == 0]
+
+    # -- the drag -----------------------------------------------------------------------------------------------------
+
+    def begin_drag(self, hit: Hit) -> None:
+        """Pull a point."""
+        self.end_drag()
+        grips = self._grips(hit.object_index)
+        grip = grips.take(hit.rest_point[None], self._scene.state, pulls=True)
+        self._drag = (hit.object_index, grip, hit.point - grips.pose(grip)[0])
+        self.moved = False
+
+    def drag_to(self, point: ArrayLike) -> None:
+        """Pull to a point."""
+        if self._drag is None:
+            raise ConfigError("nothing is dragged", hint="call begin_drag with a hit of pick")
+        index, grip, offset = self._drag
+        self._grips(index).aim(grip, vector3("point", point) - offset)
+
+    def end_drag(self) -> None:
+        """Stop pulling."""
+        if self._drag is not None:
+            self._grips(self._drag[0]).let_go(self._drag[1])
+            self._drag = None
+
+    def drag(self) -> DragView | None:
+        """Return the drag."""
+        if self._drag is None:
+            return None
+        index, grip, offset = self._drag
+        grips = self._grips(index)
+        return DragView(
+            point=grips.points(grip, self._scene.state)[0] + offset,
+            target=grips.pose(grip, goal=True)[0] + offset,
+            force=grips.force(grip) if self.moved else np.zeros(3),
+        )
+
+    # -- pins ---------------------------------------------------------------------------------------------------------
+
+    def pin(self, hit: Hit, radius: float | None) -> int:
+        """Hold the region around a point."""
+        grips = self._grips(hit.object_index)
+        body = grips.body
+        reach = PIN_RADIUS * float(np.linalg.norm(np.ptp(body.bounds, axis=0))) if radius is None else radius
+        if not (isinstance(reach, int | float) and math.isfinite(reach) and reach > 0.0):
+            raise ConfigError(f"radius must be a finite length > 0 [m], got {radius!r}")
+        if len(self._pins) >= self._options.pin_max + self._held_at_start:
+            raise ConfigError(f"there are {len(self._pins)} pins already", hint="let go of one first")
+        X = np.concatenate([body.surface_points, body.points])
+        distance = np.linalg.norm(X - hit.rest_point, axis=1)
+        inside = np.argsort(distance)[: max(int((distance <= reach).sum()), 4)]
+        spread = sample_farthest(X[inside], self._options.pin_points, first=0)
+        return self._add(hit.object_index, grips.take(X[inside][spread], self._scene.state))
+
+    def move_pin(self, pin: int, position: ArrayLike, wxyz: ArrayLike | None) -> None:
+        """Move and turn a pinned region."""
+        index, grip = self._pin(pin)
+        turn = None
+        if wxyz is not None:
+            w, x, y, z = unit_quaternion(wxyz)
+            turn = (x, y, z, w)
+        self._grips(index).aim(grip, vector3("position", position), turn)
+
+    def unpin(self, pin: int) -> None:
+        """Let a region go."""
+        index, grip = self._pin(pin)
+        self._grips(index).let_go(grip)
+        del self._pins[pin]
+
+    def pins(self) -> dict[int, PinView]:
+        """Return the pins."""
+        found = {}
+        for number, (index, grip) in self._pins.items():
+            grips = self._grips(index)
+            position, (x, y, z, w) = grips.pose(grip)
+            points = grips.points(grip, self._scene.state)
+            error = float(np.linalg.norm(points - grips.targets(grip), axis=1).max())
+            found[number] = PinView(
+                position=position, wxyz=np.array([w, x, y, z]), points=points, error=error, object_index=index
+            )
+        return found
+
+    # -- inside -------------------------------------------------------------------------------------------------------
+
+    def _grips(self, index: int) -> Grips:
+        count = len(self._scene.grips)
+        if not 0 <= index < count:
+            raise ConfigError(f"object_index must lie in 0..{count - 1}, got {index}")
+        return self._scene.grips[index]
+
+    def _pin(self, pin: int) -> tuple[int, int]:
+        if pin not in self._pins:
+            raise ConfigError(f"there is no pin {pin}", hint=f"there are {sorted(self._pins)}")
+        return self._pins[pin]
+
+    def _add(self, index: int, grip: int) -> int:
+        number = self._next
+        self._next += 1
+        self._pins[number] = (index, grip)
+        return number
+
+
+def unit_quaternion(wxyz: ArrayLike) -> list[float]:
+    """Return a quaternion of length one.
+
+    Raises:
+        ConfigError: If it is not four finite numbers, or all are zero.
+    """
+    try:
+        numbers = np.array(wxyz, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    length = float(np.linalg.norm(numbers)) if numbers.shape == (4,) else 0.0
+    if not (np.isfinite(length) and length > 1e-9):
+        raise ConfigError(f"wxyz must be four finite numbers, not all zero, got {wxyz!r}")
+    return (numbers / length).tolist()

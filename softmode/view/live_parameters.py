@@ -1,0 +1,69 @@
+"""Parameters of a live scene: checked, written into the model while it runs, read back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
+
+from softmode.deformables.parameters import PARAMETER_LIMITS, set_parameters
+from softmode.errors import ConfigError
+from softmode.view.live_scenes import LiveScene
+from softmode.view.live_types import LiveParameters, vector3
+
+LIMITS = {name: PARAMETER_LIMITS[name] for name in ("youngs_modulus", "poissons_ratio", "density", "friction")}
+"""Closed ranges of the parameters that other quantities follow, and"""
+DAMPING_LIMITS = {"viscosity": (0.0, 10.0), "mass_damping": (0.0, 1.0e4)}
+"""of those that every step reads anew."""
+GRAVITY_MAX = 1000.0
+"""Largest gravity [m/s^2]."""
+
+
+def checked(gravity: float | ArrayLike | None, values: dict[str, float | None]) -> dict[str, Any]:
+    """Return the values that are given, gravity as a vector.
+
+    Raises:
+        ConfigError: If one lies outside its range.
+    """
+    limits, chosen = LIMITS | DAMPING_LIMITS, {}
+    for name, value in values.items():
+        if value is None:
+            continue
+        low, high = limits[name]
+        if not (isinstance(value, int | float | np.number) and low <= float(value) <= high):
+            raise ConfigError(f"{name} must lie in {low:g}..{high:g}, got {value!r}")
+        chosen[name] = float(value)
+    if gravity is not None:
+        downwards = isinstance(gravity, int | float | np.number)
+        vector = vector3("gravity", (0.0, 0.0, -float(gravity)) if downwards else gravity)  # type: ignore[arg-type]
+        if np.linalg.norm(vector) > GRAVITY_MAX:
+            raise ConfigError(f"gravity must be at most {GRAVITY_MAX:g} m/s^2, got {gravity!r}")
+        chosen["gravity"] = tuple((vector + 0.0).tolist())
+    return chosen
+
+
+def apply(scene: LiveScene, given: dict[str, Any]) -> None:
+    """Write what was given into the model, for all objects; the captured steps follow."""
+    data, device = scene.model.softmode, scene.model.device
+    shape = data.friction.shape
+    arrays = {name: wp.full(shape, given[name], dtype=float, device=device) for name in LIMITS if name in given}
+    if arrays:
+        set_parameters(scene.solver, **arrays)
+    for name in DAMPING_LIMITS:
+        if name in given:
+            getattr(data, name).fill_(given[name])
+    if "gravity" in given:
+        scene.model.set_gravity(given["gravity"])
+        if hasattr(scene.solver, "reduced"):  # a coupled solver, whose MuJoCo keeps its own
+            scene.solver.rigid.notify_model_changed(newton.ModelFlags.MODEL_PROPERTIES)
+
+
+def present(scene: LiveScene) -> LiveParameters:
+    """Return the values of the first object."""
+    data = scene.model.softmode
+    values = {name: float(getattr(data, name).numpy()[0]) for name in LIMITS | DAMPING_LIMITS}
+    x, y, z = (scene.model.gravity.numpy()[0] + 0.0).tolist()
+    return LiveParameters(**values, gravity=(x, y, z), handles=scene.objects[0].body.mode_count)
