@@ -36,7 +36,7 @@ class GripOptions:
     pull_rate: float = 250.0
     """It is no stiffer than the mass times the square of this [1/s],"""
     pull_sag: float = 0.05
-    """but stiff enough to carry the weight at this fraction of the body's size. Its damping is critical for the mass."""
+    """but stiff enough to carry the weight at this fraction of the size. Its damping is critical for the mass."""
     pull_force: float = 0.3
     """Largest force of a pull, over E times the size squared; the weight over `pull_sag` comes on top."""
     hold_stiffness: float = 20.0

@@ -37,8 +37,8 @@ class LiveOptions:
         """Check the ranges."""
         if not 1.0e-4 <= self.substep <= 0.05:
             raise ConfigError(f"substep must lie in 1e-4..0.05 s, got {self.substep!r}")
-        if not 0.01 <= self.budget <= 10.0:
-            raise ConfigError(f"budget must lie in 0.01..10, got {self.budget!r}")
+        if not 0.001 <= self.budget <= 1.0e6:
+            raise ConfigError(f"budget must lie in 0.001..1e6, got {self.budget!r}")
         if not 0 <= self.pin_max <= 64:
             raise ConfigError(f"pin_max must lie in 0..64, got {self.pin_max!r}")
         if not 4 <= self.pin_points <= 64:

@@ -53,11 +53,11 @@ class GripScene(Scene):
 
 @pytest.mark.parametrize("coupled", [False, True])
 def test_a_pull_adds_its_force_times_dt_to_the_momentum(coupled):
-    """dp = dt (f + m g) of a free body that is pulled at a point: to 2e-6 of dt |f|, the rounding of float32 rows."""
+    """A momentum changes by dt (f + m g), a free body pulled at a point: to 2e-6 of dt |f|, the rounding of float32 rows."""
     scene = GripScene(coupled=coupled, gravity=DOWN, options=TIGHT)
     grips = scene.grips[0]
     number = grips.take(cube().surface_points[3:4], scene.state, pulls=True)
-    grips.aim(number, grips.pose(number)[0] + [0.03, -0.02, 0.05])
+    grips.aim(number, grips.pose(number)[0] + np.array([0.03, -0.02, 0.05]))
     weight = scene.mass() * np.array(DOWN)
     for _ in range(20):
         before = scene.momentum()[0]
@@ -75,7 +75,7 @@ def test_a_pull_is_a_spring_and_moves_what_a_constant_force_does():
     grips.take(scene.points(-1, 12), scene.state)
     pull = grips.take(cube().surface_points[sample : sample + 1], scene.state, pulls=True)
     start = grips.points(pull, scene.state)[0]
-    goal = start + [0.01, 0.0, 0.005]
+    goal = start + np.array([0.01, 0.0, 0.005])
     grips.aim(pull, goal)
     scene.step(250)
     force, moved = grips.force(pull), grips.points(pull, scene.state)[0]
@@ -117,17 +117,19 @@ def test_a_hold_moves_and_turns_what_it_holds():
     before, centre = grips.points(number, scene.state), grips.pose(number)[0]
     start = scene.centre()
     half = np.sqrt(0.5)
-    grips.aim(number, centre + [0.0, 0.1, 0.0], (0.0, 0.0, half, half))
+    grips.aim(number, centre + np.array([0.0, 0.1, 0.0]), (0.0, 0.0, half, half))
     grips.begin_frame(100)
     scene.step(50)
-    np.testing.assert_allclose(grips.pose(number)[0], centre + [0.0, 0.05, 0.0], atol=1e-12)
+    np.testing.assert_allclose(grips.pose(number)[0], centre + np.array([0.0, 0.05, 0.0]), atol=1e-12)
     scene.step(450)
     turn = rotation((0, 0, 1), np.pi / 2)
-    expected = centre + [0.0, 0.1, 0.0] + (before - centre) @ turn.T
+    expected = centre + np.array([0.0, 0.1, 0.0]) + (before - centre) @ turn.T
     np.testing.assert_allclose(grips.targets(number), expected, atol=1e-12)
     size = np.sqrt(3.0) * EDGE
     np.testing.assert_allclose(grips.points(number, scene.state), expected, atol=1e-3 * size)
-    np.testing.assert_allclose(scene.centre(), centre + [0.0, 0.1, 0.0] + turn @ (start - centre), atol=1e-2 * size)
+    np.testing.assert_allclose(
+        scene.centre(), centre + np.array([0.0, 0.1, 0.0]) + turn @ (start - centre), atol=1e-2 * size
+    )
 
 
 def test_let_go_leaves_nothing_behind():
@@ -180,11 +182,11 @@ def test_a_captured_step_takes_grips_up(integrator):
         run()
         hold = grips.take(scene.points(1), scene.state)
         grips.begin_frame(6)
-        grips.aim(hold, grips.pose(hold)[0] + [0.01, 0.0, 0.0])
+        grips.aim(hold, grips.pose(hold)[0] + np.array([0.01, 0.0, 0.0]))
         for _ in range(4):
             run()
         pull = grips.take(scene.points(-1, 1), scene.state, pulls=True)
-        grips.aim(pull, grips.pose(pull)[0] + [0.0, 0.02, 0.0])
+        grips.aim(pull, grips.pose(pull)[0] + np.array([0.0, 0.02, 0.0]))
         grips.let_go(hold)
         for _ in range(4):
             run()
