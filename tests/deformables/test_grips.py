@@ -53,7 +53,7 @@ class GripScene(Scene):
 
 @pytest.mark.parametrize("coupled", [False, True])
 def test_a_pull_adds_its_force_times_dt_to_the_momentum(coupled):
-    """A momentum changes by dt (f + m g), a free body pulled at a point: to 2e-6 of dt |f|, the rounding of float32 rows."""
+    """A free body pulled at a point gains dt (f + m g): to 2e-6 of dt |f|, the rounding of float32 rows."""
     scene = GripScene(coupled=coupled, gravity=DOWN, options=TIGHT)
     grips = scene.grips[0]
     number = grips.take(cube().surface_points[3:4], scene.state, pulls=True)
