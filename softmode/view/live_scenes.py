@@ -227,6 +227,7 @@ class EnvScene:
         import gymnasium as gym
 
         from softmode.envs.catalogue import config_class
+        from softmode.learning.config_values import config_of
 
         kind = config_class(name)
         if config is not None and not isinstance(config, kind):
@@ -236,9 +237,8 @@ class EnvScene:
         check_policy(policy)
         trained = None if policy in POLICIES else trained_policy(policy, name)
         given = dict(trained.env_options) if trained else {}
-        base = config or kind()
-        if isinstance(given.get("config"), dict):
-            base = replace(base, **given.pop("config")) if config is None else base
+        learnt = config_of(kind, given.pop("config", {}))
+        base = learnt if config is None else config
         given_scene = replace(base.scene, grip_slots=grip_slots(options), grip_options=strength_of(options))
         if source is not None and source.config is not None:
             given_scene = replace(given_scene, object=source.config)
@@ -290,6 +290,8 @@ class EnvScene:
 
     def marker_place(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the centres of the goal's marker and its pose."""
+        if self.marker is None:
+            return np.zeros((0, 3)), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
         points, place = self._scene.marker_points, self._scene.marker_place
         return points.numpy()[0].astype(np.float64), place.numpy()[0].astype(np.float64)
 
