@@ -8,6 +8,7 @@ import pytest
 import warp as wp
 
 from softmode.deformables.attachments import attach
+from softmode.deformables.grips import Grips, add_grip_slots
 from softmode.deformables.materials import Material
 from softmode.deformables.sensing import ContactSensor, SurfacePressure
 from softmode.deformables.solver_reduced import SolverReduced, add_reduced_body, register_custom_attributes
@@ -81,6 +82,48 @@ def test_cuda_worlds_are_alike(kind):
     """256 replicas that start alike stay alike to the bit: no world sees another, no sum has a free order."""
     worlds = drop("cuda:0", kind, 256)
     np.testing.assert_array_equal(worlds, np.broadcast_to(worlds[:1], worlds.shape))
+
+
+def grip(device: str) -> np.ndarray:
+    """Hold a cube by its top, pull it by a corner, move the hold, let go of the pull; return the particles."""
+    world = newton.ModelBuilder()
+    instance = add_reduced_body(
+        world, cube(), material=Material(youngs_modulus=1.0e5, viscosity=0.01), position=(0.0, 0.0, 1.0)
+    )
+    add_grip_slots(world, instance, 7)
+    model = world.finalize(device=device)
+    solver = SolverReduced(model, [cube()])
+    grips = Grips(solver, instance, slot_count=7)
+    first, second, control = model.state(), model.state(), model.control()
+
+    def two_steps() -> None:
+        for start, end in ((first, second), (second, first)):
+            grips.apply(start, control, DT)
+            solver.step(start, end, control, None, DT)
+
+    two_steps()
+    with wp.ScopedCapture(device=device) as capture:
+        two_steps()
+    solver.reset(first)
+    order = np.argsort(-cube().surface_points[:, 2])
+    hold = grips.take(cube().surface_points[order[:6]], first)
+    pull = grips.take(cube().surface_points[order[-1:]], first, pulls=True)
+    grips.aim(pull, grips.pose(pull)[0] + np.array([0.02, 0.0, 0.0]))
+    grips.aim(hold, grips.pose(hold)[0] + np.array([0.0, 0.01, 0.0]), (0.0, 0.0, 0.6, 0.8))
+    grips.begin_frame(40)
+    for k in range(50):
+        wp.capture_launch(capture.graph)
+        if k == 30:
+            grips.let_go(pull)
+    assert not solver.status.numpy().any()
+    return first.particle_q.numpy()
+
+
+def test_cuda_grips():
+    """Parts that are gripped, moved and let go between launches of a graph are where they are on the CPU."""
+    moved = grip("cpu")
+    assert np.abs(moved[:, 1].mean()) > 5e-3
+    np.testing.assert_allclose(grip("cuda:0"), moved, atol=1e-4 * 0.1)
 
 
 def weigh(device: str) -> tuple[np.ndarray, np.ndarray]:

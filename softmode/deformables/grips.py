@@ -95,7 +95,7 @@ class Grips:
         options: How stiff they are.
 
     Raises:
-        ConfigError: If the instance has not so many pins.
+        ConfigError: If the last pins of the instance are not that many slots.
     """
 
     def __init__(
@@ -120,6 +120,8 @@ class Grips:
         self.first_slot = pins - slot_count
         self.body: ReducedBody = layout.bodies[layout.asset[instance]]
         self._pin = int(instances.pin_start.numpy()[instance]) + self.first_slot
+        if reduced.parameters.pin_stiffness.numpy()[self._pin : self._pin + slot_count].any():
+            raise ConfigError("the last pins of the instance are no slots", hint="add slots after its other pins")
         device: Any = reduced.model.device
         self.strength: Any = kernels.GripStrength()
         for name, value in vars(options or GripOptions()).items():

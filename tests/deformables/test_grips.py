@@ -1,5 +1,6 @@
 """Grips: momentum, statics against a constant force, release, rotation, other worlds, captured graphs, errors."""
 
+import newton
 import numpy as np
 import pytest
 import warp as wp
@@ -7,7 +8,7 @@ import warp as wp
 from softmode.deformables.grips import Grips, add_grip_slots
 from softmode.deformables.materials import Material
 from softmode.deformables.parameters import set_parameters
-from softmode.deformables.solver_reduced import SolverReducedOptions, add_reduced_body
+from softmode.deformables.solver_reduced import SolverReduced, SolverReducedOptions, add_pins, add_reduced_body
 from softmode.errors import ConfigError
 from tests.scenes import GRAVITY, Scene, add_free_box, cube, rotation
 
@@ -223,5 +224,11 @@ def test_errors():
         with pytest.raises(ConfigError, match="there is no grip 3"):
             call(3)
     assert not grips.held
+    world = newton.ModelBuilder()
+    instance = add_reduced_body(world, cube())
+    add_grip_slots(world, instance, 2)
+    add_pins(world, instance, cube().surface_points[:1], stiffness=1.0)
+    with pytest.raises(ConfigError, match="no slots"):
+        Grips(SolverReduced(world.finalize(device="cpu"), [cube()]), instance, slot_count=2)
     with pytest.raises(ConfigError, match="has 0 pins, not 9 slots"):
         Grips(GripScene(slots=0).solver, 0, slot_count=9)
