@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softmode.atomic import atomic_write
+from softmode.atomic import PendingFile
 from softmode.errors import AssetError, ConfigError
 from softmode.film import Film
 from softmode.splats.camera import CameraOptions, PinholeCamera, SplatCamera
@@ -80,9 +80,8 @@ class CoordinateRecorder:
     """Keeps coordinates and poses in memory and writes them at the end."""
 
     def __init__(self, path: Path, bodies: list[Any]) -> None:
-        """Check that the file can be written."""
-        if path.is_dir() or not path.absolute().parent.is_dir():
-            raise ConfigError(f"recording {path} cannot be written", hint="name a file in a folder that exists")
+        """Claim the file."""
+        self._pending = PendingFile(path, "recording")
         self.path, self.count = path, 0
         self._prints = [body.fingerprint for body in bodies]
         self._frames: list[tuple[float, Any, Any]] = []
@@ -96,7 +95,7 @@ class CoordinateRecorder:
     def finish(self) -> None:
         """Write the file."""
         times, q, poses = (np.array(column) for column in zip(*self._frames, strict=True))
-        with atomic_write(self.path) as file:
+        with self._pending.temporary.open("wb") as file:
             np.savez_compressed(
                 file,
                 format=np.array(_FORMAT),
@@ -105,10 +104,12 @@ class CoordinateRecorder:
                 body_q=poses.astype(np.float32).reshape(len(times), -1, 7),
                 fingerprints=np.array(self._prints),
             )
+        self._pending.publish()
 
     def discard(self) -> None:
-        """Forget the frames."""
+        """Forget the frames and remove what was not published."""
         self._frames.clear()
+        self._pending.discard()
 
 
 class FilmRecorder:

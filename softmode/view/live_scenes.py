@@ -15,14 +15,13 @@ from softmode.deformables.grips import GripOptions, Grips, add_grip_slots
 from softmode.deformables.materials import Material
 from softmode.deformables.rkpm import sample_farthest
 from softmode.deformables.solver_reduced import SolverReduced, add_reduced_body
-from softmode.envs.objects import SoftObject
+from softmode.envs.objects import ObjectConfig, SoftObject
 from softmode.envs.task import Task
 from softmode.errors import ConfigError
 from softmode.policies import POLICIES, check_policy, policy_factory, trained_policy
 from softmode.splats import Splats
 from softmode.splats.pinhole import PinholeCamera
 from softmode.view.live_types import HoldName, LiveOptions, SceneName
-from softmode.view.sources import ObjectSource
 
 BLOCK_STEPS = 2
 """Physics steps of a block of an object without an environment; even, there and back between two states."""
@@ -59,8 +58,8 @@ class LiveScene(Protocol):
     """Episodes begun."""
 
     @property
-    def source(self) -> ObjectSource:
-        """Where the first object comes from."""
+    def source(self) -> ObjectConfig:
+        """What the first object is."""
         ...
 
     def over(self, *, busy: bool) -> bool:
@@ -98,7 +97,7 @@ class ObjectScene:
     """One object, held by a part of it or above a table.
 
     Args:
-        source: Where the object comes from.
+        source: What the object is.
         thing: The object.
         scene: "hang" or "drop".
         hold: Which end a hanging object is held by.
@@ -112,7 +111,7 @@ class ObjectScene:
 
     def __init__(
         self,
-        source: ObjectSource,
+        source: ObjectConfig,
         thing: SoftObject,
         scene: SceneName,
         hold: HoldName,
@@ -221,7 +220,7 @@ class EnvScene:
         options: LiveOptions,
         device: Any,
         progress: Any,
-        source: ObjectSource | None = None,
+        source: ObjectConfig | None = None,
     ) -> None:
         """Make the environment with slots for grips and begin an episode."""
         import gymnasium as gym
@@ -240,8 +239,8 @@ class EnvScene:
         learnt = config_of(kind, given.pop("config", {}))
         base = learnt if config is None else config
         given_scene = replace(base.scene, grip_slots=grip_slots(options), grip_options=strength_of(options))
-        if source is not None and source.config is not None:
-            given_scene = replace(given_scene, object=source.config)
+        if source is not None:
+            given_scene = replace(given_scene, object=source)
         base = replace(base, scene=given_scene)
         # with cameras, so that the goal's marker is kept up to date
         given |= {"config": base, "device": device, "progress": progress, "render_mode": "rgb_array"}
@@ -264,9 +263,9 @@ class EnvScene:
         return self._scene.state
 
     @property
-    def source(self) -> ObjectSource:
-        """Where the first object comes from."""
-        return ObjectSource(config=self.config.scene.object)
+    def source(self) -> ObjectConfig:
+        """What the first object is."""
+        return self.config.scene.object
 
     def over(self, *, busy: bool) -> bool:
         """Return whether the episode has ended; its time limit waits while a person is busy, a failure does not."""

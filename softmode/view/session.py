@@ -19,7 +19,7 @@ from softmode.deformables.body import ReducedBody
 from softmode.deformables.energies import SoftEnergies
 from softmode.deformables.materials import Material
 from softmode.deformables.status import status_reasons
-from softmode.envs.objects import ObjectConfig, SoftObject
+from softmode.envs.objects import ObjectConfig, SoftObject, load_object
 from softmode.errors import ConfigError
 from softmode.view import live_parameters
 from softmode.view.hands import Hands
@@ -46,7 +46,7 @@ from softmode.view.live_types import (
     vector3,
 )
 from softmode.view.picture import LivePicture
-from softmode.view.sources import ObjectSource
+from softmode.view.sources import object_config, with_handles
 
 RATE_WINDOW = 1.0
 """Time over which the real-time factor is taken [s]."""
@@ -60,7 +60,7 @@ class LiveSession:
     """
 
     def __init__(
-        self, make: Callable[[ObjectSource | None], LiveScene], source: ObjectSource | None, options: LiveOptions
+        self, make: Callable[[ObjectConfig | None], LiveScene], source: ObjectConfig | None, options: LiveOptions
     ) -> None:
         """Make the scene; use `from_object` or `from_env`."""
         self.options = options
@@ -106,7 +106,7 @@ class LiveSession:
         """Make a session with one object.
 
         Args:
-            source: What it is: a configuration, the file of a splat, a mesh or a saved body (.npz), None for the
+            source: What it is: a configuration, the file of a splat, a mesh, a point cloud or a body, None for the
                 built-in plush.
             scene: "hang": held by one end, nothing around it. "drop": above a table.
             hold: Which end a hanging object is held by.
@@ -123,9 +123,9 @@ class LiveSession:
         chosen = options or LiveOptions()
         made = material or Material(youngs_modulus=1.0e5, density=250.0)
 
-        def make(origin: ObjectSource | None) -> LiveScene:
-            named = origin or ObjectSource.of(source, size)
-            return ObjectScene(named, named.load(progress), scene, hold, made, chosen, device)
+        def make(origin: ObjectConfig | None) -> LiveScene:
+            named = origin or object_config(source, size)
+            return ObjectScene(named, load_object(named, progress), scene, hold, made, chosen, device)
 
         return cls(make, None, chosen)
 
@@ -159,7 +159,7 @@ class LiveSession:
         """
         chosen = options or LiveOptions()
 
-        def make(origin: ObjectSource | None) -> LiveScene:
+        def make(origin: ObjectConfig | None) -> LiveScene:
             return EnvScene(name, policy, config, seed, chosen, device, progress, origin)
 
         return cls(make, None, chosen)
@@ -436,7 +436,7 @@ class LiveSession:
         if self._recorder is not None:
             raise ConfigError("a recording is being made", hint="stop it before the handles change")
         old, scene = self._object(0).body, self._scene
-        source = (self._source or scene.source).with_handles(count)
+        source = with_handles(self._source or scene.source, count)
         if count == old.mode_count:
             return
         self.end_drag()
