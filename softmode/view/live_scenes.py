@@ -22,6 +22,7 @@ from softmode.policies import POLICIES, check_policy, policy_factory, trained_po
 from softmode.splats import Splats
 from softmode.splats.pinhole import PinholeCamera
 from softmode.view.live_types import HoldName, LiveOptions, SceneName
+from softmode.view.sources import LoadedObject
 
 BLOCK_STEPS = 2
 """Physics steps of a block of an object without an environment; even, there and back between two states."""
@@ -58,8 +59,8 @@ class LiveScene(Protocol):
     """Episodes begun."""
 
     @property
-    def source(self) -> ObjectConfig:
-        """What the first object is."""
+    def source(self) -> ObjectConfig | None:
+        """What the first object is, None if that is not known."""
         ...
 
     def over(self, *, busy: bool) -> bool:
@@ -97,8 +98,7 @@ class ObjectScene:
     """One object, held by a part of it or above a table.
 
     Args:
-        source: What the object is.
-        thing: The object.
+        found: The object.
         scene: "hang" or "drop".
         hold: Which end a hanging object is held by.
         material: What it is made of.
@@ -111,8 +111,7 @@ class ObjectScene:
 
     def __init__(
         self,
-        source: ObjectConfig,
-        thing: SoftObject,
+        found: LoadedObject,
         scene: SceneName,
         hold: HoldName,
         material: Material,
@@ -123,7 +122,7 @@ class ObjectScene:
         for name, value, known in (("scene", scene, SceneName), ("hold", hold, HoldName)):
             if value not in get_args(known):
                 raise ConfigError(f"{name} is {value!r}", hint=f"use one of {', '.join(map(repr, get_args(known)))}")
-        self.source, self._pin_points = source, options.pin_points
+        thing, self.source, self._pin_points = found.thing, found.config, options.pin_points
         self.objects: tuple[SoftObject, ...] = (thing,)
         self._hold: HoldName | None = hold if scene == "hang" else None
         self.marker: Splats | None = None
@@ -135,14 +134,14 @@ class ObjectScene:
         builder, height = newton.ModelBuilder(), float(thing.body.bounds[1, 2] - thing.body.bounds[0, 2])
         if scene == "drop":
             table = newton.ModelBuilder.ShapeConfig(mu=TABLE_FRICTION, has_shape_collision=True)
-            half = 3.0 * float(np.ptp(thing.body.bounds, axis=0).max())
+            half = 3.0 * found.scale * float(np.ptp(thing.body.bounds, axis=0).max())
             place = wp.transform((0.0, 0.0, -0.1 * half), wp.quat_identity())
             color = (0.42, 0.48, 0.54)
             builder.add_shape_box(
                 -1, xform=place, hx=half, hy=half, hz=0.1 * half, cfg=table, color=color, label="table"
             )
-        position = (0.0, 0.0, thing.height + 0.6 * height)
-        instance = add_reduced_body(builder, thing.body, material=material, position=position)
+        position = (0.0, 0.0, found.scale * (thing.height + 0.6 * height))
+        instance = add_reduced_body(builder, thing.body, material=material, position=position, scale=found.scale)
         add_grip_slots(builder, instance, grip_slots(options))
         self.model: Any = builder.finalize(device=device)
         self.solver: Any = SolverReduced(self.model, [thing.body])
@@ -263,7 +262,7 @@ class EnvScene:
         return self._scene.state
 
     @property
-    def source(self) -> ObjectConfig:
+    def source(self) -> ObjectConfig | None:
         """What the first object is."""
         return self.config.scene.object
 

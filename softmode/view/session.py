@@ -19,7 +19,7 @@ from softmode.deformables.body import ReducedBody
 from softmode.deformables.energies import SoftEnergies
 from softmode.deformables.materials import Material
 from softmode.deformables.status import status_reasons
-from softmode.envs.objects import ObjectConfig, SoftObject, load_object
+from softmode.envs.objects import ObjectConfig, SoftObject
 from softmode.errors import ConfigError
 from softmode.view import live_parameters
 from softmode.view.hands import Hands
@@ -46,7 +46,7 @@ from softmode.view.live_types import (
     vector3,
 )
 from softmode.view.picture import LivePicture
-from softmode.view.sources import object_config, with_handles
+from softmode.view.sources import load_source, with_handles
 
 RATE_WINDOW = 1.0
 """Time over which the real-time factor is taken [s]."""
@@ -93,7 +93,7 @@ class LiveSession:
     @classmethod
     def from_object(
         cls,
-        source: ObjectConfig | str | Path | None = None,
+        source: ObjectConfig | SoftObject | str | Path | None = None,
         *,
         scene: SceneName = "hang",
         hold: HoldName = "top",
@@ -106,12 +106,12 @@ class LiveSession:
         """Make a session with one object.
 
         Args:
-            source: What it is: a configuration, the file of a splat, a mesh, a point cloud or a body, None for the
-                built-in plush.
+            source: What it is: a configuration, an object, the file of a splat, a mesh, a point cloud, a body or an
+                OpenUSD stage (its first deformable body, or its splats), None for the built-in plush.
             scene: "hang": held by one end, nothing around it. "drop": above a table.
             hold: Which end a hanging object is held by.
             size: Longest edge of the object [m]; None for the configuration's.
-            material: What it is made of.
+            material: What it is made of; None for what the file says, else 1e5 Pa and 250 kg/m^3.
             options: How the session runs.
             device: Warp device.
             progress: Reports the build of the object.
@@ -121,11 +121,11 @@ class LiveSession:
             AssetError: If the file cannot be used.
         """
         chosen = options or LiveOptions()
-        made = material or Material(youngs_modulus=1.0e5, density=250.0)
 
         def make(origin: ObjectConfig | None) -> LiveScene:
-            named = origin or object_config(source, size)
-            return ObjectScene(named, load_object(named, progress), scene, hold, made, chosen, device)
+            found = load_source(origin or source, None if origin else size, progress)
+            made = material or found.material or Material(youngs_modulus=1.0e5, density=250.0)
+            return ObjectScene(found, scene, hold, made, chosen, device)
 
         return cls(make, None, chosen)
 

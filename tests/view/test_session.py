@@ -25,6 +25,37 @@ PATIENT = LiveOptions(budget=1.0e6)
 SOFT = Material(youngs_modulus=3.0e4, density=300.0, viscosity=0.02)
 FRAME = 1.0 / 30.0
 
+STAGE = """#usda 1.0
+(
+    defaultPrim = "World"
+    metersPerUnit = 0.01
+    kilogramsPerUnit = 1
+    upAxis = "Z"
+)
+def Xform "World"
+{
+    def Mesh "Cube" (
+        prepend apiSchemas = ["PhysicsDeformableBodyAPI", "PhysicsVolumeDeformableSimAPI", "MaterialBindingAPI"]
+    )
+    {
+        int[] faceVertexCounts = [4, 4, 4, 4, 4, 4]
+        int[] faceVertexIndices = [0, 3, 2, 1, 4, 5, 6, 7, 0, 1, 5, 4, 1, 2, 6, 5, 2, 3, 7, 6, 3, 0, 4, 7]
+        point3f[] points = [(-5, -5, -5), (5, -5, -5), (5, 5, -5), (-5, 5, -5),
+            (-5, -5, 5), (5, -5, 5), (5, 5, 5), (-5, 5, 5)]
+        rel material:binding:physics = </World/Rubber>
+    }
+    def Material "Rubber" (
+        prepend apiSchemas = ["PhysicsVolumeDeformableMaterialAPI", "PhysicsMaterialAPI"]
+    )
+    {
+        float physics:youngsModulus = 500
+        float physics:poissonsRatio = 0.4
+        float physics:density = 0.00012
+    }
+}
+"""
+"""A cube of 10 cm in centimetres, E = 5e4 Pa, 120 kg/m^3."""
+
 
 def session(scene="hang", *, material=SOFT, options=PATIENT, **kw):
     """Return a session with a small box."""
@@ -463,8 +494,24 @@ def test_objects_come_from_files(tmp_path):
 
     trimesh.creation.box(EXTENTS).export(tmp_path / "box.stl")
     assert LiveSession.from_object(tmp_path / "box.stl").size > 0.0
-    with pytest.raises(AssetError, match="does not exist"):
+    with pytest.raises(AssetError, match="no such file"):
         LiveSession.from_object(tmp_path / "none.ply")
+
+
+def test_a_body_of_a_stage(tmp_path):
+    """A mesh that a stage declares deformable comes with the stage's material and units, and has no other handles."""
+    pytest.importorskip("pxr")
+    (tmp_path / "cube.usda").write_text(STAGE)
+    live = LiveSession.from_object(tmp_path / "cube.usda", options=PATIENT)
+    assert live.size == pytest.approx(np.sqrt(3.0) * 0.1, rel=1e-3)
+    assert live.parameters.youngs_modulus == pytest.approx(5.0e4, rel=1e-5)
+    assert live.parameters.density == pytest.approx(120.0, rel=1e-5)
+    settle(live, 30)
+    assert live.pins()[1].error < 0.01 * live.size
+    hit = side(live)
+    assert live.pick(live.centre() + np.array([0.0, -1.0, 0.0]), (0.0, 1.0, 0.0)).object_index == hit.object_index
+    with pytest.raises(ConfigError, match="cannot be given other handles"):
+        live.set_handles(3)
 
 
 def test_wrong_settings():
