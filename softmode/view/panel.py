@@ -1,0 +1,225 @@
+"""The panel of the page: what a person sets, and what the session tells."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from softmode.view.live_types import Energies, LiveStatus
+
+if TYPE_CHECKING:
+    import viser
+
+    from softmode.view.session import LiveSession
+
+Command = Callable[["LiveSession"], None]
+MouseMode = Literal["drag", "pin"]
+MODULUS_MARKS = ((3.0, "1 kPa"), (4.0, "10"), (5.0, "100"), (6.0, "1 MPa"), (7.0, "10"))
+PLOT_POINTS = 150
+
+
+class Panel:
+    """The controls beside the picture. What they ask for is put into a queue, by viser's threads.
+
+    Args:
+        server: Where they are shown.
+        session: Whose values they start with.
+        submit: Takes what shall be done with the session.
+        on_mode: Called with the mode of the mouse when it is chosen, in the thread that runs the session.
+        record_path: Names the next recording.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        session: LiveSession,
+        *,
+        submit: Callable[[Command], None],
+        on_mode: Callable[[MouseMode], None],
+        record_path: Callable[[], Path],
+    ) -> None:
+        """Build the controls."""
+        self._gui, self._submit, self._on_mode, self._record_path = server.gui, submit, on_mode, record_path
+        self.mouse_mode: MouseMode = "drag"
+        self._plot_data: deque[tuple[float, float, float, float]] = deque(maxlen=PLOT_POINTS)
+        server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+        self._add_time()
+        self._add_mouse()
+        self._add_material(session)
+        self._add_readouts()
+
+    def _add_time(self) -> None:
+        """Buttons that start, stop and record."""
+        gui = self._gui
+        buttons = gui.add_button_group("time", ("play", "pause", "step", "reset"))
+
+        @buttons.on_click
+        async def _(_: Any) -> None:
+            actions: dict[str, Command] = {
+                "play": lambda session: session.play(),
+                "pause": lambda session: session.pause(),
+                "step": lambda session: (session.pause(), session.step(), None)[-1],
+                "reset": lambda session: session.reset(),
+            }
+            self._submit(actions[str(buttons.value)])
+
+        self._record = gui.add_button("record", hint="Starts and stops an .mp4 of the scene")
+
+        @self._record.on_click
+        async def _(_: Any) -> None:
+            self._submit(self._toggle_recording)
+
+    def _toggle_recording(self, session: LiveSession) -> None:
+        """Start a recording, or write the one that is being made."""
+        if session.status().recording:
+            path = session.stop_recording()
+            self.tell(f"wrote {path}")
+        else:
+            path = self._record_path()
+            session.start_recording(path)
+            self.tell(f"recording {path}")
+
+    def _add_mouse(self) -> None:
+        """What the mouse does on the object, and the way back."""
+        gui = self._gui
+        mode = gui.add_dropdown(
+            "mouse", ("drag", "pin"), "drag", hint="drag: pull the object. pin: hold the region that is clicked"
+        )
+
+        @mode.on_update
+        async def _(_: Any) -> None:
+            chosen: MouseMode = "pin" if mode.value == "pin" else "drag"
+            self._submit(lambda session: self._set_mode(chosen))
+
+        unpin = gui.add_button_group("unpin", ("last", "all"))
+
+        @unpin.on_click
+        async def _(_: Any) -> None:
+            only_last = unpin.value == "last"
+            self._submit(lambda session: self._unpin(session, only_last))
+
+    def _set_mode(self, mode: MouseMode) -> None:
+        """Change what the mouse does."""
+        self.mouse_mode = mode
+        self._on_mode(mode)
+
+    @staticmethod
+    def _unpin(session: LiveSession, only_last: bool) -> None:
+        """Let pins go."""
+        for number in sorted(session.pins(), reverse=True)[: 1 if only_last else None]:
+            session.unpin(number)
+
+    def _add_material(self, session: LiveSession) -> None:
+        """Sliders, at the values that the session has."""
+        gui, now = self._gui, session.parameters
+        gravity = math.sqrt(sum(g * g for g in now.gravity))
+        with gui.add_folder("material"):
+            modulus = gui.add_slider(
+                "log10 E [Pa]", 3.0, 7.0, 0.05, _within(math.log10(now.youngs_modulus), 3.0, 7.0), marks=MODULUS_MARKS
+            )
+            self._slider(modulus, lambda s, v: s.set_parameters(youngs_modulus=10.0**v))
+            ratio = gui.add_slider("nu", 0.0, 0.49, 0.01, _within(now.poissons_ratio, 0.0, 0.49))
+            self._slider(ratio, lambda s, v: s.set_parameters(poissons_ratio=v))
+            density = gui.add_slider("density", 50.0, 3000.0, 10.0, _within(now.density, 50.0, 3000.0), hint="kg/m^3")
+            self._slider(density, lambda s, v: s.set_parameters(density=v))
+            viscosity = gui.add_slider(
+                "viscosity [ms]", 0.0, 50.0, 0.5, _within(1e3 * now.viscosity, 0.0, 50.0), hint="damps deformation"
+            )
+            self._slider(viscosity, lambda s, v: s.set_parameters(viscosity=1e-3 * v))
+            drag = gui.add_slider(
+                "air drag [1/s]", 0.0, 10.0, 0.1, _within(now.mass_damping, 0.0, 10.0), hint="damps all motion"
+            )
+            self._slider(drag, lambda s, v: s.set_parameters(mass_damping=v))
+            friction = gui.add_slider("friction", 0.0, 2.0, 0.05, _within(now.friction, 0.0, 2.0))
+            self._slider(friction, lambda s, v: s.set_parameters(friction=v))
+            pull = gui.add_slider("gravity", 0.0, 20.0, 0.01, _within(gravity, 0.0, 20.0), hint="m/s^2, downwards")
+            self._slider(pull, lambda s, v: s.set_parameters(gravity=v))
+        handles = gui.add_dropdown(
+            "handles",
+            _handle_choices(now.handles),
+            str(now.handles),
+            hint="skinning eigenmodes; another number builds the object anew",
+        )
+
+        @handles.on_update
+        async def _(_: Any) -> None:
+            count = int(handles.value)
+            self._submit(lambda session: session.set_handles(count))
+
+    def _slider(self, handle: Any, apply: Callable[[LiveSession, float], None]) -> None:
+        """Let a slider change the session."""
+
+        async def changed(_: Any) -> None:
+            value = float(handle.value)
+            self._submit(lambda session: apply(session, value))
+
+        handle.on_update(changed)
+
+    def _add_readouts(self) -> None:
+        """Text and a plot of energies."""
+        import viser
+
+        gui = self._gui
+        self._message = gui.add_markdown("")
+        self._text = gui.add_markdown("")
+        colors = ("#1f77b4", "#d62728", "#2ca02c")
+        self._plot = gui.add_uplot(
+            tuple(np.zeros(2) for _ in range(4)),
+            series=(
+                viser.uplot.Series(label="time"),
+                *(
+                    viser.uplot.Series(label=name, stroke=color, width=2)
+                    for name, color in zip(("kinetic", "elastic", "gravity"), colors, strict=True)
+                ),
+            ),
+            scales={"x": viser.uplot.Scale(time=False)},
+            title="energy [J]",
+            height=170,
+        )
+
+    def tell(self, message: str) -> None:
+        """Show a line of text above the readouts."""
+        self._message.content = message.replace("`", "'")
+
+    def update(self, status: LiveStatus, energies: Energies, frame_rate: float, clients: int) -> None:
+        """Show what the session tells."""
+        rows = [
+            ("time", f"{status.time:.2f} s, {'playing' if status.playing else 'paused'}"),
+            ("real time", f"{status.realtime_factor:.2f} x"),
+            ("pictures", f"{frame_rate:.0f} per second"),
+            ("physics step", f"{status.step_milliseconds:.2f} ms"),
+            ("solver", ", ".join(status.solver) or "converged"),
+            ("energy", f"{energies.kinetic:.2e} kinetic, {energies.elastic:.2e} elastic J"),
+        ]
+        if status.reward_terms:
+            rows += [("reward", ", ".join(f"{name} {value:.2f}" for name, value in status.reward_terms.items()))]
+            rows += [("episode", f"{status.episode}{', solved' if status.success else ''}")]
+        if clients > 1:
+            rows += [("viewers", str(clients))]
+        text = "| | |\n|---|---|\n" + "\n".join(f"| {name} | {value} |" for name, value in rows)
+        if text != self._text.content:
+            self._text.content = text
+        label = "stop recording" if status.recording else "record"
+        if self._record.label != label:
+            self._record.label = label
+        if self._plot_data and status.time < self._plot_data[-1][0]:
+            self._plot_data.clear()
+        if not self._plot_data or status.time > self._plot_data[-1][0]:
+            self._plot_data.append((status.time, energies.kinetic, energies.elastic, energies.gravitational))
+            if len(self._plot_data) > 1:
+                self._plot.data = tuple(np.array(column) for column in zip(*self._plot_data, strict=True))
+
+
+def _within(value: float, low: float, high: float) -> float:
+    """Return a value that a slider can show."""
+    return min(max(value, low), high)
+
+
+def _handle_choices(now: int) -> tuple[str, ...]:
+    """Return the counts on offer, the present one among them."""
+    return tuple(str(count) for count in sorted({2, 4, 8, 12, 16, 24, now}))
