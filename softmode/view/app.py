@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from unittest import mock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +57,16 @@ class ViewOptions:
     def is_local(self) -> bool:
         """Whether only this machine can reach it."""
         return self.host in LOOPBACK
+
+    def check(self) -> None:
+        """Make sure that a server can be started here.
+
+        Raises:
+            ConfigError: If the address or the port cannot be used.
+            MissingExtraError: If viser is not installed.
+        """
+        _viser()
+        _free_port(self.host, self.port)
 
 
 class ViewApp:
@@ -269,15 +278,22 @@ def _forward(wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
 
 
-def _serve(options: ViewOptions) -> viser.ViserServer:
-    """Start viser's server where it was told to be, and nowhere else."""
+def _viser() -> Any:
+    """Import viser."""
     try:
         import viser
-        import websockets.asyncio.server as transport
     except ImportError as error:
         raise MissingExtraError(
             "the browser tool needs viser", hint="install it with: pip install 'softmode[viz]'"
         ) from error
+    return viser
+
+
+def _serve(options: ViewOptions) -> viser.ViserServer:
+    """Start viser's server where it was told to be, and nowhere else."""
+    viser = _viser()
+    import websockets.asyncio.server as transport  # viser's own
+
     port = _free_port(options.host, options.port)
     serve = transport.serve
     if options.is_local:
@@ -285,7 +301,7 @@ def _serve(options: ViewOptions) -> viser.ViserServer:
         # comes from, and viser has no argument for it. None is a client that is no browser.
         origins = [None, *(f"http://{name}:{port}" for name in ("127.0.0.1", "localhost", "[::1]"))]
         serve = functools.partial(serve, origins=origins)
-    with _quiet(), mock.patch.object(transport, "serve", serve):
+    with _quiet(), _replaced(transport, "serve", serve):
         server = viser.ViserServer(host=options.host, port=port, label="softmode", verbose=False)
     if server.get_port() != port:  # viser takes the next port when one is taken
         with _quiet():
@@ -312,6 +328,17 @@ def _port_error(host: str, port: int, reason: str) -> ConfigError:
     return ConfigError(
         f"cannot listen at {host}, port {port}: {reason}", hint="give another --port, or 0 for any free one"
     )
+
+
+@contextlib.contextmanager
+def _replaced(module: Any, name: str, value: Any) -> Iterator[None]:
+    """Let a module have another attribute for a while."""
+    before = getattr(module, name)
+    setattr(module, name, value)
+    try:
+        yield
+    finally:
+        setattr(module, name, before)
 
 
 @contextlib.contextmanager

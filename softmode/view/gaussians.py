@@ -14,11 +14,13 @@ UPPER = np.array([0, 1, 2, 4, 5, 8])
 
 
 class GaussianBuffer:
-    """Packs splats into eight 32-bit words each: centre (3 float32), a free word, covariance (6 float16), RGBA (4 bytes).
+    """Packs splats into eight 32-bit words each.
 
-    Half precision knows nothing below 6e-8, and the covariance of a splat of a millimetre is 1e-6 m^2. Lengths are hence
-    given in a `unit` in which the widest splat at the start has a standard deviation of 30: it may grow by 8, and one
-    that is thinner by 3,800 keeps its full precision. The node that shows them is scaled by `unit`.
+    Centre (three float32), a word that is free, covariance (six float16, upper triangle), colour and opacity (bytes).
+
+    Half precision knows nothing below 6e-8, and the covariance of a splat of a millimetre is 1e-6 m^2. Lengths are
+    hence given in a `unit` in which the widest splat at the start has a standard deviation of 30: it may grow by 8,
+    and one that is thinner by 3,800 keeps its full precision. The node that shows them is scaled by `unit`.
 
     Args:
         picture: The splats at the start; their colours and opacities are kept.
@@ -30,10 +32,8 @@ class GaussianBuffer:
         widest = float(covariances.trace(axis1=1, axis2=2).max(initial=0.0)) if len(covariances) else 0.0
         self.unit = float(np.sqrt(widest)) / LARGEST if widest > 0.0 else 1.0
         self.words = np.zeros((len(picture.means), 8), np.uint32)
-        rgba = np.concatenate([picture.colors, picture.opacities.reshape(-1, 1)], axis=1)
-        self.words[:, 7] = np.ascontiguousarray(np.rint(255.0 * rgba.clip(0.0, 1.0)).astype(np.uint8)).view(np.uint32)[
-            :, 0
-        ]
+        rgba = np.concatenate([picture.colors, picture.opacities.reshape(-1, 1)], axis=1).clip(0.0, 1.0)
+        self.words[:, 7:].view(np.uint8)[:] = np.rint(255.0 * rgba)
 
     def pack(self, means: NDArray[np.float32], covariances: NDArray[np.float32]) -> NDArray[np.uint32]:
         """Write centres [m], shape (N, 3), and covariances [m^2], shape (N, 3, 3), and return the words, shape (N, 8).

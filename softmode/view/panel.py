@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Command = Callable[["LiveSession"], None]
 MouseMode = Literal["drag", "pin"]
-MODULUS_MARKS = ((3.0, "1 kPa"), (4.0, "10"), (5.0, "100"), (6.0, "1 MPa"), (7.0, "10"))
+MODULUS_MARKS = ((3.0, "1 k"), (4.0, "10 k"), (5.0, "100 k"), (6.0, "1 M"), (7.0, "10 M"))
 PLOT_POINTS = 150
 
 
@@ -88,7 +88,10 @@ class Panel:
         """What the mouse does on the object, and the way back."""
         gui = self._gui
         mode = gui.add_dropdown(
-            "mouse", ("drag", "pin"), "drag", hint="drag: pull the object. pin: hold the region that is clicked"
+            "mouse",
+            ("drag", "pin"),
+            initial_value="drag",
+            hint="drag: pull the object. pin: hold the region that is clicked",
         )
 
         @mode.on_update
@@ -142,7 +145,7 @@ class Panel:
         handles = gui.add_dropdown(
             "handles",
             _handle_choices(now.handles),
-            str(now.handles),
+            initial_value=str(now.handles),
             hint="skinning eigenmodes; another number builds the object anew",
         )
 
