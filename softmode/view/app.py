@@ -101,7 +101,7 @@ class ViewApp:
             self._panel = Panel(
                 self._server,
                 session,
-                submit=self._commands.put,
+                submit=self.submit,
                 on_mode=self._on_mode,
                 record_path=self._record_path,
             )
@@ -138,6 +138,10 @@ class ViewApp:
             self.frame(period)
             due = max(due + period, time.perf_counter())  # a frame that came late does not hurry the next ones
             self._stop.wait(due - time.perf_counter())
+
+    def submit(self, command: Command) -> None:
+        """Queue something to be done with the session before the next frame; may be called from any thread."""
+        self._commands.put(command)
 
     def stop(self) -> None:
         """Let :meth:`run` return; may be called from any thread."""
@@ -185,7 +189,7 @@ class ViewApp:
         eye, forward = np.array(camera.position), _forward(np.array(camera.wxyz))
         start, end = np.array(event.start_position), np.array(event.end_position)
         client, phase = event.client_id, event.phase
-        self._commands.put(lambda session: self._do_drag(session, client, phase, eye, forward, start, end))
+        self.submit(lambda session: self._do_drag(session, client, phase, eye, forward, start, end))
 
     async def _on_click(self, event: Any) -> None:
         """Queue a click on the object."""
@@ -196,7 +200,7 @@ class ViewApp:
             if hit is not None and self._panel.mouse_mode == "pin":
                 session.pin(hit)
 
-        self._commands.put(pin)
+        self.submit(pin)
 
     def _on_pin(self, number: int, position: NDArray[np.float64], wxyz: NDArray[np.float64]) -> None:
         """Queue the motion of a gizmo."""
@@ -205,7 +209,7 @@ class ViewApp:
             if number in session.pins():
                 session.move_pin(number, position, wxyz)
 
-        self._commands.put(move)
+        self.submit(move)
 
     # -- in the thread of the session ---------------------------------------------------------------------------------
 
