@@ -61,7 +61,7 @@ class Stage:
         )
         self._add_grips(picture, on_drag, on_click)
         self._line = server.scene.add_line_segments(
-            "/drag", np.zeros((1, 2, 3), np.float32), colors=DRAG_COLOR, line_width=4.0, visible=False
+            "/drag", np.zeros((1, 2, 3), np.float32), colors=DRAG_COLOR, thickness=4.0, thickness_units="screen", visible=False
         )
         self._grip = server.scene.add_icosphere(
             "/grip", radius=0.02 * self.size, color=DRAG_COLOR, visible=False, cast_shadow=False

@@ -21,7 +21,7 @@ SAUSAGE = ObjectConfig(
     extents=(0.04, 0.04, 0.12),
     colors=((0.95, 0.45, 0.1), (0.85, 0.25, 0.1)),
     splat_count=1200,
-    build=BuildOptions(mode_count=4, point_count=128),
+    build=BuildOptions(mode_count=4),
 )
 """A soft capsule on end."""
 
@@ -29,9 +29,13 @@ SAUSAGE = ObjectConfig(
 class Served:
     """An app whose session lives in a thread of its own."""
 
-    def __init__(self, app: ViewApp) -> None:
-        """Remember the app."""
-        self.app = app
+    def __init__(self, app: ViewApp, low: np.ndarray) -> None:
+        """Remember the app and which surface samples are the lowest tenth at the start."""
+        self.app, self._low = app, low
+
+    def lowest(self, session: LiveSession) -> np.ndarray:
+        """Return the mean of the lowest tenth of the object, where it is now [m]."""
+        return session.surface()[self._low].mean(axis=0)
 
     def ask(self, what: Callable[[LiveSession], T]) -> T:
         """Return what a function of the session says, in the session's thread."""
@@ -59,7 +63,8 @@ def served(config: ObjectConfig = SAUSAGE, *, frame_rate: float = 30.0, **given:
             session = LiveSession.from_object(config, device="cpu")
             session.set_parameters(viscosity=0.02, mass_damping=2.0)
             with ViewApp(session, ViewOptions(port=0, frame_rate=frame_rate, **given)) as app:
-                ready.put(app)
+                height = session.surface()[:, 2]
+                ready.put(Served(app, height <= np.quantile(height, 0.1)))
                 app.run()
             session.close()
         except BaseException as error:
@@ -68,23 +73,12 @@ def served(config: ObjectConfig = SAUSAGE, *, frame_rate: float = 30.0, **given:
 
     thread = threading.Thread(target=work, daemon=True)
     thread.start()
-    app = ready.get(timeout=180.0)
-    if isinstance(app, BaseException):
-        raise app
+    one = ready.get(timeout=180.0)
+    if isinstance(one, BaseException):
+        raise one
     try:
-        yield Served(app)
+        yield one
     finally:
-        app.stop()
+        one.app.stop()
         thread.join(timeout=30.0)
         assert not thread.is_alive()
-
-
-def lowest(session: LiveSession) -> np.ndarray:
-    """Return the mean of the lowest tenth of the object at rest, where it is now [m]."""
-    surface, rest = session.surface(), session_rest(session)
-    return surface[rest[:, 2] <= np.quantile(rest[:, 2], 0.1)].mean(axis=0)
-
-
-def session_rest(session: LiveSession) -> np.ndarray:
-    """Return the surface samples at rest [m]."""
-    return session.scene.objects[0].body.surface_points

@@ -16,7 +16,7 @@ from softmode.errors import ConfigError, MissingExtraError
 from softmode.view.app import ViewOptions
 from softmode.view.gaussians import GaussianBuffer
 from softmode.view.live_types import SplatPicture
-from tests.view.serving import Served, lowest, served
+from tests.view.serving import Served, served
 
 pytest.importorskip("viser", reason="the extra viz is not installed")
 from tests.view.page_client import PageClient
@@ -33,7 +33,7 @@ def view() -> Iterator[Served]:
 
 def camera_message(eye: np.ndarray) -> dict[str, Any]:
     """Return a camera at a point on the negative y axis that looks along y, up is z."""
-    half = np.sqrt(0.5)
+    half = float(np.sqrt(0.5))
     return {
         "type": "ViewerCameraMessage",
         "wxyz": (half, -half, 0.0, 0.0),  # forward, the third axis, is +y
@@ -130,7 +130,7 @@ def test_mouse_messages_drag_the_object(view: Served) -> None:
     """A drag to the right pulls the lower end to the right, where the cursor's plane is, and lets it return."""
     view.ask(lambda session: session.reset())
     assert view.wait(lambda session: session.energies().kinetic < 1e-5)
-    rest = view.ask(lowest)
+    rest = view.ask(view.lowest)
     size = view.ask(lambda session: session.size)
     eye = rest - np.array([0.0, 6.0 * size, 0.0])
     grip = rest - np.array([0.0, 0.1 * size, 0.0])  # the proxies stand out a little from the object
@@ -140,7 +140,7 @@ def test_mouse_messages_drag_the_object(view: Served) -> None:
         assert view.wait(lambda session: session.drag() is not None)
         gripped = view.ask(lambda session: session.drag().point)  # type: ignore[union-attr]
         client.send(drag_message("update", grip, grip + np.array([0.5 * size, 0.0, 0.0])))
-        moved = view.wait(lambda session: bool(lowest(session)[0] > rest[0] + 0.15 * size))
+        moved = view.wait(lambda session: bool(view.lowest(session)[0] > rest[0] + 0.15 * size))
         target = view.ask(lambda session: session.drag().target)  # type: ignore[union-attr]
         client.send(drag_message("end", grip, grip + np.array([0.5 * size, 0.0, 0.0])))
         assert view.wait(lambda session: session.drag() is None)
@@ -148,12 +148,12 @@ def test_mouse_messages_drag_the_object(view: Served) -> None:
     assert target[1] == pytest.approx(gripped[1], abs=1e-6)  # in the plane through the grip, parallel to the picture
     far = (gripped[1] - eye[1]) / (grip[1] - eye[1])
     assert target[0] - gripped[0] == pytest.approx(0.5 * size * far, rel=0.05)
-    assert view.wait(lambda session: bool(np.linalg.norm(lowest(session) - rest) < 0.03 * session.size))
+    assert view.wait(lambda session: bool(np.linalg.norm(view.lowest(session) - rest) < 0.03 * session.size))
 
 
 def test_a_second_mouse_waits_and_a_lost_one_lets_go(view: Served) -> None:
     """Another client's drag does not disturb the first one's, whose end is assumed when it disconnects."""
-    rest = view.ask(lowest)
+    rest = view.ask(view.lowest)
     size = view.ask(lambda session: session.size)
     eye, right = rest - np.array([0.0, 6.0 * size, 0.0]), np.array([0.2 * size, 0.0, 0.0])
     with PageClient(view.app.url) as second:
