@@ -219,8 +219,8 @@ class Panel:
 
 
 def _within(value: float, low: float, high: float) -> float:
-    """Return a value that a slider can show."""
-    return min(max(value, low), high)
+    """Return a value that a slider can show, without the noise of single precision."""
+    return round(min(max(value, low), high), 5)
 
 
 def _handle_choices(now: int) -> tuple[str, ...]:

@@ -93,8 +93,10 @@ class Stage:
         scene.set_up_direction("+z")
         camera.up = (0.0, 0.0, 1.0)
         camera.fov = 0.7
-        camera.look_at = tuple(centre)
-        camera.position = tuple(centre + reach * np.array([0.85, -1.15, 0.55]))
+        right = np.array([1.15, 0.85, 0.0]) / np.hypot(1.15, 0.85)
+        middle = centre + 0.15 * reach * right  # the panel covers the right of the page
+        camera.look_at = tuple(middle)
+        camera.position = tuple(middle + reach * np.array([0.85, -1.1, 0.5]))
         camera.near, camera.far = 0.02 * reach, 100.0 * reach
         self._floor = float(low[2])
         self._centre, self._reach = centre, reach
@@ -115,7 +117,7 @@ class Stage:
                 color=tuple(round(255 * c) for c in mesh.color),
                 opacity=None if mesh.opacity >= 1.0 else mesh.opacity,
                 side="double",
-                flat_shading=True,
+                flat_shading=False,
             )
         if not meshes:  # nothing else tells up from down
             edge = 4.0 * self._reach
@@ -185,7 +187,7 @@ class Stage:
         """Add the gizmo that moves a pin."""
         gizmo = self._server.scene.add_transform_controls(
             f"/pins/{number}",
-            scale=0.3 * self.size,
+            scale=0.55 * self.size,
             position=tuple(position),
             wxyz=tuple(wxyz),
             depth_test=False,
