@@ -165,7 +165,7 @@ class ViewApp:
             self._sent.append(time.perf_counter())
         if clients and now - self._told >= READOUT_PERIOD:
             self._told = now
-            self._panel.update(self.session.status(), self.session.energies(), self.frame_rate, clients)
+            self._panel.update(self.session, self.frame_rate, clients)
 
     def _obey(self) -> bool:
         """Do what was asked for since the last frame; what cannot be done is told to the people."""

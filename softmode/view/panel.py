@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from softmode.view.live_types import Energies, LiveStatus
+from softmode.view.live_types import LiveParameters
 
 if TYPE_CHECKING:
     import viser
@@ -19,8 +21,97 @@ if TYPE_CHECKING:
 
 Command = Callable[["LiveSession"], None]
 MouseMode = Literal["drag", "pin"]
+FOLLOW_PAUSE = 1.0
+"""How long a slider that was moved by hand is left alone [s]."""
 MODULUS_MARKS = ((3.0, "1 k"), (4.0, "10 k"), (5.0, "100 k"), (6.0, "1 M"), (7.0, "10 M"))
 PLOT_POINTS = 150
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Slider:
+    """One parameter of the session on a slider."""
+
+    label: str
+    low: float
+    high: float
+    step: float
+    read: Callable[[LiveParameters], float]
+    """From the parameters to the slider."""
+    write: Callable[[LiveSession, float], None]
+    """From the slider to the session."""
+    hint: str | None = None
+    marks: tuple[tuple[float, str], ...] | None = None
+
+    def shown(self, now: LiveParameters) -> float:
+        """Return the value to show, in the slider's range and without the noise of single precision."""
+        return round(min(max(self.read(now), self.low), self.high), 5)
+
+
+SLIDERS = (
+    Slider(
+        label="log10 E [Pa]",
+        low=3.0,
+        high=7.0,
+        step=0.05,
+        read=lambda now: math.log10(now.youngs_modulus),
+        write=lambda session, value: session.set_parameters(youngs_modulus=10.0**value),
+        marks=MODULUS_MARKS,
+    ),
+    Slider(
+        label="nu",
+        low=0.0,
+        high=0.49,
+        step=0.01,
+        read=lambda now: now.poissons_ratio,
+        write=lambda session, value: session.set_parameters(poissons_ratio=value),
+        hint="Poisson's ratio",
+    ),
+    Slider(
+        label="density",
+        low=50.0,
+        high=3000.0,
+        step=10.0,
+        read=lambda now: now.density,
+        write=lambda session, value: session.set_parameters(density=value),
+        hint="kg/m^3",
+    ),
+    Slider(
+        label="viscosity [ms]",
+        low=0.0,
+        high=50.0,
+        step=0.5,
+        read=lambda now: 1e3 * now.viscosity,
+        write=lambda session, value: session.set_parameters(viscosity=1e-3 * value),
+        hint="damps deformation",
+    ),
+    Slider(
+        label="air drag [1/s]",
+        low=0.0,
+        high=10.0,
+        step=0.1,
+        read=lambda now: now.mass_damping,
+        write=lambda session, value: session.set_parameters(mass_damping=value),
+        hint="damps all motion",
+    ),
+    Slider(
+        label="friction",
+        low=0.0,
+        high=2.0,
+        step=0.05,
+        read=lambda now: now.friction,
+        write=lambda session, value: session.set_parameters(friction=value),
+        hint="Coulomb's coefficient",
+    ),
+    Slider(
+        label="gravity",
+        low=0.0,
+        high=20.0,
+        step=0.01,
+        read=lambda now: math.hypot(*now.gravity),
+        write=lambda session, value: session.set_parameters(gravity=value),
+        hint="m/s^2, downwards",
+    ),
+)
 
 
 class Panel:
@@ -46,6 +137,8 @@ class Panel:
         """Build the controls."""
         self._gui, self._submit, self._on_mode, self._record_path = server.gui, submit, on_mode, record_path
         self.mouse_mode: MouseMode = "drag"
+        self._sliders: dict[Slider, Any] = {}
+        self._touched: dict[Slider, float] = {}
         self._plot_data: deque[tuple[float, float, float, float]] = deque(maxlen=PLOT_POINTS)
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         self._add_time()
@@ -120,28 +213,18 @@ class Panel:
     def _add_material(self, session: LiveSession) -> None:
         """Sliders, at the values that the session has."""
         gui, now = self._gui, session.parameters
-        gravity = math.sqrt(sum(g * g for g in now.gravity))
         with gui.add_folder("material"):
-            modulus = gui.add_slider(
-                "log10 E [Pa]", 3.0, 7.0, 0.05, _within(math.log10(now.youngs_modulus), 3.0, 7.0), marks=MODULUS_MARKS
-            )
-            self._slider(modulus, lambda s, v: s.set_parameters(youngs_modulus=10.0**v))
-            ratio = gui.add_slider("nu", 0.0, 0.49, 0.01, _within(now.poissons_ratio, 0.0, 0.49))
-            self._slider(ratio, lambda s, v: s.set_parameters(poissons_ratio=v))
-            density = gui.add_slider("density", 50.0, 3000.0, 10.0, _within(now.density, 50.0, 3000.0), hint="kg/m^3")
-            self._slider(density, lambda s, v: s.set_parameters(density=v))
-            viscosity = gui.add_slider(
-                "viscosity [ms]", 0.0, 50.0, 0.5, _within(1e3 * now.viscosity, 0.0, 50.0), hint="damps deformation"
-            )
-            self._slider(viscosity, lambda s, v: s.set_parameters(viscosity=1e-3 * v))
-            drag = gui.add_slider(
-                "air drag [1/s]", 0.0, 10.0, 0.1, _within(now.mass_damping, 0.0, 10.0), hint="damps all motion"
-            )
-            self._slider(drag, lambda s, v: s.set_parameters(mass_damping=v))
-            friction = gui.add_slider("friction", 0.0, 2.0, 0.05, _within(now.friction, 0.0, 2.0))
-            self._slider(friction, lambda s, v: s.set_parameters(friction=v))
-            pull = gui.add_slider("gravity", 0.0, 20.0, 0.01, _within(gravity, 0.0, 20.0), hint="m/s^2, downwards")
-            self._slider(pull, lambda s, v: s.set_parameters(gravity=v))
+            for slider in SLIDERS:
+                handle = gui.add_slider(
+                    slider.label,
+                    slider.low,
+                    slider.high,
+                    slider.step,
+                    slider.shown(now),
+                    hint=slider.hint,
+                    marks=slider.marks,
+                )
+                self._connect(slider, handle)
         handles = gui.add_dropdown(
             "handles",
             _handle_choices(now.handles),
@@ -150,22 +233,43 @@ class Panel:
         )
 
         @handles.on_update
-        async def _(_: Any) -> None:
+        async def _(event: Any) -> None:
+            if event.client is None:
+                return
             count = int(handles.value)
             self._submit(lambda session: session.set_handles(count))
 
-    def _slider(self, handle: Any, apply: Callable[[LiveSession, float], None]) -> None:
-        """Let a slider change the session."""
+        self._handles = handles
 
-        async def changed(_: Any) -> None:
+    def _connect(self, slider: Slider, handle: Any) -> None:
+        """Let a slider change the session."""
+        self._sliders[slider] = handle
+        self._touched[slider] = -math.inf
+
+        async def changed(event: Any) -> None:
+            if event.client is None:  # not a person: the slider follows the session
+                return
             value = float(handle.value)
-            self._submit(lambda session: apply(session, value))
+            self._touched[slider] = time.monotonic()
+            self._submit(lambda session: slider.write(session, value))
 
         handle.on_update(changed)
 
+    def _follow(self, now: LiveParameters) -> None:
+        """Let sliders that nobody moves show what the session has: an environment draws anew in each episode."""
+        for slider, handle in self._sliders.items():
+            value = slider.shown(now)
+            if (
+                abs(handle.value - value) > 0.5 * slider.step
+                and time.monotonic() - self._touched[slider] > FOLLOW_PAUSE
+            ):
+                handle.value = value
+        if self._handles.value != str(now.handles) and str(now.handles) in self._handles.options:
+            self._handles.value = str(now.handles)
+
     def _add_readouts(self) -> None:
         """Text and a plot of energies."""
-        import viser
+        from viser import uplot
 
         gui = self._gui
         self._message = gui.add_markdown("")
@@ -174,13 +278,13 @@ class Panel:
         self._plot = gui.add_uplot(
             tuple(np.zeros(2) for _ in range(4)),
             series=(
-                viser.uplot.Series(label="time"),
+                uplot.Series(label="time"),
                 *(
-                    viser.uplot.Series(label=name, stroke=color, width=2)
+                    uplot.Series(label=name, stroke=color, width=2)
                     for name, color in zip(("kinetic", "elastic", "gravity"), colors, strict=True)
                 ),
             ),
-            scales={"x": viser.uplot.Scale(time=False)},
+            scales={"x": uplot.Scale(time=False)},
             title="energy [J]",
             height=170,
         )
@@ -189,8 +293,10 @@ class Panel:
         """Show a line of text above the readouts."""
         self._message.content = message.replace("`", "'")
 
-    def update(self, status: LiveStatus, energies: Energies, frame_rate: float, clients: int) -> None:
+    def update(self, session: LiveSession, frame_rate: float, clients: int) -> None:
         """Show what the session tells."""
+        status, energies = session.status(), session.energies()
+        self._follow(session.parameters)
         rows = [
             ("time", f"{status.time:.2f} s, {'playing' if status.playing else 'paused'}"),
             ("real time", f"{status.realtime_factor:.2f} x"),
@@ -216,11 +322,6 @@ class Panel:
             self._plot_data.append((status.time, energies.kinetic, energies.elastic, energies.gravitational))
             if len(self._plot_data) > 1:
                 self._plot.data = tuple(np.array(column) for column in zip(*self._plot_data, strict=True))
-
-
-def _within(value: float, low: float, high: float) -> float:
-    """Return a value that a slider can show, without the noise of single precision."""
-    return round(min(max(value, low), high), 5)
 
 
 def _handle_choices(now: int) -> tuple[str, ...]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from softmode.view.gaussians import GaussianBuffer
 from softmode.view.live_types import DragView, SplatPicture
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 GRIP_MAX = 400
 """Spheres that receive the mouse."""
 DRAG_COLOR = (255, 120, 30)
-Handler = Callable[[Any], Awaitable[None]]
+Handler = Callable[[Any], Coroutine[Any, Any, None]]
 
 
 class Stage:
@@ -61,7 +61,12 @@ class Stage:
         )
         self._add_grips(picture, on_drag, on_click)
         self._line = server.scene.add_line_segments(
-            "/drag", np.zeros((1, 2, 3), np.float32), colors=DRAG_COLOR, thickness=4.0, thickness_units="screen", visible=False
+            "/drag",
+            np.zeros((1, 2, 3), np.float32),
+            colors=DRAG_COLOR,
+            thickness=4.0,
+            thickness_units="screen",
+            visible=False,
         )
         self._grip = server.scene.add_icosphere(
             "/grip", radius=0.02 * self.size, color=DRAG_COLOR, visible=False, cast_shadow=False
@@ -98,7 +103,7 @@ class Stage:
         camera.look_at = tuple(middle)
         camera.position = tuple(middle + reach * np.array([0.85, -1.1, 0.5]))
         camera.near, camera.far = 0.02 * reach, 100.0 * reach
-        self._floor = float(low[2])
+        self._floor = float(low[2]) - 0.3 * reach  # room to pull
         self._centre, self._reach = centre, reach
 
     def _add_meshes(self) -> None:
@@ -114,7 +119,7 @@ class Stage:
                 f"{parent}/{number}",
                 mesh.vertices,
                 mesh.faces,
-                color=tuple(round(255 * c) for c in mesh.color),
+                color=np.rint(255.0 * np.array(mesh.color)).astype(np.uint8),
                 opacity=None if mesh.opacity >= 1.0 else mesh.opacity,
                 side="double",
                 flat_shading=False,
@@ -140,7 +145,7 @@ class Stage:
         keep = np.linspace(0, len(surface) - 1, min(len(surface), GRIP_MAX)).round().astype(int)
         self._grip_samples = np.unique(keep)
         samples = surface[self._grip_samples]
-        distance = cKDTree(samples).query(picture.means)[0]
+        distance = KDTree(samples).query(picture.means)[0]
         near = distance[distance < 0.25 * self.size]  # an environment has other splats too
         radius = 1.3 * float(np.quantile(near, 0.95)) if len(near) else 0.1 * self.size
         self._grips = self._server.scene.add_batched_glb(
@@ -187,7 +192,7 @@ class Stage:
         """Add the gizmo that moves a pin."""
         gizmo = self._server.scene.add_transform_controls(
             f"/pins/{number}",
-            scale=0.55 * self.size,
+            scale=0.4 * self.size,
             position=tuple(position),
             wxyz=tuple(wxyz),
             depth_test=False,
@@ -204,10 +209,11 @@ class Stage:
 def _invisible_sphere(radius: float) -> bytes:
     """Return a GLB with a sphere that is blended with opacity zero: it writes neither colour nor depth."""
     import trimesh
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
 
     sphere = trimesh.creation.icosphere(subdivisions=1, radius=radius)
-    material = trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 255, 255, 0], alphaMode="BLEND")
-    sphere.visual = trimesh.visual.TextureVisuals(material=material)
+    sphere.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=[255, 255, 255, 0], alphaMode="BLEND"))
     data = sphere.export(file_type="glb")
     assert isinstance(data, bytes)
     return data

@@ -240,7 +240,7 @@ def test_bad_addresses_are_refused(given: dict[str, Any], words: str) -> None:
 
 
 def test_a_port_that_is_taken_is_an_error(view: Served, capsys: pytest.CaptureFixture[str]) -> None:
-    """Not the next free one, as viser would have it: the error names the port and the remedy, before anything is built."""
+    """Not the next free one, as viser would have it: the error names port and remedy, before anything is built."""
     port = view.app.url.rpartition(":")[2]
     assert main(["view", "--port", port, "--no-open", "--duration", "1"]) == 2
     said = capsys.readouterr().err

@@ -102,7 +102,7 @@ def test_the_object_is_drawn_where_it_is(view: Served, page: Any) -> None:
     assert mask.sum() > 0.5 * expected.prod() * np.pi / 4.0  # filled, not speckled
 
 
-def project(points: NDArray[np.float64], camera: Any) -> NDArray[np.float64]:
+def project(points: NDArray[np.float64], camera: Any, size: tuple[int, int] = (WIDTH, HEIGHT)) -> NDArray[np.float64]:
     """Return where a page's camera sees points, (x, y) [px]."""
     w, x, y, z = camera.wxyz
     rotation = np.array(
@@ -113,8 +113,8 @@ def project(points: NDArray[np.float64], camera: Any) -> NDArray[np.float64]:
         ]
     )
     local = (points - camera.position) @ rotation
-    focal = 0.5 * HEIGHT / np.tan(0.5 * camera.fov)
-    return focal * local[:, :2] / local[:, 2:] + 0.5 * np.array([WIDTH, HEIGHT])
+    focal = 0.5 * size[1] / np.tan(0.5 * camera.fov)
+    return focal * local[:, :2] / local[:, 2:] + 0.5 * np.array(size)
 
 
 def test_a_drag_deforms_the_object_and_release_lets_it_return(view: Served, page: Any) -> None:
@@ -160,7 +160,9 @@ def test_the_panel_sets_the_modulus(view: Served, page: Any) -> None:
 def modulus_field(page: Any, modulus: float) -> int:
     """Return which of the visible inputs shows the logarithm of a modulus."""
     values = [page.locator("input").filter(visible=True).nth(k).input_value() for k in range(4)]
-    found = [k for k, value in enumerate(values) if value.startswith(f"{np.log10(modulus):.2f}".rstrip("0").rstrip("."))]
+    found = [
+        k for k, value in enumerate(values) if value.startswith(f"{np.log10(modulus):.2f}".rstrip("0").rstrip("."))
+    ]
     assert found, values
     return found[0]
 
