@@ -48,7 +48,8 @@ def main() -> None:
         page.screenshot(path=out, timeout=120_000)
         page.mouse.up()
         browser.close()
-    Image.open(out).convert("RGB").save(out, optimize=True)
+    shot = Image.open(out).convert("RGB")
+    shot.resize((850, 680), Image.Resampling.LANCZOS).save(out, optimize=True)
     print(f"wrote {out}, {out.stat().st_size / 1e3:.0f} kB")
 
 
