@@ -101,7 +101,7 @@ class Stage:
         right = np.array([1.15, 0.85, 0.0]) / np.hypot(1.15, 0.85)
         middle = centre + 0.15 * reach * right  # the panel covers the right of the page
         camera.look_at = tuple(middle)
-        camera.position = tuple(middle + reach * np.array([0.85, -1.1, 0.5]))
+        camera.position = tuple(middle + reach * np.array([0.95, -1.25, 0.6]))
         camera.near, camera.far = 0.02 * reach, 100.0 * reach
         self._floor = float(low[2]) - 0.3 * reach  # room to pull
         self._centre, self._reach = centre, reach

@@ -71,9 +71,9 @@ def picture(page: Any) -> NDArray[np.float64]:
 
 
 def orange(page: Any) -> NDArray[np.bool_]:
-    """Return which pixels have the object's colours: red above green above blue, by much."""
+    """Return which pixels have the object's colours: red above green above blue, unlike a gizmo's pink arrow."""
     r, g, b = picture(page).transpose(2, 0, 1)
-    return (r > 0.45) & (r - b > 0.35) & (r > g + 0.15)
+    return (r > 0.45) & (r - b > 0.35) & (r > g + 0.15) & (g > b + 0.03)
 
 
 def places(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
