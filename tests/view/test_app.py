@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import math
+import signal
 import socket
+import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,9 +17,10 @@ import pytest
 
 from softmode.cli import main
 from softmode.errors import ConfigError, MissingExtraError
-from softmode.view.app import ViewOptions
+from softmode.view.app import ViewApp, ViewOptions
 from softmode.view.gaussians import GaussianBuffer
 from softmode.view.live_types import SplatPicture
+from softmode.view.session import LiveSession
 from tests.view.serving import Served, served
 
 pytest.importorskip("viser", reason="the extra viz is not installed")
@@ -25,9 +30,9 @@ NAME = "/grips"
 
 
 @pytest.fixture(scope="module")
-def view() -> Iterator[Served]:
+def view(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """Serve a hanging sausage."""
-    with served() as one:
+    with served(record_folder=tmp_path_factory.mktemp("recordings")) as one:
         yield one
 
 
@@ -185,6 +190,19 @@ def test_a_drag_beside_the_object_does_nothing(view: Served) -> None:
             assert view.ask(lambda session: session.drag()) is None
 
 
+def test_the_record_button_writes_a_film(view: Served) -> None:
+    """Pressed twice, it leaves one .mp4 in the folder for recordings."""
+    folder = view.app.options.record_folder
+    view.ask(view.app._panel._toggle_recording)
+    assert view.ask(lambda session: session.status().recording)
+    begun = view.ask(lambda session: session.status().time)
+    assert view.wait(lambda session: session.status().time > begun + 0.2)
+    view.ask(view.app._panel._toggle_recording)
+    (film,) = folder.glob("*.mp4")
+    assert film.stat().st_size > 1000
+    assert film.name in view.app._panel._message.content
+
+
 def test_what_cannot_be_done_is_told_and_survived(view: Served, capfd: pytest.CaptureFixture[str]) -> None:
     """A command with a value out of range leaves the session as it was, and the app alive."""
     before = view.ask(lambda session: session.parameters)
@@ -266,6 +284,52 @@ def test_the_command_serves_for_a_while(tmp_path: Path, capfd: pytest.CaptureFix
     assert "http://127.0.0.1:" in said.out and "warning" not in said.err and "viser" not in said.out
     assert main([*arguments, "--host", "0.0.0.0", "--scene", "drop"]) == 0
     assert "anyone who reaches port" in capfd.readouterr().err
+
+
+def test_an_interrupted_command_ends_cleanly() -> None:
+    """Ctrl-C while it serves: exit code 0, one line, no traceback."""
+    program = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # the background ignores it
+        "from softmode.cli import main; sys.exit(main(['view', '--port', '0', '--no-open']))"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout is not None
+        assert "http://127.0.0.1:" in process.stdout.readline()
+        time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60.0)
+    finally:
+        process.kill()
+    assert process.returncode == 0, err
+    assert "stopped" in err and "Traceback" not in err
+
+
+def test_an_environment_is_shown_and_followed() -> None:
+    """Frames of the robot stand where its links are, the reward is told, sliders follow the next episode's draw."""
+    session = LiveSession.from_env("softmode/PushSoft-v0", device="cpu")
+    with ViewApp(session, ViewOptions(port=0)) as app, PageClient(app.url):
+        while not app._server.get_clients():
+            time.sleep(0.01)
+        slider = next(handle for one, handle in app._panel._sliders.items() if one.label.startswith("log10 E"))
+        for _ in range(2):
+            app._told = -math.inf  # readouts are due
+            for _ in range(8):
+                app.frame(1.0 / 30.0)
+            poses = session.poses()
+            assert len(app._stage._frames) > 5
+            for body, frame in app._stage._frames.items():
+                np.testing.assert_allclose(frame.position, poses[body, :3], atol=1e-6)
+                np.testing.assert_allclose(frame.wxyz, poses[body, [6, 3, 4, 5]], atol=1e-6)
+            assert "reward" in app._panel._text.content
+            drawn = session.parameters.youngs_modulus
+            assert slider.value == pytest.approx(np.clip(math.log10(drawn), 3.0, 7.0), abs=0.026)
+            app.submit(lambda session: session.reset())
+            app.frame(1.0 / 30.0)
+            assert session.parameters.youngs_modulus != drawn
+    session.close()
 
 
 @pytest.mark.parametrize(
