@@ -1,4 +1,4 @@
-"""The command line: play, train, evaluate, export, record, bench, list-envs, robots, splat and body."""
+"""The command line: play, train, evaluate, export, record, view, bench, list-envs, robots, splat and body."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from typing import Annotated, Any, Literal
 from softmode import ENVIRONMENTS
 from softmode.cli_bench import Bench
 from softmode.cli_body import BodyBuild, BodyCheck, BodyShow
-from softmode.cli_common import bar_interval, quiet_warp, warp_device
+from softmode.cli_common import BuildBar, bar_interval, quiet_warp, warp_device
 from softmode.cli_record import Record
 from softmode.cli_splat import SplatConvert, SplatFromMesh, SplatInfo
 from softmode.cli_train import Evaluate, Export, Train, policy_file
+from softmode.cli_view import View
 from softmode.errors import ConfigError, MaterialError, MissingExtraError, SoftmodeError
 from softmode.film import Film
 from softmode.policies import POLICIES, check_policy, policy_factory
@@ -129,6 +130,7 @@ def main(arguments: list[str] | None = None) -> int:
             | Annotated[Export, tyro.conf.subcommand("export")]
             | Annotated[Bench, tyro.conf.subcommand("bench")]
             | Annotated[Record, tyro.conf.subcommand("record")]
+            | Annotated[View, tyro.conf.subcommand("view")]
             | Annotated[ListEnvs, tyro.conf.subcommand("list-envs")]
             | Annotated[Robots, tyro.conf.subcommand("robots")]
             | splat  # type: ignore[arg-type]
@@ -191,7 +193,7 @@ def _play(options: Play, film: Film | None) -> int:
     with quiet_warp():
         if not any(Path(wp.config.kernel_cache_dir or "").glob("wp_softmode.deformables.kernels_*")):
             print("compiling kernels (first run only, a minute or two)", file=sys.stderr, flush=True)
-        with _BuildBar() as progress:
+        with BuildBar() as progress:
             env = gym.make(
                 options.env,
                 render_mode="rgb_array" if film or options.rerun else None,
@@ -305,28 +307,6 @@ def _task_config(options: Play, trained: dict[str, Any]) -> Any:
         thing = dataclasses.replace(thing, **given)
         scene = dataclasses.replace(scene, object=thing)
     return dataclasses.replace(base, scene=scene, mesh_samples=4 if options.video else base.mesh_samples)
-
-
-class _BuildBar:
-    """A progress bar over the build of a body, on stderr; it appears with the first report."""
-
-    def __init__(self) -> None:
-        self._bar: Any = None
-
-    def __enter__(self) -> _BuildBar:
-        return self
-
-    def __call__(self, stage: str, fraction: float) -> None:
-        if self._bar is None:
-            from tqdm import tqdm
-
-            self._bar = tqdm(total=100, desc="building the body", unit="%", mininterval=bar_interval())
-        self._bar.set_postfix_str(stage, refresh=False)
-        self._bar.update(round(100.0 * fraction) - self._bar.n)
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.close()
 
 
 if __name__ == "__main__":

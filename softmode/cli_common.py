@@ -40,3 +40,29 @@ def warp_device(name: str | None) -> Any:
 def bar_interval() -> float:
     """Return how often a progress bar is drawn [s]: smoothly on a terminal, seldom in a log."""
     return 0.1 if sys.stderr.isatty() else 5.0
+
+
+class BuildBar:
+    """A progress bar over the build of a body, on stderr; it appears with the first report."""
+
+    def __init__(self) -> None:
+        """Show nothing yet."""
+        self._bar: Any = None
+
+    def __enter__(self) -> BuildBar:
+        """Return the bar."""
+        return self
+
+    def __call__(self, stage: str, fraction: float) -> None:
+        """Show how far a stage of the build is, 0..1."""
+        if self._bar is None:
+            from tqdm import tqdm
+
+            self._bar = tqdm(total=100, desc="building the body", unit="%", mininterval=bar_interval())
+        self._bar.set_postfix_str(stage, refresh=False)
+        self._bar.update(round(100.0 * fraction) - self._bar.n)
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the bar as it is."""
+        if self._bar is not None:
+            self._bar.close()

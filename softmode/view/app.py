@@ -1,0 +1,352 @@
+"""A page in the browser that shows a live session and lets people pull, pin and tune it."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import io
+import queue
+import socket
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softmode.errors import ConfigError, MissingExtraError, SoftmodeError
+from softmode.view.panel import Command, MouseMode, Panel
+from softmode.view.stage import Stage
+
+if TYPE_CHECKING:
+    import viser
+
+    from softmode.view.session import LiveSession
+
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+READOUT_PERIOD = 0.25
+"""Time between two readouts [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewOptions:
+    """Where a live session is served and how often it is shown."""
+
+    host: str = "127.0.0.1"
+    """Address to listen at. Whoever reaches it may drive the session; there is no password."""
+    port: int = 8080
+    """Port to listen at; 0 for any free one."""
+    frame_rate: float = 30.0
+    """Pictures per second [1/s]."""
+    record_folder: Path = Path("out")
+    """Where recordings are written."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if not 0 <= self.port <= 65535:
+            raise ConfigError(f"port must lie in 0..65535, got {self.port}", hint="give a port like 8080, or 0 for any")
+        if not 1.0 <= self.frame_rate <= 120.0:
+            raise ConfigError(f"frame_rate must lie in 1..120, got {self.frame_rate}", hint="give a rate like 30")
+
+    @property
+    def is_local(self) -> bool:
+        """Whether only this machine can reach it."""
+        return self.host in LOOPBACK
+
+    def check(self) -> None:
+        """Make sure that a server can be started here.
+
+        Raises:
+            ConfigError: If the address or the port cannot be used.
+            MissingExtraError: If viser is not installed.
+        """
+        _viser()
+        _free_port(self.host, self.port)
+
+
+class ViewApp:
+    """A server whose page shows a live session; all browsers that open it see and drive the same one.
+
+    The session is called from the thread that calls `run` or `frame` alone: what browsers ask for waits in a queue.
+    A context manager; `close` ends the server, not the session.
+
+    Args:
+        session: What to show.
+        options: Where, and how often.
+
+    Raises:
+        ConfigError: If the address or the port cannot be used.
+        MissingExtraError: If viser is not installed.
+    """
+
+    def __init__(self, session: LiveSession, options: ViewOptions | None = None) -> None:
+        """Start the server and build the page."""
+        self.session, self.options = session, options or ViewOptions()
+        self._commands: queue.SimpleQueue[Command] = queue.SimpleQueue()
+        self._stop = threading.Event()
+        self._drag: _Drag | None = None
+        self._sent: deque[float] = deque(maxlen=60)
+        self._told = -np.inf
+        self._clients = 0
+        self._server = _serve(self.options)
+        try:
+            self._stage = Stage(
+                self._server, session, on_drag=self._on_drag, on_click=self._on_click, on_pin=self._on_pin
+            )
+            self._panel = Panel(
+                self._server,
+                session,
+                submit=self.submit,
+                on_mode=self._on_mode,
+                record_path=self._record_path,
+            )
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> ViewApp:
+        """Return the app."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the server."""
+        self.close()
+
+    @property
+    def url(self) -> str:
+        """Where to point the browser."""
+        host = "localhost" if self.options.host in ("0.0.0.0", "::") else self.options.host
+        return f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
+
+    @property
+    def frame_rate(self) -> float:
+        """Pictures sent per second, over the last two seconds or so; 0 before there are two."""
+        if len(self._sent) < 2 or self._sent[-1] == self._sent[0]:
+            return 0.0
+        return (len(self._sent) - 1) / (self._sent[-1] - self._sent[0])
+
+    def run(self, duration: float | None = None) -> None:
+        """Run until :meth:`stop` is called, or for `duration` seconds of the clock."""
+        period = 1.0 / self.options.frame_rate
+        begun = due = time.perf_counter()
+        while not self._stop.is_set() and (duration is None or time.perf_counter() - begun < duration):
+            self.frame(period)
+            due = max(due + period, time.perf_counter())  # a frame that came late does not hurry the next ones
+            self._stop.wait(due - time.perf_counter())
+
+    def submit(self, command: Command) -> None:
+        """Queue something to be done with the session before the next frame; may be called from any thread."""
+        self._commands.put(command)
+
+    def stop(self) -> None:
+        """Let :meth:`run` return; may be called from any thread."""
+        self._stop.set()
+
+    def close(self) -> None:
+        """End the server; may be called twice."""
+        self._stop.set()
+        with _quiet():
+            self._server.stop()
+
+    def frame(self, frame_dt: float) -> None:
+        """Do what was asked for, let `frame_dt` seconds pass, show the result."""
+        asked = self._obey()
+        passed = self.session.advance(frame_dt)
+        clients = len(self._server.get_clients())
+        arrived, self._clients = clients > self._clients, clients
+        now = time.perf_counter()
+        if clients and (asked or passed > 0.0 or arrived):
+            self._stage.update()
+            self._sent.append(time.perf_counter())
+        if clients and now - self._told >= READOUT_PERIOD:
+            self._told = now
+            self._panel.update(self.session, self.frame_rate, clients)
+
+    def _obey(self) -> bool:
+        """Do what was asked for since the last frame; what cannot be done is told to the people."""
+        asked = False
+        with contextlib.suppress(queue.Empty):
+            while True:
+                command = self._commands.get_nowait()
+                asked = True
+                try:
+                    command(self.session)
+                except SoftmodeError as error:
+                    self._panel.tell(f"**{error}**")
+                    print(f"softmode: {error}", file=sys.stderr)
+        return asked
+
+    # -- what browsers ask for, in viser's thread ---------------------------------------------------------------------
+
+    async def _on_drag(self, event: Any) -> None:
+        """Queue one step of a drag of the mouse; async, so that steps stay in order."""
+        camera = event.client.camera
+        eye, forward = np.array(camera.position), _forward(np.array(camera.wxyz))
+        start, end = np.array(event.start_position), np.array(event.end_position)
+        client, phase = event.client_id, event.phase
+        self.submit(lambda session: self._do_drag(session, client, phase, eye, forward, start, end))
+
+    async def _on_click(self, event: Any) -> None:
+        """Queue a click on the object."""
+        eye, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+
+        def pin(session: LiveSession) -> None:
+            hit = session.pick(eye, direction)
+            if hit is not None and self._panel.mouse_mode == "pin":
+                session.pin(hit)
+
+        self.submit(pin)
+
+    def _on_pin(self, number: int, position: NDArray[np.float64], wxyz: NDArray[np.float64]) -> None:
+        """Queue the motion of a gizmo."""
+
+        def move(session: LiveSession) -> None:
+            if number in session.pins():
+                session.move_pin(number, position, wxyz)
+
+        self.submit(move)
+
+    # -- in the thread of the session ---------------------------------------------------------------------------------
+
+    def _on_mode(self, mode: MouseMode) -> None:
+        """Clicks count where they pin."""
+        self._stage.set_clickable(mode == "pin")
+
+    def _do_drag(
+        self,
+        session: LiveSession,
+        client: int,
+        phase: str,
+        eye: NDArray[np.float64],
+        forward: NDArray[np.float64],
+        start: NDArray[np.float64],
+        end: NDArray[np.float64],
+    ) -> None:
+        """Begin, follow or end a drag; one at a time, the first one's."""
+        if phase == "start":
+            if self._drag is not None:
+                return
+            hit = session.pick(eye, start - eye)
+            if hit is None:
+                return
+            depth = float(forward @ (hit.point - eye))
+            if self._panel.mouse_mode == "pin":
+                number = session.pin(hit)
+                centre = session.pins()[number].position
+                self._drag = _Drag(client=client, depth=depth, pin=number, offset=centre - hit.point)
+            else:
+                session.begin_drag(hit)
+                self._drag = _Drag(client=client, depth=depth, pin=None, offset=np.zeros(3))
+        drag = self._drag
+        if drag is None or drag.client != client:
+            return
+        # The mouse's ray, cut with the plane through the gripped point that is parallel to the picture.
+        ray = end - eye
+        cursor = eye + ray * (drag.depth / float(forward @ ray))
+        if drag.pin is None and session.drag() is not None:  # a reset, or another body, ends it
+            session.drag_to(cursor)
+        elif drag.pin in session.pins():
+            session.move_pin(drag.pin, cursor + drag.offset)
+            self._stage.move_gizmo(drag.pin, cursor + drag.offset)
+        if phase == "end":
+            self._drag = None
+            if drag.pin is None:
+                session.end_drag()
+
+    def _record_path(self) -> Path:
+        """Name the next recording."""
+        return self.options.record_folder / time.strftime("view-%Y%m%d-%H%M%S.mp4")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Drag:
+    """What the mouse of one browser holds."""
+
+    client: int
+    depth: float
+    """Of the gripped point before the camera [m]."""
+    pin: int | None
+    """The pin that is moved, None for a pull."""
+    offset: NDArray[np.float64]
+    """From the gripped point to the centre of the pin [m]."""
+
+
+def _forward(wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the direction in which a camera looks, the third axis of its frame."""
+    w, x, y, z = wxyz / np.linalg.norm(wxyz)
+    return np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+
+
+def _viser() -> Any:
+    """Import viser."""
+    try:
+        import viser
+    except ImportError as error:
+        raise MissingExtraError(
+            "the browser tool needs viser", hint="install it with: pip install 'softmode[viz]'"
+        ) from error
+    return viser
+
+
+def _serve(options: ViewOptions) -> viser.ViserServer:
+    """Start viser's server where it was told to be, and nowhere else."""
+    viser = _viser()
+    import websockets.asyncio.server as transport  # viser's own
+
+    port = _free_port(options.host, options.port)
+    serve = transport.serve
+    if options.is_local:
+        # A web page of anyone's, open in the same browser, reaches this machine's ports too; browsers say where a page
+        # comes from, and viser has no argument for it. None is a client that is no browser.
+        origins = [None, *(f"http://{name}:{port}" for name in ("127.0.0.1", "localhost", "[::1]"))]
+        serve = functools.partial(serve, origins=origins)
+    with _quiet(), _replaced(transport, "serve", serve):
+        server = viser.ViserServer(host=options.host, port=port, label="softmode", verbose=False)
+    if server.get_port() != port:  # viser takes the next port when one is taken
+        with _quiet():
+            server.stop()
+        raise _port_error(options.host, port, "it was taken in the meantime")
+    # Any browser may ask viser for a tunnel to a public server, button or not.
+    server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
+    return server
+
+
+def _free_port(host: str, port: int) -> int:
+    """Return the port, or a free one for 0, after making sure that it can be had: viser tries others, or hangs."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+            return int(probe.getsockname()[1])
+    except OSError as error:
+        raise _port_error(host, port, error.strerror or str(error)) from error
+
+
+def _port_error(host: str, port: int, reason: str) -> ConfigError:
+    return ConfigError(
+        f"cannot listen at {host}, port {port}: {reason}", hint="give another --port, or 0 for any free one"
+    )
+
+
+@contextlib.contextmanager
+def _replaced(module: Any, name: str, value: Any) -> Iterator[None]:
+    """Let a module have another attribute for a while."""
+    before = getattr(module, name)
+    setattr(module, name, value)
+    try:
+        yield
+    finally:
+        setattr(module, name, before)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep viser's greetings from the terminal."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield

@@ -1,0 +1,329 @@
+"""The panel of the page: what a person sets, and what the session tells."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from softmode.view.live_types import LiveParameters
+
+if TYPE_CHECKING:
+    import viser
+
+    from softmode.view.session import LiveSession
+
+Command = Callable[["LiveSession"], None]
+MouseMode = Literal["drag", "pin"]
+FOLLOW_PAUSE = 1.0
+"""How long a slider that was moved by hand is left alone [s]."""
+MODULUS_MARKS = ((3.0, "1 k"), (4.0, "10 k"), (5.0, "100 k"), (6.0, "1 M"), (7.0, "10 M"))
+PLOT_POINTS = 150
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Slider:
+    """One parameter of the session on a slider."""
+
+    label: str
+    low: float
+    high: float
+    step: float
+    read: Callable[[LiveParameters], float]
+    """From the parameters to the slider."""
+    write: Callable[[LiveSession, float], None]
+    """From the slider to the session."""
+    hint: str | None = None
+    marks: tuple[tuple[float, str], ...] | None = None
+
+    def shown(self, now: LiveParameters) -> float:
+        """Return the value to show, in the slider's range and without the noise of single precision."""
+        return round(min(max(self.read(now), self.low), self.high), 5)
+
+
+SLIDERS = (
+    Slider(
+        label="log10 E [Pa]",
+        low=3.0,
+        high=7.0,
+        step=0.05,
+        read=lambda now: math.log10(now.youngs_modulus),
+        write=lambda session, value: session.set_parameters(youngs_modulus=10.0**value),
+        marks=MODULUS_MARKS,
+    ),
+    Slider(
+        label="nu",
+        low=0.0,
+        high=0.49,
+        step=0.01,
+        read=lambda now: now.poissons_ratio,
+        write=lambda session, value: session.set_parameters(poissons_ratio=value),
+        hint="Poisson's ratio",
+    ),
+    Slider(
+        label="density",
+        low=50.0,
+        high=3000.0,
+        step=10.0,
+        read=lambda now: now.density,
+        write=lambda session, value: session.set_parameters(density=value),
+        hint="kg/m^3",
+    ),
+    Slider(
+        label="viscosity [ms]",
+        low=0.0,
+        high=50.0,
+        step=0.5,
+        read=lambda now: 1e3 * now.viscosity,
+        write=lambda session, value: session.set_parameters(viscosity=1e-3 * value),
+        hint="damps deformation",
+    ),
+    Slider(
+        label="air drag [1/s]",
+        low=0.0,
+        high=10.0,
+        step=0.1,
+        read=lambda now: now.mass_damping,
+        write=lambda session, value: session.set_parameters(mass_damping=value),
+        hint="damps all motion",
+    ),
+    Slider(
+        label="friction",
+        low=0.0,
+        high=2.0,
+        step=0.05,
+        read=lambda now: now.friction,
+        write=lambda session, value: session.set_parameters(friction=value),
+        hint="Coulomb's coefficient",
+    ),
+    Slider(
+        label="gravity",
+        low=0.0,
+        high=20.0,
+        step=0.01,
+        read=lambda now: math.hypot(*now.gravity),
+        write=lambda session, value: session.set_parameters(gravity=value),
+        hint="m/s^2, downwards",
+    ),
+)
+
+
+class Panel:
+    """The controls beside the picture. What they ask for is put into a queue, by viser's threads.
+
+    Args:
+        server: Where they are shown.
+        session: Whose values they start with.
+        submit: Takes what shall be done with the session.
+        on_mode: Called with the mode of the mouse when it is chosen, in the thread that runs the session.
+        record_path: Names the next recording.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        session: LiveSession,
+        *,
+        submit: Callable[[Command], None],
+        on_mode: Callable[[MouseMode], None],
+        record_path: Callable[[], Path],
+    ) -> None:
+        """Build the controls."""
+        self._gui, self._submit, self._on_mode, self._record_path = server.gui, submit, on_mode, record_path
+        self.mouse_mode: MouseMode = "drag"
+        self._sliders: dict[Slider, Any] = {}
+        self._touched: dict[Slider, float] = {}
+        self._plot_data: deque[tuple[float, float, float, float]] = deque(maxlen=PLOT_POINTS)
+        server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+        self._add_time()
+        self._add_mouse()
+        self._add_material(session)
+        self._add_readouts()
+
+    def _add_time(self) -> None:
+        """Buttons that start, stop and record."""
+        gui = self._gui
+        buttons = gui.add_button_group("time", ("play", "pause", "step", "reset"))
+
+        @buttons.on_click
+        async def _(_: Any) -> None:
+            actions: dict[str, Command] = {
+                "play": lambda session: session.play(),
+                "pause": lambda session: session.pause(),
+                "step": lambda session: (session.pause(), session.step(), None)[-1],
+                "reset": lambda session: session.reset(),
+            }
+            self._submit(actions[str(buttons.value)])
+
+        self._record = gui.add_button("record", hint="Starts and stops an .mp4 of the scene")
+
+        @self._record.on_click
+        async def _(_: Any) -> None:
+            self._submit(self._toggle_recording)
+
+    def _toggle_recording(self, session: LiveSession) -> None:
+        """Start a recording, or write the one that is being made."""
+        if session.status().recording:
+            path = session.stop_recording()
+            self.tell(f"wrote {path}")
+        else:
+            path = self._record_path()
+            session.start_recording(path)
+            self.tell(f"recording {path}")
+
+    def _add_mouse(self) -> None:
+        """What the mouse does on the object, and the way back."""
+        gui = self._gui
+        mode = gui.add_dropdown(
+            "mouse",
+            ("drag", "pin"),
+            initial_value="drag",
+            hint="drag: pull the object. pin: hold the region that is clicked",
+        )
+
+        @mode.on_update
+        async def _(_: Any) -> None:
+            chosen: MouseMode = "pin" if mode.value == "pin" else "drag"
+            self._submit(lambda session: self._set_mode(chosen))
+
+        unpin = gui.add_button_group("unpin", ("last", "all"))
+
+        @unpin.on_click
+        async def _(_: Any) -> None:
+            only_last = unpin.value == "last"
+            self._submit(lambda session: self._unpin(session, only_last))
+
+    def _set_mode(self, mode: MouseMode) -> None:
+        """Change what the mouse does."""
+        self.mouse_mode = mode
+        self._on_mode(mode)
+
+    @staticmethod
+    def _unpin(session: LiveSession, only_last: bool) -> None:
+        """Let pins go."""
+        for number in sorted(session.pins(), reverse=True)[: 1 if only_last else None]:
+            session.unpin(number)
+
+    def _add_material(self, session: LiveSession) -> None:
+        """Sliders, at the values that the session has."""
+        gui, now = self._gui, session.parameters
+        with gui.add_folder("material"):
+            for slider in SLIDERS:
+                handle = gui.add_slider(
+                    slider.label,
+                    slider.low,
+                    slider.high,
+                    slider.step,
+                    slider.shown(now),
+                    hint=slider.hint,
+                    marks=slider.marks,
+                )
+                self._connect(slider, handle)
+        handles = gui.add_dropdown(
+            "handles",
+            _handle_choices(now.handles),
+            initial_value=str(now.handles),
+            hint="skinning eigenmodes; another number builds the object anew",
+        )
+
+        @handles.on_update
+        async def _(event: Any) -> None:
+            if event.client is None:
+                return
+            count = int(handles.value)
+            self._submit(lambda session: session.set_handles(count))
+
+        self._handles = handles
+
+    def _connect(self, slider: Slider, handle: Any) -> None:
+        """Let a slider change the session."""
+        self._sliders[slider] = handle
+        self._touched[slider] = -math.inf
+
+        async def changed(event: Any) -> None:
+            if event.client is None:  # not a person: the slider follows the session
+                return
+            value = float(handle.value)
+            self._touched[slider] = time.monotonic()
+            self._submit(lambda session: slider.write(session, value))
+
+        handle.on_update(changed)
+
+    def _follow(self, now: LiveParameters) -> None:
+        """Let sliders that nobody moves show what the session has: an environment draws anew in each episode."""
+        for slider, handle in self._sliders.items():
+            value = slider.shown(now)
+            if (
+                abs(handle.value - value) > 0.5 * slider.step
+                and time.monotonic() - self._touched[slider] > FOLLOW_PAUSE
+            ):
+                handle.value = value
+        if self._handles.value != str(now.handles) and str(now.handles) in self._handles.options:
+            self._handles.value = str(now.handles)
+
+    def _add_readouts(self) -> None:
+        """Text and a plot of energies."""
+        from viser import uplot
+
+        gui = self._gui
+        self._message = gui.add_markdown("")
+        self._text = gui.add_markdown("")
+        colors = ("#1f77b4", "#d62728", "#2ca02c")
+        self._plot = gui.add_uplot(
+            tuple(np.zeros(2) for _ in range(4)),
+            series=(
+                uplot.Series(label="time"),
+                *(
+                    uplot.Series(label=name, stroke=color, width=2)
+                    for name, color in zip(("kinetic", "elastic", "gravity"), colors, strict=True)
+                ),
+            ),
+            scales={"x": uplot.Scale(time=False)},
+            title="energy [J]",
+            height=170,
+        )
+
+    def tell(self, message: str) -> None:
+        """Show a line of text above the readouts."""
+        self._message.content = message.replace("`", "'")
+
+    def update(self, session: LiveSession, frame_rate: float, clients: int) -> None:
+        """Show what the session tells."""
+        status, energies = session.status(), session.energies()
+        self._follow(session.parameters)
+        rows = [
+            ("time", f"{status.time:.2f} s, {'playing' if status.playing else 'paused'}"),
+            ("real time", f"{status.realtime_factor:.2f} x"),
+            ("pictures", f"{frame_rate:.0f} per second"),
+            ("physics step", f"{status.step_milliseconds:.2f} ms"),
+            ("solver", ", ".join(status.solver) or "converged"),
+            ("energy", f"{energies.kinetic:.2e} kinetic, {energies.elastic:.2e} elastic J"),
+        ]
+        if status.reward_terms:
+            rows += [("reward", ", ".join(f"{name} {value:.2f}" for name, value in status.reward_terms.items()))]
+            rows += [("episode", f"{status.episode}{', solved' if status.success else ''}")]
+        if clients > 1:
+            rows += [("viewers", str(clients))]
+        text = "| | |\n|---|---|\n" + "\n".join(f"| {name} | {value} |" for name, value in rows)
+        if text != self._text.content:
+            self._text.content = text
+        label = "stop recording" if status.recording else "record"
+        if self._record.label != label:
+            self._record.label = label
+        if self._plot_data and status.time < self._plot_data[-1][0]:
+            self._plot_data.clear()
+        if not self._plot_data or status.time > self._plot_data[-1][0]:
+            self._plot_data.append((status.time, energies.kinetic, energies.elastic, energies.gravitational))
+            if len(self._plot_data) > 1:
+                self._plot.data = tuple(np.array(column) for column in zip(*self._plot_data, strict=True))
+
+
+def _handle_choices(now: int) -> tuple[str, ...]:
+    """Return the counts on offer, the present one among them."""
+    return tuple(str(count) for count in sorted({2, 4, 8, 12, 16, 24, now}))
