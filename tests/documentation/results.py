@@ -187,3 +187,13 @@ def _body_tool(names: dict[str, Any], folder: Path) -> None:
     """What the page makes is well."""
     assert names["report"].severity == 0
     np.testing.assert_array_equal(names["thing"].splats.means, names["splats"].means)
+
+
+@_result("docs/usd.md")
+def _usd(names: dict[str, Any], folder: Path) -> None:
+    """What the recorded toy plays back is what was simulated: it falls from 0.1 m to the ground."""
+    played = names["played"]
+    assert names["q"].shape == (10, names["toy"].body.function_count, 3) and np.isfinite(names["q"]).all()
+    fallen = names["splats"].means[:, 2].mean() - played.splats_at(0).means[:, 2].mean()
+    assert -0.08 < fallen < -0.03  # on the ground its centre is some 4 cm high
+    assert played.points_at(9)[:, 2].min() > -2e-3
