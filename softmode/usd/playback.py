@@ -84,8 +84,22 @@ def read_animation(path: str | os.PathLike[str]) -> UsdPlayback:
     """
     name = f"OpenUSD file {path}"
     with tempfile.TemporaryDirectory() as folder:
-        request = process.make_request("animation", path, f"{folder}/answer", asset_root=None, limits=_LIMITS)
-        answer = process.ask({**request, "most": MAX_SPLATS}, name=name)
+        answer = process.ask(animation_request(path, f"{folder}/answer"), name=name)
+    return animation_from_answer(answer, name)
+
+
+def animation_request(path: str | os.PathLike[str], answer: str) -> dict[str, Any]:
+    """Return the request for the process of its own; `answer` is where its answer goes."""
+    request = process.make_request("animation", path, answer, asset_root=None, limits=_LIMITS)
+    return {**request, "most": MAX_SPLATS}
+
+
+def animation_from_answer(answer: process.Answer, name: str) -> UsdPlayback:
+    """Return the animation that the process sent.
+
+    Raises:
+        AssetError: If it contradicts itself.
+    """
     stage = answer.described
     if stage["up"] != "Z" or stage["meters"] != 1.0:
         raise AssetError(
@@ -98,6 +112,8 @@ def read_animation(path: str | os.PathLike[str]) -> UsdPlayback:
             hint="Write it with softmode.usd.UsdAnimation; splats that other tools animate are read by read_splats",
         )
     rate = float(stage["rate"])
+    if not (np.isfinite(rate) and rate > 0.0):
+        raise AssetError(f"{name}: timeCodesPerSecond is {rate}", hint="Set it to the number of time codes in a second")
     try:
         bodies = tuple(_played(sent, answer.arrays, rate, name) for sent in stage["bodies"])
     except (TypeError, IndexError, KeyError, ValueError) as error:

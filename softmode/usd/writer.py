@@ -1,4 +1,6 @@
-"""Soft bodies as OpenUSD: `write_usd`, and how one body is authored on a stage. ::
+"""Soft bodies as OpenUSD: `write_usd`, and how one body is authored on a stage.
+
+What a stage holds::
 
     /World                        Xform, default prim; metres, z up
       /World/<body>               Xform, PhysicsDeformableBodyAPI: place, mass, the ReducedBody as softmode:body:*

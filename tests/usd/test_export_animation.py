@@ -23,9 +23,11 @@ from softmode.usd import (
     UsdAnimationOptions,
     UsdExportOptions,
     add_usd,
+    process,
     read_animation,
     write_usd,
 )
+from softmode.usd.playback import animation_from_answer, animation_request
 from tests.usd.export_scenes import (
     KINDS,
     MATERIAL,
@@ -35,6 +37,7 @@ from tests.usd.export_scenes import (
     small_splats,
     some_state,
 )
+from tests.usd.test_damage import mutate
 
 pytest.importorskip("pxr", reason="needs the extra [usd]")
 Usd, UsdGeom = (importlib.import_module(f"pxr.{name}") for name in ("Usd", "UsdGeom"))
@@ -292,3 +295,31 @@ def test_what_is_no_animation_is_refused(tmp_path: Path) -> None:
     stage.GetRootLayer().Save()
     with pytest.raises(AssetError, match=r"c\.usda"):
         read_animation(tmp_path / "c.usda")
+
+
+def test_damaged_animations(tmp_path: Path) -> None:
+    """60 damaged text and binary files: an animation that is whole, or a typed error; the process that called lives."""
+    Scene("affine").record(tmp_path / "a.usda")
+    Scene("affine").record(tmp_path / "a.usdc")
+    valid = [(tmp_path / f"a.{suffix}").read_bytes() for suffix in ("usda", "usdc")]
+    requests = []
+    for trial in range(60):
+        path = tmp_path / f"{trial}.usd"
+        path.write_bytes(mutate(valid[trial % 2], np.random.default_rng(trial)))
+        requests.append(animation_request(path, str(tmp_path / f"answer_{trial}")))
+    (tmp_path / "requests.json").write_text(json.dumps(requests))
+    subprocess.run([sys.executable, "-m", "tests.usd.fork_server", str(tmp_path / "requests.json")], check=True)
+    refused = 0
+    for request in requests:
+        code = int(Path(request["answer"] + ".code").read_text())
+        try:
+            if code:
+                raise process.refusal(code, Path(request["answer"] + ".errors").read_text(errors="replace"), "file")
+            found = animation_from_answer(process.read_answer(request["answer"], "file"), "file")
+            for played in found.bodies:
+                assert np.isfinite(played.coordinates).all() and np.isfinite(played.times).all()
+                assert_same(played.body, small_body("affine"))
+        except AssetError as error:
+            assert error.message and error.hint
+            refused += 1
+    assert 15 < refused < 60
