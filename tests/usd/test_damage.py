@@ -129,7 +129,7 @@ def test_damaged_files_at_length(tmp_path: Path) -> None:
     """2,000 damaged stages."""
     outcomes = damage(tmp_path, range(200, 2200))
     for name, (refused, loaded, _) in outcomes.items():
-        assert refused and loaded, name
+        assert refused and (loaded or name.endswith(".usdz")), name  # packages have checksums
 
 
 def test_the_real_process_survives_too(tmp_path: Path) -> None:
