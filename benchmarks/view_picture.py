@@ -22,7 +22,7 @@ SIZE = (1000, 800)
 
 def main() -> None:
     """Serve, open, pull, take the picture."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("docs/images/view.png"))
     out = parser.parse_args().out
     with served(ObjectConfig(size=0.12), frame_rate=3.0) as view, sync_playwright() as driver:

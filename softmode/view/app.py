@@ -136,8 +136,9 @@ class ViewApp:
         begun = due = time.perf_counter()
         while not self._stop.is_set() and (duration is None or time.perf_counter() - begun < duration):
             self.frame(period)
-            due = max(due + period, time.perf_counter())  # a frame that came late does not hurry the next ones
-            self._stop.wait(due - time.perf_counter())
+            now = time.perf_counter()
+            due = max(due + period, now - period)  # makes up for one late frame, not for a long pause
+            self._stop.wait(max(due - now, 0.0))
 
     def submit(self, command: Command) -> None:
         """Queue something to be done with the session before the next frame; may be called from any thread."""
