@@ -35,7 +35,7 @@ MODULUS, DENSITY, GRAVITY = 1.5e5, 1000.0, 9.81
 
 def in_core(x: np.ndarray) -> np.ndarray:
     """Return which points of the bar, (N, 3), lie in its core."""
-    return (np.abs(x[:, 1:]) < 0.5 * CORE).all(axis=1)
+    return np.abs(x[:, 1:]).max(axis=1) < 0.5 * CORE
 
 
 def make_bar(ratio: float) -> ReducedBody:
