@@ -1,4 +1,4 @@
-"""What is built and installed: the archives, their metadata, and a first step in an environment that has nothing else."""
+"""What is built and installed: the archives, their metadata, and a first step where nothing else is installed."""
 
 from __future__ import annotations
 
@@ -82,10 +82,6 @@ def test_metadata(dist: Path) -> None:
     assert metadata["Version"] == softmode.__version__ and metadata["Requires-Python"] == ">=3.11"
     required = metadata.get_all("Requires-Dist") or []
     assert {re.split(r"[^\w-]", line)[0] for line in required if "extra ==" not in line} == CORE
-    assert (
-        f"## {softmode.__version__}" in (ROOT / "CHANGELOG.md").read_text()
-        or "Unreleased" in (ROOT / "CHANGELOG.md").read_text()
-    )
 
 
 def test_command_prints_the_version() -> None:
