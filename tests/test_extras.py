@@ -49,6 +49,10 @@ CASES = {
     ),
     "stage out": ("usd", "from softmode.usd import write_usd; write_usd('out.usdc', [None])"),
     "animation": ("usd", "from softmode.usd import UsdAnimation; UsdAnimation('out.usdc', None, [])"),
+    "picture of a body": (
+        "viz",
+        "from softmode.viz.body_picture import write_body_picture as w; w('toy.png', None, None, None)",
+    ),
     "rerun": ("viz", "from softmode.viz.rerun_logger import RerunLogger; RerunLogger('out.rrd', None)"),
     "SPZ version 4": ("spz", "from softmode.splats import read_splats; read_splats('toy.spz')"),
     "robot by name": ("robots", "from softmode import robots; robots.load('so101')"),
