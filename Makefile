@@ -1,6 +1,7 @@
 # softmode: set-up, tests and the demo. Needs python3 >= 3.11 and make; everything is installed into .venv.
 #   make demo            the arm lifts a soft object; writes out/lift.mp4
 #   make test            the fast tests (what CI runs)
+#   make dist            sdist and wheel in dist/; make smoke installs the wheel into an environment of its own and steps
 SHELL  := /bin/bash
 PYTHON ?= python3
 VENV   := .venv
@@ -21,7 +22,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 unexport VIRTUAL_ENV
 
 .DEFAULT_GOAL := help
-.PHONY: help lock demo test test-slow lint bench accuracy baselines clean coupling docs
+.PHONY: help lock resolve demo test test-slow lint docs dist smoke bench accuracy baselines clean coupling
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -53,6 +54,12 @@ lock: $(VENV)/.created  ## pin the newest versions that pyproject.toml allows
 	  --extra rsl-rl --extra skrl --override <(echo "torch; python_version < '3'") --no-header --no-annotate \
 	  --no-emit-index-url pyproject.toml -o constraints.txt
 
+resolve: $(VENV)/.created  ## check that all extras resolve to wheels on every supported Python
+	set -eo pipefail; for python in 3.11 3.12 3.13 3.14; do \
+	  echo "Python $$python:"; $(UV) pip compile --quiet --only-binary :all: --python-version $$python --all-extras \
+	    --no-header --no-annotate pyproject.toml | wc -l | sed 's/$$/ packages/'; \
+	done
+
 demo: $(VENV)/.demo  ## play the scripted lift and write out/lift.mp4
 	$(BIN)/softmode play softmode/LiftSoft-v0 --policy scripted --video out/lift.mp4 $(ARGS)
 
@@ -66,6 +73,13 @@ lint: $(VENV)/.dev  ## ruff and pyright
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
+
+dist: $(VENV)/.dev  ## build sdist and wheel
+	rm -rf dist
+	$(BIN)/python -m hatchling build -t sdist -t wheel
+
+smoke: dist  ## install the wheel alone into a new environment, make an environment, reset, step
+	$(BIN)/python -m pytest tests/test_packaging.py $(ARGS)
 
 bench: $(VENV)/.demo  ## time the build, a step and each stage of a grasp
 	$(BIN)/python benchmarks/build.py

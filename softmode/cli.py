@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from softmode import ENVIRONMENTS
+from softmode import ENVIRONMENTS, __version__
 from softmode.cli_bench import Bench
 from softmode.cli_body import BodyBuild, BodyCheck, BodyShow
 from softmode.cli_common import BuildBar, bar_interval, quiet_warp, warp_device
@@ -104,6 +104,9 @@ class Robots:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; errors that softmode expects print one line and return 2, an interruption returns 130."""
+    if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+        print(f"softmode {__version__}")
+        return 0
     try:
         try:
             import tyro

@@ -12,6 +12,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+NEEDS = {"behaviour_cloning": "torch", "train_ppo": "torch", "rerun_episode": "rerun", "usd_in_usd_out": "pxr"}
+"""Optional packages of examples; the others run with the extras demo, data and robots."""
 
 
 def test_there_are_examples():
@@ -36,8 +38,8 @@ def test_example_reads_well(path: Path):
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_example_runs(path: Path, tmp_path: Path):
     """The short version ends without error; its test_final asserts the physics."""
-    if path.stem.startswith("train_"):
-        pytest.importorskip("torch")
+    if path.stem in NEEDS:
+        pytest.importorskip(NEEDS[path.stem])
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         [sys.executable, str(path), "--short"],

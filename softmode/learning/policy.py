@@ -10,9 +10,16 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch
 
-from softmode.errors import CheckpointError, ConfigError
+from softmode.errors import CheckpointError, ConfigError, MissingExtraError
+
+try:
+    import torch
+except ImportError as error:
+    raise MissingExtraError(
+        "trained policies need torch", hint="install it with: pip install 'softmode[rl]'"
+    ) from error
+
 from softmode.learning.checkpoints import Checkpoint, check_env, read_checkpoint
 from softmode.learning.distributed import local_device
 from softmode.learning.environments import with_config

@@ -13,10 +13,15 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch
 
 from softmode import __version__
 from softmode.errors import CheckpointError, ConfigError, MissingExtraError, RunError, TrainingDiverged
+
+try:
+    import torch
+except ImportError as error:
+    raise MissingExtraError("training needs torch", hint="install it with: pip install 'softmode[rl]'") from error
+
 from softmode.learning.checkpoints import Checkpoint, check_env, read_checkpoint, write_checkpoint
 from softmode.learning.distributed import Ranks, local_device
 from softmode.learning.environments import make_vector_env
