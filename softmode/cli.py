@@ -18,6 +18,7 @@ from softmode.cli_record import Record
 from softmode.cli_splat import SplatConvert, SplatFromMesh, SplatInfo
 from softmode.cli_train import Evaluate, Export, Train, policy_file
 from softmode.cli_view import View
+from softmode.envs.catalogue import config_class, registered_id
 from softmode.errors import ConfigError, MaterialError, MissingExtraError, SoftmodeError
 from softmode.film import Film
 from softmode.policies import POLICIES, check_policy, policy_factory
@@ -28,7 +29,7 @@ class Play:
     """Play episodes of an environment and film them."""
 
     env: str
-    """Id of the environment, for example softmode/LiftSoft-v0."""
+    """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
     policy: str = "scripted"
     """scripted, random, zero, or the checkpoint of a run, for example runs/LiftSoft-v0/*/best.npz."""
     episodes: int = 1
@@ -157,8 +158,7 @@ def main(arguments: list[str] | None = None) -> int:
 def play(options: Play) -> int:
     """Play episodes; see :class:`Play`."""
     check_policy(options.policy)
-    if options.env not in ENVIRONMENTS:
-        raise ConfigError(f"unknown environment {options.env!r}", hint=f"use one of {', '.join(ENVIRONMENTS)}")
+    registered_id(options.env)
     if options.episodes < 1:
         raise ConfigError(f"episodes must be at least 1, got {options.episodes}", hint="give a count like 3")
     if options.seed < 0:
@@ -262,7 +262,7 @@ def _play_episode(
     for log in logs:
         log.record()
     total, steps, seconds = 0.0, 0, 0.0
-    limit = gym.spec(options.env).max_episode_steps
+    limit = gym.spec(registered_id(options.env)).max_episode_steps
     with tqdm(total=limit, desc=f"seed {seed}", unit="step", mininterval=bar_interval()) as bar:
         done = False
         while not done:
@@ -286,7 +286,6 @@ def _play_episode(
 
 def _task_config(options: Play, trained: dict[str, Any]) -> Any:
     """Turn the options that concern the object into a configuration, else as that of a trained policy."""
-    from softmode.envs.catalogue import config_class
     from softmode.envs.objects import ObjectConfig
     from softmode.learning.config_values import config_of
 

@@ -14,7 +14,7 @@ class Bench:
     """Time a vector environment with random actions; --stages says where the time goes."""
 
     env: str
-    """Id of the environment."""
+    """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
     num_envs: tuple[int, ...] = (1, 16)
     """Numbers of worlds, one measurement each."""
     device: str | None = None

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from softmode import ENVIRONMENTS
 from softmode.cli_common import bar_interval, quiet_warp, warp_device
+from softmode.envs.catalogue import purpose, registered_id
 from softmode.errors import ConfigError
 from softmode.policies import check_policy, policy_factory, trained_policy
 
@@ -32,7 +32,7 @@ class Record:
     """Record episodes of an environment as a LeRobot v3.0 dataset."""
 
     env: str
-    """Id of the environment, for example softmode/LiftSoft-v0."""
+    """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
     out: Annotated[Path | None, _short("-o")] = None
     """Folder of the dataset, out/NAME if omitted; must not exist, unless --append is given."""
     policy: str = "scripted"
@@ -63,10 +63,9 @@ class Record:
 
 def record(options: Record) -> int:
     """Record episodes; see :class:`Record`."""
-    if options.env not in ENVIRONMENTS:
-        raise ConfigError(f"unknown environment {options.env!r}", hint=f"use one of {', '.join(ENVIRONMENTS)}")
+    short_name = registered_id(options.env).rpartition("/")[2]
     check_policy(options.policy)
-    out = Path("out", options.env.rpartition("/")[2]) if options.out is None else options.out
+    out = Path("out", short_name) if options.out is None else options.out
     if not options.append and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"{out} exists", hint="choose another folder, or give --append")
 
@@ -110,7 +109,7 @@ def record(options: Record) -> int:
                     policy,
                     writer,
                     episodes=options.episodes,
-                    task=ENVIRONMENTS[options.env],
+                    task=purpose(options.env),
                     seed=options.seed,
                     noise=options.noise,
                     only_successes=options.only_successes,

@@ -16,7 +16,7 @@ class Train:
     """Train a policy; several GPUs: torchrun --nproc-per-node 2 -m softmode.cli train ID --device cuda."""
 
     env: str
-    """Id of the environment, for example softmode/LiftSoft-v0."""
+    """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
     algo: Literal["ppo"] = "ppo"
     """Algorithm."""
     num_envs: int = 16
@@ -93,7 +93,7 @@ class Evaluate:
     """Play whole episodes with a trained policy and print how often it succeeds."""
 
     env: str
-    """Id of the environment, for example softmode/LiftSoft-v0."""
+    """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
     policy: Path
     """Checkpoint of a run, for example best.npz."""
     episodes: int = 200
@@ -171,10 +171,11 @@ def policy_file(path: str, env: str) -> Any:
     """
     require_torch()
     from softmode.errors import CheckpointError
+    from softmode.learning.checkpoints import same_env
     from softmode.learning.policy import load_policy
 
     policy = load_policy(path)
-    if policy.env != env:
+    if not same_env(policy.env, env):
         raise CheckpointError(f"checkpoint {path} is of {policy.env}, not of {env}", hint=f"play {policy.env}")
     return policy
 

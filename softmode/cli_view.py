@@ -87,22 +87,25 @@ def view(options: View) -> int:
 
 def _session(options: View) -> LiveSession:
     """Make the session that was asked for."""
+    from gymnasium.envs.registration import registry
+
     from softmode.cli_common import BuildBar, warp_device
+    from softmode.envs.catalogue import registered_id
     from softmode.view.session import LiveSession
 
     if len(options.target) > 1:
         raise ConfigError(f"{len(options.target)} things to show: {', '.join(options.target)}", hint="name one")
     device, target = warp_device(options.device), next(iter(options.target), None)
     with BuildBar() as progress:
-        if target is not None and (target in ENVIRONMENTS or target.startswith("softmode/")):
-            if target not in ENVIRONMENTS:
-                raise ConfigError(f"unknown environment {target!r}", hint=f"use one of {', '.join(ENVIRONMENTS)}")
+        missing = target is not None and not Path(target).exists()
+        if target is not None and missing and (target.startswith("softmode/") or ":" in target or target in registry):
+            registered_id(target)
             if options.size is not None:
                 raise ConfigError("size is an object's, not an environment's", hint="leave --size out")
             return LiveSession.from_env(
                 target, policy=options.policy, seed=options.seed, device=device, progress=progress
             )
-        if target is not None and not Path(target).exists():
+        if missing:
             raise AssetError(
                 f"{target} is neither a file nor an environment",
                 hint=f"give a splat, mesh or .npz file, or one of {', '.join(ENVIRONMENTS)}",

@@ -90,6 +90,41 @@ def test_other_policies_play(policy: str, capsys: pytest.CaptureFixture[str], sh
     assert "seed 0: E 1e+05 Pa" in out and "seed 1" in out and "0 of 2 episodes succeeded" in out
 
 
+def test_a_task_of_ones_own_plays(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
+    """module:id imports the module, from the working folder too; its scripted policy is that of its task."""
+    (tmp_path / "slow_lift.py").write_text(OWN_TASK)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    given = ["slow_lift:SlowLift-v0", "--youngs-modulus", "1e5"]
+    assert main(["play", *given]) == 0
+    out = capsys.readouterr().out
+    assert "a script of its own" in out and "seed 0: E 1e+05 Pa" in out
+    assert main(["play", "SlowLift-v0", "--policy", "zero"]) == 0
+    assert main(["play", "CartPole-v1"]) == 2
+    assert main(["play", "no_such_module:SlowLift-v0"]) == 2
+    err = capsys.readouterr().err
+    assert "not made of a softmode task" in err and "no_such_module" in err
+
+
+OWN_TASK = """
+import gymnasium as gym
+from softmode.envs.lift_soft import LiftSoft
+from softmode.envs.soft_env import SoftEnv
+
+def rest(env):
+    print("a script of its own")
+    return lambda observation: env.action_space.low * 0
+
+class SlowLift(LiftSoft):
+    scripted_policy = rest
+
+class SlowLiftEnv(SoftEnv):
+    task_class = SlowLift
+
+gym.register("SlowLift-v0", entry_point=SlowLiftEnv, max_episode_steps=3)
+"""
+
+
 def test_list_envs_names_every_environment(capsys: pytest.CaptureFixture[str]) -> None:
     """One line per environment, without loading the simulator."""
     assert main(["list-envs"]) == 0

@@ -41,12 +41,16 @@ def scripted_policy(env: Any) -> Any:
         ShapeSoft: ScriptedShape,
     }
     task = getattr(env.unwrapped, "task", None)
+    own = getattr(type(task), "scripted_policy", None)
+    if own is not None:
+        return own(env)
     for kind, policy in policies.items():
         if isinstance(task, kind):
             return policy(env)
+    known = ", ".join(kind.__name__ for kind in policies)
     raise ConfigError(
         f"there is no scripted policy for {env}",
-        hint=f"there is one for {', '.join(kind.__name__ for kind in policies)}",
+        hint=f"there is one for {known}; a task of yours may set scripted_policy",
     )
 
 

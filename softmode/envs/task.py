@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, ClassVar, Literal, Self, get_args
@@ -189,6 +189,8 @@ class Task:
     """Names of the reward's terms."""
     metric_names: ClassVar[tuple[str, ...]] = ()
     """Names of the figures in info."""
+    scripted_policy: ClassVar[Callable[[Any], Callable[[Any], Any]] | None] = None
+    """Makes the policy that `--policy scripted` plays, from observation to action, for an environment."""
     point_count: ClassVar[int] = 16
     """Surface points of the object in the observation."""
 

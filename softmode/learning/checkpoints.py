@@ -136,13 +136,18 @@ def read_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
         raise CheckpointError(f"checkpoint {path} is damaged ({error})", hint=hint) from error
 
 
+def same_env(one: str, other: str) -> bool:
+    """Return whether two names are of one id; the module in front of a colon only says who registers it."""
+    return one.rpartition(":")[2] == other.rpartition(":")[2]
+
+
 def check_env(checkpoint: Checkpoint, path: object, env: str | None, interface: Interface) -> None:
     """Refuse a checkpoint of another environment or other spaces.
 
     Raises:
         CheckpointError: If it is one.
     """
-    if env is not None and checkpoint.env != env:
+    if env is not None and not same_env(checkpoint.env, env):
         raise CheckpointError(f"checkpoint {path} is of {checkpoint.env}, not of {env}", hint=f"play {checkpoint.env}")
     if checkpoint.interface != interface:
         raise CheckpointError(

@@ -7,8 +7,7 @@ from typing import Any
 import gymnasium as gym
 import torch
 
-from softmode import ENVIRONMENTS
-from softmode.envs.catalogue import config_class
+from softmode.envs.catalogue import config_class, is_soft
 from softmode.errors import ConfigError
 from softmode.learning.config_values import config_of
 
@@ -17,7 +16,7 @@ def make_vector_env(env: str, num_envs: int, device: torch.device, options: dict
     """Return the vector environment of an id: softmode's own with tensors on the device, others as gymnasium has them.
 
     Args:
-        env: Id of the environment.
+        env: Id of the environment, or module:id.
         num_envs: Number of worlds.
         device: Where a softmode environment computes.
         options: Keyword arguments of the environment; ``config`` may be a dict of the fields that differ.
@@ -26,12 +25,8 @@ def make_vector_env(env: str, num_envs: int, device: torch.device, options: dict
         ConfigError: If the id is not registered or an option is unknown.
     """
     given = dict(options)
-    try:
-        gym.spec(env)
-        if env not in ENVIRONMENTS:
-            return gym.make_vec(env, num_envs=num_envs, vectorization_mode="sync", **given)
-    except (gym.error.UnregisteredEnv, gym.error.NameNotFound, gym.error.NamespaceNotFound) as error:
-        raise ConfigError(f"unknown environment {env!r}", hint=f"use one of {', '.join(ENVIRONMENTS)}") from error
+    if not is_soft(env):
+        return gym.make_vec(env, num_envs=num_envs, vectorization_mode="sync", **given)
     given = with_config(env, given)
     try:
         return gym.make_vec(env, num_envs=num_envs, **{"device": str(device), "output": "torch", **given})
@@ -49,6 +44,6 @@ def with_config(env: str, options: dict[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigError: If a field is unknown or outside its range.
     """
-    if env not in ENVIRONMENTS or not isinstance(options.get("config"), dict):
+    if not isinstance(options.get("config"), dict) or not is_soft(env):
         return options
     return {**options, "config": config_of(config_class(env), options["config"])}

@@ -58,7 +58,8 @@ class RunFolder:
     @staticmethod
     def name_for(root: Path, env: str, name: str | None) -> Path:
         """Return ``root/<Env>/<YYYYmmdd-HHMMSS>[_name]``, a folder that is not there yet."""
-        base = root / env.rpartition("/")[2] / (time.strftime("%Y%m%d-%H%M%S") + (f"_{name}" if name else ""))
+        task = env.rpartition(":")[2].rpartition("/")[2]
+        base = root / task / (time.strftime("%Y%m%d-%H%M%S") + (f"_{name}" if name else ""))
         path, k = base, 1
         while path.exists():
             path, k = base.with_name(f"{base.name}-{k}"), k + 1

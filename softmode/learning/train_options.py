@@ -27,7 +27,7 @@ class TrainOptions:
     """
 
     env: str
-    """Id of the environment."""
+    """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
     num_envs: int = 16
     """Worlds of each process."""
     device: str = "cpu"

@@ -22,7 +22,7 @@ try:
 except ImportError as error:
     raise MissingExtraError("training needs torch", hint="install it with: pip install 'softmode[rl]'") from error
 
-from softmode.learning.checkpoints import Checkpoint, check_env, read_checkpoint, write_checkpoint
+from softmode.learning.checkpoints import Checkpoint, check_env, read_checkpoint, same_env, write_checkpoint
 from softmode.learning.distributed import Ranks, local_device
 from softmode.learning.environments import make_vector_env
 from softmode.learning.nan_guard import NanGuard
@@ -83,7 +83,7 @@ def _starting_point(options: TrainOptions) -> tuple[TrainOptions, Checkpoint | N
     assert options.run_dir is not None
     config = RunFolder(options.run_dir, resume=True).read_config()
     start = read_checkpoint(options.run_dir / LATEST)
-    if start.env != options.env:
+    if not same_env(start.env, options.env):
         raise CheckpointError(
             f"the run in {options.run_dir} trains {start.env}, not {options.env}", hint=f"train {start.env}"
         )
@@ -166,7 +166,7 @@ class _Run:
         if path is None:
             return None
         checkpoint = read_checkpoint(path)
-        if checkpoint.env != self.options.env:
+        if not same_env(checkpoint.env, self.options.env):
             raise CheckpointError(f"teacher {path} plays {checkpoint.env}", hint=f"give one of {self.options.env}")
         seen = checkpoint.interface
         if dict(seen.vectors) != {STATE: self.privileged} or seen.action_size != self.env.interface.action_size:
