@@ -8,6 +8,8 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 UV     := $(BIN)/uv
 ARGS   ?=
+# Processes that run tests, each a file of them at a time, with up to 4 GB.
+WORKERS ?= 2
 
 # Tests train with stable-baselines3, rsl_rl and skrl, which need torch; a CPU wheel (200 MB) is enough, and the three and
 # what they bring are 32 MB more. Where pip's own settings find no CPU wheel, the default one for Linux brings gigabytes of
@@ -64,10 +66,10 @@ demo: $(VENV)/.demo  ## play the scripted lift and write out/lift.mp4
 	$(BIN)/softmode play softmode/LiftSoft-v0 --policy scripted --video out/lift.mp4 $(ARGS)
 
 test: $(VENV)/.dev  ## run the fast tests
-	$(BIN)/python -m pytest $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
 
 test-slow: $(VENV)/.dev  ## run all tests, slow ones included
-	$(BIN)/python -m pytest -m 'slow or not slow' $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile -m 'slow or not slow' $(ARGS)
 
 lint: $(VENV)/.dev  ## ruff and pyright
 	$(BIN)/ruff check .
