@@ -74,7 +74,9 @@ class UsdDeformable:
         exact = self._exact_properties()
         values.update(exact)
         values.update({name: v for name, v in self.properties.items() if not _agree(exact.get(name), v)})
-        if self.mass is not None and not _agree(values["density"] * volume, self.mass):
+        # The mass that softmode wrote beside a density says nothing new: who edits that density is heard.
+        written = exact.get("density", values["density"]) * volume
+        if self.mass is not None and not _agree(written, self.mass):
             values["density"] = self.mass / volume
         try:
             return Material(**values)

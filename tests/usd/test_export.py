@@ -202,10 +202,17 @@ def test_edited_material_is_heard_and_an_edited_body_refused(tmp_path: Path) -> 
     """The standard attributes are there to be edited; the arrays of a body are not."""
     write_usd(tmp_path / "toy.usda", placed())
     layer = Sdf.Layer.FindOrOpen(str(tmp_path / "toy.usda"))
-    layer.GetAttributeAtPath("/World/toy/PhysicsMaterial.physics:youngsModulus").default = 5.0e4
+    for name, value in (("youngsModulus", 5.0e4), ("density", 640.0), ("dynamicFriction", 0.25)):
+        layer.GetAttributeAtPath(f"/World/toy/PhysicsMaterial.physics:{name}").default = value
     layer.Save()
     (found,) = add_usd(newton.ModelBuilder(), tmp_path / "toy.usda").bodies.values()
-    assert found.material == dataclasses.replace(MATERIAL, youngs_modulus=5.0e4)
+    edited = dataclasses.replace(MATERIAL, youngs_modulus=5.0e4, density=640.0, friction=0.25)
+    assert found.material == edited, "although the mass that was written beside them is there still"
+    layer.GetAttributeAtPath("/World/toy.physics:mass").default = 0.05
+    layer.Save()
+    (found,) = add_usd(newton.ModelBuilder(), tmp_path / "toy.usda").bodies.values()
+    volume = found.body.volume * found.scale**3
+    assert found.material.density * volume == pytest.approx(0.05, rel=2.0**-23), "an edited mass goes before density"
     weights = layer.GetAttributeAtPath("/World/toy.softmode:body:weights")
     weights.default = type(weights.default)([1.01 * w for w in weights.default])
     layer.Save()

@@ -82,6 +82,10 @@ def test_sublayers_and_clips(tree: Path) -> None:
     write(path, 'def "World" (clips = { dictionary default = { asset[] assetPaths = [@/etc/a.usd@] } })\n{\n}')
     with pytest.raises(AssetError, match="value clips"):
         read_usd_scene(path)
+    inner = '"a" (clips = { dictionary default = { asset[] assetPaths = [@/etc/a.usd@] } }) {\n}'
+    write(path, ARCS["variant"].format("parts/toy.usda").replace('"a" {\n}', inner))
+    with pytest.raises(AssetError, match="value clips"):
+        read_usd_scene(path)
 
 
 def test_a_wider_root_is_the_remedy(tree: Path) -> None:

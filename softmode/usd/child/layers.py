@@ -65,7 +65,7 @@ def open_layers(path: str, root: str, budget: Budget) -> Any:
 def _assets(layer: Any) -> list[tuple[str, bool]]:
     """Return every asset path of a layer and whether it names a layer."""
     Sdf = importlib.import_module("pxr.Sdf")
-    found = [(str(name), True) for name in layer.GetCompositionAssetDependencies()]
+    found = [(str(name), True) for name in layer.GetCompositionAssetDependencies() if name]  # "": the layer itself
     single, several = Sdf.ValueTypeNames.Asset, Sdf.ValueTypeNames.AssetArray
 
     def visit(path: Any) -> None:
@@ -77,7 +77,7 @@ def _assets(layer: Any) -> list[tuple[str, bool]]:
             for value in values:
                 items = [value] if isinstance(value, Sdf.AssetPath) else (value or [])
                 found.extend((item.path, False) for item in items)
-        elif path.IsPrimPath():
+        elif path.IsPrimPath() or path.IsPrimVariantSelectionPath():  # a variant speaks of its prim, too
             prim = layer.GetPrimAtPath(path)
             if prim is not None and prim.HasInfo("clips"):
                 raise Refused(f"{path} has value clips, which softmode does not read", "Flatten the stage")

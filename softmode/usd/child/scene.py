@@ -21,7 +21,8 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
         arrays: Takes the arrays.
     """
     Usd, UsdGeom, UsdPhysics = (importlib.import_module(f"pxr.{name}") for name in ("Usd", "UsdGeom", "UsdPhysics"))
-    uninstance(stage)
+    meters, kilograms = UsdGeom.GetStageMetersPerUnit(stage), UsdPhysics.GetStageKilogramsPerUnit(stage)
+    uninstance(stage, every=request["copy"] is not None and (meters != 1.0 or kilograms != 1.0))
     prims = list(prims_of(stage))
     time = Usd.TimeCode.EarliestTime()
     transforms = UsdGeom.XformCache(time)
@@ -68,8 +69,8 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
         copy.write_rest(stage, prims, request["copy"], used, [str(body.prim.GetPath()) for body in bodies], ignored)
     return {
         "up": str(UsdGeom.GetStageUpAxis(stage)),
-        "meters": UsdGeom.GetStageMetersPerUnit(stage),
-        "kilograms": UsdPhysics.GetStageKilogramsPerUnit(stage),
+        "meters": meters,
+        "kilograms": kilograms,
         "bodies": described,
         "scenery": [
             read_splats(prim)
