@@ -324,12 +324,19 @@ def _properties(body: dict[str, Any], frame: _Frame) -> tuple[dict[str, float], 
         "friction": 1.0,
     }
     material = body["material"] or {}
-    values = {key: float(material[key]) * unit for key, unit in units.items() if key in material}
+    values = {key: shortest(material[key]) * unit for key, unit in units.items() if key in material}
     sources = {key: f"{material['path']}.{material[f'{key}_from']}" for key in values}
     if body["density"] is not None:
-        values["density"] = float(body["density"]) * units["density"]
+        values["density"] = shortest(body["density"]) * units["density"]
         sources["density"] = f"{body['path']}.density"
     return values, sources
+
+
+def shortest(value: float | np.floating) -> float:
+    """Return the double of fewest digits that is a float32 number: 0.4, not 0.4000000059604645; others as they are."""
+    with np.errstate(over="ignore"):
+        single = np.float32(value)
+    return float(str(single)) if single == value else float(value)
 
 
 def _bundle(sent: dict[str, Any] | None, arrays: list[NDArray[Any]]) -> dict[str, Any] | None:

@@ -110,6 +110,15 @@ def test_inside_the_root_all_arcs_load(tree: Path) -> None:
     assert [body.path for body in read_usd_scene(top).deformables] == ["/World/Toy"]
 
 
+def test_other_units_are_told(tree: Path) -> None:
+    """A layer in other units is taken as it is, as OpenUSD does, and the notes say so."""
+    path = write(tree / "a.usda", ARCS["reference"].format("parts/toy.usda"))
+    assert read_usd_scene(path).notes == ()
+    path.write_text(path.read_text().replace("metersPerUnit = 1", "metersPerUnit = 0.01"))
+    (note,) = read_usd_scene(path).notes
+    assert note.startswith("toy.usda: metersPerUnit 1.0, the stage's is 0.01")
+
+
 def test_packages(tree: Path) -> None:
     """A .usdz package holds all of its stage."""
     package = tree / "toy.usdz"

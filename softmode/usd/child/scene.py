@@ -77,8 +77,21 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
             for prim in prims
             if prim.GetTypeName() == tokens.SPLATS and str(prim.GetPath()) not in used and visible(prim)
         ],
-        "notes": [f"{path}: {kind} between deformables is not read" for path, kind in ignored],
+        "notes": [f"{path}: {kind} between deformables is not read" for path, kind in ignored] + _other_units(stage),
     }
+
+
+def _other_units(stage: Any) -> list[str]:
+    """Return a note for each layer whose unit or axis is not the stage's: OpenUSD takes its numbers as they are."""
+    UsdGeom = importlib.import_module("pxr.UsdGeom")
+    expected = {"metersPerUnit": UsdGeom.GetStageMetersPerUnit(stage), "upAxis": UsdGeom.GetStageUpAxis(stage)}
+    notes = []
+    for layer in stage.GetUsedLayers():
+        for name, value in expected.items():
+            given = layer.pseudoRoot.GetInfo(name) if layer.pseudoRoot.HasInfo(name) else value
+            if given != value:
+                notes.append(f"{layer.GetDisplayName()}: {name} {given}, the stage's is {value}; nothing converts it")
+    return notes
 
 
 def _geometry(prim: Any, time: Any, arrays: Any) -> dict[str, Any]:
