@@ -175,13 +175,7 @@ def scene_from_answer(answer: process.Answer, name: str) -> UsdScene:
         AssetError: If values contradict each other.
     """
     stage = answer.described
-    meters, kilograms = float(stage["meters"]), float(stage["kilograms"])
-    for what, value in (("metersPerUnit", meters), ("kilogramsPerUnit", kilograms)):
-        if not (np.isfinite(value) and value > 0.0):
-            raise AssetError(f"{name}: {what} is {value}", hint="Set it to the size of the unit in SI units")
-    if stage["up"] not in UP_AXES:
-        raise AssetError(f"{name}: upAxis is {stage['up'][:20]!r}", hint="Set it to X, Y or Z")
-    frame = _Frame(up_rotation(UP_AXES[stage["up"]]), meters, kilograms)
+    frame = stage_frame(stage, name)
     try:
         bodies = tuple(_deformable(body, answer.arrays, frame, name) for body in stage["bodies"])
         scenery = [_splats(prim, answer.arrays, frame, np.eye(4), name) for prim in stage["scenery"]]
@@ -192,8 +186,8 @@ def scene_from_answer(answer: process.Answer, name: str) -> UsdScene:
     return UsdScene(
         file=name.removeprefix("OpenUSD file "),
         deformables=bodies,
-        meters_per_unit=meters,
-        kilograms_per_unit=kilograms,
+        meters_per_unit=frame.meters,
+        kilograms_per_unit=frame.kilograms,
         up_axis=stage["up"],
         scenery=joined(scenery, name) if scenery else None,
         notes=tuple(stage["notes"]),
@@ -201,7 +195,7 @@ def scene_from_answer(answer: process.Answer, name: str) -> UsdScene:
 
 
 @dataclass(frozen=True)
-class _Frame:
+class StageFrame:
     """How a stage is turned and scaled: every frame of it, not only the outermost, so that local shapes agree too."""
 
     up: Array
@@ -222,7 +216,22 @@ class _Frame:
             return (self.meters * points.astype(np.float64)) @ self.up.T
 
 
-def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame, name: str) -> UsdDeformable:
+def stage_frame(stage: dict[str, Any], name: str) -> StageFrame:
+    """Return the units and axes of a stage that the process described.
+
+    Raises:
+        AssetError: If they are none.
+    """
+    meters, kilograms = float(stage["meters"]), float(stage["kilograms"])
+    for what, value in (("metersPerUnit", meters), ("kilogramsPerUnit", kilograms)):
+        if not (np.isfinite(value) and value > 0.0):
+            raise AssetError(f"{name}: {what} is {value}", hint="Set it to the size of the unit in SI units")
+    if stage["up"] not in UP_AXES:
+        raise AssetError(f"{name}: upAxis is {stage['up'][:20]!r}", hint="Set it to X, Y or Z")
+    return StageFrame(up_rotation(UP_AXES[stage["up"]]), meters, kilograms)
+
+
+def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFrame, name: str) -> UsdDeformable:
     """Build one body from what the process sent."""
     where = f"{name}: {body['geometry']}"
     world = frame.matrix(body["matrix"] if body["bundle"] is None else body["body_matrix"])
@@ -243,13 +252,13 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame,
     kind = body["kind"]
     surface, points, radii = None, np.zeros((0, 3)), np.zeros(0)
     if kind == "Mesh":
-        surface = mesh_surface(_parts(shape, arrays, frame), stretch, where)
+        surface = mesh_surface(parts_of(shape, arrays, frame), stretch, where)
         if body["surface"]:
             notes.append("a surface deformable, simulated as the solid that it encloses")
     elif kind == "TetMesh":
-        surface = tet_surface(_parts(shape, arrays, frame), stretch, where)
+        surface = tet_surface(parts_of(shape, arrays, frame), stretch, where)
     elif kind == "Points":
-        parts = _parts(shape, arrays, frame)
+        parts = parts_of(shape, arrays, frame)
         points = finite_points(parts, where) @ stretch.T
         widths = np.asarray(parts.get("widths", 0.0), dtype=np.float64)
         if not (widths.size in (1, len(points)) and np.isfinite(widths).all() and (widths >= 0.0).all()):
@@ -261,7 +270,7 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame,
     for mesh in body["meshes"]:
         relative = _snapped(to_asset @ frame.matrix(mesh["matrix"]))
         meshes.append(
-            mesh_surface(_parts(mesh, arrays, frame), relative[:3, :3], f"{name}: {mesh['path']}", relative[:3, 3])
+            mesh_surface(parts_of(mesh, arrays, frame), relative[:3, :3], f"{name}: {mesh['path']}", relative[:3, 3])
         )
     properties, sources = _properties(body, frame)
     mass = body["mass"]
@@ -288,7 +297,7 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame,
     )
 
 
-def _splats(prim: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame, into: Array, name: str) -> Splats:
+def _splats(prim: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFrame, into: Array, name: str) -> Splats:
     """Return the splats of a prim in another frame than the world, given the map there; untouched if it is theirs."""
     part = splats_from_prim(prim, arrays, f"{name}: {prim['path']}")
     if frame.meters != 1.0 or not np.array_equal(frame.up, np.eye(3)):
@@ -303,7 +312,7 @@ def _snapped(matrix: Array) -> Array:
     return near if np.allclose(near, np.eye(4), atol=1e-9) else matrix
 
 
-def _parts(shape: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame) -> dict[str, Any]:
+def parts_of(shape: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFrame) -> dict[str, Any]:
     """Return the arrays of a geometry in metres, its own frame."""
     found: dict[str, Any] = {key: arrays[value] for key, value in shape.items() if type(value) is int}
     points = found.get("points", np.zeros((0, 3)))
@@ -315,7 +324,7 @@ def _parts(shape: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame) -> 
     return {**found, "left_handed": shape["left_handed"]}
 
 
-def _properties(body: dict[str, Any], frame: _Frame) -> tuple[dict[str, float], dict[str, str]]:
+def _properties(body: dict[str, Any], frame: StageFrame) -> tuple[dict[str, float], dict[str, str]]:
     """Return material properties in SI units and where they come from."""
     units = {
         "youngs_modulus": frame.kilograms / frame.meters,

@@ -47,11 +47,11 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
                 "surface": any(name in tokens.SURFACE_SIM_APIS for name in applied(geometry)),
                 "matrix": flat(transforms.GetLocalToWorldTransform(geometry)),
                 "body_matrix": flat(transforms.GetLocalToWorldTransform(body.prim)),
-                "shape": _geometry(geometry, time, arrays),
+                "shape": geometry_of(geometry, time, arrays),
                 "meshes": [
                     {
                         "matrix": flat(transforms.GetLocalToWorldTransform(mesh)),
-                        **_geometry(mesh, time, arrays),
+                        **geometry_of(mesh, time, arrays),
                     }
                     for mesh in body.meshes
                 ],
@@ -59,7 +59,7 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
                 "mass": _scalar(body.prim, geometry, "mass"),
                 "density": _scalar(body.prim, geometry, "density"),
                 "material": _material(geometry, body.prim),
-                "bundle": _bundle(body.prim, arrays),
+                "bundle": bundle_of(body.prim, arrays),
                 "notes": body.notes,
             }
         )
@@ -94,7 +94,7 @@ def _other_units(stage: Any) -> list[str]:
     return notes
 
 
-def _geometry(prim: Any, time: Any, arrays: Any) -> dict[str, Any]:
+def geometry_of(prim: Any, time: Any, arrays: Any) -> dict[str, Any]:
     """Return the numbers of the arrays of a Mesh, TetMesh or Points prim, by attribute."""
     found: dict[str, Any] = {"path": str(prim.GetPath())}
     names = {
@@ -163,7 +163,7 @@ def _material(geometry: Any, body: Any) -> dict[str, Any] | None:
     return None
 
 
-def _bundle(prim: Any, arrays: Any) -> dict[str, Any] | None:
+def bundle_of(prim: Any, arrays: Any) -> dict[str, Any] | None:
     """Return softmode's own attributes of a body: strings, numbers, and the numbers of arrays."""
     marker = prim.GetAttribute(tokens.FORMAT)
     if not marker or not marker.HasAuthoredValue():
