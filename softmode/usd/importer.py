@@ -115,7 +115,8 @@ def add_usd(
 
     The file is opened in a process of its own, which sends the soft bodies as arrays and writes the rest as one checked
     crate; Newton's importer reads that. Bodies are built once and kept in the cache. One that softmode wrote comes back
-    as it was; it is not built again.
+    as it was; it is not built again. Gravity of the stage, if it has a `PhysicsScene`, becomes the builder's, turned as
+    the stage is.
 
     Args:
         builder: Builder of the world, Z up; it may be replicated afterwards.

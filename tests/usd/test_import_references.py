@@ -119,6 +119,20 @@ def test_other_units_are_told(tree: Path) -> None:
     assert note.startswith("toy.usda: metersPerUnit 1.0, the stage's is 0.01")
 
 
+def test_brackets_in_names(tree: Path) -> None:
+    """Brackets belong to the names of files and folders, and of packages in such folders."""
+    folder = tree / "toys [new]"
+    (tree / "parts").rename(folder)
+    UsdUtils.CreateNewUsdzPackage(str(folder / "toy.usda"), str(folder / "toy.usdz"))
+    for name in ("toy.usda", "toy.usdz", "toy.usdz[toy.usda]"):
+        path = write(tree / "[a].usda", ARCS["reference"].format(f"toys [new]/{name}"))
+        assert [body.path for body in read_usd_scene(path).deformables] == ["/World/Toy"], name
+    assert len(read_usd_scene(folder / "toy.usdz").deformables) == 1
+    path = write(tree / "[a].usda", ARCS["reference"].format("[b]/../../secret/toy.usda"))
+    with pytest.raises(AssetError, match="outside"):
+        read_usd_scene(path)
+
+
 def test_packages(tree: Path) -> None:
     """A .usdz package holds all of its stage."""
     package = tree / "toy.usdz"
