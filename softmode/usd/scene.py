@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from softmode.deformables.authoring import SCALE_MAX, SCALE_MIN
 from softmode.deformables.materials import Material, MaterialModel
 from softmode.errors import AssetError, MaterialError
 from softmode.splats.formats.usd import UP_AXES, joined, placed, splats_from_prim
@@ -235,14 +236,22 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFr
     """Build one body from what the process sent."""
     where = f"{name}: {body['geometry']}"
     world = frame.matrix(body["matrix"] if body["bundle"] is None else body["body_matrix"])
+    scale, own = 1.0, frame
+    if body["bundle"] is not None:  # in metres with z up whatever stage refers to it, and so are the numbers beside it
+        own = StageFrame(np.eye(3), 1.0, 1.0)
+        world[:3, :3] = frame.meters * (world[:3, :3] @ frame.up)
     rotation, stretch = split_transform(world, where)
-    scale = 1.0
     if body["bundle"] is not None:  # the prim's frame is the body's: its place may turn and scale, no more
         scale = float(stretch[0, 0])
         if not np.array_equal(stretch, scale * np.eye(3)):
             raise AssetError(
                 f"{name}: {body['path']}: a body of softmode is stretched or mirrored by its transform",
                 hint="Scale it evenly, or delete its softmode: attributes to have the body built anew",
+            )
+        if not SCALE_MIN <= scale <= SCALE_MAX:
+            raise AssetError(
+                f"{name}: {body['path']}: a body of softmode is scaled by {scale:g}, outside {SCALE_MIN}..{SCALE_MAX}",
+                hint="It is in metres: scale it by 1 / metersPerUnit where it is referred to in other units",
             )
         stretch = np.eye(3)
     to_asset = np.eye(4)  # world -> asset frame
@@ -258,7 +267,7 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFr
     elif kind == "TetMesh":
         surface = tet_surface(parts_of(shape, arrays, frame), stretch, where)
     elif kind == "Points":
-        parts = parts_of(shape, arrays, frame)
+        parts = parts_of(shape, arrays, own)
         points = finite_points(parts, where) @ stretch.T
         widths = np.asarray(parts.get("widths", 0.0), dtype=np.float64)
         if not (widths.size in (1, len(points)) and np.isfinite(widths).all() and (widths >= 0.0).all()):
@@ -272,7 +281,7 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFr
         meshes.append(
             mesh_surface(parts_of(mesh, arrays, frame), relative[:3, :3], f"{name}: {mesh['path']}", relative[:3, 3])
         )
-    properties, sources = _properties(body, frame)
+    properties, sources = _properties(body, own)
     mass = body["mass"]
     if mass is None and "masses" in shape:
         mass = float(np.sum(arrays[shape["masses"]], dtype=np.float64)) or None
@@ -291,7 +300,7 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFr
         scale=scale,
         properties=properties,
         sources=sources,
-        mass=None if mass is None else mass * frame.kilograms,
+        mass=None if mass is None else mass * own.kilograms,
         bundle=_bundle(body["bundle"], arrays),
         notes=tuple(notes),
     )
