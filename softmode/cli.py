@@ -48,7 +48,7 @@ class Play:
     splat: Path | None = None
     """Splat file of the object (INRIA .ply, or a SOG v2 folder, meta.json or .sog); the built-in plush if omitted."""
     object: Path | None = None
-    """Body file of the object, from `softmode body build`; instead of a splat file."""
+    """Body file of the object, from `softmode body build`, or a stage with a body; instead of a splat file."""
     size: float | None = None
     """Longest edge of the object [m], as the task has it if omitted; the gripper opens 0.09 m."""
     up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None

@@ -30,8 +30,8 @@ class _Asset:
     """A file, and how it becomes a body."""
 
     file: Path
-    """Splats (.ply, .splat, .spz, .sog, meta.json, .usd, ...), a mesh (.glb, .obj, .stl, ...) or a point cloud (.npz
-    with points, normals, colors; .ply)."""
+    """Splats (.ply, .splat, .spz, .sog, meta.json, .usd, ...), a mesh (.glb, .obj, .stl, .usd, ...) or a point cloud
+    (.npz with points, normals, colors; .ply)."""
     size: float | None = None
     """Longest edge of the object [m]; 0.08 if omitted."""
     up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None

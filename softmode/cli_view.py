@@ -44,6 +44,8 @@ class View:
     """Pictures per second."""
     record_folder: Path = Path("out")
     """Where recordings are written."""
+    record_as: Literal["mp4", "npz", "usdc"] = "mp4"
+    """What the button records: a video, coordinates, or an OpenUSD stage (extra [usd])."""
     device: str | None = None
     """Warp device, for example cpu or cuda:0."""
 
@@ -59,7 +61,11 @@ def view(options: View) -> int:
     if options.duration is not None and not 0.0 < options.duration < float("inf"):
         raise ConfigError(f"duration must be a finite number > 0, got {options.duration}", hint="give seconds, like 60")
     served = ViewOptions(
-        host=options.host, port=options.port, frame_rate=options.frame_rate, record_folder=options.record_folder
+        host=options.host,
+        port=options.port,
+        frame_rate=options.frame_rate,
+        record_folder=options.record_folder,
+        record_as=options.record_as,
     )
     served.check()  # a building that takes a minute need not come first
     from softmode.cli_common import quiet_warp

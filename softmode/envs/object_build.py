@@ -19,6 +19,7 @@ from softmode.errors import AssetError, ConfigError
 from softmode.splats import Splats
 from softmode.splats.formats import READABLE
 from softmode.splats.point_cloud import ply_kind
+from softmode.usd import tokens
 
 FileKind = Literal["splat", "points", "mesh", "body"]
 Box = tuple[float, float, float, float, float, float]
@@ -56,7 +57,7 @@ class BuiltObject:
 
 
 def file_kind(path: str | Path) -> FileKind:
-    """Return what a file is, by its suffix and, for .ply and .npz, its contents.
+    """Return what a file is, by its suffix and, for .ply, .npz and OpenUSD, its contents.
 
     Raises:
         AssetError: If it is missing or cannot be read.
@@ -76,6 +77,10 @@ def file_kind(path: str | Path) -> FileKind:
     if suffix == ".ply":
         found = ply_kind(file)
         return "splat" if found == "splats" else "mesh" if found == "mesh" else "points"
+    if suffix in tokens.SUFFIXES:
+        from softmode.usd.asset import asset_kind
+
+        return asset_kind(file)
     return "splat" if file.is_dir() or suffix in READABLE else "mesh"
 
 

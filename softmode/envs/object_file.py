@@ -11,6 +11,7 @@ from softmode.deformables.reduced_body import ReducedBody
 from softmode.errors import AssetError
 from softmode.splats.point_cloud import splats_from_points
 from softmode.splats.splats import Splats
+from softmode.usd import tokens
 
 _FIELDS = ("means", "quats", "scales", "opacities", "sh")
 _LIGHT = np.array([0.37, 0.29, 0.88])
@@ -29,7 +30,7 @@ def write_object(path: str | os.PathLike[str], body: ReducedBody, splats: Splats
 
 
 def read_object(path: str | os.PathLike[str]) -> tuple[ReducedBody, Splats | None]:
-    """Read a file written by `write_object` or `ReducedBody.save`.
+    """Read a file written by `write_object` or `ReducedBody.save`, or a stage with one body from `usd.write_usd`.
 
     Returns:
         The body, and its splats in the body frame, or None if the file has none.
@@ -37,6 +38,10 @@ def read_object(path: str | os.PathLike[str]) -> tuple[ReducedBody, Splats | Non
     Raises:
         AssetError: If the file is missing, damaged, foreign, or of another version.
     """
+    if os.fspath(path).lower().endswith(tokens.SUFFIXES):
+        from softmode.usd.asset import read_usd_body
+
+        return read_usd_body(path)
     body = ReducedBody.load(path)
     stored = read_beside(path, "splats.")
     if not stored:

@@ -56,10 +56,11 @@ class ObjectConfig:
     splat: str | Path | None = None
     """Splat file (.ply, SOG v2, .spz, .splat, OpenUSD), or a point cloud (.npz, see `read_points`, or .ply)."""
     mesh: str | Path | None = None
-    """Mesh file (.obj, .glb, .stl, ... whatever trimesh reads). One that is not closed stands for what it encloses."""
+    """Mesh file (.obj, .glb, .stl, ... whatever trimesh reads, OpenUSD). One that is not closed stands for what it
+    encloses."""
     body: str | Path | None = None
-    """File of a body (`softmode body build`, or `ReducedBody.save`): taken as it is, with its own size, pose, surface
-    samples, regions and splats."""
+    """File of a body (`softmode body build`, `ReducedBody.save`, or a stage with one from `usd.write_usd`): taken as it
+    is, with its own size, pose, surface samples, regions and splats."""
     size: float = 0.08
     """Longest edge of the bounding box of plush, splat file or mesh, upright [m]; the gripper opens 0.09 m."""
     colors: tuple[Color, Color] | None = None

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.errors import AssetError
+from softmode.usd import tokens
 
 if TYPE_CHECKING:
     import trimesh
@@ -143,8 +144,10 @@ class ColoredMesh:
 def read_mesh(path: str | os.PathLike[str]) -> ColoredMesh:
     """Read a mesh file of any kind that trimesh reads (.obj, .glb, .gltf, .ply, .stl, .off, ...), with its textures.
 
+    Of OpenUSD stages the visible meshes are read, with their display colours.
+
     Args:
-        path: The file. The result keeps its frame and unit.
+        path: The file. The result keeps its frame and unit; that of a stage is in metres with z up.
 
     Raises:
         AssetError: If the file is missing, of an unknown kind, damaged, or holds no surface.
@@ -152,6 +155,10 @@ def read_mesh(path: str | os.PathLike[str]) -> ColoredMesh:
     import trimesh
 
     file = Path(path)
+    if file.suffix.lower() in tokens.SUFFIXES:
+        from softmode.usd.asset import read_usd_mesh
+
+        return read_usd_mesh(file)
     name = f"mesh file {file}"
     if not file.is_file():
         raise AssetError(f"{name}: no such file", hint="Check the path")

@@ -25,6 +25,7 @@ from softmode.usd.handles import handles_from_coordinates, local_coordinates, ri
 from softmode.usd.openusd import check_stage, openusd, whole_stage
 from softmode.usd.placed import PlacedBody
 from softmode.usd.rigid import RigidMeshes
+from softmode.usd.scene import shortest
 from softmode.usd.skinned import SkinnedSplats
 from softmode.usd.writer import (
     UsdExportOptions,
@@ -207,7 +208,7 @@ class UsdAnimation:
         columns = {name: getattr(data, name).numpy() for name in (*MATERIAL_FIELDS, "material_model", "scale")}
         placed = []
         for i, given, q in zip(self._instances, self._bodies, states, strict=True):
-            values = {name: _shortest(columns[name][i]) for name in MATERIAL_FIELDS}
+            values = {name: shortest(columns[name][i]) for name in MATERIAL_FIELDS}
             rotation, translation = rigid_motion(given.body, q)
             splats = given.splats
             if splats is not None and self.options.sh_degree is not None:
@@ -302,8 +303,3 @@ class UsdAnimation:
             if waiting > _SAVE_BYTES:
                 save(layer)
                 waiting = 0.0
-
-
-def _shortest(value: np.float32) -> float:
-    """Return the double nearest to a float32 that is written in fewest digits: 0.4, not 0.4000000059604645."""
-    return float(str(value))

@@ -1,7 +1,8 @@
 """A `ReducedBody` as attributes of a prim: one flat array for each array field, and a header in JSON for the rest.
 
-Nothing is rounded and nothing is pickled: arrays keep their dtype, and JSON gives floats back to the bit. A sha256 over
-all of it goes along, so that a body of which a part was edited or lost in a conversion is told from a whole one.
+Nothing is rounded and nothing is pickled: arrays keep their dtype, and JSON gives floats back to the bit. The signs of
+zeros, which crate files drop where they compress an array, are in the header. A sha256 over all of it goes along, so
+that a body of which a part was edited or lost in a conversion is told from a whole one.
 """
 
 from __future__ import annotations
@@ -40,8 +41,10 @@ def encode_body(body: ReducedBody) -> tuple[str, dict[str, NDArray], str]:
     """Return the header, the arrays by field, flat in C order, and the digest of both."""
     fields, arrays = body_fields(body)
     fields["arrays"] = {name: [array.dtype.str, list(array.shape)] for name, array in arrays.items()}
-    header = json.dumps(fields)
     flat = {name: np.ascontiguousarray(array).reshape(-1) for name, array in arrays.items()}
+    zeros = {name: np.flatnonzero((array == 0.0) & np.signbit(array)).tolist() for name, array in flat.items()}
+    fields["negative_zeros"] = {name: where for name, where in zeros.items() if where}
+    header = json.dumps(fields)
     return header, flat, content_digest(header, flat)
 
 
@@ -60,13 +63,18 @@ def decode_body(header: str, arrays: Mapping[str, NDArray], digest: str, source:
     try:
         fields = json.loads(header)
         described = {str(name): (np.dtype(kind), tuple(shape)) for name, (kind, shape) in fields.pop("arrays").items()}
+        zeros = {str(name): np.array(where, np.int64) for name, where in fields.pop("negative_zeros", {}).items()}
         unknown = [kind.str for kind, _ in described.values() if kind.str not in DTYPES]
         if unknown or not all(isinstance(n, int) and n >= 0 for _, shape in described.values() for n in shape):
             raise ValueError(f"arrays of {unknown or 'negative size'}")
-    except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError, RecursionError) as error:
         raise AssetError(f"{source}: its softmode body has no readable header ({error})", hint=_HINT) from error
     flat = {name: np.zeros(0, kind) for name, (kind, _) in described.items()}
-    flat.update({name: np.asarray(array) for name, array in arrays.items()})
+    flat.update({name: np.array(array) for name, array in arrays.items()})
+    for name, where in zeros.items():
+        array = flat.get(name, np.zeros(0))
+        where = where[(where >= 0) & (where < array.size)] if array.dtype.kind == "f" else where[:0]
+        array[where[array[where] == 0.0]] = -0.0
     if content_digest(header, flat) != digest:
         raise AssetError(f"{source}: its softmode body was changed since it was written", hint=_HINT)
     shaped: dict[str, NDArray] = {}

@@ -24,11 +24,10 @@ from softmode.deformables.quadrature import (
 )
 from softmode.deformables.skinning import average_basis
 from softmode.errors import AssetError, BasisError, ConfigError, SoftmodeError
-from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.mesh_samples import sample_mesh
 from softmode.splats.splats import Splats, quat_from_rotation
+from softmode.usd.asset import colored_mesh
 from softmode.usd.bundle import body_of
-from softmode.usd.geometry import SurfaceMesh
 from softmode.usd.scene import UsdDeformable, UsdScene, open_scene
 
 Array = NDArray[np.float64]
@@ -116,7 +115,8 @@ def add_usd(
 
     The file is opened in a process of its own, which sends the soft bodies as arrays and writes the rest as one checked
     crate; Newton's importer reads that. Bodies are built once and kept in the cache. One that softmode wrote comes back
-    as it was; it is not built again.
+    as it was; it is not built again. Gravity of the stage, if it has a `PhysicsScene`, becomes the builder's, turned as
+    the stage is.
 
     Args:
         builder: Builder of the world, Z up; it may be replicated afterwards.
@@ -293,7 +293,7 @@ def _integrate(deformable: UsdDeformable, surface_count: int) -> Quadrature:
         try:
             return quadrature_from_mesh(surface.vertices, surface.faces, surface_count=surface_count)
         except AssetError:
-            cover = sample_mesh(_colored(surface, deformable.path), _COVER)
+            cover = sample_mesh(colored_mesh([surface], deformable.path), _COVER)
             return quadrature_from_points(cover.means, surface_count=surface_count)
     if splats is not None and deformable.kind != "Points":
         return quadrature_from_splats(
@@ -315,24 +315,4 @@ def _mesh_splats(deformable: UsdDeformable, count: int) -> Splats | None:
     meshes = [mesh for mesh in (deformable.meshes or (deformable.surface,)) if mesh is not None and len(mesh.faces)]
     if not meshes:
         return None
-    start = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    whole = SurfaceMesh(
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.faces + first for mesh, first in zip(meshes, start, strict=True)]),
-        np.concatenate([mesh.colors for mesh in meshes]),
-    )
-    return sample_mesh(_colored(whole, deformable.path), count)
-
-
-def _colored(mesh: SurfaceMesh, name: str) -> ColoredMesh:
-    """Return a mesh in its display colours, which are linear in OpenUSD and gamma-encoded in splats."""
-    linear = mesh.colors[mesh.faces]
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0) ** (1.0 / 2.4) - 0.055)
-    return ColoredMesh(
-        corners=mesh.vertices[mesh.faces].astype(np.float32),
-        corner_colors=encoded.astype(np.float32),
-        corner_uvs=np.zeros((len(mesh.faces), 3, 2), np.float32),
-        texture_index=np.full(len(mesh.faces), -1, np.int32),
-        textures=(),
-        name=name,
-    )
+    return sample_mesh(colored_mesh(meshes, deformable.path), count)

@@ -10,6 +10,7 @@ import importlib.util
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -24,6 +25,7 @@ from softmode.errors import AssetError, MissingExtraError
 
 REEXPORT = "The file is damaged or incomplete: copy or export it again"
 """The remedy for a file that contradicts itself."""
+_LIGHTEN = "If the file is damaged, copy or export it again; if it is merely large, import a part of it"
 _CHILD = Path(__file__).with_name("child") / "__main__.py"
 _DTYPES = {
     "f": "<f4",
@@ -140,7 +142,7 @@ def ask(request: dict[str, Any], *, name: str) -> Answer:
                     check=False,
                 ).returncode
         except subprocess.TimeoutExpired as error:
-            raise AssetError(f"{name}: OpenUSD does not come to an end with it", hint=REEXPORT) from error
+            raise AssetError(f"{name}: OpenUSD does not come to an end with it", hint=_LIGHTEN) from error
         if code:
             raise refusal(code, _tail(report), name)
     return read_answer(request["answer"], name)
@@ -148,14 +150,17 @@ def ask(request: dict[str, Any], *, name: str) -> Answer:
 
 def refusal(code: int, report: str, name: str) -> AssetError:
     """Return the error for an exit code and what the process wrote to its standard error."""
-    reason, hint = "OpenUSD exceeds its memory or time, or crashes, with it", REEXPORT
+    reason, hint = "OpenUSD crashes with it, or takes more memory than is given", _LIGHTEN
+    if code == -getattr(signal, "SIGPROF", 0):
+        reason = "OpenUSD takes more processor time than is given"
     if code == 3:  # an error of OpenUSD: where in its sources : 'what'
-        said = json.loads(report.rpartition("\nanswer: ")[2])
+        said, hint = json.loads(report.rpartition("\nanswer: ")[2]), REEXPORT
         reason = (re.findall(r" : '(.+?)(?:' Error in|'?$)", said["reason"]) or [said["reason"]])[0].strip()
         hint = said["hint"] or hint
         if said["hint"]:
             return AssetError(f"{name}: {reason[:400]}", hint=hint)
     elif code == 1:  # an error of Python, before OpenUSD saw the file
+        hint = REEXPORT
         reason = (report.strip().splitlines() or ["no message"])[-1]
     return AssetError(f"{name}: cannot be read ({reason[:300]})", hint=hint)
 

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from softmode.deformables.authoring import SCALE_MAX, SCALE_MIN
 from softmode.deformables.materials import Material, MaterialModel
 from softmode.errors import AssetError, MaterialError
 from softmode.splats.formats.usd import UP_AXES, joined, placed, splats_from_prim
@@ -74,7 +75,9 @@ class UsdDeformable:
         exact = self._exact_properties()
         values.update(exact)
         values.update({name: v for name, v in self.properties.items() if not _agree(exact.get(name), v)})
-        if self.mass is not None and not _agree(values["density"] * volume, self.mass):
+        # The mass that softmode wrote beside a density says nothing new: who edits that density is heard.
+        written = exact.get("density", values["density"]) * volume
+        if self.mass is not None and not _agree(written, self.mass):
             values["density"] = self.mass / volume
         try:
             return Material(**values)
@@ -173,13 +176,7 @@ def scene_from_answer(answer: process.Answer, name: str) -> UsdScene:
         AssetError: If values contradict each other.
     """
     stage = answer.described
-    meters, kilograms = float(stage["meters"]), float(stage["kilograms"])
-    for what, value in (("metersPerUnit", meters), ("kilogramsPerUnit", kilograms)):
-        if not (np.isfinite(value) and value > 0.0):
-            raise AssetError(f"{name}: {what} is {value}", hint="Set it to the size of the unit in SI units")
-    if stage["up"] not in UP_AXES:
-        raise AssetError(f"{name}: upAxis is {stage['up'][:20]!r}", hint="Set it to X, Y or Z")
-    frame = _Frame(up_rotation(UP_AXES[stage["up"]]), meters, kilograms)
+    frame = stage_frame(stage, name)
     try:
         bodies = tuple(_deformable(body, answer.arrays, frame, name) for body in stage["bodies"])
         scenery = [_splats(prim, answer.arrays, frame, np.eye(4), name) for prim in stage["scenery"]]
@@ -190,8 +187,8 @@ def scene_from_answer(answer: process.Answer, name: str) -> UsdScene:
     return UsdScene(
         file=name.removeprefix("OpenUSD file "),
         deformables=bodies,
-        meters_per_unit=meters,
-        kilograms_per_unit=kilograms,
+        meters_per_unit=frame.meters,
+        kilograms_per_unit=frame.kilograms,
         up_axis=stage["up"],
         scenery=joined(scenery, name) if scenery else None,
         notes=tuple(stage["notes"]),
@@ -199,7 +196,7 @@ def scene_from_answer(answer: process.Answer, name: str) -> UsdScene:
 
 
 @dataclass(frozen=True)
-class _Frame:
+class StageFrame:
     """How a stage is turned and scaled: every frame of it, not only the outermost, so that local shapes agree too."""
 
     up: Array
@@ -220,18 +217,41 @@ class _Frame:
             return (self.meters * points.astype(np.float64)) @ self.up.T
 
 
-def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame, name: str) -> UsdDeformable:
+def stage_frame(stage: dict[str, Any], name: str) -> StageFrame:
+    """Return the units and axes of a stage that the process described.
+
+    Raises:
+        AssetError: If they are none.
+    """
+    meters, kilograms = float(stage["meters"]), float(stage["kilograms"])
+    for what, value in (("metersPerUnit", meters), ("kilogramsPerUnit", kilograms)):
+        if not (np.isfinite(value) and value > 0.0):
+            raise AssetError(f"{name}: {what} is {value}", hint="Set it to the size of the unit in SI units")
+    if stage["up"] not in UP_AXES:
+        raise AssetError(f"{name}: upAxis is {stage['up'][:20]!r}", hint="Set it to X, Y or Z")
+    return StageFrame(up_rotation(UP_AXES[stage["up"]]), meters, kilograms)
+
+
+def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFrame, name: str) -> UsdDeformable:
     """Build one body from what the process sent."""
     where = f"{name}: {body['geometry']}"
     world = frame.matrix(body["matrix"] if body["bundle"] is None else body["body_matrix"])
+    scale, own = 1.0, frame
+    if body["bundle"] is not None:  # in metres with z up whatever stage refers to it, and so are the numbers beside it
+        own = StageFrame(np.eye(3), 1.0, 1.0)
+        world[:3, :3] = frame.meters * (world[:3, :3] @ frame.up)
     rotation, stretch = split_transform(world, where)
-    scale = 1.0
     if body["bundle"] is not None:  # the prim's frame is the body's: its place may turn and scale, no more
         scale = float(stretch[0, 0])
         if not np.array_equal(stretch, scale * np.eye(3)):
             raise AssetError(
                 f"{name}: {body['path']}: a body of softmode is stretched or mirrored by its transform",
                 hint="Scale it evenly, or delete its softmode: attributes to have the body built anew",
+            )
+        if not SCALE_MIN <= scale <= SCALE_MAX:
+            raise AssetError(
+                f"{name}: {body['path']}: a body of softmode is scaled by {scale:g}, outside {SCALE_MIN}..{SCALE_MAX}",
+                hint="It is in metres: scale it by 1 / metersPerUnit where it is referred to in other units",
             )
         stretch = np.eye(3)
     to_asset = np.eye(4)  # world -> asset frame
@@ -241,13 +261,13 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame,
     kind = body["kind"]
     surface, points, radii = None, np.zeros((0, 3)), np.zeros(0)
     if kind == "Mesh":
-        surface = mesh_surface(_parts(shape, arrays, frame), stretch, where)
+        surface = mesh_surface(parts_of(shape, arrays, frame), stretch, where)
         if body["surface"]:
             notes.append("a surface deformable, simulated as the solid that it encloses")
     elif kind == "TetMesh":
-        surface = tet_surface(_parts(shape, arrays, frame), stretch, where)
+        surface = tet_surface(parts_of(shape, arrays, frame), stretch, where)
     elif kind == "Points":
-        parts = _parts(shape, arrays, frame)
+        parts = parts_of(shape, arrays, own)
         points = finite_points(parts, where) @ stretch.T
         widths = np.asarray(parts.get("widths", 0.0), dtype=np.float64)
         if not (widths.size in (1, len(points)) and np.isfinite(widths).all() and (widths >= 0.0).all()):
@@ -259,9 +279,9 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame,
     for mesh in body["meshes"]:
         relative = _snapped(to_asset @ frame.matrix(mesh["matrix"]))
         meshes.append(
-            mesh_surface(_parts(mesh, arrays, frame), relative[:3, :3], f"{name}: {mesh['path']}", relative[:3, 3])
+            mesh_surface(parts_of(mesh, arrays, frame), relative[:3, :3], f"{name}: {mesh['path']}", relative[:3, 3])
         )
-    properties, sources = _properties(body, frame)
+    properties, sources = _properties(body, own)
     mass = body["mass"]
     if mass is None and "masses" in shape:
         mass = float(np.sum(arrays[shape["masses"]], dtype=np.float64)) or None
@@ -280,13 +300,13 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame,
         scale=scale,
         properties=properties,
         sources=sources,
-        mass=None if mass is None else mass * frame.kilograms,
+        mass=None if mass is None else mass * own.kilograms,
         bundle=_bundle(body["bundle"], arrays),
         notes=tuple(notes),
     )
 
 
-def _splats(prim: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame, into: Array, name: str) -> Splats:
+def _splats(prim: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFrame, into: Array, name: str) -> Splats:
     """Return the splats of a prim in another frame than the world, given the map there; untouched if it is theirs."""
     part = splats_from_prim(prim, arrays, f"{name}: {prim['path']}")
     if frame.meters != 1.0 or not np.array_equal(frame.up, np.eye(3)):
@@ -301,7 +321,7 @@ def _snapped(matrix: Array) -> Array:
     return near if np.allclose(near, np.eye(4), atol=1e-9) else matrix
 
 
-def _parts(shape: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame) -> dict[str, Any]:
+def parts_of(shape: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFrame) -> dict[str, Any]:
     """Return the arrays of a geometry in metres, its own frame."""
     found: dict[str, Any] = {key: arrays[value] for key, value in shape.items() if type(value) is int}
     points = found.get("points", np.zeros((0, 3)))
@@ -313,7 +333,7 @@ def _parts(shape: dict[str, Any], arrays: list[NDArray[Any]], frame: _Frame) -> 
     return {**found, "left_handed": shape["left_handed"]}
 
 
-def _properties(body: dict[str, Any], frame: _Frame) -> tuple[dict[str, float], dict[str, str]]:
+def _properties(body: dict[str, Any], frame: StageFrame) -> tuple[dict[str, float], dict[str, str]]:
     """Return material properties in SI units and where they come from."""
     units = {
         "youngs_modulus": frame.kilograms / frame.meters,
@@ -322,12 +342,19 @@ def _properties(body: dict[str, Any], frame: _Frame) -> tuple[dict[str, float], 
         "friction": 1.0,
     }
     material = body["material"] or {}
-    values = {key: float(material[key]) * unit for key, unit in units.items() if key in material}
+    values = {key: shortest(material[key]) * unit for key, unit in units.items() if key in material}
     sources = {key: f"{material['path']}.{material[f'{key}_from']}" for key in values}
     if body["density"] is not None:
-        values["density"] = float(body["density"]) * units["density"]
+        values["density"] = shortest(body["density"]) * units["density"]
         sources["density"] = f"{body['path']}.density"
     return values, sources
+
+
+def shortest(value: float | np.floating) -> float:
+    """Return the double of fewest digits that is a float32 number: 0.4, not 0.4000000059604645; others as they are."""
+    with np.errstate(over="ignore"):
+        single = np.float32(value)
+    return float(str(single)) if single == value else float(value)
 
 
 def _bundle(sent: dict[str, Any] | None, arrays: list[NDArray[Any]]) -> dict[str, Any] | None:

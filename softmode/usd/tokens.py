@@ -9,6 +9,9 @@ Reference:
 
 from __future__ import annotations
 
+SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
+"""Suffixes of stages that can be read."""
+
 # Schemas of the AOUSD proposal and of Newton.
 BODY_API = "PhysicsDeformableBodyAPI"
 VOLUME_SIM_API = "PhysicsVolumeDeformableSimAPI"

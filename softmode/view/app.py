@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,8 @@ class ViewOptions:
     """Pictures per second [1/s]."""
     record_folder: Path = Path("out")
     """Where recordings are written."""
+    record_as: Literal["mp4", "npz", "usdc"] = "mp4"
+    """What a recording is: a video, coordinates to be shown again, or an OpenUSD stage."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -261,7 +263,7 @@ class ViewApp:
 
     def _record_path(self) -> Path:
         """Name the next recording."""
-        return self.options.record_folder / time.strftime("view-%Y%m%d-%H%M%S.mp4")
+        return self.options.record_folder / f"{time.strftime('view-%Y%m%d-%H%M%S')}.{self.options.record_as}"
 
 
 @dataclass(frozen=True, kw_only=True)

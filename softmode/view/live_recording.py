@@ -1,7 +1,8 @@
-"""Recordings of a live session: pictures as a video, or coordinates to be shown again."""
+"""Recordings of a live session: a video, coordinates to be shown again, or an OpenUSD stage."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.atomic import PendingFile
-from softmode.errors import AssetError, ConfigError
+from softmode.errors import AssetError, ConfigError, SolverDiverged
 from softmode.film import Film
 from softmode.splats.camera import CameraOptions, PinholeCamera, SplatCamera
 from softmode.view.live_types import vector3
@@ -138,6 +139,31 @@ class FilmRecorder:
     def discard(self) -> None:
         """Remove what was written."""
         self._film.discard()
+
+
+class UsdRecorder:
+    """Keeps coordinates and writes a stage with handle matrices at the end."""
+
+    def __init__(self, path: Path, model: Any, objects: Sequence[Any]) -> None:
+        """Find the objects in the model."""
+        from softmode.usd import PlacedBody, UsdAnimation, UsdAnimationOptions
+
+        bodies = [PlacedBody(body=thing.body, splats=thing.splats) for thing in objects]
+        self._animation = UsdAnimation(path, model, bodies, options=UsdAnimationOptions(fps=RECORD_HZ))
+        self.path, self.count = path, 0
+
+    def add(self, time: float, state: Any) -> None:
+        """Take a frame; one that is not finite is left out."""
+        with contextlib.suppress(SolverDiverged):
+            self._animation.record(state, time)
+        self.count += 1
+
+    def finish(self) -> None:
+        """Write the stage."""
+        self._animation.publish()
+
+    def discard(self) -> None:
+        """Nothing was written that is not whole."""
 
 
 def live_camera(

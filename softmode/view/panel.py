@@ -161,7 +161,7 @@ class Panel:
             }
             self._submit(actions[str(buttons.value)])
 
-        self._record = gui.add_button("record", hint="Starts and stops an .mp4 of the scene")
+        self._record = gui.add_button("record", hint="Starts and stops a recording of the scene")
 
         @self._record.on_click
         async def _(_: Any) -> None:

@@ -29,6 +29,7 @@ from softmode.view.live_recording import (
     FilmRecorder,
     LiveRecording,
     Recorder,
+    UsdRecorder,
     live_camera,
 )
 from softmode.view.live_scenes import EnvScene, LiveScene, ObjectScene
@@ -462,17 +463,19 @@ class LiveSession:
     def start_recording(
         self, path: str | Path, *, position: ArrayLike | None = None, target: ArrayLike | None = None, edge: int = 480
     ) -> None:
-        """Record from now on, 30 frames per simulated second: ".mp4" draws pictures, ".npz" keeps coordinates.
+        """Record from now on, 30 frames per simulated second.
 
         Args:
-            path: The file; it appears when the recording is stopped, complete or not at all.
+            path: The file: ".mp4" draws pictures, ".npz" keeps coordinates for `show_frame`, ".usdc", ".usd" or ".usda"
+                is an OpenUSD stage as `UsdAnimation` writes it. It appears when the recording is stopped, complete or
+                not at all.
             position: Where the camera stands [m]; None for a view of all.
             target: Where it looks [m].
             edge: Width and height of the pictures [px].
 
         Raises:
             ConfigError: If a recording is being made, or the path has another suffix or cannot be written.
-            MissingExtraError: If what encodes videos is not installed.
+            MissingExtraError: If what encodes videos, or OpenUSD, is not installed.
         """
         if self._recorder is not None:
             raise ConfigError(f"{self._recorder.path} is being recorded", hint="stop that recording first")
@@ -482,8 +485,10 @@ class LiveSession:
         elif suffix == ".mp4":
             camera = live_camera(self._scene.cameras, self.bounds(), position, target, edge)
             self._recorder = FilmRecorder(file, self._scene.model, self._picture, camera)
+        elif suffix in (".usdc", ".usd", ".usda"):
+            self._recorder = UsdRecorder(file, self._scene.model, self._scene.objects)
         else:
-            raise ConfigError(f"recording {file} is no .mp4 or .npz file", hint="name it like out/poke.mp4")
+            raise ConfigError(f"recording {file} is no .mp4, .npz or .usdc file", hint="name it like out/poke.mp4")
         self._record_from = self._clock
         self._record()
 

@@ -14,6 +14,8 @@ import newton
 import numpy as np
 import pytest
 
+pytest.importorskip("pxr", reason="needs the extra [usd]")
+
 from softmode.errors import AssetError, ConfigError, MissingExtraError, StorageError
 from softmode.usd import PlacedBody, UsdExportOptions, add_usd, write_usd, writer
 from softmode.usd.handles import handles_from_coordinates
@@ -27,8 +29,8 @@ from tests.usd.export_scenes import (
     small_splats,
     some_state,
 )
+from tests.usd.stages import Author
 
-pytest.importorskip("pxr", reason="needs the extra [usd]")
 Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade = (
     importlib.import_module(f"pxr.{name}") for name in ("Gf", "Sdf", "Usd", "UsdGeom", "UsdPhysics", "UsdShade")
 )
@@ -202,15 +204,55 @@ def test_edited_material_is_heard_and_an_edited_body_refused(tmp_path: Path) -> 
     """The standard attributes are there to be edited; the arrays of a body are not."""
     write_usd(tmp_path / "toy.usda", placed())
     layer = Sdf.Layer.FindOrOpen(str(tmp_path / "toy.usda"))
-    layer.GetAttributeAtPath("/World/toy/PhysicsMaterial.physics:youngsModulus").default = 5.0e4
+    for name, value in (("youngsModulus", 5.0e4), ("density", 640.0), ("dynamicFriction", 0.25)):
+        layer.GetAttributeAtPath(f"/World/toy/PhysicsMaterial.physics:{name}").default = value
     layer.Save()
     (found,) = add_usd(newton.ModelBuilder(), tmp_path / "toy.usda").bodies.values()
-    assert found.material == dataclasses.replace(MATERIAL, youngs_modulus=5.0e4)
+    edited = dataclasses.replace(MATERIAL, youngs_modulus=5.0e4, density=640.0, friction=0.25)
+    assert found.material == edited, "although the mass that was written beside them is there still"
+    layer.GetAttributeAtPath("/World/toy.physics:mass").default = 0.05
+    layer.Save()
+    (found,) = add_usd(newton.ModelBuilder(), tmp_path / "toy.usda").bodies.values()
+    volume = found.body.volume * found.scale**3
+    assert found.material.density * volume == pytest.approx(0.05, rel=2.0**-23), "an edited mass goes before density"
     weights = layer.GetAttributeAtPath("/World/toy.softmode:body:weights")
     weights.default = type(weights.default)([1.01 * w for w in weights.default])
     layer.Save()
     with pytest.raises(AssetError, match="/World/toy: its softmode body was changed"):
         add_usd(newton.ModelBuilder(), tmp_path / "toy.usda")
+
+
+@pytest.mark.parametrize(("up", "meters", "kilograms"), [("Z", 1.0, 1.0), ("Y", 0.01, 1.0), ("Z", 0.001, 0.001)])
+def test_a_body_in_a_stage_of_other_units(tmp_path: Path, up: str, meters: float, kilograms: float) -> None:
+    """A stage in other units that turns and scales what it refers to has the body where it was, of the same material.
+
+    One that leaves it as it is, a hundredth of its size, is told what to do.
+    """
+    write_usd(tmp_path / "toy.usdc", placed())
+    author = Author.create(tmp_path / "a.usda", up, meters, kilograms)
+    prim = UsdGeom.Xform.Define(author.stage, "/World/Toys").GetPrim()
+    prim.GetReferences().AddReference("./toy.usdc")
+    turn = np.stack([author.vector(axis) for axis in np.eye(3)], axis=1)  # z up, metres -> the stage's
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn
+    UsdGeom.Xformable(prim).AddTransformOp().Set(Gf.Matrix4d(*matrix.T.ravel().tolist()))
+    author.save()
+    (plain,) = add_usd(newton.ModelBuilder(), tmp_path / "toy.usdc").bodies.values()
+    (found,) = add_usd(newton.ModelBuilder(), tmp_path / "a.usda").bodies.values()
+    assert_same(found.body, plain.body)
+    assert found.material == plain.material == MATERIAL
+    assert found.scale == pytest.approx(plain.scale, rel=1e-12)
+    np.testing.assert_allclose(found.position, plain.position, atol=1e-12)
+    np.testing.assert_allclose(found.rotation, plain.rotation, atol=1e-12)
+    assert found.splats is not None and plain.splats is not None
+    np.testing.assert_allclose(found.splats.means, plain.splats.means, atol=1e-7)
+    np.testing.assert_allclose(found.splats.covariances(), plain.splats.covariances(), rtol=1e-4, atol=1e-12)
+    UsdGeom.Xformable(prim).ClearXformOpOrder()
+    author.save()
+    if meters != 1.0:
+        with pytest.raises(AssetError, match="scaled by") as caught:
+            add_usd(newton.ModelBuilder(), tmp_path / "a.usda")
+        assert "metersPerUnit" in caught.value.hint
 
 
 def test_validators_find_nothing(tmp_path: Path) -> None:

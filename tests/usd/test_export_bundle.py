@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+pytest.importorskip("pxr", reason="needs the extra [usd]")
+
 from softmode.errors import AssetError
-from softmode.usd.bundle import decode_body, encode_body
+from softmode.usd import PlacedBody, read_usd_scene, write_usd
+from softmode.usd.bundle import body_of, decode_body, encode_body
 from softmode.usd.handles import (
     coordinates_from_handles,
     handle_weights,
@@ -28,7 +34,27 @@ def test_round_trip_is_exact(kind: str) -> None:
     assert_same(decode_body(header, there, digest, "test"), body)
 
 
-@pytest.mark.parametrize("change", ["value", "missing", "extra", "header", "digest", "dtype", "nonsense"])
+@pytest.mark.parametrize("suffix", [".usdc", ".usda"])
+def test_signs_of_zeros_survive_the_file(suffix: str, tmp_path: Path) -> None:
+    """A crate stores an array of whole or of few different numbers as such, -0.0 as 0.0; the body has its signs back.
+
+    The normals of a box are such an array.
+    """
+    normals = small_body("affine").surface_normals.copy()
+    axis = np.abs(normals).argmax(axis=1)
+    normals = np.where(np.arange(3) == axis[:, None], np.sign(normals), -0.0)
+    normals[::5] += 0.0
+    body = dataclasses.replace(small_body("affine"), surface_normals=normals)
+    header, arrays, digest = encode_body(body)
+    lost = {name: array + 0.0 if array.dtype.kind == "f" else array for name, array in arrays.items()}
+    assert_same(decode_body(header, lost, digest, "test"), body)
+    write_usd(tmp_path / f"bar{suffix}", PlacedBody(body=body))
+    (found,) = read_usd_scene(tmp_path / f"bar{suffix}").deformables
+    assert found.bundle is not None
+    assert_same(body_of(found.bundle, "test"), body)
+
+
+@pytest.mark.parametrize("change", ["value", "missing", "extra", "header", "digest", "dtype", "nonsense", "zeros"])
 def test_change_is_told(change: str) -> None:
     """What is not as it was written is refused, whichever part it is."""
     header, arrays, digest = encode_body(small_body("affine"))
@@ -45,6 +71,8 @@ def test_change_is_told(change: str) -> None:
         digest = digest[::-1]
     elif change == "dtype":
         arrays["points"] = arrays["points"].astype(np.float32)
+    elif change == "zeros":
+        header = header.replace('"negative_zeros": {', '"negative_zeros": {"points": [0, -9, 1e99], ')
     else:
         header = "[1, 2"
     with pytest.raises(AssetError, match="softmode body") as caught:

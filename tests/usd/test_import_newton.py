@@ -24,7 +24,7 @@ from softmode.deformables.status import status_reasons
 from softmode.errors import AssetError, ConfigError, MissingExtraError
 from softmode.splats.rasterizer import SplatArrays
 from softmode.usd import add_usd, process, read_usd_scene
-from tests.usd.stages import KINDS, Author, UsdGeom, UsdVol, box, shell, transform
+from tests.usd.stages import KINDS, Author, Gf, Sdf, UsdGeom, UsdVol, box, shell, transform
 
 EPSILON = float(np.finfo(np.float32).eps)
 SMALL = BuildOptions(mode_count=3, kernel_count=120, cubature_count=128)
@@ -44,17 +44,25 @@ def everything(path: Path, up: str = "Z", meters: float = 1.0, kilograms: float 
 
 def arrays(builder: newton.ModelBuilder) -> dict[str, np.ndarray]:
     """Return what a model says of its rigid and soft bodies."""
+    found = rigid_arrays(builder)
+    model: Any = builder.finalize()
+    for name in ("particle_q", "particle_mass"):
+        found[name] = getattr(model, name).numpy()
+    for name in ("youngs_modulus", "poissons_ratio", "density", "friction"):
+        found[name] = getattr(model.softmode, name).numpy()
+    return found
+
+
+def rigid_arrays(builder: newton.ModelBuilder) -> dict[str, np.ndarray]:
+    """Return what a model says of its rigid bodies and of gravity."""
     model: Any = builder.finalize()
     state = model.state()
     newton.eval_fk(model, model.joint_q, model.joint_qd, state)
     names = (
-        *("body_mass", "body_inertia", "shape_scale", "joint_type", "joint_limit_lower", "joint_limit_upper"),
-        *("joint_target_ke", "joint_target_kd", "joint_effort_limit", "particle_q", "particle_mass", "gravity"),
+        *("body_mass", "body_inertia", "shape_scale", "joint_type", "joint_limit_lower"),
+        *("joint_limit_upper", "joint_target_ke", "joint_target_kd", "joint_effort_limit", "gravity"),
     )
-    soft = ("youngs_modulus", "poissons_ratio", "density", "friction")
-    found = {name: getattr(model, name).numpy() for name in names}
-    found |= {name: getattr(model.softmode, name).numpy() for name in soft}
-    return found | {"body": state.body_q.numpy()[:, :3]}
+    return {name: getattr(model, name).numpy() for name in names} | {"body": state.body_q.numpy()[:, :3]}
 
 
 def test_everything_in_a_stage(tmp_path: Path) -> None:
@@ -92,6 +100,62 @@ def test_units_of_everything(tmp_path: Path, up: str, meters: float, kilograms: 
     for name, value in models[0].items():
         scale = np.abs(value[np.isfinite(value)]).max(initial=1e-12)
         np.testing.assert_allclose(models[1][name], value, atol=1e-5 * scale, err_msg=name)
+
+
+@pytest.mark.parametrize(("up", "meters", "kilograms"), [("Z", 1.0, 1.0), ("Y", 0.01, 1.0), ("Z", 0.001, 0.001)])
+def test_instances_of_a_prototype_in_the_same_file(tmp_path: Path, up: str, meters: float, kilograms: float) -> None:
+    """Robots and props that are instances of a class of their own file have the masses and sizes of plain ones."""
+    models = []
+    for name, units in (("plain", ("Z", 1.0, 1.0)), ("instanced", (up, meters, kilograms))):
+        author = Author.create(tmp_path / f"{name}.usda", *units)
+        if name == "plain":
+            author.robot("/World/R", (0.0, 0.0, 0.0))
+            author.prop("/World/P", (0.3, 0.0, 0.2))
+        else:
+            author.robot("/Robot", (0.0, 0.0, 0.0))
+            author.prop("/Box/Cube", (0.3, 0.0, 0.2))
+            for path, prototype in (("/World/R", "/Robot"), ("/World/P", "/Box")):
+                prim = UsdGeom.Xform.Define(author.stage, path).GetPrim()
+                prim.GetReferences().AddInternalReference(prototype)
+                author.stage.GetPrimAtPath(prototype).SetSpecifier(Sdf.SpecifierClass)
+                prim.SetInstanceable(True)
+        author.save()
+        builder = newton.ModelBuilder()
+        add_usd(builder, tmp_path / f"{name}.usda")
+        models.append(rigid_arrays(builder))
+    for name, value in models[0].items():
+        scale = np.abs(value[np.isfinite(value)]).max(initial=1e-12)
+        np.testing.assert_allclose(models[1][name], value, atol=1e-5 * scale, err_msg=name)
+
+
+def test_what_moves_is_read_at_its_first_time(tmp_path: Path) -> None:
+    """Rigid and soft bodies whose places are only time samples start where the first sample has them."""
+    author = Author.create(tmp_path / "a.usda")
+    prop = author.prop("/World/Prop", (0.0, 0.0, 0.0))
+    toy = author.body("/World/Toy")
+    for k, prim in enumerate((prop, toy)):
+        xform = UsdGeom.Xformable(prim)
+        xform.ClearXformOpOrder()
+        prim.RemoveProperty("xformOp:translate")
+        op = xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble)
+        for code, height in ((3.0, 1.0 + k), (9.0, 5.0)):
+            op.Set((0.0, 0.0, height), code)
+    author.save()
+    builder = newton.ModelBuilder()
+    found = add_usd(builder, tmp_path / "a.usda", build_options=SMALL, surface_count=100)
+    np.testing.assert_allclose(np.array(builder.body_q)[0, :3], (0.0, 0.0, 1.0), atol=EPSILON)
+    np.testing.assert_allclose(found.bodies["/World/Toy"].position, (0.0, 0.0, 2.0), atol=1e-8)
+
+
+@pytest.mark.parametrize("time", [None, 2.0])
+def test_rotations_that_are_not_finite_are_refused(tmp_path: Path, time: float | None) -> None:
+    """Newton's importer gets no NaN in a quaternion, be it a default or a time sample."""
+    author = Author.create(tmp_path / "a.usda")
+    op = UsdGeom.Xformable(author.prop("/World/Prop", (0.0, 0.0, 0.0))).AddOrientOp()
+    op.Set(Gf.Quatf(1.0, float("nan"), 0.0, 0.0), *(() if time is None else (time,)))
+    author.save()
+    with pytest.raises(AssetError, match="/World/Prop: xformOp:orient holds NaN"):
+        add_usd(newton.ModelBuilder(), tmp_path / "a.usda")
 
 
 def test_it_rests_on_the_ground(tmp_path: Path) -> None:

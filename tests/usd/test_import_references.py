@@ -82,6 +82,10 @@ def test_sublayers_and_clips(tree: Path) -> None:
     write(path, 'def "World" (clips = { dictionary default = { asset[] assetPaths = [@/etc/a.usd@] } })\n{\n}')
     with pytest.raises(AssetError, match="value clips"):
         read_usd_scene(path)
+    inner = '"a" (clips = { dictionary default = { asset[] assetPaths = [@/etc/a.usd@] } }) {\n}'
+    write(path, ARCS["variant"].format("parts/toy.usda").replace('"a" {\n}', inner))
+    with pytest.raises(AssetError, match="value clips"):
+        read_usd_scene(path)
 
 
 def test_a_wider_root_is_the_remedy(tree: Path) -> None:
@@ -104,6 +108,29 @@ def test_inside_the_root_all_arcs_load(tree: Path) -> None:
         + ARCS["texture"].format("OmniPBR.mdl").replace("World", "Shader")
     )
     assert [body.path for body in read_usd_scene(top).deformables] == ["/World/Toy"]
+
+
+def test_other_units_are_told(tree: Path) -> None:
+    """A layer in other units is taken as it is, as OpenUSD does, and the notes say so."""
+    path = write(tree / "a.usda", ARCS["reference"].format("parts/toy.usda"))
+    assert read_usd_scene(path).notes == ()
+    path.write_text(path.read_text().replace("metersPerUnit = 1", "metersPerUnit = 0.01"))
+    (note,) = read_usd_scene(path).notes
+    assert note.startswith("toy.usda: metersPerUnit 1.0, the stage's is 0.01")
+
+
+def test_brackets_in_names(tree: Path) -> None:
+    """Brackets belong to the names of files and folders, and of packages in such folders."""
+    folder = tree / "toys [new]"
+    (tree / "parts").rename(folder)
+    UsdUtils.CreateNewUsdzPackage(str(folder / "toy.usda"), str(folder / "toy.usdz"))
+    for name in ("toy.usda", "toy.usdz", "toy.usdz[toy.usda]"):
+        path = write(tree / "[a].usda", ARCS["reference"].format(f"toys [new]/{name}"))
+        assert [body.path for body in read_usd_scene(path).deformables] == ["/World/Toy"], name
+    assert len(read_usd_scene(folder / "toy.usdz").deformables) == 1
+    path = write(tree / "[a].usda", ARCS["reference"].format("[b]/../../secret/toy.usda"))
+    with pytest.raises(AssetError, match="outside"):
+        read_usd_scene(path)
 
 
 def test_packages(tree: Path) -> None:

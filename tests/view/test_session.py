@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import newton
 import numpy as np
 import pytest
 
@@ -438,6 +439,27 @@ def test_a_recording_of_coordinates_is_played_back(hanging, tmp_path):
     path.write_bytes(path.read_bytes()[:300])
     with pytest.raises(AssetError, match="cannot be read"):
         LiveRecording.load(path)
+
+
+def test_a_recording_as_a_stage(hanging, tmp_path):
+    """What is pulled, and of what it is made, comes back from an OpenUSD stage."""
+    pytest.importorskip("pxr", reason="needs the extra [usd]")
+    from softmode.usd import add_usd, read_animation
+
+    path = tmp_path / "poke.usdc"
+    hanging.set_parameters(youngs_modulus=3.0e4)
+    hanging.start_recording(path)
+    hanging.begin_drag(side(hanging))
+    hanging.drag_to(hanging.centre() + np.array([0.05, 0.0, 0.0]))
+    settle(hanging, 6)
+    kept = hanging.surface()
+    assert not path.exists() and hanging.stop_recording() == path
+    (body,) = read_animation(path).bodies
+    np.testing.assert_allclose(body.times, np.arange(7) / 30.0, atol=1e-6)
+    np.testing.assert_allclose(body.points_at(6), kept, atol=1e-6)
+    assert np.abs(body.points_at(6) - body.points_at(0)).max() > 1e-3
+    (found,) = add_usd(newton.ModelBuilder(), path).bodies.values()
+    assert found.material.youngs_modulus == 3.0e4
 
 
 def test_a_video_shows_the_object(hanging, tmp_path):

@@ -8,7 +8,7 @@ from typing import Any
 from .. import tokens
 from .answer import prims_of
 from .limits import Refused
-from .scene import _bundle
+from .scene import bundle_of
 from .splats import read_prim
 
 MAX_FRAMES = 1_000_000
@@ -27,7 +27,7 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
     most = request["most"]
     bodies = []
     for prim in prims_of(stage):
-        found = _bundle(prim, arrays)
+        found = bundle_of(prim, arrays)
         handles = prim.GetAttribute(tokens.HANDLES)
         if found is None or not handles or not handles.GetNumTimeSamples():
             continue

@@ -8,7 +8,7 @@ import os
 import sys
 from typing import Any
 
-from .layers import inside, open_layers
+from .layers import inside, open_layers, split_package
 from .limits import MAX_DEPTH, Budget, Refused
 
 MAX_PRIMS = 200_000
@@ -34,7 +34,7 @@ class Arrays:
 def load(request: dict[str, Any]) -> None:
     """Import what the request needs: loading it shall not count against the limits."""
     modules = ["Sdf", "Usd", "UsdGeom"]
-    if request["what"] == "scene":
+    if request["what"] in ("scene", "asset"):
         modules += ["UsdPhysics", "UsdShade"]
         importlib.import_module("numpy")
     for module in modules:
@@ -82,7 +82,7 @@ def open_stage(path: str, root: str, budget: Budget, strict: bool) -> Any:
     layer = open_layers(path, root, budget)
     stage = Usd.Stage.Open(layer, load=Usd.Stage.LoadAll)
     for used in stage.GetUsedLayers():
-        real = used.realPath.split("[", 1)[0]
+        real, _ = split_package(used.realPath)
         if real and real != os.path.realpath(path) and real != path and not inside(real, root):
             raise Refused(f"reads {used.realPath[:200]}, outside {root}", "Pass the folder that holds it as asset_root")
     if strict and stage.GetCompositionErrors():

@@ -71,6 +71,7 @@ def write_rest(
         if spec is not None and spec.HasInfo("apiSchemas"):
             left = [item for item in spec.GetInfo("apiSchemas").GetAppliedItems() if item not in deformable]
             spec.SetInfo("apiSchemas", Sdf.TokenListOp.CreateExplicit(left))
+    _hold_still(layer)
     meters, kilograms = UsdGeom.GetStageMetersPerUnit(stage), UsdPhysics.GetStageKilogramsPerUnit(stage)
     if meters != 1.0 or kilograms != 1.0:
         _convert(Usd.Stage.Open(layer), meters, kilograms)
@@ -78,18 +79,34 @@ def write_rest(
         raise Refused("cannot be flattened", "Flatten it with usdcat --flatten")
 
 
+def _hold_still(layer: Any) -> None:
+    """Give what has time samples the value of the first: Newton reads defaults, deformables are read at that time."""
+
+    def visit(path: Any) -> None:
+        times = layer.ListTimeSamplesForPath(path) if path.IsPropertyPath() else ()
+        if times:
+            layer.GetAttributeAtPath(path).default = layer.QueryTimeSample(path, times[0])
+            for time in times:
+                layer.EraseTimeSample(path, time)
+
+    layer.Traverse("/", visit)
+
+
 def _check(prim: Any) -> None:
     """Refuse numbers that are not finite where geometry or physics needs them, and indices that point nowhere."""
     numpy = importlib.import_module("numpy")
+    first = importlib.import_module("pxr.Usd").TimeCode.EarliestTime()
     kind = str(prim.GetTypeName())
     values: dict[str, Any] = {}
     for attribute in prim.GetAuthoredAttributes():
         name = attribute.GetName()
         if not name.startswith(("physics:", "xformOp:", "drive:", "limit:")) and name not in _CHECKED:
             continue
-        value = attribute.Get()
+        value = attribute.Get(first)
         if value is None or isinstance(value, str | bool | int):
             continue
+        if hasattr(value, "GetImaginary"):  # a quaternion, which numpy does not know
+            value = (value.GetReal(), *value.GetImaginary())
         try:
             array = numpy.asarray(value, dtype=float) if isinstance(value, float) else numpy.array(value)
         except (TypeError, ValueError):

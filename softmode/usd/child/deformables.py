@@ -51,14 +51,20 @@ def _is_body(prim: Any) -> bool:
     return True
 
 
-def uninstance(stage: Any) -> None:
-    """Make the instances that hold deformables ordinary prims, in the session: their parts must be told apart."""
+def uninstance(stage: Any, *, every: bool = False) -> None:
+    """Make the instances that hold deformables, or all, ordinary prims, in the session.
+
+    Parts of a deformable must be told apart, and what is converted to other units is edited prim by prim, which
+    instances of one prototype do not allow.
+    """
     from .answer import prims_of
 
     for _ in range(64):
         found = set()
         for prim in prims_of(stage):
-            if prim.IsInstanceProxy() and (_is_body(prim) or any(a in tokens.SIM_APIS for a in applied(prim))):
+            if every and prim.IsInstance():
+                found.add(str(prim.GetPath()))
+            elif prim.IsInstanceProxy() and (_is_body(prim) or any(a in tokens.SIM_APIS for a in applied(prim))):
                 owner = prim
                 while owner.IsInstanceProxy():
                     owner = owner.GetParent()
@@ -68,7 +74,7 @@ def uninstance(stage: Any) -> None:
         stage.SetEditTarget(stage.GetSessionLayer())
         for path in found:
             stage.GetPrimAtPath(path).SetInstanceable(False)
-    raise Refused("nests instances of deformables too deeply", "Flatten the stage")
+    raise Refused("nests instances too deeply", "Flatten the stage")
 
 
 def find_bodies(prims: list[Any]) -> tuple[list[Body], list[tuple[str, str]]]:

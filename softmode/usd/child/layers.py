@@ -20,6 +20,15 @@ def inside(path: str, root: str) -> bool:
     return real == folder or real.startswith(folder.rstrip(os.sep) + os.sep)
 
 
+def split_package(path: str) -> tuple[str, str]:
+    """Return the file of a path, and what follows its bracket if it names a member of a package, "a.usdz[b.usda]"."""
+    if not path.endswith("]"):  # brackets are letters like others
+        return path, ""
+    found = re.match(r"(.*?\.usdz)\[(.*)$", path, re.IGNORECASE | re.DOTALL)
+    outer, _, inner = path.partition("[")
+    return (found.group(1), found.group(2)) if found else (outer, inner)
+
+
 def open_layers(path: str, root: str, budget: Budget) -> Any:
     """Open the layer of a file and all that it refers to; return the first.
 
@@ -40,7 +49,7 @@ def open_layers(path: str, root: str, budget: Budget) -> Any:
     queue, seen = [path], {path}
     while queue:
         identifier = queue.pop()
-        outer = identifier.split("[", 1)[0]
+        outer, _ = split_package(identifier)
         if not os.path.isfile(outer):
             raise Refused(f"refers to {identifier}, which does not exist", "Restore the file")
         if identifier == outer:
@@ -65,7 +74,7 @@ def open_layers(path: str, root: str, budget: Budget) -> Any:
 def _assets(layer: Any) -> list[tuple[str, bool]]:
     """Return every asset path of a layer and whether it names a layer."""
     Sdf = importlib.import_module("pxr.Sdf")
-    found = [(str(name), True) for name in layer.GetCompositionAssetDependencies()]
+    found = [(str(name), True) for name in layer.GetCompositionAssetDependencies() if name]  # "": the layer itself
     single, several = Sdf.ValueTypeNames.Asset, Sdf.ValueTypeNames.AssetArray
 
     def visit(path: Any) -> None:
@@ -77,7 +86,7 @@ def _assets(layer: Any) -> list[tuple[str, bool]]:
             for value in values:
                 items = [value] if isinstance(value, Sdf.AssetPath) else (value or [])
                 found.extend((item.path, False) for item in items)
-        elif path.IsPrimPath():
+        elif path.IsPrimPath() or path.IsPrimVariantSelectionPath():  # a variant speaks of its prim, too
             prim = layer.GetPrimAtPath(path)
             if prim is not None and prim.HasInfo("clips"):
                 raise Refused(f"{path} has value clips, which softmode does not read", "Flatten the stage")
@@ -97,14 +106,14 @@ def _resolved(asset: str, anchor: str, root: str) -> str:
         raise Refused(f"refers to {shown}, with arguments", "Name the file alone")
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:", asset):
         raise Refused(f"refers to the address {shown}", _HINT)
-    outer, bracket, inner = asset.partition("[")
+    outer, inner = split_package(asset)
     parts = inner.rstrip("]").split("/")
     if os.path.isabs(outer) or outer.startswith(("/", "\\", "~")) or re.match(r"[A-Za-z]:", outer) or parts[0] == "~":
         raise Refused(f"refers to the absolute path {shown}", _HINT)
-    if bracket and (".." in parts or inner.startswith("/")):
+    if inner and (".." in parts or inner.startswith("/")):
         raise Refused(f"refers to {shown}, outside its package", _HINT)
-    package, within, member = anchor.partition("[")
-    if within:  # a layer of a package names members of the same package
+    package, member = split_package(anchor)
+    if member:  # a layer of a package names members of the same package
         target = os.path.normpath(os.path.join(os.path.dirname(member.rstrip("]")), outer))
         if target.startswith(".."):
             raise Refused(f"refers to {shown}, outside its package", _HINT)
@@ -114,4 +123,4 @@ def _resolved(asset: str, anchor: str, root: str) -> str:
     target = os.path.normpath(os.path.join(os.path.dirname(anchor), outer))
     if not inside(target, root):
         raise Refused(f"refers to {shown}, outside {root}", _HINT)
-    return target + bracket + inner
+    return f"{target}[{inner}" if inner else target

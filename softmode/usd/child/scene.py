@@ -21,7 +21,8 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
         arrays: Takes the arrays.
     """
     Usd, UsdGeom, UsdPhysics = (importlib.import_module(f"pxr.{name}") for name in ("Usd", "UsdGeom", "UsdPhysics"))
-    uninstance(stage)
+    meters, kilograms = UsdGeom.GetStageMetersPerUnit(stage), UsdPhysics.GetStageKilogramsPerUnit(stage)
+    uninstance(stage, every=request["copy"] is not None and (meters != 1.0 or kilograms != 1.0))
     prims = list(prims_of(stage))
     time = Usd.TimeCode.EarliestTime()
     transforms = UsdGeom.XformCache(time)
@@ -46,11 +47,11 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
                 "surface": any(name in tokens.SURFACE_SIM_APIS for name in applied(geometry)),
                 "matrix": flat(transforms.GetLocalToWorldTransform(geometry)),
                 "body_matrix": flat(transforms.GetLocalToWorldTransform(body.prim)),
-                "shape": _geometry(geometry, time, arrays),
+                "shape": geometry_of(geometry, time, arrays),
                 "meshes": [
                     {
                         "matrix": flat(transforms.GetLocalToWorldTransform(mesh)),
-                        **_geometry(mesh, time, arrays),
+                        **geometry_of(mesh, time, arrays),
                     }
                     for mesh in body.meshes
                 ],
@@ -58,7 +59,7 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
                 "mass": _scalar(body.prim, geometry, "mass"),
                 "density": _scalar(body.prim, geometry, "density"),
                 "material": _material(geometry, body.prim),
-                "bundle": _bundle(body.prim, arrays),
+                "bundle": bundle_of(body.prim, arrays),
                 "notes": body.notes,
             }
         )
@@ -68,19 +69,32 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
         copy.write_rest(stage, prims, request["copy"], used, [str(body.prim.GetPath()) for body in bodies], ignored)
     return {
         "up": str(UsdGeom.GetStageUpAxis(stage)),
-        "meters": UsdGeom.GetStageMetersPerUnit(stage),
-        "kilograms": UsdPhysics.GetStageKilogramsPerUnit(stage),
+        "meters": meters,
+        "kilograms": kilograms,
         "bodies": described,
         "scenery": [
             read_splats(prim)
             for prim in prims
             if prim.GetTypeName() == tokens.SPLATS and str(prim.GetPath()) not in used and visible(prim)
         ],
-        "notes": [f"{path}: {kind} between deformables is not read" for path, kind in ignored],
+        "notes": [f"{path}: {kind} between deformables is not read" for path, kind in ignored] + _other_units(stage),
     }
 
 
-def _geometry(prim: Any, time: Any, arrays: Any) -> dict[str, Any]:
+def _other_units(stage: Any) -> list[str]:
+    """Return a note for each layer whose unit or axis is not the stage's: OpenUSD takes its numbers as they are."""
+    UsdGeom = importlib.import_module("pxr.UsdGeom")
+    expected = {"metersPerUnit": UsdGeom.GetStageMetersPerUnit(stage), "upAxis": UsdGeom.GetStageUpAxis(stage)}
+    notes = []
+    for layer in stage.GetUsedLayers():
+        for name, value in expected.items():
+            given = layer.pseudoRoot.GetInfo(name) if layer.pseudoRoot.HasInfo(name) else value
+            if given != value:
+                notes.append(f"{layer.GetDisplayName()}: {name} {given}, the stage's is {value}; nothing converts it")
+    return notes
+
+
+def geometry_of(prim: Any, time: Any, arrays: Any) -> dict[str, Any]:
     """Return the numbers of the arrays of a Mesh, TetMesh or Points prim, by attribute."""
     found: dict[str, Any] = {"path": str(prim.GetPath())}
     names = {
@@ -149,7 +163,7 @@ def _material(geometry: Any, body: Any) -> dict[str, Any] | None:
     return None
 
 
-def _bundle(prim: Any, arrays: Any) -> dict[str, Any] | None:
+def bundle_of(prim: Any, arrays: Any) -> dict[str, Any] | None:
     """Return softmode's own attributes of a body: strings, numbers, and the numbers of arrays."""
     marker = prim.GetAttribute(tokens.FORMAT)
     if not marker or not marker.HasAuthoredValue():

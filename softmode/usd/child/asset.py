@@ -1,0 +1,48 @@
+"""Read what a stage shows by meshes, and tell what else it holds."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from .. import tokens
+from .answer import prims_of
+from .deformables import visible
+from .scene import geometry_of
+from .splats import flat
+
+
+def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
+    """Return the visible Mesh prims, or the TetMesh prims where there is none; guides and proxies are not looked at.
+
+    Args:
+        stage: The stage.
+        request: `geometry`: whether to send the meshes, or only to count.
+        arrays: Takes the arrays.
+    """
+    Usd, UsdGeom, UsdPhysics = (importlib.import_module(f"pxr.{name}") for name in ("Usd", "UsdGeom", "UsdPhysics"))
+    time = Usd.TimeCode.EarliestTime()
+    transforms = UsdGeom.XformCache(time)
+    prims = list(prims_of(stage))
+    shown = (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
+    meshes = [
+        prim
+        for prim in prims
+        if prim.GetTypeName() == tokens.MESH and visible(prim) and UsdGeom.Imageable(prim).ComputePurpose() in shown
+    ] or [prim for prim in prims if prim.GetTypeName() == tokens.TET_MESH]
+    sent = [
+        {
+            "kind": str(prim.GetTypeName()),
+            "matrix": flat(transforms.GetLocalToWorldTransform(prim)),
+            **geometry_of(prim, time, arrays),
+        }
+        for prim in (meshes if request["geometry"] else ())
+    ]
+    return {
+        "up": str(UsdGeom.GetStageUpAxis(stage)),
+        "meters": UsdGeom.GetStageMetersPerUnit(stage),
+        "kilograms": UsdPhysics.GetStageKilogramsPerUnit(stage),
+        "meshes": sent,
+        "splat_count": sum(prim.GetTypeName() == tokens.SPLATS and visible(prim) for prim in prims),
+        "body_count": sum(bool(prim.GetAttribute(tokens.FORMAT)) for prim in prims),
+    }
