@@ -238,7 +238,7 @@ class LiveSession:
         """Return the corners of a box around what is worth seeing at the start [m], shape (2, 3)."""
         corners = self.splats().means
         if isinstance(self._scene, EnvScene):
-            corners = np.concatenate([corners, [[-0.1, -0.35, 0.0], [0.75, 0.35, 0.6]]])
+            corners = np.concatenate([corners, [[-0.08, -0.2, 0.0], [0.6, 0.2, 0.45]]])
         return np.stack([corners.min(axis=0), corners.max(axis=0)]).astype(np.float64)
 
     def splats(self) -> SplatPicture:
