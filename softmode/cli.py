@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -223,8 +224,8 @@ def _play(options: Play, film: Film | None) -> int:
     if film:
         film.publish()
         print(f"wrote {film.path} and {film.sheet_path}")
-    if options.rerun and options.rerun.endswith(".rrd"):
-        print(f"wrote {options.rerun}; open it with: rerun {options.rerun}")
+    if options.rerun and Path(options.rerun).suffix.lower() == ".rrd":
+        print(f"wrote {options.rerun}; open it with: rerun {shlex.quote(options.rerun)}")
     if options.usd:
         print(f"wrote {options.usd}; read it with softmode.usd.read_animation, or open it in any viewer of OpenUSD")
     if options.episodes > 1:

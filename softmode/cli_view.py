@@ -21,7 +21,8 @@ class View:
     """Show a soft object or an environment in the browser; pull and pin it with the mouse, tune it with sliders."""
 
     target: tuple[str, ...]
-    """An environment's id, or the file of a splat, a mesh or a saved body (.npz); the built-in plush if omitted."""
+    """An environment's id, or the file of a splat, a mesh, a saved body (.npz) or an OpenUSD stage; the built-in plush
+    if omitted."""
     scene: Literal["hang", "drop"] = "hang"
     """An object hangs, held by one end, or drops on a table."""
     hold: Literal["top", "base"] = "top"
@@ -83,7 +84,12 @@ def view(options: View) -> int:
                     )
                 if options.open:
                     _open(app.url)
-                app.run(options.duration)
+                try:
+                    app.run(options.duration)
+                except KeyboardInterrupt:
+                    print("softmode: stopped", file=sys.stderr)
+                if session.status().recording:
+                    print(f"softmode: wrote {session.stop_recording()}")
         except KeyboardInterrupt:
             print("softmode: stopped", file=sys.stderr)
         finally:
@@ -106,8 +112,7 @@ def _session(options: View) -> LiveSession:
         missing = target is not None and not Path(target).exists()
         if target is not None and missing and (target.startswith("softmode/") or ":" in target or target in registry):
             registered_id(target)
-            if options.size is not None:
-                raise ConfigError("size is an object's, not an environment's", hint="leave --size out")
+            _refuse(options, ("scene", "hold", "size"), "an environment")
             return LiveSession.from_env(
                 target, policy=options.policy, seed=options.seed, device=device, progress=progress
             )
@@ -116,9 +121,17 @@ def _session(options: View) -> LiveSession:
                 f"{target} is neither a file nor an environment",
                 hint=f"give a splat, mesh or .npz file, or one of {', '.join(ENVIRONMENTS)}",
             )
+        _refuse(options, ("policy", "seed"), "an object")
         return LiveSession.from_object(
             target, scene=options.scene, hold=options.hold, size=options.size, device=device, progress=progress
         )
+
+
+def _refuse(options: View, names: tuple[str, ...], what: str) -> None:
+    """Refuse options that say nothing about what is shown."""
+    for field in dataclasses.fields(View):
+        if field.name in names and getattr(options, field.name) != field.default:
+            raise ConfigError(f"--{field.name} says nothing about {what}", hint=f"leave --{field.name} out")
 
 
 def _open(url: str) -> None:

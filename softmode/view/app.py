@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import io
 import queue
@@ -250,12 +251,14 @@ class ViewApp:
             return
         # The mouse's ray, cut with the plane through the gripped point that is parallel to the picture.
         ray = end - eye
-        cursor = eye + ray * (drag.depth / float(forward @ ray))
-        if drag.pin is None and session.drag() is not None:  # a reset, or another body, ends it
-            session.drag_to(cursor)
-        elif drag.pin in session.pins():
-            session.move_pin(drag.pin, cursor + drag.offset)
-            self._stage.move_gizmo(drag.pin, cursor + drag.offset)
+        ahead = float(forward @ ray)
+        if ahead > 1e-6 * float(np.linalg.norm(ray)):  # else it does not meet the plane: the camera has been turned
+            cursor = eye + ray * (drag.depth / ahead)
+            if drag.pin is None and session.drag() is not None:  # a reset, or another body, ends it
+                session.drag_to(cursor)
+            elif drag.pin in session.pins():
+                session.move_pin(drag.pin, cursor + drag.offset)
+                self._stage.move_gizmo(drag.pin, cursor + drag.offset)
         if phase == "end":
             self._drag = None
             if drag.pin is None:
@@ -313,7 +316,7 @@ def _serve(options: ViewOptions) -> viser.ViserServer:
     if server.get_port() != port:  # viser takes the next port when one is taken
         with _quiet():
             server.stop()
-        raise _port_error(options.host, port, "it was taken in the meantime")
+        raise _port_error(options.host, port)
     # Any browser may ask viser for a tunnel to a public server, button or not.
     server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
     return server
@@ -328,13 +331,17 @@ def _free_port(host: str, port: int) -> int:
             probe.bind(address)
             return int(probe.getsockname()[1])
     except OSError as error:
-        raise _port_error(host, port, error.strerror or str(error)) from error
+        raise _port_error(host, port, error) from error
 
 
-def _port_error(host: str, port: int, reason: str) -> ConfigError:
-    return ConfigError(
-        f"cannot listen at {host}, port {port}: {reason}", hint="give another --port, or 0 for any free one"
-    )
+def _port_error(host: str, port: int, error: OSError | None = None) -> ConfigError:
+    """Return the error that names the remedy: another port if this one is taken or kept back, else another address."""
+    reason = "it was taken in the meantime" if error is None else error.strerror or str(error)
+    if error is None or error.errno in (errno.EADDRINUSE, errno.EACCES):
+        hint = "give another --port, or 0 for any free one"
+    else:
+        hint = "give an address of this machine as --host, such as 127.0.0.1"
+    return ConfigError(f"cannot listen at {host}, port {port}: {reason}", hint=hint)
 
 
 @contextlib.contextmanager

@@ -29,6 +29,7 @@ class Hands:
         """Hold nothing."""
         self._options, self._next = options, 1
         self._pins: dict[int, tuple[int, int]] = {}
+        self._own: set[int] = set()  # pins that a scene holds by itself; numbers are not used twice
         self._drag: tuple[int, int, NDArray[np.float64]] | None = None
         self.moved = False
         """Whether a step has been taken since the drag began."""
@@ -40,7 +41,7 @@ class Hands:
         for index, grips in enumerate(scene.grips):
             for grip in grips.held:
                 self._add(index, grip)
-        self._held_at_start = len(self._pins)
+        self._own.update(self._pins)
 
     @property
     def busy(self) -> bool:
@@ -54,10 +55,18 @@ class Hands:
         self._pins.clear()
         self._drag = None
 
-    def kept(self) -> list[tuple[Grip, Any, Any]]:
-        """Return the pins of the first object with position and rotation, to be held on another build of it."""
+    def kept(self) -> dict[int, tuple[Grip, Any, Any]]:
+        """Return the pins of the first object with position and rotation, for `hold_again`."""
         grips = self._scene.grips[0]
-        return [(grips.held[grip], *grips.pose(grip)) for index, grip in self._pins.values() if index == 0]
+        pins = self._pins.items()
+        return {number: (grips.held[grip], *grips.pose(grip)) for number, (index, grip) in pins if index == 0}
+
+    def hold_again(self, kept: dict[int, tuple[Grip, Any, Any]]) -> None:
+        """Hold another build of the first object by the pins that it had, and by nothing else."""
+        self.let_go()
+        grips = self._scene.grips[0]
+        for number, (grip, position, rotation) in kept.items():
+            self._pins[number] = (0, grips.restore(grip, position, rotation.tolist()))
 
     # -- the drag -----------------------------------------------------------------------------------------------------
 
@@ -103,8 +112,8 @@ class Hands:
         reach = PIN_RADIUS * float(np.linalg.norm(np.ptp(body.bounds, axis=0))) if radius is None else radius
         if not (isinstance(reach, int | float) and math.isfinite(reach) and reach > 0.0):
             raise ConfigError(f"radius must be a finite length > 0 [m], got {radius!r}")
-        if len(self._pins) >= self._options.pin_max + self._held_at_start:
-            raise ConfigError(f"there are {len(self._pins)} pins already", hint="let go of one first")
+        if len(self._pins.keys() - self._own) >= self._options.pin_max:
+            raise ConfigError(f"there are {self._options.pin_max} pins already", hint="let go of one first")
         X = np.concatenate([body.surface_points, body.points])
         distance = np.linalg.norm(X - hit.rest_point, axis=1)
         inside = np.argsort(distance)[: max(int((distance <= reach).sum()), 4)]

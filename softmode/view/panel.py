@@ -237,9 +237,15 @@ class Panel:
             if event.client is None:
                 return
             count = int(handles.value)
-            self._submit(lambda session: session.set_handles(count))
+            self._submit(lambda session: self._set_handles(session, count))
 
         self._handles = handles
+
+    def _set_handles(self, session: LiveSession, count: int) -> None:
+        """Build the object with other handles; the picture stands still for as long as that takes."""
+        self.tell(f"building with {count} handles ...")
+        session.set_handles(count)
+        self.tell(f"built with {count} handles")
 
     def _connect(self, slider: Slider, handle: Any) -> None:
         """Let a slider change the session."""
@@ -249,7 +255,7 @@ class Panel:
         async def changed(event: Any) -> None:
             if event.client is None:  # not a person: the slider follows the session
                 return
-            value = float(handle.value)
+            value = min(max(float(handle.value), slider.low), slider.high)  # a page may send anything
             self._touched[slider] = time.monotonic()
             self._submit(lambda session: slider.write(session, value))
 

@@ -239,7 +239,7 @@ class LiveSession:
         """Return the corners of a box around what is worth seeing at the start [m], shape (2, 3)."""
         corners = self.splats().means
         if isinstance(self._scene, EnvScene):
-            corners = np.concatenate([corners, [[-0.1, -0.35, 0.0], [0.75, 0.35, 0.6]]])
+            corners = np.concatenate([corners, [[-0.08, -0.2, 0.0], [0.6, 0.2, 0.45]]])
         return np.stack([corners.min(axis=0), corners.max(axis=0)]).astype(np.float64)
 
     def splats(self) -> SplatPicture:
@@ -428,11 +428,11 @@ class LiveSession:
     def set_handles(self, count: int) -> None:
         """Give the object another number of skinning eigenmodes: builds it anew, or takes it from the cache.
 
-        Position, deformation and velocity are carried over by least squares, pins are kept, a drag ends. With an
-        environment a new episode begins.
+        Position, deformation and velocity are carried over by least squares, pins keep their numbers, a drag ends. With
+        an environment a new episode begins.
 
         Raises:
-            ConfigError: If the count lies outside 0..64, or the object came as a saved body, which cannot be rebuilt.
+            ConfigError: If the count lies outside 1..64, or the object came as a saved body, which cannot be rebuilt.
         """
         if self._recorder is not None:
             raise ConfigError("a recording is being made", hint="stop it before the handles change")
@@ -447,13 +447,10 @@ class LiveSession:
         made = self._make(source)  # a build that fails leaves all as it was
         scene.close()
         self._scene, self._source = made, source
-        if not isinstance(made, EnvScene):
-            made.grips[0].let_go_all()
-            for grip, position, rotation in kept:
-                made.grips[0].restore(grip, position, rotation.tolist())
         self._bind()
         self._clock = clock
         if not isinstance(made, EnvScene):
+            self._hands.hold_again(kept)
             self._carry_over(old, q, qd)
             self._time = elapsed
         live_parameters.apply(self._scene, self._given)

@@ -97,8 +97,8 @@ def with_handles(config: ObjectConfig | None, count: int) -> ObjectConfig:
     Raises:
         ConfigError: If it is of a body that is built, or the count is out of range.
     """
-    if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 0 <= count <= HANDLES_MAX:
-        raise ConfigError(f"handles must be a whole number in 0..{HANDLES_MAX}, got {count!r}")
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 1 <= count <= HANDLES_MAX:
+        raise ConfigError(f"handles must be a whole number in 1..{HANDLES_MAX}, got {count!r}")
     if config is None or config.body is not None:
         raise ConfigError("a body that is built cannot be given other handles", hint="open what it was built from")
     return replace(config, build=replace(config.build, mode_count=int(count)))

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
+import operator
+import socket
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
+from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +31,10 @@ __all__ = ["RerunLogger", "RerunOptions", "RerunScene"]
 
 LIVE = "rerun+http"
 """How the address of a running viewer begins."""
+PORT = 9876
+"""Where a viewer listens if its address does not say."""
+CONNECT = 5.0
+"""Seconds in which a viewer has to answer."""
 FLUSH = 1.0
 """Seconds for which rows of a file are gathered into chunks."""
 
@@ -87,7 +95,8 @@ class RerunLogger:
         options: What the recording holds.
 
     Raises:
-        ConfigError: If the file cannot be written there, the scene is none of these, or a world does not exist.
+        ConfigError: If the file cannot be written there, no viewer answers at the address, the scene is none of these,
+            or a world does not exist.
         MissingExtraError: If rerun is not installed.
     """
 
@@ -99,7 +108,7 @@ class RerunLogger:
         import rerun as rr
 
         self.options = options if options is not None else RerunOptions()
-        self.worlds = tuple(int(w) for w in worlds)
+        self.worlds = _whole(worlds)
         self._source = source_of(scene, self.worlds or (0,))
         model = self._source.model
         count = max(int(model.world_count), 1)
@@ -122,10 +131,8 @@ class RerunLogger:
             self._stream.set_log_tick_enabled(False)
             if self._file is not None:
                 self._stream.save(self._file.temporary)
-            elif str(target) == "spawn":
-                self._stream.spawn()
             else:
-                self._stream.connect_grpc(str(target))
+                _reach(self._stream, str(target))
             self._stream.send_recording_name(self._source.name)
             self._prepare()
         except BaseException:
@@ -151,11 +158,17 @@ class RerunLogger:
         """End the recording and put the file in place; does nothing the second time.
 
         Raises:
-            StorageError: If what was written cannot be read back, as on a full disk.
+            StorageError: If what was written cannot be read back, as on a full disk, or the viewer has gone.
         """
         if self._stream is None:
             return
-        self._end()
+        try:
+            self._end()
+        except RuntimeError as error:  # rerun's, of a sink that takes nothing
+            if self._file is not None:
+                self._file.discard()
+            hint = "look whether the viewer still runs" if self._file is None else "check the free space"
+            raise StorageError(f"the recording could not be sent: {error}", hint=hint) from error
         if self._file is None:
             return
         try:
@@ -170,15 +183,18 @@ class RerunLogger:
     def discard(self) -> None:
         """End the recording and remove the file unless it was published."""
         if self._stream is not None:
-            self._end()
+            with contextlib.suppress(RuntimeError):  # of a viewer that has gone, which is no news here
+                self._end()
         if self._file is not None:
             self._file.discard()
 
     def _end(self) -> None:
         """Write out what is still in memory and close."""
         stream, self._stream = self._stream, None
-        stream.flush()
-        stream.disconnect()
+        try:
+            stream.flush()
+        finally:
+            stream.disconnect()
 
     # -- what does not change -----------------------------------------------------------------------------------------
 
@@ -407,6 +423,36 @@ def _colors(splats: Splats) -> dict[str, Any]:
     """Return the fields of colour and opacity; higher degrees would have to turn with every splat."""
     rgba = np.concatenate([splats.colors(), splats.opacities[:, None]], axis=1)
     return {"colors": np.round(255.0 * np.clip(rgba, 0.0, 1.0)).astype(np.uint8), "spherical_harmonics_degree": 0}
+
+
+def _whole(worlds: Sequence[int]) -> tuple[int, ...]:
+    """Return whole numbers as a tuple.
+
+    Raises:
+        ConfigError: If they are none.
+    """
+    try:
+        return tuple(operator.index(w) for w in worlds)
+    except TypeError as error:
+        raise ConfigError(f"worlds must be whole numbers, got {worlds!r}", hint="give them like (0, 2)") from error
+
+
+def _reach(stream: Any, target: str) -> None:
+    """Open a viewer, or connect to one.
+
+    Raises:
+        ConfigError: If none is there.
+    """
+    try:
+        if target == "spawn":
+            stream.spawn()
+            return
+        place = urlsplit(target)
+        if place.hostname:  # rerun itself would try for as long as there is something to send
+            socket.create_connection((place.hostname, place.port or PORT), timeout=CONNECT).close()
+        stream.connect_grpc(target)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise ConfigError(f"no rerun viewer answers at {target!r}: {error}", hint="start one with: rerun") from error
 
 
 def check_target(target: str | Path) -> bool:

@@ -178,6 +178,35 @@ def test_a_second_mouse_waits_and_a_lost_one_lets_go(view: Served) -> None:
         assert view.wait(lambda session: session.drag() is None)
 
 
+def test_a_cursor_beside_the_camera_changes_nothing(view: Served) -> None:
+    """A ray along the picture's plane, or behind the camera, meets the plane of the grip nowhere: the target stays."""
+    rest = view.ask(view.lowest)
+    size = view.ask(lambda session: session.size)
+    eye = rest - np.array([0.0, 6.0 * size, 0.0])
+    with PageClient(view.app.url) as client:
+        client.send(camera_message(eye))
+        client.send(drag_message("start", rest, rest))
+        assert view.wait(lambda session: session.drag() is not None)
+        before = view.ask(lambda session: session.drag().target)  # type: ignore[union-attr]
+        for away in ([1.0, 0.0, 0.0], [0.0, -1.0, 0.2], [0.0, 0.0, 0.0]):
+            client.send(drag_message("update", rest, eye + np.array(away)))
+        for _ in range(5):
+            after = view.ask(lambda session: session.drag().target)  # type: ignore[union-attr]
+        np.testing.assert_array_equal(after, before)
+        client.send(drag_message("end", rest, eye))
+        assert view.wait(lambda session: session.drag() is None)
+
+
+def test_a_slider_beyond_its_end_stays_at_its_end(view: Served) -> None:
+    """A page that sends more than the slider has is given the slider's end, and the view goes on."""
+    before = view.ask(lambda session: session.parameters.youngs_modulus)
+    slider, handle = next((s, h) for s, h in view.app._panel._sliders.items() if s.label.startswith("log10 E"))
+    with PageClient(view.app.url) as client:
+        client.send({"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": 1e6}})
+        assert view.wait(lambda session: session.parameters.youngs_modulus == pytest.approx(10.0**slider.high))
+    view.ask(lambda session: session.set_parameters(youngs_modulus=before))
+
+
 def test_a_drag_beside_the_object_does_nothing(view: Served) -> None:
     """A ray that meets no splat grips nothing."""
     size = view.ask(lambda session: session.size)
@@ -258,6 +287,14 @@ def test_bad_addresses_are_refused(given: dict[str, Any], words: str) -> None:
         ViewOptions(**given).check()
 
 
+def test_the_remedy_fits_the_address() -> None:
+    """Where the address is wrong, another port is of no use."""
+    for host in ("256.1.1.1", "8.8.8.8"):
+        with pytest.raises(ConfigError) as caught:
+            ViewOptions(host=host, port=0).check()
+        assert "--host" in caught.value.hint and "--port" not in caught.value.hint
+
+
 def test_a_port_that_is_taken_is_an_error(view: Served, capsys: pytest.CaptureFixture[str]) -> None:
     """Not the next free one, as viser would have it: the error names port and remedy, before anything is built."""
     port = view.app.url.rpartition(":")[2]
@@ -284,6 +321,23 @@ def test_the_command_serves_for_a_while(tmp_path: Path, capfd: pytest.CaptureFix
     assert "http://127.0.0.1:" in said.out and "warning" not in said.err and "viser" not in said.out
     assert main([*arguments, "--host", "0.0.0.0", "--scene", "drop"]) == 0
     assert "anyone who reaches port" in capfd.readouterr().err
+
+
+def test_a_recording_is_kept_when_the_command_ends(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was being recorded is written, not thrown away."""
+    enter = ViewApp.__enter__
+
+    def press_record(app: ViewApp) -> ViewApp:
+        app.submit(app._panel._toggle_recording)
+        return enter(app)
+
+    monkeypatch.setattr(ViewApp, "__enter__", press_record)
+    folder = tmp_path / "röm 1"
+    assert main(["view", "--port", "0", "--no-open", "--duration", "1", "--record-folder", str(folder)]) == 0
+    (film,) = folder.glob("*.mp4")
+    assert film.stat().st_size > 1000 and str(film) in capfd.readouterr().out
 
 
 def test_an_interrupted_command_ends_cleanly() -> None:
@@ -339,6 +393,8 @@ def test_an_environment_is_shown_and_followed() -> None:
         (["softmode/Nothing-v0"], "unknown environment"),
         (["--duration", "-1"], "duration"),
         (["a", "b"], "name one"),
+        (["softmode/PushSoft-v0", "--hold", "base"], "--hold says nothing about an environment"),
+        (["--policy", "zero"], "--policy says nothing about an object"),
     ],
 )
 def test_the_command_refuses(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:

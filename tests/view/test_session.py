@@ -1,5 +1,6 @@
 """The live session: time, picking, pulling, pinning, parameters, handles, recordings, environments."""
 
+from dataclasses import replace
 from typing import Any
 
 import newton
@@ -298,7 +299,7 @@ def test_pins_are_limited_and_known():
     live = session(options=LiveOptions(budget=1.0e6, pin_max=2))
     hit = side(live)
     assert [live.pin(hit), live.pin(hit)] == [2, 3]
-    with pytest.raises(ConfigError, match="3 pins already"):
+    with pytest.raises(ConfigError, match="2 pins already"):
         live.pin(hit)
     live.unpin(3)
     assert live.pin(hit, 0.001) == 4 and len(live.pins()[4].points) == 4
@@ -404,9 +405,29 @@ def test_handles_change_while_it_moves():
     live.end_drag()
     settle(live, 60)
     assert live.pins()[next(iter(live.pins()))].error < 0.01 * SIZE and live.status().solver == ()
-    for wrong in (-1, 65, 2.5):
+    for wrong in (-1, 0, 65, 2.5):
         with pytest.raises(ConfigError, match="handles"):
             live.set_handles(wrong)
+
+
+def test_pins_keep_their_numbers_when_handles_change():
+    """A pin is let go by the number that `pin` gave; as many as before may be set, the one it hangs by not counted."""
+    live = session(options=replace(PATIENT, pin_max=2))
+    (own,) = live.pins()
+    number = live.pin(side(live))
+    before = live.pins()
+    live.set_handles(8)
+    assert list(live.pins()) == [own, number]
+    for one, pin in live.pins().items():
+        np.testing.assert_array_equal(pin.position, before[one].position)
+    live.pin(side(live))
+    with pytest.raises(ConfigError, match="2 pins already"):
+        live.pin(side(live))
+    live.begin_drag(side(live))  # there is room for the drag still
+    live.unpin(number)
+    live.unpin(own)
+    live.set_handles(4)
+    assert len(live.pins()) == 1
 
 
 # -- recording --------------------------------------------------------------------------------------------------------

@@ -337,6 +337,18 @@ def test_live_viewer(falling: Any, tmp_path: Path) -> None:
     assert len(file.of("world_0/scene/soft/plush", "GaussianSplats3D:centers")) == 3
 
 
+def test_a_viewer_that_is_not_there(falling: Any) -> None:
+    """Nobody listens at the address: an error that says so, before anything is simulated."""
+    scene, thing = falling
+    source = RerunScene(model=scene.model, solver=scene.solver, objects=[thing])
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))  # bound, but not listening: connections are refused
+        nobody = f"rerun+http://127.0.0.1:{probe.getsockname()[1]}/proxy"
+        for target in (nobody, "rerun+http://", "rerun+http://127.0.0.1:99999/proxy"):
+            with pytest.raises(ConfigError, match="no rerun viewer answers"):
+                RerunLogger(target, source)
+
+
 def test_bad_input_is_refused(falling: Any, env: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What cannot be recorded, or not there, is refused with the name of the argument; nothing is left behind."""
     scene, thing = falling
@@ -346,6 +358,7 @@ def test_bad_input_is_refused(falling: Any, env: Any, tmp_path: Path, monkeypatc
         ("worlds must name", "a.rrd", source, {"worlds": (2,)}),
         ("worlds must name", "a.rrd", source, {"worlds": (0, 0)}),
         ("worlds must name", "a.rrd", source, {"worlds": ()}),
+        ("worlds must be whole", "a.rrd", source, {"worlds": (0.5,)}),
         ("scene is a Model", "a.rrd", scene.model, {}),
         (
             "objects names 2 soft bodies",
