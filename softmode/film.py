@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from softmode.atomic import PendingFile
 from softmode.errors import ConfigError, MissingExtraError
 
 if TYPE_CHECKING:
@@ -41,22 +42,13 @@ class Film:
             raise ConfigError(f"video {path} is no .mp4 file", hint="name it like out/lift.mp4")
         self.path = path
         self.sheet_path = path.with_suffix(".png")
-        self._made = [folder for folder in path.absolute().parents if not folder.exists()]
-        self._temporary = path.with_name(f".{path.stem}-{os.getpid()}.mp4")
-        self._sheet = self._temporary.with_suffix(".png")
+        if self.sheet_path.is_dir():
+            raise ConfigError(f"contact sheet {self.sheet_path} is a folder", hint="name the video otherwise")
+        self._file = PendingFile(path, "video")
+        self._sheet = self._file.temporary.with_suffix(".png")
         self._writer: Any = None
         self._frames: list[NDArray[np.uint8]] = []
         self._count, self._stride = 0, 1
-        try:
-            if path.is_dir() or self.sheet_path.is_dir():
-                raise IsADirectoryError(f"{path} or {self.sheet_path} is a folder")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._temporary.open("xb").close()  # with the permissions that the umask asks for
-        except OSError as error:
-            self._remove_folders()
-            raise ConfigError(
-                f"video {path} cannot be written: {error.strerror or error}", hint="choose another folder"
-            ) from error
 
     def __enter__(self) -> Film:
         """Return the film."""
@@ -72,7 +64,7 @@ class Film:
             import imageio.v2 as imageio
 
             self._writer = imageio.get_writer(
-                self._temporary,
+                self._file.temporary,
                 format="FFMPEG",
                 fps=fps,
                 codec="libx264",
@@ -92,8 +84,8 @@ class Film:
         from PIL import Image
 
         self._writer.close()
-        if self._temporary.stat().st_size == 0:
-            raise OSError(f"the encoder wrote nothing to {self._temporary}")
+        if self._file.temporary.stat().st_size == 0:
+            raise OSError(f"the encoder wrote nothing to {self._file.temporary}")
         # Equal steps in what changed, so that a long rest at the end does not fill the sheet.
         coarse = np.array([frame[::4, ::4] for frame in self._frames], np.float32)
         change = np.abs(np.diff(coarse, axis=0)).mean(axis=(1, 2, 3))
@@ -102,20 +94,12 @@ class Film:
         rows = [np.concatenate([self._frames[i] for i in chosen[k : k + 3]], axis=1) for k in range(0, len(chosen), 3)]
         Image.fromarray(np.concatenate(rows, axis=0)).save(self._sheet)
         os.replace(self._sheet, self.sheet_path)
-        os.replace(self._temporary, self.path)
-        self._made = []
+        self._file.publish()
 
     def discard(self) -> None:
         """Remove what was not published."""
         if self._writer is not None:
             with contextlib.suppress(Exception):  # an encoder that was interrupted too has nothing left to say
                 self._writer.close()
-        self._temporary.unlink(missing_ok=True)
         self._sheet.unlink(missing_ok=True)
-        self._remove_folders()
-
-    def _remove_folders(self) -> None:
-        """Remove the folders that were made for a film which did not come to be."""
-        for folder in self._made:
-            with contextlib.suppress(OSError):
-                folder.rmdir()
+        self._file.discard()
