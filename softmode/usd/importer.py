@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from softmode.deformables.authoring import add_reduced_body
+from softmode.deformables.authoring import SCALE_MAX, SCALE_MIN, add_reduced_body
 from softmode.deformables.body import BuildOptions, ReducedBody, build_body, cached_body
 from softmode.deformables.materials import Material
 from softmode.deformables.quadrature import (
@@ -216,6 +216,12 @@ def _build(
 ) -> UsdBody:
     """Build or recall the body of a deformable, with its material, place and splats; its instance is yet to come."""
     if deformable.bundle is not None:
+        if not SCALE_MIN <= deformable.scale <= SCALE_MAX:
+            raise AssetError(
+                f"{deformable.path}: a body of softmode is scaled by {deformable.scale:g}, outside "
+                f"{SCALE_MIN}..{SCALE_MAX}",
+                hint="It is in metres: scale it by 1 / metersPerUnit where it is referred to in other units",
+            )
         body = body_of(deformable.bundle, deformable.path)
         offset = np.zeros(3)  # the prim's frame is the body frame
     else:

@@ -10,7 +10,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.deformables.authoring import SCALE_MAX, SCALE_MIN
 from softmode.deformables.materials import Material, MaterialModel
 from softmode.errors import AssetError, MaterialError
 from softmode.splats.formats.usd import UP_AXES, joined, placed, splats_from_prim
@@ -247,11 +246,6 @@ def _deformable(body: dict[str, Any], arrays: list[NDArray[Any]], frame: StageFr
             raise AssetError(
                 f"{name}: {body['path']}: a body of softmode is stretched or mirrored by its transform",
                 hint="Scale it evenly, or delete its softmode: attributes to have the body built anew",
-            )
-        if not SCALE_MIN <= scale <= SCALE_MAX:
-            raise AssetError(
-                f"{name}: {body['path']}: a body of softmode is scaled by {scale:g}, outside {SCALE_MIN}..{SCALE_MAX}",
-                hint="It is in metres: scale it by 1 / metersPerUnit where it is referred to in other units",
             )
         stretch = np.eye(3)
     to_asset = np.eye(4)  # world -> asset frame

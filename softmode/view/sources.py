@@ -15,9 +15,7 @@ from softmode.envs.object_build import config_of_file
 from softmode.envs.object_file import surface_cover
 from softmode.envs.objects import ObjectConfig, SoftObject, load_object
 from softmode.errors import ConfigError
-
-USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
-"""Suffixes of OpenUSD stages."""
+from softmode.usd import tokens
 
 HANDLES_MAX = 64
 """Most eigenmodes that `LiveSession.set_handles` builds."""
@@ -55,7 +53,7 @@ def load_source(
     if isinstance(source, SoftObject):
         _refuse_size(size, f"the body {source.body.name!r}")
         return LoadedObject(thing=source)
-    if isinstance(source, str | Path) and Path(source).suffix.lower() in USD_SUFFIXES:
+    if isinstance(source, str | Path) and Path(source).suffix.lower() in tokens.SUFFIXES:
         found = _usd_object(source, progress)
         if found is not None:
             _refuse_size(size, f"the body {found.thing.body.name!r} of {source}")
