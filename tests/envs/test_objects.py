@@ -13,6 +13,7 @@ from softmode.envs import objects
 from softmode.envs.objects import ObjectConfig, choose_part, load_object, stable_rotation
 from softmode.errors import AssetError, ConfigError
 from softmode.splats import Splats, make_plush, write_ply
+from softmode.splats.point_cloud import splats_from_points
 
 
 def shell(count: int, radius: float, centre: tuple[float, float, float], seed: int = 0) -> Splats:
@@ -72,6 +73,14 @@ def test_thickest_part_does_not_depend_on_the_frame(capture: Splats) -> None:
     a = 0.7
     tilt = [[1.0, 0.0, 0.0], [0.0, np.cos(a), -np.sin(a)], [0.0, np.sin(a), np.cos(a)]]
     assert choose_part(capture.transformed(rotation=tilt), "thickest").count == 900
+
+
+@pytest.mark.parametrize("count", [1000, 3000, 10000])
+def test_points_strewn_at_random_are_one_part(count: int) -> None:
+    """Of points that are uniform on a sphere, independently of each other, none is taken for a floater."""
+    points = np.random.default_rng(count).normal(size=(count, 3))
+    points *= 0.05 / np.linalg.norm(points, axis=1, keepdims=True)
+    assert choose_part(splats_from_points(points), "thickest").count == count
 
 
 def test_all_keeps_everything(capture: Splats) -> None:
