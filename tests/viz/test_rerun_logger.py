@@ -331,8 +331,10 @@ def test_live_viewer(falling: Any, tmp_path: Path) -> None:
         with RerunLogger(f"rerun+http://127.0.0.1:{port}/proxy", source) as log:
             for k in range(3):
                 log.record(scene.state, time=k * scene.dt)
-        for _ in range(300):
-            if path.exists() and path.stat().st_size > 3 * 12 * thing.splats.count:
+        sizes = [0] * 10
+        for _ in range(300):  # until the centres of three frames are there, and for a second nothing has come since
+            sizes = [*sizes[1:], path.stat().st_size if path.exists() else 0]
+            if min(sizes) == max(sizes) > 3 * 12 * thing.splats.count:
                 break
             time.sleep(0.1)
     finally:
