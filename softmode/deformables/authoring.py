@@ -7,6 +7,7 @@ from typing import Any
 import newton
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.body import ReducedBody
 from softmode.deformables.materials import Material
@@ -87,6 +88,18 @@ def bulk_stiffness(body: ReducedBody, youngs_modulus: float, poissons_ratio: flo
     return 20.0 * wave / (scale * float(np.linalg.norm(np.ptp(body.bounds, axis=0))))
 
 
+def rotation_matrix(rotation: ArrayLike) -> NDArray[np.float64]:
+    """Return a rotation as a float64 matrix, shape (3, 3).
+
+    Raises:
+        ConfigError: If it is no rotation.
+    """
+    R = np.asarray(rotation, dtype=np.float64)
+    if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=1e-5) or np.linalg.det(R) < 0.0:
+        raise ConfigError("rotation must be a rotation matrix of shape (3, 3)", hint="orthonormalise it")
+    return R
+
+
 def add_reduced_body(
     builder: newton.ModelBuilder,
     body: ReducedBody,
@@ -129,10 +142,8 @@ def add_reduced_body(
     """
     register_custom_attributes(builder)
     material = material or Material()
-    R = np.eye(3) if rotation is None else np.asarray(rotation, float)
+    R = np.eye(3) if rotation is None else rotation_matrix(rotation)
     p = np.asarray(position, float)
-    if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=1e-5) or np.linalg.det(R) < 0:
-        raise ConfigError("rotation must be a rotation matrix of shape (3, 3)", hint="orthonormalise it")
     for name, value in (("position", position), ("velocity", velocity), ("angular_velocity", angular_velocity)):
         if np.shape(value) != (3,) or not np.isfinite(value).all():
             raise ConfigError(f"{name} must be three finite numbers, got {value!r}")

@@ -121,7 +121,8 @@ def build_object(
     """
     if config.body is not None:
         raise ConfigError(f"{config.body} is a body already", hint="give the file that it was built from")
-    splats, solid, name, _ = object_source(config)
+    cropped = None if config.splat is None else read_cropped(config)
+    splats, solid, name, _ = object_source(config, cropped)
     quadrature, turn = standing_quadrature(config, solid, splats.name)
     low, high = quadrature.bounds
     seat = np.array([*(0.5 * (low + high))[:2], low[2]])
@@ -136,7 +137,7 @@ def build_object(
     )
     shown = shown_splats(splats, body, turn)
     kind = "mesh" if config.mesh is not None else "splat" if config.splat is not None else config.shape
-    given = read_cropped(config).count if config.splat is not None else splats.count
+    given = splats.count if cropped is None else cropped.count
     told = {"asset": name, "asset_kind": kind, "asset_splats": given, "asset_left_out": given - shown.count}
     rows = {"turn": json.dumps(turn.tolist()), "seat": json.dumps(seat.tolist())}
     return BuiltObject(

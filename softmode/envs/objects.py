@@ -30,6 +30,7 @@ from softmode.splats import Splats, make_plush, read_splats, split_components
 from softmode.splats.colored_mesh import ColoredMesh, read_mesh
 from softmode.splats.point_cloud import is_point_cloud, read_points
 from softmode.splats.splats import UpAxis, up_rotation
+from softmode.usd import tokens
 
 Shape = Literal["plush", "box", "cylinder", "capsule", "sphere"]
 Part = Literal["thickest", "tallest", "largest", "all"]
@@ -174,11 +175,9 @@ def load_object(config: ObjectConfig, progress: Callable[[str, float], None] | b
     """
     if config.body is not None:
         body, shown = read_object(config.body)
-        return _tie(
-            body, surface_cover(body) if shown is None else shown, 0.0 if body.driven_count else config.contact_radius
-        )
+        shown = surface_cover(body) if shown is None else shown
+        return tied(body, shown, 0.0 if body.driven_count else config.contact_radius)
     splats, solid, name, key = object_source(config)
-    turns = config.pose == "stable" and (config.splat is not None or config.mesh is not None)
 
     def build() -> ReducedBody:
         quadrature, turn = standing_quadrature(config, solid, splats.name)
@@ -191,9 +190,9 @@ def load_object(config: ObjectConfig, progress: Callable[[str, float], None] | b
         return replace(body, provenance={**body.provenance, "turn": json.dumps(turn.tolist())})
 
     clamp = (config.clamped_height,) if config.clamped_height > 0.0 else ()
-    body = cached_body((RECIPE, *key, turns, config.surface_count, config.build, *clamp), build)
+    body = cached_body((RECIPE, *key, _may_turn(config), config.surface_count, config.build, *clamp), build)
     turn = np.array(json.loads(str(body.provenance["turn"])))
-    return _tie(body, shown_splats(splats, body, turn), 0.0 if clamp else config.contact_radius)
+    return tied(body, shown_splats(splats, body, turn), 0.0 if clamp else config.contact_radius)
 
 
 def standing_quadrature(
@@ -217,10 +216,15 @@ def standing_quadrature(
     except AssetError as error:
         raise AssetError(f"{name}: {error.message}", hint=error.hint) from error
     turn = None
-    if config.pose == "stable" and (config.splat is not None or config.mesh is not None):
+    if _may_turn(config):
         centre = quadrature.weights @ quadrature.points / quadrature.volume
         turn = stable_rotation(quadrature.surface_points - centre)
     return (quadrature, np.eye(3)) if turn is None else (turned(quadrature, turn), turn)
+
+
+def _may_turn(config: ObjectConfig) -> bool:
+    """Return whether an object is laid on a stable side if it has to be."""
+    return config.pose == "stable" and (config.splat is not None or config.mesh is not None)
 
 
 def shown_splats(splats: Splats, body: ReducedBody, turn: NDArray[np.float64]) -> Splats:
@@ -230,8 +234,14 @@ def shown_splats(splats: Splats, body: ReducedBody, turn: NDArray[np.float64]) -
     return splats.subset(_drawn(splats, body)).transformed(translation=-body.offset)
 
 
-def _tie(body: ReducedBody, shown: Splats, contact_radius: float) -> SoftObject:
-    """Tie splats to the functions that move them."""
+def tied(body: ReducedBody, shown: Splats, contact_radius: float = 0.0) -> SoftObject:
+    """Tie splats in the body frame to the functions that move them.
+
+    Args:
+        body: The body.
+        shown: Its splats.
+        contact_radius: How far the surface that touches stands out below the body's [m].
+    """
     basis, grad_basis = average_basis(lambda x: body.evaluate(x)[0], shown.means, shown.covariances())
     return SoftObject(body, shown, basis, grad_basis, float(-body.surface_points[:, 2].min()) + contact_radius)
 
@@ -294,8 +304,12 @@ _Source = tuple[Splats, Callable[[], Quadrature], str, tuple[Any, ...]]
 """Splats, how their solid is integrated, its name, and what it depends on beside the configuration."""
 
 
-def object_source(config: ObjectConfig) -> _Source:
+def object_source(config: ObjectConfig, cropped: Splats | None = None) -> _Source:
     """Return what an object is made of, before it is turned to a stable pose.
+
+    Args:
+        config: Which object.
+        cropped: What `read_cropped` gives for its splat file, if that has been read already.
 
     Raises:
         AssetError: If a file cannot be read.
@@ -310,7 +324,7 @@ def object_source(config: ObjectConfig) -> _Source:
         mesh = ColoredMesh.from_trimesh(primitive_mesh(shape, extents), name=shape)
         splats = surface_splats(mesh, config.splat_count, config.colors or DEFAULT_COLORS)
         return splats, lambda: primitive_quadrature(shape, extents, count), shape, (shape, extents)
-    splats = _read_splats(config)
+    splats = _read_splats(config, cropped)
     name = "plush"
     if config.splat is not None:
         file = Path(config.splat).resolve()
@@ -341,9 +355,12 @@ def _mesh_solid(mesh: ColoredMesh, surface_count: int) -> Quadrature:
         )
 
 
-def _read_splats(config: ObjectConfig) -> Splats:
+def _read_splats(config: ObjectConfig, cropped: Splats | None = None) -> Splats:
     """Return the splats upright, standing on z = 0 around the origin, scaled to the wanted size."""
-    splats = make_plush() if config.splat is None else choose_part(read_cropped(config), config.part)
+    if config.splat is None:
+        splats = make_plush()
+    else:
+        splats = choose_part(read_cropped(config) if cropped is None else cropped, config.part)
     low, high = splats.bounds(quantile=0.0 if config.splat is None else 0.002)
     extent = float((high - low).max())
     if not extent > 0.0:
@@ -363,7 +380,7 @@ def read_cropped(config: ObjectConfig) -> Splats:
     if is_point_cloud(file):
         splats, up = read_points(file), "+z"
     else:
-        splats, up = read_splats(file), "+z" if file.suffix.lower().startswith(".usd") else "-y"
+        splats, up = read_splats(file), "+z" if file.suffix.lower() in tokens.SUFFIXES else "-y"
     splats = splats.oriented(config.up or up)
     if config.crop is None:
         return splats

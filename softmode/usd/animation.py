@@ -119,6 +119,7 @@ class UsdAnimation:
                 + (", others or in another order" if len(found) == len(bodies) else ""),
                 hint="pass a PlacedBody for each add_reduced_body, in that order",
             )
+        self._starts = data.function_start.numpy()[self._instances].tolist()
         self._bodies = tuple(bodies)
         self._placed: tuple[PlacedBody, ...] = ()
         self._meshes = RigidMeshes(model, world) if self.options.rigid_meshes else None
@@ -187,11 +188,10 @@ class UsdAnimation:
         if not (np.isfinite(when) and (not self._times or when > self._times[-1])):
             before = f" after one at {self._times[-1]} s" if self._times else ""
             raise ConfigError(f"time is {when} s{before}", hint="give times that grow, or None")
-        start = self.model.softmode.function_start.numpy()
         q = state.softmode.q.numpy()
         parts = [
-            np.array(q[start[i] : start[i] + placed.body.function_count], dtype=np.float64)
-            for i, placed in zip(self._instances, self._bodies, strict=True)
+            np.array(q[start : start + placed.body.function_count], dtype=np.float64)
+            for start, placed in zip(self._starts, self._bodies, strict=True)
         ]
         if not all(np.isfinite(part).all() for part in parts):
             raise SolverDiverged(f"the state at {when} s is not finite", hint="record until a reset, or reset first")

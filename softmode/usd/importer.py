@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from softmode.deformables.authoring import SCALE_MAX, SCALE_MIN, add_reduced_body
+from softmode.deformables.authoring import SCALE_MAX, SCALE_MIN, add_reduced_body, rotation_matrix
 from softmode.deformables.body import BuildOptions, ReducedBody, build_body, cached_body
 from softmode.deformables.materials import Material
 from softmode.deformables.quadrature import (
@@ -180,13 +180,10 @@ def add_usd(
 
 def _place(position: Sequence[float], rotation: ArrayLike | None) -> tuple[Array, Array]:
     """Return the rotation (3, 3) and translation (3,) of a stage, checked."""
-    turn = np.eye(3) if rotation is None else np.asarray(rotation, dtype=np.float64)
     shift = np.asarray(position, dtype=np.float64)
     if shift.shape != (3,) or not np.isfinite(shift).all():
         raise ConfigError(f"position must be three finite numbers, got {position!r}", hint="give metres")
-    if turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-5) or np.linalg.det(turn) < 0.0:
-        raise ConfigError("rotation must be a rotation matrix of shape (3, 3)", hint="orthonormalise it")
-    return turn, shift
+    return np.eye(3) if rotation is None else rotation_matrix(rotation), shift
 
 
 def _add_rest(builder: newton.ModelBuilder, crate: str, name: str, options: dict[str, Any]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.deformables.authoring import SCALE_MAX, SCALE_MIN
+from softmode.deformables.authoring import SCALE_MAX, SCALE_MIN, rotation_matrix
 from softmode.deformables.materials import Material
 from softmode.deformables.reduced_body import ReducedBody
 from softmode.errors import ConfigError
@@ -39,13 +39,9 @@ class PlacedBody:
 
     def __post_init__(self) -> None:
         """Check the place."""
-        rotation = np.asarray(self.rotation, dtype=np.float64)
-        object.__setattr__(self, "rotation", rotation)
         if np.shape(self.position) != (3,) or not np.isfinite(self.position).all():
             raise ConfigError(f"position must be three finite numbers, got {self.position!r}", hint="give metres")
-        proper = rotation.shape == (3, 3) and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5)
-        if not (proper and np.linalg.det(rotation) > 0.0):
-            raise ConfigError("rotation must be a rotation matrix of shape (3, 3)", hint="orthonormalise it")
+        object.__setattr__(self, "rotation", rotation_matrix(self.rotation))
         if not SCALE_MIN <= self.scale <= SCALE_MAX:
             raise ConfigError(f"scale must lie in [{SCALE_MIN}, {SCALE_MAX}], got {self.scale!r}", hint="build anew")
 

@@ -32,83 +32,87 @@ class Slider:
     """One parameter of the session on a slider."""
 
     label: str
+    parameter: str
+    """What it sets, by its name in `LiveParameters`."""
     low: float
     high: float
     step: float
-    read: Callable[[LiveParameters], float]
-    """From the parameters to the slider."""
-    write: Callable[[LiveSession, float], None]
-    """From the slider to the session."""
+    read: Callable[[Any], float] = float
+    """From the parameter to the slider."""
+    write: Callable[[float], float] = float
+    """From the slider to the parameter."""
     hint: str | None = None
     marks: tuple[tuple[float, str], ...] | None = None
 
+    def set(self, session: LiveSession, value: float) -> None:
+        """Give the session what the slider shows."""
+        session.set_parameters(**{self.parameter: self.write(value)})
+
     def shown(self, now: LiveParameters) -> float:
         """Return the value to show, in the slider's range and without the noise of single precision."""
-        return round(min(max(self.read(now), self.low), self.high), 5)
+        return round(min(max(self.read(getattr(now, self.parameter)), self.low), self.high), 5)
 
 
 SLIDERS = (
     Slider(
         label="log10 E [Pa]",
+        parameter="youngs_modulus",
         low=3.0,
         high=7.0,
         step=0.05,
-        read=lambda now: math.log10(now.youngs_modulus),
-        write=lambda session, value: session.set_parameters(youngs_modulus=10.0**value),
+        read=math.log10,
+        write=lambda value: 10.0**value,
         marks=MODULUS_MARKS,
     ),
     Slider(
         label="nu",
+        parameter="poissons_ratio",
         low=0.0,
         high=0.49,
         step=0.01,
-        read=lambda now: now.poissons_ratio,
-        write=lambda session, value: session.set_parameters(poissons_ratio=value),
         hint="Poisson's ratio",
     ),
     Slider(
         label="density",
+        parameter="density",
         low=50.0,
         high=3000.0,
         step=10.0,
-        read=lambda now: now.density,
-        write=lambda session, value: session.set_parameters(density=value),
         hint="kg/m^3",
     ),
     Slider(
         label="viscosity [ms]",
+        parameter="viscosity",
         low=0.0,
         high=50.0,
         step=0.5,
-        read=lambda now: 1e3 * now.viscosity,
-        write=lambda session, value: session.set_parameters(viscosity=1e-3 * value),
+        read=lambda value: 1e3 * value,
+        write=lambda value: 1e-3 * value,
         hint="damps deformation",
     ),
     Slider(
         label="air drag [1/s]",
+        parameter="mass_damping",
         low=0.0,
         high=10.0,
         step=0.1,
-        read=lambda now: now.mass_damping,
-        write=lambda session, value: session.set_parameters(mass_damping=value),
         hint="damps all motion",
     ),
     Slider(
         label="friction",
+        parameter="friction",
         low=0.0,
         high=2.0,
         step=0.05,
-        read=lambda now: now.friction,
-        write=lambda session, value: session.set_parameters(friction=value),
         hint="Coulomb's coefficient",
     ),
     Slider(
         label="gravity",
+        parameter="gravity",
         low=0.0,
         high=20.0,
         step=0.01,
-        read=lambda now: math.hypot(*now.gravity),
-        write=lambda session, value: session.set_parameters(gravity=value),
+        read=lambda value: math.hypot(*value),
         hint="m/s^2, downwards",
     ),
 )
@@ -257,7 +261,7 @@ class Panel:
                 return
             value = min(max(float(handle.value), slider.low), slider.high)  # a page may send anything
             self._touched[slider] = time.monotonic()
-            self._submit(lambda session: slider.write(session, value))
+            self._submit(lambda session: slider.set(session, value))
 
         handle.on_update(changed)
 

@@ -10,10 +10,9 @@ import newton
 import numpy as np
 
 from softmode.deformables.materials import Material
-from softmode.deformables.skinning import average_basis
 from softmode.envs.object_build import config_of_file
 from softmode.envs.object_file import surface_cover
-from softmode.envs.objects import ObjectConfig, SoftObject, load_object
+from softmode.envs.objects import ObjectConfig, SoftObject, load_object, tied
 from softmode.errors import ConfigError
 from softmode.usd import tokens
 
@@ -84,9 +83,7 @@ def _usd_object(path: str | Path, progress: Any) -> LoadedObject | None:
         return None
     first = next(iter(found.bodies.values()))
     body, splats = first.body, first.splats or surface_cover(first.body)
-    basis, grad_basis = average_basis(lambda x: body.evaluate(x)[0], splats.means, splats.covariances())
-    thing = SoftObject(body, splats, basis, grad_basis, float(-body.surface_points[:, 2].min()))
-    return LoadedObject(thing=thing, material=first.material, scale=first.scale)
+    return LoadedObject(thing=tied(body, splats), material=first.material, scale=first.scale)
 
 
 def with_handles(config: ObjectConfig | None, count: int) -> ObjectConfig:
