@@ -16,8 +16,8 @@ from pathlib import Path
 import warp as wp
 
 from benchmarks.accuracy_runner import Result, Row, run_all
-from softmode.deformables.body import BuildOptions
-from softmode.deformables.solver_reduced import SolverReducedOptions
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from tests.oracle.scenes import KAPPAS, SCENES
 
 MODES = (6, 9, 16, 32)

@@ -20,16 +20,16 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from softmode.deformables.body import BuildOptions, ReducedBody, Region, build_body
-from softmode.deformables.materials import Material, MaterialModel
-from softmode.deformables.quadrature import Quadrature, quadrature_from_mesh
-from softmode.deformables.solver_reduced import (
-    SolverReduced,
-    SolverReducedOptions,
-    add_pins,
-    add_reduced_body,
-    register_custom_attributes,
-)
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.body.regions import Region
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature_grid import Quadrature
+from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
+from softmode.deformables.materials.material import Material
+from softmode.deformables.materials.material_kernels import MaterialModel
+from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
+from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.errors import ConfigError
 from tests.oracle import frames
 from tests.oracle.scenes import SCENES, Clamp, Scene, rotation

@@ -16,8 +16,12 @@ import time
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from softmode.deformables.body import BuildOptions, ReducedBody, Region, build_body
-from softmode.deformables.quadrature import Quadrature, quadrature_from_box
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.body.regions import Region
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.build.quadrature_grid import Quadrature
 
 LEFT = Region(name="left", box=((-np.inf,) * 3, (-2.0, np.inf, np.inf)))
 RIGHT = Region(name="right", box=((2.0, -np.inf, -np.inf), (np.inf,) * 3))

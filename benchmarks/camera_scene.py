@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from softmode.deformables.skinning import SkinSplats
+from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
 from softmode.splats.splats import SH_DC, Splats, quats_from_rotations
 

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from softmode.deformables.materials import Material
-from softmode.deformables.solver_reduced import SolverReducedOptions, add_reduced_body
-from softmode.envs.lift_soft import LiftSoftEnv
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.envs.scripted import ScriptedLift
+from softmode.envs.tasks.lift_soft.task import LiftSoftEnv
 from tests import reference
 from tests.deformables.test_coupling import grasp, impact, totals
 from tests.deformables.test_friction import MU, incline

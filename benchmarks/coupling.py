@@ -18,8 +18,8 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from benchmarks.coupling_schemes import SCHEMES, Coupled, Cube, SchemeName, World
-from softmode.deformables.materials import Material
-from softmode.deformables.solver_reduced import SolverReduced
+from softmode.deformables.materials.material import Material
+from softmode.deformables.solver.solver_reduced import SolverReduced
 from tests.scenes import GRAVITY, GRIPPER, RIGID_GAP, add_free_box, add_gripper
 
 EDGE = 0.1

@@ -13,11 +13,11 @@ import warp as wp
 from newton.solvers import SolverMuJoCo, SolverVBD
 from newton.solvers.experimental.coupled import SolverCoupledProxy  # pyright: ignore[reportMissingImports]
 
-from softmode.deformables.body import ReducedBody
-from softmode.deformables.coupling import SolverCoupledReduced
-from softmode.deformables.materials import Material
-from softmode.deformables.proxy import SolverReducedProxy
-from softmode.deformables.solver_reduced import add_reduced_body, register_custom_attributes
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.coupling.proxy import SolverReducedProxy
+from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body, register_custom_attributes
 from tests import reference
 from tests.scenes import cube, rotation
 

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from softmode.deformables.body import BuildOptions, build_body
-from softmode.deformables.quadrature import quadrature_from_splats
-from softmode.envs.lift_soft import LiftSoftEnv
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_splats
 from softmode.envs.scripted import ScriptedLift
+from softmode.envs.tasks.lift_soft.task import LiftSoftEnv
 from softmode.splats import make_plush
 
 GRASP_STEPS = 55

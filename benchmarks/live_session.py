@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softmode.cli_common import quiet_warp
+from softmode.cli.common import quiet_warp
 from softmode.splats import make_plush
 from softmode.splats.formats import write_splats
 from softmode.view.live_types import LiveOptions

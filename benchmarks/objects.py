@@ -1,8 +1,8 @@
 """What the preset objects cost, and how far a rope bends with which handles.
 
-The first table has one line per preset of `softmode.envs.presets`: sizes, processor time of the build without a cache,
-time of a step at rest on the ground. The second one holds a rope in its middle and compares the drop of its ends with
-the heavy elastica's.
+The first table has one line per preset of `softmode.objects.presets`: sizes, processor time of the build without a
+cache, time of a step at rest on the ground. The second one holds a rope in its middle and compares the drop of its
+ends with the heavy elastica's.
 
 Run: ``python -m benchmarks.objects [--load 2.5]``
 """
@@ -18,10 +18,11 @@ import newton
 import numpy as np
 import warp as wp
 
-from softmode.deformables.body import BuildOptions
-from softmode.deformables.solver_reduced import SolverReduced, add_reduced_body
-from softmode.envs import presets
-from softmode.envs.objects import load_object
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.solver.solver_reduced import SolverReduced
+from softmode.objects import presets
+from softmode.objects.soft_object import load_object
 from tests.envs.test_primitives import hang, heavy_elastica
 from tests.scenes import GRAVITY
 

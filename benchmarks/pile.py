@@ -11,10 +11,12 @@ import newton
 import numpy as np
 import warp as wp
 
-from softmode.deformables.body import BuildOptions, build_body
-from softmode.deformables.materials import Material
-from softmode.deformables.quadrature import quadrature_from_box
-from softmode.deformables.solver_reduced import SolverReduced, add_reduced_body, register_custom_attributes
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body, register_custom_attributes
+from softmode.deformables.solver.solver_reduced import SolverReduced
 
 DT = 0.004
 EDGE = 0.1

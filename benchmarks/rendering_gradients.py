@@ -13,8 +13,8 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from softmode.deformables.skinning import SkinSplats
-from softmode.deformables.skinning_adjoint import AdjointSkinning
+from softmode.deformables.skinning.skin_splats import SkinSplats
+from softmode.deformables.skinning.skinning_adjoint import AdjointSkinning
 from softmode.splats import Splats
 from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
 from softmode.splats.rasterizer_adjoint import AdjointRasterizer

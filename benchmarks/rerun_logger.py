@@ -19,11 +19,11 @@ import newton
 import numpy as np
 
 import softmode  # noqa: F401  (registers the environments)
-from softmode.deformables.materials import Material
-from softmode.deformables.skinning import average_basis
-from softmode.envs.objects import ObjectConfig, SoftObject, load_object
-from softmode.envs.splat_scene import PlacedObject, SplatScene
-from softmode.policies import policy_factory
+from softmode.deformables.materials.material import Material
+from softmode.deformables.skinning.skin_splats import average_basis
+from softmode.learning.players import policy_factory
+from softmode.objects.soft_object import ObjectConfig, SoftObject, load_object
+from softmode.scenes.splat_scene import PlacedObject, SplatScene
 from softmode.splats import Splats
 from softmode.viz.rerun_logger import RerunLogger, RerunOptions
 

@@ -19,7 +19,8 @@ from typing import Any
 
 import warp as wp
 
-from softmode.deformables.body import BuildOptions, build_body
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
 from softmode.errors import SoftmodeError
 from tests.shape_trials import base_of, drop, solve_reference, try_build, try_pull, voxelise
 from tests.shapes import SHAPES, Shape

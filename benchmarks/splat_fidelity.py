@@ -25,10 +25,12 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import binary_dilation
 
-from softmode.deformables.body import BuildOptions, ReducedBody, build_body
-from softmode.deformables.quadrature import quadrature_from_box
-from softmode.deformables.skinning import STRETCH_LIMIT, SkinSplats, average_basis
-from softmode.envs.objects import ObjectConfig, load_object
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.skinning.skin_splats import STRETCH_LIMIT, SkinSplats, average_basis
+from softmode.objects.soft_object import ObjectConfig, load_object
 from softmode.splats import Splats
 from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays

@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from softmode.splats.colored_mesh import ColoredMesh, read_mesh
-from softmode.splats.mesh_fit import FIELD_OF_VIEW, FitOptions, splats_from_mesh
+from softmode.objects.mesh_file import read_mesh
+from softmode.objects.mesh_fit import FIELD_OF_VIEW, FitOptions, splats_from_mesh
+from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.mesh_samples import sample_mesh
 from softmode.splats.rasterizer import SplatArrays, SplatRasterizer
 from softmode.splats.reference_views import orbit_poses, render_mesh

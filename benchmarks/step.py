@@ -20,16 +20,14 @@ import newton
 import numpy as np
 import warp as wp
 
-from softmode.deformables.body import BuildOptions, ReducedBody, build_body
-from softmode.deformables.materials import Material, MaterialModel
-from softmode.deformables.quadrature import quadrature_from_box
-from softmode.deformables.solver_reduced import (
-    SolverReduced,
-    SolverReducedOptions,
-    add_pins,
-    add_reduced_body,
-    register_custom_attributes,
-)
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.materials.material import Material
+from softmode.deformables.materials.material_kernels import MaterialModel
+from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
+from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 
 SIZE = (5.0, 1.0, 1.0)
 CLAMP_LENGTH = 0.5

@@ -20,9 +20,10 @@ import newton
 import numpy as np
 import warp as wp
 
-from softmode.deformables.materials import Material
-from softmode.deformables.solver_reduced import SolverReduced, add_reduced_body
-from softmode.envs.objects import ObjectConfig, load_object
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.solver.solver_reduced import SolverReduced
+from softmode.objects.soft_object import ObjectConfig, load_object
 from softmode.splats import Splats, make_plush
 from softmode.usd import (
     PlacedBody,

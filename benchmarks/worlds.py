@@ -19,8 +19,9 @@ import numpy as np
 import warp as wp
 
 from softmode.envs.rl_scene import rl_scene
-from softmode.envs.table_scene import TableScene, TableSceneConfig
-from softmode.splats.camera import PinholeCamera, SplatCamera
+from softmode.scenes.table_scene import TableScene, TableSceneConfig
+from softmode.splats.camera import SplatCamera
+from softmode.splats.pinhole import PinholeCamera
 
 
 def main() -> None:

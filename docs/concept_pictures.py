@@ -15,13 +15,17 @@ import warp as wp
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from softmode.deformables.body import BuildOptions, ReducedBody, build_body
-from softmode.deformables.materials import Material
-from softmode.deformables.quadrature import Quadrature, quadrature_from_splats
-from softmode.deformables.rkpm import BasisRKPM, make_basis
-from softmode.deformables.skinning import SkinSplats, average_basis
-from softmode.deformables.skinning_weights import SkinningWeights
-from softmode.deformables.solver_reduced import SolverReduced, SolverReducedOptions, add_reduced_body
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.body.rkpm import BasisRKPM, make_basis
+from softmode.deformables.body.skinning_weights import SkinningWeights
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_splats
+from softmode.deformables.build.quadrature_grid import Quadrature
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.skinning.skin_splats import SkinSplats, average_basis
+from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.splats import Splats, make_plush
 from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays

@@ -21,7 +21,7 @@ from torch import nn
 import softmode
 from softmode.demonstrations import Dataset, DatasetWriter, read_dataset
 from softmode.demonstrations.recording import environment_features, record_episodes
-from softmode.policies import policy_factory
+from softmode.learning.players import policy_factory
 
 KEYS = ("observation.state", "observation.environment_state", "action")
 CHUNK, PLAYED, NOISE = 8, 4, 0.3  # actions predicted at once, those of them played, pushes while recording

@@ -16,13 +16,13 @@ import warp as wp
 from gymnasium.utils.env_checker import check_env
 
 from softmode.envs import check_vector_env
-from softmode.envs.objects import ObjectConfig
 from softmode.envs.rl_scene import rl_scene
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.table_scene import TableSceneConfig
 from softmode.envs.task import Segment, Task, TaskConfig
-from softmode.film import Film
+from softmode.objects.soft_object import ObjectConfig
+from softmode.scenes.table_scene import TableSceneConfig
+from softmode.viz.film import Film
 
 # ----------------------------------------------------------------------------------------------------------------------
 RADIUS, HEIGHT = 0.02, 0.12  # of the post [m]

@@ -15,9 +15,9 @@ import numpy as np
 import warp as wp
 from PIL import Image
 
-from softmode.deformables.body import BuildOptions
-from softmode.deformables.skinning import SkinSplats
-from softmode.envs.objects import ObjectConfig, load_object
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.skinning.skin_splats import SkinSplats
+from softmode.objects.soft_object import ObjectConfig, load_object
 from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
 

@@ -18,15 +18,18 @@ import numpy as np
 import warp as wp
 from PIL import Image
 
-from softmode.deformables.body import BuildOptions, ReducedBody, Region, build_body
-from softmode.deformables.materials import Material
-from softmode.deformables.quadrature import quadrature_from_box
-from softmode.deformables.skinning import average_basis
-from softmode.deformables.solver_reduced import SolverReducedOptions
-from softmode.envs.objects import SoftObject
-from softmode.envs.splat_scene import PlacedObject, SplatScene
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.body.regions import Region
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.materials.material import Material
+from softmode.deformables.skinning.skin_splats import average_basis
+from softmode.deformables.solver.solver_reduced import SolverReducedOptions
+from softmode.objects.soft_object import SoftObject
+from softmode.scenes.splat_scene import PlacedObject, SplatScene
 from softmode.splats import Splats
-from softmode.splats.camera import PinholeCamera
+from softmode.splats.pinhole import PinholeCamera
 
 LENGTH, CLAMP, EDGE, CORE = 0.32, 0.04, 0.04, 0.02
 """The bar and what of it is clamped; edges of its section and of its core [m]."""

@@ -15,9 +15,9 @@ import numpy as np
 import warp as wp
 
 import softmode  # noqa: F401  (registers the environments)
-from softmode.envs.lift_soft import LiftSoftConfig
 from softmode.envs.scripted import scripted_policy
-from softmode.film import Film
+from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
+from softmode.viz.film import Film
 
 GRAVITY = 9.81
 

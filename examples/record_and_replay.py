@@ -19,8 +19,8 @@ import warp as wp
 import softmode
 from softmode.demonstrations import Dataset, DatasetWriter, read_dataset
 from softmode.demonstrations.recording import environment_features, observation_columns, record_episodes
-from softmode.film import Film
-from softmode.policies import policy_factory
+from softmode.learning.players import policy_factory
+from softmode.viz.film import Film
 
 ENV, OUT, SEED, ASIDE = "softmode/PushSoft-v0", Path("out/record_and_replay"), 100, 0.03
 

@@ -18,14 +18,16 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 from PIL import Image
 
-from softmode.deformables.coupling import SolverCoupledReduced
-from softmode.deformables.materials import Material
-from softmode.deformables.skinning import SkinSplats
-from softmode.deformables.solver_reduced import add_reduced_body
-from softmode.envs.objects import ObjectConfig, load_object
+from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.skinning.skin_splats import SkinSplats
+from softmode.objects.soft_object import ObjectConfig, load_object
 from softmode.robots import add_arm
 from softmode.splats import make_plush
-from softmode.splats.camera import CameraOptions, CameraRandomization, PinholeCamera, SplatCamera
+from softmode.splats.camera import CameraOptions, SplatCamera
+from softmode.splats.camera_randomization import CameraRandomization
+from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.rasterizer import RasterizerOptions, SplatArrays
 from softmode.splats.rigid_splats import RigidSplats, RigidSplatsSkin
 

@@ -34,10 +34,11 @@ _EPISODE_STEPS = {
 
 
 def _register() -> None:
-    """Register every environment once; task Name lives in ``softmode.envs.name`` as NameEnv and NameVectorEnv."""
+    """Register every environment once; ``softmode.envs.tasks.name.task`` has NameEnv and NameVectorEnv of task Name."""
     for name in ENVIRONMENTS:
         task = name.removeprefix("softmode/").removesuffix("-v0")
-        module = "softmode.envs." + "".join(f"_{c.lower()}" if c.isupper() else c for c in task).lstrip("_")
+        folder = "".join(f"_{c.lower()}" if c.isupper() else c for c in task).lstrip("_")
+        module = f"softmode.envs.tasks.{folder}.task"
         if name not in registry:
             register(
                 id=name,

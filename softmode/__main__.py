@@ -2,6 +2,6 @@
 
 import sys
 
-from softmode.cli import main
+from softmode.cli.main import main
 
 sys.exit(main())

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from softmode.deformables.body import ReducedBody
-from softmode.deformables.materials import Material, MaterialModel
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.materials.material import Material
+from softmode.deformables.materials.material_kernels import MaterialModel
 
 I3 = np.eye(3)
 TRANSPOSE = np.einsum("il,jk->ijkl", I3, I3)

@@ -11,14 +11,13 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
-from softmode.deformables.body import BuildOptions, ReducedBody, build_body
-from softmode.deformables.coupling import SolverCoupledReduced
-from softmode.deformables.quadrature import quadrature_from_box
-from softmode.deformables.solver_reduced import (
-    SolverReduced,
-    SolverReducedOptions,
-    register_custom_attributes,
-)
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
+from softmode.deformables.model.authoring import register_custom_attributes
+from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 
 GRAVITY = 9.81
 """Standard gravity of every scene that has any [m/s^2]."""

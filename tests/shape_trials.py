@@ -16,10 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage, sparse
 from scipy.sparse import linalg as sparse_linalg
 
-from softmode.deformables.body import BuildOptions, ReducedBody, Region, build_body
-from softmode.deformables.materials import Material
-from softmode.deformables.quadrature import Quadrature
-from softmode.deformables.solver_reduced import SolverReducedOptions, add_reduced_body
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.body.regions import Region
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature_grid import Quadrature
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from tests.oracle.fem import Mesh, Solid
 from tests.scenes import Scene
 from tests.shapes import Shape

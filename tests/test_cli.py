@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from softmode.cli import main
-from softmode.film import Film
+from softmode.cli.main import main
 from softmode.splats import make_plush, write_ply
+from softmode.viz.film import Film
 
 ROOT = Path(__file__).resolve().parents[1]
 os.environ.setdefault("SOFTMODE_CACHE", str(ROOT / ".cache" / "softmode"))
@@ -108,7 +108,7 @@ def test_a_task_of_ones_own_plays(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 OWN_TASK = """
 import gymnasium as gym
-from softmode.envs.lift_soft import LiftSoft
+from softmode.envs.tasks.lift_soft.task import LiftSoft
 from softmode.envs.soft_env import SoftEnv
 
 def rest(env):
@@ -268,7 +268,7 @@ def test_interrupted_film_leaves_the_old_one(
 
 def test_installed_command_exits_with_the_code(tmp_path: Path) -> None:
     """`python -m softmode.cli` hands the exit code to the shell and writes errors to stderr only."""
-    command = [sys.executable, "-m", "softmode.cli", *PLAY, "--policy", "clever"]
+    command = [sys.executable, "-m", "softmode.cli.main", *PLAY, "--policy", "clever"]
     run = subprocess.run(
         command, capture_output=True, text=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}
     )

@@ -13,14 +13,16 @@ import trimesh
 from PIL import Image
 from scipy.optimize import brentq
 
-from softmode.cli import main
-from softmode.deformables.body import BuildOptions, ReducedBody, build_body
-from softmode.deformables.cubature import POISSON_RATIO
-from softmode.deformables.quadrature import quadrature_from_box
-from softmode.envs.object_build import config_of_file, file_kind
-from softmode.envs.object_file import read_object, surface_cover, write_object
-from softmode.envs.objects import ObjectConfig, load_object
+from softmode.cli.main import main
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.cubature import POISSON_RATIO
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.errors import AssetError, ConfigError
+from softmode.objects.object_build import config_of_file, file_kind
+from softmode.objects.object_file import read_object, surface_cover, write_object
+from softmode.objects.soft_object import ObjectConfig, load_object
 from softmode.splats import Splats, make_plush, write_ply
 from softmode.splats.point_cloud import splats_from_points
 from softmode.viz.body_picture import mode_frequencies

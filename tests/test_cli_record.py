@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from softmode import ENVIRONMENTS
-from softmode.cli import main
+from softmode.cli.main import main
 from softmode.demonstrations import read_dataset
 
 pytest.importorskip("pyarrow")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softmode.cli import main
+from softmode.cli.main import main
 from softmode.splats import make_plush, read_splats, write_ply
 from tests.splats.meshes import bumpy_sphere
 from tests.test_cli import listing

@@ -11,8 +11,8 @@ import pytest
 
 pytest.importorskip("torch")
 
-from softmode import cli
-from softmode.cli_train import parse_env_options, parse_overrides
+from softmode.cli import main as cli
+from softmode.cli.train import parse_env_options, parse_overrides
 from softmode.errors import ConfigError
 from softmode.learning.config_values import config_of
 
@@ -108,11 +108,11 @@ def test_values_are_parsed():
         "discount": 0.9, "hidden": [8, 8], "schedule": "linear", "clip_value": None,
     }  # fmt: skip
     assert parse_env_options('{"obs_type": "pixels"}') == {"obs_type": "pixels"}
-    from softmode.envs.lift_soft import LiftSoftConfig
+    from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
 
     config = config_of(LiftSoftConfig, {"image_size": 64, "scene": {"object": {"size": 0.07}}, "goal_range": [0, 0, 0]})
     assert config.image_size == 64 and config.scene.object.size == 0.07 and config.goal_range == (0, 0, 0)
-    from softmode.envs.push_soft import PushSoftConfig
+    from softmode.envs.tasks.push_soft.task import PushSoftConfig
 
     config = config_of(PushSoftConfig, {"scene": {"substeps": 8}})
     assert config.scene == dataclasses.replace(PushSoftConfig().scene, substeps=8)
@@ -122,6 +122,6 @@ def test_values_are_parsed():
 
 def test_the_command_line_stays_light():
     """Parsing loads no torch."""
-    code = "import sys, softmode.cli; print([name for name in ('torch', 'tensorboard') if name in sys.modules])"
+    code = "import sys, softmode.cli.main; print([name for name in ('torch', 'tensorboard') if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

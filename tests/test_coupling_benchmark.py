@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.coupling import GRASPS, describe, gripper_world, impact, lift, random_grasps, show_impact, squeeze
 from benchmarks.coupling_schemes import SCHEMES, Coupled
-from softmode.deformables.materials import Material
+from softmode.deformables.materials.material import Material
 from tests.scenes import GRAVITY
 
 COLUMNS = [pytest.param(s, marks=pytest.mark.slow) if s.startswith("VBD") else s for s in SCHEMES]

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.attachments import attach
-from softmode.deformables.grips import Grips, add_grip_slots
-from softmode.deformables.materials import Material
-from softmode.deformables.sensing import ContactSensor, SurfacePressure
-from softmode.deformables.solver_reduced import SolverReduced, add_reduced_body, register_custom_attributes
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body, register_custom_attributes
+from softmode.deformables.solver.attachments import attach
+from softmode.deformables.solver.solver_reduced import SolverReduced
+from softmode.deformables.tools.grips import Grips, add_grip_slots
+from softmode.deformables.tools.sensing import ContactSensor, SurfacePressure
 from tests.scenes import cube
 
 pytestmark = pytest.mark.gpu
@@ -165,8 +166,8 @@ def test_cuda_senses():
 
 def test_cuda_lifts():
     """The scripted policy lifts the plush on CUDA with pixel observations."""
-    from softmode.envs.lift_soft import LiftSoftEnv
     from softmode.envs.scripted import ScriptedLift
+    from softmode.envs.tasks.lift_soft.task import LiftSoftEnv
 
     env = LiftSoftEnv(obs_type="pixels_agent_pos", device="cuda:0")
     observation, info = env.reset(seed=1)

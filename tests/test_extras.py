@@ -24,19 +24,22 @@ OPTIONAL = (
 """Modules that only extras bring; `compression` is where Python 3.14 keeps Zstandard."""
 
 CASES = {
-    "command line": ("demo", "import softmode.cli; softmode.cli.main(['list-envs'])"),
-    "film": ("demo", "from softmode.film import Film; Film(Path('lift.mp4'))"),
+    "command line": ("demo", "import softmode.cli.main; softmode.cli.main.main(['list-envs'])"),
+    "film": ("demo", "from softmode.viz.film import Film; Film(Path('lift.mp4'))"),
     "tensors": ("rl", "import softmode, gymnasium as g; g.make_vec('softmode/PushSoft-v0', output='torch')"),
     "Stable-Baselines3": ("rl", "from softmode.envs.adapters import StableBaselinesVecEnv"),
     "rsl_rl": ("rsl-rl", "from softmode.envs.adapters import RslRlVecEnv"),
     "skrl": ("skrl", "from softmode.envs.adapters import SkrlWrapper"),
     "training": ("rl", "from softmode.learning.trainer import train"),
     "trained policy": ("rl", "from softmode.learning.policy import load_policy"),
-    "policy by file": ("rl", "from softmode.policies import trained_policy as t; t('a.npz', 'softmode/PushSoft-v0')"),
-    "policy to play": ("rl", "from softmode.policies import policy_factory as f; f(str(Path('a.npz')), None)"),
+    "policy by file": (
+        "rl",
+        "from softmode.learning.players import trained_policy as t; t('a.npz', 'softmode/PushSoft-v0')",
+    ),
+    "policy to play": ("rl", "from softmode.learning.players import policy_factory as f; f(str(Path('a.npz')), None)"),
     "TensorBoard": ("rl", "from softmode.learning.run_folder import RunFolder as R; R.start_tensorboard(None, None)"),
     "autograd of splats": ("rl", "from softmode.splats.rasterizer_torch import _function; _function()"),
-    "autograd of steps": ("rl", "from softmode.deformables.adjoint_torch import _function; _function()"),
+    "autograd of steps": ("rl", "from softmode.deformables.gradients.adjoint_torch import _function; _function()"),
     "read OpenUSD": ("usd", "from softmode.splats import read_splats; read_splats('toy.usda')"),
     "write OpenUSD": (
         "usd",

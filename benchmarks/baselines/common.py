@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from threadpoolctl import threadpool_limits
 
-from softmode.atomic import atomic_write
-from softmode.deformables.body import cache_directory
+from softmode.deformables.build.cache import cache_directory
+from softmode.files import atomic_write
 from tests.oracle import frames
 from tests.oracle.fem import Mesh, simulate
 from tests.oracle.scenes import BEND, SCENES, Scene

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from softmode.atomic import atomic_write
-from softmode.deformables.body import cache_directory, fingerprint_of
+from softmode.deformables.build.cache import cache_directory, fingerprint_of
+from softmode.files import atomic_write
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,20 +18,19 @@ from numpy.typing import ArrayLike
 
 from benchmarks.baselines.common import CLAMP, SCENE, SOFT, STIFFNESS, Row, measure, sample
 from benchmarks.baselines.neural_weights import NeuralWeights, NeuralWeightsOptions, train_neural_weights
-from softmode.deformables.body import BuildOptions, ReducedBody, Region, build_body
-from softmode.deformables.cubature import select_cubature
-from softmode.deformables.functions import orthonormalise
-from softmode.deformables.materials import Material, MaterialModel
-from softmode.deformables.quadrature import Quadrature, quadrature_from_mesh
-from softmode.deformables.skinning_weights import SkinningWeights
-from softmode.deformables.solver_reduced import (
-    Integrator,
-    SolverReduced,
-    SolverReducedOptions,
-    add_pins,
-    add_reduced_body,
-    register_custom_attributes,
-)
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.body.regions import Region
+from softmode.deformables.body.skinning_weights import SkinningWeights
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.cubature import select_cubature
+from softmode.deformables.build.functions import orthonormalise
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature_grid import Quadrature
+from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
+from softmode.deformables.materials.material import Material
+from softmode.deformables.materials.material_kernels import MaterialModel
+from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
+from softmode.deformables.solver.solver_reduced import Integrator, SolverReduced, SolverReducedOptions
 
 POINTS = 5000
 """Quadrature points, as in the papers."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from softmode.splats import Splats
+from softmode.splats.splats import Splats
 
 GREEN = (0.20, 0.80, 0.35)
 

@@ -5,9 +5,9 @@ What it costs in accuracy stands in docs/performance.md ("A preset for reinforce
 
 from dataclasses import replace
 
-from softmode.deformables.build_options import BuildOptions
-from softmode.deformables.solver_reduced import SolverReducedOptions
-from softmode.envs.table_scene import TableSceneConfig
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.solver.solver_reduced import SolverReducedOptions
+from softmode.scenes.table_scene import TableSceneConfig
 
 RL_SOLVER = SolverReducedOptions(
     carry_stiffness=True, tolerance=1.0e-4, force_tolerance=1.0e-3, iteration_max=12, friction_lag=4

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.envs.lift_soft import LiftSoft
 from softmode.envs.scripted_grasp import ScriptedGrasp
+from softmode.envs.tasks.lift_soft.task import LiftSoft
 from softmode.errors import ConfigError
 
 
@@ -21,16 +21,16 @@ def scripted_policy(env: Any) -> Any:
     Raises:
         ConfigError: If its task has none, or it takes other actions than tool steps.
     """
-    from softmode.envs.place_in_bin import PlaceInBin
-    from softmode.envs.press_soft import PressSoft
-    from softmode.envs.push_soft import PushSoft
-    from softmode.envs.rope_route import RopeRoute
-    from softmode.envs.scripted_place import ScriptedPlace
-    from softmode.envs.scripted_press import ScriptedPress
-    from softmode.envs.scripted_push import ScriptedPush
-    from softmode.envs.scripted_rope import ScriptedRope
-    from softmode.envs.scripted_shape import ScriptedShape
-    from softmode.envs.shape_soft import ShapeSoft
+    from softmode.envs.tasks.place_in_bin.scripted import ScriptedPlace
+    from softmode.envs.tasks.place_in_bin.task import PlaceInBin
+    from softmode.envs.tasks.press_soft.scripted import ScriptedPress
+    from softmode.envs.tasks.press_soft.task import PressSoft
+    from softmode.envs.tasks.push_soft.scripted import ScriptedPush
+    from softmode.envs.tasks.push_soft.task import PushSoft
+    from softmode.envs.tasks.rope_route.scripted import ScriptedRope
+    from softmode.envs.tasks.rope_route.task import RopeRoute
+    from softmode.envs.tasks.shape_soft.scripted import ScriptedShape
+    from softmode.envs.tasks.shape_soft.task import ShapeSoft
 
     policies = {
         LiftSoft: ScriptedLift,

@@ -12,10 +12,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from softmode.deformables.status import status_reasons
-from softmode.envs.objects import ObjectConfig
+from softmode.deformables.model.status import status_reasons
 from softmode.envs.task import EndReason, ObservationType, Task, TaskConfig
 from softmode.errors import ConfigError
+from softmode.objects.soft_object import ObjectConfig
 
 CONTROL_MODES = ("pose_delta", "joint_delta")
 

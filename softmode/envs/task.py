@@ -14,16 +14,17 @@ import warp as wp
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
-from softmode.deformables import status as bits
-from softmode.deformables.parameters import set_parameters
-from softmode.deformables.rkpm import sample_farthest
+from softmode.deformables.body.rkpm import sample_farthest
+from softmode.deformables.model import status as bits
+from softmode.deformables.solver.parameters import set_parameters
 from softmode.envs import task_kernels as kernels
 from softmode.envs.parameters import Parameter, ParameterTable
-from softmode.envs.table_scene import GAP, TableScene, TableSceneConfig
 from softmode.errors import ConfigError
-from softmode.splats import Splats
-from softmode.splats.camera import CameraOptions, PinholeCamera
+from softmode.scenes.table_scene import GAP, TableScene, TableSceneConfig
+from softmode.splats.camera import CameraOptions
 from softmode.splats.camera_randomization import CameraRandomization
+from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.splats import Splats
 
 ObservationType = Literal["state", "pixels", "pixels_agent_pos"]
 CameraName = Literal["front", "wrist"]

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode import __version__
-from softmode.atomic import atomic_write
 from softmode.errors import CheckpointError, ConfigError
+from softmode.files import atomic_write
 from softmode.learning.hyperparameters import Hyperparameters
 from softmode.learning.spaces import Interface
 

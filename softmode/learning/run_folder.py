@@ -11,8 +11,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from softmode.atomic import atomic_write
 from softmode.errors import MissingExtraError, RunError
+from softmode.files import atomic_write
 
 CONFIG, PROGRESS, LATEST, BEST = "config.json", "progress.csv", "latest.npz", "best.npz"
 """Names of the files of a run."""

@@ -10,11 +10,13 @@ import newton
 import numpy as np
 import warp as wp
 
-from softmode.deformables.attachments import Attachment, attach
-from softmode.deformables.authoring import add_reduced_body
-from softmode.deformables.body import BuildOptions, ReducedBody, build_body
-from softmode.deformables.materials import Material
-from softmode.deformables.quadrature import quadrature_from_capsule
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_capsule
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.solver.attachments import Attachment, attach
 from softmode.robots.arm import ArmIndices
 
 

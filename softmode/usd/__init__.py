@@ -10,11 +10,11 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from softmode.objects.stage_scene import UsdDeformable, UsdScene, read_usd_scene
     from softmode.usd.animation import UsdAnimation, UsdAnimationOptions
     from softmode.usd.importer import UsdBody, UsdImport, add_usd
     from softmode.usd.placed import PlacedBody
     from softmode.usd.playback import PlayedBody, UsdPlayback, read_animation
-    from softmode.usd.scene import UsdDeformable, UsdScene, read_usd_scene
     from softmode.usd.writer import UsdExportOptions, write_usd
 
 _HOME = {

@@ -16,17 +16,18 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.deformables.authoring import MATERIAL_FIELDS, body_key
-from softmode.deformables.materials import Material, MaterialModel
+from softmode.deformables.materials.material import Material
+from softmode.deformables.materials.material_kernels import MaterialModel
+from softmode.deformables.model.authoring import MATERIAL_FIELDS, body_key
 from softmode.errors import ConfigError, SolverDiverged
+from softmode.objects.stage_scene import shortest
+from softmode.scenes.skinned_splats import SkinnedSplats
 from softmode.splats.formats.usd import set_splat_column, splat_columns
-from softmode.usd import tokens
+from softmode.stages import tokens
 from softmode.usd.handles import handles_from_coordinates, local_coordinates, rigid_motion
 from softmode.usd.openusd import check_stage, openusd, whole_stage
 from softmode.usd.placed import PlacedBody
 from softmode.usd.rigid import RigidMeshes
-from softmode.usd.scene import shortest
-from softmode.usd.skinned import SkinnedSplats
 from softmode.usd.writer import (
     UsdExportOptions,
     attribute,

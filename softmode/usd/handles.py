@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softmode.deformables.reduced_body import ReducedBody
-from softmode.deformables.skinning_weights import MONOMIALS
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.body.skinning_weights import MONOMIALS
 
 Array = NDArray[np.float64]
 

@@ -13,22 +13,22 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from softmode.deformables.authoring import SCALE_MAX, SCALE_MIN, add_reduced_body, rotation_matrix
-from softmode.deformables.body import BuildOptions, ReducedBody, build_body, cached_body
-from softmode.deformables.materials import Material
-from softmode.deformables.quadrature import (
-    Quadrature,
-    quadrature_from_mesh,
-    quadrature_from_points,
-    quadrature_from_splats,
-)
-from softmode.deformables.skinning import average_basis
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.cache import cached_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_points, quadrature_from_splats
+from softmode.deformables.build.quadrature_grid import Quadrature
+from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import SCALE_MAX, SCALE_MIN, add_reduced_body, rotation_matrix
+from softmode.deformables.skinning.skin_splats import average_basis
 from softmode.errors import AssetError, BasisError, ConfigError, SoftmodeError
+from softmode.objects.stage_asset import colored_mesh
+from softmode.objects.stage_bundle import body_of
+from softmode.objects.stage_scene import UsdDeformable, UsdScene, open_scene
 from softmode.splats.mesh_samples import sample_mesh
 from softmode.splats.splats import Splats, quat_from_rotation
-from softmode.usd.asset import colored_mesh
-from softmode.usd.bundle import body_of
-from softmode.usd.scene import UsdDeformable, UsdScene, open_scene
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -130,7 +130,7 @@ def add_usd(
         splat_count: Number of splats on a body that the stage shows by meshes.
         contact_radius: How far the surface that touches stands out from the body's [m].
         newton_options: Arguments for `newton.ModelBuilder.add_usd`, such as ``{"floating": False}``.
-        progress: Passed to :func:`softmode.deformables.body.build_body`.
+        progress: Passed to :func:`softmode.deformables.build.build_body.build_body`.
 
     Returns:
         The soft bodies by prim path and what Newton's importer says of the rest.
@@ -258,7 +258,7 @@ def build_deformable(
         deformable: From `read_usd_scene`.
         options: How it is reduced; defaults when None.
         surface_count: Number of surface samples.
-        progress: Passed to :func:`softmode.deformables.body.build_body`.
+        progress: Passed to :func:`softmode.deformables.build.build_body.build_body`.
 
     Returns:
         The body, named after its prim.

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.deformables.materials import Material
-from softmode.deformables.reduced_body import ReducedBody
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.materials.material import Material
 from softmode.usd.handles import handle_weights
 
 

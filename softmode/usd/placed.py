@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.deformables.authoring import SCALE_MAX, SCALE_MIN, rotation_matrix
-from softmode.deformables.materials import Material
-from softmode.deformables.reduced_body import ReducedBody
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import SCALE_MAX, SCALE_MIN, rotation_matrix
 from softmode.errors import ConfigError
 from softmode.splats.splats import Splats
 

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.deformables.reduced_body import ReducedBody
+from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.errors import AssetError, ConfigError
+from softmode.objects.stage_bundle import body_of
+from softmode.scenes.skinned_splats import SkinnedSplats
 from softmode.splats.formats.usd import splats_from_prim
 from softmode.splats.splats import MAX_SPLATS, Splats
-from softmode.usd import process
-from softmode.usd.bundle import body_of
+from softmode.stages import process
 from softmode.usd.handles import coordinates_from_handles, world_coordinates
-from softmode.usd.skinned import SkinnedSplats
 
 Array = NDArray[np.float64]
 _LIMITS = process.Limits()

@@ -22,12 +22,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.deformables.materials import Material
+from softmode.deformables.materials.material import Material
 from softmode.errors import ConfigError
+from softmode.objects.stage_bundle import DTYPES, encode_body
 from softmode.splats.formats.usd import define_splats, set_splat_column, splat_columns
 from softmode.splats.splats import quats_from_rotations
-from softmode.usd import kaolin, tokens
-from softmode.usd.bundle import DTYPES, encode_body
+from softmode.stages import tokens
+from softmode.usd import kaolin
 from softmode.usd.handles import handle_weights
 from softmode.usd.openusd import openusd, whole_stage
 from softmode.usd.placed import PlacedBody

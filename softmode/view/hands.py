@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softmode.deformables.grips import Grip, Grips
-from softmode.deformables.rkpm import sample_farthest
+from softmode.deformables.body.rkpm import sample_farthest
+from softmode.deformables.tools.grips import Grip, Grips
 from softmode.errors import ConfigError
 from softmode.view.live_scenes import LiveScene
 from softmode.view.live_types import DragView, Hit, LiveOptions, PinView, vector3

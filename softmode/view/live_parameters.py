@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from softmode.deformables.parameters import PARAMETER_LIMITS, set_parameters
+from softmode.deformables.solver.parameters import PARAMETER_LIMITS, set_parameters
 from softmode.errors import ConfigError
 from softmode.view.live_scenes import LiveScene
 from softmode.view.live_types import LiveParameters, vector3

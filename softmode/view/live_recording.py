@@ -12,12 +12,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softmode.atomic import PendingFile
 from softmode.errors import AssetError, ConfigError, SolverDiverged
-from softmode.film import Film
-from softmode.splats.camera import CameraOptions, PinholeCamera, SplatCamera
+from softmode.files import PendingFile
+from softmode.splats.camera import CameraOptions, SplatCamera
+from softmode.splats.pinhole import PinholeCamera
 from softmode.view.live_types import vector3
 from softmode.view.picture import LivePicture
+from softmode.viz.film import Film
 
 RECORD_HZ = 30
 """Frames per simulated second."""
@@ -146,7 +147,8 @@ class UsdRecorder:
 
     def __init__(self, path: Path, model: Any, objects: Sequence[Any]) -> None:
         """Find the objects in the model."""
-        from softmode.usd import PlacedBody, UsdAnimation, UsdAnimationOptions
+        from softmode.usd.animation import UsdAnimation, UsdAnimationOptions
+        from softmode.usd.placed import PlacedBody
 
         bodies = [PlacedBody(body=thing.body, splats=thing.splats) for thing in objects]
         self._animation = UsdAnimation(path, model, bodies, options=UsdAnimationOptions(fps=RECORD_HZ))

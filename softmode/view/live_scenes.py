@@ -11,16 +11,17 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from softmode.deformables.grips import GripOptions, Grips, add_grip_slots
-from softmode.deformables.materials import Material
-from softmode.deformables.rkpm import sample_farthest
-from softmode.deformables.solver_reduced import SolverReduced, add_reduced_body
-from softmode.envs.objects import ObjectConfig, SoftObject
+from softmode.deformables.body.rkpm import sample_farthest
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.solver.solver_reduced import SolverReduced
+from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.envs.task import Task
 from softmode.errors import ConfigError
-from softmode.policies import POLICIES, check_policy, policy_factory, trained_policy
-from softmode.splats import Splats
+from softmode.learning.players import POLICIES, check_policy, policy_factory, trained_policy
+from softmode.objects.soft_object import ObjectConfig, SoftObject
 from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.splats import Splats
 from softmode.view.live_types import HoldName, LiveOptions, SceneName
 from softmode.view.sources import LoadedObject
 
@@ -198,7 +199,7 @@ class EnvScene:
 
     Args:
         name: Id of the environment.
-        policy: Who plays; see :data:`softmode.policies.POLICIES`.
+        policy: Who plays; see :data:`softmode.learning.players.POLICIES`.
         config: The task's configuration; None for the default.
         seed: Seed of the first episode.
         options: How the session runs.

@@ -158,7 +158,7 @@ class LiveStatus:
     step_milliseconds: float
     """Mean time that one physics step takes [ms]."""
     solver: tuple[str, ...]
-    """Names of the solver's flags in the last frame, empty when all is well; see `softmode.deformables.status`."""
+    """Names of the solver's flags in the last frame, empty if all is well; see `softmode.deformables.model.status`."""
     recording: bool
     """Whether a recording is being made."""
     reward_terms: dict[str, float]

@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.deformables.skinning import SkinSplats
-from softmode.envs.objects import SoftObject
-from softmode.splats import Splats
+from softmode.deformables.skinning.skin_splats import SkinSplats
+from softmode.objects.soft_object import SoftObject
 from softmode.splats.rasterizer import SplatArrays
-from softmode.splats.splats import rotations_from_quats
+from softmode.splats.splats import Splats, rotations_from_quats
 from softmode.view.live_types import Hit, SplatPicture
 
 Array = NDArray[np.float64]

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softmode.deformables.body import ReducedBody
-from softmode.deformables.energies import SoftEnergies
-from softmode.deformables.materials import Material
-from softmode.deformables.status import status_reasons
-from softmode.envs.objects import ObjectConfig, SoftObject
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.status import status_reasons
+from softmode.deformables.solver.energies import SoftEnergies
 from softmode.errors import ConfigError
+from softmode.objects.soft_object import ObjectConfig, SoftObject
 from softmode.view import live_parameters
 from softmode.view.hands import Hands
 from softmode.view.live_recording import (
@@ -248,9 +248,9 @@ class LiveSession:
         return self._picture.read()
 
     def meshes(self) -> tuple[Any, ...]:
-        """Return the meshes of the rigid shapes, `softmode.viz.scene_meshes.SceneMesh`; they do not change."""
+        """Return the meshes of the rigid shapes, `softmode.scenes.scene_meshes.SceneMesh`; they do not change."""
         if self._meshes is None:
-            from softmode.viz.scene_meshes import scene_meshes
+            from softmode.scenes.scene_meshes import scene_meshes
 
             self._meshes = scene_meshes(self._scene.model)
         return self._meshes

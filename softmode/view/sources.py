@@ -9,12 +9,12 @@ from typing import Any
 import newton
 import numpy as np
 
-from softmode.deformables.materials import Material
-from softmode.envs.object_build import config_of_file
-from softmode.envs.object_file import surface_cover
-from softmode.envs.objects import ObjectConfig, SoftObject, load_object, tied
+from softmode.deformables.materials.material import Material
 from softmode.errors import ConfigError
-from softmode.usd import tokens
+from softmode.objects.object_build import config_of_file
+from softmode.objects.object_file import surface_cover
+from softmode.objects.soft_object import ObjectConfig, SoftObject, load_object, tied
+from softmode.stages import tokens
 
 HANDLES_MAX = 64
 """Most eigenmodes that `LiveSession.set_handles` builds."""
@@ -76,7 +76,7 @@ def _refuse_size(size: float | None, what: str) -> None:
 
 def _usd_object(path: str | Path, progress: Any) -> LoadedObject | None:
     """Return the first deformable body of a stage, None if there is none."""
-    from softmode.usd import add_usd
+    from softmode.usd.importer import add_usd
 
     found = add_usd(newton.ModelBuilder(), path, progress=progress)
     if not found.bodies:

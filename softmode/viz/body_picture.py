@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from softmode.deformables.body_report import BodyReport
-from softmode.deformables.cubature import POISSON_RATIO
-from softmode.deformables.reduced_body import ReducedBody
-from softmode.deformables.reduced_stiffness import elastic_modes, reduced_stiffness
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.build.cubature import POISSON_RATIO
+from softmode.deformables.build.reduced_stiffness import elastic_modes, reduced_stiffness
+from softmode.deformables.build.report import BodyReport
 from softmode.errors import ConfigError, MissingExtraError
-from softmode.splats import Splats
-from softmode.splats.splats import SH_DC
+from softmode.splats.splats import SH_DC, Splats
 
 Array = NDArray[np.float64]
 
@@ -101,7 +100,7 @@ def write_body_picture(
         ) from error
     from PIL import Image
 
-    from softmode.atomic import atomic_write
+    from softmode.files import atomic_write
 
     target = Path(path)
     if target.suffix.lower() != ".png":
@@ -162,7 +161,7 @@ def write_body_picture(
 
 def _moved(body: ReducedBody, splats: Splats, modes: Array) -> list[Splats]:
     """Return the splats displaced by each mode, so far that the largest displacement is a fixed part of the size."""
-    from softmode.deformables.skinning import average_basis
+    from softmode.deformables.skinning.skin_splats import average_basis
 
     value, gradient = average_basis(lambda x: body.evaluate(x)[0], splats.means, splats.covariances())
     size, found = float(np.linalg.norm(np.ptp(body.bounds, axis=0))), []

@@ -16,16 +16,16 @@ from urllib.parse import urlsplit
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.atomic import PendingFile
-from softmode.deformables.energies import SoftEnergies
-from softmode.deformables.sensing import ContactSensor
+from softmode.deformables.solver.energies import SoftEnergies
+from softmode.deformables.tools.sensing import ContactSensor
 from softmode.errors import ConfigError, MissingExtraError, StorageError
-from softmode.splats import Splats
+from softmode.files import PendingFile
+from softmode.scenes.deformed_splats import DeformedSplats, SplatFrame
+from softmode.scenes.scene_meshes import PLANE_EXTENT, scene_meshes, scene_poses
 from softmode.splats.camera import SplatCamera
-from softmode.viz.deformed_splats import DeformedSplats, SplatFrame
+from softmode.splats.splats import Splats
 from softmode.viz.rerun_blueprint import make_blueprint
 from softmode.viz.rerun_sources import Moment, RerunScene, source_of
-from softmode.viz.scene_meshes import PLANE_EXTENT, scene_meshes, scene_poses
 
 __all__ = ["RerunLogger", "RerunOptions", "RerunScene"]
 
@@ -89,7 +89,7 @@ class RerunLogger:
     Args:
         target: File to write (.rrd); or address of a running viewer, like "rerun+http://127.0.0.1:9876/proxy"; or
             "spawn", which opens one.
-        scene: An environment of softmode (its task in this process), a :class:`softmode.envs.splat_scene.SplatScene`,
+        scene: An environment of softmode (its task in this process), a :class:`softmode.scenes.splat_scene.SplatScene`,
             or a :class:`RerunScene`.
         worlds: Which worlds.
         options: What the recording holds.

@@ -9,14 +9,14 @@ from typing import Any, Protocol
 import newton
 import numpy as np
 
-from softmode.deformables.status import status_reasons
-from softmode.envs.objects import SoftObject
+from softmode.deformables.model.status import status_reasons
 from softmode.envs.soft_env import info_arrays
-from softmode.envs.splat_scene import SplatScene
 from softmode.envs.task import EndReason, Task
 from softmode.errors import ConfigError
-from softmode.splats import Splats
+from softmode.objects.soft_object import SoftObject
+from softmode.scenes.splat_scene import SplatScene
 from softmode.splats.camera import SplatCamera
+from softmode.splats.splats import Splats
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -29,7 +29,7 @@ class RerunScene:
     model: Any
     """The model."""
     solver: Any
-    """Its :class:`softmode.deformables.solver_reduced.SolverReduced`, or one that couples it."""
+    """Its :class:`softmode.deformables.solver.solver_reduced.SolverReduced`, or one that couples it."""
     objects: Sequence[SoftObject | None] = ()
     """The soft bodies of a world in the order in which they were added, None for one without splats."""
     cameras: Sequence[SplatCamera] = ()

@@ -7,8 +7,10 @@ import functools
 
 import numpy as np
 
-from softmode.deformables.body import BuildOptions, ReducedBody, build_body
-from softmode.deformables.quadrature import quadrature_from_box
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box
 
 
 @functools.cache

@@ -2,9 +2,12 @@
 
 import warp as wp
 
-from softmode.deformables import contact, materials, shape_queries
-from softmode.deformables.materials import HessianBlocks, MaterialParameters
-from softmode.deformables.singular_value_kernels import positive_part, singular_values
+from softmode.deformables.contact import penalty_kernels as contact
+from softmode.deformables.contact import shape_query_kernels as shape_queries
+from softmode.deformables.materials import material as materials
+from softmode.deformables.materials.hessian_kernels import HessianBlocks
+from softmode.deformables.materials.material_kernels import MaterialParameters
+from softmode.deformables.materials.singular_value_kernels import positive_part, singular_values
 
 wp.set_module_options({"enable_backward": False})
 

@@ -7,15 +7,18 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.adjoint import AdjointOptions, AdjointReduced
-from softmode.deformables.adjoint_torch import rollout
-from softmode.deformables.body import BuildOptions, build_body
-from softmode.deformables.markers import Markers
-from softmode.deformables.materials import Material, MaterialModel
-from softmode.deformables.quadrature import quadrature_from_box
-from softmode.deformables.regions import Region
-from softmode.deformables.rigid_dofs import RigidDofs
-from softmode.deformables.solver_reduced import SolverReducedOptions, add_pins, add_reduced_body
+from softmode.deformables.body.regions import Region
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.gradients.adjoint import AdjointOptions, AdjointReduced
+from softmode.deformables.gradients.adjoint_torch import rollout
+from softmode.deformables.materials.material import Material
+from softmode.deformables.materials.material_kernels import MaterialModel
+from softmode.deformables.model.authoring import add_pins, add_reduced_body
+from softmode.deformables.model.rigid_dofs import RigidDofs
+from softmode.deformables.solver.solver_reduced import SolverReducedOptions
+from softmode.deformables.tools.markers import Markers
 from softmode.errors import ConfigError, SolverDiverged
 from tests.scenes import GRAVITY, Scene, cube
 
@@ -296,7 +299,8 @@ def gradients_on(device):
     """Return the gradients of the sum of all coordinates of two hanging cubes."""
     import newton
 
-    from softmode.deformables.solver_reduced import SolverReduced, register_custom_attributes
+    from softmode.deformables.model.authoring import register_custom_attributes
+    from softmode.deformables.solver.solver_reduced import SolverReduced
 
     world, builder = newton.ModelBuilder(), newton.ModelBuilder()
     index = add_reduced_body(world, cube(), material=MATERIAL, angular_velocity=(4.0, -6.0, 3.0))

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.attachments import attach
-from softmode.deformables.materials import Material
-from softmode.deformables.solver_reduced import SolverReducedOptions, add_reduced_body
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.solver.attachments import attach
+from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.errors import ConfigError
 from tests.scenes import GRAVITY, Scene, add_free_box, cube, rotation
 

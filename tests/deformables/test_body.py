@@ -13,21 +13,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from softmode.deformables.body import (
-    BuildOptions,
-    ReducedBody,
-    build_body,
-    cache_directory,
-    cached_body,
-    fingerprint_of,
-)
-from softmode.deformables.functions import RANK_TOLERANCE
-from softmode.deformables.quadrature import (
-    Quadrature,
-    quadrature_from_box,
-    quadrature_from_capsule,
-    quadrature_from_sphere,
-)
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.cache import cache_directory, cached_body, fingerprint_of
+from softmode.deformables.build.functions import RANK_TOLERANCE
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_capsule, quadrature_from_sphere
+from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.errors import AssetError, BasisError, ConfigError, MaterialError
 
 SMALL = BuildOptions(mode_count=4, kernel_count=80, cubature_count=48)

@@ -9,14 +9,21 @@ import numpy as np
 import pytest
 import trimesh
 
-from softmode.deformables.body import BuildOptions, ReducedBody, build_body
-from softmode.deformables.body_interior import interior_from_quadrature, interior_from_surface, winding_numbers
-from softmode.deformables.body_report import BodyReport, report_body
-from softmode.deformables.quadrature import Quadrature, quadrature_from_box, quadrature_from_mesh
-from softmode.deformables.rkpm import make_basis
-from softmode.envs import place_in_bin, presets, push_soft, shape_soft
-from softmode.envs.objects import ObjectConfig, load_object, object_source
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.body.rkpm import make_basis
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.interior import interior_from_quadrature, interior_from_surface, winding_numbers
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.build.quadrature_grid import Quadrature
+from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
+from softmode.deformables.build.report import BodyReport, report_body
+from softmode.envs.tasks.place_in_bin import task as place_in_bin
+from softmode.envs.tasks.push_soft import task as push_soft
+from softmode.envs.tasks.shape_soft import task as shape_soft
 from softmode.errors import BasisError
+from softmode.objects import presets
+from softmode.objects.soft_object import ObjectConfig, load_object, object_source
 
 GOOD = {
     "plush": ObjectConfig(),

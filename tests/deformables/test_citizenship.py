@@ -13,10 +13,11 @@ import warp as wp
 from newton.solvers import SolverBase, SolverMuJoCo
 from newton.solvers.experimental.coupled import ModelView  # pyright: ignore[reportMissingImports]
 
-from softmode.deformables.coupling import SolverCoupledReduced
-from softmode.deformables.materials import Material
-from softmode.deformables.proxy import SolverReducedProxy
-from softmode.deformables.solver_reduced import SolverReduced, add_pins, add_reduced_body, register_custom_attributes
+from softmode.deformables.coupling.proxy import SolverReducedProxy
+from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
+from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.errors import ConfigError
 from tests.scenes import GRAVITY, add_free_box, cube
 

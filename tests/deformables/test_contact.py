@@ -6,10 +6,11 @@ import pytest
 import trimesh
 import warp as wp
 
-from softmode.deformables import status as bits
-from softmode.deformables.materials import Material
-from softmode.deformables.solver_reduced import SolverReduced, SolverReducedOptions, add_reduced_body
-from softmode.deformables.tables import OVERLAP
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model import status as bits
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.model.struct_kernels import OVERLAP
+from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from tests import reference
 from tests.deformables.probe_kernels import evaluate_potentials
 from tests.deformables.test_coupling import impact, totals

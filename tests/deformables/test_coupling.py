@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables import assembly_kernels
-from softmode.deformables import status as bits
-from softmode.deformables.coupling import SolverCoupledReduced
-from softmode.deformables.lanes import from_blocks, to_blocks
-from softmode.deformables.materials import Material
-from softmode.deformables.solver_reduced import SolverReducedOptions, add_pins, add_reduced_body
+from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model import status as bits
+from softmode.deformables.model.authoring import add_pins, add_reduced_body
+from softmode.deformables.model.lane_kernels import from_blocks, to_blocks
+from softmode.deformables.solver import assembly_kernels
+from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.errors import ConfigError
 from tests import reference
 from tests.scenes import GRAVITY, GRIPPER, RIGID_GAP, Scene, add_free_box, add_gripper, cube

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softmode.deformables import cubature
-from softmode.deformables.body import BuildOptions, Region, build_body
-from softmode.deformables.cubature import select_cubature
-from softmode.deformables.materials import MaterialModel
-from softmode.deformables.quadrature import quadrature_from_box
-from softmode.deformables.reduced_stiffness import elastic_modes, reduced_stiffness
+from softmode.deformables.body.regions import Region
+from softmode.deformables.build import cubature
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.cubature import select_cubature
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.build.reduced_stiffness import elastic_modes, reduced_stiffness
+from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.errors import BasisError, ConfigError
 from tests.reference import lame, stress
 

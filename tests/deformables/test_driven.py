@@ -6,12 +6,15 @@ import newton
 import numpy as np
 import pytest
 
-from softmode.deformables.attachments import attach
-from softmode.deformables.body import BuildOptions, Region, build_body
-from softmode.deformables.lanes import from_blocks
-from softmode.deformables.materials import Material
-from softmode.deformables.quadrature import quadrature_from_box
-from softmode.deformables.solver_reduced import SolverReducedOptions, add_reduced_body, drive_regions
+from softmode.deformables.body.regions import Region
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body, drive_regions
+from softmode.deformables.model.lane_kernels import from_blocks
+from softmode.deformables.solver.attachments import attach
+from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.errors import ConfigError
 from tests.scenes import GRAVITY, Scene, rotation
 

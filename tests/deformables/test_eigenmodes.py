@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softmode.deformables.eigenmodes import solve_eigenmodes
-from softmode.deformables.rkpm import KernelName, make_basis
+from softmode.deformables.body.rkpm import KernelName, make_basis
+from softmode.deformables.build.eigenmodes import solve_eigenmodes
 from softmode.errors import ConfigError
 
 SIZE = np.array([0.06, 0.05, 0.04])

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.factor import LANES, BlockCholesky, pad
+from softmode.deformables.model.lane_kernels import LANES, pad
+from softmode.deformables.solver.factor import BlockCholesky
 
 FLOAT32 = float(np.finfo(np.float32).eps)
 

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.materials import Material
-from softmode.deformables.solver_reduced import SolverReducedOptions, add_reduced_body
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from tests import reference
 from tests.deformables.probe_kernels import evaluate_stick
 from tests.deformables.test_coupling import grasp

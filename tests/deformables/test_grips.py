@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.grips import Grips, add_grip_slots
-from softmode.deformables.materials import Material
-from softmode.deformables.parameters import set_parameters
-from softmode.deformables.solver_reduced import SolverReduced, SolverReducedOptions, add_pins, add_reduced_body
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_pins, add_reduced_body
+from softmode.deformables.solver.parameters import set_parameters
+from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
+from softmode.deformables.tools.grips import Grips, add_grip_slots
 from softmode.errors import ConfigError
 from tests.scenes import GRAVITY, Scene, add_free_box, cube, rotation
 

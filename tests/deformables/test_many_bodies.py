@@ -7,17 +7,14 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.body import BuildOptions, Region, build_body
-from softmode.deformables.materials import Material, MaterialModel
-from softmode.deformables.quadrature import quadrature_from_box
-from softmode.deformables.solver_reduced import (
-    SolverReduced,
-    SolverReducedOptions,
-    add_pins,
-    add_reduced_body,
-    drive_regions,
-    register_custom_attributes,
-)
+from softmode.deformables.body.regions import Region
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.materials.material import Material
+from softmode.deformables.materials.material_kernels import MaterialModel
+from softmode.deformables.model.authoring import add_pins, add_reduced_body, drive_regions, register_custom_attributes
+from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from tests.scenes import GRAVITY, Scene, bar, cube, rotation
 
 DOWN = (0.0, 0.0, -GRAVITY)

@@ -6,8 +6,8 @@ import pytest
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
-from softmode.deformables.materials import Material
-from softmode.deformables.solver_reduced import add_reduced_body
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
 from softmode.errors import ConfigError
 from tests.deformables.test_coupling import Potential
 from tests.scenes import GRAVITY, GRIPPER, Scene, add_free_box, add_gripper, cube

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.materials import HessianBlocks, Material, MaterialModel, MaterialParameters
+from softmode.deformables.materials.hessian_kernels import HessianBlocks
+from softmode.deformables.materials.material import Material
+from softmode.deformables.materials.material_kernels import MaterialModel, MaterialParameters
 from softmode.errors import MaterialError
 from tests import reference
 from tests.deformables.probe_kernels import decompose, evaluate_materials

@@ -8,20 +8,17 @@ import pytest
 import warp as wp
 from scipy.spatial import ConvexHull
 
-from softmode.deformables import status as bits
-from softmode.deformables.attachments import attach
-from softmode.deformables.body import BuildOptions, build_body
-from softmode.deformables.lanes import from_blocks, to_blocks
-from softmode.deformables.materials import Material
-from softmode.deformables.pairs import thickness
-from softmode.deformables.quadrature import quadrature_from_box, quadrature_from_implicit, quadrature_from_sphere
-from softmode.deformables.solver_reduced import (
-    SolverReduced,
-    SolverReducedOptions,
-    add_pins,
-    add_reduced_body,
-    register_custom_attributes,
-)
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_sphere
+from softmode.deformables.build.quadrature_implicit import quadrature_from_implicit
+from softmode.deformables.contact.pairs import thickness
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model import status as bits
+from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
+from softmode.deformables.model.lane_kernels import from_blocks, to_blocks
+from softmode.deformables.solver.attachments import attach
+from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from tests import reference
 from tests.deformables.test_driven import held_bar
 from tests.scenes import GRAVITY, RIGID_GAP, Scene, add_free_box, cube, rotation

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.materials import Material
-from softmode.deformables.parameters import PARAMETER_FLAGS, PARAMETER_LIMITS, ShapeFriction, set_parameters
-from softmode.deformables.solver_reduced import add_pins, add_reduced_body
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_pins, add_reduced_body
+from softmode.deformables.solver.parameters import PARAMETER_FLAGS, PARAMETER_LIMITS, ShapeFriction, set_parameters
 from softmode.errors import ConfigError
 from tests.deformables.test_many_bodies import clamped
 from tests.scenes import GRAVITY, Scene, add_gripper, cube, rotation

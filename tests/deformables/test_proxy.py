@@ -11,9 +11,10 @@ from newton.solvers.experimental.coupled import SolverCoupledProxy  # pyright: i
 
 from benchmarks.coupling import HELD, gripper_world, impact, squeeze
 from benchmarks.coupling_schemes import Coupled, Cube, World
-from softmode.deformables.materials import Material
-from softmode.deformables.proxy import SolverReducedProxy
-from softmode.deformables.solver_reduced import SolverReduced, add_pins, add_reduced_body, register_custom_attributes
+from softmode.deformables.coupling.proxy import SolverReducedProxy
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
+from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.errors import ConfigError
 from tests.scenes import GRAVITY, add_free_box, cube
 

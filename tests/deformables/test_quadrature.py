@@ -11,16 +11,16 @@ import trimesh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from softmode.deformables.quadrature import (
-    Quadrature,
+from softmode.deformables.build.quadrature import (
     quadrature_from_box,
     quadrature_from_capsule,
-    quadrature_from_implicit,
-    quadrature_from_mesh,
     quadrature_from_points,
     quadrature_from_sphere,
     quadrature_from_splats,
 )
+from softmode.deformables.build.quadrature_grid import Quadrature
+from softmode.deformables.build.quadrature_implicit import quadrature_from_implicit
+from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
 from softmode.errors import AssetError, ConfigError
 
 RADIUS = 0.05

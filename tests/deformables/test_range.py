@@ -18,8 +18,8 @@ from benchmarks.range import (
     potential,
     solve_step,
 )
-from softmode.deformables.materials import Material
-from softmode.deformables.solver_reduced import SolverReducedOptions
+from softmode.deformables.materials.material import Material
+from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from tests import reference
 
 # Corners of the range; stiff and nearly incompressible in large steps costs most iterations and precision.

@@ -9,8 +9,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softmode.deformables.materials import Material, MaterialModel
-from softmode.deformables.solver_reduced import add_reduced_body
+from softmode.deformables.materials.material import Material
+from softmode.deformables.materials.material_kernels import MaterialModel
+from softmode.deformables.model.authoring import add_reduced_body
 from tests import reference
 from tests.scenes import Scene, cube
 

@@ -8,10 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softmode.deformables.body import BuildOptions, ReducedBody, Region, build_body
-from softmode.deformables.quadrature import Quadrature, quadrature_from_box, quadrature_from_capsule
-from softmode.deformables.region_samples import refine_at_faces
-from softmode.deformables.regions import Envelope
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.body.regions import Envelope, Region
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_capsule
+from softmode.deformables.build.quadrature_grid import Quadrature
+from softmode.deformables.build.region_samples import refine_at_faces
 from softmode.errors import BasisError, ConfigError
 
 INF = np.inf

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softmode.deformables.rkpm import BasisRKPM, KernelName, make_basis, sample_farthest
+from softmode.deformables.body.rkpm import BasisRKPM, KernelName, make_basis, sample_farthest
 from softmode.errors import BasisError, ConfigError
 
 KERNELS: list[KernelName] = ["cubic", "gaussian"]
@@ -56,7 +56,7 @@ def test_chunks_do_not_change_the_result(monkeypatch) -> None:
     points = grid((0.06, 0.05, 0.04), (8, 8, 8))
     basis = make_basis(points, 60)
     whole = basis.evaluate(points)
-    monkeypatch.setattr("softmode.deformables.rkpm._PAIRS_PER_CHUNK", 60 * 7)
+    monkeypatch.setattr("softmode.deformables.body.rkpm._PAIRS_PER_CHUNK", 60 * 7)
     parts = basis.evaluate(points)
     np.testing.assert_array_equal(whole.value.indices, parts.value.indices)
     np.testing.assert_allclose(whole.value.data, parts.value.data, rtol=1e-12, atol=1e-14)

@@ -6,16 +6,18 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.adjoint import AdjointReduced
-from softmode.deformables.attachments import attach
-from softmode.deformables.body import BuildOptions, build_body
-from softmode.deformables.lanes import from_blocks
-from softmode.deformables.markers import Markers
-from softmode.deformables.materials import Material
-from softmode.deformables.quadrature import quadrature_from_box
-from softmode.deformables.sensing import ContactSensor, SurfacePressure
-from softmode.deformables.skinning import SkinSplats
-from softmode.deformables.solver_reduced import SolverReducedOptions, add_pins, add_reduced_body, drive_regions
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.gradients.adjoint import AdjointReduced
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_pins, add_reduced_body, drive_regions
+from softmode.deformables.model.lane_kernels import from_blocks
+from softmode.deformables.skinning.skin_splats import SkinSplats
+from softmode.deformables.solver.attachments import attach
+from softmode.deformables.solver.solver_reduced import SolverReducedOptions
+from softmode.deformables.tools.markers import Markers
+from softmode.deformables.tools.sensing import ContactSensor, SurfacePressure
 from softmode.errors import ConfigError
 from tests.deformables.affine_body import affine_cube, mean_gradient
 from tests.deformables.test_adjoint import EXACT

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.attachments import Attachment, attach
-from softmode.deformables.materials import Material
-from softmode.deformables.sensing import ContactSensor, ForceTorqueSensor, SurfacePressure
-from softmode.deformables.solver_reduced import add_reduced_body
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.solver.attachments import Attachment, attach
+from softmode.deformables.tools.sensing import ContactSensor, ForceTorqueSensor, SurfacePressure
 from softmode.errors import ConfigError
 from tests import reference
 from tests.deformables.test_attachments import joined

@@ -8,11 +8,12 @@ import pytest
 import trimesh
 import warp as wp
 
-from softmode.deformables import shape_tables
-from softmode.deformables import status as bits
-from softmode.deformables.shape_queries import Heightfields
-from softmode.deformables.shape_tables import heightfields, is_closed
-from softmode.deformables.solver_reduced import SolverReduced, add_reduced_body
+from softmode.deformables.contact import shape_tables
+from softmode.deformables.contact.shape_query_kernels import Heightfields
+from softmode.deformables.contact.shape_tables import heightfields, is_closed
+from softmode.deformables.model import status as bits
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.errors import ConfigError
 from tests import reference
 from tests.deformables.probe_kernels import query_points

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from softmode.deformables.body import BuildOptions, build_body
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
 from tests.shape_trials import Voxels, base_of, drop, solve_reference, try_build, try_pull, voxelise
 from tests.shapes import SHAPES
 

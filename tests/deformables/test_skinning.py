@@ -9,8 +9,8 @@ import pytest
 import warp as wp
 from scipy.linalg import polar
 
-from softmode.deformables.skinning import STRETCH_LIMIT, SkinSplats, average_basis
-from softmode.deformables.skinning_kernels import vec6
+from softmode.deformables.skinning.skin_splats import STRETCH_LIMIT, SkinSplats, average_basis
+from softmode.deformables.skinning.skinning_kernels import vec6
 from softmode.errors import BasisError
 from softmode.splats.splats import rotations_from_quats
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.skinning_adjoint import AdjointSkinning
-from softmode.deformables.skinning_kernels import vec6
+from softmode.deformables.skinning.skinning_adjoint import AdjointSkinning
+from softmode.deformables.skinning.skinning_kernels import vec6
 from softmode.errors import BasisError
 from tests.deformables.test_skinning import WORLDS, Case, M, N
 

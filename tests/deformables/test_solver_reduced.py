@@ -5,16 +5,12 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables import status as bits
-from softmode.deformables.lanes import from_blocks, to_blocks
-from softmode.deformables.materials import Material, MaterialModel
-from softmode.deformables.solver_reduced import (
-    SolverReduced,
-    SolverReducedOptions,
-    add_pins,
-    add_reduced_body,
-    register_custom_attributes,
-)
+from softmode.deformables.materials.material import Material
+from softmode.deformables.materials.material_kernels import MaterialModel
+from softmode.deformables.model import status as bits
+from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
+from softmode.deformables.model.lane_kernels import from_blocks, to_blocks
+from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.errors import ConfigError
 from tests import reference
 from tests.scenes import GRAVITY, Scene, bar, cube, random_rotation, rotation

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.attachments import attach
-from softmode.deformables.solver_reduced import SolverReduced, add_reduced_body
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.solver.attachments import attach
+from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.errors import ConfigError
 from tests.scenes import Scene, add_free_box, cube
 

@@ -6,9 +6,10 @@ import pytest
 import trimesh
 import warp as wp
 
-from softmode.deformables.materials import Material
-from softmode.deformables.solver_reduced import SolverReduced, add_reduced_body
-from softmode.deformables.surface_samples import inner_offsets
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.model.inner_offsets import inner_offsets
+from softmode.deformables.solver.solver_reduced import SolverReduced
 from tests import reference
 from tests.scenes import GRAVITY, Scene, add_free_box, cube, rotation_of
 

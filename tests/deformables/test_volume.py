@@ -13,8 +13,10 @@ import warp as wp
 from newton import ModelBuilder
 from scipy.optimize import brentq
 
-from softmode.deformables.materials import Material, MaterialModel
-from softmode.deformables.solver_reduced import SolverReducedOptions, add_reduced_body
+from softmode.deformables.materials.material import Material
+from softmode.deformables.materials.material_kernels import MaterialModel
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from tests import reference
 from tests.deformables.affine_body import affine_cube, mean_gradient
 from tests.scenes import Scene

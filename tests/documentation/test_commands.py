@@ -23,7 +23,7 @@ def parse(monkeypatch: pytest.MonkeyPatch) -> Any:
     """The command line of softmode, which reads its arguments and does nothing."""
     import tyro
 
-    from softmode import cli
+    from softmode.cli import main as cli
 
     real = tyro.cli
 
@@ -43,7 +43,7 @@ def _check(words: list[str], parse: Any) -> None:
     if program == "torchrun":
         rest = rest[rest.index("-m") :]
         program = "python"
-    if program == "python" and rest[:2] in (["-m", "softmode"], ["-m", "softmode.cli"]):
+    if program == "python" and rest[:2] in (["-m", "softmode"], ["-m", "softmode.cli.main"]):
         program, rest = "softmode", rest[2:]
     if program == "softmode":
         assert parse(rest) == 0

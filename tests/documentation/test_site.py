@@ -65,7 +65,10 @@ def test_the_site_builds(tmp_path: Path) -> None:
     method = (tmp_path / "method.html").read_text()
     assert method.count("<math") > 10 and "ERROR" not in method
     reference = (tmp_path / "api" / "deformables.html").read_text()
-    for name in ("softmode.deformables.body.build_body", "softmode.deformables.solver_reduced.SolverReduced.step"):
+    for name in (
+        "softmode.deformables.build.build_body.build_body",
+        "softmode.deformables.solver.solver_reduced.SolverReduced.step",
+    ):
         assert f'id="{name}"' in reference
     for html in tmp_path.rglob("*.html"):
         assert not re.search(r"<(?:script|link)[^>]+(?:src|href)=\"https?:", html.read_text()), html

@@ -11,7 +11,7 @@ import gymnasium as gym
 import pytest
 
 import softmode  # noqa: F401  (registers the environments)
-from softmode.envs.lift_soft import LiftSoftEnv
+from softmode.envs.tasks.lift_soft.task import LiftSoftEnv
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -39,7 +39,7 @@ def lift() -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def pixels() -> Iterator[Any]:
     """Return one world with small pictures."""
-    from softmode.envs.lift_soft import LiftSoftConfig
+    from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
 
     env = gym.make_vec(
         "softmode/LiftSoft-v0",

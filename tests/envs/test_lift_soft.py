@@ -15,9 +15,9 @@ import warp as wp
 from gymnasium.utils.env_checker import check_env, data_equivalence
 
 import softmode
-from softmode.deformables.status import status_reasons
-from softmode.envs.lift_soft import LiftSoftConfig, LiftSoftEnv
+from softmode.deformables.model.status import status_reasons
 from softmode.envs.task_kernels import bound_observation
+from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv
 from softmode.errors import ConfigError, MaterialError
 
 ENV_ID = "softmode/LiftSoft-v0"

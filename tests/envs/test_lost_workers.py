@@ -11,7 +11,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import softmode  # noqa: F401
-from softmode.deformables import status as bits
+from softmode.deformables.model import status as bits
 from softmode.errors import AssetError, ConfigError, WorkerError
 
 TASK = "softmode/PushSoft-v0"

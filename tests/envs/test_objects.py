@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softmode.deformables.body import BuildOptions
-from softmode.envs import objects
-from softmode.envs.objects import ObjectConfig, choose_part, load_object, stable_rotation
+from softmode.deformables.build.options import BuildOptions
 from softmode.errors import AssetError, ConfigError
+from softmode.objects import soft_object as objects
+from softmode.objects.soft_object import ObjectConfig, choose_part, load_object, stable_rotation
 from softmode.splats import Splats, make_plush, write_ply
 from softmode.splats.point_cloud import splats_from_points
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import softmode  # noqa: F401  (registers the environments)
-from softmode.deformables.status import WORLD_COLLAPSED, WORLD_ITERATION_LIMIT
-from softmode.envs.place_in_bin import Bin, PlaceInBinConfig, PlaceInBinEnv, bin_scene
+from softmode.deformables.model.status import WORLD_COLLAPSED, WORLD_ITERATION_LIMIT
 from softmode.envs.scripted import scripted_policy
-from softmode.envs.scripted_place import ScriptedPlace
 from softmode.envs.task import EndReason
+from softmode.envs.tasks.place_in_bin.scripted import ScriptedPlace
+from softmode.envs.tasks.place_in_bin.task import Bin, PlaceInBinConfig, PlaceInBinEnv, bin_scene
 from softmode.errors import ConfigError
 
 ENV_ID = "softmode/PlaceInBin-v0"

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
 
-from softmode.envs.press_soft import START_HEIGHT, THICKNESS, PressSoftConfig, PressSoftEnv
 from softmode.envs.scripted import scripted_policy
-from softmode.envs.scripted_press import ScriptedPress
+from softmode.envs.tasks.press_soft.scripted import ScriptedPress
+from softmode.envs.tasks.press_soft.task import START_HEIGHT, THICKNESS, PressSoftConfig, PressSoftEnv
 from softmode.errors import ConfigError
 
 ENV_ID = "softmode/PressSoft-v0"

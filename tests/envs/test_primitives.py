@@ -11,11 +11,12 @@ import trimesh
 from scipy.integrate import solve_bvp
 from trimesh.visual import ColorVisuals
 
-from softmode.deformables.solver_reduced import add_pins, add_reduced_body
-from softmode.envs import objects, presets
-from softmode.envs.objects import ObjectConfig, load_object
-from softmode.envs.primitives import checker, primitive_mesh, primitive_quadrature
+from softmode.deformables.model.authoring import add_pins, add_reduced_body
 from softmode.errors import ConfigError
+from softmode.objects import presets
+from softmode.objects import soft_object as objects
+from softmode.objects.primitives import checker, primitive_mesh, primitive_quadrature
+from softmode.objects.soft_object import ObjectConfig, load_object
 from softmode.splats.splats import rotations_from_quats
 from tests.scenes import GRAVITY, Scene
 

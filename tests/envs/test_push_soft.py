@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import softmode  # noqa: F401  (registers the environments)
-from softmode.deformables.body import BuildOptions
-from softmode.envs.objects import ObjectConfig
-from softmode.envs.push_soft import PushSoftConfig, PushSoftEnv, push_scene
+from softmode.deformables.build.options import BuildOptions
 from softmode.envs.scripted import scripted_policy
-from softmode.envs.scripted_push import ScriptedPush
+from softmode.envs.tasks.push_soft.scripted import ScriptedPush
+from softmode.envs.tasks.push_soft.task import PushSoftConfig, PushSoftEnv, push_scene
 from softmode.errors import ConfigError
+from softmode.objects.soft_object import ObjectConfig
 
 ENV_ID = "softmode/PushSoft-v0"
 IDLE = np.zeros(5, np.float32)

@@ -10,9 +10,17 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
 
-from softmode.envs.rope_route import GRASP, LENGTH, PEG_SIZE, RopeRouteConfig, RopeRouteEnv, pegs_at, rope_scene
 from softmode.envs.scripted import scripted_policy
-from softmode.envs.scripted_rope import ScriptedRope
+from softmode.envs.tasks.rope_route.scripted import ScriptedRope
+from softmode.envs.tasks.rope_route.task import (
+    GRASP,
+    LENGTH,
+    PEG_SIZE,
+    RopeRouteConfig,
+    RopeRouteEnv,
+    pegs_at,
+    rope_scene,
+)
 from softmode.errors import ConfigError
 
 ENV_ID = "softmode/RopeRoute-v0"

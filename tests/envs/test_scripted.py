@@ -9,8 +9,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from softmode.envs.lift_soft import LiftSoftEnv
 from softmode.envs.scripted import ScriptedLift
+from softmode.envs.tasks.lift_soft.task import LiftSoftEnv
 from softmode.errors import ConfigError
 
 

@@ -11,13 +11,13 @@ import pytest
 import warp as wp
 
 import softmode  # noqa: F401  (registers the environments)
-from softmode.envs.objects import ObjectConfig
 from softmode.envs.scripted import scripted_policy
-from softmode.envs.scripted_shape import ScriptedShape
-from softmode.envs.shape_soft import ShapeSoftConfig, ShapeSoftEnv, ShapeSoftVectorEnv, shape_scene
-from softmode.envs.shape_targets import record_press
-from softmode.envs.table_scene import GAP
+from softmode.envs.tasks.shape_soft.scripted import ScriptedShape
+from softmode.envs.tasks.shape_soft.targets import record_press
+from softmode.envs.tasks.shape_soft.task import ShapeSoftConfig, ShapeSoftEnv, ShapeSoftVectorEnv, shape_scene
 from softmode.errors import ConfigError
+from softmode.objects.soft_object import ObjectConfig
+from softmode.scenes.table_scene import GAP
 
 ENV_ID = "softmode/ShapeSoft-v0"
 IDLE = np.array([0.0, 0.0, 0.0, 0.0, 2.0 * 0.08 / 0.09 - 1.0], np.float32)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from softmode.envs.lift_soft import LiftSoftConfig
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.task import EndReason
+from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
 from softmode.errors import ConfigError
 
 ENV_ID = "softmode/LiftSoft-v0"

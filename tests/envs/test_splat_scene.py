@@ -8,14 +8,14 @@ import newton
 import numpy as np
 import pytest
 
-from softmode.deformables.body import BuildOptions
-from softmode.deformables.materials import Material
-from softmode.deformables.status import status_reasons
-from softmode.envs.objects import ObjectConfig, SoftObject, load_object
-from softmode.envs.splat_scene import PlacedObject, SplatScene
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.status import status_reasons
 from softmode.errors import ConfigError
-from softmode.film import Film
-from softmode.splats.camera import PinholeCamera
+from softmode.objects.soft_object import ObjectConfig, SoftObject, load_object
+from softmode.scenes.splat_scene import PlacedObject, SplatScene
+from softmode.splats.pinhole import PinholeCamera
+from softmode.viz.film import Film
 from tests.scenes import GRAVITY
 
 EDGE, DENSITY, DT = 0.06, 300.0, 1.0 / 240.0

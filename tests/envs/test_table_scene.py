@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softmode.envs.table_scene import TableScene, TableSceneConfig
 from softmode.errors import ConfigError, MaterialError
+from softmode.scenes.table_scene import TableScene, TableSceneConfig
 
 POSITIONS = np.array([[0.45, 0.0], [0.42, -0.06], [0.48, 0.05]])
 YAWS = np.array([0.3, -1.0, 2.0])

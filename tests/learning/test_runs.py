@@ -101,7 +101,7 @@ def test_a_killed_run_goes_on(tmp_path: Path):
     command = [
         sys.executable,
         "-m",
-        "softmode.cli",
+        "softmode.cli.main",
         "train",
         "Pendulum-v1",
         "--run-dir",

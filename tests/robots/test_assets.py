@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from softmode import robots
-from softmode.cli import main
+from softmode.cli.main import main
 from softmode.errors import AssetError, ConfigError, SoftmodeError
 from softmode.robots.assets import ALIASES, find
 from tests.robots.files import MJCF, URDF, write_mjcf, write_urdf, write_wedge

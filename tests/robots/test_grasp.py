@@ -9,8 +9,8 @@ import pytest
 import warp as wp
 
 from softmode import robots
-from softmode.deformables.authoring import add_reduced_body
-from softmode.deformables.materials import Material
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
 from tests.scenes import GRAVITY, Scene, cube
 
 EDGE, DT = 0.04, 0.004

@@ -6,9 +6,9 @@ import pytest
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
-from softmode.deformables.coupling import SolverCoupledReduced
-from softmode.deformables.sensing import ContactSensor, ForceTorqueSensor
-from softmode.deformables.solver_reduced import register_custom_attributes
+from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
+from softmode.deformables.model.authoring import register_custom_attributes
+from softmode.deformables.tools.sensing import ContactSensor, ForceTorqueSensor
 from softmode.errors import AssetError
 from softmode.robots import add_arm, add_soft_fingertips
 from tests.scenes import GRAVITY, add_free_box, add_gripper

@@ -7,7 +7,8 @@ import numpy as np
 import warp as wp
 
 from softmode.splats import Splats
-from softmode.splats.camera import CameraOptions, PinholeCamera
+from softmode.splats.camera import CameraOptions
+from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.rasterizer import SplatArrays
 from softmode.splats.splats import SH_DC
 

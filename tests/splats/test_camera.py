@@ -11,7 +11,8 @@ import warp as wp
 
 from softmode.errors import ConfigError
 from softmode.splats import make_plush
-from softmode.splats.camera import CameraOptions, PinholeCamera, SplatCamera
+from softmode.splats.camera import CameraOptions, SplatCamera
+from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
 from softmode.splats.rasterizer_adjoint import AdjointRasterizer
 from softmode.splats.shadow import ShadowOptions

@@ -10,8 +10,9 @@ import warp as wp
 
 from softmode.errors import ConfigError
 from softmode.splats import make_plush
-from softmode.splats.camera import CameraOptions, PinholeCamera, SplatCamera
+from softmode.splats.camera import CameraOptions, SplatCamera
 from softmode.splats.camera_randomization import CameraRandomization, ViewVariation
+from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.rasterizer import SplatRasterizer, ViewArrays
 from tests.splats.camera_scene import PLAIN, arrays, camera, scene
 

@@ -15,7 +15,7 @@ from softmode.errors import AssetError, ConfigError, MissingExtraError
 from softmode.splats import Splats, read_splats, write_splats, write_usd
 from softmode.splats.formats import read_usd
 from softmode.splats.splats import sh_basis, up_rotation
-from softmode.usd import process
+from softmode.stages import process
 from tests.splats.test_splats import random_splats
 
 pytest.importorskip("pxr", reason="needs the extra [usd]")

@@ -12,11 +12,11 @@ import warp as wp
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from softmode.deformables.quadrature import quadrature_from_splats
+from softmode.deformables.build.quadrature import quadrature_from_splats
 from softmode.errors import ConfigError
-from softmode.splats import mesh_fit_kernels as kernels
+from softmode.objects import mesh_fit_kernels as kernels
+from softmode.objects.mesh_fit import FitOptions, MeshFit, splats_from_mesh
 from softmode.splats.colored_mesh import ColoredMesh
-from softmode.splats.mesh_fit import FitOptions, MeshFit, splats_from_mesh
 from softmode.splats.mesh_samples import sample_mesh
 from softmode.splats.rasterizer import SplatArrays, SplatRasterizer
 from softmode.splats.reference_views import orbit_poses, render_mesh

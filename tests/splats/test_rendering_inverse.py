@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.optimize import minimize
 
-from softmode.deformables.skinning import SkinSplats
-from softmode.deformables.skinning_adjoint import AdjointSkinning
+from softmode.deformables.skinning.skin_splats import SkinSplats
+from softmode.deformables.skinning.skinning_adjoint import AdjointSkinning
 from softmode.splats import Splats
 from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
 from softmode.splats.rasterizer_adjoint import AdjointRasterizer, exp_twist

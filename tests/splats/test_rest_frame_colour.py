@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.skinning import SkinSplats
+from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.errors import ConfigError
 from softmode.splats import Splats
 from softmode.splats.rasterizer import SplatArrays, SplatRasterizer

@@ -7,9 +7,13 @@ import functools
 
 import numpy as np
 
-from softmode.deformables.body import BuildOptions, ReducedBody, Region, build_body
-from softmode.deformables.materials import Material, MaterialModel
-from softmode.deformables.quadrature import quadrature_from_box
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.body.regions import Region
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.materials.material import Material
+from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.splats import Splats
 from tests.splats.test_splats import random_splats
 

@@ -11,7 +11,7 @@ import sys
 import time
 from typing import Any
 
-from softmode.usd.child import answer
+from softmode.stages.child import answer
 
 
 def answer_in_fork(request: dict[str, Any], wall: float) -> int:

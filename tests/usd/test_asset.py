@@ -9,11 +9,11 @@ import pytest
 
 pytest.importorskip("pxr", reason="needs the extra [usd]")
 
-from softmode.deformables.body import BuildOptions
-from softmode.envs.object_build import config_of_file, file_kind
-from softmode.envs.objects import ObjectConfig, load_object
+from softmode.deformables.build.options import BuildOptions
 from softmode.errors import AssetError
-from softmode.splats.colored_mesh import read_mesh
+from softmode.objects.mesh_file import read_mesh
+from softmode.objects.object_build import config_of_file, file_kind
+from softmode.objects.soft_object import ObjectConfig, load_object
 from softmode.usd import PlacedBody, write_usd
 from tests.usd.export_scenes import assert_same, assert_same_splats, small_body, small_splats
 from tests.usd.stages import EDGES, Author, Gf, UsdGeom, UsdVol, box, shell, transform

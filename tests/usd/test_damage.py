@@ -19,9 +19,10 @@ pytest.importorskip("pxr", reason="needs the extra [usd]")
 import newton
 
 from softmode.errors import AssetError, MaterialError, SoftmodeError
-from softmode.usd import add_usd, process, read_usd_scene
+from softmode.objects.stage_scene import UsdScene, scene_from_answer, scene_request
+from softmode.stages import process
+from softmode.usd import add_usd, read_usd_scene
 from softmode.usd.importer import _add_rest
-from softmode.usd.scene import UsdScene, scene_from_answer, scene_request
 from tests.usd.stages import KINDS, Author, Sdf, UsdUtils, UsdVol, shell, transform
 
 NUMBERS = (b"nan", b"inf", b"-inf", b"-1", b"0", b"1e308", b"-1e308", b"2147483647", b"99999999999999999999", b"0.5")

@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.solver_reduced import add_reduced_body
+from softmode.deformables.model.authoring import add_reduced_body
 from softmode.errors import AssetError, ConfigError, SolverDiverged, StorageError
 from softmode.splats.formats import read_usd
+from softmode.stages import process
 from softmode.usd import (
     PlacedBody,
     UsdAnimation,
     UsdAnimationOptions,
     UsdExportOptions,
     add_usd,
-    process,
     read_animation,
     write_usd,
 )

@@ -11,8 +11,8 @@ import pytest
 pytest.importorskip("pxr", reason="needs the extra [usd]")
 
 from softmode.errors import AssetError
+from softmode.objects.stage_bundle import body_of, decode_body, encode_body
 from softmode.usd import PlacedBody, read_usd_scene, write_usd
-from softmode.usd.bundle import body_of, decode_body, encode_body
 from softmode.usd.handles import (
     coordinates_from_handles,
     handle_weights,

@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from softmode.cli import main
+from softmode.cli.main import main
 from softmode.errors import ConfigError
 from softmode.splats.formats import read_usd
 from softmode.usd import UsdAnimation, read_animation

@@ -15,15 +15,18 @@ pytest.importorskip("pxr", reason="needs the extra [usd]")
 import newton
 import warp as wp
 
-from softmode.deformables.body import BuildOptions, build_body
-from softmode.deformables.coupling import SolverCoupledReduced
-from softmode.deformables.materials import Material
-from softmode.deformables.quadrature import quadrature_from_mesh, quadrature_from_splats
-from softmode.deformables.skinning import SkinSplats
-from softmode.deformables.status import status_reasons
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_splats
+from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
+from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.status import status_reasons
+from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.errors import AssetError, ConfigError, MissingExtraError
 from softmode.splats.rasterizer import SplatArrays
-from softmode.usd import add_usd, process, read_usd_scene
+from softmode.stages import process
+from softmode.usd import add_usd, read_usd_scene
 from tests.usd.stages import KINDS, Author, Gf, Sdf, UsdGeom, UsdVol, box, shell, transform
 
 EPSILON = float(np.finfo(np.float32).eps)

@@ -12,8 +12,8 @@ pytest.importorskip("pxr", reason="needs the extra [usd]")
 
 from softmode.errors import AssetError
 from softmode.splats import read_splats
+from softmode.stages.child.layers import MAX_LAYERS
 from softmode.usd import read_usd_scene
-from softmode.usd.child.layers import MAX_LAYERS
 from tests.usd.stages import Author, Sdf, UsdUtils, UsdVol, shell
 
 

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("pxr", reason="needs the extra [usd]")
 
-from softmode.deformables.materials import Material
+from softmode.deformables.materials.material import Material
 from softmode.errors import AssetError, MaterialError
 from softmode.usd import read_usd_scene
 from softmode.usd.importer import build_deformable

@@ -10,8 +10,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from softmode.deformables.body import BuildOptions
-from softmode.envs.objects import ObjectConfig
+from softmode.deformables.build.options import BuildOptions
+from softmode.objects.soft_object import ObjectConfig
 from softmode.view.app import ViewApp, ViewOptions
 from softmode.view.session import LiveSession
 

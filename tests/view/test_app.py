@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softmode.cli import main
+from softmode.cli.main import main
 from softmode.errors import ConfigError, MissingExtraError
 from softmode.view.app import ViewApp, ViewOptions
 from softmode.view.gaussians import GaussianBuffer
@@ -344,7 +344,7 @@ def test_an_interrupted_command_ends_cleanly() -> None:
     """Ctrl-C while it serves: exit code 0, one line, no traceback."""
     program = (
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # the background ignores it
-        "from softmode.cli import main; sys.exit(main(['view', '--port', '0', '--no-open']))"
+        "from softmode.cli.main import main; sys.exit(main(['view', '--port', '0', '--no-open']))"
     )
     process = subprocess.Popen(
         [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -7,11 +7,11 @@ import newton
 import numpy as np
 import pytest
 
-from softmode.deformables.body import BuildOptions
-from softmode.deformables.materials import Material
-from softmode.envs.lift_soft import LiftSoftConfig, lift_scene
-from softmode.envs.objects import ObjectConfig, load_object
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.materials.material import Material
+from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, lift_scene
 from softmode.errors import AssetError, ConfigError
+from softmode.objects.soft_object import ObjectConfig, load_object
 from softmode.splats.formats import write_splats
 from softmode.view.live_recording import LiveRecording
 from softmode.view.live_types import LiveOptions

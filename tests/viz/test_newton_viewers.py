@@ -14,8 +14,8 @@ import pytest
 import warp as wp
 from newton.viewer import Picking, ViewerFile, ViewerNull, ViewerUSD
 
-from softmode.deformables.materials import Material
-from softmode.deformables.solver_reduced import add_reduced_body
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
 from tests.scenes import GRAVITY, Scene, cube
 
 EDGE = 0.1

@@ -20,19 +20,20 @@ import pytest
 from PIL import Image
 
 import softmode  # noqa: F401  (registers the environments)
-from softmode.cli import main
-from softmode.deformables.energies import SoftEnergies
-from softmode.deformables.materials import Material
-from softmode.deformables.sensing import ContactSensor
-from softmode.deformables.skinning import SkinSplats
-from softmode.deformables.solver_reduced import add_reduced_body
-from softmode.envs.lift_soft import LiftSoftConfig
-from softmode.envs.objects import ObjectConfig, load_object
+from softmode.cli.main import main
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.skinning.skin_splats import SkinSplats
+from softmode.deformables.solver.energies import SoftEnergies
+from softmode.deformables.tools.sensing import ContactSensor
+from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
 from softmode.errors import ConfigError, MissingExtraError
-from softmode.policies import policy_factory
+from softmode.learning.players import policy_factory
+from softmode.objects.soft_object import ObjectConfig, load_object
+from softmode.scenes.deformed_splats import DeformedSplats, splat_axes
 from softmode.splats.splats import rotations_from_quats
-from softmode.viz.deformed_splats import DeformedSplats, splat_axes
-from softmode.viz.rerun_logger import RerunLogger, RerunOptions, RerunScene
+from softmode.viz.rerun_logger import RerunLogger, RerunOptions
+from softmode.viz.rerun_sources import RerunScene
 from tests.scenes import GRAVITY, Scene
 
 pytest.importorskip("rerun", reason="needs the extra viz")

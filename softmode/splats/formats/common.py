@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from softmode.atomic import atomic_write
 from softmode.errors import AssetError
+from softmode.files import atomic_write
 from softmode.splats.splats import MAX_SPLATS, SH_DC
 
 REEXPORT = "The file is damaged or incomplete: copy or export it again"

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from softmode.errors import AssetError, ConfigError, MissingExtraError
 from softmode.splats.formats.common import REEXPORT, atomic_splat_file, typed_errors
 from softmode.splats.splats import MAX_SPLATS, Splats, UpAxis, rotate_sh, up_rotation
-from softmode.usd import process
+from softmode.stages import process
 
 _LIMITS = process.Limits(memory=128 * 2.0**20, memory_per_byte=16.0, seconds=1.0)
 """Splats alone need little: 16 bytes for each of the file is generous."""

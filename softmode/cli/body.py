@@ -1,0 +1,252 @@
+"""The commands ``softmode body build``, ``softmode body show`` and ``softmode body check``."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from softmode.errors import AssetError, ConfigError
+
+if TYPE_CHECKING:
+    from softmode.deformables.body.reduced_body import ReducedBody
+    from softmode.deformables.body.regions import Region
+    from softmode.deformables.build.quadrature_grid import Quadrature
+    from softmode.deformables.build.report import BodyReport
+    from softmode.objects.object_build import StifferBox
+    from softmode.splats.splats import Splats
+
+
+def _short(name: str) -> Any:
+    """Return what gives an option a short name; evaluated when tyro reads the annotation, not on import."""
+    import tyro
+
+    return tyro.conf.arg(aliases=[name])
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Asset:
+    """A file, and how it becomes a body."""
+
+    file: Path
+    """Splats (.ply, .splat, .spz, .sog, meta.json, .usd, ...), a mesh (.glb, .obj, .stl, .usd, ...) or a point cloud
+    (.npz with points, normals, colors; .ply)."""
+    size: float | None = None
+    """Longest edge of the object [m]; 0.08 if omitted."""
+    up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
+    """Axis of the file that points up; -y for splats, +y for glTF, +z for the rest if omitted."""
+    crop: tuple[float, float, float, float, float, float] | None = None
+    """Box x0 y0 z0 x1 y1 z1 of a splat file, once turned up, outside which splats are dropped."""
+    part: Literal["thickest", "tallest", "largest", "all"] = "thickest"
+    """Which of the separate parts of a splat file is the object."""
+    pose: Literal["stable", "captured"] = "stable"
+    """Lay an object that cannot stand on its stable side, or leave it as it is in the file."""
+    modes: int = 8
+    """Skinning eigenmodes beside the constant handle."""
+    handles: Literal["affine", "quadratic"] = "affine"
+    """What each eigenmode carries: (X, Y, Z, 1), or all ten monomials up to degree two, for slender and flat bodies."""
+    kernels: int = 400
+    """Reproducing kernels."""
+    points: int = 384
+    """Cubature points, at which a step evaluates stress."""
+    surface: int = 400
+    """Surface samples, which feel contact."""
+    splats: int = 2000
+    """Splats on a mesh; a splat file keeps its own."""
+    rank_tolerance: float | None = None
+    """Functions smaller than this are dropped as noise; 1e-5 if omitted, 1e-9 for slender and flat bodies."""
+    poissons_ratio: float = 0.4
+    """Poisson's ratio that the static responses of regions are made for; any other can be simulated."""
+    region: tuple[str, ...] = ()
+    """NAME=x0,y0,z0,x1,y1,z1: a part that scenes hold, move or grasp [m]; a seventh number makes it soft, stiffness / E
+    [1/m^2]. Coordinates: z up, bounding box centred over the origin, standing on z = 0; inf is allowed."""
+    stiffness: tuple[str, ...] = ()
+    """NAME=x0,y0,z0,x1,y1,z1,FACTOR: a part that is FACTOR times as stiff as the rest, in the same coordinates."""
+    seed: int = 0
+    """Seed of every random choice of the build."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BodyBuild(_Asset):
+    """Build the body of a splat file, mesh or point cloud and save it with its splats."""
+
+    out: Annotated[Path | None, _short("-o")] = None
+    """Body file to write, FILE.npz beside the file if omitted; `softmode play --object`, `body show` and `body check`
+    take it, and `ReducedBody.load` reads it."""
+
+    def run(self) -> int:
+        """Build, write, say what is wrong; return 0."""
+        stem = self.file.parent.name if self.file.name == "meta.json" else self.file.stem
+        out = self.out if self.out is not None else self.file.with_name(f"{stem}.npz")
+        _check_target(out, ".npz", self.file)
+        from softmode.objects.object_file import write_object
+
+        body, splats, quadrature = _load(self)
+        write_object(out, body, splats)
+        _print_report(_report(body, splats, quadrature), measures=False)
+        print(
+            f"wrote {body.name!r} to {out}: {body.function_count} functions, {body.point_count} cubature points, "
+            f"{body.surface_count} surface samples, {splats.count} splats; built in {body.build_seconds:.2f} s"
+        )
+        return 0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BodyShow(_Asset):
+    """Draw a body: soft modes, skinning weights, cubature, kernels, spectra, report."""
+
+    out: Annotated[Path | None, _short("-o")] = None
+    """Picture to write, FILE.png beside the file if omitted."""
+    youngs_modulus: float = 1.0e5
+    """Young's modulus for the frequencies [Pa]."""
+    density: float = 300.0
+    """Density for the frequencies [kg/m^3]."""
+
+    def run(self) -> int:
+        """Draw, print, return 0."""
+        stem = self.file.parent.name if self.file.name == "meta.json" else self.file.stem
+        out = self.out if self.out is not None else self.file.with_name(f"{stem}.png")
+        _check_target(out, ".png", self.file)
+        for name in ("youngs_modulus", "density"):
+            if not 0.0 < getattr(self, name) < float("inf"):
+                raise ConfigError(f"{name} must be a finite number > 0, got {getattr(self, name)}")
+        from softmode.cli.common import quiet_warp
+        from softmode.viz.body_picture import mode_frequencies, write_body_picture
+
+        body, splats, quadrature = _load(self)
+        report = _report(body, splats, quadrature)
+        material = {"youngs_modulus": self.youngs_modulus, "density": self.density}
+        with quiet_warp():
+            write_body_picture(out, body, splats, report, **material)
+        for key, value in body.provenance.items():
+            print(f"{key:34} {value:.4g}" if isinstance(value, float) else f"{key:34} {value}")
+        print(f"{'eigenvalues [1/m^2]':34} {'  '.join(f'{value:.4g}' for value in body.eigenvalues)}")
+        lowest = mode_frequencies(body, **material)[:8]
+        print(f"{'frequencies [Hz]':34} {'  '.join(f'{value:.4g}' for value in lowest)}")
+        _print_report(report, measures=True)
+        print(f"wrote {out}")
+        return 0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BodyCheck(_Asset):
+    """Examine a body, or the body that a file would become; exit code 0: well, 1: with warnings, 2: broken."""
+
+    def run(self) -> int:
+        """Measure, print findings with remedies, return the exit code."""
+        body, splats, quadrature = _load(self)
+        report = _report(body, splats, quadrature)
+        _print_report(report, measures=True)
+        print(f"{body.name}: {('all is well', 'usable, with warnings', 'broken')[report.severity]}")
+        return report.severity
+
+
+def _load(options: _Asset) -> tuple[ReducedBody, Splats, Quadrature | None]:
+    """Return a body with its splats: read, or built from its asset, then also with what it was built from."""
+    from softmode.deformables.build.functions import RANK_TOLERANCE
+    from softmode.deformables.build.options import BuildOptions
+    from softmode.objects.object_build import build_object, config_of_file, file_kind
+    from softmode.objects.object_file import read_object, surface_cover
+
+    kind = file_kind(options.file)
+    if kind == "body":
+        given = [
+            field.name.replace("_", "-")
+            for field in dataclasses.fields(_Asset)
+            if field.name != "file" and getattr(options, field.name) != field.default
+        ]
+        if given or isinstance(options, BodyBuild):
+            raise ConfigError(
+                f"{options.file} is a body already{': --' + ', --'.join(given) if given else ''}",
+                hint="give the file that it was built from",
+            )
+        body, splats = read_object(options.file)
+        return body, surface_cover(body) if splats is None else splats, None
+    if kind == "mesh" and (options.crop is not None or options.part != "thickest"):
+        raise ConfigError(f"{options.file} is a mesh; crop and part are for splats", hint="leave them out")
+    build = BuildOptions(
+        mode_count=options.modes,
+        kernel_count=options.kernels,
+        handles=options.handles,
+        poissons_ratio=options.poissons_ratio,
+        rank_tolerance=RANK_TOLERANCE if options.rank_tolerance is None else options.rank_tolerance,
+        cubature_count=options.points,
+        seed=options.seed,
+    )
+    config = config_of_file(
+        options.file,
+        **({} if options.size is None else {"size": options.size}),
+        up=options.up,
+        crop=options.crop,
+        part=options.part,
+        pose=options.pose,
+        surface_count=options.surface,
+        splat_count=options.splats,
+        build=build,
+    )
+    regions = [_region(text) for text in options.region]
+    stiffness = [_stiffer(text) for text in options.stiffness]
+    built = build_object(config, regions=regions, stiffness=stiffness)
+    return built.body, built.splats, built.quadrature
+
+
+def _report(body: ReducedBody, splats: Splats, quadrature: Quadrature | None) -> BodyReport:
+    """Examine a body with its splats."""
+    from softmode.deformables.build.report import report_body
+
+    return report_body(body, quadrature=quadrature, splats=splats.means)
+
+
+def _print_report(report: BodyReport, *, measures: bool) -> None:
+    """Print measures and findings."""
+    if measures:
+        for measure in report.measures:
+            print(f"{measure.name:44} {measure.value:.4g} {measure.unit}".rstrip())
+    for finding in report.findings:
+        remedy = finding.remedy[:1].upper() + finding.remedy[1:]
+        print(f"{finding.severity}: {finding.name}: {finding.what}. {remedy}.")
+
+
+def _named_numbers(option: str, text: str, counts: tuple[int, ...]) -> tuple[str, list[float]]:
+    """Return the name and the numbers of NAME=number,number,..."""
+    name, _, values = text.partition("=")
+    try:
+        found = [float(word) for word in values.split(",")]
+    except ValueError:
+        found = []
+    if not name or len(found) not in counts:
+        raise ConfigError(
+            f"{option} {text!r}: expected NAME= and {' or '.join(map(str, counts))} numbers separated by commas",
+            hint=f"give it like --{option} root=-inf,-inf,-inf,inf,inf,0.01" + (",10" if 6 not in counts else ""),
+        )
+    return name, found
+
+
+def _region(text: str) -> Region:
+    """Return the region NAME=x0,y0,z0,x1,y1,z1[,stiffness]."""
+    from softmode.deformables.body.regions import Region
+
+    name, values = _named_numbers("region", text, (6, 7))
+    return Region(name=name, box=(values[:3], values[3:6]), stiffness=values[6] if len(values) == 7 else None)
+
+
+def _stiffer(text: str) -> StifferBox:
+    """Return the part NAME=x0,y0,z0,x1,y1,z1,factor."""
+    from softmode.objects.object_build import StifferBox
+
+    _, (x0, y0, z0, x1, y1, z1, factor) = _named_numbers("stiffness", text, (7,))
+    return StifferBox(box=(x0, y0, z0, x1, y1, z1), factor=factor)
+
+
+def _check_target(path: Path, suffix: str, source: Path) -> None:
+    """Refuse a file that cannot be written, or that is the source, before any work is done."""
+    if path.suffix.lower() != suffix:
+        raise ConfigError(f"out {path} is no {suffix} file", hint=f"name it like toy{suffix}")
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        raise AssetError(f"{path}: there is no folder {folder}", hint="make the folder first")
+    if path.is_dir() or not os.access(folder, os.W_OK):
+        raise AssetError(f"{path}: cannot be written there", hint="choose another name or folder")
+    if path.exists() and source.exists() and path.samefile(source):
+        raise ConfigError(f"{path} is the file that is read", hint="choose another name with --out")

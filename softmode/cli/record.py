@@ -1,0 +1,141 @@
+"""The command ``softmode record``: episodes of an environment as a LeRobot dataset."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from softmode.cli.common import bar_interval, quiet_warp, warp_device
+from softmode.envs.catalogue import purpose, registered_id
+from softmode.errors import ConfigError
+from softmode.learning.players import check_policy, policy_factory, trained_policy
+
+if TYPE_CHECKING:
+    from softmode.demonstrations.writer import DatasetWriter
+
+
+ROBOT = "softmode_arm"
+"""Name of the robot in the dataset."""
+
+
+def _short(name: str) -> Any:
+    """Return what gives an option a short name; evaluated when tyro reads the annotation, not on import."""
+    import tyro
+
+    return tyro.conf.arg(aliases=[name])
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Record:
+    """Record episodes of an environment as a LeRobot v3.0 dataset."""
+
+    env: str
+    """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
+    out: Annotated[Path | None, _short("-o")] = None
+    """Folder of the dataset, out/NAME if omitted; must not exist, unless --append is given."""
+    policy: str = "scripted"
+    """scripted, random, zero, or the checkpoint of a run."""
+    episodes: int = 10
+    """Episodes to record."""
+    seed: int = 0
+    """Seed of the first episode; the next ones count up."""
+    obs_type: Literal["pixels_agent_pos", "state", "pixels"] | None = None
+    """What is observed: pictures and the robot's own state, the full state, or pictures alone; the first if omitted, or
+    what a trained policy observes."""
+    pictures: Literal["video", "png"] = "video"
+    """Store pictures as H.264 films, small, or as PNG, exact."""
+    only_successes: bool = False
+    """Record only episodes that end in success."""
+    noise: float = 0.0
+    """Standard deviation of random pushes that are added to the actions played, not to those recorded; 0.3 makes
+    demonstrations that show how to come back from errors."""
+    append: bool = False
+    """Add to the dataset in the folder, if there is one."""
+    device: str | None = None
+    """Warp device, for example cpu or cuda:0."""
+
+    def run(self) -> int:
+        """Record; return the exit code."""
+        return record(self)
+
+
+def record(options: Record) -> int:
+    """Record episodes; see :class:`Record`."""
+    short_name = registered_id(options.env).rpartition("/")[2]
+    check_policy(options.policy)
+    out = Path("out", short_name) if options.out is None else options.out
+    if not options.append and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ConfigError(f"{out} exists", hint="choose another folder, or give --append")
+
+    import gymnasium as gym
+    from tqdm import tqdm
+
+    from softmode.demonstrations.recording import check_recording, environment_features, record_episodes
+    from softmode.demonstrations.writer import DatasetWriter
+
+    check_recording(options.episodes, options.seed, options.noise)
+    trained = trained_policy(options.policy, options.env)
+    given: dict[str, Any] = {"obs_type": "pixels_agent_pos"}
+    if trained is not None:
+        from softmode.learning.environments import with_config
+
+        given = dict(with_config(options.env, trained.env_options))
+    if options.obs_type is not None:
+        given["obs_type"] = options.obs_type
+    with quiet_warp():
+        env = gym.make(options.env, **given, device=warp_device(options.device))
+    try:
+        policy = policy_factory(options.policy, env, trained)
+        features = environment_features(env, pictures=options.pictures)
+        fps = int(env.metadata["render_fps"])
+        with (
+            DatasetWriter(out, features, fps=fps, robot_type=ROBOT, append=options.append) as writer,
+            tqdm(total=options.episodes, desc="recording", unit="episode", mininterval=bar_interval()) as bar,
+        ):
+            before = writer.episode_count
+            played = 0
+
+            def tell(seed: int, success: bool, recorded: int) -> None:
+                nonlocal played
+                played = seed + 1 - options.seed
+                bar.set_postfix_str(f"seed {seed}: {'success' if success else 'no success'}")
+                bar.update(recorded - bar.n)
+
+            try:
+                result = record_episodes(
+                    env,
+                    policy,
+                    writer,
+                    episodes=options.episodes,
+                    task=purpose(options.env),
+                    seed=options.seed,
+                    noise=options.noise,
+                    only_successes=options.only_successes,
+                    progress=tell,
+                )
+            except KeyboardInterrupt:
+                bar.close()
+                _tell_interrupted(writer, options.episodes - (writer.episode_count - before), options.seed + played)
+                return 130
+            total = writer.episode_count
+    finally:
+        env.close()
+    print(
+        f"{result.successes} of {result.episodes} recorded episodes succeeded, {result.attempts} were played; "
+        f"{out} holds {total} episodes"
+    )
+    return 0
+
+
+def _tell_interrupted(writer: DatasetWriter, missing: int, seed: int) -> None:
+    """Say what is there after an interruption, and how to go on."""
+    if not writer.episode_count:
+        print("softmode: interrupted, nothing was written", file=sys.stderr)
+        return
+    print(
+        f"softmode: interrupted; {writer.folder} holds {writer.episode_count} complete episodes, record the other "
+        f"{missing} with --append --seed {seed} --episodes {missing}",
+        file=sys.stderr,
+    )

@@ -1,0 +1,152 @@
+"""The commands ``softmode splat from-mesh``, ``softmode splat info`` and ``softmode splat convert``."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Literal
+
+from softmode.errors import AssetError, ConfigError
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SplatFromMesh:
+    """Make splats of a textured or vertex-coloured mesh: sample its surface, then fit the splats to pictures of it."""
+
+    mesh: Path
+    """Mesh file of any kind that trimesh reads (.glb, .obj, .ply, .stl, ...), with its textures."""
+    out: Path | None = None
+    """Splat file to write, of the kind its suffix names; MESH_splats.ply beside the mesh if omitted."""
+    count: int = 10_000
+    """Number of splats."""
+    size: float | None = None
+    """Longest edge of the result [m]; as in the file if omitted."""
+    iterations: int = 200
+    """Steps of the fit; 0 writes the splats as they were sampled."""
+    pixels: int = 128
+    """Edge of the pictures [px]."""
+    views: int = 64
+    """Pictures to fit; a quarter as many more, from other directions, only measure the result."""
+    seed: int = 0
+    """Seed; the same one gives the same splats."""
+    device: str | None = None
+    """Warp device, for example cpu or cuda:0."""
+
+    def run(self) -> int:
+        """Sample, fit, write; return the exit code."""
+        out = self.out if self.out is not None else self.mesh.with_name(f"{self.mesh.stem}_splats.ply")
+        _check_target(out)
+        if self.size is not None and not 0.0 < self.size < float("inf"):
+            raise ConfigError(f"size must be a finite number > 0, got {self.size}", hint="give it in metres, like 0.08")
+        if self.count < 1:
+            raise ConfigError(f"count must be at least 1, got {self.count}", hint="give a number of splats like 10000")
+
+        from tqdm import tqdm
+
+        from softmode.cli.common import bar_interval, quiet_warp, warp_device
+        from softmode.objects.mesh_file import read_mesh
+        from softmode.splats.formats import write_splats
+
+        with quiet_warp():
+            from softmode.objects.mesh_fit import FitOptions, splats_from_mesh
+
+            options = FitOptions(
+                iterations=self.iterations,
+                size=self.pixels,
+                view_count=self.views,
+                held_out_count=max(self.views // 4, 1),
+                seed=self.seed,
+            )
+            mesh = read_mesh(self.mesh)
+            print(f"{mesh.name}: {len(mesh.corners)} triangles, {len(mesh.textures)} textures", flush=True)
+            with tqdm(total=options.iterations, desc="fitting", unit="step", mininterval=bar_interval()) as bar:
+
+                def advance(done: int, loss: float) -> None:
+                    bar.set_postfix_str(f"loss {loss:.2e}", refresh=False)
+                    bar.update(done - bar.n)
+
+                fit = splats_from_mesh(
+                    mesh, count=self.count, options=options, device=warp_device(self.device), progress=advance
+                )
+        splats = fit.splats
+        if self.size is not None:
+            low, high = splats.bounds()
+            extent = float((high - low).max())
+            splats = splats.transformed(scale=self.size / extent)
+        write_splats(out, splats)
+        print(
+            f"PSNR over {options.held_out_count} held-out views of {options.size} px: "
+            f"{fit.history[0][1]:.1f} dB sampled, {fit.psnr:.1f} dB fitted"
+        )
+        print(f"wrote {splats.count} splats to {out}")
+        return 0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SplatInfo:
+    """Print what a splat file holds."""
+
+    file: Path
+    """The splat file."""
+
+    def run(self) -> int:
+        """Print count, degree, box, scales and opacities."""
+        import numpy as np
+
+        from softmode.splats.formats import read_splats
+
+        splats = read_splats(self.file)
+        low, high = splats.bounds()
+        deciles = [0.1, 0.5, 0.9]
+
+        def row(values: object, digits: int = 4) -> str:
+            return "  ".join(f"{value:.{digits}g}" for value in np.ravel(np.asarray(values)))
+
+        print(f"splats      {splats.count}")
+        print(f"sh degree   {splats.sh_degree}")
+        print(f"centres     {row(low)}  to  {row(high)}")
+        print(f"98 % within {row(splats.bounds(quantile=0.01)[0])}  to  {row(splats.bounds(quantile=0.01)[1])}")
+        print(f"size        {row(high - low)}")
+        print(f"scales      {row(np.quantile(splats.scales.max(axis=1), deciles))}  (10, 50, 90 %, longest axis)")
+        print(f"flatness    {row(np.median(splats.scales.min(axis=1) / splats.scales.max(axis=1)))}")
+        print(f"opacities   {row(np.quantile(splats.opacities, deciles))}  (10, 50, 90 %)")
+        return 0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SplatConvert:
+    """Read a splat file and write it as another kind, named by the suffix."""
+
+    source: Path
+    """File to read."""
+    target: Path
+    """File to write: .ply, .compressed.ply, .splat, .spz, .usd, .usda or .usdc."""
+    up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] = "+z"
+    """Axis of the written file onto which +z of the read one is turned; +z leaves it."""
+
+    def run(self) -> int:
+        """Read and write."""
+        from softmode.splats.formats import read_splats, write_splats
+
+        _check_target(self.target)
+        splats = read_splats(self.source)
+        write_splats(self.target, splats, up=self.up)
+        print(f"wrote {splats.count} splats of degree {splats.sh_degree} to {self.target}")
+        return 0
+
+
+def _check_target(path: Path) -> None:
+    """Refuse a file that cannot be written before any work is done."""
+    from softmode.splats.formats import WRITABLE
+
+    if not path.name.lower().endswith(WRITABLE):
+        raise AssetError(
+            f"splat file {path}: cannot write {path.suffix or '(no suffix)'!r}",
+            hint=f"name it like toy.ply; writable are {', '.join(WRITABLE)}",
+        )
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        raise AssetError(f"splat file {path}: there is no folder {folder}", hint="make the folder first")
+    if path.is_dir() or not os.access(folder, os.W_OK):
+        raise AssetError(f"splat file {path}: cannot be written there", hint="choose another name or folder")

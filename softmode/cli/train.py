@@ -1,0 +1,196 @@
+"""The commands ``softmode train``, ``softmode evaluate`` and ``softmode export``."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+from softmode.cli.common import quiet_warp
+from softmode.errors import ConfigError, StorageError
+from softmode.learning.players import require_torch
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Train:
+    """Train a policy; several GPUs: torchrun --nproc-per-node 2 -m softmode.cli train ID --device cuda."""
+
+    env: str
+    """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
+    algo: Literal["ppo"] = "ppo"
+    """Algorithm."""
+    num_envs: int = 16
+    """Worlds of each process: 16 on a CPU, 4096 on a GPU."""
+    device: str = "cpu"
+    """cpu, cuda:0, or cuda under torchrun."""
+    seed: int = 0
+    """Seed of networks, exploration and worlds."""
+    obs_type: Literal["state", "pixels", "pixels_agent_pos"] | None = None
+    """What the policy sees; the environment's own choice if omitted."""
+    env_options: str = "{}"
+    """Further keyword arguments of the environment as JSON."""
+    total_steps: float | None = None
+    """Environment steps of all worlds together after which training ends; 1e7 if no limit is given."""
+    time_limit: float | None = None
+    """Seconds of training after which it ends."""
+    set: tuple[str, ...] = ()
+    """Hyperparameters other than the preset's, as NAME=VALUE, for example discount=0.97 hidden=[64,64]."""
+    run_dir: Path | None = None
+    """Folder of the run, not there yet; runs/<Env>/<time>[_name] if omitted."""
+    name: str | None = None
+    """Suffix of the folder's name."""
+    resume: bool = False
+    """Go on with the run in --run-dir after it was ended or killed."""
+    init: Path | None = None
+    """Checkpoint of the same environment whose networks training starts from."""
+    teacher: Path | None = None
+    """Checkpoint of a policy on the state of the same environment, whose actions one from pixels is drawn to."""
+    nan_guard: bool = False
+    """Check every observation and reward; dump the last steps of worlds that are not finite, and stop."""
+    eval_episodes: int = 200
+    """Episodes of the evaluation at the end; none with 0."""
+    checkpoint_seconds: float = 30.0
+    """Seconds between two checkpoints."""
+
+    def run(self) -> int:
+        """Train; return the exit code."""
+        require_torch()
+        from softmode.learning.train_options import TrainOptions
+        from softmode.learning.trainer import train
+
+        options = TrainOptions(
+            env=self.env,
+            num_envs=self.num_envs,
+            device=self.device,
+            seed=self.seed,
+            total_steps=None if self.total_steps is None else int(self.total_steps),
+            time_limit=self.time_limit,
+            env_options=self._env_options(),
+            overrides=parse_overrides(self.set),
+            run_dir=self.run_dir,
+            name=self.name,
+            resume=self.resume,
+            init=self.init,
+            teacher=self.teacher,
+            nan_guard=self.nan_guard,
+            eval_episodes=self.eval_episodes,
+            checkpoint_seconds=self.checkpoint_seconds,
+        )
+        with quiet_warp():
+            try:
+                train(options, report=lambda line: print(line, flush=True))
+            except KeyboardInterrupt:
+                return 130
+        return 0
+
+    def _env_options(self) -> dict[str, Any]:
+        options = parse_env_options(self.env_options)
+        return options if self.obs_type is None else {**options, "obs_type": self.obs_type}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Evaluate:
+    """Play whole episodes with a trained policy and print how often it succeeds."""
+
+    env: str
+    """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
+    policy: Path
+    """Checkpoint of a run, for example best.npz."""
+    episodes: int = 200
+    """Number of episodes."""
+    num_envs: int = 16
+    """Worlds that play them."""
+    device: str = "cpu"
+    """cpu or cuda:0."""
+    seed: int = 1_000_000_000
+    """Seed of the first world; the others' count up."""
+    obs_type: Literal["state", "pixels", "pixels_agent_pos"] | None = None
+    """What the policy sees; as in its run if omitted."""
+    env_options: str = "{}"
+    """Further keyword arguments of the environment as JSON."""
+
+    def run(self) -> int:
+        """Evaluate; return the exit code."""
+        require_torch()
+        from softmode.learning.distributed import local_device
+        from softmode.learning.environments import make_vector_env
+        from softmode.learning.policy import evaluate, load_policy
+
+        if self.num_envs < 1:
+            raise ConfigError(f"num_envs must be at least 1, got {self.num_envs}", hint="give a count like 16")
+        policy = load_policy(self.policy, self.device)
+        options = {**policy.env_options, **parse_env_options(self.env_options)}
+        if self.obs_type is not None:
+            options["obs_type"] = self.obs_type
+        device = local_device(self.device)
+        with quiet_warp():
+            env = make_vector_env(self.env, self.num_envs, device, options)
+            try:
+                policy.check(env)
+                print(evaluate(env, policy, self.episodes, seed=self.seed, device=device))
+            finally:
+                env.close()
+        return 0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write the policy of a run's checkpoint to a file of its own, without optimizer and critic."""
+
+    checkpoint: Path
+    """Checkpoint of a run, for example best.npz."""
+    out: Path
+    """File to write (.npz), not there yet; play, evaluate, --init and --teacher read it."""
+
+    def run(self) -> int:
+        """Write the file; return the exit code."""
+        require_torch()
+        from softmode.learning.checkpoints import policy_only, read_checkpoint, write_checkpoint
+        from softmode.learning.policy import load_policy
+
+        if self.out.exists():
+            raise ConfigError(f"{self.out} exists", hint="remove it, or write another file")
+        load_policy(self.checkpoint)  # refuses a file whose actor does not fit its header
+        try:
+            self.out.parent.mkdir(parents=True, exist_ok=True)
+            write_checkpoint(policy_only(read_checkpoint(self.checkpoint)), self.out)
+        except OSError as error:
+            raise StorageError(
+                f"{self.out} cannot be written ({error.strerror or error})", hint="choose another folder"
+            ) from error
+        print(f"{self.out}: {self.out.stat().st_size / 1e3:.0f} kB")
+        return 0
+
+
+def parse_env_options(text: str) -> dict[str, Any]:
+    """Return the keyword arguments in a JSON object.
+
+    Raises:
+        ConfigError: If it is none.
+    """
+    try:
+        options = json.loads(text)
+    except ValueError as error:
+        raise ConfigError(f"env-options is no JSON ({error})", hint='write it like {"obs_type": "state"}') from error
+    if not isinstance(options, dict):
+        raise ConfigError("env-options is no JSON object", hint='write it like {"obs_type": "state"}')
+    return options
+
+
+def parse_overrides(pairs: tuple[str, ...]) -> dict[str, Any]:
+    """Return the values of NAME=VALUE pairs; a value is JSON, or a word.
+
+    Raises:
+        ConfigError: If a pair is none.
+    """
+    overrides: dict[str, Any] = {}
+    for pair in pairs:
+        name, equals, text = pair.partition("=")
+        if not equals or not name:
+            raise ConfigError(f"{pair!r} is no NAME=VALUE", hint="write it like discount=0.97")
+        try:
+            overrides[name.replace("-", "_")] = json.loads(text)
+        except ValueError:
+            overrides[name.replace("-", "_")] = text
+    return overrides

@@ -1,0 +1,143 @@
+"""The command ``softmode view``: a soft object or an environment in the browser, to pull, pin and tune."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import sys
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from softmode import ENVIRONMENTS
+from softmode.errors import AssetError, ConfigError
+
+if TYPE_CHECKING:
+    from softmode.view.session import LiveSession
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class View:
+    """Show a soft object or an environment in the browser; pull and pin it with the mouse, tune it with sliders."""
+
+    target: tuple[str, ...]
+    """An environment's id, or the file of a splat, a mesh, a saved body (.npz) or an OpenUSD stage; the built-in plush
+    if omitted."""
+    scene: Literal["hang", "drop"] = "hang"
+    """An object hangs, held by one end, or drops on a table."""
+    hold: Literal["top", "base"] = "top"
+    """Which end of a hanging object is held."""
+    size: float | None = None
+    """Longest edge of an object [m]."""
+    policy: str = "scripted"
+    """What moves the arm of an environment: scripted, random, zero, or the checkpoint of a run."""
+    seed: int = 0
+    """Seed of an environment's first episode."""
+    host: str = "127.0.0.1"
+    """Address to listen at. Anyone who reaches it may drive the session; the default is this machine alone."""
+    port: int = 8080
+    """Port to listen at; 0 for any free one."""
+    open: bool = True
+    """Open a browser, where there is a display."""
+    duration: float | None = None
+    """Seconds after which to end; until Ctrl-C if omitted."""
+    frame_rate: float = 30.0
+    """Pictures per second."""
+    record_folder: Path = Path("out")
+    """Where recordings are written."""
+    record_as: Literal["mp4", "npz", "usdc"] = "mp4"
+    """What the button records: a video, coordinates, or an OpenUSD stage (extra [usd])."""
+    device: str | None = None
+    """Warp device, for example cpu or cuda:0."""
+
+    def run(self) -> int:
+        """Serve; return the exit code."""
+        return view(self)
+
+
+def view(options: View) -> int:
+    """Serve a session until Ctrl-C; see :class:`View`."""
+    from softmode.view.app import ViewApp, ViewOptions
+
+    if options.duration is not None and not 0.0 < options.duration < float("inf"):
+        raise ConfigError(f"duration must be a finite number > 0, got {options.duration}", hint="give seconds, like 60")
+    served = ViewOptions(
+        host=options.host,
+        port=options.port,
+        frame_rate=options.frame_rate,
+        record_folder=options.record_folder,
+        record_as=options.record_as,
+    )
+    served.check()  # a building that takes a minute need not come first
+    from softmode.cli.common import quiet_warp
+
+    with quiet_warp():
+        session = _session(options)
+        try:
+            with ViewApp(session, served) as app:
+                print(f"softmode: open {app.url} in a browser; Ctrl-C ends it", flush=True)
+                if not served.is_local:
+                    print(
+                        f"softmode: warning: listening at {options.host}: anyone who reaches port "
+                        f"{app.url.rpartition(':')[2]} of this machine can drive this session, without a password",
+                        file=sys.stderr,
+                    )
+                if options.open:
+                    _open(app.url)
+                try:
+                    app.run(options.duration)
+                except KeyboardInterrupt:
+                    print("softmode: stopped", file=sys.stderr)
+                if session.status().recording:
+                    print(f"softmode: wrote {session.stop_recording()}")
+        except KeyboardInterrupt:
+            print("softmode: stopped", file=sys.stderr)
+        finally:
+            session.close()
+    return 0
+
+
+def _session(options: View) -> LiveSession:
+    """Make the session that was asked for."""
+    from gymnasium.envs.registration import registry
+
+    from softmode.cli.common import BuildBar, warp_device
+    from softmode.envs.catalogue import registered_id
+    from softmode.view.session import LiveSession
+
+    if len(options.target) > 1:
+        raise ConfigError(f"{len(options.target)} things to show: {', '.join(options.target)}", hint="name one")
+    device, target = warp_device(options.device), next(iter(options.target), None)
+    with BuildBar() as progress:
+        missing = target is not None and not Path(target).exists()
+        if target is not None and missing and (target.startswith("softmode/") or ":" in target or target in registry):
+            registered_id(target)
+            _refuse(options, ("scene", "hold", "size"), "an environment")
+            return LiveSession.from_env(
+                target, policy=options.policy, seed=options.seed, device=device, progress=progress
+            )
+        if missing:
+            raise AssetError(
+                f"{target} is neither a file nor an environment",
+                hint=f"give a splat, mesh or .npz file, or one of {', '.join(ENVIRONMENTS)}",
+            )
+        _refuse(options, ("policy", "seed"), "an object")
+        return LiveSession.from_object(
+            target, scene=options.scene, hold=options.hold, size=options.size, device=device, progress=progress
+        )
+
+
+def _refuse(options: View, names: tuple[str, ...], what: str) -> None:
+    """Refuse options that say nothing about what is shown."""
+    for field in dataclasses.fields(View):
+        if field.name in names and getattr(options, field.name) != field.default:
+            raise ConfigError(f"--{field.name} says nothing about {what}", hint=f"leave --{field.name} out")
+
+
+def _open(url: str) -> None:
+    """Open a browser without waiting for it, where there is a display."""
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        return
+    import webbrowser
+
+    threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()

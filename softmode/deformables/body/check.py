@@ -1,0 +1,95 @@
+"""What must hold of a reduced body's fields, whoever made them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from softmode.errors import BasisError
+
+if TYPE_CHECKING:
+    from softmode.deformables.body.reduced_body import ReducedBody
+
+_KINDS = {
+    "name": str,
+    "volume": float,
+    "kernel": str,
+    "length": float,
+    "driven_count": int,
+    "region_names": tuple,
+    "fingerprint": str,
+    "provenance": dict,
+    "build_seconds": float,
+}
+_FLOAT32 = ("grad_basis", "surface_basis")
+_INDICES = ("handle_degrees", "handle_regions", "core_index", "region_index")
+
+
+def check_body(body: ReducedBody) -> None:
+    """Verify types, shapes, dtypes, ranges, finiteness and the weights' sum.
+
+    Raises:
+        BasisError: If any is wrong.
+    """
+    for name, kind in _KINDS.items():
+        if not isinstance(getattr(body, name), kind):
+            raise BasisError(f"{name}: expected {kind.__name__}, got {type(getattr(body, name)).__name__}")
+    p, s, n, k = (len(v) for v in (body.points, body.surface_points, body.mean_basis, body.centres))
+    m, j, raw = len(body.eigenvalues), len(body.handle_degrees), len(body.transform)
+    r, regions, cores, samples = body.driven_count, len(body.region_names), len(body.core_index), len(body.region_index)
+    expected = {
+        "points": (p, 3),
+        "weights": (p,),
+        "grad_basis": (p, n, 3),
+        "stiffness_scale": (p,),
+        "surface_points": (s, 3),
+        "surface_normals": (s, 3),
+        "surface_areas": (s,),
+        "surface_basis": (s, n),
+        "mean_basis": (n,),
+        "linear_coordinates": (n, 4),
+        "eigenvalues": (m,),
+        "bounds": (2, 3),
+        "offset": (3,),
+        "centres": (k, 3),
+        "radii": (k,),
+        "handles": (k, j),
+        "handle_degrees": (j,),
+        "handle_regions": (j,),
+        "transform": (raw, n),
+        "region_stiffness": (regions,),
+        "region_radii": (regions,),
+        "region_cores": (cores, 2, 3),
+        "core_index": (cores,),
+        "region_points": (samples, 3),
+        "region_index": (samples,),
+        "region_weights": (samples,),
+        "drive": (r, samples),
+        "drive_affine": (regions, r, 4),
+    }
+    for name, shape in expected.items():
+        value = getattr(body, name)
+        dtype = np.float32 if name in _FLOAT32 else np.int64 if name in _INDICES else np.float64
+        if value.shape != shape or value.dtype != dtype:
+            raise BasisError(f"{name}: expected {np.dtype(dtype)} {shape}, got {value.dtype} {value.shape}")
+        if not np.isfinite(value).all():
+            raise BasisError(f"{name}: not all finite")
+    if not (body.volume > 0.0 and (body.weights >= 0.0).all() and abs(body.weights.sum() / body.volume - 1.0) < 1e-6):
+        raise BasisError(f"weights: expected >= 0 with sum {body.volume}, got sum {body.weights.sum()}")
+    if not 0 <= r <= n:
+        raise BasisError(f"driven_count: expected 0..{n}, got {r}")
+    exact = int((body.region_stiffness == 0.0).sum())
+    ranges = {
+        "handle_degrees": (0, 2),
+        "handle_regions": (-1, exact - 1),
+        "core_index": (0, regions - 1),
+        "region_index": (0, regions - 1),
+    }
+    for name, (low, high) in ranges.items():
+        value = getattr(body, name)
+        if len(value) and not (low <= value.min() and value.max() <= high):
+            raise BasisError(f"{name}: expected {low}..{high}, got {value.min()}..{value.max()}")
+    counts = np.array([1, 4, 10])[body.handle_degrees]
+    if counts.sum() != raw or set(body.core_index) != set(range(regions)):
+        raise BasisError(f"transform: expected {counts.sum()} rows and a core for each region, got {raw} rows")

@@ -1,0 +1,309 @@
+"""ReducedBody: the frozen, saveable product of the build.
+
+x(X) = X + sum_k b_k(X) q_k in the body frame (origin: centre of mass). The functions b_k are combinations of the
+skinning products W_j times monomials, orthonormal in the mass inner product (1 / V) sum_p V_p rho_p b_k b_l = delta_kl.
+So the kinetic energy is mass / 2 |qdot|^2 and |q| is the rms displacement in metres. Every affine motion is exact.
+
+Without exact regions b_0 = 1, b_1..b_3 are linear, and the others, free of mean and linear moment, are ordered by the
+mean square of their gradient. With them the first `driven_count` functions span every motion of the regions and the
+others vanish there: to hold or move a region exactly is to prescribe the first coordinates.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
+
+from softmode.deformables.body.check import check_body
+from softmode.deformables.body.file import read_body, write_body
+from softmode.deformables.body.regions import Envelope, Region
+from softmode.deformables.body.rkpm import BasisRKPM, KernelName
+from softmode.deformables.body.skinning_weights import SkinningWeights, enveloped
+from softmode.errors import BasisError, ConfigError
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Scalar = str | int | float | bool | None
+
+REACH = 0.35
+"""How far from its nearest kernel centre a point may lie, as a fraction of the kernel's support. Inside an object the
+ratio stays under 0.3; beyond, the functions grow as extrapolated polynomials do (tenfold at 0.5), so they are held
+constant."""
+_CHUNK = 16384
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReducedBody:
+    """A deformable body ready to simulate: arrays only, float64 unless said, body frame, SI units."""
+
+    name: str
+    """Name for messages and reports."""
+    points: Array
+    """Cubature points [m], shape (P, 3)."""
+    weights: Array
+    """Their volumes [m^3], > 0, sum = `volume`, shape (P,)."""
+    grad_basis: NDArray[np.float32]
+    """Gradients of the functions at the cubature points [1/m], shape (P, n, 3), float32."""
+    stiffness_scale: Array
+    """Young's modulus relative to the body's, shape (P,)."""
+    surface_points: Array
+    """Surface samples [m], shape (S, 3)."""
+    surface_normals: Array
+    """Outward unit normals, shape (S, 3)."""
+    surface_areas: Array
+    """Areas [m^2], sum = surface area, shape (S,)."""
+    surface_basis: NDArray[np.float32]
+    """Functions at the surface samples, shape (S, n), float32."""
+    volume: float
+    """Volume [m^3]."""
+    mean_basis: Array
+    """(1/V) sum V_p rho_p b_k over the full quadrature, shape (n,); gravity acts as mass * g * mean_basis_k."""
+    linear_coordinates: Array
+    """Coefficients c (n, 4) with sum_k b_k c_kj = (X, Y, Z, 1)_j for every X."""
+    eigenvalues: Array
+    """Eigenvalues of the skinning eigenmodes [1/m^2], the constant handle's 0 first, shape (m + 1,)."""
+    bounds: Array
+    """Corners of the bounding box in the body frame [m], shape (2, 3)."""
+    offset: Array
+    """Origin of the body frame in asset coordinates [m]: X_body = X_asset - offset, shape (3,)."""
+    centres: Array
+    """Kernel centres [m], shape (K, 3)."""
+    radii: Array
+    """Nominal kernel radii [m], shape (K,)."""
+    kernel: KernelName
+    """Bell of the kernels."""
+    handles: Array
+    """Coefficients of the weights W_j in the kernels, shape (K, J): constant handle, regions, eigenmodes, responses."""
+    handle_degrees: Indices
+    """Degree of the monomials each weight carries, 0 (translation), 1 (affine) or 2 (quadratic), int64, shape (J,)."""
+    handle_regions: Indices
+    """Exact region whose blend is part of a weight, counted among the exact ones, or -1, int64, shape (J,)."""
+    transform: Array
+    """b = (W_0 Z, ..., W_J Z) @ transform, Z monomials in (X, Y, Z) over `length`; shape (raw functions, n)."""
+    length: float
+    """Unit of length of the raw functions [m]."""
+    driven_count: int
+    """Number r of driven functions: the first r take every value on the exact regions, the others vanish there."""
+    region_names: tuple[str, ...]
+    """Names of the regions given at build time, R of them."""
+    region_stiffness: Array
+    """Stiffness kappa / E [1/m^2] of soft regions, 0 for exact ones, shape (R,)."""
+    region_radii: Array
+    """How far each region reaches beyond its cores [m], shape (R,)."""
+    region_cores: Array
+    """Boxes and points (boxes of no extent) that make up the regions [m], shape (C, 2, 3)."""
+    core_index: Indices
+    """Region of each core, int64, shape (C,)."""
+    region_points: Array
+    """Points that sample the regions [m], shape (N, 3)."""
+    region_index: Indices
+    """Region of each of these points, int64, shape (N,)."""
+    region_weights: Array
+    """Their volumes [m^3]; corners of exact regions have none; shape (N,)."""
+    drive: Array
+    """q[:r] = drive @ u for displacements u of the region points: least squares, shape (r, N)."""
+    drive_affine: Array
+    """q[:r] = sum_i drive_affine[i] @ vstack([(A_i - I)^T, t_i]) for regions moved by x = A_i X + t_i, (R, r, 4)."""
+    fingerprint: str
+    """sha256 of the quadrature, the fields, the options and the regions."""
+    provenance: dict[str, Scalar]
+    """What went in, what was measured, what was lost."""
+    build_seconds: float
+    """Wall time of the build [s]."""
+
+    @property
+    def function_count(self) -> int:
+        """Number of scalar functions n."""
+        return self.grad_basis.shape[1]
+
+    @property
+    def mode_count(self) -> int:
+        """Number of skinning eigenmodes m, without the constant handle."""
+        return len(self.eigenvalues) - 1
+
+    @property
+    def point_count(self) -> int:
+        """Number of cubature points P."""
+        return len(self.points)
+
+    @property
+    def surface_count(self) -> int:
+        """Number of surface samples S."""
+        return len(self.surface_points)
+
+    @cached_property
+    def regions(self) -> tuple[Region, ...]:
+        """The regions, in the body frame."""
+        found = []
+        for i, name in enumerate(self.region_names):
+            core = self.region_cores[self.core_index == i]
+            solid = len(core) == 1 and (core[0, 1] > core[0, 0]).any()
+            stiffness = float(self.region_stiffness[i]) or None
+            radius = float(self.region_radii[i])
+            form = {"box": core[0]} if solid else {"points": core[:, 0]}
+            found.append(Region(name=name, radius=radius, stiffness=stiffness, **form))
+        return tuple(found)
+
+    @cached_property
+    def _envelope(self) -> Envelope | None:
+        exact = tuple(region for region in self.regions if region.stiffness is None)
+        return Envelope(exact, self.length) if exact else None
+
+    @cached_property
+    def _kernels(self) -> tuple[BasisRKPM, KDTree]:
+        return BasisRKPM(centres=self.centres, radii=self.radii, kernel=self.kernel), KDTree(self.centres)
+
+    def evaluate(self, points: ArrayLike, *, outside: str = "clamp") -> tuple[Array, Array]:
+        """Evaluate the functions and their gradients at rest points of the body frame.
+
+        Args:
+            points: Rest positions [m], shape (N, 3).
+            outside: "clamp" continues the functions beyond the kernels' reach: affine motions exactly, all that is
+                orthogonal to them (in the coordinates) constant, from the nearest point within reach; "raise" refuses
+                such points.
+
+        Returns:
+            Values (N, n) and gradients [1/m] (N, n, 3).
+
+        Raises:
+            BasisError: If points are not finite, or out of reach with outside="raise".
+        """
+        x, inner, far = self._within_reach(points)
+        if outside not in ("clamp", "raise"):
+            raise ConfigError(f"outside: expected 'clamp' or 'raise', got {outside!r}")
+        if far.any() and outside == "raise":
+            raise BasisError(
+                f"points: {int(far.sum())} of {len(x)} lie outside the body (first: row {int(far.argmax())})",
+                hint="Drop them, or pass outside='clamp'.",
+            )
+        value = np.empty((len(x), self.function_count))
+        gradient = np.empty((len(x), self.function_count, 3))
+        for i in range(0, len(x), _CHUNK):
+            value[i : i + _CHUNK], gradient[i : i + _CHUNK] = self._evaluate_inside(inner[i : i + _CHUNK])
+        if far.any():
+            # The functions' content of (X, Y, Z, 1): rows of the left inverse of the linear coordinates.
+            content = np.linalg.solve(self.linear_coordinates.T @ self.linear_coordinates, self.linear_coordinates.T)
+            value[far] += (x[far] - inner[far]) @ content[:3]
+            gradient[far] = content[:3].T
+        return value, gradient
+
+    def skinning_weights(self, points: ArrayLike) -> tuple[Array, Array]:
+        """Evaluate the skinning weights W_j and their gradients at rest points of the body frame.
+
+        With T_j the map that handle j applies, x(X) = X + sum_j W_j(X) T_j(X) for points within the kernels' reach;
+        beyond it the weights are those of the nearest point within.
+
+        Args:
+            points: Rest positions [m], shape (N, 3).
+
+        Returns:
+            Weights (N, J), the constant handle's first, and gradients [1/m] (N, J, 3).
+
+        Raises:
+            BasisError: If points are not finite.
+        """
+        inner = self._within_reach(points)[1]
+        weight = np.empty((len(inner), len(self.handle_degrees)))
+        gradient = np.empty((*weight.shape, 3))
+        for i in range(0, len(inner), _CHUNK):
+            weight[i : i + _CHUNK], gradient[i : i + _CHUNK] = self._weights_inside(inner[i : i + _CHUNK])
+        return weight, gradient
+
+    def _within_reach(self, points: ArrayLike) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Return the points, the nearest ones to them within the kernels' reach, and which differ."""
+        x = np.asarray(points, dtype=np.float64)
+        if x.ndim != 2 or x.shape[1] != 3 or not np.isfinite(x).all():
+            raise BasisError(f"points: expected finite positions of shape (N, 3), got shape {x.shape}")
+        basis, tree = self._kernels
+        distance, nearest = tree.query(x)
+        ratio = distance / (REACH * basis.support[nearest])
+        far = ratio > 1.0
+        inner = np.where(
+            far[:, None], self.centres[nearest] + (x - self.centres[nearest]) / np.maximum(ratio, 1.0)[:, None], x
+        )
+        return x, inner, far
+
+    @cached_property
+    def _skin(self) -> SkinningWeights:
+        return SkinningWeights(coefficients=self.handles, degrees=self.handle_degrees, blends=self.handle_regions)
+
+    def _weights_inside(self, x: Array) -> tuple[Array, Array]:
+        """Evaluate weights (N, J) and gradients (N, J, 3) at points within reach."""
+        return self._skin.evaluate(*enveloped(self._kernels[0].evaluate(x), self._envelope))
+
+    def _evaluate_inside(self, x: Array) -> tuple[Array, Array]:
+        """Evaluate functions (N, n) and gradients (N, n, 3) at points within reach."""
+        weight, slope = self._weights_inside(x)
+        raw, raw_gradient = self._skin.products(weight, slope, x, self.length)
+        gradient = np.stack([raw_gradient[:, :, d] @ self.transform for d in range(3)], axis=2)
+        return raw @ self.transform, gradient
+
+    def covers(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Return which points (N, 3) the kernels reach, that is, which `evaluate` does not clamp."""
+        basis, tree = self._kernels
+        distance, nearest = tree.query(np.asarray(points, dtype=np.float64))
+        return distance <= REACH * basis.support[nearest]
+
+    def affine(self, matrix: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
+        """Return the coordinates q (n, 3) of x = A X + t, with A (3, 3) and t (3,) [m] in the body frame."""
+        a, t = np.asarray(matrix, dtype=np.float64), np.asarray(translation, dtype=np.float64)
+        if a.shape != (3, 3) or t.shape != (3,):
+            raise ConfigError(f"matrix (3, 3) and translation (3,): got shapes {a.shape} and {t.shape}")
+        return self.linear_coordinates @ np.vstack([(a - np.eye(3)).T, t])
+
+    def region_rows(self, name: str) -> NDArray[np.intp]:
+        """Return which rows of `region_points` sample a region.
+
+        Raises:
+            ConfigError: If the body has no region of that name.
+        """
+        if name not in self.region_names:
+            raise ConfigError(f"name: expected one of {self.region_names}, got {name!r}")
+        return np.flatnonzero(self.region_index == self.region_names.index(name))
+
+    def driven_coordinates(self, displacements: ArrayLike) -> Array:
+        """Return the driven coordinates (r, 3) [m] nearest to displacements (N, 3) [m] of the region points."""
+        u = np.asarray(displacements, dtype=np.float64)
+        if u.shape != self.region_points.shape:
+            raise ConfigError(f"displacements: expected shape {self.region_points.shape}, got {u.shape}")
+        return self.drive @ u
+
+    def driven_affine(self, matrices: ArrayLike, translations: ArrayLike) -> Array:
+        """Return the driven coordinates (r, 3) [m] of regions moved by x = A X + t, each its own, body frame.
+
+        Args:
+            matrices: A of every region, shape (R, 3, 3); those of soft regions are not used.
+            translations: t of every region [m], shape (R, 3).
+        """
+        a, t = np.asarray(matrices, dtype=np.float64), np.asarray(translations, dtype=np.float64)
+        count = len(self.region_names)
+        if a.shape != (count, 3, 3) or t.shape != (count, 3):
+            raise ConfigError(f"matrices ({count}, 3, 3), translations ({count}, 3): got {a.shape} and {t.shape}")
+        motion = np.concatenate([(a - np.eye(3)).transpose(0, 2, 1), t[:, None]], axis=1)
+        return np.einsum("irk,ikc->rc", self.drive_affine, motion)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write an .npz without pickle; the file appears complete or not at all."""
+        write_body(self, path)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> ReducedBody:
+        """Read a file written by `save`.
+
+        Raises:
+            AssetError: If the file is missing, damaged, foreign, or of another version.
+        """
+        return read_body(cls, path)
+
+    def check(self) -> None:
+        """Verify shapes, dtypes, finiteness and the weights' sum.
+
+        Raises:
+            BasisError: If any is wrong.
+        """
+        check_body(self)

@@ -1,0 +1,215 @@
+"""The basis of a body: from quadrature points and regions to orthonormal functions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softmode.deformables.body.regions import Envelope, Region
+from softmode.deformables.body.rkpm import BasisRKPM, ShapeFunctions, make_basis
+from softmode.deformables.body.skinning_weights import SkinningWeights, enveloped
+from softmode.deformables.build.eigenmodes import solve_eigenmodes
+from softmode.deformables.build.functions import Functions, orthonormalise
+from softmode.deformables.build.galerkin import mass_matrix
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.region_samples import RegionSamples, drive_matrices
+from softmode.deformables.build.static_response import lame_parameters, solve_harmonic_weights, solve_static_responses
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Domain:
+    """What the functions live on: quadrature and fields in the body frame, and the regions."""
+
+    points: Array
+    """Quadrature points, refined at the faces of exact regions [m], shape (P, 3)."""
+    volumes: Array
+    """Their volumes [m^3], shape (P,)."""
+    stiffness: Array
+    """Relative Young's modulus, shape (P,)."""
+    density: Array
+    """Relative density of volume mean one, shape (P,)."""
+    seeds: Array
+    """Points among which kernel centres are chosen [m], shape (S, 3)."""
+    spacing: float
+    """Spacing of the seeds [m]."""
+    length: float
+    """Unit of length [m]."""
+    regions: tuple[Region, ...]
+    """Regions."""
+    samples: RegionSamples
+    """Points of the regions."""
+
+    @property
+    def envelope(self) -> Envelope | None:
+        """The envelope of the exact regions, if any."""
+        exact = tuple(region for region in self.regions if region.stiffness is None)
+        return Envelope(exact, self.length) if exact else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class BodyBasis:
+    """Kernels, weights and functions of a body."""
+
+    kernels: BasisRKPM
+    """Reproducing kernels."""
+    weights: SkinningWeights
+    """Skinning weights."""
+    eigenvalues: Array
+    """Eigenvalues of the eigenmodes among them, the constant handle's 0 first [1/m^2], shape (m + 1,)."""
+    functions: Functions
+    """Orthonormal functions."""
+    gradient: Array
+    """Their gradients at the quadrature points [1/m], shape (P, n, 3)."""
+    drive: Array
+    """Driven coordinates from displacements of the region samples, shape (r, N)."""
+    drive_affine: Array
+    """Driven coordinates from affine motions of the regions, shape (R, r, 4)."""
+
+
+def make_body_basis(domain: Domain, options: BuildOptions, stage: Callable[[str], None]) -> BodyBasis:
+    """Build kernels, weights and functions.
+
+    Args:
+        domain: The object.
+        options: Sizes and seed.
+        stage: Called with the name of each stage when it is done.
+
+    Raises:
+        BasisError: If the basis cannot be built.
+        ConfigError: If options do not fit the object.
+    """
+    envelope, points, volumes, samples = domain.envelope, domain.points, domain.volumes, domain.samples
+    kernels = make_basis(
+        domain.seeds, options.kernel_count, kernel=options.kernel, spacing=domain.spacing, seed=options.seed
+    )
+    shape, blend, blend_slope = enveloped(kernels.evaluate(points), envelope)
+    stage("kernels")
+    springs, pull = _springs(kernels, domain)
+    mu, lame = lame_parameters(options.poissons_ratio)
+    scalar = 1.0 / (lame + 4.0 * mu)  # Of the weight-space Hessian, FreeForm eq. (35).
+    modes = solve_eigenmodes(
+        shape,
+        volumes,
+        options.mode_count,
+        stiffness_scale=domain.stiffness,
+        springs=None if springs is None else scalar * springs,
+        vanishing=envelope is not None,
+    )
+    stage("eigenmodes")
+    region_weights = _region_weights(
+        domain, shape, blend_slope, *(None if x is None else scalar * x for x in (springs, pull))
+    )
+    skin = _weights(domain, options, modes.coefficients, region_weights, shape, blend_slope.shape[1], springs)
+    stage("responses")
+    raw, raw_gradient = skin.products(*skin.evaluate(shape, blend, blend_slope), points, domain.length)
+    trace = None
+    if envelope is not None:
+        at = samples.points[samples.exact]
+        trace = skin.products(*skin.evaluate(*enveloped(kernels.evaluate(at), envelope)), at, domain.length)[0]
+    total = volumes.sum()
+    found = orthonormalise(
+        raw,
+        raw_gradient,
+        volumes * domain.density / total,
+        volumes * domain.stiffness / total,
+        leading=skin.leading,
+        length=domain.length,
+        kept=skin.translating,
+        held=bool(domain.regions),
+        rank_tolerance=options.rank_tolerance,
+        trace=trace,
+    )
+    driven = np.zeros((0, 0)) if trace is None else trace @ found.transform[:, : found.driven_count]
+    drive, drive_affine = drive_matrices(samples, driven, len(domain.regions))
+    gradient = np.stack([raw_gradient[:, :, d] @ found.transform for d in range(3)], axis=2)
+    stage("functions")
+    return BodyBasis(
+        kernels=kernels,
+        weights=skin,
+        eigenvalues=modes.eigenvalues,
+        functions=found,
+        gradient=gradient,
+        drive=drive,
+        drive_affine=drive_affine,
+    )
+
+
+def _springs(kernels: BasisRKPM, domain: Domain) -> tuple[Array | None, Array | None]:
+    """Return what soft regions add, per E: springs [m] (K, K), and their pull on the weights of regions [m] (K, R).
+
+    Columns of the pull: exact regions first, then soft ones, as `solve_harmonic_weights` wants them.
+    """
+    samples, envelope = domain.samples, domain.envelope
+    soft = np.flatnonzero(~samples.exact)
+    if not len(soft):
+        return None, None
+    stiffness = np.array([region.stiffness or 0.0 for region in domain.regions])[samples.index[soft]]
+    shape, blend, _ = enveloped(kernels.evaluate(samples.points[soft]), envelope)
+    own = samples.index[soft][:, None] == np.unique(samples.index[soft])
+    strength = stiffness * samples.weights[soft]
+    pull = shape.value.T @ (strength[:, None] * np.concatenate([-blend, own.astype(np.float64)], axis=1))
+    return mass_matrix(shape, strength), np.asarray(pull)
+
+
+def _region_weights(
+    domain: Domain, shape: ShapeFunctions, blend_slope: Array, springs: Array | None, pull: Array | None
+) -> Array:
+    """Return coefficients of the weights of all regions but the last, exact ones first, (K, R - 1).
+
+    The weights of all regions sum to one: beside the constant handle the last one adds nothing.
+    """
+    count = len(domain.regions) - 1
+    if count < 1:
+        return np.zeros((shape.centre_count, 0))
+    gradient = np.zeros((len(domain.points), count, 3))
+    exact = min(blend_slope.shape[1], count)
+    gradient[:, :exact] = blend_slope[:, :exact]
+    return solve_harmonic_weights(
+        shape,
+        domain.volumes,
+        blend_gradient=gradient,
+        stiffness_scale=domain.stiffness,
+        springs=springs,
+        spring_load=None if pull is None else pull[:, :count],
+    )
+
+
+def _weights(
+    domain: Domain,
+    options: BuildOptions,
+    modes: Array,
+    region_weights: Array,
+    shape: ShapeFunctions,
+    exact_count: int,
+    springs: Array | None,
+) -> SkinningWeights:
+    """Gather the weights: constant handle, regions, eigenmodes, static responses."""
+    degree = 1 if options.handles == "affine" else 2
+    region_count = region_weights.shape[1]
+    # Squares and products of coordinates do not vanish on a region: there the constant handle stays affine.
+    parts, degrees = [modes[:, :1], region_weights], [degree if exact_count == 0 else 1, *[1] * region_count]
+    parts.append(modes[:, 1:])
+    degrees += [degree] * (modes.shape[1] - 1)
+    if domain.regions and options.static_responses:
+        responses = solve_static_responses(
+            shape,
+            domain.volumes,
+            density=domain.density,
+            poissons_ratio=options.poissons_ratio,
+            stiffness_scale=domain.stiffness,
+            springs=springs,
+            derivative_count=options.response_derivatives,
+        )
+        parts.append(responses)
+        degrees += [0] * responses.shape[1]
+    blends = np.full(len(degrees), -1, dtype=np.int64)
+    exact = min(exact_count, region_count)
+    blends[1 : 1 + exact] = np.arange(exact)
+    return SkinningWeights(
+        coefficients=np.concatenate(parts, axis=1), degrees=np.array(degrees, dtype=np.int64), blends=blends
+    )

@@ -1,0 +1,234 @@
+"""The build of a body: kernels, weights, orthonormal functions, cubature; and the names users import."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import threadpool_limits
+
+from softmode.deformables.body.file import FORMAT_VERSION
+from softmode.deformables.body.reduced_body import ReducedBody, Scalar
+from softmode.deformables.body.regions import Region
+from softmode.deformables.build.basis import Domain, make_body_basis
+from softmode.deformables.build.cache import cache_directory, cached_body, fingerprint_of
+from softmode.deformables.build.cubature import select_cubature
+from softmode.deformables.build.options import BuildOptions, HandleName
+from softmode.deformables.build.quadrature_grid import Quadrature
+from softmode.deformables.build.region_samples import refine_at_faces, sample_regions
+from softmode.errors import MaterialError
+
+__all__ = [
+    "BuildOptions",
+    "HandleName",
+    "ReducedBody",
+    "Region",
+    "build_body",
+    "cache_directory",
+    "cached_body",
+    "fingerprint_of",
+]
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+
+_PROGRESS = {"kernels": 0.1, "eigenmodes": 0.2, "responses": 0.35, "functions": 0.45, "cubature": 0.95, "surface": 1.0}
+"""Fraction of a build that is done after each stage."""
+
+
+def build_body(
+    quadrature: Quadrature,
+    options: BuildOptions | None = None,
+    *,
+    name: str = "body",
+    regions: Sequence[Region] = (),
+    stiffness_scale: ArrayLike | None = None,
+    density_scale: ArrayLike | None = None,
+    progress: bool | Progress | None = None,
+) -> ReducedBody:
+    """Reduce an object: kernels, weights, orthonormal functions, cubature.
+
+    Args:
+        quadrature: The object.
+        options: Sizes and seed; defaults when None.
+        name: Name for messages and reports.
+        regions: Parts that a scene holds, moves or grasps. Exact ones get weights of their own (one on the region,
+            zero on the others) and all other weights vanish there, so that holding them costs no accuracy; soft ones
+            enter the weights as springs. The more of a scene's supports are known here, the better the body bends.
+        stiffness_scale: Young's modulus per quadrature point relative to the body's, shape (P,); ones when None.
+        density_scale: Density per quadrature point relative to any common reference, shape (P,); normalised to volume
+            mean 1.
+        progress: True or False shows a bar or not; None shows one on a terminal when the build exceeds two seconds; a
+            callable receives (stage, fraction done).
+
+    Returns:
+        The body, in the frame of its centre of mass.
+
+    Raises:
+        MaterialError: If a scale is not finite and positive.
+        BasisError: If the basis cannot be built, or a region holds too few points or overlaps another.
+        ConfigError: If options do not fit the object, or regions share a name.
+    """
+    # One BLAS thread: the matrices are small, threads that compete for a busy core cost tenfold, and their number would
+    # decide the last bits of the result.
+    with threadpool_limits(limits=1, user_api="blas"):
+        return _build(
+            quadrature, options or BuildOptions(), name, tuple(regions), stiffness_scale, density_scale, progress
+        )
+
+
+def _build(
+    quadrature: Quadrature,
+    options: BuildOptions,
+    name: str,
+    regions: tuple[Region, ...],
+    stiffness_scale: ArrayLike | None,
+    density_scale: ArrayLike | None,
+    progress: bool | Progress | None,
+) -> ReducedBody:
+    """Do what :func:`build_body` says."""
+    start = time.perf_counter()
+    stiffness = _positive_field("stiffness_scale", stiffness_scale, len(quadrature.points))
+    density = _positive_field("density_scale", density_scale, len(quadrature.points))
+    fingerprint = fingerprint_of(FORMAT_VERSION, quadrature, options, name, list(regions), stiffness, density)
+    density = density * (quadrature.volume / (quadrature.weights @ density))
+    mass = quadrature.weights * density / quadrature.volume
+    offset = mass @ quadrature.points
+    seeds, bounds = quadrature.points - offset, quadrature.bounds - offset
+    length = float(np.sqrt(mass @ (seeds**2).sum(axis=1)))
+    regions = tuple(region.moved(offset, bounds) for region in regions)
+    samples = sample_regions(regions, seeds, quadrature.weights, quadrature.spacing)
+    points, volumes, parent = refine_at_faces(regions, seeds, quadrature.weights, quadrature.spacing)
+    stiffness = stiffness[parent]
+    seconds: dict[str, float] = {}
+    with _reporter(progress, name) as report:
+
+        def stage(label: str) -> None:
+            seconds[label] = time.perf_counter() - start - sum(seconds.values())
+            report(label, _PROGRESS[label])
+
+        basis = make_body_basis(
+            Domain(
+                points=points,
+                volumes=volumes,
+                stiffness=stiffness,
+                density=density[parent],
+                seeds=seeds,
+                spacing=quadrature.spacing,
+                length=length,
+                regions=regions,
+                samples=samples,
+            ),
+            options,
+            stage,
+        )
+        count = len(points) if options.cubature_count is None else options.cubature_count
+        chosen = select_cubature(
+            volumes,
+            basis.gradient,
+            count,
+            stiffness_scale=stiffness,
+            driven_count=basis.functions.driven_count,
+            seed=options.seed,
+        )
+        stage("cubature")
+        function_count = basis.gradient.shape[1]
+        cores = [region.cores for region in regions]
+        body = ReducedBody(
+            name=name,
+            points=points[chosen.index],
+            weights=chosen.weights,
+            grad_basis=basis.gradient[chosen.index].astype(np.float32),
+            stiffness_scale=stiffness[chosen.index],
+            surface_points=quadrature.surface_points - offset,
+            surface_normals=quadrature.surface_normals.copy(),
+            surface_areas=quadrature.surface_areas.copy(),
+            surface_basis=np.zeros((len(quadrature.surface_points), function_count), dtype=np.float32),
+            volume=quadrature.volume,
+            mean_basis=basis.functions.mean,
+            linear_coordinates=basis.functions.linear,
+            eigenvalues=basis.eigenvalues,
+            bounds=bounds,
+            offset=offset,
+            centres=basis.kernels.centres,
+            radii=basis.kernels.radii,
+            kernel=options.kernel,
+            handles=basis.weights.coefficients,
+            handle_degrees=basis.weights.degrees,
+            handle_regions=basis.weights.blends,
+            transform=basis.functions.transform,
+            length=length,
+            driven_count=basis.functions.driven_count,
+            region_names=tuple(region.name for region in regions),
+            region_stiffness=np.array([region.stiffness or 0.0 for region in regions], dtype=np.float64),
+            region_radii=np.array([region.radius for region in regions], dtype=np.float64),
+            region_cores=np.concatenate([np.zeros((0, 2, 3)), *cores]),
+            core_index=np.repeat(np.arange(len(regions), dtype=np.int64), [len(core) for core in cores]),
+            region_points=samples.points,
+            region_index=samples.index,
+            region_weights=samples.weights,
+            drive=basis.drive,
+            drive_affine=basis.drive_affine,
+            fingerprint=fingerprint,
+            provenance={},
+            build_seconds=0.0,
+        )
+        surface = body.evaluate(body.surface_points)[0]
+        stage("surface")
+    provenance: dict[str, Scalar] = {
+        **{f"quadrature_{key}": v for key, v in quadrature.report.items() if isinstance(v, str | int | float | bool)},
+        **{f"option_{key}": v for key, v in dataclasses.asdict(options).items()},
+        **{f"seconds_{key}": v for key, v in seconds.items()},
+        "quadrature_count": len(points),
+        "function_count": function_count,
+        "dropped_functions": len(basis.weights.owner) - function_count,
+        "heterogeneous": stiffness_scale is not None or density_scale is not None,
+        "cubature_count": len(chosen.index),
+        "cubature_force_error": chosen.force_error,
+        "cubature_stiffness_error": chosen.stiffness_error,
+        "soft_mode_error": chosen.soft_mode_error,
+        **{f"cubature_force_error_{size}": error for size, error in chosen.trade_off.items()},
+    }
+    return dataclasses.replace(
+        body,
+        surface_basis=surface.astype(np.float32),
+        provenance=provenance,
+        build_seconds=time.perf_counter() - start,
+    )
+
+
+def _positive_field(name: str, value: ArrayLike | None, count: int) -> Array:
+    if value is None:
+        return np.ones(count)
+    found = np.array(value, dtype=np.float64)
+    if found.shape != (count,):
+        raise MaterialError(f"{name}: expected one value per quadrature point, shape ({count},), got {found.shape}")
+    if not (np.isfinite(found).all() and (found > 0.0).all()):
+        bad = int(np.flatnonzero(~(np.isfinite(found) & (found > 0.0)))[0])
+        raise MaterialError(f"{name}: expected finite values > 0, got {found[bad]} at row {bad}")
+    return found
+
+
+@contextlib.contextmanager
+def _reporter(progress: bool | Progress | None, name: str) -> Iterator[Progress]:
+    if callable(progress):
+        yield progress
+        return
+    shown = progress if progress is not None else sys.stderr.isatty()
+    if not shown:
+        yield lambda stage, fraction: None
+        return
+    from tqdm import tqdm
+
+    with tqdm(total=100, desc=f"build {name}", delay=0.0 if progress else 2.0, unit="%", leave=False) as bar:
+
+        def report(stage: str, fraction: float) -> None:
+            bar.set_postfix_str(stage, refresh=False)
+            bar.update(round(100.0 * fraction) - bar.n)
+
+        yield report

@@ -1,0 +1,120 @@
+"""The cache of built bodies: a folder of files named by the fingerprint of what went in."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softmode.deformables.body.file import FORMAT_VERSION
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.errors import AssetError, ConfigError
+
+
+def cached_body(
+    key: tuple[Any, ...], build: Callable[[], ReducedBody], *, directory: str | os.PathLike[str] | None = None
+) -> ReducedBody:
+    """Return the body stored under a key, building it once when it is absent or damaged.
+
+    Processes that ask for one key at a time wait for the first: a lock file guards the build, an atomic rename
+    publishes it.
+
+    Args:
+        key: Everything the result depends on; see `fingerprint_of` for what can be hashed.
+        build: Called without arguments when the cache has no usable entry.
+        directory: Cache folder; default is `cache_directory()` / "bodies".
+
+    Returns:
+        The body.
+    """
+    folder = Path(directory) if directory is not None else cache_directory() / "bodies"
+    path = folder / f"{fingerprint_of(FORMAT_VERSION, *key)}.npz"
+    with contextlib.suppress(AssetError):
+        return ReducedBody.load(path)
+    folder.mkdir(parents=True, exist_ok=True)
+    with _locked(path.with_suffix(".lock")):
+        with contextlib.suppress(AssetError):
+            return ReducedBody.load(path)
+        body = build()
+        body.save(path)
+    return body
+
+
+def cache_directory() -> Path:
+    """Return the user's cache folder: the environment variable SOFTMODE_CACHE, or ~/.cache/softmode."""
+    override = os.environ.get("SOFTMODE_CACHE")
+    return Path(override) if override else Path.home() / ".cache" / "softmode"
+
+
+def fingerprint_of(*values: Any) -> str:
+    """Return the sha256 of nested scalars, strings, bytes, files (paths), arrays, dataclasses, sequences, mappings."""
+    digest = hashlib.sha256()
+    for value in values:
+        _feed(digest, value)
+    return digest.hexdigest()
+
+
+def _feed(digest: Any, value: Any) -> None:
+    if isinstance(value, np.ndarray):
+        digest.update(f"array {value.dtype.str} {value.shape};".encode())
+        digest.update(np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, Path):
+        digest.update(f"file {value.stat().st_size};".encode())
+        digest.update(value.read_bytes())
+    elif isinstance(value, bytes):
+        digest.update(f"bytes {len(value)};".encode() + value)
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        digest.update(f"{type(value).__name__};".encode())
+        for f in dataclasses.fields(value):
+            _feed(digest, f.name)
+            _feed(digest, getattr(value, f.name))
+    elif isinstance(value, dict):
+        digest.update(f"dict {len(value)};".encode())
+        for key in sorted(value, key=str):
+            _feed(digest, str(key))
+            _feed(digest, value[key])
+    elif isinstance(value, list | tuple):
+        digest.update(f"sequence {len(value)};".encode())
+        for item in value:
+            _feed(digest, item)
+    elif value is None or isinstance(value, str | bool | int | float | np.generic):
+        item = value.item() if isinstance(value, np.generic) else value
+        digest.update(f"{type(item).__name__} {item!r};".encode())
+    else:
+        raise ConfigError(f"key: cannot take the fingerprint of a {type(value).__name__}")
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Hold an exclusive lock on a file; the system releases it if the process dies."""
+    with open(path, "a+b") as file:
+        if sys.platform == "win32":
+            import msvcrt
+
+            while True:
+                try:
+                    msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)
+                    break
+                except OSError:
+                    time.sleep(0.05)
+            try:
+                yield
+            finally:
+                file.seek(0)
+                msvcrt.locking(file.fileno(), msvcrt.LK_UNLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX)
+            try:
+                yield
+            finally:
+                fcntl.flock(file, fcntl.LOCK_UN)

@@ -1,0 +1,1 @@
+"""Gaps, normals, friction memory and energies of touching surfaces."""

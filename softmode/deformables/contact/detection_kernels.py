@@ -1,0 +1,585 @@
+"""Detection of contact between surface samples and the rigid shapes of the Newton model, once per step.
+
+Every sample is tested against the shapes near its body; gap, normal and lever arm are frozen for the step and become
+*entries*, the point constraints of the step (see ``contact`` for their energy): first the pins of the instance, then
+its contacts in sample order.
+
+The queries are ours because Newton's public ``sdf_*`` functions come without their gradients, and because its soft
+contact records are appended by an atomic counter: fixed slots per sample keep the order, and so the bits, reproducible.
+"""
+
+import warp as wp
+
+from softmode.deformables.contact.penalty_kernels import stiffness_per_area
+from softmode.deformables.contact.shape_query_kernels import (
+    HEIGHTFIELD,
+    PLANE,
+    Heightfields,
+    SurfaceQuery,
+    query_heightfield,
+    query_shape,
+)
+from softmode.deformables.model.lane_kernels import barrier
+from softmode.deformables.model.status import WORLD_CONTACT_OVERFLOW
+from softmode.deformables.model.struct_kernels import (
+    OVERLAP,
+    SLOTS,
+    Basis,
+    Entries,
+    Instances,
+    Motion,
+    Rigid,
+    Samples,
+    interpolate,
+    interpolate_change,
+    mat23d,
+    sample_area,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+OPPOSED = wp.constant(0.3)
+"""Cosine beyond which a direction counts as against a normal."""
+
+
+@wp.struct
+class Shapes:
+    """The rigid shapes of the model and where their bodies are at the start of the step."""
+
+    kind: wp.array[int]
+    scale: wp.array[wp.vec3]
+    source: wp.array[wp.uint64]
+    fields: Heightfields
+    margin: wp.array[float]
+    lower: wp.array[wp.vec3]  # bounds in the shape's frame [m]
+    upper: wp.array[wp.vec3]
+    body: wp.array[int]
+    transform: wp.array[wp.transform]
+    friction: wp.array[float]
+    body_q: wp.array[wp.transform]
+    body_qd: wp.array[wp.spatial_vector]
+    body_com: wp.array[wp.vec3]
+    body_mass: wp.array[float]  # [kg]
+
+
+@wp.kernel
+def place_samples(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    # Out:
+    samples: Samples,
+):
+    """Compute where the surface samples are at the start of the step and how far they would drift during it."""
+    i, s = wp.tid()
+    if s >= instances.sample_count[i]:
+        return
+    row = instances.row_start[i] + s
+    n = instances.function_count[i]
+    samples.position[i, s] = basis.row_point[row] + interpolate(basis.row, row, motion.q_start, i, n)
+    samples.drift[i, s] = wp.vec3(interpolate_change(basis.row, row, motion.q_inertial, motion.q_start, i, n))
+
+
+@wp.kernel
+def bound_samples(
+    instances: Instances,
+    team: int,
+    # In and out:
+    samples: Samples,
+):
+    """Bound the samples of an instance, grown by margin and drift."""
+    i, lane = wp.tid()
+    lower = wp.vec3(1.0e30)
+    upper = wp.vec3(-1.0e30)
+    drift_lower = wp.vec3(1.0e30)
+    drift_upper = wp.vec3(-1.0e30)
+    reach = float(0.0)
+    for s in range(lane, instances.sample_count[i], team):
+        x = wp.vec3(samples.position[i, s])
+        drift = samples.drift[i, s]
+        lower = wp.min(lower, x)
+        upper = wp.max(upper, x)
+        drift_lower = wp.min(drift_lower, drift)
+        drift_upper = wp.max(drift_upper, drift)
+        reach = wp.max(reach, wp.length(drift))
+    samples.reach[i, lane, 0] = lower - wp.vec3(2.0 * reach)
+    samples.reach[i, lane, 1] = upper + wp.vec3(2.0 * reach)
+    samples.reach[i, lane, 2] = drift_lower
+    samples.reach[i, lane, 3] = drift_upper
+    barrier()
+    if lane != 0:
+        return
+    lower = samples.reach[i, 0, 0]
+    upper = samples.reach[i, 0, 1]
+    for k in range(1, team):
+        lower = wp.min(lower, samples.reach[i, k, 0])
+        upper = wp.max(upper, samples.reach[i, k, 1])
+        drift_lower = wp.min(drift_lower, samples.reach[i, k, 2])
+        drift_upper = wp.max(drift_upper, samples.reach[i, k, 3])
+    samples.drift_lower[i] = drift_lower
+    samples.drift_upper[i] = drift_upper
+    grow = wp.vec3(instances.margin[i] + instances.contact_radius[i])
+    samples.lower[i] = lower - grow
+    samples.upper[i] = upper + grow
+
+
+@wp.func
+def point_velocity(body_q: wp.transform, body_qd: wp.spatial_vector, com: wp.vec3, point: wp.vec3):
+    """Return the velocity [m/s] of a world point that moves with a body."""
+    arm = point - wp.transform_point(body_q, com)
+    return wp.spatial_top(body_qd) + wp.cross(wp.spatial_bottom(body_qd), arm)
+
+
+@wp.kernel
+def cull_shapes(
+    instances: Instances,
+    candidate: wp.array2d[int],  # (instance_count, candidate_max), -1 pads
+    shapes: Shapes,
+    samples: Samples,
+    pin_body: wp.array[int],  # (pin_total,)
+    pin_stiffness: wp.array[float],  # (pin_total,) [N/m]
+    dt: float,
+    # Out:
+    near_out: wp.array2d[int],  # (instance_count, candidate_max)
+):
+    """Mark the candidate shapes whose bounding sphere reaches the bounds of the instance.
+
+    A body does not touch the shapes of a rigid body that it is fixed to, until it is released.
+    """
+    i, c = wp.tid()
+    shape = candidate[i, c]
+    near_out[i, c] = 0
+    if shape < 0:
+        return
+    if shapes.kind[shape] == PLANE or shapes.kind[shape] == HEIGHTFIELD:  # solid below without end
+        near_out[i, c] = 1
+        return
+    pose = shapes.transform[shape]
+    lower = shapes.lower[shape]
+    upper = shapes.upper[shape]
+    radius = 0.5 * wp.length(upper - lower)
+    body = shapes.body[shape]
+    if body >= 0:
+        pose = shapes.body_q[body] * pose
+        if instances.link_pin_count[i] > 0:
+            for pin in range(instances.pin_start[i], instances.pin_start[i] + instances.pin_count[i]):
+                if pin_body[pin] == body and pin_stiffness[pin] > 0.0:
+                    return
+    centre = wp.transform_point(pose, 0.5 * (lower + upper))
+    reach = radius + shapes.margin[shape]
+    if body >= 0:
+        twist = shapes.body_qd[body]
+        speed = wp.length(point_velocity(shapes.body_q[body], twist, shapes.body_com[body], centre))
+        reach += 2.0 * dt * (speed + radius * wp.length(wp.spatial_bottom(twist)))
+    nearest = wp.min(wp.max(centre, samples.lower[i]), samples.upper[i])
+    if wp.length(centre - nearest) <= reach:
+        near_out[i, c] = 1
+
+
+@wp.func
+def march(
+    shapes: Shapes,
+    shape: int,
+    x: wp.vec3,
+    nearest: SurfaceQuery,
+    along: wp.vec3,
+    end: float,
+    back: int,
+    thick: float,
+    reach: float,
+):
+    """Return gap and normal of the half-space that stands for a shape along a way from ``x``, in the shape's frame.
+
+    The way is marched by distances to the shape grown by ``thick``. To the body's inside (``back``), for a sample past
+    the middle of a thin plate or through it: where the way leaves the shape, else what is ``nearest`` to x. The way of
+    a fast sample: where it first meets the shape, or else passes nearest.
+    """
+    kind = shapes.kind[shape]
+    scale = shapes.scale[shape]
+    source = shapes.source[shape]
+    query = nearest
+    out = query
+    at = float(0.0)
+    out_at = float(0.0)
+    inside = query.distance <= 0.0
+    depth = 0.5 * end
+    least = 1.0e-3 * end
+    for _ in range(64):
+        if at >= end:
+            break
+        at = wp.min(at + wp.max(wp.abs(query.distance), least), end)
+        y = x + at * along
+        query = query_shape(kind, scale, source, y, reach)
+        if kind == HEIGHTFIELD:
+            query = query_heightfield(y, shapes.fields, shapes.fields.index[shape], reach)
+        query.distance -= thick
+        if back == 1:
+            if inside and query.distance > 0.0:
+                if wp.dot(query.normal, along) > OPPOSED:
+                    out = query
+                    out_at = at
+                break
+            if not inside and at > depth:
+                break
+            inside = query.distance <= 0.0
+        else:
+            if query.distance < out.distance:
+                out = query
+                out_at = at
+            if query.distance <= least:
+                inside = bool(True)
+                break
+    slope = wp.dot(out.normal, along)
+    out.distance -= out_at * slope
+    if back == 0 and not inside:
+        out.distance = wp.max(out.distance, -end * slope)  # a way that misses the shape misses its half-space
+    return out
+
+
+@wp.kernel
+def find_contacts(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    candidate: wp.array2d[int],
+    near: wp.array2d[int],
+    shapes: Shapes,
+    dt: float,
+    # In and out:
+    samples: Samples,
+):
+    """Keep the deepest contacts of each sample within margin plus twice the relative motion of the step."""
+    i, s = wp.tid()
+    if s >= instances.sample_count[i]:
+        return
+    samples.shape[i, s, 0] = -1
+    samples.shape[i, s, 1] = -1
+    samples.gap[i, s, 0] = wp.float64(1.0e30)
+    samples.gap[i, s, 1] = wp.float64(1.0e30)
+    x = samples.position[i, s]
+    row = instances.row_start[i] + s
+    for c in range(candidate.shape[1]):
+        if near[i, c] == 0:
+            continue
+        shape = candidate[i, c]
+        pose = shapes.transform[shape]
+        body = shapes.body[shape]
+        drift = samples.drift[i, s]
+        if body >= 0:
+            pose = shapes.body_q[body] * pose
+            moving = point_velocity(shapes.body_q[body], shapes.body_qd[body], shapes.body_com[body], wp.vec3(x))
+            drift -= dt * moving
+        reach = instances.margin[i] + 2.0 * wp.length(drift)
+        # the difference to the shape's origin in float64: far from the world's origin only the offset is large
+        turn = wp.transform_get_rotation(pose)
+        local = wp.quat_rotate_inv(turn, wp.vec3(x - wp.vec3d(wp.transform_get_translation(pose))))
+        thick = shapes.margin[shape] + instances.contact_radius[i]
+        far = reach + thick
+        kind = shapes.kind[shape]
+        if kind != HEIGHTFIELD:  # inside a mesh the surface may be as far away as the mesh is large
+            far = wp.max(far, wp.length(shapes.upper[shape] - shapes.lower[shape]))
+        # struct arguments are copied: one of many arrays costs more than the distance to a box
+        query = query_shape(kind, shapes.scale[shape], shapes.source[shape], local, far)
+        if kind == HEIGHTFIELD:
+            query = query_heightfield(local, shapes.fields, shapes.fields.index[shape], far)
+        query.distance -= thick
+        # In general the half-space at the nearest point stands for the shape during the step, but
+        along = wp.vec3()
+        end = float(0.0)
+        back = int(0)
+        depth = instances.scale[i] * float(wp.length(basis.inner_point[row]))
+        travel = wp.length(drift)
+        if query.distance < 2.0 * depth:
+            bent = interpolate(basis.inner_row, row, motion.q_start, i, instances.function_count[i])
+            inner = wp.quat_rotate_inv(turn, wp.vec3(basis.inner_point[row] + bent))
+            depth = wp.length(inner)
+            if query.distance < depth and wp.dot(query.normal, inner) < -OPPOSED * depth:
+                # the nearest surface faces away from the body's inside: the sample must go back to it
+                along = inner / depth
+                end = 2.0 * depth
+                back = 1
+        if end == 0.0 and query.distance > 0.0 and travel > instances.margin[i] and travel > query.distance:
+            # a half-space at the start would also stop fast samples that fly past a small shape
+            along = wp.quat_rotate_inv(turn, drift) / travel
+            end = travel
+        if end > 0.0:
+            query = march(shapes, shape, local, query, along, end, back, thick, far)
+        gap = wp.float64(query.distance)
+        if gap < wp.float64(reach) and gap < samples.gap[i, s, 1]:
+            normal = wp.quat_rotate(turn, query.normal)
+            slot = int(1)
+            if gap < samples.gap[i, s, 0]:
+                samples.shape[i, s, 1] = samples.shape[i, s, 0]
+                samples.gap[i, s, 1] = samples.gap[i, s, 0]
+                samples.normal[i, s, 1] = samples.normal[i, s, 0]
+                slot = 0
+            samples.shape[i, s, slot] = shape
+            samples.gap[i, s, slot] = gap
+            samples.normal[i, s, slot] = normal
+
+
+@wp.func
+def turn(rotation: wp.vec3, arm: wp.vec3):
+    """Return how far the end of an arm moves in a finite rotation, given as a vector [rad].
+
+    The linear omega dt x arm would move out by (omega dt)^2 / 2 of the arm in every step, and friction with it.
+    """
+    half = 0.5 * wp.length(rotation)
+    sinc = 1.0 - half * half / 6.0
+    if half > 1.0e-2:
+        sinc = wp.sin(half) / half
+    linear = wp.cross(rotation, arm)
+    return sinc * wp.cos(half) * linear + 0.5 * sinc * sinc * wp.cross(rotation, linear)
+
+
+@wp.func
+def shape_area(shapes: Shapes, shape: int):
+    """Return the surface area of a shape's bounds [m^2]."""
+    if shapes.kind[shape] == PLANE:
+        return float(1.0e30)
+    edge = shapes.upper[shape] - shapes.lower[shape]
+    return 2.0 * (edge[0] * edge[1] + edge[1] * edge[2] + edge[2] * edge[0])
+
+
+@wp.func
+def shape_frame(shapes: Shapes, shape: int):
+    """Return origin and rotation of a shape at the start of the step, in float64."""
+    pose = shapes.transform[shape]
+    body = shapes.body[shape]
+    if body >= 0:
+        pose = shapes.body_q[body] * pose
+    return wp.vec3d(wp.transform_get_translation(pose)), wp.normalize(wp.quatd(wp.transform_get_rotation(pose)))
+
+
+@wp.func
+def remembered_slip(
+    shapes: Shapes,
+    shape: int,
+    x: wp.vec3d,
+    normal: wp.vec3d,
+    stick_shape: wp.array[wp.vec2i],
+    stick_point: wp.array[mat23d],
+    particle: int,
+    prescribed: int,
+):
+    """Return the tangential displacement [m] that a sample carries over from the step before, and its anchor.
+
+    Zero where the sample has not been in contact with this shape.
+    """
+    origin, rotation = shape_frame(shapes, shape)
+    anchor = wp.quat_rotate_inv(rotation, x - origin)
+    slip = wp.vec3d()
+    for k in range(SLOTS):
+        if stick_shape[particle][k] == shape:
+            point = wp.vec3d(stick_point[particle][k, 0], stick_point[particle][k, 1], stick_point[particle][k, 2])
+            slip = wp.quat_rotate(rotation, point)
+            if prescribed == 0:
+                slip = x - origin - slip
+                anchor = point
+    return slip - wp.dot(slip, normal) * normal, anchor
+
+
+@wp.func
+def rank_contacts(
+    found: wp.array3d[int],  # (instance_count, sample_max, SLOTS), -1 where empty
+    gap: wp.array3d[wp.float64],  # likewise [m]
+    tally: wp.array3d[int],  # (instance_count, team, 2), scratch
+    i: int,
+    begin: int,
+    end: int,
+    lane: int,
+    team: int,
+):
+    """Return where a thread writes what touches and what is close of its samples, and how many there are in all.
+
+    What touches stands before what is close, each in sample order. Every thread of the team must call it.
+    """
+    touching = int(0)
+    close = int(0)
+    for s in range(begin, end):
+        for slot in range(SLOTS):
+            if found[i, s, slot] >= 0:
+                if gap[i, s, slot] <= wp.float64(0.0):
+                    touching += 1
+                else:
+                    close += 1
+    tally[i, lane, 0] = touching
+    tally[i, lane, 1] = close
+    barrier()
+    at_touching = int(0)
+    at_close = int(0)
+    total = int(0)
+    for k in range(team):
+        if k < lane:
+            at_touching += tally[i, k, 0]
+            at_close += tally[i, k, 1]
+        at_close += tally[i, k, 0]
+        total += tally[i, k, 0] + tally[i, k, 1]
+    return at_touching, at_close, total
+
+
+@wp.kernel
+def gather_contacts(
+    instances: Instances,
+    basis: Basis,
+    shapes: Shapes,
+    samples: Samples,
+    entry_max: int,
+    prescribed: int,
+    stick_ratio: wp.float64,
+    team: int,
+    dt: float,
+    # State in:
+    stick_shape: wp.array[wp.vec2i],  # (particle_count,), see ``stick_kernels``
+    stick_point: wp.array[mat23d],
+    # Out:
+    entries: Entries,
+    status: wp.array[int],
+):
+    """Compact the slots of an instance behind its pins, in sample order: touching contacts first, then near ones.
+
+    Each thread of a team counts its own run of samples, then writes where the counts before it end.
+    """
+    i, lane = wp.tid()
+    count = instances.sample_count[i]
+    begin = lane * count / team
+    end = (lane + 1) * count / team
+    at_touching, at_close, total = rank_contacts(samples.shape, samples.gap, samples.tally, i, begin, end, lane, team)
+    at_touching += instances.pin_count[i]
+    at_close += instances.pin_count[i]
+    total += instances.pin_count[i]
+    if lane == 0:
+        entries.count[i] = wp.min(total, entry_max)
+        if total > entry_max:
+            wp.atomic_or(status, instances.world[i], WORLD_CONTACT_OVERFLOW)
+    for s in range(begin, end):
+        for slot in range(SLOTS):
+            shape = samples.shape[i, s, slot]
+            samples.entry[i, s, slot] = -1
+            if shape < 0:
+                continue
+            gap = wp.max(samples.gap[i, s, slot], -wp.float64(OVERLAP * instances.size[i]))
+            e = at_close
+            if gap <= wp.float64(0.0):
+                e = at_touching
+                at_touching += 1
+            else:
+                at_close += 1
+            if e >= entry_max:
+                continue
+            samples.entry[i, s, slot] = e
+            # of unit length in float64: what is left of the gap in the slip must not count against the stick range
+            normal = wp.normalize(wp.vec3d(samples.normal[i, s, slot]))
+            # both bodies feel the force at the sample, not the shape at its own surface: a pair of forces on two
+            # points would make angular momentum out of friction times penetration
+            point = wp.vec3(samples.position[i, s])
+            drift = wp.vec3()
+            arm = wp.vec3()
+            body = shapes.body[shape]
+            if body >= 0:
+                arm = point - wp.transform_point(shapes.body_q[body], shapes.body_com[body])
+                if prescribed != 0:
+                    twist = shapes.body_qd[body]
+                    drift = dt * wp.spatial_top(twist) + turn(dt * wp.spatial_bottom(twist), arm)
+            row = instances.row_start[i] + s
+            entries.row[i, e] = row
+            entries.dof_begin[i, e] = 0
+            entries.dof_end[i, e] = 0
+            entries.shape[i, e] = shape
+            entries.body[i, e] = body
+            entries.arm[i, e] = arm
+            entries.normal[i, e] = normal
+            partner_mass = float(0.0)
+            if body >= 0 and prescribed == 0:
+                partner_mass = shapes.body_mass[body]
+            kappa = stiffness_per_area(instances, i, partner_mass, shape_area(shapes, shape), dt)
+            stiffness = wp.float64(kappa * sample_area(instances.scale[i], basis.row_area[row]))
+            slip, anchor = remembered_slip(
+                shapes,
+                shape,
+                samples.position[i, s],
+                normal,
+                stick_shape,
+                stick_point,
+                instances.particle_start[i] + s,
+                prescribed,
+            )
+            # d enters as offset + displacement, with the gap along the normal and the shape's own motion taken off
+            entries.offset[i, e] = gap * normal + slip - wp.vec3d(drift)
+            entries.anchor[i, e] = anchor
+            entries.stick[i, e] = stick_ratio * stiffness
+            entries.stiffness[i, e] = stiffness
+            entries.friction[i, e] = wp.float64(wp.sqrt(instances.friction[i] * shapes.friction[shape]))
+
+
+@wp.kernel
+def gather_pins(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    shapes: Shapes,
+    first_row: int,
+    pin_body: wp.array[int],  # (pin_total,), rigid body that holds the target, -1 for the world
+    pin_stiffness: wp.array[float],  # (pin_total,) [N/m], negative while released
+    pin_target: wp.array[wp.vec3d],  # (pin_total,), in the frame of that body [m]
+    prescribed: int,
+    dt: float,
+    # Out:
+    entries: Entries,
+):
+    """Write the pins of an instance as its first entries: offset = x_n - target."""
+    i, e = wp.tid()
+    if e >= instances.pin_count[i]:
+        return
+    pin = instances.pin_start[i] + e
+    row = first_row + pin
+    x = basis.row_point[row] + interpolate(basis.row, row, motion.q_start, i, instances.function_count[i])
+    entries.row[i, e] = row
+    body = pin_body[pin]
+    target = pin_target[pin]
+    if body >= 0:
+        pose = shapes.body_q[body]
+        rotation = wp.transform_get_rotation(pose)
+        arm = wp.quat_rotate(rotation, wp.vec3(target) - shapes.body_com[body])
+        # only the offset is large far from the world's origin
+        target = wp.vec3d(wp.transform_get_translation(pose)) + wp.vec3d(wp.quat_rotate(rotation, wp.vec3(target)))
+        if prescribed != 0:
+            twist = shapes.body_qd[body]
+            target += wp.vec3d(dt * wp.spatial_top(twist) + turn(dt * wp.spatial_bottom(twist), arm))
+        entries.arm[i, e] = arm
+    entries.dof_begin[i, e] = 0
+    entries.dof_end[i, e] = 0
+    entries.shape[i, e] = -1
+    entries.body[i, e] = body
+    entries.offset[i, e] = x - target
+    entries.stiffness[i, e] = wp.float64(wp.max(pin_stiffness[pin], 0.0))
+
+
+@wp.kernel
+def entry_jacobians(
+    instances: Instances,
+    rigid: Rigid,
+    # In and out:
+    entries: Entries,
+):
+    """Compute the motion of the rigid body at each contact or pin per unit joint motion: J_v - arm x J_w."""
+    i, e = wp.tid()
+    w = instances.world[i]
+    if e >= entries.count[i] or rigid.count[w] == 0:
+        return
+    body = entries.body[i, e]
+    if body < 0:
+        return
+    a = rigid.body_articulation[body]
+    if a < 0:
+        return
+    begin = rigid.articulation_dof_start[a] - rigid.dof_start[w]
+    entries.dof_begin[i, e] = begin
+    entries.dof_end[i, e] = begin + rigid.articulation_dof_count[a]
+    r = 6 * rigid.body_link[body]
+    J = rigid.jacobian
+    for local in range(rigid.articulation_dof_count[a]):
+        linear = wp.vec3(J[a, r, local], J[a, r + 1, local], J[a, r + 2, local])
+        angular = wp.vec3(J[a, r + 3, local], J[a, r + 4, local], J[a, r + 5, local])
+        entries.jacobian[i, e, begin + local] = linear + wp.cross(angular, entries.arm[i, e])

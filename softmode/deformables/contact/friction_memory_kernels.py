@@ -1,0 +1,82 @@
+"""Memory of friction: where every surface sample sticks, carried from step to step in the state.
+
+A contact that sticks is a spring, so a body at rest stays where it is; what exceeds the cone slides and is lost. The
+memory of a sample is, per slot, the shape it sticks to and a point in that shape's frame (see ``remember_slip``).
+"""
+
+import warp as wp
+
+from softmode.deformables.contact.detection_kernels import Shapes, shape_frame
+from softmode.deformables.model.struct_kernels import SLOTS, Entries, Instances, Samples, in_mask, mat23d
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def remember_slip(
+    instances: Instances,
+    shapes: Shapes,
+    samples: Samples,
+    entries: Entries,
+    prescribed: int,
+    # State out:
+    stick_shape_out: wp.array[wp.vec2i],
+    stick_point_out: wp.array[mat23d],
+):
+    """Write where every sample sticks at the end of the step: what of its slip is elastic stays, the rest is slid.
+
+    A contact that has opened has no friction to hold a displacement, and is forgotten. Shapes with dofs in the solve
+    keep the anchor, to the bit while the contact sticks, so that errors of the solve do not add up; shapes that move as
+    prescribed keep the displacement itself, in their frame, because a belt moves without its pose.
+    """
+    i, s = wp.tid()
+    if s >= instances.sample_count[i]:
+        return
+    stuck = wp.vec2i(-1, -1)
+    points = mat23d()
+    for slot in range(SLOTS):
+        e = samples.entry[i, s, slot]
+        if e < 0:
+            continue
+        limit = entries.friction[i, e] * entries.normal_force[i, e]
+        if not (limit > wp.float64(0.0)) or entries.stick[i, e] == wp.float64(0.0):
+            continue
+        shape = entries.shape[i, e]
+        origin, rotation = shape_frame(shapes, shape)
+        total = entries.slip[i, e]
+        stretch = entries.stick[i, e] * wp.length(total)
+        if not wp.isfinite(stretch + limit):
+            continue
+        elastic = total
+        if stretch > limit:
+            elastic = limit / stretch * total
+        point = entries.anchor[i, e]
+        if prescribed != 0:
+            point = wp.quat_rotate_inv(rotation, elastic)
+        elif stretch > limit:
+            n = entries.normal[i, e]
+            before = entries.offset[i, e] - wp.dot(n, entries.offset[i, e]) * n
+            slid = samples.position[i, s] - before + total - elastic
+            point = wp.quat_rotate_inv(rotation, slid - origin)
+        stuck[slot] = shape
+        for axis in range(3):
+            points[slot, axis] = point[axis]
+    particle = instances.particle_start[i] + s
+    stick_shape_out[particle] = stuck
+    stick_point_out[particle] = points
+
+
+@wp.kernel
+def forget_slip(
+    instances: Instances,
+    instance_world: wp.array[int],
+    world_mask: wp.array[wp.bool],
+    # State out:
+    stick_shape_out: wp.array[wp.vec2i],
+    stick_partner_out: wp.array[wp.vec2i],
+):
+    """Let the samples in masked worlds stick to nothing."""
+    i, s = wp.tid()
+    if s < instances.sample_count[i] and in_mask(instance_world[i], world_mask):
+        stick_shape_out[instances.particle_start[i] + s] = wp.vec2i(-1, -1)
+        stick_partner_out[instances.particle_start[i] + s] = wp.vec2i(-1, -1)

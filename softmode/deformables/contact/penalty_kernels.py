@@ -1,0 +1,263 @@
+"""Energy of pins and of contact between surface samples and rigid shapes; the reactions.
+
+With the displacement d of the sample relative to the shape during the step, a contact adds
+
+    E(d) = A kappa psi_n(-g0 - n . d) + psi_t(|s + d_t|; mu f_n, k_t),
+
+psi_n the C2 penalty p^3/(6 eps) for p < eps, p^2/2 - eps p/2 + eps^2/6 beyond (p the penetration), and a stiffer one
+where p is large (see ``normal_potential``); s the slip that the contact remembers (see ``stick_kernels``); psi_t the
+incremental potential of elastic-plastic friction, a spring k_t up to the force mu f_n and that force beyond (Cundall
+and Strack 1979, doi:10.1680/geot.1979.29.1.47), with the normal force f_n of the last Newton iterate. k_t does not
+depend on f_n: the energy of the spring cannot grow but by work, whatever the normal force does, so friction takes
+energy in every closed cycle.
+
+Contacts without memory (k_t = 0) have the smoothed Coulomb potential of Li et al. 2020 instead (IPC,
+doi:10.1145/3386569.3392425, eq. 13), mu f_n f0(|d_t|), which creeps.
+"""
+
+import warp as wp
+
+from softmode.deformables.model.lane_kernels import vec8d
+from softmode.deformables.model.struct_kernels import (
+    Basis,
+    Entries,
+    Instances,
+    Motion,
+    Progress,
+    Rigid,
+    first_coupled,
+    interpolate_change,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+BULK_FACTOR = wp.constant(40.0)
+"""Contact stiffness per area over P-wave modulus per size: under a pressure that squeezes a body by 10 %, contact sinks
+by 0.25 % of its size. 20 sinks 1.4 to 1.6 times as deep in a grasp and saves 3 % of the iterations."""
+INERTIA_FACTOR = wp.constant(100.0)
+"""Contact stiffness over effective mass / dt^2, per area: what hits flat is stopped within a step, v dt / 100 deep. 0
+sinks 1.5 to 3 mm at 5 m/s instead of 0.2 to 0.9; 1000 sinks 0.2 mm for a third more iterations."""
+STIFFNESS_FLOOR = wp.constant(1.0e8)
+"""Least contact stiffness per area [Pa/m]: under 25 kPa, a firm grasp, contact sinks by 0.25 mm."""
+HARDENING = wp.constant(wp.float64(9.0))
+"""Stiffness that contact gains where it is deep, over that where it is not: what an arm presses with its full force
+sinks in 1.4 to 2.4 mm instead of 7 to 8. Ten times the stiffness throughout costs light bodies momentum."""
+HARDENING_DEPTH = wp.constant(wp.float64(2.0))
+"""Penetration beyond which it does, in ranges of the onset."""
+
+
+@wp.func
+def penalty(penetration: wp.float64, eps: wp.float64):
+    """Return the C2 penalty of a penetration [m] per unit stiffness, and its first two derivatives."""
+    p = wp.max(penetration, wp.float64(0.0))
+    half = wp.float64(0.5)
+    six = wp.float64(6.0)
+    if p < eps:
+        return p * p * p / (six * eps), half * p * p / eps, p / eps
+    return half * p * p - half * eps * p + eps * eps / six, p - half * eps, wp.float64(1.0)
+
+
+@wp.func
+def normal_potential(penetration: wp.float64, eps: wp.float64):
+    """Return the contact potential of a penetration [m] per unit stiffness, and its first two derivatives.
+
+    The C2 penalty, and a stiffer one that sets in twice as deep and as slowly.
+    """
+    psi, slope, curvature = penalty(penetration, eps)
+    deep = HARDENING_DEPTH * eps
+    psi_deep, slope_deep, curvature_deep = penalty(penetration - deep, deep)
+    return psi + HARDENING * psi_deep, slope + HARDENING * slope_deep, curvature + HARDENING * curvature_deep
+
+
+@wp.func
+def friction_potential(y: wp.float64, eps: wp.float64):
+    """Return f0(y), f1(y) / y and f1'(y), f1 = f0', of the smoothed Coulomb potential with stick range ``eps`` [m]."""
+    one = wp.float64(1.0)
+    two = wp.float64(2.0)
+    three = wp.float64(3.0)
+    if y < eps:
+        return (
+            y * y / eps - y * y * y / (three * eps * eps) + eps / three,
+            two / eps - y / (eps * eps),
+            two / eps - two * y / (eps * eps),
+        )
+    return y, one / y, wp.float64(0.0)
+
+
+@wp.func
+def stick_potential(y: wp.float64, limit: wp.float64, stiffness: wp.float64):
+    """Return energy [J], force over slip and curvature along the slip [N/m] of elastic-plastic friction at slip y [m].
+
+    A spring up to the force ``limit`` [N], constant force beyond; nothing where the limit is 0.
+    """
+    zero = wp.float64(0.0)
+    half = wp.float64(0.5)
+    if limit <= zero:
+        return zero, zero, zero
+    if stiffness * y <= limit:
+        return half * stiffness * y * y, stiffness, stiffness
+    return limit * (y - half * limit / stiffness), limit / y, zero
+
+
+@wp.func
+def slip_potential(y: wp.float64, limit: wp.float64, stick: wp.float64, stick_range: wp.float64):
+    """Return energy [J], force over slip and curvature along the slip [N/m] of friction, with memory or smoothed."""
+    if stick > wp.float64(0.0):
+        return stick_potential(y, limit, stick)
+    f0, secant, tangent = friction_potential(y, stick_range)
+    return limit * f0, limit * secant, limit * tangent
+
+
+@wp.func
+def stiffness_per_area(instances: Instances, i: int, partner_mass: float, partner_area: float, dt: float):
+    """Return the contact stiffness per area [Pa/m] of a body against a partner, from the parameters as they are now.
+
+    What ``contact_stiffness`` gives, or, where that is 0, the largest of BULK_FACTOR times the wave modulus over the
+    size, INERTIA_FACTOR times the effective mass per area over dt^2, and STIFFNESS_FLOOR.
+
+    Args:
+        instances: The bodies.
+        i: The body.
+        partner_mass: Mass of what it touches [kg]; 0 where that does not yield.
+        partner_area: Its surface area [m^2].
+        dt: Step [s].
+    """
+    if instances.contact_stiffness[i] > 0.0:
+        return instances.contact_stiffness[i]
+    E = instances.youngs_modulus[i]
+    nu = instances.poissons_ratio[i]
+    wave = E * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
+    mass = float(instances.mass[i])
+    if partner_mass > 0.0:
+        mass *= partner_mass / (mass + partner_mass)
+    inertia = mass / (wp.min(instances.area[i], partner_area) * dt * dt)
+    return wp.max(wp.max(BULK_FACTOR * wave / instances.size[i], INERTIA_FACTOR * inertia), STIFFNESS_FLOOR)
+
+
+@wp.func
+def evaluate_entry(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    progress: Progress,
+    rigid: Rigid,
+    stick_range: wp.float64,  # eps of the friction potential for this step [m]
+    # State in:
+    selected: wp.array[int],
+    q: wp.array2d[vec8d],
+    r: wp.array2d[wp.float64],
+    derivatives: int,
+    # In and out:
+    entries: Entries,
+    i: int,
+    e: int,
+):
+    """Evaluate pins and contacts at displacement d = sum_k b_k (q_k - q_nk) - J r, less that of a soft partner.
+
+    A contact of two soft bodies is an entry of each, which has one half of its energy and all of its force.
+    """
+    w = instances.world[i]
+    if selected[w] == 0 or e >= entries.count[i]:
+        return
+    d = interpolate_change(basis.row, entries.row[i, e], q, motion.q_start, i, instances.function_count[i])
+    smoothing = instances.smoothing[i]
+    share = wp.float64(1.0)
+    if e >= entries.count[i] - entries.pair_count[i]:
+        j = entries.partner[i, e]
+        if j >= 0:
+            d -= interpolate_change(
+                basis.row, entries.partner_row[i, e], q, motion.q_start, j, instances.function_count[j]
+            )
+            smoothing = wp.min(smoothing, instances.smoothing[j])
+            share = wp.float64(0.5)
+    for k in range(entries.dof_begin[i, e], entries.dof_end[i, e]):
+        d -= r[w, k] * wp.vec3d(entries.jacobian[i, e, k])
+    stiffness = entries.stiffness[i, e]
+    identity = wp.identity(n=3, dtype=wp.float64)
+    H = stiffness * identity
+    if e < instances.pin_count[i]:
+        x = entries.offset[i, e] + d
+        entries.energy[i, e] = wp.float64(0.5) * stiffness * wp.length_sq(x)
+        entries.force[i, e] = -stiffness * x
+    else:
+        n = entries.normal[i, e]
+        total = entries.offset[i, e] + d
+        psi, slope, curvature = normal_potential(-wp.dot(n, total), wp.float64(smoothing))
+        if derivatives != 0 and progress.iteration[w] <= progress.friction_lag:
+            held = slope
+            if progress.iteration[w] == 0:
+                # in an impact the first guess lies far too deep: friction of such a force would be too stiff to solve
+                deep = wp.float64(smoothing) - wp.float64(2.0) * wp.min(
+                    wp.dot(n, entries.offset[i, e]), wp.float64(0.0)
+                )
+                _psi, most, _curvature = normal_potential(deep, wp.float64(smoothing))
+                held = wp.min(slope, most)
+            entries.normal_force[i, e] = stiffness * held
+        normal_force = entries.normal_force[i, e]
+        # offset = gap n + memory - drift of the shape: the tangential part is the slip
+        t = total - wp.dot(n, total) * n
+        y = wp.length(t)
+        limit = entries.friction[i, e] * normal_force
+        stick = entries.stick[i, e]
+        f0, secant, tangent = slip_potential(y, limit, stick, stick_range)
+        entries.slip[i, e] = t
+        entries.energy[i, e] = share * (stiffness * psi + f0)
+        entries.force[i, e] = stiffness * slope * n - secant * t
+        # f0 is concave in y^2, so the quadratic of the secant's curvature lies above it and its steps cannot overshoot,
+        # from however far away; the potential's own curvature along the slip converges faster once the state is close
+        N = wp.outer(n, n)
+        H = stiffness * curvature * N + secant * (identity - N)
+        if progress.exact[w] != 0 and y > wp.float64(1.0e-9) * stick_range:
+            H += (tangent - secant) / (y * y) * wp.outer(t, t)
+    if derivatives != 0:
+        entries.hessian[i, e] = wp.mat33(H)
+        for k in range(entries.dof_begin[i, e], entries.dof_end[i, e]):
+            entries.coupling[i, e, k] = wp.mat33(H) * entries.jacobian[i, e, k]
+
+
+@wp.kernel
+def evaluate_entries(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    progress: Progress,
+    rigid: Rigid,
+    stick_range: wp.float64,  # eps of the friction potential for this step [m]
+    # State in:
+    selected: wp.array[int],
+    q: wp.array2d[vec8d],
+    r: wp.array2d[wp.float64],
+    derivatives: int,
+    # In and out:
+    entries: Entries,
+):
+    """Launch :func:`evaluate_entry`."""
+    i, e = wp.tid()
+    evaluate_entry(instances, basis, motion, progress, rigid, stick_range, selected, q, r, derivatives, entries, i, e)
+
+
+@wp.kernel
+def sum_reactions(
+    instances: Instances,
+    progress: Progress,
+    entries: Entries,
+    # Out:
+    body_wrench_out: wp.array[wp.spatial_vector],  # (body_count,) on the rigid bodies, about their COM [N, N m]
+    instance_force_out: wp.array[wp.vec3d],  # (instance_count,) total contact force on the body [N]
+):
+    """Sum the forces of contacts and links per rigid body (equal and opposite), of contacts per instance, in order."""
+    w = wp.tid()
+    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
+        total = wp.vec3d()
+        for e in range(first_coupled(instances, i), entries.count[i]):
+            f = entries.force[i, e]
+            paired = e >= entries.count[i] - entries.pair_count[i]
+            if e >= instances.pin_count[i] and not (paired and entries.partner[i, e] < 0):
+                total += f  # a contact of the body with itself is none of the world's business
+            body = entries.body[i, e]
+            if body >= 0:
+                reaction = -wp.vec3(f)
+                body_wrench_out[body] = body_wrench_out[body] + wp.spatial_vector(
+                    reaction, wp.cross(entries.arm[i, e], reaction)
+                )
+        instance_force_out[i] = total

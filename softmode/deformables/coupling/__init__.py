@@ -1,0 +1,1 @@
+"""Rigid degrees of freedom of other solvers as unknowns of the same step."""

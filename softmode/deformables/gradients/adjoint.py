@@ -1,0 +1,470 @@
+"""Gradients of a trajectory: the adjoint of the reduced step by the implicit function theorem.
+
+A step is the root of r(q_t; q_(t-1), v_(t-1), theta) = 0, the gradient of the incremental potential of ``kernels``.
+With H_t = dr/dq_t at the converged q_t, as it is and not projected, a loss L of the trajectory has
+
+    H_t^T lambda_t = dL/dq_t,        t = T .. 1,   dL/dq_t total: what later steps pass back is in it,
+    dL/dtheta     -= lambda_t^T dr/dtheta,
+    dL/dq_(t-1)   -= (dr/dq_(t-1))^T lambda_t,     dL/dv_(t-1) likewise.
+
+No Newton iteration is taped: a step leaves q, v, the generalised force and its point constraints. The products with H_t
+are matrix-free in float64; GMRES (Saad and Schultz 1986, doi:10.1137/0907058) solves them, preconditioned by the
+solver's own float32 Cholesky factor at q_t. Both integrators are covered, and driven functions.
+"""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from softmode.deformables.gradients import adjoint_kernels as kernels
+from softmode.deformables.gradients.krylov import Gmres
+from softmode.deformables.model.authoring import NAMESPACE
+from softmode.deformables.model.lane_kernels import vec8d
+from softmode.deformables.model.status import WORLD_NOT_FINITE
+from softmode.deformables.model.struct_kernels import Entries, Points
+from softmode.deformables.solver.solver_reduced import SolverReduced
+from softmode.deformables.solver.step_kernels import sum_forces
+from softmode.errors import ConfigError, SolverDiverged
+
+Array = NDArray[np.float64]
+
+_ENTRY = ("row", "normal", "offset", "stiffness", "friction")
+"""What a step's point constraints are made of, besides their count: members of the solver's ``Entries``."""
+_SUMS = ("youngs_modulus", "poissons_ratio", "viscosity", "friction", "density", "mass_damping")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdjointOptions:
+    """How the linear systems are solved and which steps are trusted."""
+
+    tolerance: float = 1.0e-12
+    """GMRES stops at this residual relative to the right-hand side."""
+    cycle_length: int = 40
+    """Krylov vectors kept before a restart."""
+    cycle_max: int = 5
+    """Restarts at most."""
+    residual_warning: float = 1.0e-4
+    """|r| / |f| of a step above which a warning is given: away from the root the theorem does not hold, and"""
+    residual_max: float = 1.0e-2
+    """above which the step is refused."""
+
+    def __post_init__(self) -> None:
+        """Check every range."""
+        for name in ("cycle_length", "cycle_max"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("tolerance", "residual_warning", "residual_max"):
+            if not getattr(self, name) > 0.0:
+                raise ConfigError(f"{name} must be > 0, got {getattr(self, name)!r}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReducedGradients:
+    """Derivatives of the loss, on the solver's device; T steps, I instances, N functions of all instances."""
+
+    q: wp.array
+    """By the initial coordinates, vec3d (N,)."""
+    qd: wp.array
+    """By the initial velocities, vec3d (N,)."""
+    force: wp.array
+    """By the generalised force of each step (lambda_t), vec3d (T, N); see ``Markers.interpolate`` for point forces."""
+    q_driven: wp.array
+    """By where the driven functions are put in each step, vec3d (T, N); zero for the others."""
+    pin_target: wp.array
+    """By the pin targets of each step, vec3d (T, pin_count)."""
+    pin_stiffness: wp.array
+    """By the stiffness of each pin, (pin_count,)."""
+    youngs_modulus: wp.array
+    """By E of each instance, (I,)."""
+    log_modulus: wp.array
+    """By ln E at each cubature point, (I, point_max): the gradient by a field of moduli."""
+    poissons_ratio: wp.array
+    """By nu, (I,)."""
+    density: wp.array
+    """By rho, (I,): inertia, weight and mass damping."""
+    viscosity: wp.array
+    """By tau, (I,)."""
+    mass_damping: wp.array
+    """By alpha, (I,)."""
+    friction: wp.array
+    """By the body's friction coefficient, (I,)."""
+    gravity: wp.array
+    """By the gravity that each instance feels, vec3d (I,)."""
+    grad_residual: wp.array
+    """|r| / |f| of each step and instance, (T, I): how far from its root the solver stopped."""
+
+    def numpy(self) -> dict[str, Array]:
+        """Return copies on the host."""
+        return {f.name: getattr(self, f.name).numpy() for f in fields(self)}
+
+
+class AdjointReduced:
+    """Records the steps of a solver and differentiates a loss of them.
+
+    ``start(state)``, then ``step`` (or ``solver.step`` and ``record``) up to ``step_max`` times, then ``backward``.
+
+    Differentiated: elasticity, viscosity, inertia and mass damping, gravity, external forces, pins and driven functions
+    (exactly); contact at the normals of the start of each step, the normal force of friction included. Not
+    differentiated: the turning of contact normals with the point of contact, contacts appearing or vanishing at the end
+    of their detection range (where they carry no force), the motion of rigid shapes, what BDF2 remembers from before
+    the record, and how the automatic contact stiffness follows E, nu and density: give ``contact_stiffness_per_area``
+    where that matters. Friction must be without memory. Parameters must not change between recording and ``backward``.
+
+    Args:
+        solver: The solver; rigid dofs must not take part in its solve.
+        step_max: Steps that can be recorded. A step keeps four vec3d per function, and 68 bytes per pin and, with
+            shapes in the model, per contact slot; ``backward`` takes as much again.
+        options: Tolerances.
+
+    Raises:
+        ConfigError: If rigid joints are unknowns of the solver, soft bodies may touch each other, a pin follows a rigid
+            body, or friction has memory.
+    """
+
+    def __init__(self, solver: SolverReduced, step_max: int, *, options: AdjointOptions | None = None) -> None:
+        """Allocate the record and the work space."""
+        if solver.rigid.count_max:
+            raise ConfigError(
+                "the step solves for joint dofs, whose solver has no derivative",
+                hint="use SolverReduced with prescribed rigid bodies",
+            )
+        if solver.pairs is not None:
+            raise ConfigError(
+                "contact between soft bodies has no derivative",
+                hint="use SolverReducedOptions(soft_contact=False), or one body per world",
+            )
+        if solver.instances.link_pin_count.numpy().any():
+            raise ConfigError("pins that follow a rigid body have no derivative", hint="pin to the world (link=-1)")
+        if solver.model.shape_count and solver.options.stick_ratio > 0.0:
+            raise ConfigError(
+                "friction remembers where contacts stick, and that memory has no derivative",
+                hint="use SolverReducedOptions(stick_ratio=0.0), friction smoothed over stick_velocity",
+            )
+        self.solver, self.options, self.step_max = solver, options or AdjointOptions(), step_max
+        self.device, layout = solver.model.device, solver.layout
+        self.instances, self.total = layout.instance_count, int(solver.parameters.q.shape[0])
+        self.pin_total = int(solver.parameters.pin_target.shape[0]) if layout.pin_max else 0
+        self.entry_max = solver.entry_max if solver.model.shape_count else layout.pin_max
+        self.generation = 0
+        """Number of records begun."""
+        self.dt: list[float] = []
+
+        # row 0 of the states is the one before the record, which BDF2 remembers; row t + 1 is time t
+        states, entries = (step_max + 2, self.total), (self.instances, max(self.entry_max, 1))
+        self._q, self._qd = self._zeros(states, wp.vec3d), self._zeros(states, wp.vec3d)
+        self._dt_before = self._zeros((step_max + 1, self.instances), wp.float64)
+        self._force, self._costate = (self._zeros((step_max, *solver.functions), vec8d) for _ in range(2))
+        self._entry_count = self._zeros((step_max, self.instances), int)
+        kinds = {name: getattr(solver.entries, name).dtype for name in _ENTRY}
+        self._entry = {name: self._zeros((step_max, *entries), kind) for name, kind in kinds.items()}
+
+        points = (self.instances, layout.point_max)
+        self._step: Any = kernels.Linearised()
+        self._step.place, self._step.place_start, self._step.point = (self._zeros(points, wp.mat33d) for _ in range(3))
+        self._step.entry_slip, self._step.entry = (self._zeros(entries, wp.vec3d) for _ in range(2))
+        self._step.entry_hessian = self._zeros(entries, wp.mat33d)
+        self._points: Any = Points()
+        self._points.stress = self._step.point
+        self._constraints: Any = Entries()
+        self._constraints.count, self._constraints.row = solver.entries.count, solver.entries.row
+        self._constraints.force = self._step.entry
+        self._gmres = Gmres(solver, cycle_length=self.options.cycle_length, cycle_max=self.options.cycle_max)
+        self._driven = self._zeros(solver.functions, vec8d)
+        self._state = solver.model.state()
+        self._resolution = wp.array(
+            1.0e-9 * layout.size * solver.instances.scale.numpy(), dtype=wp.float64, device=self.device
+        )
+
+    @property
+    def step_count(self) -> int:
+        """Number of recorded steps T."""
+        return len(self.dt)
+
+    @property
+    def q(self) -> Any:
+        """Recorded coordinates [m], vec3d (T + 1, N)."""
+        return self._q[1 : self.step_count + 2]
+
+    @property
+    def qd(self) -> Any:
+        """Recorded velocities [m/s], vec3d (T + 1, N)."""
+        return self._qd[1 : self.step_count + 2]
+
+    # -- forward ------------------------------------------------------------------------------------------------------
+
+    def start(self, state: newton.State) -> None:
+        """Forget the record and begin a new one at ``state``."""
+        self.dt = []
+        self.generation += 1
+        data = getattr(state, NAMESPACE)
+        wp.copy(self._q[0], data.q_before)
+        wp.copy(self._qd[0], data.qd_before)
+        self._copy_state(state, 0)
+
+    def step(
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        control: newton.Control | None,
+        dt: float,
+        *,
+        force: Any = None,
+    ) -> None:
+        """Advance by ``dt`` [s] as the solver does, with an extra generalised force [N], vec3d (N,), and record it."""
+        solver = self.solver
+        solver.begin(state_in, control, dt)
+        if force is not None:
+            self._launch(kernels.add_force, self._blocks, [solver.instances, force], [solver.motion])
+        solver.detect(state_in, control, dt, prescribed=True)
+        solver.minimise(dt)
+        solver.finish(state_out, dt)
+        self.record(state_out, dt)
+
+    def record(self, state: newton.State, dt: float) -> None:
+        """Record the step of ``dt`` [s] that ``solver`` has just taken to ``state``.
+
+        Raises:
+            ConfigError: If ``step_max`` steps are recorded already.
+        """
+        t, solver = self.step_count, self.solver
+        if t == self.step_max:
+            raise ConfigError(f"{t} steps are recorded, the most there is room for", hint="raise step_max")
+        self._copy_state(state, t + 1)
+        wp.copy(self._force[t], solver.motion.force)
+        for stored, values in self._entries(t):
+            wp.copy(stored, values)
+        self.dt.append(float(dt))
+
+    def _copy_state(self, state: newton.State, t: int) -> None:
+        """Keep the state of time t."""
+        data = getattr(state, NAMESPACE)
+        wp.copy(self._q[t + 1], data.q)
+        wp.copy(self._qd[t + 1], data.qd)
+        wp.copy(self._dt_before[t], data.dt_before)
+
+    def _entries(self, t: int) -> list[tuple[Any, Any]]:
+        """Return pairs of what is stored of the point constraints of step t and where the solver has it."""
+        entries, width = self.solver.entries, self.entry_max
+        pairs = [(self._entry_count[t], entries.count)]
+        if width:
+            pairs += [(stored[t], getattr(entries, name)[:, :width]) for name, stored in self._entry.items()]
+        return pairs
+
+    # -- backward -----------------------------------------------------------------------------------------------------
+
+    def backward(self, *, loss_q: Any = None, loss_qd: Any = None) -> ReducedGradients:
+        """Differentiate a loss of the recorded steps.
+
+        Args:
+            loss_q: dL/dq_t at fixed q_s and v_s elsewhere, t = 0 .. T, shape (T + 1, N, 3), an array of NumPy or Warp
+                (vec3d); None for zero.
+            loss_qd: dL/dv_t, likewise; that v_t depends on q_t is accounted for.
+
+        Returns:
+            The gradients; arrays are new with each call.
+
+        Raises:
+            ConfigError: If nothing is recorded or a shape does not fit.
+            SolverDiverged: If a step is further from its root than ``residual_max``, or its linear system is singular.
+
+        Warns:
+            RuntimeWarning: If a step is further from its root than ``residual_warning``.
+        """
+        steps, solver, entry = self.step_count, self.solver, max(self.entry_max, 1)
+        if steps == 0:
+            raise ConfigError("no step is recorded", hint="call start and step first")
+        q_bar, qd_bar = self._cotangent("loss_q", loss_q), self._cotangent("loss_qd", loss_qd)
+        points = (self.instances, solver.layout.point_max)
+        field = {name: self._zeros(points, wp.float64) for name in ("log_modulus", "poissons_ratio", "viscosity")}
+        friction = self._zeros((self.instances, entry), wp.float64)
+        sums: Any = kernels.Sums()
+        sums.mass, sums.mass_damping, sums.gravity = (self._zeros(solver.functions, vec8d) for _ in range(3))
+        pin_target = self._zeros((steps, max(self.pin_total, 1)), wp.vec3d)
+        pin_stiffness = self._zeros((max(self.pin_total, 1),), wp.float64)
+        residual, error = (self._zeros((steps, self.instances), wp.float64) for _ in range(2))
+        tables = [solver.instances, solver.basis]
+
+        for t in reversed(range(steps)):
+            now, before, earlier = ([q_bar[row], qd_bar[row]] for row in (t + 2, t + 1, t))
+            costate, dt = self._costate[t], wp.float64(self.dt[t])
+            self._restore(t)
+            self._measure(t, residual[t])
+            self._launch(kernels.add_velocity, solver.functions, [solver.motion, now[1], dt], [now[0]])
+            self._solve(t, now[0], costate)
+            wp.copy(error[t], self._gmres.error)
+            self._launch(kernels.accumulate_points, points, [*tables, costate, dt], [*field.values(), self._step])
+            if self.entry_max:
+                constraints = [pin_stiffness, friction, pin_target[t], self._step]
+                dim = (self.instances, self.entry_max)
+                self._launch(kernels.accumulate_entries, dim, [*tables, solver.entries, costate], constraints)
+            self._sum_points(solver.progress.active)
+            self._launch(
+                kernels.propagate,
+                solver.functions,
+                [
+                    *tables,
+                    solver.motion,
+                    solver.gradient_chunk,
+                    solver.model.gravity,
+                    solver.q,
+                    costate,
+                    self._driven,
+                    dt,
+                ],
+                [*now, *before, *earlier, sums],
+            )
+
+        self._check(residual.numpy(), error.numpy())
+        totals = {name: self._zeros((self.instances,), wp.float64) for name in _SUMS}
+        gravity = self._zeros((self.instances,), wp.vec3d)
+        gathered = [*field.values(), friction, sums]
+        self._launch(
+            kernels.sum_gradients,
+            self.instances,
+            [solver.instances, solver.parameters.density, *gathered],
+            [*totals.values(), gravity],
+        )
+        return ReducedGradients(
+            q=self._unpack(q_bar[1:2])[0],
+            qd=self._unpack(qd_bar[1:2])[0],
+            force=self._unpack(self._costate[:steps]),
+            q_driven=self._unpack(q_bar[2:]),
+            pin_target=pin_target[:, : self.pin_total],
+            pin_stiffness=pin_stiffness[: self.pin_total],
+            log_modulus=field["log_modulus"],
+            gravity=gravity,
+            grad_residual=residual,
+            **totals,
+        )
+
+    def _cotangent(self, name: str, values: Any) -> Any:
+        """Return dL/dq or dL/dv in blocks, with a row of zeros for the state before the record."""
+        shape = (self.step_count + 1, self.total)
+        out = self._zeros((self.step_count + 2, *self.solver.functions), vec8d)
+        if values is None:
+            return out
+        if not isinstance(values, wp.array):
+            host = np.asarray(values, dtype=np.float64)
+            if host.shape != (*shape, 3) or not np.isfinite(host).all():
+                raise ConfigError(f"{name}: expected finite numbers of shape {(*shape, 3)}, got shape {host.shape}")
+            values = wp.array(host, dtype=wp.vec3d, device=self.device)
+        if values.shape != shape or values.dtype != wp.vec3d:
+            raise ConfigError(f"{name}: expected vec3d {shape}, got {values.dtype} {values.shape}")
+        self._launch(kernels.pack, (shape[0], *self._blocks), [self.solver.instances, values], [out[1:]])
+        return out
+
+    def _unpack(self, blocks: Any) -> Any:
+        """Return blocks (T, ...) as vec3d (T, N)."""
+        out = self._zeros((blocks.shape[0], self.total), wp.vec3d)
+        dim = (blocks.shape[0], self.instances, self.solver.stride)
+        self._launch(kernels.unpack, dim, [self.solver.instances, blocks], [out])
+        return out
+
+    def _restore(self, t: int) -> None:
+        """Put recorded step t back into the solver, evaluate it at its root and factor the solver's matrix there."""
+        solver, dt = self.solver, self.dt[t]
+        data = getattr(self._state, NAMESPACE)
+        for name, rows in (("q", self._q), ("qd", self._qd)):
+            wp.copy(getattr(data, name), rows[t + 1])
+            wp.copy(getattr(data, f"{name}_before"), rows[t])
+        wp.copy(data.dt_before, self._dt_before[t])
+        solver.begin(self._state, None, dt)
+        wp.copy(solver.motion.force, self._force[t])
+        end = solver.q.reshape((1, *solver.functions))
+        self._launch(kernels.pack, (1, *self._blocks), [solver.instances, self._q[t + 2 : t + 3]], [end])
+        for stored, values in self._entries(t):
+            wp.copy(values, stored)
+        solver.adapt(dt)
+        progress = solver.progress
+        for flag in (progress.active, progress.renew, progress.exact):
+            flag.fill_(1)
+        progress.project.zero_()
+        progress.iteration.zero_()
+        solver._evaluate(progress.active, solver.q, solver.rigid.r, dt, derivatives=True)
+        solver._gather_gradient(dt)
+        solver._assemble(dt)
+        solver.system.factor(progress.active)
+
+    def _measure(self, t: int, residual: Any) -> None:
+        """Measure the residual of the restored step and linearise it."""
+        solver, dt = self.solver, self.dt[t]
+        step = [solver.instances, solver.motion, solver.entries, self._resolution]
+        self._launch(
+            kernels.measure_residual,
+            self.instances,
+            [*step, solver.q, solver.gradient, solver.gradient_chunk, wp.float64(dt)],
+            [residual],
+        )
+        tables = [solver.instances, solver.basis, solver.motion]
+        points = (self.instances, solver.layout.point_max)
+        self._launch(kernels.place_points, points, [*tables, solver.q], [self._step])
+        if self.entry_max:
+            stick_range = wp.float64(solver.options.stick_velocity * dt)
+            dim = (self.instances, self.entry_max)
+            self._launch(kernels.place_entries, dim, [*tables, solver.entries, stick_range, solver.q], [self._step])
+
+    def _solve(self, t: int, right: Any, solution: Any) -> None:
+        """Solve H_t^T solution = right at the free functions; leave H_t^T solution at the driven ones."""
+
+        def apply(active: Any, direction: Any, product: Any) -> None:
+            self._apply(t, active, direction, product)
+
+        self._gmres.solve(apply, right, solution, tolerance=self.options.tolerance)
+
+    def _apply(self, t: int, active: Any, direction: Any, product: Any) -> None:
+        """Write H_t^T direction in active worlds to ``product`` and, for the driven functions, to ``_driven``."""
+        solver, dt = self.solver, wp.float64(self.dt[t])
+        tables, points = [solver.instances, solver.basis], (self.instances, solver.layout.point_max)
+        self._launch(kernels.apply_points, points, [*tables, active, direction, dt], [self._step])
+        if self.entry_max:
+            dim = (self.instances, self.entry_max)
+            self._launch(kernels.apply_entries, dim, [*tables, solver.entries, active, direction], [self._step])
+        self._sum_points(active)
+        self._launch(
+            kernels.sum_product,
+            solver.functions,
+            [*tables, solver.motion, active, solver.gradient_chunk, direction, dt],
+            [product, self._driven],
+        )
+
+    def _sum_points(self, active: Any) -> None:
+        """Sum what stands at the points, less what stands at the entries, into the solver's chunks."""
+        solver, chunk = self.solver, self.solver.gradient_chunk
+        dim = (self.instances, chunk.shape[1], solver.layout.block_count)
+        tables = [solver.instances, solver.basis, self._points, self._constraints]
+        self._launch(sum_forces, dim, [*tables, active, chunk.shape[1]], [chunk])
+
+    def _check(self, residual: Array, error: Array) -> None:
+        """Refuse steps that are no roots and systems that were not solved."""
+        status = self.solver.status.numpy()
+        if (status & WORLD_NOT_FINITE).any() or not np.isfinite(residual).all():
+            raise SolverDiverged("a recorded step produced no finite state", hint="shorten dt or soften the load")
+        if residual.max() > self.options.residual_warning:
+            t, i = np.unravel_index(residual.argmax(), residual.shape)
+            message = f"step {t} of instance {i} stopped at a residual of {residual[t, i]:.1e} of the forces"
+            hint = "lower SolverReducedOptions.tolerance (and force_tolerance)"
+            if residual[t, i] > self.options.residual_max:
+                raise SolverDiverged(f"{message}, above residual_max = {self.options.residual_max:.1e}", hint=hint)
+            warnings.warn(f"{message}: its gradient is as inexact; {hint}", RuntimeWarning, stacklevel=3)
+        if error.max() > 1.0e3 * self.options.tolerance:
+            t, i = np.unravel_index(error.argmax(), error.shape)
+            raise SolverDiverged(
+                f"the linear system of step {t}, instance {i}, was solved to {error[t, i]:.1e} only",
+                hint="raise AdjointOptions.cycle_length or cycle_max; at a bifurcation there is no gradient",
+            )
+
+    @property
+    def _blocks(self) -> tuple[int, int]:
+        return self.instances, self.solver.layout.block_count
+
+    def _zeros(self, shape: Sequence[int], dtype: Any) -> Any:
+        return wp.zeros(tuple(shape), dtype=dtype, device=self.device)
+
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: Sequence[Any] = ()) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=list(outputs), device=self.device)

@@ -1,0 +1,476 @@
+"""Device side of the adjoint: the exact linearisation of one step in float64, its solution, what it gives.
+
+Vectors have the layout of the solver's unknowns, (instance_count, 3 block_count) blocks of eight. An instance is one
+linear system: contact couples a body with rigid shapes only. Every sum runs in a fixed order.
+"""
+
+import warp as wp
+
+from softmode.deformables.contact.penalty_kernels import friction_potential, normal_potential
+from softmode.deformables.materials.hessian_kernels import stress_derivative
+from softmode.deformables.materials.material_kernels import green_strain, hooke_stress, stress
+from softmode.deformables.model.deformation_kernels import displacement_gradient, elastic_gradient
+from softmode.deformables.model.lane_kernels import LANES, free_part, vec8d
+from softmode.deformables.model.struct_kernels import Basis, Entries, Instances, Motion, interpolate, interpolate_change
+from softmode.deformables.solver.step_kernels import material_of
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Linearised:
+    """A recorded step at its root."""
+
+    place: wp.array2d[wp.mat33d]  # (instance_count, point_max), G = F / s - I, s the scale of the body
+    place_start: wp.array2d[wp.mat33d]  # the same at the start of the step
+    point: wp.array2d[wp.mat33d]  # V times what is summed over the points next [N m]
+    entry_slip: wp.array2d[wp.vec3d]  # pins: x - target [m]; contacts: friction force per coefficient, times -1 [N]
+    entry_hessian: wp.array2d[wp.mat33d]  # -d force / d displacement [N/m]; not symmetric where a contact slips
+    entry: wp.array2d[wp.vec3d]  # what is summed over the entries next [N]
+
+
+# -- layout ------------------------------------------------------------------------------------------------------------
+
+
+@wp.kernel
+def pack(
+    instances: Instances,
+    values: wp.array2d[wp.vec3d],  # (step_count, function_total), as in a state
+    # Out:
+    out: wp.array3d[vec8d],  # (step_count, instance_count, 3 block_count)
+):
+    """Put vectors of a state into blocks."""
+    t, i, b = wp.tid()
+    stride = out.shape[2] / 3
+    for axis in range(3):
+        block = vec8d()
+        for lane in range(LANES):
+            k = LANES * b + lane
+            if k < instances.function_count[i]:
+                block[lane] = values[t, instances.function_start[i] + k][axis]
+        out[t, i, axis * stride + b] = block
+
+
+@wp.kernel
+def unpack(
+    instances: Instances,
+    values: wp.array3d[vec8d],
+    # Out:
+    out: wp.array2d[wp.vec3d],
+):
+    """Put blocks into the layout of a state."""
+    t, i, k = wp.tid()
+    if k >= instances.function_count[i]:
+        return
+    stride = values.shape[2] / 3
+    b = k / LANES
+    lane = k % LANES
+    out[t, instances.function_start[i] + k] = wp.vec3d(
+        values[t, i, b][lane], values[t, i, stride + b][lane], values[t, i, 2 * stride + b][lane]
+    )
+
+
+@wp.kernel
+def add_force(
+    instances: Instances,
+    force: wp.array[wp.vec3d],  # (function_total,) [N]
+    # In and out:
+    motion: Motion,
+):
+    """Add a generalised force to that of a step."""
+    i, b = wp.tid()
+    stride = motion.force.shape[1] / 3
+    for axis in range(3):
+        block = motion.force[i, axis * stride + b]
+        for lane in range(LANES):
+            k = LANES * b + lane
+            if k < instances.function_count[i]:
+                block[lane] += force[instances.function_start[i] + k][axis]
+        motion.force[i, axis * stride + b] = block
+
+
+# -- the linearisation at a recorded step ------------------------------------------------------------------------------
+
+
+@wp.kernel
+def place_points(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    q: wp.array2d[vec8d],
+    # Out:
+    step: Linearised,
+):
+    """Evaluate the elastic displacement gradient at both ends of the step."""
+    i, p = wp.tid()
+    if p >= instances.point_count[i]:
+        return
+    point = instances.point_start[i] + p
+    n = instances.function_count[i]
+    s = wp.float64(instances.scale[i])
+    step.place[i, p] = elastic_gradient(basis.gradient, q, i, point, n, s)
+    step.place_start[i, p] = elastic_gradient(basis.gradient, motion.q_start, i, point, n, s)
+
+
+@wp.kernel
+def place_entries(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    entries: Entries,
+    stick_range: wp.float64,
+    q: wp.array2d[vec8d],
+    # Out:
+    step: Linearised,
+):
+    """Linearise pins and contacts, the normal force of friction included, at fixed normals."""
+    i, e = wp.tid()
+    if e >= entries.count[i]:
+        return
+    d = interpolate_change(basis.row, entries.row[i, e], q, motion.q_start, i, instances.function_count[i])
+    x = entries.offset[i, e] + d
+    k = entries.stiffness[i, e]
+    identity = wp.identity(n=3, dtype=wp.float64)
+    if e < instances.pin_count[i]:
+        step.entry_slip[i, e] = x
+        step.entry_hessian[i, e] = k * identity
+        return
+    n = entries.normal[i, e]
+    _psi, slope, curvature = normal_potential(-wp.dot(n, x), wp.float64(instances.smoothing[i]))
+    t = x - wp.dot(n, x) * n
+    y = wp.length(t)
+    _f0, f1_over_y, f1_slope = friction_potential(y, stick_range)
+    c = entries.friction[i, e]
+    N = wp.outer(n, n)
+    slip = f1_over_y * (identity - N)
+    if y > wp.float64(1.0e-9) * stick_range:
+        slip += (f1_slope - f1_over_y) / (y * y) * wp.outer(t, t)
+    step.entry_slip[i, e] = k * slope * f1_over_y * t
+    step.entry_hessian[i, e] = k * curvature * N + c * k * slope * slip - c * k * curvature * f1_over_y * wp.outer(t, n)
+
+
+@wp.kernel
+def measure_residual(
+    instances: Instances,
+    motion: Motion,
+    entries: Entries,
+    resolution: wp.array[wp.float64],  # (instance_count,), motion [m] whose inertia is no force worth naming
+    q: wp.array2d[vec8d],
+    gradient: wp.array2d[vec8d],
+    internal: wp.array3d[vec8d],  # (instance_count, chunk_count, 3 block_count), forces of points less entries
+    dt: wp.float64,
+    # Out:
+    ratio_out: wp.array[wp.float64],  # (instance_count,)
+):
+    """Compute |r| / |f|: the residual of a step against the largest of the forces that it balances."""
+    i = wp.tid()
+    rate = motion.rate[i] / dt
+    weight = instances.mass[i] * rate * rate
+    total = wp.float64(0.0)
+    inertial = wp.float64(0.0)
+    elastic = wp.float64(0.0)
+    external = wp.float64(0.0)
+    for e in range(q.shape[1]):
+        r = gradient[i, e]
+        total += wp.dot(r, r)
+        inertia = weight * (q[i, e] - motion.q_inertial[i, e])
+        inertial += wp.dot(inertia, inertia)
+        force = motion.force[i, e]
+        external += wp.dot(force, force)
+        stress = vec8d()
+        for chunk in range(internal.shape[1]):
+            stress = stress + internal[i, chunk, e]
+        elastic += wp.dot(stress, stress)
+    scale = wp.sqrt(wp.max(inertial, wp.max(elastic, external)))
+    for e in range(entries.count[i]):
+        scale += wp.length(entries.force[i, e])
+    ratio_out[i] = wp.sqrt(total) / (scale + weight * resolution[i])
+
+
+# -- products with H^T -------------------------------------------------------------------------------------------------
+
+
+@wp.kernel
+def apply_points(
+    instances: Instances,
+    basis: Basis,
+    active: wp.array[int],  # (world_count,)
+    direction: wp.array2d[vec8d],
+    dt: wp.float64,
+    # Out:
+    step: Linearised,
+):
+    """Apply the elastic Hessian at the cubature points."""
+    i, p = wp.tid()
+    if active[instances.world[i]] == 0 or p >= instances.point_count[i]:
+        return
+    point = instances.point_start[i] + p
+    dF = displacement_gradient(basis.gradient, direction, i, point, instances.function_count[i])
+    material = material_of(instances, basis, i, point)
+    # V s^3 of the energy, less one s for each of the two derivatives by F = s (I + place)
+    step.point[i, p] = (
+        wp.float64(instances.scale[i])
+        * basis.point_weight[point]
+        * stress_derivative(material, step.place[i, p], step.place_start[i, p], dt, dF)
+    )
+
+
+@wp.kernel
+def apply_entries(
+    instances: Instances,
+    basis: Basis,
+    entries: Entries,
+    active: wp.array[int],
+    direction: wp.array2d[vec8d],
+    # Out:
+    step: Linearised,
+):
+    """Evaluate the force of pins and contacts: less their transposed Hessian times the direction."""
+    i, e = wp.tid()
+    if active[instances.world[i]] == 0 or e >= entries.count[i]:
+        return
+    d = interpolate(basis.row, entries.row[i, e], direction, i, instances.function_count[i])
+    step.entry[i, e] = -(wp.transpose(step.entry_hessian[i, e]) * d)
+
+
+@wp.kernel
+def sum_product(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    active: wp.array[int],
+    chunk: wp.array3d[vec8d],  # sums of V dP grad b over the points less b f over the entries
+    direction: wp.array2d[vec8d],
+    dt: wp.float64,
+    # Out:
+    out: wp.array2d[vec8d],  # zero for driven functions
+    driven_out: wp.array2d[vec8d],  # zero for the others
+):
+    """Compute H^T d = m c/dt (c/dt + alpha) d + sum_p V dP grad b + sum_e b H_e^T d_e."""
+    i, e = wp.tid()
+    if active[instances.world[i]] == 0:
+        return
+    stride = basis.row.shape[1]
+    b = e % stride
+    rate = motion.rate[i] / dt
+    total = instances.mass[i] * rate * (rate + wp.float64(instances.mass_damping[i])) * direction[i, e]
+    if LANES * b < instances.function_count[i]:
+        for k in range(chunk.shape[1]):
+            total = total + chunk[i, k, e]
+    free = free_part(total, instances.driven_count[i] - LANES * b)
+    out[i, e] = free
+    driven_out[i, e] = total - free
+
+
+# -- what lambda gives -------------------------------------------------------------------------------------------------
+
+
+@wp.kernel
+def add_velocity(
+    motion: Motion,
+    qd_bar: wp.array2d[vec8d],
+    dt: wp.float64,
+    # In and out:
+    q_bar: wp.array2d[vec8d],
+):
+    """Pass dL/dv_t to q_t: v = c (q - q_rate) / dt."""
+    i, e = wp.tid()
+    q_bar[i, e] = q_bar[i, e] + motion.rate[i] / dt * qd_bar[i, e]
+
+
+@wp.kernel
+def accumulate_points(
+    instances: Instances,
+    basis: Basis,
+    costate: wp.array2d[vec8d],  # lambda
+    dt: wp.float64,
+    # In and out, (instance_count, point_max):
+    log_modulus: wp.array2d[wp.float64],
+    poissons_ratio: wp.array2d[wp.float64],
+    viscosity: wp.array2d[wp.float64],
+    # Out:
+    step: Linearised,  # point: V dP_start^T[Lambda], what the start of the step feels through dissipation
+):
+    """Add -V Lambda : dP/d(ln E, nu, tau); the stress is linear in mu, in lambda and in tau."""
+    i, p = wp.tid()
+    if p >= instances.point_count[i]:
+        return
+    point = instances.point_start[i] + p
+    s = wp.float64(instances.scale[i])
+    V = s * s * basis.point_weight[point]  # of the stress by F = s (I + place)
+    G = step.place[i, p]
+    G_start = step.place_start[i, p]
+    material = material_of(instances, basis, i, point)
+    L = displacement_gradient(basis.gradient, costate, i, point, instances.function_count[i])
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    two = wp.float64(2.0)
+    mu = material.mu
+    lam = material.lam
+    nu = wp.float64(instances.poissons_ratio[i])
+    log_modulus[i, p] = log_modulus[i, p] - V * wp.ddot(L, stress(material, G, G_start, dt))
+
+    # d ln(mu)/d nu = -1 / (1 + nu); dlambda/dnu = E (1 + 2 nu^2) / ((1 + nu) (1 - 2 nu))^2
+    modulus = two * mu * (one + nu)
+    root = (one + nu) * (one - two * nu)
+    material.lam = zero
+    by_mu = stress(material, G, G_start, dt) / mu
+    material.mu = zero
+    material.lam = one
+    by_lam = stress(material, G, G_start, dt)
+    slope = modulus * (one + two * nu * nu) / (root * root) * by_lam - mu / (one + nu) * by_mu
+    poissons_ratio[i, p] = poissons_ratio[i, p] - V * wp.ddot(L, slope)
+
+    # viscous stress: tau / dt F C (E - E_start) with Hooke's tensor C
+    material.mu = mu
+    material.lam = lam
+    F = wp.identity(n=3, dtype=wp.float64) + G
+    by_tau = one / dt * (F * hooke_stress(material, green_strain(G) - green_strain(G_start)))
+    viscosity[i, p] = viscosity[i, p] - V * wp.ddot(L, by_tau)
+    F_start = wp.identity(n=3, dtype=wp.float64) + G_start
+    strain = wp.float64(0.5) / s * (wp.transpose(F) * L + wp.transpose(L) * F)
+    step.point[i, p] = -V * material.viscosity / dt * (F_start * hooke_stress(material, strain))
+
+
+@wp.kernel
+def accumulate_entries(
+    instances: Instances,
+    basis: Basis,
+    entries: Entries,
+    costate: wp.array2d[vec8d],
+    # In and out:
+    pin_stiffness: wp.array[wp.float64],  # (pin_count,)
+    friction: wp.array2d[wp.float64],  # (instance_count, entry_max)
+    # Out:
+    pin_target_out: wp.array[wp.vec3d],  # (pin_count,), of this step
+    step: Linearised,  # entry: what the start of the step feels through slip
+):
+    """Add the gradients of pins, friction and of where a slipping contact started."""
+    i, e = wp.tid()
+    if e >= entries.count[i]:
+        return
+    L = interpolate(basis.row, entries.row[i, e], costate, i, instances.function_count[i])
+    step.entry[i, e] = wp.vec3d()
+    if e < instances.pin_count[i]:
+        pin = instances.pin_start[i] + e
+        pin_target_out[pin] = entries.stiffness[i, e] * L
+        pin_stiffness[pin] = pin_stiffness[pin] - wp.dot(L, step.entry_slip[i, e])
+        return
+    n = entries.normal[i, e]
+    back = wp.transpose(step.entry_hessian[i, e]) * L
+    step.entry[i, e] = back - wp.dot(n, back) * n
+    # c = sqrt(friction of body * friction of shape)
+    if instances.friction[i] > 0.0:
+        share = wp.float64(0.5) * entries.friction[i, e] / wp.float64(instances.friction[i])
+        friction[i, e] = friction[i, e] - share * wp.dot(L, step.entry_slip[i, e])
+
+
+@wp.struct
+class Sums:
+    """Gradients that are gathered over the steps, per unknown, (instance_count, 3 block_count)."""
+
+    mass: wp.array2d[vec8d]
+    mass_damping: wp.array2d[vec8d]
+    gravity: wp.array2d[vec8d]
+
+
+@wp.kernel
+def propagate(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    chunk: wp.array3d[vec8d],  # sums over points and entries of what the start of the step feels
+    gravity: wp.array[wp.vec3],
+    q: wp.array2d[vec8d],
+    costate: wp.array2d[vec8d],
+    driven: wp.array2d[vec8d],  # H^T lambda at the driven functions
+    dt: wp.float64,
+    # In and out:
+    q_bar: wp.array2d[vec8d],  # dL/dq_t; becomes dL/d(q_driven)
+    qd_bar: wp.array2d[vec8d],
+    q_bar_1: wp.array2d[vec8d],  # of the step before
+    qd_bar_1: wp.array2d[vec8d],
+    q_bar_2: wp.array2d[vec8d],
+    qd_bar_2: wp.array2d[vec8d],
+    sums: Sums,
+):
+    """Subtract lambda^T dr/d(q_(t-1), v_(t-1), q_(t-2), v_(t-2), m, alpha, g)."""
+    i, e = wp.tid()
+    stride = basis.row.shape[1]
+    b = e % stride
+    axis = e / stride
+    m = instances.mass[i]
+    rate = motion.rate[i] / dt
+    alpha = wp.float64(instances.mass_damping[i])
+    L = costate[i, e]
+    start = vec8d()
+    if LANES * b < instances.function_count[i]:
+        for k in range(chunk.shape[1]):
+            start = start - chunk[i, k, e]
+    q_rate = m * rate * (rate + alpha) * L - rate * qd_bar[i, e]
+    qd_rate = m * rate * L
+    third = wp.float64(0.0)
+    if motion.rate[i] > wp.float64(1.0):
+        third = wp.float64(1.0) / wp.float64(3.0)
+    q_bar_1[i, e] = q_bar_1[i, e] + start + (wp.float64(1.0) + third) * q_rate
+    qd_bar_1[i, e] = qd_bar_1[i, e] + (wp.float64(1.0) + third) * qd_rate
+    if third > wp.float64(0.0):
+        q_bar_2[i, e] = q_bar_2[i, e] - third * q_rate
+        qd_bar_2[i, e] = qd_bar_2[i, e] - third * qd_rate
+    q_bar[i, e] = q_bar[i, e] - free_part(q_bar[i, e], instances.driven_count[i] - LANES * b) - driven[i, e]
+
+    travel = rate * (q[i, e] - motion.q_rate[i, e])
+    mean = basis.mean[instances.asset[i], b]
+    g = wp.float64(gravity[wp.max(instances.world[i], 0)][axis])
+    per_mass = rate * rate * (q[i, e] - motion.q_inertial[i, e]) + alpha * travel - g * mean
+    sums.mass[i, e] = sums.mass[i, e] - wp.cw_mul(L, per_mass)
+    sums.mass_damping[i, e] = sums.mass_damping[i, e] - m * wp.cw_mul(L, travel)
+    sums.gravity[i, e] = sums.gravity[i, e] + m * wp.cw_mul(mean, L)
+
+
+@wp.kernel
+def sum_gradients(
+    instances: Instances,
+    density: wp.array[float],
+    log_modulus: wp.array2d[wp.float64],
+    poissons_ratio: wp.array2d[wp.float64],
+    viscosity: wp.array2d[wp.float64],
+    friction: wp.array2d[wp.float64],
+    sums: Sums,
+    # Out, (instance_count,):
+    youngs_modulus_out: wp.array[wp.float64],
+    poissons_ratio_out: wp.array[wp.float64],
+    viscosity_out: wp.array[wp.float64],
+    friction_out: wp.array[wp.float64],
+    density_out: wp.array[wp.float64],
+    mass_damping_out: wp.array[wp.float64],
+    gravity_out: wp.array[wp.vec3d],
+):
+    """Sum over points, entries and functions, in order."""
+    i = wp.tid()
+    modulus = wp.float64(0.0)
+    nu = wp.float64(0.0)
+    tau = wp.float64(0.0)
+    for p in range(instances.point_count[i]):
+        modulus += log_modulus[i, p]
+        nu += poissons_ratio[i, p]
+        tau += viscosity[i, p]
+    youngs_modulus_out[i] = modulus / wp.float64(instances.youngs_modulus[i])
+    poissons_ratio_out[i] = nu
+    viscosity_out[i] = tau
+    c = wp.float64(0.0)
+    for e in range(friction.shape[1]):
+        c += friction[i, e]
+    friction_out[i] = c
+    mass = wp.float64(0.0)
+    alpha = wp.float64(0.0)
+    g = wp.vec3d()
+    stride = sums.mass.shape[1] / 3
+    for e in range(3 * stride):
+        for lane in range(LANES):
+            mass += sums.mass[i, e][lane]
+            alpha += sums.mass_damping[i, e][lane]
+            g[e / stride] += sums.gravity[i, e][lane]
+    density_out[i] = instances.mass[i] / wp.float64(density[i]) * mass
+    mass_damping_out[i] = alpha
+    gravity_out[i] = g

@@ -1,0 +1,1 @@
+"""Energy, stress and Hessian of hyperelastic materials at a point."""

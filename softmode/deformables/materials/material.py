@@ -1,0 +1,123 @@
+"""Hyperelastic materials: energy density, first Piola-Kirchhoff stress and projected Hessian, per point.
+
+Every material is isotropic; F is the deformation gradient, J = det F, I_C = |F|^2, E = (F^T F - I)/2, and F = R S is
+its polar decomposition with the rotation R nearest to F. Lame's parameters are mu = Y / (2 (1 + nu)) and lambda = Y nu
+/ ((1 + nu) (1 - 2 nu)) with Young's modulus Y and Poisson's ratio nu. All agree with Hooke's law mu |e|^2 + lambda/2
+tr(e)^2 to second order in the small strain e (ARAP with lambda = 0).
+
+====================== =============================================================================== ================
+model                  energy density                                                                  domain
+====================== =============================================================================== ================
+STABLE_NEO_HOOKEAN_LOG m/2 (I_C - 3) + l/2 [(J - a)^2 - (1 - a)^2] - m/2 ln((I_C + 1)/4), m = 4/3 mu,  all F
+                       l = lambda + 5/6 mu, a = 1 + m/l - m/(4 l). Smith, de Goes, Kim 2018,
+                       doi:10.1145/3180491, eq. (14)
+STABLE_NEO_HOOKEAN     mu/2 (I_C - 3) + (lambda+mu)/2 [(J - g)^2 - (1 - g)^2], g = 1 + mu/(lambda+mu). all F, but stays
+                       FreeForm's eq. (16) with the factor 1/2 on mu that its eq. (26) needs           at a point
+ARAP                   mu |F - R|^2                                                                    all F
+COROTATED              mu |F - R|^2 + lambda/2 (J - 1)^2. Stomakhin et al. 2012,                       all F
+                       doi:10.2312/SCA/SCA12/025-032
+STVK                   mu E : E + lambda/2 tr(E)^2                                                     all F, soft below
+                                                                                                       0.58 of length
+NEO_HOOKEAN            mu/2 (I_C - 3) - mu ln J + lambda/2 ln(J)^2. Bonet and Wood 2008, eq. (6.28)    J > 0
+====================== =============================================================================== ================
+
+When to use which:
+
+- STABLE_NEO_HOOKEAN_LOG, the default: rubber, flesh, foam under any load; keeps its volume as nu says, and comes back
+  from flat, mirrored and point-like states.
+- STABLE_NEO_HOOKEAN: parity with published results. F = 0 is a strict local minimum of it.
+- ARAP: parity with shape-editing methods. It has no resistance to a change of volume: pressed to 60 % of its height
+  between frictionless plates it keeps 60 % of its volume, where a Neo-Hookean with nu = 0.45 keeps 93 %.
+- COROTATED: stress linear in the stretch; the usual choice of material point methods and of control.
+- STVK: large rotations with small strains, as in plates and rods. In compression its force falls off from a stretch of
+  1/sqrt(3) on, and a flat body has no stress at all.
+- NEO_HOOKEAN: parity with finite-element codes that use ln J. Energy is infinite at J <= 0, which the line search never
+  accepts; stress and Hessian there are finite, but the state must start with J > 0 everywhere.
+
+Damping. The Kelvin-Voigt stress tau C : dE/dt with C Hooke's tensor (2 mu e + lambda tr(e) I) is Rayleigh's stiffness
+damping beta K in a form that does not see rotations: with beta = ``viscosity`` and alpha = ``mass_damping`` a mode of
+angular frequency omega of the body at rest has the damping ratio zeta = alpha / (2 omega) + beta omega / 2.
+"""
+
+from dataclasses import dataclass
+
+from softmode.deformables.materials.hessian_kernels import HessianBlocks, hessian, stress_derivative
+from softmode.deformables.materials.material_kernels import (
+    MaterialModel,
+    MaterialParameters,
+    cofactor,
+    determinant_minus_one,
+    energy,
+    green_strain,
+    hooke_energy,
+    hooke_stress,
+    invariant_derivatives,
+    lame,
+    strain_measure,
+    stress,
+)
+from softmode.errors import MaterialError
+
+__all__ = [
+    "HessianBlocks",
+    "Material",
+    "MaterialModel",
+    "MaterialParameters",
+    "cofactor",
+    "determinant_minus_one",
+    "energy",
+    "green_strain",
+    "hessian",
+    "hooke_energy",
+    "hooke_stress",
+    "invariant_derivatives",
+    "lame",
+    "strain_measure",
+    "stress",
+    "stress_derivative",
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Material:
+    """Elastic and dissipative properties of one body.
+
+    Raises:
+        MaterialError: If a value lies outside its admissible range.
+    """
+
+    youngs_modulus: float = 1.0e5
+    """E [Pa], > 0."""
+    poissons_ratio: float = 0.4
+    """nu, in (-1, 0.5)."""
+    density: float = 300.0
+    """rho [kg/m^3], > 0."""
+    viscosity: float = 0.002
+    """Relaxation time tau [s], >= 0, of the Kelvin-Voigt stress tau (2 mu dE/dt + lambda tr(dE/dt) I), E the Green
+    strain: Rayleigh's stiffness coefficient beta. Damps every deformation, and neither translation nor rotation."""
+    mass_damping: float = 0.0
+    """Rayleigh's mass coefficient alpha [1/s], >= 0: damps rigid motion too, as if in a thick fluid."""
+    friction: float = 0.8
+    """Coulomb coefficient of the surface, >= 0; a contact uses sqrt(friction of body * friction of shape)."""
+    model: MaterialModel = MaterialModel.STABLE_NEO_HOOKEAN_LOG
+    """The energy density."""
+
+    def __post_init__(self) -> None:
+        """Check every range."""
+        for name in ("youngs_modulus", "density"):
+            value = getattr(self, name)
+            if not 0.0 < value < float("inf"):
+                raise MaterialError(
+                    f"{name} must be a finite number > 0, got {value!r}", hint=f"give {name} in SI units"
+                )
+        if not -1.0 < self.poissons_ratio < 0.5:
+            raise MaterialError(
+                f"poissons_ratio must lie in (-1, 0.5), got {self.poissons_ratio!r}",
+                hint="use 0.49 for a nearly incompressible material",
+            )
+        for name in ("viscosity", "mass_damping", "friction"):
+            value = getattr(self, name)
+            if not 0.0 <= value < float("inf"):
+                raise MaterialError(
+                    f"{name} must be a finite number >= 0, got {value!r}", hint="use 0 to switch it off"
+                )

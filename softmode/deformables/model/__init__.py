@@ -1,0 +1,1 @@
+"""Bodies in a Newton model, and the tables that a step reads and writes."""

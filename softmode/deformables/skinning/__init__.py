@@ -1,0 +1,1 @@
+"""Points and Gaussians at any rest point, moved by the reduced coordinates, forward and adjoint."""

@@ -1,0 +1,184 @@
+"""Forward skinning on the device: splat means, F Sigma F^T and the rotation of F from the reduced coordinates q.
+
+x(X) = X + sum_k b_k(X) q_k and F(X) = I + sum_k q_k grad b_k(X)^T. The displacement q carries the whole rigid motion of
+a body, metres of it, while splats are millimetres in size: the mean displacement of the splats is summed in float64,
+what is left of it in float32, and their sum is rounded once at the end.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from softmode.deformables.skinning import skinning_cpu_kernels as cpu_kernels
+from softmode.deformables.skinning import skinning_kernels as kernels
+from softmode.errors import BasisError
+
+STRETCH_LIMIT = 8.0
+"""Largest principal stretch that a splat follows; see `limited_stretch`. A simple shear of 3 has 3.3; where a surface
+is torn, less than 8 opens gaps in it, and more gains nothing."""
+
+
+def average_basis(
+    values: Callable[[NDArray[np.float64]], NDArray[np.floating]], means: ArrayLike, covariances: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return basis values and gradients averaged over each splat, for `SkinSplats`.
+
+    A splat is as wide as the deformation varies where a basis is coarse or torn: the gradient at its centre then draws
+    it out into a spike, or leaves it behind. The Gaussian that has the mean of x(X) and the best affine fit to it is
+    the one with E[b_k] and E[grad b_k] = Sigma^-1 E[(X - mean) b_k] (Stein's lemma): statistical linearisation. Both
+    expectations are taken by the cubature rule of degree three, mean +/- sqrt(3) sigma_i e_i (Arasaratnam and Haykin
+    2009, DOI 10.1109/TAC.2009.2019800). x(X) is linear in q, so this is done once and costs nothing in a frame; affine
+    motion stays exact.
+
+    Args:
+        values: Basis values (N, n) at points [m] (N, 3); for a body `lambda x: body.evaluate(x)[0]`.
+        means: Rest centres in the body frame [m], shape (N, 3).
+        covariances: Rest covariances [m^2], shape (N, 3, 3).
+
+    Returns:
+        Values, shape (N, n), and gradients [1/m], shape (N, n, 3).
+    """
+    x = np.asarray(means, dtype=np.float64)
+    variance, axes = np.linalg.eigh(np.asarray(covariances, dtype=np.float64))
+    # Below this width the difference of two values would be rounding; a derivative is as good.
+    least = 1e-5 * max(float(np.ptp(x, axis=0).max()), float(np.sqrt(variance.max())))
+    value, gradient = 0.0, 0.0
+    for i in range(3):
+        arm = np.maximum(np.sqrt(3.0 * np.maximum(variance[:, i], 0.0)), least)[:, None]
+        ahead, behind = (np.asarray(values(x + sign * arm * axes[:, :, i]), dtype=np.float64) for sign in (1.0, -1.0))
+        value = value + (ahead + behind) / 6.0
+        gradient = gradient + ((ahead - behind) / (2.0 * arm))[:, :, None] * axes[:, None, :, i]
+    return np.asarray(value), np.asarray(gradient)
+
+
+class SkinSplats:
+    """The splats of one object with the basis that moves them; worlds share it.
+
+    Args:
+        means: Rest centres in the body frame [m], shape (N, 3).
+        covariances: Rest covariances [m^2], shape (N, 3, 3).
+        basis: Basis values, averaged over each splat (`average_basis`) or at its centre, shape (N, n).
+        grad_basis: Basis gradients likewise [1/m], shape (N, n, 3).
+        stretch_limit: Largest principal stretch that a splat follows.
+        device: Warp device.
+
+    Raises:
+        BasisError: If the shapes do not belong together.
+    """
+
+    def __init__(
+        self,
+        means: ArrayLike,
+        covariances: ArrayLike,
+        basis: ArrayLike,
+        grad_basis: ArrayLike,
+        *,
+        stretch_limit: float = STRETCH_LIMIT,
+        device: Any = None,
+    ) -> None:
+        """Upload the rest state."""
+        x, s = np.asarray(means, dtype=np.float64), np.asarray(covariances, dtype=np.float64)
+        b, g = np.asarray(basis, dtype=np.float64), np.asarray(grad_basis, dtype=np.float64)
+        n = len(x)
+        if x.shape != (n, 3) or s.shape != (n, 3, 3) or b.ndim != 2 or len(b) != n or g.shape != (*b.shape, 3):
+            raise BasisError(
+                f"means {x.shape}, covariances {s.shape}, basis {b.shape}, grad_basis {g.shape} do not belong together",
+                hint="Expected (N, 3), (N, 3, 3), (N, n) and (N, n, 3)",
+            )
+        self.stretch_limit = float(stretch_limit)
+        self.device = wp.get_device(device)
+        six = np.stack([s[:, 0, 0], s[:, 0, 1], s[:, 0, 2], s[:, 1, 1], s[:, 1, 2], s[:, 2, 2]], axis=1)
+        mean = b.mean(axis=0)
+        basis4 = np.concatenate([g, (b - mean)[..., None]], axis=2).transpose(1, 0, 2).astype(np.float32)
+        self.rest_means = wp.array(x.astype(np.float32), dtype=wp.vec3, device=self.device)
+        self.rest_covariances = wp.array(six.astype(np.float32), dtype=kernels.vec6, device=self.device)
+        self.basis = wp.array(np.ascontiguousarray(basis4), dtype=wp.vec4, device=self.device)
+        """Gradient [1/m] and value less its average over the splats, shape (n, N)."""
+        self.mean_basis = wp.array(mean, dtype=wp.float64, device=self.device)
+        """Average of the basis values over the splats, shape (n,)."""
+        self._motion: dict[int, tuple[wp.array, wp.array]] = {}  # by world count; kept, as graphs may hold them
+
+    @property
+    def count(self) -> int:
+        """Number of splats N."""
+        return self.rest_means.shape[0]
+
+    @property
+    def function_count(self) -> int:
+        """Number of basis functions n."""
+        return self.basis.shape[0]
+
+    def launch(
+        self,
+        q: wp.array,
+        function_start: wp.array,
+        means: wp.array,
+        covariances: wp.array,
+        *,
+        rotations: wp.array | None = None,
+        first_splat: int = 0,
+    ) -> None:
+        """Write the deformed means and covariances of all worlds; capturable after one launch for as many worlds.
+
+        Args:
+            q: Reduced coordinates of all instances [m], flat vec3d.
+            function_start: First entry of q of this object's instance in each world, int32, shape (world_count,).
+            means: Output centres [m], vec3, shape (world_count, total splats).
+            covariances: Output covariances [m^2], vec6, shape (world_count, total splats).
+            rotations: Output rotations of F, rest frame to world, quat, like `means`; None, or shape (1, 1) as in
+                `SplatArrays` of degree 0, for colours that are the same from everywhere.
+            first_splat: Column where this object's splats begin.
+
+        Raises:
+            BasisError: If an output has not a row per world or too few columns, `rotations` has another shape than
+                `means`, or the first launch for that number of worlds is captured.
+        """
+        if rotations is not None and rotations.shape != means.shape:
+            if rotations.shape != (1, 1):
+                raise BasisError(f"rotations has shape {rotations.shape}, means {means.shape}; one per splat is needed")
+            rotations = None
+        worlds = function_start.shape[0]
+        shape, columns = (worlds, means.shape[-1]), first_splat + self.count
+        if means.shape != shape or covariances.shape != shape or not 0 <= first_splat <= columns <= shape[1]:
+            raise BasisError(
+                f"means {means.shape} and covariances {covariances.shape} do not hold columns {first_splat} to "
+                f"{columns} of {worlds} worlds",
+                hint="Build them by SplatArrays.from_splats(..., world_count=...)",
+            )
+        if worlds not in self._motion:
+            if self.device.is_capturing:  # what a capture allocates belongs to its graph, and goes with it
+                raise BasisError(
+                    f"the first launch for {worlds} worlds is being captured",
+                    hint="Launch once before the capture; that compiles the kernels too",
+                )
+            self._motion[worlds] = (
+                wp.zeros(worlds, dtype=wp.vec3d, device=self.device),
+                wp.zeros((worlds, self.function_count), dtype=wp.vec4, device=self.device),
+            )
+        motion = self._motion[worlds]
+        lanes = 32 if self.device.is_cuda else 1
+        wp.launch(
+            kernels.split_motion,
+            dim=(worlds, lanes),
+            inputs=[self.mean_basis, function_start, q, lanes],
+            outputs=[*motion],
+            device=self.device,
+        )
+        inputs = [self.rest_means, self.rest_covariances, self.basis, self.stretch_limit, *motion, first_splat]
+        outputs = [means, covariances, rotations]
+        if self.device.is_cpu and self.count >= cpu_kernels.BLOCK:
+            blocks = -(-self.count // cpu_kernels.BLOCK)
+            wp.launch(cpu_kernels.skin_blocks, (blocks, worlds), inputs, outputs, device=self.device)
+            return
+        together = 4 if self.device.is_cuda and worlds > 1 else 1
+        wp.launch(
+            kernels.skin_kernel(together),
+            dim=(-(-worlds // together), self.count),
+            inputs=inputs,
+            outputs=outputs,
+            device=self.device,
+            block_dim=128,
+        )

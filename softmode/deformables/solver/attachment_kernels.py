@@ -1,0 +1,44 @@
+"""Device side of attachments: pins are held or released per world."""
+
+import warp as wp
+
+from softmode.deformables.model.struct_kernels import Instances, in_mask
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def hold_pins(
+    instances: Instances,
+    instance_start: wp.array[int],  # (world_count + 1,)
+    instance_world: wp.array[int],
+    world_mask: wp.array[wp.bool],
+    local: int,
+    first: int,
+    sign: float,
+    # In and out:
+    pin_stiffness: wp.array[float],  # [N/m], negative while released
+):
+    """Hold (sign 1) or release (sign -1) pins of one body in the masked worlds."""
+    w, p = wp.tid()
+    i = instance_start[w] + local
+    if i >= instance_start[w + 1]:
+        return
+    if in_mask(instance_world[i], world_mask):
+        pin = instances.pin_start[i] + first + p
+        pin_stiffness[pin] = sign * wp.abs(pin_stiffness[pin])
+
+
+@wp.kernel
+def hold_all_pins(
+    instances: Instances,
+    instance_world: wp.array[int],
+    world_mask: wp.array[wp.bool],
+    # In and out:
+    pin_stiffness: wp.array[float],
+):
+    """Hold every pin of the masked worlds."""
+    i, p = wp.tid()
+    if p < instances.pin_count[i] and in_mask(instance_world[i], world_mask):
+        pin = instances.pin_start[i] + p
+        pin_stiffness[pin] = wp.abs(pin_stiffness[pin])

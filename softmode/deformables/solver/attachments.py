@@ -1,0 +1,147 @@
+"""Attachments: parts of a soft body held by a rigid body or by the world, two-way, until they are released.
+
+An attachment is a layer of glue: springs from surface samples (or rest points, or the quadrature of a soft region) to
+targets that move with the rigid body. The springs are pins (see ``authoring``), so they are unknowns of the same solve
+as everything else, and what they pull at one end they pull at the other.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.model.authoring import NAMESPACE, add_pins, body_key, bulk_stiffness
+from softmode.errors import ConfigError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attachment:
+    """Where the pins of an attachment stand; what :meth:`SolverReduced.release` and ``hold`` take."""
+
+    instance: int
+    """Index of the soft body in the builder of one world."""
+    first: int
+    """Its first pin among the pins of the soft body."""
+    count: int
+    """Number of pins."""
+
+
+def attach(
+    builder: newton.ModelBuilder,
+    instance: int,
+    body: ReducedBody,
+    *,
+    link: int = -1,
+    region: str | None = None,
+    box: tuple[Sequence[float], Sequence[float]] | None = None,
+    points: np.ndarray | None = None,
+    stiffness: float | None = None,
+    link_pose: Any = None,
+) -> Attachment:
+    """Fix a part of a soft body to a rigid body or to the world, where both are now.
+
+    The body does not touch the shapes of the link while it is held. It can be let go at run time by
+    :meth:`softmode.deformables.solver.solver_reduced.SolverReduced.release`; a reset holds it again.
+
+    Args:
+        builder: Builder of the world that holds the soft body and the link.
+        instance: Index from :func:`softmode.deformables.model.authoring.add_reduced_body`.
+        body: The soft body.
+        link: Rigid body of the builder, -1 for the world.
+        region: Name of a soft region that the body was built with; or
+        box: lower and upper corner in the body's rest frame, at its scale [m]: the surface samples inside; or
+        points: rest points, likewise [m], shape (count, 3). One of the three.
+        stiffness: Per area of surface [Pa/m]; default twenty times the bulk's. A region brings its own, as it was
+            built; for points it is shared equally, as if they covered the whole surface.
+        link_pose: Pose of the link in the world, a ``wp.transform``; default ``builder.body_q[link]``. Give it when the
+            joint coordinates of the builder do not put the link there.
+
+    Returns:
+        The attachment.
+
+    Raises:
+        ConfigError: If not one of region, box and points is given, no point lies in it, a point lies
+            outside the body, the region is exact or unknown,
+            or the link or the instance of the body does not exist.
+    """
+    if sum(where is not None for where in (region, box, points)) != 1:
+        raise ConfigError("attach needs exactly one of region, box and points")
+    if not -1 <= link < builder.body_count:
+        raise ConfigError(f"link must be a rigid body of the builder or -1, got {link}; it has {builder.body_count}")
+    keys = _column(builder, "body_key") if f"{NAMESPACE}:body_key" in builder.custom_attributes else []
+    if not 0 <= instance < len(keys):
+        raise ConfigError(
+            f"instance must be the index of a soft body of the builder, got {instance}; it has {len(keys)}",
+            hint="pass what add_reduced_body returned",
+        )
+    if keys[instance] != body_key(body):
+        raise ConfigError(
+            f"instance {instance} is not of body {body.name!r}", hint="pass the body that add_reduced_body was given"
+        )
+    modulus, ratio = (float(_column(builder, name)[instance]) for name in ("youngs_modulus", "poissons_ratio"))
+    s = float(_column(builder, "scale")[instance])
+    per_area = bulk_stiffness(body, modulus, ratio, s) if stiffness is None else stiffness
+    if not 0.0 < per_area < np.inf:
+        raise ConfigError(f"stiffness must be a finite number > 0 [Pa/m], got {stiffness!r}")
+    if region is not None:
+        X, pins = _region_pins(body, region, modulus)
+        pins = s * pins  # kappa of the larger region is less by s^2, its volume more by s^3
+    elif points is not None:
+        X = np.asarray(points, float).reshape(-1, 3) / s
+        pins = np.full(len(X), s * s * per_area * body.surface_areas.sum() / max(len(X), 1))
+        outside = X[~np.isfinite(X).all(axis=1)] if not np.isfinite(X).all() else X[~body.covers(X)]
+        if len(outside):
+            raise ConfigError(
+                f"{len(outside)} of {len(X)} points lie outside body {body.name!r}, the first at {s * outside[0]} [m]",
+                hint=f"give points of its rest frame; it spans {s * body.bounds[0]} to {s * body.bounds[1]}",
+            )
+    else:
+        assert box is not None
+        lower, upper = np.asarray(box[0], float) / s, np.asarray(box[1], float) / s
+        inside = ((body.surface_points >= lower) & (body.surface_points <= upper)).all(axis=1)
+        X, pins = body.surface_points[inside], s * s * per_area * body.surface_areas[inside]
+    if len(X) == 0:
+        low, high = s * body.surface_points.min(axis=0), s * body.surface_points.max(axis=0)
+        raise ConfigError(
+            f"the attachment of body {body.name!r} holds no point", hint=f"its surface spans {low} to {high} [m]"
+        )
+    first = _column(builder, "pin_instance").count(instance)
+    pose: Any = wp.transform_identity()
+    if link >= 0:
+        pose = builder.body_q[link] if link_pose is None else link_pose
+    world = X + body.evaluate(X)[0] @ _coordinates(builder, instance, body)
+    matrix = np.asarray(wp.transform_to_matrix(pose), float).reshape(4, 4)
+    add_pins(builder, instance, s * X, stiffness=pins, targets=(world - matrix[:3, 3]) @ matrix[:3, :3], link=link)
+    return Attachment(instance=instance, first=first, count=len(X))
+
+
+def _region_pins(body: ReducedBody, name: str, youngs_modulus: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rest points [m] of a soft region, shape (count, 3), and the stiffness [N/m] it was built for.
+
+    Raises:
+        ConfigError: If the region is unknown or exact.
+    """
+    if name not in body.region_names:
+        raise ConfigError(f"body {body.name!r} has no region {name!r}", hint=f"it has {list(body.region_names)}")
+    stiffness = float(body.region_stiffness[body.region_names.index(name)])
+    if stiffness == 0.0:
+        raise ConfigError(f"region {name!r} is held exactly and needs no pins", hint="move it with drive_regions")
+    rows = body.region_rows(name)
+    rows = rows[body.region_weights[rows] > 0.0]
+    return body.region_points[rows], stiffness * youngs_modulus * body.region_weights[rows]
+
+
+def _column(builder: newton.ModelBuilder, name: str) -> list[Any]:
+    """Return the values of an attribute that a builder holds so far."""
+    values: Any = builder.custom_attributes[f"{NAMESPACE}:{name}"].values
+    return list(values.values() if isinstance(values, dict) else values or [])
+
+
+def _coordinates(builder: newton.ModelBuilder, instance: int, body: ReducedBody) -> np.ndarray:
+    """Return the initial coordinates of an instance [m], shape (function_count, 3)."""
+    start = _column(builder, "function_start")[instance]
+    return np.array([[float(x) for x in q] for q in _column(builder, "q")[start : start + body.function_count]])

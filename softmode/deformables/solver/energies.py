@@ -1,0 +1,60 @@
+"""Energies of soft bodies: kinetic, elastic, gravitational, evaluated where the solver evaluates them."""
+
+from typing import Any
+
+import newton
+import warp as wp
+
+from softmode.deformables.model.authoring import NAMESPACE
+from softmode.deformables.solver import energy_kernels as kernels
+from softmode.deformables.solver.solver_reduced import SolverReduced
+from softmode.errors import ConfigError
+
+
+class SoftEnergies:
+    """Energies of every soft body of a model, in float64; ``update`` reads nothing back and may be captured.
+
+    The elastic energy is that of the material at the cubature points, without what a step dissipates; contacts, pins
+    and other springs store energy of their own that is in none of the three. Without contact, pins and damping their
+    sum is conserved up to the dissipation of the integrator.
+
+    Args:
+        solver: A :class:`softmode.deformables.solver.solver_reduced.SolverReduced`, or a solver that couples one.
+
+    Attributes:
+        kinetic: m/2 sum_k |dq_k/dt|^2 [J], shape (instance_count,); instances follow each other world by world.
+        elastic: s^3 sum_p V_p Psi(F_p / s) [J], s the body's scale, likewise.
+        gravitational: -m g.c [J], c the centre of mass, likewise; zero for a body at the origin.
+
+    Raises:
+        ConfigError: If the solver has no soft bodies.
+    """
+
+    def __init__(self, solver: Any) -> None:
+        """Allocate the energies."""
+        reduced = getattr(solver, "reduced", solver)
+        if not isinstance(reduced, SolverReduced):
+            raise ConfigError(
+                f"solver is a {type(solver).__name__}", hint="pass a SolverReduced or a SolverCoupledReduced"
+            )
+        self._solver: Any = reduced
+        self.kinetic, self.elastic, self.gravitational = (
+            wp.zeros(reduced.instance_count, dtype=wp.float64, device=reduced.model.device) for _ in range(3)
+        )
+
+    def update(self, state: newton.State) -> None:
+        """Evaluate the energies of a state of the solver's model."""
+        reduced, data = self._solver, getattr(state, NAMESPACE)
+        common = {"dim": reduced.instance_count, "device": reduced.model.device}
+        wp.launch(
+            kernels.sum_kinetic_and_gravitational,
+            inputs=[reduced.instances, reduced.basis, reduced.model.gravity, data.q, data.qd],
+            outputs=[self.kinetic, self.gravitational],
+            **common,
+        )
+        wp.launch(
+            kernels.sum_elastic,
+            inputs=[reduced.instances, reduced.basis, data.q],
+            outputs=[self.elastic],
+            **common,
+        )

@@ -1,0 +1,36 @@
+"""Which bodies share a linear system, and the systems of a step."""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from softmode.deformables.model.lane_kernels import LANES
+from softmode.deformables.model.layout import Layout
+from softmode.deformables.solver.factor import BlockCholesky
+
+
+def join_systems(layout: Layout, part_count: int, column_count: int, device: Any) -> tuple[wp.array, BlockCholesky]:
+    """Allocate a linear system per instance or, of ``part_count`` parts, per world; say where instances find theirs.
+
+    Returns:
+        First system of each world, shape (world_count + 1,), and the systems.
+    """
+    size, world, instances = 3 * LANES * layout.block_count, layout.instance_world, layout.instances
+    start, system, part = layout.instance_start, np.arange(layout.instance_count), np.zeros_like(world)
+    if part_count > 1:
+        start, system, part = np.arange(layout.world_count + 1), world, system - start[world]
+    instances.system = wp.array(system, dtype=int, device=device)
+    instances.system_block = wp.array(3 * layout.block_count * part, dtype=int, device=device)
+    system_world = wp.array(np.repeat(np.arange(layout.world_count), np.diff(start)), dtype=int, device=device)
+    systems = BlockCholesky(system_world, part_count * size, column_count, device, part_count)
+    # a world of fewer bodies keeps the identity in the place of the others
+    used = np.zeros((systems.system_count, part_count), bool)
+    used[system, part] = True
+    if not used.all():
+        matrix = np.zeros(systems.scalars.shape, np.float32)
+        for w, a in np.argwhere(~used):
+            rows = np.arange(a * size, (a + 1) * size)
+            matrix[w, rows, rows] = 1.0
+        systems.scalars.assign(matrix)
+    return wp.array(start, dtype=int, device=device), systems

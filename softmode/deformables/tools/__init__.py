@@ -1,0 +1,1 @@
+"""Acting on and reading a running solver: grips, sensors, markers."""

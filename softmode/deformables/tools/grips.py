@@ -1,0 +1,342 @@
+"""Grips: parts of a soft body that are taken hold of, moved and let go while a captured step runs.
+
+A grip is made of pins (see ``authoring``) whose slots are in the model from the start, idle and at no cost; taking hold
+writes their rest points and basis rows into the solver's tables. A grip that *holds* is stiff and keeps the shape that
+the part has when it is taken; one that *pulls* is one point on a damped spring.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.model.authoring import NAMESPACE, add_pins
+from softmode.deformables.model.lane_kernels import LANES
+from softmode.deformables.solver.solver_reduced import SolverReduced
+from softmode.deformables.tools import grip_kernels as kernels
+from softmode.errors import ConfigError
+
+Array = NDArray[np.float64]
+_IDENTITY = (0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GripOptions:
+    """How stiff grips are; they follow the body's material, mass and the gravity of the moment."""
+
+    pull_stiffness: float = 0.25
+    """Stiffness of a grip that pulls, over E times the body's size."""
+    pull_rate: float = 250.0
+    """It is no stiffer than the mass times the square of this [1/s],"""
+    pull_sag: float = 0.05
+    """but stiff enough to carry the weight at this fraction of the size. Its damping is critical for the mass."""
+    pull_force: float = 0.1
+    """Largest force of a pull, over E times the size squared; the weight over `pull_sag` comes on top."""
+    hold_stiffness: float = 60.0
+    """Stiffness of a grip that holds, over E times the body's size,"""
+    hold_sag: float = 1.0e-4
+    """but stiff enough to carry the weight at this fraction of the size."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name, value in vars(self).items():
+            if not 0.0 < value < np.inf:
+                raise ConfigError(f"{name} must be a finite number > 0, got {value!r}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grip:
+    """What is held."""
+
+    rest_points: Array
+    """Rest points of the body, at its scale 1, in the body frame [m], shape (n, 3)."""
+    rows: Array
+    """Functions at these points, shape (n, function_count)."""
+    offsets: Array
+    """Where they are to be, relative to the grip's position and before it turns [m], shape (n, 3)."""
+    pulls: bool
+    """Whether it is a damped spring; else it holds."""
+
+
+def add_grip_slots(builder: newton.ModelBuilder, instance: int, count: int) -> None:
+    """Keep pins of a body free for grips; call it before the next body is added, and after the body's own pins.
+
+    Args:
+        builder: Builder that holds the instance.
+        instance: Index from :func:`softmode.deformables.model.authoring.add_reduced_body`.
+        count: Points that may be gripped at a time, over all grips.
+
+    Raises:
+        ConfigError: If the count is below 1.
+    """
+    if count < 1:
+        raise ConfigError(f"count must be at least 1, got {count}", hint="give the points gripped at a time")
+    add_pins(builder, instance, np.zeros((count, 3)), stiffness=0.0)
+
+
+class Grips:
+    """The grips of one instance; make it before the step is captured, and `apply` it before every physics step.
+
+    What takes hold, moves or lets go is called between launches of the captured graph. A reset of the solver does not
+    let go. Idle slots cost nothing: they lie behind the pins that the instance counts.
+
+    Args:
+        solver: A :class:`softmode.deformables.solver.solver_reduced.SolverReduced`, or a solver that couples one.
+        instance: Index of the instance in the model.
+        slot_count: What :func:`add_grip_slots` was given.
+        grip_max: Grips at a time.
+        options: How stiff they are.
+
+    Raises:
+        ConfigError: If the last pins of the instance are not that many slots.
+    """
+
+    def __init__(
+        self,
+        solver: Any,
+        instance: int,
+        *,
+        slot_count: int,
+        grip_max: int = 66,
+        options: GripOptions | None = None,
+    ) -> None:
+        """Find the slots and take them out of use."""
+        self.solver: SolverReduced = getattr(solver, "reduced", solver)
+        reduced, layout = self.solver, self.solver.layout
+        self.instance, self.slot_count, self.grip_max = instance, slot_count, grip_max
+        instances = reduced.instances
+        pins = int(instances.pin_count.numpy()[instance]) if 0 <= instance < layout.instance_count else 0
+        if not 0 < slot_count <= pins:
+            raise ConfigError(
+                f"instance {instance} has {pins} pins, not {slot_count} slots", hint="call add_grip_slots for it"
+            )
+        self.first_slot = pins - slot_count
+        self.body: ReducedBody = layout.bodies[layout.asset[instance]]
+        self._pin = int(instances.pin_start.numpy()[instance]) + self.first_slot
+        if reduced.parameters.pin_stiffness.numpy()[self._pin : self._pin + slot_count].any():
+            raise ConfigError("the last pins of the instance are no slots", hint="add slots after its other pins")
+        device: Any = reduced.model.device
+        self.strength: Any = kernels.GripStrength()
+        for name, value in vars(options or GripOptions()).items():
+            setattr(self.strength, name, float(value))
+        self.table: Any = kernels.GripTable()
+        self.table.kind = wp.zeros(grip_max, dtype=int, device=device)
+        for name in ("position", "goal_position"):
+            setattr(self.table, name, wp.zeros(grip_max, dtype=wp.vec3d, device=device))
+        for name in ("rotation", "goal_rotation"):
+            setattr(self.table, name, wp.full(grip_max, wp.quatd(*_IDENTITY), dtype=wp.quatd, device=device))
+        self.table.remaining = wp.zeros(1, dtype=int, device=device)
+        self.table.grip = wp.zeros(slot_count, dtype=int, device=device)
+        self.table.offset = wp.zeros(slot_count, dtype=wp.vec3d, device=device)
+        self.table.share = wp.zeros(slot_count, dtype=float, device=device)
+        self._held: dict[int, Grip] = {}
+        self._write_slots()
+
+    # -- in the step --------------------------------------------------------------------------------------------------
+
+    def apply(self, state: Any, control: Any, dt: float) -> None:
+        """Move the grips and say where their points shall be at the end of the step from `state`; capturable.
+
+        Args:
+            state: State that the step starts from.
+            control: Control of the step; it carries the targets.
+            dt: Physics step [s].
+        """
+        reduced, device = self.solver, self.solver.model.device
+        wp.launch(kernels.move_grips, dim=self.grip_max, inputs=[self.table], device=device)
+        wp.launch(
+            kernels.write_pins,
+            dim=self.slot_count,
+            inputs=[
+                reduced.instances,
+                reduced.basis,
+                reduced.model.gravity,
+                self.strength,
+                self.instance,
+                self.first_slot,
+                reduced.layout.first_pin_row,
+                wp.float64(dt),
+                getattr(state, NAMESPACE).q,
+                self.table,
+            ],
+            outputs=[reduced.parameters.pin_stiffness, getattr(control, NAMESPACE).pin_target],
+            device=device,
+        )
+
+    # -- between launches ---------------------------------------------------------------------------------------------
+
+    @property
+    def held(self) -> dict[int, Grip]:
+        """The grips by number, in the order of their slots."""
+        return dict(self._held)
+
+    def take(self, rest_points: ArrayLike, state: Any, *, pulls: bool = False) -> int:
+        """Take hold of points of the body where they are now.
+
+        Args:
+            rest_points: In the body frame, at scale 1 [m], shape (n, 3); they share the grip's stiffness.
+            state: The present state.
+            pulls: Whether the grip pulls, one point on a damped spring, or holds.
+
+        Returns:
+            Number of the grip. Its position is the mean of the points.
+
+        Raises:
+            ConfigError: If the points are not finite, or more than there is room for, or there are too many grips.
+        """
+        X = np.asarray(rest_points, dtype=np.float64)
+        if X.ndim != 2 or X.shape[1] != 3 or not len(X) or not np.isfinite(X).all() or (pulls and len(X) != 1):
+            raise ConfigError(f"rest_points must be finite, shape (n > 0, 3), one for a pull, got {X.shape}")
+        free = [g for g in range(self.grip_max) if g not in self._held]
+        left = self.slot_count - sum(len(grip.offsets) for grip in self._held.values())
+        if not free or len(X) > left:
+            raise ConfigError(f"no room for a grip of {len(X)} points, {left} are left", hint="let go of another")
+        rows = self.body.evaluate(X)[0].astype(np.float32).astype(np.float64)
+        x = X + rows @ self._coordinates(state)
+        centre = x.mean(axis=0)
+        self._held[free[0]] = Grip(rest_points=X, rows=rows, offsets=x - centre, pulls=pulls)
+        self._set_poses(free[0], centre)
+        self._write_slots()
+        return free[0]
+
+    def restore(self, grip: Grip, position: ArrayLike, rotation: Sequence[float] = _IDENTITY) -> int:
+        """Take a grip up again on this body, which may be another build of the same asset.
+
+        Args:
+            grip: What `held` had.
+            position: Its position [m], shape (3,).
+            rotation: Its rotation, quaternion (x, y, z, w).
+
+        Returns:
+            Number of the grip.
+        """
+        free = [g for g in range(self.grip_max) if g not in self._held]
+        rows = self.body.evaluate(grip.rest_points)[0].astype(np.float32).astype(np.float64)
+        self._held[free[0]] = Grip(rest_points=grip.rest_points, rows=rows, offsets=grip.offsets, pulls=grip.pulls)
+        self._set_poses(free[0], np.asarray(position, float), rotation)
+        self._write_slots()
+        return free[0]
+
+    def let_go(self, grip: int) -> None:
+        """Let go of a grip.
+
+        Raises:
+            ConfigError: If there is none of that number.
+        """
+        self._checked(grip)
+        del self._held[grip]
+        self._write_slots()
+
+    def let_go_all(self) -> None:
+        """Let go of everything."""
+        self._held.clear()
+        self._write_slots()
+
+    def aim(self, grip: int, position: ArrayLike, rotation: Sequence[float] | None = None) -> None:
+        """Say where a grip shall be at the end of the frame.
+
+        Args:
+            grip: Its number.
+            position: Where [m], shape (3,).
+            rotation: How it is turned since it was taken, quaternion (x, y, z, w); None leaves the goal as it is.
+
+        Raises:
+            ConfigError: If there is none of that number.
+        """
+        self._checked(grip)
+        self.table.goal_position[grip : grip + 1].assign(np.asarray(position, np.float64)[None])
+        if rotation is not None:
+            self.table.goal_rotation[grip : grip + 1].assign(np.asarray(rotation, np.float64)[None])
+
+    def begin_frame(self, step_count: int) -> None:
+        """Let the next so many steps take the grips to their goals."""
+        self.table.remaining.fill_(step_count)
+
+    # -- reading ------------------------------------------------------------------------------------------------------
+
+    def pose(self, grip: int, *, goal: bool = False) -> tuple[Array, Array]:
+        """Return where a grip is, or shall be: position [m] (3,) and quaternion (x, y, z, w), (4,)."""
+        self._checked(grip)
+        place, turn = (self.table.goal_position, self.table.goal_rotation) if goal else (None, None)
+        place, turn = place or self.table.position, turn or self.table.rotation
+        return place.numpy()[grip].astype(np.float64), turn.numpy()[grip].astype(np.float64)
+
+    def points(self, grip: int, state: Any) -> Array:
+        """Return where the points of a grip are [m], shape (n, 3)."""
+        held = self._checked(grip)
+        return held.rest_points + held.rows @ self._coordinates(state)
+
+    def targets(self, grip: int) -> Array:
+        """Return where the points of a grip should be [m], shape (n, 3)."""
+        held = self._checked(grip)
+        position, (x, y, z, w) = self.pose(grip)
+        axis = np.array([x, y, z])
+        cross = np.cross(axis, held.offsets)
+        return position + held.offsets + 2.0 * (w * cross + np.cross(axis, cross))
+
+    def force(self, grip: int) -> Array:
+        """Return the force of a grip on the body at the end of the last step [N], shape (3,)."""
+        first = self.first_slot
+        for number, held in self._held.items():
+            if number == grip:
+                rows: Any = self.solver.entries.force[self.instance]
+                return rows.numpy()[first : first + len(held.offsets)].sum(axis=0)
+            first += len(held.offsets)
+        self._checked(grip)
+        return np.zeros(3)
+
+    # -- inside -------------------------------------------------------------------------------------------------------
+
+    def _checked(self, grip: int) -> Grip:
+        if grip not in self._held:
+            raise ConfigError(f"there is no grip {grip}", hint=f"there are {sorted(self._held)}")
+        return self._held[grip]
+
+    def _coordinates(self, state: Any) -> Array:
+        """Return the reduced coordinates of the instance [m], shape (n, 3)."""
+        start = int(self.solver.instances.function_start.numpy()[self.instance])
+        q: Any = getattr(state, NAMESPACE).q[start : start + self.body.function_count]
+        return q.numpy().astype(np.float64)
+
+    def _set_poses(self, grip: int, position: Array, rotation: Sequence[float] = _IDENTITY) -> None:
+        """Put a grip where it starts, at rest."""
+        table, turn = self.table, np.asarray(rotation, np.float64)[None]
+        for array, value in (
+            (table.position, position[None]),
+            (table.goal_position, position[None]),
+            (table.rotation, turn),
+            (table.goal_rotation, turn),
+        ):
+            array[grip : grip + 1].assign(value)
+
+    def _write_slots(self) -> None:
+        """Write the points of all grips, one after another, into the tables of pins."""
+        reduced, table = self.solver, self.table
+        kind = np.zeros(self.grip_max, np.int32)
+        owner, share = np.zeros(self.slot_count, np.int32), np.zeros(self.slot_count, np.float32)
+        rest, offset = np.zeros((self.slot_count, 3)), np.zeros((self.slot_count, 3))
+        width = reduced.basis.row.shape[1] * LANES
+        rows = np.zeros((self.slot_count, width), np.float32)
+        at = 0
+        for number, grip in self._held.items():
+            mine = slice(at, at + len(grip.offsets))
+            kind[number] = int(kernels.PULL) if grip.pulls else int(kernels.HOLD)
+            owner[mine], share[mine] = number, 1.0 / len(grip.offsets)
+            rest[mine], offset[mine] = grip.rest_points, grip.offsets
+            rows[mine, : grip.rows.shape[1]] = grip.rows
+            at = mine.stop
+        for array, values in ((table.kind, kind), (table.grip, owner), (table.share, share), (table.offset, offset)):
+            array.assign(values)
+        row = reduced.layout.first_pin_row + self._pin
+        reduced.basis.row[row : row + self.slot_count].assign(rows.reshape(self.slot_count, -1, LANES))
+        reduced.basis.row_point[row : row + self.slot_count].assign(rest)
+        reduced.parameters.pin_stiffness[self._pin : self._pin + self.slot_count].assign(np.zeros(self.slot_count))
+        count = reduced.instances.pin_count
+        count[self.instance : self.instance + 1].assign(np.array([self.first_slot + at], np.int32))

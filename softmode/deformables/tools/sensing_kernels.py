@@ -1,0 +1,301 @@
+"""Device side of the sensors: fixed-order sums over the point constraints of the last step."""
+
+import warp as wp
+
+from softmode.deformables.model.lane_kernels import sum8d
+from softmode.deformables.model.struct_kernels import (
+    Basis,
+    Entries,
+    Instances,
+    Motion,
+    blocks_of,
+    interpolate,
+    sample_area,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Readings:
+    """What a contact sensor reads, shape (world_count, link_count, soft_count); world frame."""
+
+    force: wp.array3d[wp.vec3]  # on the link [N]
+    friction: wp.array3d[wp.vec3]  # its tangential part [N]
+    torque: wp.array3d[wp.vec3]  # about the link's centre of mass [N m]
+    position: wp.array3d[wp.vec3]  # centre of pressure [m]
+    normal: wp.array3d[wp.vec3]  # mean normal, out of the link
+    area: wp.array3d[float]  # [m^2]
+
+
+@wp.struct
+class Patch:
+    """Contact of one soft body with everything, shape (world_count,); world frame."""
+
+    force: wp.array[wp.vec3]  # [N]
+    friction: wp.array[wp.vec3]  # [N]
+    torque: wp.array[wp.vec3]  # about the body's centre of mass [N m]
+    position: wp.array[wp.vec3]  # centre of pressure [m]
+    normal: wp.array[wp.vec3]
+    area: wp.array[float]  # [m^2]
+
+
+@wp.func
+def point_of(instances: Instances, basis: Basis, motion: Motion, entries: Entries, i: int, e: int):
+    """Return where an entry was at the start of the step [m]: both bodies feel the force there.
+
+    Where a sample of another soft body touches this one, the row is a mean of rows and its place that of the sample.
+    """
+    row = entries.row[i, e]
+    k = i
+    if row >= basis.row_point.shape[0]:
+        row = entries.partner_row[i, e]
+        k = entries.partner[i, e]
+    return basis.row_point[row] + interpolate(basis.row, row, motion.q_start, k, instances.function_count[k])
+
+
+@wp.func
+def is_internal(entries: Entries, i: int, e: int):
+    """Return whether an entry is a contact of a body with itself, which puts no force on it."""
+    return e >= entries.count[i] - entries.pair_count[i] and entries.partner[i, e] < 0
+
+
+@wp.func
+def normal_part(entries: Entries, i: int, e: int):
+    """Return n . f [N], or 0 where the step failed."""
+    value = wp.dot(entries.normal[i, e], entries.force[i, e])
+    return wp.where(wp.isfinite(value), value, wp.float64(0.0))
+
+
+@wp.func
+def first_of_sample(entries: Entries, first: int, i: int, e: int):
+    """Return whether no earlier entry is the same sample pressed by the same body: its area counts once."""
+    for k in range(first, e):
+        same = entries.row[i, k] == entries.row[i, e] and entries.body[i, k] == entries.body[i, e]
+        if same and entries.shape[i, k] >= 0 and normal_part(entries, i, k) > wp.float64(0.0):
+            return False
+    return True
+
+
+@wp.func
+def mean_of(total: wp.vec3d, weight: wp.float64):
+    """Return a weighted mean, zero where nothing weighs."""
+    return wp.where(weight > wp.float64(0.0), total / wp.max(weight, wp.float64(1.0e-300)), wp.vec3d())
+
+
+@wp.kernel
+def read_contacts(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    entries: Entries,
+    instance_start: wp.array[int],  # (world_count + 1,)
+    link_body: wp.array2d[int],  # (world_count, link_count), -1 for all fixed shapes
+    soft: wp.array[int],  # (soft_count,), body within its world
+    # Out:
+    matrix_out: Readings,
+    total_out: Readings,  # soft_count = 1: of all soft bodies of the world
+):
+    """Sum the contacts of a link with one soft body, in the last column with all of them."""
+    w, l, column = wp.tid()
+    begin = instance_start[w]
+    end = instance_start[w + 1]
+    if column < soft.shape[0]:
+        begin = begin + soft[column]
+        end = begin + 1
+    body = link_body[w, l]
+    force = wp.vec3d()
+    friction = wp.vec3d()
+    torque = wp.vec3d()
+    position = wp.vec3d()
+    normal = wp.vec3d()
+    weight = wp.float64(0.0)
+    area = wp.float64(0.0)
+    for i in range(begin, end):
+        first = instances.pin_count[i]
+        for e in range(first, entries.count[i]):
+            # entries without a shape are contacts of soft bodies with each other
+            if entries.body[i, e] != body or entries.shape[i, e] < 0:
+                continue
+            f = entries.force[i, e]
+            if not wp.isfinite(wp.length_sq(f)):
+                continue
+            n = entries.normal[i, e]
+            pressing = normal_part(entries, i, e)
+            x = point_of(instances, basis, motion, entries, i, e)
+            arm = wp.vec3d(entries.arm[i, e])
+            if body < 0:
+                arm = x
+            force -= f
+            friction -= f - pressing * n
+            torque -= wp.cross(arm, f)
+            if pressing > wp.float64(0.0):
+                weight += pressing
+                position += pressing * x
+                normal += pressing * n
+                if first_of_sample(entries, first, i, e):
+                    area += wp.float64(sample_area(instances.scale[i], basis.row_area[entries.row[i, e]]))
+    position = mean_of(position, weight)
+    normal = wp.normalize(normal)
+    if column < soft.shape[0]:
+        matrix_out.force[w, l, column] = wp.vec3(force)
+        matrix_out.friction[w, l, column] = wp.vec3(friction)
+        matrix_out.torque[w, l, column] = wp.vec3(torque)
+        matrix_out.position[w, l, column] = wp.vec3(position)
+        matrix_out.normal[w, l, column] = wp.vec3(normal)
+        matrix_out.area[w, l, column] = float(area)
+    else:
+        total_out.force[w, l, 0] = wp.vec3(force)
+        total_out.friction[w, l, 0] = wp.vec3(friction)
+        total_out.torque[w, l, 0] = wp.vec3(torque)
+        total_out.position[w, l, 0] = wp.vec3(position)
+        total_out.normal[w, l, 0] = wp.vec3(normal)
+        total_out.area[w, l, 0] = float(area)
+
+
+@wp.kernel
+def read_attachments(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    entries: Entries,
+    instance_start: wp.array[int],
+    soft: wp.array[int],  # (attachment_count,)
+    first_pin: wp.array[int],
+    pin_count: wp.array[int],
+    # Out:
+    force_out: wp.array2d[wp.vec3],  # (world_count, attachment_count) [N]
+    torque_out: wp.array2d[wp.vec3],  # [N m]
+):
+    """Sum what the pins of an attachment pull at their other end."""
+    w, a = wp.tid()
+    i = instance_start[w] + soft[a]
+    force = wp.vec3d()
+    torque = wp.vec3d()
+    for e in range(first_pin[a], wp.min(first_pin[a] + pin_count[a], entries.count[i])):
+        f = entries.force[i, e]
+        if not wp.isfinite(wp.length_sq(f)):
+            continue
+        arm = wp.vec3d(entries.arm[i, e])
+        if entries.body[i, e] < 0:
+            # the offset of a pin is its soft end less its target
+            arm = point_of(instances, basis, motion, entries, i, e) - entries.offset[i, e]
+        force -= f
+        torque -= wp.cross(arm, f)
+    force_out[w, a] = wp.vec3(force)
+    torque_out[w, a] = wp.vec3(torque)
+
+
+@wp.kernel
+def find_samples(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    entries: Entries,
+    instance_start: wp.array[int],
+    soft: int,
+    position: wp.array2d[wp.vec3d],  # (instance_count, sample_max), samples at the start of the step [m]
+    surface_normal: wp.array2d[wp.vec3],  # and their normals, outward
+    # Out:
+    sample_out: wp.array2d[int],  # (world_count, entry_max)
+):
+    """Find the sample of each contact: its own, or the nearest that faces the sample of another soft body."""
+    w, e = wp.tid()
+    i = instance_start[w] + soft
+    if e < instances.pin_count[i] or e >= entries.count[i] or is_internal(entries, i, e):
+        return
+    found = entries.row[i, e] - instances.row_start[i]
+    if entries.row[i, e] >= basis.row_point.shape[0]:
+        x = point_of(instances, basis, motion, entries, i, e)
+        nearest = wp.float64(1.0e30)
+        for s in range(instances.sample_count[i]):
+            distance = wp.length_sq(position[i, s] - x)
+            if wp.dot(surface_normal[i, s], wp.vec3(entries.normal[i, e])) > -0.5:
+                distance += wp.float64(1.0e10)  # only where none faces it
+            if distance < nearest:
+                nearest = distance
+                found = s
+    sample_out[w, e] = found
+
+
+@wp.kernel
+def gather_pressure(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    entries: Entries,
+    instance_start: wp.array[int],
+    soft: int,
+    sample: wp.array2d[int],  # (world_count, entry_max)
+    # In and out, zero before:
+    normal_force: wp.array2d[wp.vec3d],  # (world_count, sample_count) [N]
+    friction: wp.array2d[wp.vec3d],  # (world_count, sample_count) [N]
+    # Out:
+    patch_out: Patch,
+):
+    """Sum the contact forces on each surface sample, and on the body."""
+    w = wp.tid()
+    i = instance_start[w] + soft
+    centre = wp.vec3d()
+    stride = basis.row.shape[1]
+    for b in range(blocks_of(instances.function_count[i])):
+        mean = basis.mean[instances.asset[i], b]
+        for axis in range(3):
+            centre[axis] += sum8d(wp.cw_mul(mean, motion.q_start[i, axis * stride + b]))
+    total = wp.vec3d()
+    tangential = wp.vec3d()
+    torque = wp.vec3d()
+    position = wp.vec3d()
+    normal = wp.vec3d()
+    weight = wp.float64(0.0)
+    area = wp.float64(0.0)
+    for e in range(instances.pin_count[i], entries.count[i]):
+        f = entries.force[i, e]
+        if is_internal(entries, i, e) or not wp.isfinite(wp.length_sq(f)):
+            continue
+        n = entries.normal[i, e]
+        pressing = normal_part(entries, i, e)
+        x = point_of(instances, basis, motion, entries, i, e)
+        total += f
+        tangential += f - pressing * n
+        torque += wp.cross(x - centre, f)
+        if pressing > wp.float64(0.0):
+            weight += pressing
+            position += pressing * x
+            normal += pressing * n
+        s = sample[w, e]
+        before = wp.length_sq(normal_force[w, s])
+        normal_force[w, s] = normal_force[w, s] + pressing * n
+        friction[w, s] = friction[w, s] + (f - pressing * n)
+        if before == wp.float64(0.0) and pressing > wp.float64(0.0):
+            area += wp.float64(sample_area(instances.scale[i], basis.row_area[instances.row_start[i] + s]))
+    patch_out.force[w] = wp.vec3(total)
+    patch_out.friction[w] = wp.vec3(tangential)
+    patch_out.torque[w] = wp.vec3(torque)
+    patch_out.position[w] = wp.vec3(mean_of(position, weight))
+    patch_out.normal[w] = wp.vec3(wp.normalize(normal))
+    patch_out.area[w] = float(area)
+
+
+@wp.kernel
+def spread_pressure(
+    instances: Instances,
+    basis: Basis,
+    instance_start: wp.array[int],
+    soft: int,
+    normal_force: wp.array2d[wp.vec3d],
+    friction: wp.array2d[wp.vec3d],
+    # Out, shape (world_count, sample_count):
+    pressure_out: wp.array2d[float],  # [Pa]
+    traction_out: wp.array2d[wp.vec3],  # [Pa]
+    normal_out: wp.array2d[wp.vec3],
+):
+    """Divide the forces on the samples by their areas."""
+    w, s = wp.tid()
+    i = instance_start[w] + soft
+    area = wp.max(
+        wp.float64(sample_area(instances.scale[i], basis.row_area[instances.row_start[i] + s])), wp.float64(1.0e-30)
+    )
+    pressure_out[w, s] = float(wp.length(normal_force[w, s]) / area)
+    traction_out[w, s] = wp.vec3(friction[w, s] / area)
+    normal_out[w, s] = wp.vec3(wp.normalize(normal_force[w, s]))

@@ -1,0 +1,1 @@
+"""The tasks, a folder each: task, device code, scripted policy."""

@@ -1,0 +1,1 @@
+"""LiftSoft: pick a soft object from a table and hold it at a goal."""

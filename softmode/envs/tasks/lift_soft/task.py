@@ -1,0 +1,155 @@
+"""LiftSoft: pick a soft object from a table and hold it at a goal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from softmode.envs.markers import sphere_marker
+from softmode.envs.parameters import Parameter
+from softmode.envs.rl_scene import rl_scene
+from softmode.envs.soft_env import SoftEnv
+from softmode.envs.soft_vector_env import SoftVectorEnv
+from softmode.envs.task import Segment, Task, TaskConfig
+from softmode.envs.tasks.lift_soft import kernels
+from softmode.errors import ConfigError
+from softmode.objects.presets import BEAM, BEAM_MATERIAL
+from softmode.objects.soft_object import ObjectConfig
+from softmode.robots.arm import ArmDescription
+from softmode.scenes.table_scene import TableSceneConfig
+from softmode.splats.splats import Splats
+
+
+def lift_scene() -> TableSceneConfig:
+    """Return the scene: a plush under the open gripper, coarse enough for training (`rl_scene`)."""
+    return rl_scene(
+        TableSceneConfig(
+            object=ObjectConfig(surface_count=200),
+            constraint_max=96,
+            arm=ArmDescription(home_position=(0.45, 0.0, 0.17)),
+        )
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiftSoftConfig(TaskConfig):
+    """Goal and success of LiftSoft."""
+
+    scene: TableSceneConfig = field(default_factory=lift_scene)
+    """Objects, robot and physics."""
+    goal_height: float = 0.15
+    """Middle of the goal's range of heights: how far the object's centre of mass is to rise [m]."""
+    goal_range: tuple[float, float, float] = (0.04, 0.08, 0.05)
+    """Half-width of the goal's random position in x and y, around the object's default place, and in height [m]."""
+    goal_tolerance: float = 0.03
+    """Distance from the goal that counts as there [m]."""
+    hold_steps: int = 15
+    """Control steps in a row at the goal, held by both fingers, that make a success."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        super().__post_init__()
+        if not 0.0 < self.goal_height - self.goal_range[2] <= self.goal_height + self.goal_range[2] <= 0.4:
+            raise ConfigError(
+                f"goal_height {self.goal_height} and goal_range {self.goal_range} must keep the goal in 0..0.4 m"
+            )
+        if not min(self.goal_range) >= 0.0:
+            raise ConfigError(f"goal_range must be >= 0, got {self.goal_range}")
+        if not 0.0 < self.goal_tolerance < self.goal_height:
+            raise ConfigError(f"goal_tolerance must lie in 0..goal_height, got {self.goal_tolerance}")
+        if self.hold_steps < 1:
+            raise ConfigError(f"hold_steps must be at least 1, got {self.hold_steps}")
+
+    @classmethod
+    def presets(cls) -> dict[str, LiftSoftConfig]:
+        """Return "beam": object and goals of Isaac Lab's `Isaac-Lift-Soft-Franka`, as high as this arm reaches."""
+        scene = replace(lift_scene(), object=BEAM, material=BEAM_MATERIAL)
+        return {"beam": cls(scene=scene, yaw_range=0.5, goal_height=0.2, goal_range=(0.08, 0.15, 0.08))}
+
+
+class LiftSoft(Task):
+    """Lift the object to a goal in the air and hold it there.
+
+    Reward terms: ``reach`` (0..1, tool to object), ``grasp`` (0 or 0.5, both fingers touch), ``lift`` (0..1, share of
+    the goal's height while grasped), ``goal`` (0..2, nearness to the goal while lifted), ``hold`` (0 or 2, at the
+    goal). Success: at the goal, held by both fingers, for ``hold_steps`` steps in a row.
+    """
+
+    config: LiftSoftConfig
+    config_class = LiftSoftConfig
+    term_names = ("reach", "grasp", "lift", "goal", "hold")
+    metric_names = ("object_height", "goal_distance")
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Add the goal: x, y [m] and how far to rise [m]."""
+        config = self.config
+        middle = np.array([*config.scene.object_position, config.goal_height])
+        low, high = middle - config.goal_range, middle + config.goal_range
+        control = config.scene.control
+        return (
+            *super().parameters(),
+            Parameter(
+                name="goal",
+                low=tuple(low.tolist()),
+                high=tuple(high.tolist()),
+                least=(*control.workspace_lower[:2], 0.01),
+                most=(*control.workspace_upper[:2], 0.4),
+            ),
+        )
+
+    def goal_segments(self) -> tuple[Segment, ...]:
+        """The goal's position [m]."""
+        return (Segment("goal", 3, -2.0, 2.0),)
+
+    def observe(self) -> None:
+        """Write goal, rise and distance."""
+        scene = self.scene
+        self.launch(
+            kernels.observe,
+            [
+                self.table.values,
+                self.table.column("goal"),
+                scene.object_position,
+                scene.soft.height,
+                self.table.column("scale"),
+                self.column("goal"),
+            ],
+            [self.observation, self.metrics, scene.marker_place],
+        )
+
+    def evaluate(self) -> None:
+        """Judge the grasp and the height."""
+        scene, config = self.scene, self.config
+        self.launch(
+            kernels.evaluate,
+            [
+                self.table.values,
+                self.table.column("goal"),
+                scene.object_position,
+                scene.controller.tool_pose,
+                scene.finger_force,
+                self.metrics,
+                config.goal_tolerance,
+                config.hold_steps,
+            ],
+            [self.held, self.terms, self.success],
+        )
+
+    def marker(self) -> Splats:
+        """Return a small ball."""
+        return sphere_marker(0.4 * self.config.goal_tolerance)
+
+
+class LiftSoftEnv(SoftEnv):
+    """One arm, one soft object, one goal; see :class:`LiftSoft` and :class:`SoftEnv`."""
+
+    config: LiftSoftConfig
+    task: LiftSoft
+    task_class = LiftSoft
+
+
+class LiftSoftVectorEnv(SoftVectorEnv):
+    """Many worlds of it; see :class:`LiftSoft` and :class:`SoftVectorEnv`."""
+
+    task_class = LiftSoft

@@ -1,0 +1,1 @@
+"""PlaceInBin: put a soft toy into a bin."""

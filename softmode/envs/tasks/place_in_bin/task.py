@@ -1,0 +1,326 @@
+"""PlaceInBin: put a soft toy into a bin that holds other soft objects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+import warp as wp
+
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.materials.material import Material
+from softmode.envs.parameters import Parameter
+from softmode.envs.rl_scene import RL_SOLVER
+from softmode.envs.soft_env import SoftEnv
+from softmode.envs.soft_vector_env import SoftVectorEnv
+from softmode.envs.task import Segment, Task, TaskConfig
+from softmode.envs.tasks.place_in_bin import kernels
+from softmode.errors import ConfigError
+from softmode.objects.soft_object import ObjectConfig
+from softmode.robots.arm import ArmDescription
+from softmode.robots.control import ArmControlOptions
+from softmode.scenes.table_scene import Fixture, TableSceneConfig
+from softmode.splats.pinhole import PinholeCamera
+
+_BUILD = BuildOptions(mode_count=1, cubature_count=48)
+TOY = ObjectConfig(
+    shape="box",
+    extents=(0.05, 0.05, 0.05),
+    surface_count=150,
+    build=BuildOptions(mode_count=3, cubature_count=128),
+)
+"""A soft die."""
+BALL = ObjectConfig(
+    shape="sphere",
+    extents=(0.045, 0.045, 0.045),
+    surface_count=80,
+    colors=((0.25, 0.45, 0.80), (0.85, 0.88, 0.95)),
+    build=_BUILD,
+)
+"""A soft ball."""
+DISC = ObjectConfig(
+    shape="cylinder",
+    extents=(0.05, 0.05, 0.03),
+    surface_count=80,
+    colors=((0.75, 0.25, 0.45), (0.97, 0.85, 0.80)),
+    build=_BUILD,
+)
+"""A soft disc."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bin:
+    """An open box on the table, its edges along x and y."""
+
+    position: tuple[float, float] = (0.45, 0.14)
+    """Where its centre is [m]."""
+    inner: tuple[float, float] = (0.16, 0.16)
+    """Inner edges [m]."""
+    height: float = 0.06
+    """Height of the rim above the table [m]."""
+    wall: float = 0.01
+    """Thickness of the walls [m]."""
+    floor: float = 0.004
+    """Thickness of the floor [m]."""
+    friction: float = 0.6
+    """Coulomb coefficient of walls and floor."""
+    color: tuple[float, float, float] = (0.30, 0.42, 0.36)
+    """Its colour, sRGB."""
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        if not all(0.02 <= edge <= 0.5 for edge in self.inner):
+            raise ConfigError(f"bin: inner must lie in 0.02..0.5 m, got {self.inner}")
+        if not 0.0 < self.floor < self.height <= 0.3:
+            raise ConfigError(f"bin: 0 < floor < height <= 0.3 m, got {self.floor} and {self.height}")
+        if not 0.002 <= self.wall <= 0.05:
+            raise ConfigError(f"bin: wall must lie in 0.002..0.05 m, got {self.wall}")
+
+    def fixtures(self) -> tuple[Fixture, ...]:
+        """Return floor and walls."""
+        (x, y), (a, b), t = self.position, (0.5 * self.inner[0], 0.5 * self.inner[1]), 0.5 * self.wall
+        z = 0.5 * self.height
+        boxes = {
+            "floor": ((x, y, 0.5 * self.floor), (a, b, 0.5 * self.floor)),
+            "near": ((x - a - t, y, z), (t, b + 2.0 * t, z)),
+            "far": ((x + a + t, y, z), (t, b + 2.0 * t, z)),
+            "right": ((x, y - b - t, z), (a, t, z)),
+            "left": ((x, y + b + t, z), (a, t, z)),
+        }
+        return tuple(
+            Fixture(label=f"bin/{name}", position=place, size=size, friction=self.friction, color=self.color)
+            for name, (place, size) in boxes.items()
+        )
+
+
+def bin_scene() -> TableSceneConfig:
+    """Return the scene without its bin: a die on the table, a ball and a disc for the bin."""
+    return TableSceneConfig(
+        object=TOY,
+        others=(BALL, DISC),
+        material=Material(youngs_modulus=1.0e5, poissons_ratio=0.3, density=300.0, friction=0.8),
+        arm=ArmDescription(home_position=(0.43, 0.0, 0.18)),
+        control=ArmControlOptions(workspace_lower=(0.25, -0.35, 0.022), workspace_upper=(0.65, 0.35, 0.40)),
+        solver=RL_SOLVER,
+        substeps=4,
+        object_position=(0.43, -0.13),
+        constraint_max=160,
+        rigid_contact_max=64,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaceInBinConfig(TaskConfig):
+    """Bin and success of PlaceInBin."""
+
+    scene: TableSceneConfig = field(default_factory=bin_scene)
+    """Objects, robot and physics, without the bin; `others` start inside it."""
+    position_range: tuple[float, float] = (0.06, 0.06)
+    """Half-width of the toy's random position in x and y [m]."""
+    bin: Bin = field(default_factory=Bin)
+    """The container."""
+    other_range: tuple[float, float] = (0.045, 0.012)
+    """Half-width of the random positions of the other objects in x and y [m], about places side by side along y."""
+    rim_allowance: float = 0.02
+    """Height over the rim below which the centre of an object in the bin, maybe upon others, counts as in [m]."""
+    rest_speed: float = 0.03
+    """Speed of the toy under which it counts as at rest [m/s]."""
+    hold_steps: int = 10
+    """Control steps in a row at rest in the bin, let go, that make a success."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        super().__post_init__()
+        if not min(self.other_range) >= 0.0:
+            raise ConfigError(f"other_range must be >= 0, got {self.other_range}")
+        if not 0.0 <= self.rim_allowance <= 0.1:
+            raise ConfigError(f"rim_allowance must lie in 0..0.1 m, got {self.rim_allowance}")
+        if not self.rest_speed > 0.0:
+            raise ConfigError(f"rest_speed must be above 0, got {self.rest_speed}")
+        if self.hold_steps < 1:
+            raise ConfigError(f"hold_steps must be at least 1, got {self.hold_steps}")
+
+    @classmethod
+    def presets(cls) -> dict[str, PlaceInBinConfig]:
+        """Return "plush": three plush toys, which cost more time."""
+        build = BuildOptions(mode_count=3, cubature_count=128)
+        toy, other = (ObjectConfig(size=size, surface_count=160, build=build) for size in (0.07, 0.055))
+        return {"plush": cls(scene=replace(bin_scene(), object=toy, others=(other, other)))}
+
+
+class PlaceInBin(Task):
+    """Put the toy into the bin, let it go, and leave the other objects in.
+
+    Reward terms: ``reach`` (0..1, tool to toy), ``grasp`` (0 or 0.5, both fingers hold it), ``lift`` (0..1, share of
+    the height that clears the rim), ``carry`` (0..1, nearness to the bin, times that share), ``lower`` (0..1, how far
+    down over the bin), ``release`` (0 or 1, in the bin and no finger touches anything), ``rest`` (0 or 2, and it rests,
+    all other objects being in the bin). What is in the bin keeps the first four. Success: all of that for
+    ``hold_steps`` steps in a row. Failure: ``spilled``, another object is outside the bin's walls.
+    """
+
+    config: PlaceInBinConfig
+    config_class = PlaceInBinConfig
+    term_names = ("reach", "grasp", "lift", "carry", "lower", "release", "rest")
+    metric_names = ("object_height", "bin_distance", "others_inside")
+
+    CLEARANCE = 0.015
+    """Between the rim and the bottom of what is carried over it [m]."""
+
+    def scene_config(self) -> TableSceneConfig:
+        """Add the bin."""
+        scene = self.config.scene
+        return replace(scene, fixtures=(*scene.fixtures, *self.config.bin.fixtures()))
+
+    def build(self) -> None:
+        """Check that everything starts where it has room."""
+        given = self.config.bin
+        self.rim = (*given.position, given.height)
+        """Centre of the bin's opening [m]."""
+        self.half = (0.5 * given.inner[0], 0.5 * given.inner[1])
+        """Half of its inner edges [m]."""
+        self.highest = given.height + self.config.rim_allowance
+        """Height of its centre below which an object is in the bin [m]."""
+        points = [thing.body.surface_points for thing in self.scene.objects]
+        self.radius = float(np.linalg.norm(points[0], axis=1).max())
+        """From the centre of the unscaled toy to its farthest point [m]."""
+        scale = (self.config.scale_range or (1.0, 1.0))[1]
+        self._check_room([scale * float(np.linalg.norm(x[:, :2], axis=1).max()) for x in points])
+
+    def _check_room(self, radii: list[float]) -> None:
+        """Refuse objects that may start in each other or in a wall; their horizontal radii are given [m]."""
+        config, (a, b) = self.config, self.half
+        (toy, *others), (dx, dy) = radii, config.other_range
+        width = 2.0 * b / max(len(others), 1)
+        fits = (
+            all(dx + r <= a for r in others)
+            and all(dy + r <= 0.5 * width for r in (*others[:1], *others[-1:]))
+            and all(2.0 * dy + r + s <= width for r, s in pairwise(others))
+        )
+        if not fits:
+            raise ConfigError(
+                f"other objects with radii {np.round(others, 3).tolist()} m have no room in the bin",
+                hint="make them, scale_range or other_range smaller, or bin.inner larger",
+            )
+        (x, y), (x_range, y_range) = config.scene.object_position, config.position_range
+        apart = max(
+            abs(x - self.rim[0]) - x_range - a - config.bin.wall, abs(y - self.rim[1]) - y_range - b - config.bin.wall
+        )
+        if apart < toy:
+            raise ConfigError(
+                f"a toy of radius {toy:.3f} m may start in the bin's wall",
+                hint="move scene.object_position or bin.position, or make position_range smaller",
+            )
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Add place [m] and yaw [rad] of every other object."""
+        config = self.config
+        count = len(config.scene.others)
+        (x, y), (a, b) = config.bin.position, config.bin.inner
+        (dx, dy) = config.other_range
+        more: list[Parameter] = []
+        for k in range(count):
+            middle = y + b * ((k + 0.5) / count - 0.5)
+            more += [
+                Parameter(
+                    name=f"other_position_{k + 1}",
+                    low=(x - dx, middle - dy),
+                    high=(x + dx, middle + dy),
+                    least=(x - 0.5 * a, y - 0.5 * b),
+                    most=(x + 0.5 * a, y + 0.5 * b),
+                ),
+                Parameter(name=f"other_yaw_{k + 1}", low=(-np.pi,), high=(np.pi,), least=(-7.0,), most=(7.0,)),
+            ]
+        return (*super().parameters(), *more)
+
+    def goal_segments(self) -> tuple[Segment, ...]:
+        """The centre of the bin's opening, and the same from the tool [m]."""
+        return (Segment("goal", 3, -2.0, 2.0), Segment("goal_offset", 3, -4.0, 4.0))
+
+    def object_segments(self) -> tuple[Segment, ...]:
+        """The way of the toy to the bin, and the other objects' centres from the toy's [m]."""
+        count = len(self.config.scene.others)
+        others = (Segment("other_offsets", 3 * count, -4.0, 4.0),) if count else ()
+        return (Segment("object_goal", 3, -4.0, 4.0), *others)
+
+    def place(self) -> None:
+        """Put the toy on the table and the others into the bin."""
+        super().place()
+        for k in range(1, len(self.scene.objects)):
+            self.place_object(k, f"other_position_{k}", f"other_yaw_{k}", self.config.bin.floor)
+
+    def observe(self) -> None:
+        """Write ways and distances."""
+        scene = self.scene
+        self.launch(
+            kernels.observe,
+            [
+                wp.vec3(*self.rim),
+                wp.vec2(*self.half),
+                self.highest,
+                scene.object_position,
+                scene.controller.tool_pose,
+                self.column("goal"),
+                self.column("object_goal"),
+            ],
+            [self.observation, self.metrics],
+        )
+
+    def evaluate(self) -> None:
+        """Judge where everything is."""
+        scene, config = self.scene, self.config
+        self.launch(
+            kernels.evaluate,
+            [
+                self.table.values,
+                self.table.column("scale"),
+                wp.vec3(*self.rim),
+                wp.vec2(*self.half),
+                0.3 * min(self.half),
+                config.bin.wall,
+                config.bin.floor,
+                self.highest,
+                scene.soft.height,
+                self.radius,
+                self.CLEARANCE,
+                config.rest_speed,
+                config.hold_steps,
+                scene.object_position,
+                scene.object_velocity,
+                scene.controller.tool_pose,
+                scene.finger_force,
+                self.metrics,
+            ],
+            [self.held, self.terms, self.success, self.failure],
+        )
+
+    def observation_camera(self) -> PinholeCamera:
+        """Return a camera that sees toy and bin from above, or the one on the hand."""
+        if self.config.camera != "front":
+            return super().observation_camera()
+        return bin_camera("pixels", self.config.image_size)
+
+    def render_cameras(self) -> list[PinholeCamera]:
+        """Return that camera, and the overview."""
+        return [bin_camera("front", self.config.render_size), *super().render_cameras()[1:]]
+
+
+def bin_camera(name: str, edge: int) -> PinholeCamera:
+    """Return the camera in front of the table that looks over the rim into the bin."""
+    return PinholeCamera.look_at(
+        name, position=(0.98, 0.02, 0.52), target=(0.42, 0.022, 0.04), width=edge, height=edge, fov_y=0.70
+    )
+
+
+class PlaceInBinEnv(SoftEnv):
+    """One arm, a toy, a bin with other soft objects; see :class:`PlaceInBin` and :class:`SoftEnv`."""
+
+    config: PlaceInBinConfig
+    task: PlaceInBin
+    task_class = PlaceInBin
+
+
+class PlaceInBinVectorEnv(SoftVectorEnv):
+    """Many worlds of it; see :class:`PlaceInBin` and :class:`SoftVectorEnv`."""
+
+    task_class = PlaceInBin

@@ -1,0 +1,1 @@
+"""PressSoft: press on a soft pad and hold a contact force."""

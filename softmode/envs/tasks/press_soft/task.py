@@ -1,0 +1,239 @@
+"""PressSoft: press on a soft pad of unknown stiffness and hold a contact force."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.materials.material import Material
+from softmode.envs.markers import sphere_marker
+from softmode.envs.parameters import Parameter
+from softmode.envs.rl_scene import RL_SOLVER
+from softmode.envs.soft_env import SoftEnv
+from softmode.envs.soft_vector_env import SoftVectorEnv
+from softmode.envs.task import Segment, Task, TaskConfig
+from softmode.envs.tasks.press_soft import kernels
+from softmode.errors import ConfigError
+from softmode.objects.soft_object import ObjectConfig
+from softmode.robots.arm import ArmDescription
+from softmode.robots.control import ArmControlOptions
+from softmode.scenes.table_scene import TableSceneConfig
+from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.splats import Splats
+
+THICKNESS = 0.04
+"""Thickness of the default pad [m]."""
+START_HEIGHT = 0.02
+"""Height of the finger tips over the pad at the start of an episode [m]."""
+COMPLIANCE = 6.0
+"""Factor by which the arm's drives are more compliant than usual; their damping ratio stays."""
+CLEARANCE = 0.005
+"""What has to remain of it over a pad that is scaled up [m]."""
+MOST_FORCE = 100.0
+"""Greatest goal force that may be asked for [N]."""
+GAUGE = 0.01
+"""Height of the marker over the pad per newton that is missing [m/N]."""
+
+
+def press_scene() -> TableSceneConfig:
+    """Return a disc under the closed fingers of a compliant arm, which start over it and move by small steps.
+
+    The drives have a sixth of their usual stiffness, 3 kN/m at the tool, as impedance control gives an arm that is to
+    touch things: the command's lead of at most 1 cm presses with 30 N, and a full step on the stiffest pad with 4 N.
+    The fingers stay closed: the gripper's share of an action is a hundredth of a millimetre. The command does not take
+    them below half of the pad's thickness.
+    """
+    arm = ArmDescription()
+    arm = replace(
+        arm,
+        drive_stiffnesses=tuple(COMPLIANCE**-1 * k for k in arm.drive_stiffnesses),
+        drive_dampings=tuple(COMPLIANCE**-0.5 * k for k in arm.drive_dampings),
+    )
+    tip = arm.tool_length - arm.hand_length - arm.gripper.finger_length  # of the finger tips over the tool point
+    return TableSceneConfig(
+        object=ObjectConfig(
+            shape="cylinder",
+            extents=(0.06, 0.06, THICKNESS),
+            surface_count=200,
+            build=BuildOptions(mode_count=3, handles="quadratic", cubature_count=192),
+        ),
+        material=Material(youngs_modulus=2.0e5, poissons_ratio=0.4, density=1000.0),
+        arm=replace(arm, home_position=(0.45, 0.0, THICKNESS + START_HEIGHT - tip), home_opening=0.0),
+        control=ArmControlOptions(
+            translation_scale=0.0015,
+            opening_rate=1.0e-5,
+            max_lead=0.01,
+            workspace_lower=(0.35, -0.10, 0.5 * THICKNESS - tip),
+            workspace_upper=(0.55, 0.10, 0.20),
+        ),
+        solver=RL_SOLVER,
+        substeps=4,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PressSoftConfig(TaskConfig):
+    """Goal and success of PressSoft."""
+
+    scene: TableSceneConfig = field(default_factory=press_scene)
+    """Objects, robot and physics."""
+    position_range: tuple[float, float] = (0.02, 0.02)
+    """Half-width of the pad's random position in x and y [m]."""
+    force_range: tuple[float, float] = (2.0, 10.0)
+    """Range of the goal force [N]."""
+    force_tolerance: float = 0.1
+    """Error of the force that counts as none, as a share of the goal."""
+    least_tolerance: float = 0.3
+    """The same in newtons, where that is more [N]."""
+    centre_tolerance: float = 0.012
+    """Horizontal distance of the tool from the pad's axis within which the force counts [m]."""
+    hold_steps: int = 15
+    """Control steps in a row with the right force that make a success."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        super().__post_init__()
+        low, high = self.force_range
+        if not 0.0 < low <= high <= MOST_FORCE:
+            raise ConfigError(f"force_range must satisfy 0 < low <= high <= {MOST_FORCE} N, got {self.force_range}")
+        if not (0.0 < self.force_tolerance < 1.0 and 0.0 <= self.least_tolerance < low):
+            raise ConfigError(
+                f"force_tolerance {self.force_tolerance} must lie in 0..1 and least_tolerance {self.least_tolerance} N "
+                f"below the least goal, {low} N"
+            )
+        if not self.centre_tolerance > 0.0:
+            raise ConfigError(f"centre_tolerance must be positive, got {self.centre_tolerance}")
+        if self.hold_steps < 1:
+            raise ConfigError(f"hold_steps must be at least 1, got {self.hold_steps}")
+
+
+class PressSoft(Task):
+    """Press the closed fingers on the middle of a pad until it pushes back with the goal force, and hold that.
+
+    The contact force is the vertical component of what the pad exerts on both fingers, of the contact solve itself.
+    Young's modulus is random over two decades and not observed: the same step means another force on every pad.
+
+    Reward terms: ``reach`` (0..1, finger tips to the middle of the pad's top), ``force`` (0..1.5, nearness to the goal
+    force while there), ``hold`` (0 or 2, within the tolerance), ``overshoot`` (-1..0, beyond 1.3 times the goal).
+    Success: within the tolerance, over the middle of the pad, for ``hold_steps`` steps in a row.
+    """
+
+    config: PressSoftConfig
+    config_class = PressSoftConfig
+    term_names = ("reach", "force", "hold", "overshoot")
+    metric_names = ("contact_force", "force_error", "indentation", "centre_distance")
+
+    @property
+    def top(self) -> float:
+        """Height of the unscaled pad [m]."""
+        return float(np.ptp(self.scene.soft.body.surface_points[:, 2]))
+
+    @property
+    def tip_length(self) -> float:
+        """Distance from the tool point down to the finger tips [m]."""
+        arm = self.config.scene.arm
+        return arm.hand_length + arm.gripper.finger_length - arm.tool_length
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Add the goal force [N]; a pad must not reach up to the fingers.
+
+        Raises:
+            ConfigError: If a pad of the greatest scale does.
+        """
+        config = self.config
+        room = config.scene.arm.home_position[2] - self.tip_length - CLEARANCE
+        most = min(2.0, room / self.top)
+        largest = 1.0 if config.scale_range is None else config.scale_range[1]
+        if largest > most:
+            raise ConfigError(
+                f"a pad of height {self.top:.3f} m, scaled by up to {largest}, reaches the finger tips at the start",
+                hint=f"keep the scale below {most:.2f}, or raise scene.arm.home_position",
+            )
+        (low, high), least = config.force_range, config.least_tolerance
+        drawn = [replace(p, most=(most,)) if p.name == "scale" else p for p in super().parameters()]
+        return (
+            *drawn,
+            Parameter(name="goal_force", low=(low,), high=(high,), least=(max(least, 0.01),), most=(MOST_FORCE,)),
+        )
+
+    def goal_segments(self) -> tuple[Segment, ...]:
+        """Goal force, contact force and what is missing [N]."""
+        return (
+            Segment("goal_force", 1, 0.0, MOST_FORCE),
+            Segment("contact_force", 1, -200.0, 200.0),
+            Segment("missing_force", 1, -200.0, 200.0),
+        )
+
+    def observe(self) -> None:
+        """Write the forces, the indentation and the distance from the middle."""
+        scene, table = self.scene, self.table
+        self.launch(
+            kernels.observe,
+            [
+                table.values,
+                table.column("goal_force"),
+                table.column("scale"),
+                scene.object_position,
+                scene.controller.tool_pose,
+                scene.finger_force,
+                self.top,
+                self.tip_length,
+                GAUGE,
+                self.column("goal_force"),
+            ],
+            [self.observation, self.metrics, scene.marker_place],
+        )
+
+    def evaluate(self) -> None:
+        """Judge place and force."""
+        config = self.config
+        self.launch(
+            kernels.evaluate,
+            [
+                self.table.values,
+                self.table.column("goal_force"),
+                self.metrics,
+                config.force_tolerance,
+                config.least_tolerance,
+                config.centre_tolerance,
+                config.hold_steps,
+            ],
+            [self.held, self.terms, self.success],
+        )
+
+    def marker(self) -> Splats:
+        """Return a small ball; it hangs beside the pad, over its top by `GAUGE` per newton that is missing."""
+        return sphere_marker(0.006)
+
+    def observation_camera(self) -> PinholeCamera:
+        """Return a camera close to the pad, or the one on the hand."""
+        if self.config.camera != "front":
+            return super().observation_camera()
+        return pad_camera("pixels", self.config.image_size)
+
+    def render_cameras(self) -> list[PinholeCamera]:
+        """Return that camera and the overview."""
+        return [pad_camera("front", self.config.render_size), *super().render_cameras()[1:]]
+
+
+def pad_camera(name: str, edge: int) -> PinholeCamera:
+    """Return a camera that sees pad, finger tips and marker."""
+    return PinholeCamera.look_at(
+        name, position=(0.80, -0.24, 0.21), target=(0.465, 0.015, 0.065), width=edge, height=edge, fov_y=0.42
+    )
+
+
+class PressSoftEnv(SoftEnv):
+    """One arm, one pad, one force; see :class:`PressSoft` and :class:`SoftEnv`."""
+
+    config: PressSoftConfig
+    task: PressSoft
+    task_class = PressSoft
+
+
+class PressSoftVectorEnv(SoftVectorEnv):
+    """Many worlds of it; see :class:`PressSoft` and :class:`SoftVectorEnv`."""
+
+    task_class = PressSoft

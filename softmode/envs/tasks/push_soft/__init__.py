@@ -1,0 +1,1 @@
+"""PushSoft: push a soft object over the table to a goal."""

@@ -1,0 +1,229 @@
+"""PushSoft: push a soft object over the table to a goal pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import warp as wp
+from scipy.spatial import ConvexHull
+
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.materials.material import Material
+from softmode.envs.markers import dots
+from softmode.envs.parameters import Parameter
+from softmode.envs.rl_scene import RL_SOLVER
+from softmode.envs.soft_env import SoftEnv
+from softmode.envs.soft_vector_env import SoftVectorEnv
+from softmode.envs.task import Segment, Task, TaskConfig
+from softmode.envs.tasks.push_soft import kernels
+from softmode.errors import ConfigError
+from softmode.objects.soft_object import ObjectConfig, load_object
+from softmode.robots.arm import ArmDescription
+from softmode.robots.control import ArmControlOptions
+from softmode.scenes.table_scene import TableSceneConfig
+from softmode.splats.splats import Splats
+
+PUCK = ObjectConfig(
+    shape="cylinder",
+    extents=(0.07, 0.07, 0.04),
+    surface_count=120,
+    build=BuildOptions(mode_count=4, cubature_count=64),
+)
+"""A soft disc."""
+PUCK_MATERIAL = Material(youngs_modulus=1.0e5, density=300.0, friction=0.4)
+"""Soft foam that slides: nothing lower than its width over twice its friction topples when it is pushed."""
+
+
+def push_scene() -> TableSceneConfig:
+    """Return the scene: a puck, and a fork of two fingers that starts low over the table between robot and puck."""
+    return TableSceneConfig(
+        object=PUCK,
+        material=PUCK_MATERIAL,
+        table_friction=0.4,
+        solver=RL_SOLVER,
+        substeps=4,
+        object_position=(0.42, 0.0),
+        arm=ArmDescription(home_position=(0.31, 0.0, 0.03), home_opening=0.045),
+        control=ArmControlOptions(workspace_lower=(0.25, -0.35, 0.024), workspace_upper=(0.66, 0.35, 0.16)),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PushSoftConfig(TaskConfig):
+    """Goal and success of PushSoft."""
+
+    scene: TableSceneConfig = field(default_factory=push_scene)
+    """Objects, robot and physics."""
+    position_range: tuple[float, float] = (0.03, 0.06)
+    """Half-width of the object's random position in x and y [m]."""
+    goal_distance: tuple[float, float] = (0.08, 0.20)
+    """Range of the distance from the object to its goal [m]."""
+    goal_direction: tuple[float, float] = (-1.0, 1.0)
+    """Range of the direction to the goal, from the x axis, which points away from the robot, about z [rad]."""
+    goal_yaw: tuple[float, float] = (0.0, 0.0)
+    """Range of the angle by which to turn the object about z [rad]; counts with `yaw_tolerance` only."""
+    goal_tolerance: float = 0.02
+    """Distance from the goal that counts as there [m]."""
+    yaw_tolerance: float | None = None
+    """Error of the object's yaw that counts as there [rad]; None ignores yaw, as for round objects."""
+    rest_speed: float = 0.02
+    """Speed of the object under which it counts as at rest [m/s]."""
+    hold_steps: int = 10
+    """Control steps in a row at rest at the goal that make a success."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        super().__post_init__()
+        (near, far), (least, most) = self.goal_distance, self.goal_direction
+        if not 0.0 <= near <= far <= 0.5:
+            raise ConfigError(f"goal_distance must satisfy 0 <= low <= high <= 0.5 m, got {self.goal_distance}")
+        for name in ("goal_direction", "goal_yaw"):
+            least, most = getattr(self, name)
+            if not -np.pi <= least <= most <= np.pi:
+                raise ConfigError(f"{name} must satisfy -pi <= low <= high <= pi, got {(least, most)}")
+        if not 0.0 < self.goal_tolerance <= 0.1:
+            raise ConfigError(f"goal_tolerance must lie in 0..0.1 m, got {self.goal_tolerance}")
+        if self.yaw_tolerance is not None and not 0.0 < self.yaw_tolerance <= np.pi:
+            raise ConfigError(f"yaw_tolerance must lie in 0..pi, or be None, got {self.yaw_tolerance}")
+        if not self.rest_speed > 0.0:
+            raise ConfigError(f"rest_speed must be above 0, got {self.rest_speed}")
+        if self.hold_steps < 1:
+            raise ConfigError(f"hold_steps must be at least 1, got {self.hold_steps}")
+
+
+class PushSoft(Task):
+    """Push the object to a goal on the table and leave it there at rest.
+
+    Reward terms: ``reach`` (0..0.5, tool to the side of the object that faces away from the goal), ``progress``
+    (-1..1, object towards the goal in this step, over the longest tool step), ``goal`` (0..1, nearness to the goal),
+    ``rest`` (0 or 2, at rest at the goal). Success: at rest at the goal for ``hold_steps`` steps in a row.
+
+    Yaw is the rotation about the vertical that best maps the observed surface points from rest to where they are, so
+    that it is defined for a deformed object.
+    """
+
+    config: PushSoftConfig
+    config_class = PushSoftConfig
+    term_names = ("reach", "progress", "goal", "rest")
+    metric_names = ("goal_distance", "yaw_error")
+
+    def build(self) -> None:
+        """Allocate what the reward remembers."""
+        self.before = wp.zeros(self.world_count, dtype=float, device=self.device)
+        body = self.scene.soft.body
+        rest = body.surface_points[self.points]
+        self._rest = wp.array(rest, dtype=wp.vec3, device=self.device)
+        pad = self.config.scene.arm.gripper.pad_size
+        self.push_distance = float(np.linalg.norm(body.surface_points[:, :2], axis=1).max() + 0.5 * pad[0])
+        """From the centre of the unscaled object to the tool that pushes it [m]."""
+        self.push_height = self.config.scene.control.workspace_lower[2] + 0.006
+        """Height of the tool that pushes [m]."""
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Add the goal: distance [m] and direction [rad] from the object, and the angle to turn [rad]."""
+        config = self.config
+        low, high = np.transpose((config.goal_distance, config.goal_direction)).tolist()
+        low_yaw, high_yaw = config.goal_yaw
+        return (
+            *super().parameters(),
+            Parameter(
+                name="goal", low=tuple(low), high=tuple(high), least=(0.0, -2.0 * np.pi), most=(0.5, 2.0 * np.pi)
+            ),
+            Parameter(name="goal_yaw", low=(low_yaw,), high=(high_yaw,), least=(-2.0 * np.pi,), most=(2.0 * np.pi,)),
+        )
+
+    def goal_segments(self) -> tuple[Segment, ...]:
+        """The goal's position [m] and heading, and its position relative to the tool [m]."""
+        return (
+            Segment("goal", 2, -2.0, 2.0),
+            Segment("goal_heading", 2, -1.0, 1.0),
+            Segment("goal_offset", 2, -4.0, 4.0),
+        )
+
+    def object_segments(self) -> tuple[Segment, ...]:
+        """The way of the object to the goal [m], its heading seen from the goal, the way of the tool behind it [m]."""
+        return (
+            Segment("object_goal", 2, -4.0, 4.0),
+            Segment("object_heading", 2, -1.0, 1.0),
+            Segment("push_offset", 3, -4.0, 4.0),
+        )
+
+    def clear(self) -> None:
+        """Forget how long the object rested and where it was."""
+        super().clear()
+        self.launch(kernels.forget_distance, [self.scene.world_mask], [self.before])
+
+    def observe(self) -> None:
+        """Write goal, ways and errors."""
+        scene, table, data = self.scene, self.table, self.scene.model.softmode
+        self.launch(
+            kernels.observe,
+            [
+                table.values,
+                table.column("position"),
+                table.column("yaw"),
+                table.column("scale"),
+                table.column("goal"),
+                table.column("goal_yaw"),
+                scene.object_position,
+                scene.controller.tool_pose,
+                data.particle_start,
+                scene.state.particle_q,
+                self._points,
+                self._rest,
+                len(scene.objects),
+                self.push_distance,
+                self.push_height,
+                scene.soft.height,
+                self.column("goal"),
+                self.column("object_goal"),
+            ],
+            [self.observation, self.metrics, scene.marker_place],
+        )
+
+    def evaluate(self) -> None:
+        """Judge the place, the speed and the way so far."""
+        scene, config = self.scene, self.config
+        self.launch(
+            kernels.evaluate,
+            [
+                self.metrics,
+                self.observation,
+                self.column("push_offset"),
+                scene.object_velocity,
+                config.goal_tolerance,
+                -1.0 if config.yaw_tolerance is None else config.yaw_tolerance,
+                config.rest_speed,
+                config.hold_steps,
+                config.scene.control.translation_scale,
+            ],
+            [self.held, self.before, self.terms, self.success],
+        )
+
+    def marker(self) -> Splats:
+        """Return the outline of the object, to be drawn on the table."""
+        soft = load_object(self.config.scene.object)
+        points = soft.body.surface_points[:, :2]
+        corners = points[ConvexHull(points).vertices]
+        edges = np.roll(corners, -1, axis=0) - corners
+        length = np.linalg.norm(edges, axis=1)
+        along = np.arange(0.0, length.sum(), 0.003)
+        start = np.concatenate([[0.0], np.cumsum(length)])
+        k = np.searchsorted(start, along, side="right") - 1
+        outline = corners[k] + edges[k] * ((along - start[k]) / length[k])[:, None]
+        return dots(np.column_stack([outline, np.full(len(outline), 0.001)]), 0.0018, opacity=0.8)
+
+
+class PushSoftEnv(SoftEnv):
+    """One arm, one soft object, one goal on the table; see :class:`PushSoft` and :class:`SoftEnv`."""
+
+    config: PushSoftConfig
+    task: PushSoft
+    task_class = PushSoft
+
+
+class PushSoftVectorEnv(SoftVectorEnv):
+    """Many worlds of it; see :class:`PushSoft` and :class:`SoftVectorEnv`."""
+
+    task_class = PushSoft

@@ -1,0 +1,1 @@
+"""RopeRoute: lead a soft rope around pegs to a goal."""

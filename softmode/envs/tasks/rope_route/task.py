@@ -1,0 +1,274 @@
+"""RopeRoute: lead a soft rope around pegs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import warp as wp
+
+from softmode.envs.markers import sphere_marker
+from softmode.envs.parameters import Parameter
+from softmode.envs.soft_env import SoftEnv
+from softmode.envs.soft_vector_env import SoftVectorEnv
+from softmode.envs.task import Segment, Task, TaskConfig
+from softmode.envs.tasks.rope_route import kernels
+from softmode.errors import ConfigError
+from softmode.objects.presets import ROPE, ROPE_MATERIAL
+from softmode.robots.arm import ArmDescription
+from softmode.robots.control import ArmControlOptions
+from softmode.scenes.table_scene import GAP, Fixture, TableSceneConfig
+from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.splats import Splats
+
+LENGTH = 0.36
+"""Length of the default rope [m]."""
+AXIS_POINTS = 25
+"""Points on the rope's axis that its winding is measured with."""
+GRASP = 0.03
+"""Distance of the point to grasp from the rope's end [m]."""
+PEGS = ((0.45, -0.03), (0.45, 0.11))
+"""Where the default pegs stand [m]; the rope is to pass them in this order, towards y."""
+PEG_SIZE = (0.015, 0.04)
+"""Radius and height of a peg [m]."""
+
+
+def pegs_at(positions: tuple[tuple[float, float], ...]) -> tuple[Fixture, ...]:
+    """Return pegs, the cylinders that the rope is led around in their order."""
+    radius, height = PEG_SIZE
+    return tuple(
+        Fixture(
+            label=f"peg_{k}",
+            shape="cylinder",
+            size=(radius, 0.5 * height),
+            position=(x, y, 0.5 * height),
+            color=(0.85, 0.62, 0.35),
+            friction=0.3,
+        )
+        for k, (x, y) in enumerate(positions)
+    )
+
+
+def rope_scene() -> TableSceneConfig:
+    """Return a rope that lies along y before a row of smooth pegs, on a smooth table, the open gripper over its end."""
+    return TableSceneConfig(
+        object=replace(
+            ROPE,
+            extents=(LENGTH, 0.016, 0.016),
+            surface_count=160,
+            build=replace(ROPE.build, cubature_count=128),
+        ),
+        material=ROPE_MATERIAL,
+        fixtures=pegs_at(PEGS),
+        arm=ArmDescription(home_position=(0.45, -0.14, 0.09), home_opening=0.05),
+        control=ArmControlOptions(workspace_lower=(0.30, -0.35, 0.024), workspace_upper=(0.62, 0.30, 0.25)),
+        object_position=(0.45, -0.12),
+        table_friction=0.4,
+        substeps=4,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RopeRouteConfig(TaskConfig):
+    """Goal and success of RopeRoute; the pegs are the cylinders among ``scene.fixtures``.
+
+    `position` is that of the rope's end, `yaw` its angle from the y axis.
+    """
+
+    scene: TableSceneConfig = field(default_factory=rope_scene)
+    """Objects, robot and physics."""
+    position_range: tuple[float, float] = (0.02, 0.015)
+    """Half-width of the random position of the rope's end in x and y [m]."""
+    yaw_range: float = 0.2
+    """Half-width of its random angle from the y axis [rad]."""
+    youngs_modulus_range: tuple[float, float] | None = (1.5e5, 6.0e5)
+    """Range of the random Young's modulus [Pa], log-uniform."""
+    goal_aside: tuple[float, float] = (0.0, 0.04)
+    """Range of the goal's distance from the last peg along x, on the side where the rope passes it [m]."""
+    goal_beyond: tuple[float, float] = (0.06, 0.10)
+    """Range of its distance from the last peg along y [m]."""
+    goal_tolerance: float = 0.025
+    """Horizontal distance of the rope's end from the goal that counts as there [m]."""
+    winding: float = 2.0
+    """Angle by which the rope, seen from a peg, has to sweep past it on the right side [rad]; pi if it were long."""
+    hold_steps: int = 10
+    """Control steps in a row with the rope as wanted that make a success."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        super().__post_init__()
+        for name in ("goal_aside", "goal_beyond"):
+            low, high = getattr(self, name)
+            if not -0.2 <= low <= high <= 0.2:
+                raise ConfigError(f"{name} must satisfy -0.2 <= low <= high <= 0.2 m, got {(low, high)}")
+        if not self.goal_tolerance > 0.0:
+            raise ConfigError(f"goal_tolerance must be positive, got {self.goal_tolerance}")
+        if not 0.0 < self.winding < np.pi:
+            raise ConfigError(f"winding must lie in 0..pi, got {self.winding}")
+        if self.hold_steps < 1:
+            raise ConfigError(f"hold_steps must be at least 1, got {self.hold_steps}")
+        if not self.pegs:
+            raise ConfigError("scene.fixtures holds no cylinder", hint="add pegs: pegs_at(((0.45, 0.0),))")
+
+    @property
+    def pegs(self) -> tuple[Fixture, ...]:
+        """The pegs, in the order in which the rope passes them."""
+        return tuple(fixture for fixture in self.scene.fixtures if fixture.shape == "cylinder")
+
+    @classmethod
+    def presets(cls) -> dict[str, RopeRouteConfig]:
+        """Return "one_peg", with a single peg, for a start."""
+        return {"one_peg": cls(scene=replace(rope_scene(), fixtures=pegs_at(PEGS[:1])))}
+
+
+class RopeRoute(Task):
+    """Grasp the rope's end and lead it past the pegs, each on its side, to a goal.
+
+    The side of the first peg is drawn (``route``: negative towards the robot, positive away from it), the next ones
+    alternate. The winding of the rope about a peg is the angle by which the axis sweeps past it, seen from above, from
+    tail to end; its sign is the side.
+
+    Reward terms: ``reach`` (0..1, tool to the point to grasp), ``grasp`` (0 or 0.5, both fingers touch the rope there),
+    ``route`` (-2..2, winding on the right side, mean over the pegs), ``goal`` (0..2, end to the goal, the more the
+    better routed), ``hold`` (0 or 2, routed and at the goal). Success: all pegs passed on their side by ``winding`` at
+    least, the whole rope below the pegs' top, and its end at the goal, for ``hold_steps`` steps in a row.
+    """
+
+    config: RopeRouteConfig
+    config_class = RopeRouteConfig
+    term_names = ("reach", "grasp", "route", "goal", "hold")
+    metric_names = ("goal_distance", "least_winding", "highest_point", "grasp_distance")
+
+    def build(self) -> None:
+        """Sample the axis."""
+        body, device = self.scene.soft.body, self.device
+        low, high = body.bounds
+        self.half_length = float(0.5 * (high[0] - low[0]))
+        rest = np.zeros((AXIS_POINTS, 3))
+        rest[:, 0] = np.linspace(-self.half_length, self.half_length, AXIS_POINTS)
+        self.grasp_point = int(np.argmin(np.abs(rest[:, 0] - (self.half_length - GRASP))))
+        """Index of the axis point to grasp."""
+        self._rest = wp.array(rest, dtype=wp.vec3d, device=device)
+        self._basis = wp.array(body.evaluate(rest)[0], dtype=wp.float64, device=device)
+        self.axis = wp.zeros((self.world_count, AXIS_POINTS), dtype=wp.vec3, device=device)
+        """Points on the axis, from tail to end [m], shape (world_count, AXIS_POINTS)."""
+        self.peg_height = min(peg.position[2] + peg.size[1] for peg in self.config.pegs)
+        """Height of the lowest peg's top [m]."""
+        self._pegs = wp.array([peg.position[:2] for peg in self.config.pegs], dtype=wp.vec2, device=device)
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Add the side of the first peg, and the goal: aside of the last peg, and beyond it [m]."""
+        config = self.config
+        low, high = zip(config.goal_aside, config.goal_beyond, strict=True)
+        return (
+            *super().parameters(),
+            Parameter(name="route", low=(-1.0,), high=(1.0,)),
+            Parameter(name="goal", low=low, high=high, least=(-0.2, -0.2), most=(0.2, 0.2)),
+        )
+
+    def goal_segments(self) -> tuple[Segment, ...]:
+        """The goal's position, that from the tool [m], and the side of every peg."""
+        return (
+            Segment("goal", 2, -2.0, 2.0),
+            Segment("goal_offset", 2, -4.0, 4.0),
+            Segment("side", len(self.config.pegs), -1.0, 1.0),
+        )
+
+    def object_segments(self) -> tuple[Segment, ...]:
+        """The point to grasp from the tool, the end from there, the goal from the end [m], the winding [rad]."""
+        return (
+            Segment("grasp_offset", 3, -4.0, 4.0),
+            Segment("end_offset", 3, -1.0, 1.0),
+            Segment("end_goal", 2, -4.0, 4.0),
+            Segment("winding", len(self.config.pegs), -10.0, 10.0),
+        )
+
+    def place(self) -> None:
+        """Put the rope down."""
+        scene, table = self.scene, self.table
+        columns = [table.column(name) for name in ("position", "yaw", "scale")]
+        self.launch(
+            kernels.place_rope,
+            [scene.world_mask, table.values, *columns, self.half_length, scene.soft.height, GAP],
+            [scene.place_position, scene.place_yaw],
+        )
+
+    def observe(self) -> None:
+        """Trace the axis and write goal, end and winding."""
+        scene, table = self.scene, self.table
+        self.launch(
+            kernels.trace_axis,
+            [scene.model.softmode.function_start, self._rest, self._basis, scene.state.softmode.q],
+            [self.axis],
+            (self.world_count, AXIS_POINTS),
+        )
+        self.launch(
+            kernels.observe,
+            [
+                table.values,
+                table.column("route"),
+                table.column("goal"),
+                self._pegs,
+                self.axis,
+                self.grasp_point,
+                scene.controller.tool_pose,
+                self.column("goal"),
+                self.column("grasp_offset"),
+                scene.soft.height,
+            ],
+            [self.observation, self.metrics, scene.marker_place],
+        )
+
+    def evaluate(self) -> None:
+        """Judge the route and the end's place."""
+        config, scene = self.config, self.scene
+        self.launch(
+            kernels.evaluate,
+            [
+                self.observation,
+                self.column("winding"),
+                len(config.pegs),
+                self.metrics,
+                scene.finger_force,
+                config.winding,
+                config.goal_tolerance,
+                self.peg_height,
+                config.hold_steps,
+            ],
+            [self.held, self.terms, self.success],
+        )
+
+    def marker(self) -> Splats:
+        """Return a ball."""
+        return sphere_marker(0.5 * self.config.goal_tolerance)
+
+    def observation_camera(self) -> PinholeCamera:
+        """Return a camera that sees rope and pegs, or the one on the hand."""
+        if self.config.camera != "front":
+            return super().observation_camera()
+        return rope_camera("pixels", self.config.image_size)
+
+    def render_cameras(self) -> list[PinholeCamera]:
+        """Return that camera and the overview."""
+        return [rope_camera("front", self.config.render_size), *super().render_cameras()[1:]]
+
+
+def rope_camera(name: str, edge: int) -> PinholeCamera:
+    """Return a camera that looks down on rope and pegs from the front, past the hand."""
+    return PinholeCamera.look_at(
+        name, position=(0.95, -0.50, 0.62), target=(0.44, -0.10, 0.02), width=edge, height=edge, fov_y=0.68
+    )
+
+
+class RopeRouteEnv(SoftEnv):
+    """One arm, one rope, some pegs; see :class:`RopeRoute` and :class:`SoftEnv`."""
+
+    config: RopeRouteConfig
+    task: RopeRoute
+    task_class = RopeRoute
+
+
+class RopeRouteVectorEnv(SoftVectorEnv):
+    """Many worlds of it; see :class:`RopeRoute` and :class:`SoftVectorEnv`."""
+
+    task_class = RopeRoute

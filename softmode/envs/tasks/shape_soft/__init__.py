@@ -1,0 +1,1 @@
+"""ShapeSoft: bend a soft post into a given shape."""

@@ -1,0 +1,101 @@
+"""What goal-conditioned learners, such as hindsight experience replay, ask of ShapeSoft's environments."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from softmode.envs.task import EndReason
+from softmode.envs.tasks.shape_soft import kernels
+from softmode.errors import ConfigError
+
+if TYPE_CHECKING:
+    from softmode.envs.tasks.shape_soft.task import ShapeSoftConfig
+
+POINTS = 12
+"""Points of a goal."""
+
+
+def reward_arguments(config: ShapeSoftConfig) -> list[Any]:
+    """Return what the reward depends on beside the goals."""
+    return [int(config.reward == "sparse"), config.reward_length, config.goal_tolerance]
+
+
+class GoalMethods:
+    """Reward and ends of episodes as functions of the goals."""
+
+    config: ShapeSoftConfig
+
+    @property
+    def task_device(self) -> Any:
+        """Device on which rewards of numpy arrays are computed: that of the task."""
+        raise NotImplementedError
+
+    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> Any:
+        """Return the reward of a step that led to `achieved_goal`, bit for bit that of the step on the same device.
+
+        Args:
+            achieved_goal: Points of the shape [m], shape (..., 36), a numpy array or a tensor.
+            desired_goal: Those of the target.
+            info: Not used.
+
+        Returns:
+            Rewards, float32, shape (...): a number, an array, or a tensor on the device of the goals.
+
+        Raises:
+            ConfigError: If the shapes do not fit.
+        """
+        size = 3 * POINTS
+        pair: tuple[Any, ...] = (achieved_goal, desired_goal)
+        if not all(hasattr(goal, "detach") for goal in pair):
+            pair = tuple(np.asarray(goal, np.float32) for goal in pair)
+        leading = tuple(pair[0].shape[:-1])
+        if any(tuple(goal.shape) != (*leading, size) for goal in pair):
+            raise ConfigError(
+                f"goals have shapes {tuple(pair[0].shape)} and {tuple(pair[1].shape)}",
+                hint=f"give both the same shape (..., {size})",
+            )
+        if not hasattr(pair[0], "detach"):
+            goals = [wp.array(goal.reshape(-1, size), dtype=float, device=self.task_device) for goal in pair]
+            return self._launch(goals).numpy().reshape(leading)[()]
+        with _torch_stream(pair[0]):
+            goals = [wp.from_torch(goal.detach().float().reshape(-1, size).contiguous()) for goal in pair]
+            return wp.to_torch(self._launch(goals)).reshape(leading)
+
+    def _launch(self, goals: list[wp.array]) -> wp.array:
+        """Compute the reward of each row."""
+        device = goals[0].device
+        reward = wp.zeros(goals[0].shape[0], dtype=float, device=device)
+        inputs = [*goals, POINTS, *reward_arguments(self.config)]
+        wp.launch(kernels.compute_reward, dim=reward.shape[0], inputs=inputs, outputs=[reward], device=device)
+        return reward
+
+    def compute_terminated(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> Any:
+        """Return whether the episode ended by a failure, which `info` (one or a sequence) knows; goals end none."""
+        if isinstance(info, Mapping):
+            return _failed(info)
+        if info is None or len(info) == 0:
+            return np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
+        return np.array([_failed(one) for one in info])
+
+    def compute_truncated(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> Any:
+        """Return False: the time limit is not the task's."""
+        return np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
+
+
+def _failed(info: Mapping[str, Any]) -> bool:
+    """Return whether an info is that of a failure."""
+    return bool(info.get("end_reason", EndReason.RUNNING) > EndReason.TIME_LIMIT)
+
+
+def _torch_stream(tensor: Any) -> Any:
+    """Return the context in which kernels wait for what torch does on the device of a tensor."""
+    if not tensor.is_cuda:
+        return contextlib.nullcontext()
+    import torch
+
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device)))

@@ -1,0 +1,116 @@
+"""Target shapes of a post that is bent: one press by the arm, recorded, and turned about the vertical."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.errors import ConfigError
+from softmode.scenes.table_scene import TableScene
+
+DIRECTIONS = 24
+"""Directions of the table; between them points are interpolated in the frame of the press."""
+LEVELS = 12
+"""Displacements of the table."""
+_STEP = 0.0015
+"""Tool travel per control step of a recorded press [m]."""
+_MOVE, _SETTLE = 4, 6
+"""Control steps of travel and of rest between two records."""
+
+
+@dataclass(frozen=True)
+class Press:
+    """A press along y, recorded."""
+
+    displacements: NDArray[np.float64]
+    """Displacement of the free end [m], rising from 0, shape (records,)."""
+    coordinates: NDArray[np.float64]
+    """Reduced coordinates with the middle of the foot at x = y = 0 and the table at z = 0 [m], (records, n, 3)."""
+
+
+def record_press(scene: TableScene, displacement: float) -> Press:
+    """Let the arm press the object of world 0 aside along y, with the fingers as they are; the scene is reset.
+
+    Args:
+        scene: A scene just built, its object between the open fingers.
+        displacement: How far the free end is to move [m].
+
+    Raises:
+        ConfigError: If the arm does not bend it so far.
+    """
+    config, body = scene.config, scene.soft.body
+    gripper, control = config.arm.gripper, config.control
+    top = body.evaluate(np.array([[0.0, 0.0, body.surface_points[:, 2].max()]]))[0][0]
+    action = np.zeros((scene.world_count, control.action_size), np.float32)
+    action[:, -1] = 2.0 * config.arm.home_opening / gripper.stroke - 1.0
+    start = int(scene.model.softmode.function_start.numpy()[0])
+    place = np.array([*config.object_position, 0.0])
+    shift = np.outer(body.linear_coordinates[:, 3], place)
+
+    def coordinates() -> NDArray[np.float64]:
+        return scene.state.softmode.q.numpy()[start : start + body.function_count].astype(float) - shift
+
+    scene.reset()
+    records = [coordinates()]
+    moved, limit = 0.0, gripper.stroke + 1.5 * displacement
+    ends = [0.0]
+    while ends[-1] < displacement + 0.002:
+        if moved > limit:
+            raise ConfigError(
+                f"the arm bends the object by {ends[-1]:.3f} m at most, not by {displacement} m",
+                hint="lower goal_displacement, or start with the object between the fingers",
+            )
+        for k in range(_MOVE + _SETTLE):
+            action[:, 1] = _STEP / control.translation_scale if k < _MOVE else 0.0
+            scene.step(action)
+        moved += _MOVE * _STEP
+        now = coordinates()
+        end = float(np.hypot(*(top @ (now - records[0]))[:2]))
+        if end > ends[-1] + 1.0e-4:
+            records.append(now)
+            ends.append(end)
+    scene.reset()
+    return Press(np.array(ends), np.array(records))
+
+
+@dataclass(frozen=True)
+class ShapeTargets:
+    """Points of the bent object on the device."""
+
+    points: Any
+    """vec3, shape (DIRECTIONS, LEVELS, points): where the press moved the rest points that were turned by direction
+    j / DIRECTIONS of a turn, at level k / (LEVELS - 1) of the greatest displacement [m]."""
+    displacement_max: float
+    """The greatest displacement [m]."""
+
+    @staticmethod
+    def from_press(body: ReducedBody, press: Press, rest: NDArray[np.float64], device: Any) -> ShapeTargets:
+        """Evaluate a press at rest points.
+
+        Args:
+            body: The body.
+            press: What `record_press` returned.
+            rest: Rest points in the body frame [m], shape (N, 3).
+            device: Warp device.
+        """
+        displacement_max = float(press.displacements[-1])
+        levels = np.linspace(0.0, displacement_max, LEVELS)
+        table = np.empty((DIRECTIONS, LEVELS, len(rest), 3), np.float32)
+        # reduced coordinates between two records: the shape between two shapes
+        between = np.clip(
+            np.searchsorted(press.displacements, levels, side="right") - 1, 0, len(press.displacements) - 2
+        )
+        low, high = press.displacements[between], press.displacements[between + 1]
+        share = ((levels - low) / (high - low))[:, None, None]
+        q = (1.0 - share) * press.coordinates[between] + share * press.coordinates[between + 1]
+        for j in range(DIRECTIONS):
+            angle = 2.0 * np.pi * j / DIRECTIONS
+            c, s = np.cos(angle), np.sin(angle)
+            turned = rest @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+            table[j] = turned + np.einsum("pn,knc->kpc", body.evaluate(turned)[0], q)
+        return ShapeTargets(wp.array(table, dtype=wp.vec3, device=device), displacement_max)

@@ -1,0 +1,98 @@
+"""Who plays an environment: a script, chance, nobody, or a trained policy from a file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from softmode.errors import CheckpointError, ConfigError, MissingExtraError
+
+POLICIES = ("scripted", "random", "zero")
+"""Policies that need no file."""
+
+
+def check_policy(name: str) -> None:
+    """Raise ConfigError if a policy is neither a name of :data:`POLICIES` nor a file."""
+    if name not in POLICIES and not Path(name).is_file():
+        raise ConfigError(
+            f"unknown policy {name!r}", hint=f"use one of {', '.join(POLICIES)}, or the file of a trained policy"
+        )
+
+
+def trained_policy(name: str, env: str) -> Any:
+    """Return the policy in a checkpoint, or None for a policy that needs no file.
+
+    Args:
+        name: What :func:`check_policy` let pass.
+        env: Id of the environment that it is to play.
+
+    Raises:
+        CheckpointError: If the file is missing, damaged, foreign, or of another environment.
+        MissingExtraError: If torch is not installed.
+    """
+    return None if name in POLICIES else policy_file(name, env)
+
+
+def policy_factory(name: str, env: Any, trained: Any = None) -> Callable[[int], Callable[[Any], Any]]:
+    """Return what makes a policy for each episode.
+
+    Args:
+        name: scripted, random, zero, or the file of a trained policy.
+        env: The environment it will play.
+        trained: The policy in that file, if it has been loaded already.
+
+    Returns:
+        A callable that takes the seed of an episode whose reset just happened and returns a callable from observation
+        to action.
+
+    Raises:
+        ConfigError: If there is no such policy, or the environment has no scripted one.
+    """
+    check_policy(name)
+    if name == "scripted":
+        from softmode.envs.scripted import scripted_policy
+
+        scripted_policy(env)  # refuses environments without one
+        return lambda seed: scripted_policy(env)
+    if name == "random":
+
+        def random(seed: int) -> Callable[[Any], Any]:
+            env.action_space.seed(seed)
+            return lambda observation: env.action_space.sample()
+
+        return random
+    if name == "zero":
+        zero = env.action_space.low * 0
+        return lambda seed: lambda observation: zero.copy()
+    if trained is None:
+        from softmode.learning.policy import load_policy
+
+        trained = load_policy(name)
+    trained.check(env)
+    return lambda seed: trained
+
+
+def policy_file(path: str, env: str) -> Any:
+    """Return the policy in a checkpoint of an environment.
+
+    Raises:
+        CheckpointError: If the file is missing, damaged, foreign, or of another environment.
+        MissingExtraError: If torch is not installed.
+    """
+    require_torch()
+    from softmode.learning.checkpoints import same_env
+    from softmode.learning.policy import load_policy
+
+    policy = load_policy(path)
+    if not same_env(policy.env, env):
+        raise CheckpointError(f"checkpoint {path} is of {policy.env}, not of {env}", hint=f"play {policy.env}")
+    return policy
+
+
+def require_torch() -> None:
+    """Raise MissingExtraError where torch is not installed."""
+    try:
+        import torch  # noqa: F401
+    except ImportError as error:
+        raise MissingExtraError("training needs torch", hint="install it with: pip install 'softmode[rl]'") from error

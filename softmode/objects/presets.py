@@ -1,0 +1,50 @@
+"""Soft objects and materials that the tasks use: a beam, a cube, a pad to press, a rope.
+
+Few functions, points and samples each, for training; `docs/objects.md` has what that costs in accuracy. A slender body
+takes all monomials up to degree two and few modes: with affine handles the anticlastic part of bending is locked, which
+makes it a third too stiff at nu = 0.3, and the default rank tolerance drops functions that are thin but not noise.
+"""
+
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.materials.material import Material
+from softmode.objects.soft_object import ObjectConfig
+
+BEAM = ObjectConfig(
+    shape="box",
+    extents=(0.30, 0.04, 0.04),
+    surface_count=200,
+    build=BuildOptions(mode_count=2, handles="quadratic", rank_tolerance=1e-9, cubature_count=256),
+)
+"""The beam of Isaac Lab's `Isaac-Lift-Soft-Franka`, lying along x."""
+BEAM_MATERIAL = Material(youngs_modulus=2.0e5, poissons_ratio=0.3, density=1000.0)
+"""Its material there."""
+
+CUBE = ObjectConfig(
+    shape="box",
+    extents=(0.06, 0.06, 0.06),
+    surface_count=200,
+    build=BuildOptions(mode_count=7, cubature_count=256),
+)
+"""A cube that fits between the fingers."""
+CUBE_MATERIAL = Material(youngs_modulus=1.0e5, poissons_ratio=0.3, density=300.0)
+"""Soft foam."""
+
+PAD = ObjectConfig(
+    shape="cylinder",
+    extents=(0.10, 0.10, 0.03),
+    surface_count=200,
+    build=BuildOptions(mode_count=7, cubature_count=256),
+)
+"""A flat disc to press on."""
+PAD_MATERIAL = Material(youngs_modulus=5.0e4, poissons_ratio=0.4, density=500.0)
+"""Soft foam rubber."""
+
+ROPE = ObjectConfig(
+    shape="capsule",
+    extents=(0.40, 0.016, 0.016),
+    surface_count=200,
+    build=BuildOptions(mode_count=4, handles="quadratic", rank_tolerance=1e-9),
+)
+"""A rope along x, 8 mm in radius."""
+ROPE_MATERIAL = Material(youngs_modulus=3.0e5, poissons_ratio=0.3, density=800.0)
+"""Soft rubber: held in the middle, its ends hang down steeply."""

@@ -1,0 +1,110 @@
+"""A stage as one object: the body that softmode wrote, its splats, or its meshes."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from typing import Literal
+
+import numpy as np
+
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.errors import AssetError
+from softmode.objects.stage_bundle import body_of
+from softmode.objects.stage_geometry import SurfaceMesh, mesh_surface, tet_surface
+from softmode.objects.stage_scene import parts_of, read_usd_scene, stage_frame
+from softmode.splats.colored_mesh import ColoredMesh
+from softmode.splats.splats import Splats
+from softmode.stages import process
+
+
+def asset_kind(path: str | os.PathLike[str]) -> Literal["body", "splat", "mesh"]:
+    """Return what the object in a stage is read from: the body that softmode wrote, splats, else meshes.
+
+    Raises:
+        AssetError: If the file is damaged, or holds several bodies that softmode wrote.
+        MissingExtraError: If the extra `[usd]` is not installed.
+    """
+    stage = _ask(path, geometry=False).described
+    if stage["body_count"] > 1:
+        raise AssetError(
+            f"OpenUSD file {path}: holds {stage['body_count']} bodies", hint="Write one body per file, or use add_usd"
+        )
+    return "body" if stage["body_count"] else "splat" if stage["splat_count"] else "mesh"
+
+
+def read_usd_body(path: str | os.PathLike[str]) -> tuple[ReducedBody, Splats | None]:
+    """Read the body that softmode wrote into a stage, as it is, and its splats in the body frame.
+
+    Args:
+        path: A stage with one such body; its place, scale and material are not asked for.
+
+    Raises:
+        AssetError: If the file is damaged, or holds no or several such bodies.
+        MissingExtraError: If the extra `[usd]` is not installed.
+    """
+    found = [body for body in read_usd_scene(path).deformables if body.bundle is not None]
+    if len(found) != 1 or found[0].bundle is None:
+        raise AssetError(
+            f"OpenUSD file {path}: holds {len(found)} bodies of softmode", hint="Write one with softmode.usd.write_usd"
+        )
+    return body_of(found[0].bundle, f"OpenUSD file {path}: {found[0].path}"), found[0].splats
+
+
+def read_usd_mesh(path: str | os.PathLike[str]) -> ColoredMesh:
+    """Read the visible meshes of a stage, or its tetrahedral ones where there is none, in metres with z up.
+
+    Colours are `primvars:displayColor`; textures and bound materials are not read.
+
+    Args:
+        path: A `.usd`, `.usda`, `.usdc` or `.usdz` file.
+
+    Raises:
+        AssetError: If the file is damaged or holds no surface.
+        MissingExtraError: If the extra `[usd]` is not installed.
+    """
+    name = f"OpenUSD file {path}"
+    answer = _ask(path, geometry=True)
+    frame = stage_frame(answer.described, name)
+    surfaces = []
+    try:
+        for prim in answer.described["meshes"]:
+            where, parts = f"{name}: {prim['path']}", parts_of(prim, answer.arrays, frame)
+            matrix = frame.matrix(prim["matrix"])
+            if not np.isfinite(matrix).all():
+                raise AssetError(f"{where}: its transform is not finite", hint="Mend its xformOps")
+            if prim["kind"] == "Mesh":
+                surfaces.append(mesh_surface(parts, matrix[:3, :3], where, matrix[:3, 3]))
+            else:
+                tets = tet_surface(parts, matrix[:3, :3], where)
+                surfaces.append(SurfaceMesh(tets.vertices + matrix[:3, 3], tets.faces, tets.colors))
+    except (TypeError, IndexError, KeyError, ValueError, OverflowError) as error:
+        if isinstance(error, AssetError):
+            raise
+        raise AssetError(f"{name}: holds invalid data ({error})", hint=process.REEXPORT) from error
+    if not surfaces:
+        raise AssetError(f"{name}: holds no visible mesh", hint="Export splats, or a closed Mesh that is visible")
+    return colored_mesh(surfaces, name)
+
+
+def colored_mesh(surfaces: list[SurfaceMesh], name: str) -> ColoredMesh:
+    """Return surfaces as one mesh in display colours, which are linear in OpenUSD and gamma-encoded in splats."""
+    linear = np.concatenate([mesh.colors[mesh.faces] for mesh in surfaces])
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0) ** (1.0 / 2.4) - 0.055)
+    count = len(linear)
+    return ColoredMesh(
+        corners=np.concatenate([mesh.vertices[mesh.faces] for mesh in surfaces]).astype(np.float32),
+        corner_colors=encoded.astype(np.float32),
+        corner_uvs=np.zeros((count, 3, 2), np.float32),
+        texture_index=np.full(count, -1, np.int32),
+        textures=(),
+        name=name,
+    )
+
+
+def _ask(path: str | os.PathLike[str], *, geometry: bool) -> process.Answer:
+    """Have the process of its own look at a stage."""
+    with tempfile.TemporaryDirectory() as folder:
+        request = process.make_request("asset", path, f"{folder}/answer", asset_root=None, limits=process.Limits())
+        request |= {"strict": True, "geometry": geometry}
+        return process.ask(request, name=f"OpenUSD file {path}")

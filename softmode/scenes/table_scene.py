@@ -1,0 +1,481 @@
+"""A robot arm at a table with soft objects, in any number of worlds: model, solver, controller, cameras, graphs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import newton
+import numpy as np
+import warp as wp
+from newton.solvers import SolverMuJoCo
+
+from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body, register_custom_attributes
+from softmode.deformables.model.status import status_reasons
+from softmode.deformables.skinning.skin_splats import SkinSplats
+from softmode.deformables.solver.solver_reduced import SolverReducedOptions
+from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
+from softmode.errors import ConfigError
+from softmode.objects.soft_object import ObjectConfig, SoftObject, load_object
+from softmode.robots.arm import ArmDescription, add_arm
+from softmode.robots.control import ArmController, ArmControlOptions
+from softmode.scenes import table_kernels as kernels
+from softmode.splats.camera import CameraOptions, SplatCamera
+from softmode.splats.camera_randomization import CameraRandomization
+from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.rasterizer import RasterizerOptions, SplatArrays
+from softmode.splats.splats import Splats
+
+GAP = 2.0e-4
+"""Height over the table at which objects are put down [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fixture:
+    """A rigid shape that stays where it is: a wall of a bin, a peg."""
+
+    label: str
+    """Name of the shape."""
+    shape: Literal["box", "sphere", "capsule", "cylinder"] = "box"
+    """Its kind; capsules and cylinders stand along z."""
+    size: tuple[float, ...]
+    """Half extents of a box, radius of a sphere, radius and half height of the others [m]."""
+    position: tuple[float, float, float]
+    """Its centre [m]; the table's top is z = 0."""
+    yaw: float = 0.0
+    """Rotation about the vertical [rad]."""
+    color: tuple[float, float, float] = (0.62, 0.62, 0.60)
+    """Its colour, sRGB."""
+    friction: float = 0.8
+    """Coulomb coefficient."""
+
+    def __post_init__(self) -> None:
+        """Check kind and size."""
+        counts = {"box": 3, "sphere": 1, "capsule": 2, "cylinder": 2}
+        if self.shape not in counts:
+            raise ConfigError(f"fixture {self.label!r} is a {self.shape!r}", hint=f"use one of {', '.join(counts)}")
+        if len(self.size) != counts[self.shape] or not all(0.0 < x < np.inf for x in self.size):
+            raise ConfigError(
+                f"fixture {self.label!r} has size {self.size}",
+                hint=f"give {counts[self.shape]} positive lengths [m] for a {self.shape}",
+            )
+        if not np.isfinite(self.position).all():
+            raise ConfigError(f"fixture {self.label!r} stands at {self.position}", hint="give finite coordinates [m]")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableSceneConfig:
+    """What stands on the table and how time runs."""
+
+    object: ObjectConfig = field(default_factory=ObjectConfig)
+    """The soft object."""
+    others: tuple[ObjectConfig, ...] = ()
+    """More soft objects, of the same material."""
+    fixtures: tuple[Fixture, ...] = ()
+    """Rigid shapes on the table."""
+    material: Material = field(default_factory=lambda: Material(youngs_modulus=2.0e5, density=250.0))
+    """Its material; Young's modulus may be changed per world at reset."""
+    arm: ArmDescription = field(default_factory=ArmDescription)
+    """The robot."""
+    control: ArmControlOptions = field(default_factory=ArmControlOptions)
+    """What actions mean."""
+    solver: SolverReducedOptions = field(default_factory=SolverReducedOptions)
+    """How the soft step is solved."""
+    control_hz: float = 30.0
+    """Control steps per second."""
+    substeps: int = 8
+    """Physics steps per control step; even."""
+    table_friction: float = 0.8
+    """Coulomb coefficient of the table."""
+    constraint_max: int = 64
+    """Rows of MuJoCo's constraints per world."""
+    rigid_contact_max: int = 32
+    """Contacts between rigid shapes per world."""
+    object_position: tuple[float, float] = (0.45, 0.0)
+    """Where the object stands by default [m]."""
+    grip_slots: int = 0
+    """Points of each soft object that may be gripped while the scene runs; see :attr:`TableScene.grips`."""
+    grip_options: GripOptions = field(default_factory=GripOptions)
+    """How stiff such grips are."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if self.substeps < 2 or self.substeps % 2:
+            raise ConfigError(f"substeps must be even and at least 2, got {self.substeps}")
+        if not 1.0 <= self.control_hz <= 1000.0:
+            raise ConfigError(f"control_hz must lie in 1..1000, got {self.control_hz}")
+        if not self.table_friction >= 0.0:
+            raise ConfigError(f"table_friction must be >= 0, got {self.table_friction}")
+        if not 0 <= self.grip_slots <= 4096:
+            raise ConfigError(f"grip_slots must lie in 0..4096, got {self.grip_slots}")
+
+
+class TableScene:
+    """Physics and pictures of a table scene; tasks add rewards and randomisation.
+
+    Args:
+        config: What to build.
+        world_count: Number of replicas.
+        cameras: Cameras to draw, grouped by image size; none draws nothing.
+        camera_options: Light and background.
+        camera_randomization: What `randomize` of the cameras draws.
+        marker: Splats around the origin that mark a place, such as a goal, in pictures; they touch nothing.
+        device: Warp device; the default one if None.
+        progress: Reports the build of the object, see :func:`softmode.deformables.build.build_body.build_body`.
+    """
+
+    def __init__(
+        self,
+        config: TableSceneConfig,
+        *,
+        world_count: int = 1,
+        cameras: Sequence[PinholeCamera] = (),
+        camera_options: CameraOptions | None = None,
+        camera_randomization: CameraRandomization | None = None,
+        marker: Splats | None = None,
+        device: Any = None,
+        progress: Any = None,
+    ) -> None:
+        """Build model, solvers and controller, and capture the control step."""
+        if world_count < 1:
+            raise ConfigError(f"world_count must be at least 1, got {world_count}")
+        self.config = config
+        self.world_count = world_count
+        self.device = wp.get_device(device)
+        self.dt = 1.0 / (config.control_hz * config.substeps)
+        kinds = (config.object, *config.others)
+        loaded = {kind: load_object(kind, progress) for kind in dict.fromkeys(kinds)}
+        self.objects: tuple[SoftObject, ...] = tuple(loaded[kind] for kind in kinds)
+        """The soft objects of a world; their instances follow each other, world by world."""
+        self._build_model()
+        self._build_solver()
+        self.marker_place = wp.zeros(world_count, dtype=wp.transform, device=self.device)
+        """Where the marker is drawn, transform, shape (world_count,)."""
+        self.marker_place.fill_(wp.transform_identity())
+        self._marker = marker
+        self._build_cameras(cameras, camera_options, camera_randomization)
+        self._graph: Any = None
+        self._camera_graphs: dict[tuple[int, int], Any] = {}
+        self.reset()
+
+    @property
+    def soft(self) -> SoftObject:
+        """The first soft object."""
+        return self.objects[0]
+
+    @property
+    def marker(self) -> Splats | None:
+        """Splats that mark a place in pictures, as they were given; the last ones of `splat_arrays`."""
+        return self._marker
+
+    # -- construction -------------------------------------------------------------------------------------------------
+
+    def _build_model(self) -> None:
+        """Add arm, table, fixtures and objects to a world and replicate it."""
+        config = self.config
+        world = newton.ModelBuilder()
+        self.arm = add_arm(world, config.arm)
+        shape = newton.ModelBuilder.ShapeConfig(mu=config.table_friction, has_shape_collision=True)
+        world.add_shape_box(
+            -1,
+            xform=wp.transform((0.35, 0.0, -0.03), wp.quat_identity()),
+            hx=0.5,
+            hy=0.6,
+            hz=0.03,
+            cfg=shape,
+            color=(0.42, 0.48, 0.54),
+            label="table",
+        )
+        for fixture in config.fixtures:
+            _add_fixture(world, fixture)
+        for thing, kind in zip(self.objects, (config.object, *config.others), strict=True):
+            instance = add_reduced_body(
+                world,
+                thing.body,
+                material=config.material,
+                position=(*config.object_position, thing.height),
+                contact_radius=kind.contact_radius,
+            )
+            if config.grip_slots:
+                add_grip_slots(world, instance, config.grip_slots)
+        builder = newton.ModelBuilder()
+        register_custom_attributes(builder)
+        SolverMuJoCo.register_custom_attributes(builder)
+        builder.replicate(world, self.world_count)
+        self.model: Any = builder.finalize(device=self.device)  # Any: it carries the attributes of soft bodies
+
+    def _build_solver(self) -> None:
+        """Make the coupled solver, the controller and the buffers of a control step."""
+        config, model, worlds = self.config, self.model, self.world_count
+        rigid = SolverMuJoCo(model, njmax=config.constraint_max, nconmax=config.rigid_contact_max)
+        bodies = list({id(thing.body): thing.body for thing in self.objects}.values())
+        self.solver = SolverCoupledReduced(model, bodies, options=config.solver, rigid=rigid)
+        self.state: Any = model.state()
+        self._scratch: Any = model.state()
+        self.control = model.control()
+        for state in (self.state, self._scratch):
+            newton.eval_fk(model, model.joint_q, model.joint_qd, state)
+        self.controller = ArmController(model, self.arm, config.control)
+        slots, instances = config.grip_slots, worlds * len(self.objects)
+        self.grips = tuple(
+            Grips(self.solver, i, slot_count=slots, options=config.grip_options)
+            for i in range(instances if slots else 0)
+        )
+        """Grips of each instance, world by world, that pull and hold it while the scene runs; none without slots."""
+        device = self.device
+        self.actions = wp.zeros((worlds, config.control.action_size), dtype=float, device=device)
+        self.object_position = wp.zeros((worlds, len(self.objects)), dtype=wp.vec3, device=device)
+        """Centre of mass of each soft object [m], shape (world_count, objects)."""
+        self.object_velocity = wp.zeros_like(self.object_position)
+        """Its velocity [m/s]."""
+        self.finger_force = wp.zeros((worlds, 2), dtype=wp.vec3, device=device)
+        starts = model.body_world_start.numpy()[:worlds]
+        fingers = starts[:, None] + np.asarray(self.arm.finger_bodies)[None]
+        self._finger_body = wp.array(fingers, dtype=int, device=device)
+        bodies = [thing.body for thing in self.objects]
+        self._linear = [wp.array(body.linear_coordinates, dtype=wp.float64, device=device) for body in bodies]
+        self._mean_basis = [wp.array(body.mean_basis, dtype=wp.float64, device=device) for body in bodies]
+        self.world_mask = wp.ones(worlds, dtype=wp.bool, device=device)
+        """Which worlds `reset_worlds` resets, shape (world_count,)."""
+        self._solver_mask = wp.zeros(worlds + 1, dtype=wp.bool, device=device)
+        self.place_position = wp.zeros(instances, dtype=wp.vec3d, device=device)
+        """Where `reset_worlds` puts the centre of mass of each object [m], shape (world_count * objects,)."""
+        self.place_yaw = wp.zeros(instances, dtype=wp.float64, device=device)
+        """Its rotation about the vertical [rad]."""
+
+    def _build_cameras(
+        self,
+        cameras: Sequence[PinholeCamera],
+        options: CameraOptions | None,
+        randomization: CameraRandomization | None,
+    ) -> None:
+        """Make one SplatCamera per image size; they share the splats."""
+        self.cameras: dict[tuple[int, int], SplatCamera] = {}
+        if not cameras:
+            return
+        stride, starts = len(self.objects), self.model.softmode.function_start.numpy()
+        self._skins = []
+        first = 0
+        for o, thing in enumerate(self.objects):
+            skin = SkinSplats(
+                thing.splats.means, thing.splats.covariances(), thing.basis, thing.grad_basis, device=self.device
+            )
+            start = wp.array(np.ascontiguousarray(starts[o::stride]), dtype=int, device=self.device)
+            self._skins.append((skin, start, first))
+            first += thing.splats.count
+        drawn = [thing.splats for thing in self.objects]
+        if self._marker is not None:
+            self._marker_first = first
+            self.marker_points = wp.array(self._marker.means[None], dtype=wp.vec3, device=self.device)
+            """Centres of the marker's splats from `marker_place` [m], shape (1 or world_count, splats); a task may put
+            an array of its own here before the first picture, to change the marker's shape."""
+            drawn.append(self._marker)
+        self.splat_arrays = SplatArrays.from_splats(drawn, world_count=self.world_count, device=self.device)
+        for size in sorted({(camera.width, camera.height) for camera in cameras}):
+            mine = [camera for camera in cameras if (camera.width, camera.height) == size]
+            self.cameras[size] = SplatCamera(
+                self.model,
+                self.splat_arrays,
+                mine,
+                options=options,
+                rasterizer_options=RasterizerOptions(),
+                randomization=randomization,
+            )
+
+    # -- time ---------------------------------------------------------------------------------------------------------
+
+    def reset(
+        self,
+        *,
+        world_mask: np.ndarray | None = None,
+        position: np.ndarray | None = None,
+        yaw: np.ndarray | None = None,
+        youngs_modulus: np.ndarray | None = None,
+    ) -> None:
+        """Put arm and object of the chosen worlds back.
+
+        Args:
+            world_mask: Which worlds, shape (world_count,); all if None.
+            position: Where the object stands [m], shape (world_count, 2); the configured place if None.
+            yaw: Its rotation about the vertical [rad], shape (world_count,); zero if None.
+            youngs_modulus: E [Pa] of the object, shape (world_count,); unchanged if None.
+        """
+        worlds, count = self.world_count, len(self.objects)
+        mask = np.ones(worlds, bool) if world_mask is None else np.asarray(world_mask, bool)
+        place = np.empty((worlds, count, 3))
+        place[:, :, :2] = self.config.object_position
+        place[:, :, 2] = [thing.height + GAP for thing in self.objects]
+        turn = np.zeros((worlds, count))
+        if position is not None:
+            place[:, 0, :2] = position
+        if yaw is not None:
+            turn[:, 0] = yaw
+        self.world_mask.assign(mask)
+        self.place_position.assign(place.reshape(-1, 3))
+        self.place_yaw.assign(turn.reshape(-1))
+        if youngs_modulus is not None:
+            self._set_stiffness(mask, np.asarray(youngs_modulus, float))
+        self.reset_worlds()
+
+    def reset_worlds(self) -> None:
+        """Put arm and objects of the worlds in `world_mask` back, objects where `place_position` says; capturable."""
+        worlds, data, state = self.world_count, self.model.softmode, self.state
+        control: Any = self.control
+        wp.copy(self._solver_mask, self.world_mask, count=worlds)
+        self.solver.reset(state, self._solver_mask)
+        for o, linear in enumerate(self._linear):
+            wp.launch(
+                kernels.place_objects,
+                dim=(worlds, linear.shape[0]),
+                inputs=[
+                    data.function_start,
+                    len(self.objects),
+                    o,
+                    linear,
+                    self.world_mask,
+                    self.place_position,
+                    self.place_yaw,
+                    data.scale,
+                ],
+                outputs=[state.softmode.q, state.softmode.qd, control.softmode.q_driven],
+                device=self.device,
+            )
+        self.solver.reduced.update_particles(state)
+        self.controller.reset(state, self.world_mask)
+        self.controller.write_targets(self.control)
+        self.observe()
+
+    def _set_stiffness(self, mask: np.ndarray, youngs_modulus: np.ndarray) -> None:
+        """Change E in the masked worlds."""
+        array = self.model.softmode.youngs_modulus
+        modulus = array.numpy()
+        for w in np.flatnonzero(mask):
+            checked = replace(self.config.material, youngs_modulus=float(youngs_modulus[w])).youngs_modulus
+            modulus[w * len(self.objects) : (w + 1) * len(self.objects)] = checked
+        array.assign(modulus)
+
+    def step(self, actions: np.ndarray) -> None:
+        """Advance one control step.
+
+        Args:
+            actions: Actions in [-1, 1], shape (world_count, action_size).
+        """
+        self.actions.assign(np.asarray(actions, np.float32).reshape(self.actions.shape))
+        if self._graph is None:
+            self._graph = self._capture_control_step()
+        wp.capture_launch(self._graph)
+
+    def _capture_control_step(self) -> Any:
+        """Compile what a control step needs, then record it; leaves the state as it was."""
+        saved = self.model.state()
+        saved.assign(self.state)
+        self.control_step()
+        with wp.ScopedCapture(device=self.device) as capture:
+            self.control_step()
+        self.state.assign(saved)
+        self.solver.reduced.progress.kept.zero_()
+        self.controller.reset(self.state)
+        return capture.graph
+
+    def control_step(self) -> None:
+        """Move the command by `actions`, run the substeps, observe; capturable."""
+        config = self.config
+        self.solver.reduced.status.zero_()
+        self.controller.command(self.actions, self.state)
+        for substep in range(config.substeps):
+            self.controller.write_targets(self.control, (substep + 1) / config.substeps)
+            first, second = (self.state, self._scratch) if substep % 2 == 0 else (self._scratch, self.state)
+            for grips in self.grips:
+                grips.apply(first, self.control, self.dt)
+            self.solver.step(first, second, self.control, None, self.dt)
+        self.observe()
+
+    def observe(self) -> None:
+        """Refresh what observations are made of; capturable."""
+        data, state, worlds = self.model.softmode, self.state, self.world_count
+        self.controller.measure(state)
+        for o, mean_basis in enumerate(self._mean_basis):
+            wp.launch(
+                kernels.observe_objects,
+                dim=worlds,
+                inputs=[
+                    data.function_start,
+                    len(self.objects),
+                    o,
+                    mean_basis,
+                    state.softmode.q,
+                    state.softmode.qd,
+                ],
+                outputs=[self.object_position, self.object_velocity],
+                device=self.device,
+            )
+        wp.launch(
+            kernels.observe_fingers,
+            dim=(worlds, 2),
+            inputs=[self._finger_body, self.solver.body_wrench],
+            outputs=[self.finger_force],
+            device=self.device,
+        )
+
+    def render(self, size: tuple[int, int]) -> SplatCamera:
+        """Draw every camera of one image size and return it; its arrays are overwritten by the next frame."""
+        camera = self.cameras[size]
+        if size not in self._camera_graphs:
+            self.draw(camera)
+            with wp.ScopedCapture(device=self.device) as capture:
+                self.draw(camera)
+            self._camera_graphs[size] = capture.graph
+        wp.capture_launch(self._camera_graphs[size])
+        return camera
+
+    def draw(self, camera: SplatCamera) -> None:
+        """Deform the splats and draw one frame; capturable after a first frame."""
+        state, arrays = self.state, self.splat_arrays
+        for skin, start, first in self._skins:
+            skin.launch(
+                state.softmode.q,
+                start,
+                arrays.means,
+                arrays.covariances,
+                rotations=arrays.rotations,
+                first_splat=first,
+            )
+        if self._marker is not None:
+            wp.launch(
+                kernels.place_marker,
+                dim=(self.world_count, self._marker.count),
+                inputs=[self.marker_points, self.marker_place, self._marker_first],
+                outputs=[arrays.means],
+                device=self.device,
+            )
+        camera.render(state)
+
+    # -- reading ------------------------------------------------------------------------------------------------------
+
+    @property
+    def status(self) -> np.ndarray:
+        """Status bits of the last control step per world, see :mod:`softmode.deformables.model.status`."""
+        return self.solver.reduced.status.numpy()
+
+    @property
+    def status_reasons(self) -> tuple[tuple[str, ...], ...]:
+        """Names of those bits per world."""
+        return tuple(status_reasons(int(bits)) for bits in self.status)
+
+
+def _add_fixture(world: newton.ModelBuilder, fixture: Fixture) -> None:
+    """Add a rigid shape that belongs to the world."""
+    half = 0.5 * fixture.yaw
+    place = wp.transform(fixture.position, wp.quat(0.0, 0.0, float(np.sin(half)), float(np.cos(half))))
+    shape = newton.ModelBuilder.ShapeConfig(mu=fixture.friction, has_shape_collision=True)
+    given: dict[str, Any] = {"xform": place, "cfg": shape, "color": fixture.color, "label": fixture.label}
+    size = fixture.size
+    if fixture.shape == "box":
+        world.add_shape_box(-1, hx=size[0], hy=size[1], hz=size[2], **given)
+    elif fixture.shape == "sphere":
+        world.add_shape_sphere(-1, radius=size[0], **given)
+    elif fixture.shape == "capsule":
+        world.add_shape_capsule(-1, radius=size[0], half_height=size[1], **given)
+    else:
+        world.add_shape_cylinder(-1, radius=size[0], half_height=size[1], **given)

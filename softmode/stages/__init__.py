@@ -1,0 +1,1 @@
+"""OpenUSD files opened in a process of its own with limits; its answers are plain arrays."""

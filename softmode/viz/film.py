@@ -1,0 +1,105 @@
+"""A video with its contact sheet, written whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from softmode.errors import ConfigError, MissingExtraError
+from softmode.files import PendingFile
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+class Film:
+    """A video and its contact sheet that appear complete or not at all.
+
+    Args:
+        path: The video to write (.mp4).
+
+    Raises:
+        ConfigError: If it cannot be written there.
+        MissingExtraError: If what encodes it is not installed.
+    """
+
+    SHEET_FRAMES = 12
+
+    def __init__(self, path: Path) -> None:
+        """Claim a temporary file beside ``path``."""
+        try:
+            import imageio.v2  # noqa: F401
+            import imageio_ffmpeg  # noqa: F401
+        except ImportError as error:
+            raise MissingExtraError(
+                "writing a video needs imageio and imageio-ffmpeg",
+                hint="install them with: pip install 'softmode[demo]'",
+            ) from error
+        if path.suffix.lower() != ".mp4":
+            raise ConfigError(f"video {path} is no .mp4 file", hint="name it like out/lift.mp4")
+        self.path = path
+        self.sheet_path = path.with_suffix(".png")
+        if self.sheet_path.is_dir():
+            raise ConfigError(f"contact sheet {self.sheet_path} is a folder", hint="name the video otherwise")
+        self._file = PendingFile(path, "video")
+        self._sheet = self._file.temporary.with_suffix(".png")
+        self._writer: Any = None
+        self._frames: list[NDArray[np.uint8]] = []
+        self._count, self._stride = 0, 1
+
+    def __enter__(self) -> Film:
+        """Return the film."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Remove what was not published."""
+        self.discard()
+
+    def add(self, frame: NDArray[np.uint8], fps: int) -> None:
+        """Append a frame."""
+        if self._writer is None:
+            import imageio.v2 as imageio
+
+            self._writer = imageio.get_writer(
+                self._file.temporary,
+                format="FFMPEG",
+                fps=fps,
+                codec="libx264",
+                quality=8,
+                macro_block_size=8,  # type: ignore[arg-type]
+            )
+        self._writer.append_data(frame)
+        if self._count % self._stride == 0:
+            self._frames.append(frame)
+        self._count += 1
+        if len(self._frames) >= 8 * self.SHEET_FRAMES:  # a long film keeps every second of them
+            self._frames, self._stride = self._frames[::2], 2 * self._stride
+
+    def publish(self) -> None:
+        """Put video and contact sheet in place."""
+        import numpy as np
+        from PIL import Image
+
+        self._writer.close()
+        if self._file.temporary.stat().st_size == 0:
+            raise OSError(f"the encoder wrote nothing to {self._file.temporary}")
+        # Equal steps in what changed, so that a long rest at the end does not fill the sheet.
+        coarse = np.array([frame[::4, ::4] for frame in self._frames], np.float32)
+        change = np.abs(np.diff(coarse, axis=0)).mean(axis=(1, 2, 3))
+        done = np.append(0.0, np.cumsum(change + 0.2 * change.mean() + 1.0e-6)) if len(change) else np.zeros(1)
+        chosen = np.abs(done - np.linspace(0.0, done[-1], self.SHEET_FRAMES)[:, None]).argmin(axis=1)
+        rows = [np.concatenate([self._frames[i] for i in chosen[k : k + 3]], axis=1) for k in range(0, len(chosen), 3)]
+        Image.fromarray(np.concatenate(rows, axis=0)).save(self._sheet)
+        os.replace(self._sheet, self.sheet_path)
+        self._file.publish()
+
+    def discard(self) -> None:
+        """Remove what was not published."""
+        if self._writer is not None:
+            with contextlib.suppress(Exception):  # an encoder that was interrupted too has nothing left to say
+                self._writer.close()
+        self._sheet.unlink(missing_ok=True)
+        self._file.discard()
