@@ -1,8 +1,8 @@
 """Fingerprints of what a user gets: equal before and after a change that only moves code.
 
 Hashes of 200 control steps of three tasks (observations, rewards and pictures), of a saved body and a USD stage, the
-entities of a recording, and the help of every command. Everything goes through Gymnasium and the command line, so that the
-same file runs on any version::
+entities of a recording, and the help of every command. Everything goes through Gymnasium and the command line, so that
+the same file runs on any version::
 
     python benchmarks/fingerprints.py --out out/before.json
     python benchmarks/fingerprints.py --out out/after.json --against out/before.json

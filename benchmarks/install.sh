@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # What an installation of the wheel costs: megabytes and seconds, with an empty and with a filled download cache, alone and
-# with extras. The figures in README.md come from here.   Run: make dist && benchmarks/install.sh [EXTRA ...]
+# with extras. The figures in docs/getting_started.md come from here.   Run: make dist && benchmarks/install.sh [EXTRA ...]
 set -euo pipefail
 cd "$(dirname "$0")/.."
 uv=${UV:-.venv/bin/uv}
