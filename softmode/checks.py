@@ -1,0 +1,75 @@
+"""Checks of arguments and fields, with one wording: what is named, what was expected, what was given."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+from softmode.errors import ConfigError, SoftmodeError
+
+
+def require_number(
+    name: str,
+    value: Any,
+    *,
+    above: float | None = None,
+    at_least: float | None = None,
+    below: float | None = None,
+    at_most: float | None = None,
+    unit: str = "",
+    hint: str = "",
+    error: type[SoftmodeError] = ConfigError,
+) -> None:
+    """Raise unless a value is a finite number within its limits.
+
+    Args:
+        name: What messages call it.
+        value: A number.
+        above: It must be larger.
+        at_least: It must not be smaller.
+        below: It must be smaller.
+        at_most: It must not be larger.
+        unit: Its unit, for the message.
+        hint: The remedy.
+        error: What is raised.
+
+    Raises:
+        ConfigError: Or ``error``, if it is not.
+    """
+    try:
+        number = math.nan if isinstance(value, str | bytes) else float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    limits = (
+        (above, " > ", number > (above if above is not None else -math.inf)),
+        (at_least, " >= ", number >= (at_least if at_least is not None else -math.inf)),
+        (below, " < ", number < (below if below is not None else math.inf)),
+        (at_most, " <= ", number <= (at_most if at_most is not None else math.inf)),
+    )
+    if math.isfinite(number) and all(held for limit, _, held in limits if limit is not None):
+        return
+    unit = f" {unit}" if unit else ""
+    if at_least is not None and at_most is not None:
+        wanted = f"lie in {at_least:g}..{at_most:g}{unit}"
+    elif isinstance(at_least, int) and isinstance(value, int) and below is None:
+        wanted = f"be at least {at_least}{unit}"
+    else:
+        bounds = " and".join(f"{sign}{limit:g}" for limit, sign, _ in limits if limit is not None)
+        wanted = f"be a finite number{bounds}{unit}"
+    raise error(f"{name} must {wanted}, got {value!r}", hint=hint)
+
+
+def require_fields(owner: Any, names: Iterable[str], **limits: Any) -> None:
+    """Raise unless every named field of an object is a finite number within the limits of :func:`require_number`.
+
+    Args:
+        owner: The object.
+        names: Its fields.
+        limits: Keywords of :func:`require_number`.
+
+    Raises:
+        ConfigError: If one of them is not.
+    """
+    for name in names:
+        require_number(name, getattr(owner, name), **limits)
