@@ -15,7 +15,9 @@ import pytest
 from softmode.lazy import lazy_names
 
 ROOT = Path(__file__).resolve().parents[1]
-LAZY = ("softmode.deformables", "softmode.usd")
+LAZY = tuple(
+    f"softmode.{name}" for name in ("deformables", "splats", "usd", "learning", "viz", "view", "demonstrations")
+)
 """Packages whose names are imported when they are first used."""
 
 
