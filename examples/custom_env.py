@@ -1,7 +1,6 @@
 """A new task in 60 lines: knock over a soft post. Observations, pictures, random draws, vectors and tensors come free.
 
 What stands between the two rules is the task: what is on the table, what is rewarded, when it is solved.
-
 Run: ``python examples/custom_env.py [--short]``; writes ``out/custom_env.mp4``
 """
 
@@ -58,6 +57,7 @@ class Topple(Task):
     """Knock over a soft post. Reward terms: ``reach`` (0..1), ``fall`` (0..3)."""
 
     config_class, term_names, metric_names = ToppleConfig, ("reach", "fall"), ("upright",)
+    config: ToppleConfig
 
     def object_segments(self) -> tuple[Segment, ...]:
         """Add a number to the observation."""
