@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import re
 import subprocess
 import sys
 import types
@@ -13,12 +14,24 @@ from pathlib import Path
 import pytest
 
 from softmode.lazy import lazy_names
+from tests.documentation.pages import PAGES, fences
 
 ROOT = Path(__file__).resolve().parents[1]
-LAZY = tuple(
-    f"softmode.{name}" for name in ("deformables", "splats", "usd", "learning", "viz", "view", "demonstrations")
+ROOMS = (
+    "deformables",
+    "splats",
+    "robots",
+    "objects",
+    "scenes",
+    "envs",
+    "usd",
+    "viz",
+    "demonstrations",
+    "learning",
+    "view",
 )
-"""Packages whose names are imported when they are first used."""
+FACES = tuple(f"softmode.{room}" for room in ROOMS)
+"""Packages that offer public names; what lies in their modules is not for users."""
 
 
 def _tree(face: str) -> ast.Module:
@@ -26,7 +39,7 @@ def _tree(face: str) -> ast.Module:
     return ast.parse((ROOT / Path(*face.split(".")) / "__init__.py").read_text())
 
 
-@pytest.mark.parametrize("face", LAZY)
+@pytest.mark.parametrize("face", [face for face in FACES if "lazy_names" in ast.unparse(_tree(face))])
 def test_the_three_lists_of_a_face_agree(face: str) -> None:
     """``__all__``, what type checkers read, and what is imported at first use list the same names and homes."""
     read_by_checkers = {
@@ -46,7 +59,7 @@ def test_the_three_lists_of_a_face_agree(face: str) -> None:
     assert sorted(import_module(face).__all__) == sorted(table)
 
 
-@pytest.mark.parametrize("face", LAZY)
+@pytest.mark.parametrize("face", FACES)
 def test_every_name_of_a_face_is_there_and_documented(face: str) -> None:
     """A face's names can be imported, are listed by ``dir``, and each class and function has a docstring of its own."""
     module = import_module(face)
@@ -58,9 +71,62 @@ def test_every_name_of_a_face_is_there_and_documented(face: str) -> None:
     assert not [name for name in module.__all__ if inspect.ismodule(getattr(module, name))]
 
 
+def private_imports(source: str) -> list[str]:
+    """Return the imports of softmode that go past its faces."""
+    public = {"softmode", "softmode.errors", *FACES}
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.partition(".")[0] == "softmode":
+            names = [alias.name for alias in node.names]
+            offered = getattr(import_module(node.module), "__all__", names) if node.module in public else []
+            found += [f"{node.module}: {name}" for name in names if name not in offered]
+        elif isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names if alias.name.partition(".")[0] == "softmode"]
+    return [name for name in found if name not in public]
+
+
+@pytest.mark.parametrize("example", sorted((ROOT / "examples").glob("*.py")), ids=lambda path: path.stem)
+def test_examples_import_from_faces_alone(example: Path) -> None:
+    """What an example imports is public, so that a user can write the same."""
+    assert not private_imports(example.read_text())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_pages_import_from_faces_alone(page: Path) -> None:
+    """What the Python of a page imports is public."""
+    assert not [name for fence in fences(page, "python") for name in private_imports(fence.text)]
+
+
+def test_private_imports_are_seen() -> None:
+    """Modules past a face and names that a face does not offer are found; faces, errors and other packages pass."""
+    source = """
+import numpy, softmode, softmode.splats.plush
+from softmode.deformables import build_body, build, numpy
+from softmode.deformables.model.authoring import add_pins
+from softmode.errors import ConfigError
+from softmodel import x
+"""
+    assert private_imports(source) == [
+        "softmode.splats.plush",
+        "softmode.deformables: build",
+        "softmode.deformables: numpy",
+        "softmode.deformables.model.authoring: add_pins",
+    ]
+
+
+@pytest.mark.parametrize("face", FACES)
+def test_every_name_of_a_face_is_in_the_reference(face: str) -> None:
+    """A package's page shows the table of its names, and an entry of each, once."""
+    page = (ROOT / "docs" / "api" / f"{face.partition('.')[2]}.md").read_text()
+    blocks = re.findall(rf"^```\{{entries\}} {face}\n(.*?)^```$", page, re.M | re.S)
+    assert f"```{{summary}} {face}\n```" in page and blocks
+    if blocks != [""]:  # an empty block shows all
+        assert sorted(" ".join(blocks).split()) == sorted(import_module(face).__all__)
+
+
 def test_faces_load_nothing_before_they_are_asked() -> None:
     """A fresh process that imports every face has loaded neither Warp nor Newton nor any extra."""
-    script = f"import sys, {', '.join(LAZY)}; print(sorted({{name.partition('.')[0] for name in sys.modules}}))"
+    script = f"import sys, {', '.join(FACES)}; print(sorted({{name.partition('.')[0] for name in sys.modules}}))"
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert not {"warp", "newton", "torch", "pxr", "scipy", "trimesh"} & set(ast.literal_eval(run.stdout))
 
