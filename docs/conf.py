@@ -56,6 +56,10 @@ autodoc_mock_imports = [name for name in _EXTRAS if importlib.util.find_spec(nam
 napoleon_numpy_docstring = False
 napoleon_use_rtype = False
 
+default_role = "code"  # what stands in single backticks is code, as in Markdown
+toc_object_entries_show_parents = "hide"
+add_module_names = False
+
 html_theme = "furo"
 html_title = "softmode"
 html_copy_source = False
