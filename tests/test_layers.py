@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import graphlib
 import tomllib
 from importlib.util import resolve_name
@@ -28,6 +29,7 @@ PARTS = ("body materials skinning", "build model", "contact", "solver", "couplin
 """Parts of deformables from the ground; the last is the package's public face."""
 
 
+@functools.cache
 def imports() -> dict[str, set[str]]:
     """Return the modules that each module of the package imports."""
     files = {path: path.relative_to(ROOT).with_suffix("").parts for path in (ROOT / "softmode").rglob("*.py")}
@@ -77,7 +79,7 @@ def test_imports_go_down_within_deformables() -> None:
 
 def test_modules_form_no_circle() -> None:
     """There is an order in which every module comes after all that it imports."""
-    arrows = imports()
+    arrows = dict(imports())
     circles = []
     while True:
         try:
