@@ -1,8 +1,8 @@
 """Draw the logo: a soft disc full of Gaussian splats, bent, and coloured by an eigenmode.
 
 `python docs/logo.py` writes docs/images/logo.svg and docs/images/favicon.svg. Splats lie on a sunflower spiral in the
-disc. The motion x(X) has a quadratic part; every splat is drawn at x with the covariance F Sigma F^T, and the outline is
-the deformed circle. The colour is the eigenmode J_2(k r) cos(2 phi) of a disc.
+disc. The motion x(X) has a quadratic part; every splat is drawn at x with the covariance F Sigma F^T, and the outline
+is the deformed circle. The colour is the eigenmode J_2(k r) cos(2 phi) of a disc.
 """
 
 from __future__ import annotations
