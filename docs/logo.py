@@ -94,7 +94,7 @@ def draw(count: int, size: float, *, rim: float, shades: int = 9) -> str:
     radius = size * scale * np.sqrt(np.pi / count)
     for i, (px, py) in enumerate(place(x)):
         axes, stretches, _ = np.linalg.svd(F[i])
-        angle = -np.degrees(np.arctan2(axes[1, 0], axes[0, 0]))
+        angle = -np.degrees(np.arctan2(axes[1, 0], axes[0, 0])) % 180.0  # an axis has no sign
         rx, ry = radius * stretches
         lines.append(
             f'<ellipse rx="{rx:.1f}" ry="{ry:.1f}" fill="url(#s{shade[i] + shades})" '
