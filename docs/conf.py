@@ -18,6 +18,9 @@ from sphinx.ext.autodoc.mock import mock
 from sphinx.pycode import ModuleAnalyzer
 from sphinx.util.logging import getLogger
 
+sys.path.insert(0, str(Path(__file__).parent / "inventories"))
+from make_inventories import PROJECTS
+
 project = "softmode"
 author = "the softmode authors"
 copyright = "the softmode authors, Apache-2.0"
@@ -27,6 +30,7 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
+    "sphinx.ext.intersphinx",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
 ]
@@ -60,8 +64,13 @@ default_role = "code"  # what stands in single backticks is code, as in Markdown
 toc_object_entries_show_parents = "hide"
 add_module_names = False
 
+# Links to other projects, from inventories that lie in the repository: nothing is fetched.
+intersphinx_mapping = {name: (other.url, f"inventories/{name}.inv") for name, other in PROJECTS.items()}
+
 html_theme = "furo"
 html_title = "softmode"
+html_logo = "images/logo.svg"
+html_favicon = "images/favicon.svg"
 html_copy_source = False
 html_show_sphinx = False
 html_theme_options = {"navigation_with_keys": True}
