@@ -12,17 +12,14 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from softmode.objects.stage_scene import UsdDeformable, UsdScene, read_usd_scene
     from softmode.usd.animation import UsdAnimation, UsdAnimationOptions
-    from softmode.usd.importer import UsdBody, UsdImport, add_usd
-    from softmode.usd.placed import PlacedBody
+    from softmode.usd.importer import UsdImport, add_usd
     from softmode.usd.playback import PlayedBody, UsdPlayback, read_animation
     from softmode.usd.writer import UsdExportOptions, write_usd
 
 _HOME = {
-    "PlacedBody": "placed",
     "PlayedBody": "playback",
     "UsdAnimation": "animation",
     "UsdAnimationOptions": "animation",
-    "UsdBody": "importer",
     "UsdDeformable": "scene",
     "UsdExportOptions": "writer",
     "UsdImport": "importer",
@@ -35,11 +32,9 @@ _HOME = {
 }
 
 __all__ = [
-    "PlacedBody",
     "PlayedBody",
     "UsdAnimation",
     "UsdAnimationOptions",
-    "UsdBody",
     "UsdDeformable",
     "UsdExportOptions",
     "UsdImport",
