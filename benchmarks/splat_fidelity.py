@@ -409,7 +409,8 @@ def main() -> None:
     measure("bar 16 modes", exact[:4], ties(values), bar, sample_bar(0.0007), pictures=arguments.pictures)
     if arguments.splat:
         thing = load(ObjectConfig(splat=arguments.splat, size=0.25, build=BuildOptions(mode_count=16)))
-        high = float(np.ptp(thing.visible_splats.means[:, 2]))
+        splats = thing.visible_splats
+        high = float(np.ptp(splats.means[:, 2]))
         loose: list[Case] = [
             ("rest", rest),
             ("bend 90", upright(bend(np.pi / 2, high))),
@@ -423,8 +424,8 @@ def main() -> None:
             "file 16 modes",
             loose,
             ties(values),
-            thing.visible_splats,
-            scatter(thing.visible_splats, 32),
+            splats,
+            scatter(splats, 32),
             pictures=arguments.pictures,
         )
 

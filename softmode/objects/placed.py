@@ -18,6 +18,7 @@ from softmode.objects.soft_object import SoftObject
 from softmode.splats.splats import Splats
 
 Vector = tuple[float, float, float]
+_PLACE = ("material", "position", "rotation", "velocity", "scale")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -84,12 +85,6 @@ class Placed:
         Returns:
             Index of the instance in this builder, for `add_pins`, `attach` and the parameters of one world.
         """
-        given: dict[str, Any] = {
-            "material": self.material,
-            "position": self.position,
-            "rotation": self.rotation,
-            "velocity": self.velocity,
-            "contact_radius": self.object.contact_radius,
-            "scale": self.scale,
-        }
+        given: dict[str, Any] = {name: getattr(self, name) for name in _PLACE}
+        given["contact_radius"] = self.object.contact_radius
         return add_reduced_body(builder, self.body, **given | options)

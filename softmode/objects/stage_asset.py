@@ -68,7 +68,7 @@ def read_usd_mesh(path: str | os.PathLike[str]) -> ColoredMesh:
     answer = _ask(path, geometry=True)
     frame = stage_frame(answer.described, name)
     surfaces = []
-    try:
+    with process.invalid_data(name):
         for prim in answer.described["meshes"]:
             where, parts = f"{name}: {prim['path']}", parts_of(prim, answer.arrays, frame)
             matrix = frame.matrix(prim["matrix"])
@@ -79,10 +79,6 @@ def read_usd_mesh(path: str | os.PathLike[str]) -> ColoredMesh:
             else:
                 tets = tet_surface(parts, matrix[:3, :3], where)
                 surfaces.append(SurfaceMesh(tets.vertices + matrix[:3, 3], tets.faces, tets.colors))
-    except (TypeError, IndexError, KeyError, ValueError, OverflowError) as error:
-        if isinstance(error, AssetError):
-            raise
-        raise AssetError(f"{name}: holds invalid data ({error})", hint=process.REEXPORT) from error
     if not surfaces:
         raise AssetError(f"{name}: holds no visible mesh", hint="Export splats, or a closed Mesh that is visible")
     return colored_mesh(surfaces, name)

@@ -25,6 +25,7 @@ from softmode.objects.stage_scene import shortest
 from softmode.scenes.skinned_splats import SkinnedSplats
 from softmode.splats.formats.usd import set_splat_column, splat_columns
 from softmode.stages import tokens
+from softmode.stages.openusd import Layer, Stage
 from softmode.usd.handles import handles_from_coordinates, local_coordinates, rigid_motion
 from softmode.usd.openusd import check_stage, openusd, whole_stage
 from softmode.usd.rigid import RigidMeshes
@@ -130,7 +131,7 @@ class UsdAnimation:
 
     @classmethod
     def of_env(
-        cls, path: str | Path, env: Any, *, world: int = 0, options: UsdAnimationOptions | None = None
+        cls, path: str | Path, env: object, *, world: int = 0, options: UsdAnimationOptions | None = None
     ) -> UsdAnimation:
         """Return an animation of an environment; `record()` then takes its present state.
 
@@ -161,7 +162,7 @@ class UsdAnimation:
         """Return the animation."""
         return self
 
-    def __exit__(self, kind: Any, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Publish what was recorded, unless an error ended the block."""
         if kind is None and self._times:
             self.publish()
@@ -257,8 +258,8 @@ class UsdAnimation:
 
     def _author_motion(
         self,
-        stage: Any,
-        layer: Any,
+        stage: Stage,
+        layer: Layer,
         path: str,
         placed: Placed,
         codes: list[float],
@@ -283,7 +284,7 @@ class UsdAnimation:
             self._bake(stage, layer, path, placed, codes, local)
 
     def _bake(
-        self, stage: Any, layer: Any, path: str, placed: Placed, codes: list[float], local: NDArray[np.float64]
+        self, stage: Stage, layer: Layer, path: str, placed: Placed, codes: list[float], local: NDArray[np.float64]
     ) -> None:
         """Author points and splats frame by frame, in the frame of their body."""
         UsdGeom, UsdVol = openusd("UsdGeom", "UsdVol")

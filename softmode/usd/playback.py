@@ -113,12 +113,8 @@ def animation_from_answer(answer: process.Answer, name: str) -> UsdPlayback:
     rate = float(stage["rate"])
     if not (np.isfinite(rate) and rate > 0.0):
         raise AssetError(f"{name}: timeCodesPerSecond is {rate}", hint="Set it to the number of time codes in a second")
-    try:
+    with process.invalid_data(name):
         bodies = tuple(_played(sent, answer.arrays, rate, name) for sent in stage["bodies"])
-    except (TypeError, IndexError, KeyError, ValueError) as error:
-        if isinstance(error, AssetError):
-            raise
-        raise AssetError(f"{name}: holds invalid data ({error})", hint=process.REEXPORT) from error
     return UsdPlayback(fps=rate, bodies=bodies)
 
 

@@ -76,7 +76,7 @@ def test_several_bodies_and_odd_names(tmp_path: Path) -> None:
     """Names become valid and unlike; bodies keep their order, one without splats has none."""
     toy = placed()
     bodies = [dataclasses.replace(toy, name=name) for name in ("my toy.ply", "my-toy.ply", "3d")]
-    bodies.append(dataclasses.replace(toy, name="bare", splats=None))
+    bodies.append(dataclasses.replace(toy, name="bare", object=dataclasses.replace(toy.object, splats=None)))
     write_usd(tmp_path / "toys.usdc", bodies)
     found = add_usd(newton.ModelBuilder(), tmp_path / "toys.usdc")
     assert list(found.bodies) == ["/World/my_toy_ply", "/World/my_toy_ply_2", "/World/_3d", "/World/bare"]
@@ -256,7 +256,8 @@ def test_a_body_in_a_stage_of_other_units(tmp_path: Path, up: str, meters: float
 
 def test_validators_find_nothing(tmp_path: Path) -> None:
     """All validators that OpenUSD registers pass a full stage, in a process without softmode; a poor one fails."""
-    write_usd(tmp_path / "toys.usdc", [placed(), dataclasses.replace(placed("quadratic"), splats=None)])
+    other = Placed(object=SoftObject(body=small_body("quadratic"), material=MATERIAL), name="toy")
+    write_usd(tmp_path / "toys.usdc", [placed(), other])
     poor = Usd.Stage.CreateNew(str(tmp_path / "poor.usda"))
     poor.DefinePrim("/A", "Xform")
     poor.GetRootLayer().Save()
