@@ -17,12 +17,12 @@ from typing import Any
 import newton
 import numpy as np
 import warp as wp
-from tests.envs.test_primitives import hang, heavy_elastica
 
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.objects import load, presets
+from tests.objects.test_primitives import hang, heavy_elastica
 from tests.scenes import GRAVITY
 
 DT = 1.0 / 240.0
@@ -68,7 +68,7 @@ def main() -> None:
     """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--load", type=float, default=2.5, help="w (L/2)^3 / (E I) of the rope")
-    load = parser.parse_args().load
+    pull = parser.parse_args().load
     wp.config.log_level = wp.LOG_WARNING
     print("| preset | functions | points | samples | splats | build [s] | ms per step |\n|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
@@ -78,9 +78,9 @@ def main() -> None:
             os.environ["SOFTMODE_CACHE"] = os.path.join(folder, name)
             print(step_time(name), flush=True)
         half, radius = 0.5 * presets.ROPE.extents[0], 0.5 * presets.ROPE.extents[1]  # type: ignore[index]
-        modulus = 1000.0 * GRAVITY * 4.0 * half**3 / (load * radius**2)
+        modulus = 1000.0 * GRAVITY * 4.0 * half**3 / (pull * radius**2)
         material = replace(presets.ROPE_MATERIAL, youngs_modulus=modulus, density=1000.0)
-        exact = half * heavy_elastica(load)[0]
+        exact = half * heavy_elastica(pull)[0]
         print(f"\nelastica: {exact / half:.3f} of half the length")
         print("| handles | modes | rank tolerance | functions | drop over the elastica's |\n|---|---|---|---|---|")
         for build in ROPES:

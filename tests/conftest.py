@@ -1,4 +1,4 @@
-"""Settings of the whole test run: where compiled kernels are kept, and which tests need a GPU."""
+"""Settings of the whole test run: where compiled kernels are kept, which tests need a GPU, a trained capture."""
 
 from __future__ import annotations
 
@@ -8,9 +8,22 @@ from pathlib import Path
 import pytest
 
 # Before the first import of warp: the cache lies in the checkout, so that a run leaves nothing outside it.
-_CACHE = Path(__file__).resolve().parents[1] / ".cache"
+ROOT = Path(__file__).resolve().parents[1]
+_CACHE = ROOT / ".cache"
 os.environ.setdefault("WARP_CACHE_PATH", str(_CACHE / "warp"))
 os.environ.setdefault("SOFTMODE_CACHE", str(_CACHE / "softmode"))
+
+PLAYBOT = ROOT.parent / "shared" / "data" / "splats" / "playbot" / "4_0" / "meta.json"
+"""A trained capture, SOG v2: a robot hovering over a patch of ground, with two loose hands. PLAYBOT by Stephane Agullo,
+CC-BY-4.0."""
+
+
+@pytest.fixture(scope="session")
+def playbot() -> Path:
+    """Return the trained capture, or skip."""
+    if not PLAYBOT.is_file():
+        pytest.skip(f"the trained capture {PLAYBOT} is not there")
+    return PLAYBOT
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
