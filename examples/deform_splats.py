@@ -16,7 +16,7 @@ import warp as wp
 from PIL import Image
 
 from softmode.deformables import BuildOptions, SkinSplats
-from softmode.objects.soft_object import ObjectConfig, load_object
+from softmode.objects import ObjectConfig, load
 from softmode.splats import PinholeCamera, SplatArrays, SplatRasterizer, ViewArrays
 
 SIZE, DISTANCE = 128, 2.4
@@ -40,8 +40,8 @@ class Deformed:
 
     def __init__(self, file: str | None = None, *, mode_count: int = 16) -> None:
         """Reduce the object and fit the coordinates of each world."""
-        self.thing = load_object(ObjectConfig(splat=file, build=BuildOptions(mode_count=mode_count)))
-        splats = self.thing.splats
+        self.thing = load(ObjectConfig(splat=file, build=BuildOptions(mode_count=mode_count)))
+        splats = self.thing.visible_splats
         x = splats.means.astype(np.float64)
         self.height = float(np.ptp(x[:, 2]))
         motions = [x]
@@ -65,7 +65,7 @@ class Deformed:
 
     def draw(self, size: int) -> np.ndarray:
         """Draw every world from the front, shape (world, size, size, 3)."""
-        distance = DISTANCE * float(np.ptp(self.thing.splats.means, axis=0).max())
+        distance = DISTANCE * float(np.ptp(self.thing.visible_splats.means, axis=0).max())
         camera = PinholeCamera.look_at(
             "front",
             position=(distance, 0.0, 0.0),
@@ -75,7 +75,7 @@ class Deformed:
             fov_y=2.0 * math.atan(1.0 / 3.0),
         )
         views = ViewArrays.from_cameras([camera] * self.worlds, world=range(self.worlds), background=(0.85, 0.88, 0.92))
-        rasterizer = SplatRasterizer(self.thing.splats.count, self.worlds, size, size)
+        rasterizer = SplatRasterizer(self.thing.visible_splats.count, self.worlds, size, size)
         rasterizer.render(self.arrays, views)
         return np.clip(rasterizer.rgb.numpy(), 0.0, 1.0)
 

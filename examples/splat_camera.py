@@ -19,7 +19,7 @@ from newton.solvers import SolverMuJoCo
 from PIL import Image
 
 from softmode.deformables import Material, SkinSplats, SolverCoupledReduced, add_reduced_body
-from softmode.objects.soft_object import ObjectConfig, load_object
+from softmode.objects import ObjectConfig, load
 from softmode.robots import add_arm
 from softmode.splats import (
     CameraOptions,
@@ -43,7 +43,7 @@ class Scene:
 
     def __init__(self, worlds: int) -> None:
         """Build model and solver, let everything fall, and draw a view per world."""
-        soft, figure = load_object(ObjectConfig()), make_plush(2000, height=0.07)
+        soft, figure = load(ObjectConfig()), make_plush(2000, height=0.07)
         figure = figure.transformed(translation=-figure.bounds().mean(axis=0))
         figure = replace(figure, sh=figure.sh[:, :, ::-1])  # red and blue swapped
         world, half = newton.ModelBuilder(), 0.5 * np.ptp(figure.bounds(), axis=0)
@@ -64,7 +64,7 @@ class Scene:
             solver.step(self.state, after, control, None, DT)
             solver.step(after, self.state, control, None, DT)
         part = RigidSplats(splats=figure, body="toy", hide_meshes=True)
-        self.toy, rest = RigidSplatsSkin(model, [part]), soft.splats
+        self.toy, rest = RigidSplatsSkin(model, [part]), soft.visible_splats
         self.plush = SkinSplats(rest.means, rest.covariances(), soft.basis, soft.grad_basis)
         self.splats = splats = SplatArrays.from_splats([rest, *self.toy.objects], world_count=worlds)
         look, up = PinholeCamera.look_at, (1.0, 0.0, 0.0)

@@ -58,7 +58,7 @@ class DeformedSplats:
         for o, thing in enumerate(objects):
             if thing is None:
                 continue
-            splats = thing.splats
+            splats = thing.visible_splats
             skin = SkinSplats(splats.means, splats.covariances(), thing.basis, thing.grad_basis, device=device)
             shape = (len(worlds), splats.count)
             self._skins[o] = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import newton
@@ -13,16 +13,14 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softmode.deformables.materials.material import Material
-from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import SoftObject
+from softmode.objects.placed import Placed
 from softmode.splats.camera import CameraOptions, SplatCamera
 from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.rasterizer import SplatArrays
-from softmode.splats.splats import Splats
 
 
 class FrameSink(Protocol):
@@ -33,20 +31,8 @@ class FrameSink(Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlacedObject:
-    """A soft object at its place."""
-
-    thing: SoftObject
-    """The object; several places may share one."""
-    position: tuple[float, float, float]
-    """Where its centre of mass starts [m]."""
-    rotation: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
-    """How it is turned, shape (3, 3)."""
-    material: Material = field(default_factory=lambda: Material(youngs_modulus=1.0e5, density=250.0))
-    """What it is made of."""
-    splats: Splats | None = None
-    """Its splats in other colours; None for those of the object."""
+FOAM = Material(youngs_modulus=1.0e5, density=250.0)
+"""What objects are made of that do not say it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +81,7 @@ class SplatScene:
     def __init__(
         self,
         fixtures: newton.ModelBuilder,
-        objects: Sequence[PlacedObject],
+        objects: Sequence[Placed],
         *,
         cameras: Sequence[PinholeCamera] = (),
         dt: float = 1.0 / 240.0,
@@ -106,20 +92,14 @@ class SplatScene:
     ) -> None:
         """Build model, solver, skins and camera."""
         if not objects:
-            raise ConfigError("objects is empty", hint="give at least one PlacedObject")
+            raise ConfigError("objects is empty", hint="give at least one Placed")
         if steps_per_frame < 2 or steps_per_frame % 2:
             raise ConfigError(f"steps_per_frame must be even and at least 2, got {steps_per_frame}")
         self.objects, self.dt, self.steps_per_frame = tuple(objects), dt, steps_per_frame
         for placed in self.objects:
-            add_reduced_body(
-                fixtures,
-                placed.thing.body,
-                material=placed.material,
-                position=placed.position,
-                rotation=placed.rotation,
-            )
+            placed.add_to(fixtures, material=placed.object.material or FOAM)
         self.model: Any = fixtures.finalize(device=device)
-        bodies = {id(placed.thing.body): placed.thing.body for placed in self.objects}
+        bodies = {id(placed.body): placed.body for placed in self.objects}
         self.solver = SolverReduced(self.model, list(bodies.values()), options=options)
         self.state, self._scratch = self.model.state(), self.model.state()
         self._step_graph: Any = None
@@ -132,10 +112,10 @@ class SplatScene:
         if not cameras:
             return
         device = self.model.device
-        shown = [placed.splats or placed.thing.splats for placed in self.objects]
+        shown = [placed.object.visible_splats for placed in self.objects]
         self.splats = SplatArrays.from_splats(shown, device=device)
         self._skins = [
-            SkinSplats(s.means, s.covariances(), p.thing.basis, p.thing.grad_basis, device=device)
+            SkinSplats(s.means, s.covariances(), p.object.basis, p.object.grad_basis, device=device)
             for s, p in zip(shown, self.objects, strict=True)
         ]
         self._first = np.concatenate([[0], np.cumsum([s.count for s in shown])]).tolist()
@@ -223,7 +203,7 @@ class SplatScene:
     def surface(self, index: int) -> NDArray[np.float64]:
         """Return the surface samples of an object [m], shape (surface_count, 3)."""
         start = int(self.model.softmode.particle_start.numpy()[index])
-        count = self.objects[index].thing.body.surface_count
+        count = self.objects[index].body.surface_count
         return self.state.particle_q.numpy()[start : start + count].astype(np.float64)
 
     def kinetic_energy(self) -> float:
@@ -231,8 +211,8 @@ class SplatScene:
         start, qd = self.model.softmode.function_start.numpy(), self.state.softmode.qd.numpy()
         total = 0.0
         for placed, first in zip(self.objects, start, strict=True):
-            body = placed.thing.body
-            mass = placed.material.density * body.volume
+            body = placed.body
+            mass = (placed.object.material or FOAM).density * body.volume
             total += 0.5 * mass * float((qd[first : first + body.function_count] ** 2).sum())
         return total
 
@@ -241,7 +221,7 @@ class SplatScene:
         if self.solver.pairs is None:
             return 0.0
         pairs = self.solver.pairs.table
-        count = np.array([placed.thing.body.surface_count for placed in self.objects])
+        count = np.array([placed.body.surface_count for placed in self.objects])
         found = pairs.near.numpy().astype(bool)[:, None] & (np.arange(pairs.gap.shape[1]) < count[:, None])
         gap = np.where(found[:, :, None] & (pairs.other.numpy() >= 0), pairs.gap.numpy(), 0.0)
         return float(max(-gap.min(), 0.0))

@@ -17,7 +17,9 @@ from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import ObjectConfig, SoftObject, load_object
+from softmode.objects.config import ObjectConfig
+from softmode.objects.loader import load
+from softmode.objects.soft_object import SoftObject
 from softmode.robots.arm import ArmDescription, add_arm
 from softmode.robots.control import ArmController, ArmControlOptions
 from softmode.scenes import table_kernels as kernels
@@ -145,7 +147,7 @@ class TableScene:
         self.device = wp.get_device(device)
         self.dt = 1.0 / (config.control_hz * config.substeps)
         kinds = (config.object, *config.others)
-        loaded = {kind: load_object(kind, progress) for kind in dict.fromkeys(kinds)}
+        loaded = {kind: load(kind, progress=progress) for kind in dict.fromkeys(kinds)}
         self.objects: tuple[SoftObject, ...] = tuple(loaded[kind] for kind in kinds)
         """The soft objects of a world; their instances follow each other, world by world."""
         self._build_model()
@@ -258,13 +260,12 @@ class TableScene:
         self._skins = []
         first = 0
         for o, thing in enumerate(self.objects):
-            skin = SkinSplats(
-                thing.splats.means, thing.splats.covariances(), thing.basis, thing.grad_basis, device=self.device
-            )
+            rest = thing.visible_splats
+            skin = SkinSplats(rest.means, rest.covariances(), thing.basis, thing.grad_basis, device=self.device)
             start = wp.array(np.ascontiguousarray(starts[o::stride]), dtype=int, device=self.device)
             self._skins.append((skin, start, first))
-            first += thing.splats.count
-        drawn = [thing.splats for thing in self.objects]
+            first += rest.count
+        drawn = [thing.visible_splats for thing in self.objects]
         if self._marker is not None:
             self._marker_first = first
             self.marker_points = wp.array(self._marker.means[None], dtype=wp.vec3, device=self.device)

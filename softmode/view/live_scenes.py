@@ -19,11 +19,12 @@ from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.envs.task import Task
 from softmode.errors import ConfigError
 from softmode.learning.players import POLICIES, check_policy, policy_factory, trained_policy
-from softmode.objects.soft_object import ObjectConfig, SoftObject
+from softmode.objects.config import ObjectConfig
+from softmode.objects.placed import Placed
+from softmode.objects.soft_object import SoftObject
 from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
 from softmode.view.live_types import HoldName, LiveOptions, SceneName
-from softmode.view.sources import LoadedObject
 
 BLOCK_STEPS = 2
 """Physics steps of a block of an object without an environment; even, there and back between two states."""
@@ -99,7 +100,7 @@ class ObjectScene:
     """One object, held by a part of it or above a table.
 
     Args:
-        found: The object.
+        found: The object, at the scale that it has.
         scene: "hang" or "drop".
         hold: Which end a hanging object is held by.
         material: What it is made of.
@@ -112,7 +113,7 @@ class ObjectScene:
 
     def __init__(
         self,
-        found: LoadedObject,
+        found: Placed,
         scene: SceneName,
         hold: HoldName,
         material: Material,
@@ -123,7 +124,7 @@ class ObjectScene:
         for name, value, known in (("scene", scene, SceneName), ("hold", hold, HoldName)):
             if value not in get_args(known):
                 raise ConfigError(f"{name} is {value!r}", hint=f"use one of {', '.join(map(repr, get_args(known)))}")
-        thing, self.source, self._pin_points = found.thing, found.config, options.pin_points
+        thing, self.source, self._pin_points = found.object, found.object.config, options.pin_points
         self.objects: tuple[SoftObject, ...] = (thing,)
         self._hold: HoldName | None = hold if scene == "hang" else None
         self.marker: Splats | None = None

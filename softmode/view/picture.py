@@ -36,17 +36,15 @@ class LivePicture:
     def __init__(self, objects: tuple[SoftObject, ...], model: Any, marker: Splats | None) -> None:
         """Upload the rest state."""
         self.objects = objects
-        shown = [thing.splats for thing in objects] + ([] if marker is None else [marker])
+        shown = [thing.visible_splats for thing in objects] + ([] if marker is None else [marker])
         self.arrays: SplatArrays = SplatArrays.from_splats(shown, device=model.device)
         self.first = np.concatenate([[0], np.cumsum([splats.count for splats in shown])])
         self.colors = np.concatenate([splats.colors() for splats in shown])
         self.opacities = np.concatenate([splats.opacities for splats in shown]).astype(np.float32)
         self._starts: Any = model.softmode.function_start
         self._skins = [
-            SkinSplats(
-                thing.splats.means, thing.splats.covariances(), thing.basis, thing.grad_basis, device=model.device
-            )
-            for thing in objects
+            SkinSplats(rest.means, rest.covariances(), thing.basis, thing.grad_basis, device=model.device)
+            for thing, rest in zip(objects, shown, strict=False)
         ]
         self._marker = None if marker is None else marker.covariances()
 
@@ -128,7 +126,7 @@ class LivePicture:
         thing = self.objects[index]
         start = int(self._starts.numpy()[index])
         q = state.softmode.q.numpy()[start : start + thing.body.function_count].astype(np.float64)
-        X = thing.splats.means[splat].astype(np.float64)
+        X = thing.visible_splats.means[splat].astype(np.float64)
         x = X + thing.basis[splat] @ q
         F = np.eye(3) + q.T @ thing.grad_basis[splat]
         U, stretch, V = np.linalg.svd(F)

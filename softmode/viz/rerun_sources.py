@@ -207,7 +207,7 @@ def source_of(scene: Any, worlds: Sequence[int]) -> Source:
         return SceneSource(scene)
     if isinstance(scene, SplatScene):
         cameras = () if scene.camera is None else (scene.camera,)
-        things = [replace(placed.thing, splats=placed.splats or placed.thing.splats) for placed in scene.objects]
+        things = [placed.object for placed in scene.objects]
         return SceneSource(RerunScene(model=scene.model, solver=scene.solver, objects=things, cameras=cameras))
     env = getattr(scene, "unwrapped", scene)
     task = scene if isinstance(scene, Task) else getattr(env, "task", None)
