@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.scenes.scene_meshes import SceneMesh, scene_meshes
+from softmode.scenes.meshes import SceneMesh, scene_meshes
 from softmode.splats.splats import rotations_from_quats
 from softmode.usd.openusd import openusd
 from softmode.usd.writer import prim_name, set_place, vectors

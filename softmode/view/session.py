@@ -250,7 +250,7 @@ class LiveSession:
     def meshes(self) -> tuple[Any, ...]:
         """Return the meshes of the rigid shapes, `softmode.scenes.scene_meshes.SceneMesh`; they do not change."""
         if self._meshes is None:
-            from softmode.scenes.scene_meshes import scene_meshes
+            from softmode.scenes.meshes import scene_meshes
 
             self._meshes = scene_meshes(self._scene.model)
         return self._meshes

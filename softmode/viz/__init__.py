@@ -3,6 +3,6 @@
 Importing this package is cheap; the recorder is in `softmode.viz.rerun_logger`.
 """
 
-from softmode.scenes.scene_meshes import SceneMesh, scene_meshes, scene_poses
+from softmode.scenes.meshes import SceneMesh, scene_meshes, scene_poses
 
 __all__ = ["SceneMesh", "scene_meshes", "scene_poses"]

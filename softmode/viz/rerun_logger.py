@@ -21,7 +21,7 @@ from softmode.deformables.tools.sensing import ContactSensor
 from softmode.errors import ConfigError, MissingExtraError, StorageError
 from softmode.files import PendingFile
 from softmode.scenes.deformed_splats import DeformedSplats, SplatFrame
-from softmode.scenes.scene_meshes import PLANE_EXTENT, scene_meshes, scene_poses
+from softmode.scenes.meshes import PLANE_EXTENT, scene_meshes, scene_poses
 from softmode.splats.camera import SplatCamera
 from softmode.splats.splats import Splats
 from softmode.viz.rerun_blueprint import make_blueprint

@@ -13,7 +13,7 @@ import warp as wp
 
 from softmode.errors import ConfigError
 from softmode.scenes import scene_meshes
-from softmode.scenes.scene_meshes import SEGMENTS
+from softmode.scenes.meshes import SEGMENTS
 from softmode.viz import scene_poses
 
 TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)

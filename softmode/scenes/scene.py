@@ -1,0 +1,96 @@
+"""What a scene is: a model that runs, with the soft objects in it and the cameras that see them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+import newton
+
+from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
+from softmode.deformables.solver.solver_reduced import SolverReduced
+from softmode.objects.soft_object import SoftObject
+from softmode.scenes.binding import BoundSplats
+from softmode.splats.camera import CameraOptions, SplatCamera
+from softmode.splats.camera_randomization import CameraRandomization
+from softmode.splats.pinhole import PinholeCamera
+
+
+class Scene(Protocol):
+    """A model with solver, state, objects and cameras, which takes steps.
+
+    :class:`softmode.scenes.SplatScene` and :class:`softmode.scenes.TableScene` are scenes, and so is what a live
+    session runs. Recorders and the browser tool read scenes.
+    """
+
+    @property
+    def model(self) -> newton.Model:
+        """The model."""
+        ...
+
+    @property
+    def solver(self) -> SolverReduced | SolverCoupledReduced:
+        """What moves it."""
+        ...
+
+    @property
+    def state(self) -> newton.State:
+        """Where everything is."""
+        ...
+
+    @property
+    def control(self) -> newton.Control:
+        """What drives joints, pins and regions."""
+        ...
+
+    @property
+    def objects(self) -> Sequence[SoftObject]:
+        """The soft objects of a world, in the order of their instances."""
+        ...
+
+    @property
+    def splats(self) -> BoundSplats | None:
+        """The splats of the objects as cameras see them; None without cameras."""
+        ...
+
+    @property
+    def cameras(self) -> Mapping[tuple[int, int], SplatCamera]:
+        """The cameras by the width and height of their pictures [px]."""
+        ...
+
+    def step(self) -> None:
+        """Take the physics steps of a frame, as a graph."""
+        ...
+
+    def reset(self) -> None:
+        """Start over."""
+        ...
+
+
+def cameras_by_size(
+    model: newton.Model,
+    splats: BoundSplats,
+    cameras: Sequence[PinholeCamera],
+    *,
+    options: CameraOptions | None = None,
+    randomization: CameraRandomization | None = None,
+) -> dict[tuple[int, int], SplatCamera]:
+    """Return one :class:`softmode.splats.camera.SplatCamera` per image size; they share the splats.
+
+    Args:
+        model: The model.
+        splats: The splats of its objects.
+        cameras: What to draw.
+        options: Light and background.
+        randomization: What `randomize` of the cameras draws.
+    """
+    return {
+        size: SplatCamera(
+            model,
+            splats.arrays,
+            [camera for camera in cameras if (camera.width, camera.height) == size],
+            options=options,
+            randomization=randomization,
+        )
+        for size in sorted({(camera.width, camera.height) for camera in cameras})
+    }
