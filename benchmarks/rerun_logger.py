@@ -61,9 +61,9 @@ def drop(thing: SoftObject, frames: int, options: RerunOptions, path: Path) -> t
         material=Material(youngs_modulus=3.0e4, density=250.0),
     )
     scene, frame = SplatScene(builder, [place]), iter(range(frames + 1))
-    scene.advance()  # compiles
+    scene.step()  # compiles
     with RerunLogger(path, scene, options=options) as log:
-        return measure(lambda: log.record(scene.state, time=next(frame) / 30.0), scene.advance, frames)
+        return measure(lambda: log.record(scene.state, time=next(frame) / 30.0), scene.step, frames)
 
 
 def lift(frames: int, options: RerunOptions, path: Path) -> tuple[float, float]:

@@ -52,7 +52,7 @@ class Drop:
         rows, frame_dt = [(0.0, *self.measure())], DT * STEPS
         for k in range(frames):
             film.add(self.scene.draw(), round(1.0 / frame_dt))
-            self.scene.advance()
+            self.scene.step()
             rows.append(((k + 1) * frame_dt, *self.measure()))
         return np.array(rows)
 

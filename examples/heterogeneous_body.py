@@ -81,7 +81,7 @@ def settle(bars: list[SoftObject], gravity: tuple[float, ...], edge: int = 0) ->
     scene = SplatScene(wall, placed, cameras=cameras, dt=0.1, options=exact)
     scene.model.set_gravity(gravity)
     for _ in range(20):
-        scene.advance()
+        scene.step()
     moved = []
     for k, body in enumerate(bar.body for bar in bars):
         end = body.surface_points[:, 0] > body.surface_points[:, 0].max() - 1.0e-6

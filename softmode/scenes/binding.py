@@ -97,7 +97,7 @@ class BoundSplats:
         self.move(getattr(state, NAMESPACE).q)
 
     def move(self, q: wp.array) -> None:
-        """Move the splats by the reduced coordinates of all instances [m], flat vec3d; capturable after a first time."""
+        """Move the splats by the coordinates q of all instances [m], flat vec3d; capturable after a first time."""
         arrays = self.arrays
         for (skin, start), columns in zip(self._skins, self.columns, strict=False):
             skin.launch(

@@ -25,6 +25,7 @@ def capture_graph(launches: Callable[[], None], device: wp.DeviceLike) -> wp.Gra
     launches()
     with wp.ScopedCapture(device=device) as capture:
         launches()
+    assert capture.graph is not None
     return capture.graph
 
 

@@ -22,7 +22,7 @@ from softmode.objects.soft_object import SoftObject
 from softmode.scenes.binding import BoundSplats
 from softmode.scenes.capture import capture_graph, capture_step, require_even
 from softmode.scenes.fixture import Fixture, add_fixture
-from softmode.scenes.scene import cameras_by_size
+from softmode.scenes.scene import cameras_by_size, host
 from softmode.splats.camera import CameraOptions, SplatCamera
 from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
@@ -230,7 +230,7 @@ class SplatScene:
         """Return the surface samples of an object [m], shape (surface_count, 3)."""
         start = int(getattr(self.model, NAMESPACE).particle_start.numpy()[index])
         count = self.objects[index].body.surface_count
-        return self.state.particle_q.numpy()[start : start + count].astype(np.float64)
+        return host(self.state.particle_q)[start : start + count].astype(np.float64)
 
     def kinetic_energy(self) -> float:
         """Return the kinetic energy of all objects, rho V / 2 sum_k |dq_k/dt|^2 [J]; the functions are orthonormal."""

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.errors import AssetError, ConfigError
+from softmode.objects.soft_object import SoftObject, tied
 from softmode.objects.stage_bundle import body_of
-from softmode.scenes.skinned_splats import SkinnedSplats
+from softmode.scenes.binding import splats_of_states
 from softmode.splats.formats.usd import splats_from_prim
 from softmode.splats.splats import MAX_SPLATS, Splats
 from softmode.stages import process
@@ -40,10 +41,10 @@ class PlayedBody:
     """Reduced coordinates in the world, as in `state.softmode.q` [m], shape (F, n, 3)."""
 
     @cached_property
-    def _skinned(self) -> SkinnedSplats:
+    def _object(self) -> SoftObject:
         if self.splats is None:
             raise ConfigError(f"{self.path} has no splats", hint="record it with a PlacedBody that has")
-        return SkinnedSplats(self.body, self.splats)
+        return tied(self.body, self.splats)
 
     def splats_at(self, frame: int) -> Splats:
         """Return its splats in the world in one frame.
@@ -53,7 +54,7 @@ class PlayedBody:
         """
         if not -len(self.times) <= frame < len(self.times):
             raise ConfigError(f"frame is {frame}, there are {len(self.times)}")
-        return next(self._skinned.frames(self.coordinates[frame][None]))
+        return next(splats_of_states(self._object, self.coordinates[frame][None]))
 
     def points_at(self, frame: int) -> Array:
         """Return its surface samples in the world in one frame [m], shape (S, 3)."""

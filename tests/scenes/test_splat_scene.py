@@ -50,7 +50,7 @@ def test_kinetic_energy_of_free_fall_is_the_work_of_gravity(cube: SoftObject) ->
     """After n steps of implicit Euler v = n g dt, so that T = 2 m v^2 / 2 for two cubes; none is kept by the graph."""
     scene = make_scene(cube, (0.0, 0.0, 1.0), (0.3, 0.0, 1.0), steps_per_frame=4)
     for frame in (1, 2):
-        scene.advance()
+        scene.step()
         assert scene.kinetic_energy() == pytest.approx(MASS * (4 * frame * GRAVITY * DT) ** 2, rel=1e-5)
     moved = (scene.surface(1) - cube.body.surface_points - (0.3, 0.0, 1.0)).mean(axis=0)
     np.testing.assert_allclose(moved, (0.0, 0.0, -GRAVITY * DT**2 * 8 * 9 / 2), atol=1e-6)
@@ -97,8 +97,8 @@ def test_graph_equals_single_steps(cube: SoftObject) -> None:
     """A frame is its physics steps, bit for bit, and the first one starts from the initial state."""
     scene, other = (make_scene(cube, (0.0, 0.0, 0.5 * EDGE + 1e-3), steps_per_frame=2) for _ in range(2))
     for _ in range(3):
-        scene.advance()
-        other._two_steps()
+        scene.step()
+        other._steps()
     np.testing.assert_array_equal(scene.state.softmode.q.numpy(), other.state.softmode.q.numpy())
     assert not status_reasons(int(scene.solver.status.numpy()[0]))
 
