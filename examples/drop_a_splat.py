@@ -7,6 +7,7 @@ Run: ``python examples/drop_a_splat.py [FILE] [--size 0.1] [--video out/drop_a_s
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import newton
@@ -14,8 +15,8 @@ import numpy as np
 import warp as wp
 
 from softmode.deformables import Material, status_reasons
-from softmode.objects.soft_object import ObjectConfig, load_object
-from softmode.scenes.splat_scene import PlacedObject, SplatScene
+from softmode.objects import Placed, load
+from softmode.scenes import SplatScene
 from softmode.splats import CameraOptions, PinholeCamera, ShadowOptions
 from softmode.viz import Film
 
@@ -29,13 +30,13 @@ class Drop:
 
     def __init__(self, file: str | None, *, size: float, edge: int) -> None:
         """Reduce the object and hang it 1.5 sizes over the table."""
-        self.thing = load_object(ObjectConfig(splat=file, size=size))
+        self.thing = replace(load(file, size=size), material=FOAM)
         self.fall = 1.5 * size
         world = newton.ModelBuilder()
         world.default_shape_cfg.mu = 0.8
         below = wp.transform((0.0, 0.0, -0.05), wp.quat_identity())
         world.add_shape_box(-1, xform=below, hx=9.0, hy=9.0, hz=0.05, color=(0.66, 0.68, 0.70), label="table")
-        placed = PlacedObject(thing=self.thing, position=(0.0, 0.0, self.fall + self.thing.height), material=FOAM)
+        placed = Placed(object=self.thing, position=(0.0, 0.0, self.fall + self.thing.height))
         eye, target = (4.2 * size, -1.6 * size, 1.8 * size), (0.0, 0.0, 1.05 * size)
         camera = PinholeCamera.look_at("film", position=eye, target=target, width=edge, height=edge, fov_y=0.66)
         light = CameraOptions(mesh_samples=4, splat_shadow=ShadowOptions(cells=48))

@@ -24,12 +24,11 @@ from softmode.deformables import (
     ReducedBody,
     Region,
     SolverReducedOptions,
-    average_basis,
     build_body,
     quadrature_from_box,
 )
-from softmode.objects.soft_object import SoftObject
-from softmode.scenes.splat_scene import PlacedObject, SplatScene
+from softmode.objects import Placed, SoftObject
+from softmode.scenes import SplatScene
 from softmode.splats import PinholeCamera, Splats
 
 LENGTH, CLAMP, EDGE, CORE = 0.32, 0.04, 0.04, 0.02
@@ -65,13 +64,13 @@ def dressed(body: ReducedBody, ratio: float) -> SoftObject:
         opacities=np.where(core & (ratio > 1.0), 0.8, 0.07),
         sh=((colors - 0.5) / 0.28209479177387814)[:, None],
     )
-    return SoftObject(body, splats, *average_basis(lambda x: body.evaluate(x)[0], means, splats.covariances()), 0.0)
+    material = Material(youngs_modulus=MODULUS, poissons_ratio=0.3, density=DENSITY)
+    return SoftObject(body=body, splats=splats, material=material)
 
 
 def settle(bars: list[SoftObject], gravity: tuple[float, ...], edge: int = 0) -> tuple[list, list]:
     """Let both bars come to rest; return the mean displacement of their free ends [m] and, with `edge`, a picture."""
-    material = Material(youngs_modulus=MODULUS, poissons_ratio=0.3, density=DENSITY)
-    placed = [PlacedObject(thing=bar, position=(0.0, 0.1 * k, 0.0), material=material) for k, bar in enumerate(bars)]
+    placed = [Placed(object=bar, position=(0.0, 0.1 * k, 0.0)) for k, bar in enumerate(bars)]
     view, size = {"position": (0.30, -0.60, 0.10), "target": (0.0, 0.03, -0.08), "fov_y": 0.45}, max(edge, 64)
     camera = PinholeCamera.look_at("bars", width=size, height=size // 2, **view)
     cameras, exact = [camera] * bool(edge), SolverReducedOptions(tolerance=1.0e-8)

@@ -16,8 +16,8 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from softmode.deformables import BuildOptions, Material, SolverReducedOptions
-from softmode.objects.soft_object import ObjectConfig, load_object
-from softmode.scenes.splat_scene import PlacedObject, Record, SplatScene
+from softmode.objects import ObjectConfig, Placed, load
+from softmode.scenes import Record, SplatScene
 from softmode.splats import CameraOptions, PinholeCamera, ShadowOptions
 from softmode.viz import Film
 
@@ -61,7 +61,7 @@ def make_scene(splat: str | None, seed: int, height: int, device: str | None) ->
     world, rng = newton.ModelBuilder(), np.random.default_rng(seed)
     add_board(world)
     configs = (replace(TOYS[0], splat=splat), *TOYS[1:]) if splat else TOYS
-    things, placed = [load_object(config) for config in configs], []
+    things, placed = [load(config) for config in configs], []
     for i in range(18):
         thing, (row, column) = things[(i + i // 6) % 3], divmod(i, 6)
         place = (0.09 * (column - 2.5) + rng.uniform(-0.005, 0.005), 0.0, 0.80 + 0.11 * row)
@@ -69,7 +69,8 @@ def make_scene(splat: str | None, seed: int, height: int, device: str | None) ->
         modulus = float(np.exp(rng.uniform(np.log(3.0e4), np.log(3.0e5))))
         stuff = Material(youngs_modulus=modulus, poissons_ratio=0.35, density=250.0, friction=0.3)
         dyed = replace(thing.splats, sh=np.roll(thing.splats.sh, i // 2, axis=2))  # red, green and blue change places
-        placed.append(PlacedObject(thing=thing, position=place, rotation=turn, material=stuff, splats=dyed))
+        toy = replace(thing, material=stuff).recolored(dyed)
+        placed.append(Placed(object=toy, position=place, rotation=turn))
     eye, target, width = (0.18, -1.6, 0.75), (0.0, 0.0, 0.54), height // 40 * 24
     camera = PinholeCamera.look_at("film", position=eye, target=target, width=width, height=height, fov_y=0.70)
     light = CameraOptions(light_direction=(-0.2, 0.7, -0.7), mesh_samples=4, splat_shadow=ShadowOptions(cells=200))

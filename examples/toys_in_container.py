@@ -16,8 +16,8 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from softmode.deformables import BuildOptions, Material, SolverReducedOptions
-from softmode.objects.soft_object import ObjectConfig, load_object
-from softmode.scenes.splat_scene import PlacedObject, Record, SplatScene
+from softmode.objects import ObjectConfig, Placed, load
+from softmode.scenes import Record, SplatScene
 from softmode.splats import CameraOptions, PinholeCamera, ShadowOptions
 from softmode.viz import Film
 
@@ -53,17 +53,18 @@ def make_scene(splat: str | None, seed: int, size: int, device: str | None) -> S
     configs = {name: replace(toy, surface_count=150, build=BUILD) for name, toy in TOYS.items()}
     if splat:
         configs["bear"] = replace(configs["bear"], splat=splat)
-    things = {name: load_object(config) for name, config in configs.items()}
+    things = {name: load(config) for name, config in configs.items()}
     placed = []
     for i, name in enumerate(FALLING):
         thing, (layer, cell) = things[name], divmod(i, len(LAYER))
-        dyed = replace(thing.splats, sh=np.roll(thing.splats.sh, i, axis=2))  # red, green and blue change places
         place = (*LAYER[cell], 0.17 + 0.13 * layer + (0.04 if cell == 0 else 0.0))
         turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()
         modulus = float(np.exp(rng.uniform(np.log(3.0e4), np.log(3.0e5))))
         stuff = Material(youngs_modulus=modulus, poissons_ratio=0.35, density=250.0)
-        splats = dyed if name.endswith("bear") else None
-        placed.append(PlacedObject(thing=thing, position=place, rotation=turn, material=stuff, splats=splats))
+        toy = replace(thing, material=stuff)
+        if name.endswith("bear"):  # red, green and blue change places
+            toy = toy.recolored(replace(thing.splats, sh=np.roll(thing.splats.sh, i, axis=2)))
+        placed.append(Placed(object=toy, position=place, rotation=turn))
     eye, target = (0.38, -0.28, 0.46), (0.0, 0.0, 0.085)
     camera = PinholeCamera.look_at("film", position=eye, target=target, width=size, height=size, fov_y=0.72)
     light = CameraOptions(mesh_samples=4, splat_shadow=ShadowOptions(cells=160))

@@ -288,7 +288,7 @@ def _play_episode(
 def _task_config(options: Play, trained: dict[str, Any]) -> Any:
     """Turn the options that concern the object into a configuration, else as that of a trained policy."""
     from softmode.learning.config_values import config_of
-    from softmode.objects.soft_object import ObjectConfig
+    from softmode.objects.config import ObjectConfig
 
     base = config_of(config_class(options.env), trained)
     scene = base.scene

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from softmode.deformables.model.status import status_reasons
 from softmode.envs.task import EndReason, ObservationType, Task, TaskConfig
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import ObjectConfig
+from softmode.objects.config import ObjectConfig
 
 CONTROL_MODES = ("pose_delta", "joint_delta")
 

@@ -46,8 +46,8 @@ class BoundSplats:
 
     Args:
         model: A model with soft bodies, the same in every world; None for states of a single body on their own.
-        objects: The soft bodies of a world in the order in which they were added, at least one; None for a body without
-            splats.
+        objects: The soft bodies of a world in the order in which they were added, at least one; None for a body that is
+            not shown.
         worlds: Which worlds; all of them if None. Without a model, each is a state.
         others: Splats behind those of the objects, which `update` leaves where they are: a marker, rigid toys.
         sh_degree: Highest degree of the colours, 0 to 3; None for that of the splats.
@@ -69,28 +69,23 @@ class BoundSplats:
     ) -> None:
         """Upload the splats at rest."""
         device = device if model is None else model.device
-        shown = [thing for thing in objects if thing is not None]
+        shown = [thing for thing in objects if thing is not None and thing.splats is not None]
         if model is not None:
             starts = _function_starts(model, len(objects), worlds)
         else:
             starts = np.array(worlds)[:, None] * shown[0].body.function_count
-        parts = [*(thing.splats for thing in shown), *others]
+        parts = [*(thing.visible_splats for thing in shown), *others]
         self.arrays = SplatArrays.from_splats(parts, world_count=len(starts), sh_degree=sh_degree, device=device)
         """The splats as they are, for cameras and rasterisers."""
         ends = np.cumsum([splats.count for splats in parts]).tolist()
         self.columns = tuple(slice(end - splats.count, end) for end, splats in zip(ends, parts, strict=True))
         """Where the splats of each object that has some are in `arrays`, then those of `others`."""
-        self.indices = tuple(o for o, thing in enumerate(objects) if thing is not None)
+        self.indices = tuple(o for o, thing in enumerate(objects) if thing is not None and thing.splats is not None)
         """Which objects have splats."""
-        self._skins = [
-            (
-                SkinSplats(
-                    thing.splats.means, thing.splats.covariances(), thing.basis, thing.grad_basis, device=device
-                ),
-                wp.array(np.ascontiguousarray(starts[:, o]), dtype=int, device=device),
-            )
-            for o, thing in zip(self.indices, shown, strict=True)
-        ]
+        self._skins = []
+        for o, thing, rest in zip(self.indices, shown, parts, strict=False):
+            skin = SkinSplats(rest.means, rest.covariances(), thing.basis, thing.grad_basis, device=device)
+            self._skins.append((skin, wp.array(np.ascontiguousarray(starts[:, o]), dtype=int, device=device)))
 
     def update(self, state: newton.State) -> None:
         """Move the splats to where a state of the model has them; capturable after a first time."""
@@ -121,7 +116,7 @@ def splats_of_states(thing: SoftObject, states: ArrayLike) -> Iterator[Splats]:
         thing: The object.
         states: Reduced coordinates [m], shape (F, n, 3).
     """
-    q, rest = np.asarray(states, dtype=np.float64), thing.splats
+    q, rest = np.asarray(states, dtype=np.float64), thing.visible_splats
     count = max(1, _ROWS // rest.count)
     for first in range(0, len(q), count):
         part = q[first : first + count]

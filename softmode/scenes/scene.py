@@ -19,7 +19,6 @@ from softmode.splats.camera import CameraOptions, SplatCamera
 from softmode.splats.camera_randomization import CameraRandomization
 from softmode.splats.pinhole import PinholeCamera
 
-
 Solver = SolverReduced | SolverCoupledReduced
 """What moves soft bodies."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import newton
@@ -13,19 +13,18 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softmode.deformables.materials.material import Material
-from softmode.deformables.model.authoring import NAMESPACE, add_reduced_body
+from softmode.deformables.model.authoring import NAMESPACE
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import SoftObject
+from softmode.objects.placed import Placed
 from softmode.scenes.binding import BoundSplats
 from softmode.scenes.capture import capture_graph, capture_step, require_even
 from softmode.scenes.fixture import Fixture, add_fixture
 from softmode.scenes.scene import cameras_by_size, host
 from softmode.splats.camera import CameraOptions, SplatCamera
 from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.splats import Splats
 
 
 class FrameSink(Protocol):
@@ -36,22 +35,8 @@ class FrameSink(Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlacedObject:
-    """A soft object at its place."""
-
-    thing: SoftObject
-    """The object; several places may share one."""
-    position: tuple[float, float, float]
-    """Where its centre of mass starts [m]."""
-    rotation: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
-    """How it is turned, shape (3, 3)."""
-    material: Material = field(default_factory=lambda: Material(youngs_modulus=1.0e5, density=250.0))
-    """What it is made of."""
-    splats: Splats | None = None
-    """Its splats in other colours; None for those of the object."""
-    scale: float = 1.0
-    """Its size over that of the object."""
+FOAM = Material(youngs_modulus=1.0e5, density=250.0)
+"""What objects are made of that do not say it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +87,7 @@ class SplatScene:
     def __init__(
         self,
         fixtures: newton.ModelBuilder | Sequence[Fixture],
-        objects: Sequence[PlacedObject],
+        objects: Sequence[Placed],
         *,
         cameras: Sequence[PinholeCamera] = (),
         dt: float = 1.0 / 240.0,
@@ -115,11 +100,11 @@ class SplatScene:
     ) -> None:
         """Build model, solver, splats and cameras."""
         if not objects:
-            raise ConfigError("objects is empty", hint="give at least one PlacedObject")
+            raise ConfigError("objects is empty", hint="give at least one Placed")
         require_even("steps_per_frame", steps_per_frame)
         self.placed, self.dt, self.steps_per_frame = tuple(objects), dt, steps_per_frame
-        self.objects = tuple(replace(p.thing, splats=p.splats or p.thing.splats) for p in self.placed)
-        """The soft objects, in the colours that they have here."""
+        self.objects = tuple(placed.object for placed in self.placed)
+        """The soft objects; :attr:`placed` says where they start."""
         if isinstance(fixtures, newton.ModelBuilder):
             builder = fixtures
         else:
@@ -127,14 +112,7 @@ class SplatScene:
             for fixture in fixtures:
                 add_fixture(builder, fixture)
         for placed in self.placed:
-            instance = add_reduced_body(
-                builder,
-                placed.thing.body,
-                material=placed.material,
-                position=placed.position,
-                rotation=placed.rotation,
-                scale=placed.scale,
-            )
+            instance = placed.add_to(builder, material=placed.object.material or FOAM)
             if grip_slots:
                 add_grip_slots(builder, instance, grip_slots)
         self.model = builder.finalize(device=device)
@@ -237,8 +215,8 @@ class SplatScene:
         start, qd = getattr(self.model, NAMESPACE).function_start.numpy(), getattr(self.state, NAMESPACE).qd.numpy()
         total = 0.0
         for placed, first in zip(self.placed, start, strict=True):
-            body = placed.thing.body
-            mass = placed.material.density * body.volume
+            body = placed.body
+            mass = (placed.object.material or FOAM).density * body.volume
             total += 0.5 * mass * float((qd[first : first + body.function_count] ** 2).sum())
         return total
 

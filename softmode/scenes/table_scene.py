@@ -17,7 +17,9 @@ from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import ObjectConfig, SoftObject, load_object
+from softmode.objects.config import ObjectConfig
+from softmode.objects.loader import Progress, load
+from softmode.objects.soft_object import SoftObject
 from softmode.robots.arm import ArmDescription, add_arm
 from softmode.robots.control import ArmController, ArmControlOptions
 from softmode.scenes import table_kernels as kernels
@@ -100,8 +102,8 @@ class TableScene:
         camera_options: CameraOptions | None = None,
         camera_randomization: CameraRandomization | None = None,
         marker: Splats | None = None,
-        device: Any = None,
-        progress: Any = None,
+        device: wp.DeviceLike = None,
+        progress: Progress = None,
     ) -> None:
         """Build model, solvers and controller, and capture the control step."""
         if world_count < 1:
@@ -111,7 +113,7 @@ class TableScene:
         self.device = wp.get_device(device)
         self.dt = 1.0 / (config.control_hz * config.substeps)
         kinds = (config.object, *config.others)
-        loaded = {kind: load_object(kind, progress) for kind in dict.fromkeys(kinds)}
+        loaded = {kind: load(kind, progress=progress) for kind in dict.fromkeys(kinds)}
         self.objects: tuple[SoftObject, ...] = tuple(loaded[kind] for kind in kinds)
         """The soft objects of a world; their instances follow each other, world by world."""
         self._build_model()

@@ -12,17 +12,14 @@ from softmode.lazy import lazy_names
 if TYPE_CHECKING:
     from softmode.objects.stage_scene import UsdDeformable, UsdScene, read_usd_scene
     from softmode.usd.animation import UsdAnimation, UsdAnimationOptions
-    from softmode.usd.importer import UsdBody, UsdImport, add_usd
-    from softmode.usd.placed import PlacedBody
+    from softmode.usd.importer import UsdImport, add_usd
     from softmode.usd.playback import PlayedBody, UsdPlayback, read_animation
     from softmode.usd.writer import UsdExportOptions, write_usd
 
 __all__ = [
-    "PlacedBody",
     "PlayedBody",
     "UsdAnimation",
     "UsdAnimationOptions",
-    "UsdBody",
     "UsdDeformable",
     "UsdExportOptions",
     "UsdImport",
@@ -37,11 +34,9 @@ __all__ = [
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "PlacedBody": ".placed",
         "PlayedBody": ".playback",
         "UsdAnimation": ".animation",
         "UsdAnimationOptions": ".animation",
-        "UsdBody": ".importer",
         "UsdDeformable": "softmode.objects.stage_scene",
         "UsdExportOptions": ".writer",
         "UsdImport": ".importer",

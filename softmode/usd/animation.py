@@ -20,14 +20,13 @@ from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model.authoring import MATERIAL_FIELDS, body_key
 from softmode.errors import ConfigError, SolverDiverged
-from softmode.objects.soft_object import tied
+from softmode.objects.placed import Placed
 from softmode.objects.stage_scene import shortest
 from softmode.scenes.binding import splats_of_states
 from softmode.splats.formats.usd import set_splat_column, splat_columns
 from softmode.stages import tokens
 from softmode.usd.handles import handles_from_coordinates, local_coordinates, rigid_motion
 from softmode.usd.openusd import check_stage, openusd, whole_stage
-from softmode.usd.placed import PlacedBody
 from softmode.usd.rigid import RigidMeshes
 from softmode.usd.writer import (
     UsdExportOptions,
@@ -100,7 +99,7 @@ class UsdAnimation:
         self,
         path: str | Path,
         model: Any,
-        bodies: Sequence[PlacedBody],
+        bodies: Sequence[Placed],
         *,
         world: int = 0,
         options: UsdAnimationOptions | None = None,
@@ -119,11 +118,11 @@ class UsdAnimation:
             raise ConfigError(
                 f"bodies: got {[placed.body.name for placed in bodies]}, world {world} holds {len(found)} soft bodies"
                 + (", others or in another order" if len(found) == len(bodies) else ""),
-                hint="pass a PlacedBody for each add_reduced_body, in that order",
+                hint="pass a Placed for each add_reduced_body, in that order",
             )
         self._starts = data.function_start.numpy()[self._instances].tolist()
         self._bodies = tuple(bodies)
-        self._placed: tuple[PlacedBody, ...] = ()
+        self._placed: tuple[Placed, ...] = ()
         self._meshes = RigidMeshes(model, world) if self.options.rigid_meshes else None
         self._live: Any = None
         self._times: list[float] = []
@@ -151,7 +150,7 @@ class UsdAnimation:
         made = cls(
             path,
             scene.model,
-            [PlacedBody(body=thing.body, splats=thing.splats) for thing in scene.objects],
+            [Placed(object=thing) for thing in scene.objects],
             world=world,
             options=options or UsdAnimationOptions(fps=scene.config.control_hz),
         )
@@ -204,7 +203,7 @@ class UsdAnimation:
         self._times.append(when)
         self._states.append(parts)
 
-    def _in_model(self, states: Sequence[NDArray[np.float64]]) -> tuple[PlacedBody, ...]:
+    def _in_model(self, states: Sequence[NDArray[np.float64]]) -> tuple[Placed, ...]:
         """Return the bodies with material, size and place as they are in the model at the first frame."""
         data = self.model.softmode
         columns = {name: getattr(data, name).numpy() for name in (*MATERIAL_FIELDS, "material_model", "scale")}
@@ -218,8 +217,11 @@ class UsdAnimation:
             placed.append(
                 dataclasses.replace(
                     given,
-                    material=Material(model=MaterialModel(int(columns["material_model"][i])), **values),
-                    splats=splats,
+                    object=dataclasses.replace(
+                        given.object,
+                        material=Material(model=MaterialModel(int(columns["material_model"][i])), **values),
+                        splats=splats,
+                    ),
                     position=tuple(translation.tolist()),
                     rotation=rotation,
                     scale=float(columns["scale"][i]),
@@ -258,7 +260,7 @@ class UsdAnimation:
         stage: Any,
         layer: Any,
         path: str,
-        placed: PlacedBody,
+        placed: Placed,
         codes: list[float],
         states: list[NDArray[np.float64]],
     ) -> None:
@@ -281,7 +283,7 @@ class UsdAnimation:
             self._bake(stage, layer, path, placed, codes, local)
 
     def _bake(
-        self, stage: Any, layer: Any, path: str, placed: PlacedBody, codes: list[float], local: NDArray[np.float64]
+        self, stage: Any, layer: Any, path: str, placed: Placed, codes: list[float], local: NDArray[np.float64]
     ) -> None:
         """Author points and splats frame by frame, in the frame of their body."""
         UsdGeom, UsdVol = openusd("UsdGeom", "UsdVol")
@@ -294,7 +296,7 @@ class UsdAnimation:
         prim = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath(f"{path}/Splats"))
         turning = placed.splats.sh_degree > 0
         near, waiting = placed.splats.quats, 0.0
-        for code, splats in zip(codes, splats_of_states(tied(placed.body, placed.splats), local), strict=True):
+        for code, splats in zip(codes, splats_of_states(placed.object, local), strict=True):
             columns = splat_columns(splats, near=near)
             near = columns["orientations"]
             del columns["opacities"]

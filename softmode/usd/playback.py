@@ -5,15 +5,13 @@ from __future__ import annotations
 import os
 import tempfile
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.errors import AssetError, ConfigError
-from softmode.objects.soft_object import SoftObject, tied
+from softmode.objects.soft_object import SoftObject
 from softmode.objects.stage_bundle import body_of
 from softmode.scenes.binding import splats_of_states
 from softmode.splats.formats.usd import splats_from_prim
@@ -31,20 +29,12 @@ class PlayedBody:
 
     path: str
     """Path of its prim."""
-    body: ReducedBody
-    """The body."""
-    splats: Splats | None
-    """Its splats in the body frame [m]."""
+    object: SoftObject
+    """The body with its splats."""
     times: Array
     """When the frames are [s], shape (F,)."""
     coordinates: Array
     """Reduced coordinates in the world, as in `state.softmode.q` [m], shape (F, n, 3)."""
-
-    @cached_property
-    def _object(self) -> SoftObject:
-        if self.splats is None:
-            raise ConfigError(f"{self.path} has no splats", hint="record it with a PlacedBody that has")
-        return tied(self.body, self.splats)
 
     def splats_at(self, frame: int) -> Splats:
         """Return its splats in the world in one frame.
@@ -54,11 +44,12 @@ class PlayedBody:
         """
         if not -len(self.times) <= frame < len(self.times):
             raise ConfigError(f"frame is {frame}, there are {len(self.times)}")
-        return next(splats_of_states(self._object, self.coordinates[frame][None]))
+        return next(splats_of_states(self.object, self.coordinates[frame][None]))
 
     def points_at(self, frame: int) -> Array:
         """Return its surface samples in the world in one frame [m], shape (S, 3)."""
-        return self.body.surface_points + self.body.surface_basis.astype(np.float64) @ self.coordinates[frame]
+        body = self.object.body
+        return body.surface_points + body.surface_basis.astype(np.float64) @ self.coordinates[frame]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -146,8 +137,9 @@ def _played(sent: dict[str, Any], arrays: list[NDArray[Any]], rate: float, name:
     ]
     return PlayedBody(
         path=sent["path"],
-        body=body,
-        splats=None if sent["splats"] is None else splats_from_prim(sent["splats"], arrays, source),
+        object=SoftObject(
+            body=body, splats=None if sent["splats"] is None else splats_from_prim(sent["splats"], arrays, source)
+        ),
         times=codes / rate,
         coordinates=np.array(world),
     )

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from softmode.deformables.materials.material import Material
 from softmode.errors import ConfigError
+from softmode.objects.placed import Placed
 from softmode.objects.stage_bundle import DTYPES, encode_body
 from softmode.splats.formats.usd import define_splats, set_splat_column, splat_columns
 from softmode.splats.splats import quats_from_rotations
@@ -31,7 +32,6 @@ from softmode.stages import tokens
 from softmode.usd import kaolin
 from softmode.usd.handles import handle_weights
 from softmode.usd.openusd import openusd, whole_stage
-from softmode.usd.placed import PlacedBody
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ class UsdExportOptions:
 
 def write_usd(
     path: str | os.PathLike[str],
-    bodies: PlacedBody | Sequence[PlacedBody],
+    bodies: Placed | Sequence[Placed],
     *,
     options: UsdExportOptions | None = None,
 ) -> None:
@@ -78,9 +78,9 @@ def write_usd(
         StorageError: If the file cannot be written.
         MissingExtraError: If the extra `[usd]` is not installed.
     """
-    placed = [bodies] if isinstance(bodies, PlacedBody) else list(bodies)
+    placed = [bodies] if isinstance(bodies, Placed) else list(bodies)
     if not placed:
-        raise ConfigError("bodies is empty", hint="give at least one PlacedBody")
+        raise ConfigError("bodies is empty", hint="give at least one Placed")
     openusd("Usd")
     with whole_stage(path) as file:
         layer = new_layer(str(file))
@@ -123,7 +123,7 @@ def new_stage(layer: Any) -> Any:
     return stage
 
 
-def author_bodies(stage: Any, bodies: Sequence[PlacedBody], options: UsdExportOptions) -> list[str]:
+def author_bodies(stage: Any, bodies: Sequence[Placed], options: UsdExportOptions) -> list[str]:
     """Author bodies under /World and return the paths of their prims."""
     seen: set[str] = set()
     return [
@@ -144,7 +144,7 @@ def prim_name(label: str, seen: set[str]) -> str:
     return chosen
 
 
-def author_body(stage: Any, path: str, placed: PlacedBody, options: UsdExportOptions) -> str:
+def author_body(stage: Any, path: str, placed: Placed, options: UsdExportOptions) -> str:
     """Author one body with all that belongs to it; return its path."""
     Usd, UsdGeom, UsdSemantics = openusd("Usd", "UsdGeom", "UsdSemantics")
     body = placed.body
@@ -218,7 +218,7 @@ def set_place(
         ops["xformOp:scale"].Set(Gf.Vec3d(float(scale)), when)
 
 
-def _author_reduced(prim: Any, placed: PlacedBody) -> None:
+def _author_reduced(prim: Any, placed: Placed) -> None:
     """Author the ReducedBody, and its material in full precision, as attributes of its prim."""
     (Vt,) = openusd("Vt")
     header, arrays, digest = encode_body(placed.body)
@@ -259,7 +259,7 @@ def _author_material(stage: Any, prim: Any, material: Material) -> None:
     binding.Bind(shader, UsdShade.Tokens.weakerThanDescendants, tokens.MATERIAL_PURPOSE)
 
 
-def _author_points(points: Any, placed: PlacedBody) -> None:
+def _author_points(points: Any, placed: Placed) -> None:
     """Author the simulation geometry: the cubature points, which fill the body, with widths and masses."""
     UsdGeom, Vt = openusd("UsdGeom", "Vt")
     body = placed.body
@@ -291,7 +291,7 @@ def _author_weights(prim: Any, weights: NDArray[np.float32], precision: str) -> 
     primvar.Set(float_array(weights, half=half))
 
 
-def _author_kaolin(prim: Any, placed: PlacedBody, weights: NDArray[np.float32] | None) -> None:
+def _author_kaolin(prim: Any, placed: Placed, weights: NDArray[np.float32] | None) -> None:
     """Author Kaolin's attributes on the prim whose points are drawn."""
     schemas = {
         tokens.KAOLIN_MATERIAL_API: ("kaolin_physics_material:", kaolin.material_values(placed.body, placed.material)),

@@ -15,15 +15,16 @@ from softmode.deformables.materials.material import Material
 from softmode.deformables.tools.grips import GripOptions
 from softmode.errors import ConfigError
 from softmode.learning.players import POLICIES, check_policy, policy_factory, trained_policy
-from softmode.objects.soft_object import ObjectConfig, SoftObject
+from softmode.objects.config import ObjectConfig
+from softmode.objects.placed import Placed
+from softmode.objects.soft_object import SoftObject
 from softmode.scenes.fixture import Fixture
 from softmode.scenes.scene import Scene
-from softmode.scenes.splat_scene import PlacedObject, SplatScene
+from softmode.scenes.splat_scene import SplatScene
 from softmode.scenes.table_scene import TableScene
 from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
 from softmode.view.live_types import HoldName, LiveOptions, SceneName
-from softmode.view.sources import LoadedObject
 
 BLOCK_STEPS = 2
 """Physics steps of a block of an object without an environment; even, there and back between two states."""
@@ -94,7 +95,7 @@ class ObjectScene:
     """One object, held by a part of it or above a table.
 
     Args:
-        found: The object.
+        found: The object, at the scale that it has.
         scene: "hang" or "drop".
         hold: Which end a hanging object is held by.
         material: What it is made of.
@@ -107,7 +108,7 @@ class ObjectScene:
 
     def __init__(
         self,
-        found: LoadedObject,
+        found: Placed,
         scene: SceneName,
         hold: HoldName,
         material: Material,
@@ -118,7 +119,7 @@ class ObjectScene:
         for name, value, known in (("scene", scene, SceneName), ("hold", hold, HoldName)):
             if value not in get_args(known):
                 raise ConfigError(f"{name} is {value!r}", hint=f"use one of {', '.join(map(repr, get_args(known)))}")
-        thing, self.source, self._pin_points = found.thing, found.config, options.pin_points
+        thing, self.source, self._pin_points = found.object, found.object.config, options.pin_points
         self._hold: HoldName | None = hold if scene == "hang" else None
         self.marker: Splats | None = None
         self.viewpoints: Sequence[PinholeCamera] = ()
@@ -135,7 +136,7 @@ class ObjectScene:
         position = (0.0, 0.0, found.scale * (thing.height + 0.6 * height))
         self.scene = SplatScene(
             table,
-            [PlacedObject(thing=thing, position=position, material=material, scale=found.scale)],
+            [replace(found, object=replace(thing, material=material), position=position)],
             dt=options.substep,
             steps_per_frame=BLOCK_STEPS,
             grip_slots=grip_slots(options),

@@ -37,7 +37,7 @@ class LivePicture:
     def __init__(self, objects: Sequence[SoftObject], model: newton.Model, marker: Splats | None) -> None:
         """Upload the rest state."""
         self.objects, self.bound = objects, BoundSplats(model, objects, others=[] if marker is None else [marker])
-        shown = [thing.splats for thing in objects] + ([] if marker is None else [marker])
+        shown = [thing.visible_splats for thing in objects] + ([] if marker is None else [marker])
         self.colors = np.concatenate([splats.colors() for splats in shown])
         self.opacities = np.concatenate([splats.opacities for splats in shown]).astype(np.float32)
         self._starts = getattr(model, NAMESPACE).function_start
@@ -119,7 +119,7 @@ class LivePicture:
         thing = self.objects[index]
         start = int(self._starts.numpy()[index])
         q = getattr(state, NAMESPACE).q.numpy()[start : start + thing.body.function_count].astype(np.float64)
-        X = thing.splats.means[splat].astype(np.float64)
+        X = thing.visible_splats.means[splat].astype(np.float64)
         x = X + thing.basis[splat] @ q
         F = np.eye(3) + q.T @ thing.grad_basis[splat]
         U, stretch, V = np.linalg.svd(F)

@@ -114,10 +114,10 @@ class UsdRecorder:
 
     def __init__(self, path: Path, model: newton.Model, objects: Sequence[SoftObject]) -> None:
         """Find the objects in the model."""
+        from softmode.objects.placed import Placed
         from softmode.usd.animation import UsdAnimation, UsdAnimationOptions
-        from softmode.usd.placed import PlacedBody
 
-        bodies = [PlacedBody(body=thing.body, splats=thing.splats) for thing in objects]
+        bodies = [Placed(object=thing) for thing in objects]
         self._animation = UsdAnimation(path, model, bodies, options=UsdAnimationOptions(fps=RECORD_HZ))
         self.path, self.count = path, 0
 

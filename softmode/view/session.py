@@ -20,7 +20,8 @@ from softmode.deformables.model.authoring import NAMESPACE
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.energies import SoftEnergies
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import ObjectConfig, SoftObject
+from softmode.objects.config import ObjectConfig
+from softmode.objects.soft_object import SoftObject
 from softmode.scenes.meshes import SceneMesh, scene_meshes
 from softmode.scenes.scene import host, soft_solver
 from softmode.view import live_parameters
@@ -119,7 +120,7 @@ class LiveSession:
 
         def make(origin: ObjectConfig | None) -> LiveScene:
             found = load_source(origin or source, None if origin else size, progress)
-            made = material or found.material or Material(youngs_modulus=1.0e5, density=250.0)
+            made = material or found.object.material or Material(youngs_modulus=1.0e5, density=250.0)
             return ObjectScene(found, scene, hold, made, chosen, device)
 
         return cls(make, None, chosen)

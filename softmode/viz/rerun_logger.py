@@ -240,9 +240,9 @@ class RerunLogger:
             self._stream.log(path, rr.GaussianSplats3D.from_fields(**fields))
         if not self.options.surface:
             return
-        points = (
-            host(moment.state.particle_q).copy()
-        )  # rerun keeps what it is given, and on CPU this is the state's own memory
+        points = host(
+            moment.state.particle_q
+        ).copy()  # rerun keeps what it is given, and on CPU this is the state's own memory
         for (w, o), (first, count) in self._samples.items():
             path = f"{self._prefix[w]}scene/soft/{self._soft[o]}/surface"
             fields: dict[str, Any] = {"positions": points[first : first + count]}

@@ -12,8 +12,8 @@ from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.status import status_reasons
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import ObjectConfig, SoftObject, load_object
-from softmode.scenes.splat_scene import PlacedObject, SplatScene
+from softmode.objects import ObjectConfig, Placed, SoftObject, load
+from softmode.scenes import SplatScene
 from softmode.splats.pinhole import PinholeCamera
 from softmode.viz.film import Film
 from tests.scenes import GRAVITY
@@ -30,19 +30,16 @@ def cube() -> SoftObject:
     """Return a red cube."""
     build = BuildOptions(mode_count=3, kernel_count=150, cubature_count=128)
     shape = {"shape": "box", "extents": (EDGE,) * 3, "splat_count": 600, "surface_count": 100}
-    return load_object(ObjectConfig(**shape, colors=RED, build=build))
+    return load(ObjectConfig(**shape, colors=RED, build=build))
 
 
 def make_scene(cube: SoftObject, *places: tuple[float, float, float], **given) -> SplatScene:
     """Return cubes over the ground, every other one green."""
     world = newton.ModelBuilder()
     world.add_ground_plane()
-    red = cube.splats
-    green = replace(red, sh=red.sh[:, :, [1, 0, 2]])
-    things = [
-        PlacedObject(thing=cube, position=p, material=STUFF, splats=green if i % 2 else None)
-        for i, p in enumerate(places)
-    ]
+    red = replace(cube, material=STUFF)
+    green = red.recolored(replace(cube.visible_splats, sh=cube.visible_splats.sh[:, :, [1, 0, 2]]))
+    things = [Placed(object=green if i % 2 else red, position=p) for i, p in enumerate(places)]
     return SplatScene(world, things, dt=DT, **given)
 
 

@@ -28,7 +28,7 @@ from softmode.deformables.tools.sensing import ContactSensor
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
 from softmode.errors import ConfigError, MissingExtraError
 from softmode.learning.players import policy_factory
-from softmode.objects.soft_object import ObjectConfig, load_object
+from softmode.objects import load
 from softmode.scenes import BoundSplats, SplatFrame
 from softmode.splats.splats import rotations_from_quats
 from softmode.viz.rerun_logger import RerunLogger, RerunOptions
@@ -217,7 +217,7 @@ def test_vector_environment(tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def falling() -> Any:
     """Return a plush over the ground in two worlds, and its object."""
-    thing = load_object(ObjectConfig(size=0.08))
+    thing = load(size=0.08)
 
     def populate(world: newton.ModelBuilder) -> None:
         add_reduced_body(

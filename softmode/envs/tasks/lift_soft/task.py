@@ -14,8 +14,8 @@ from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.task import Segment, Task, TaskConfig
 from softmode.envs.tasks.lift_soft import kernels
 from softmode.errors import ConfigError
+from softmode.objects.config import ObjectConfig
 from softmode.objects.presets import BEAM, BEAM_MATERIAL
-from softmode.objects.soft_object import ObjectConfig
 from softmode.robots.arm import ArmDescription
 from softmode.scenes.table_scene import TableSceneConfig
 from softmode.splats.splats import Splats

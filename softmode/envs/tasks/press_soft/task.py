@@ -16,7 +16,7 @@ from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.task import Segment, Task, TaskConfig
 from softmode.envs.tasks.press_soft import kernels
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import ObjectConfig
+from softmode.objects.config import ObjectConfig
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
 from softmode.scenes.table_scene import TableSceneConfig

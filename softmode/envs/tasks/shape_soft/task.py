@@ -20,7 +20,8 @@ from softmode.envs.tasks.shape_soft import kernels
 from softmode.envs.tasks.shape_soft.goals import POINTS, GoalMethods, reward_arguments
 from softmode.envs.tasks.shape_soft.targets import ShapeTargets, record_press
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import ObjectConfig, load_object
+from softmode.objects.config import ObjectConfig
+from softmode.objects.loader import load
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
 from softmode.scenes.table_scene import TableSceneConfig
@@ -225,7 +226,7 @@ class ShapeSoft(Task):
 
     def marker(self) -> Splats:
         """Return the surface of the post; `observe` bends it."""
-        return dots(load_object(self.config.scene.object).body.surface_points, 0.004, opacity=0.35)
+        return dots(load(self.config.scene.object).body.surface_points, 0.004, opacity=0.35)
 
 
 class ShapeSoftEnv(GoalMethods, SoftEnv):
