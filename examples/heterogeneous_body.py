@@ -68,7 +68,7 @@ def dressed(body: ReducedBody, ratio: float) -> SoftObject:
     return SoftObject(body=body, splats=splats, material=material)
 
 
-def settle(bars: list[SoftObject], gravity: tuple[float, ...], edge: int = 0) -> tuple[list, list]:
+def settle(bars: list[SoftObject], gravity: tuple[float, float, float], edge: int = 0) -> tuple[list, list]:
     """Let both bars come to rest; return the mean displacement of their free ends [m] and, with `edge`, a picture."""
     placed = [Placed(object=bar, position=(0.0, 0.1 * k, 0.0)) for k, bar in enumerate(bars)]
     view, size = {"position": (0.30, -0.60, 0.10), "target": (0.0, 0.03, -0.08), "fov_y": 0.45}, max(edge, 64)

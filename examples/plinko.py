@@ -68,7 +68,8 @@ def make_scene(splat: str | None, seed: int, height: int, device: str | None) ->
         turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()
         modulus = float(np.exp(rng.uniform(np.log(3.0e4), np.log(3.0e5))))
         stuff = Material(youngs_modulus=modulus, poissons_ratio=0.35, density=250.0, friction=0.3)
-        dyed = replace(thing.splats, sh=np.roll(thing.splats.sh, i // 2, axis=2))  # red, green and blue change places
+        shown = thing.visible_splats
+        dyed = replace(shown, sh=np.roll(shown.sh, i // 2, axis=2))  # red, green and blue change places
         toy = replace(thing, material=stuff).recolored(dyed)
         placed.append(Placed(object=toy, position=place, rotation=turn))
     eye, target, width = (0.18, -1.6, 0.75), (0.0, 0.0, 0.54), height // 40 * 24

@@ -71,11 +71,10 @@ class Scene:
         wrist = look("wrist", body="link7", position=(0.1, 0.0, 0.03), target=(0.02, 0.0, 0.3), up=up, fov_y=1.0)
         options, median = CameraOptions(segmentation=True, mesh_samples=4), RasterizerOptions(median_depth=True)
         both = fixed, wrist
-        self.camera = SplatCamera(
-            model, self.bound.arrays, both, options=options, rasterizer_options=median, randomization=DRAWN
-        )
+        splats, given = self.bound.arrays, {"options": options, "rasterizer_options": median, "randomization": DRAWN}
+        self.camera = SplatCamera(model, splats, both, **given)
         self.bound.update(self.state)
-        self.toy.launch(self.state, self.bound.arrays)
+        self.toy.launch(self.state, splats)
         self.camera.randomize()
         self.camera.render(self.state)
 

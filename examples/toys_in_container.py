@@ -63,7 +63,8 @@ def make_scene(splat: str | None, seed: int, size: int, device: str | None) -> S
         stuff = Material(youngs_modulus=modulus, poissons_ratio=0.35, density=250.0)
         toy = replace(thing, material=stuff)
         if name.endswith("bear"):  # red, green and blue change places
-            toy = toy.recolored(replace(thing.splats, sh=np.roll(thing.splats.sh, i, axis=2)))
+            shown = thing.visible_splats
+            toy = toy.recolored(replace(shown, sh=np.roll(shown.sh, i, axis=2)))
         placed.append(Placed(object=toy, position=place, rotation=turn))
     eye, target = (0.38, -0.28, 0.46), (0.0, 0.0, 0.085)
     camera = PinholeCamera.look_at("film", position=eye, target=target, width=size, height=size, fov_y=0.72)

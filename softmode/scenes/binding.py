@@ -15,6 +15,7 @@ from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.deformables.skinning.skinning_kernels import vec6
 from softmode.errors import ConfigError
 from softmode.objects.soft_object import SoftObject
+from softmode.scenes.host import host
 from softmode.scenes.splat_axes_kernels import principal_axes
 from softmode.splats.rasterizer import SplatArrays
 from softmode.splats.splats import Splats
@@ -38,7 +39,7 @@ class SplatFrame:
         scales = wp.zeros(six.shape, dtype=wp.vec3, device=device)
         quats = wp.zeros(six.shape, dtype=wp.quat, device=device)
         wp.launch(principal_axes, dim=six.shape, inputs=[six], outputs=[scales, quats], device=device)
-        return scales.numpy(), quats.numpy()
+        return host(scales), host(quats)
 
 
 class BoundSplats:
@@ -101,7 +102,7 @@ class BoundSplats:
 
     def frames(self) -> dict[tuple[int, int], SplatFrame]:
         """Return the splats as they are by place of the world in `worlds` and object; reads from the device."""
-        means, covariances = self.arrays.means.numpy(), self.arrays.covariances.numpy()
+        means, covariances = host(self.arrays.means), host(self.arrays.covariances)
         return {
             (w, o): SplatFrame(means=means[w, columns].copy(), covariances=covariances[w, columns].copy())
             for o, columns in zip(self.indices, self.columns, strict=False)

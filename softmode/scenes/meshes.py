@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from softmode.checks import require_number
 from softmode.errors import ConfigError
-from softmode.scenes.scene import host
+from softmode.scenes.host import host
 from softmode.splats.splats import rotations_from_quats
 
 PLANE_EXTENT = 4.0

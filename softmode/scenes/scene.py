@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 import newton
-import numpy as np
-import warp as wp
-from numpy.typing import NDArray
 
-from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
-from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.deformables.tools.grips import Grips
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.binding import BoundSplats
+from softmode.scenes.host import Solver
 from softmode.splats.camera import CameraOptions, SplatCamera
 from softmode.splats.camera_randomization import CameraRandomization
 from softmode.splats.pinhole import PinholeCamera
-
-Solver = SolverReduced | SolverCoupledReduced
-"""What moves soft bodies."""
 
 
 class Scene(Protocol):
@@ -77,16 +70,6 @@ class Scene(Protocol):
     def reset(self) -> None:
         """Start over."""
         ...
-
-
-def soft_solver(solver: Solver) -> SolverReduced:
-    """Return the solver of the soft bodies: the solver itself, or the one that it couples."""
-    return solver.reduced if isinstance(solver, SolverCoupledReduced) else solver
-
-
-def host(array: wp.array | None) -> NDArray[Any]:
-    """Return what an array of a model or a state holds, on the host; nothing for one that is not there."""
-    return np.zeros(0) if array is None else array.numpy()
 
 
 def cameras_by_size(

@@ -22,7 +22,8 @@ from softmode.objects.placed import Placed
 from softmode.scenes.binding import BoundSplats
 from softmode.scenes.capture import capture_graph, capture_step, require_even
 from softmode.scenes.fixture import Fixture, add_fixture
-from softmode.scenes.scene import cameras_by_size, host
+from softmode.scenes.host import host
+from softmode.scenes.scene import cameras_by_size
 from softmode.splats.camera import CameraOptions, SplatCamera
 from softmode.splats.pinhole import PinholeCamera
 

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.model.authoring import NAMESPACE
-from softmode.scenes.scene import Scene, soft_solver
+from softmode.scenes.host import soft_solver
+from softmode.scenes.scene import Scene
 
 Array = NDArray[np.float64]
 

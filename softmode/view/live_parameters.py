@@ -14,7 +14,8 @@ from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.model.authoring import NAMESPACE
 from softmode.deformables.solver.parameters import PARAMETER_LIMITS, set_parameters
 from softmode.errors import ConfigError
-from softmode.scenes.scene import Scene, host
+from softmode.scenes.host import host
+from softmode.scenes.scene import Scene
 from softmode.view.live_types import LiveParameters, vector3
 
 LIMITS = {name: PARAMETER_LIMITS[name] for name in ("youngs_modulus", "poissons_ratio", "density", "friction")}

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from softmode.checks import require_number
 from softmode.deformables.model.authoring import NAMESPACE
 from softmode.errors import AssetError, ConfigError
-from softmode.scenes.scene import Scene, soft_solver
+from softmode.scenes.host import soft_solver
+from softmode.scenes.scene import Scene
 
 _FORMAT = "softmode live recording 1"
 

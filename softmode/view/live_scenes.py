@@ -242,11 +242,6 @@ class EnvScene:
         self.reset()
 
     @property
-    def scene(self) -> Scene:
-        """Model, solver, state, objects and their grips."""
-        ...
-
-    @property
     def source(self) -> ObjectConfig | None:
         """What the first object is."""
         return self.config.scene.object

@@ -16,7 +16,8 @@ from softmode.deformables.model.authoring import NAMESPACE
 from softmode.errors import ConfigError, SolverDiverged
 from softmode.files import PendingFile
 from softmode.objects.soft_object import SoftObject
-from softmode.scenes.scene import Scene, host
+from softmode.scenes.host import host
+from softmode.scenes.scene import Scene
 from softmode.splats.camera import CameraOptions, SplatCamera
 from softmode.splats.pinhole import PinholeCamera
 from softmode.view.live_recording import LiveRecording

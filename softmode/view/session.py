@@ -22,8 +22,8 @@ from softmode.deformables.solver.energies import SoftEnergies
 from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
 from softmode.objects.soft_object import SoftObject
+from softmode.scenes.host import host, soft_solver
 from softmode.scenes.meshes import SceneMesh, scene_meshes
-from softmode.scenes.scene import host, soft_solver
 from softmode.view import live_parameters
 from softmode.view.coordinates import carry_over, coordinates
 from softmode.view.hands import Hands

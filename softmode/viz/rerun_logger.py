@@ -16,6 +16,7 @@ from softmode.deformables.solver.energies import SoftEnergies
 from softmode.deformables.tools.sensing import ContactSensor
 from softmode.errors import ConfigError
 from softmode.scenes.binding import BoundSplats, SplatFrame
+from softmode.scenes.host import host, soft_solver
 from softmode.scenes.meshes import distinct, scene_meshes, scene_poses
 from softmode.splats.camera import SplatCamera
 from softmode.splats.splats import Splats
@@ -126,8 +127,9 @@ class RerunLogger:
         self._starts = {w: int(layout.instance_start[w]) for w in self.worlds}
         self._soft = _distinct([layout.bodies[layout.asset[i]].name for i in instances])
         objects = source.objects or (None,) * len(self._soft)
-        self._objects, self._splats = objects, None
-        if options.splats and any(thing is not None for thing in objects):
+        self._shown = {o: thing.splats for o, thing in enumerate(objects) if thing is not None and thing.splats}
+        self._splats = None
+        if options.splats and self._shown:
             # as if colours were the same from everywhere: those of higher degrees would turn with every splat
             self._splats = BoundSplats(model, objects, worlds=self.worlds, sh_degree=0)
         self._energies = SoftEnergies(source.solver)
@@ -236,7 +238,7 @@ class RerunLogger:
             if self._changed((w, o), frame):
                 fields["scales"], fields["quaternions"] = frame.axes(self._source.model.device)
             if self.frame_count == 0:
-                fields |= _colors(self._objects[o].splats)
+                fields |= _colors(self._shown[o])
             self._stream.log(path, rr.GaussianSplats3D.from_fields(**fields))
         if not self.options.surface:
             return

@@ -14,7 +14,7 @@ import warp as wp
 from softmode.deformables.model.status import status_reasons
 from softmode.errors import ConfigError
 from softmode.objects.soft_object import SoftObject
-from softmode.scenes.scene import Solver, soft_solver
+from softmode.scenes.host import Solver, soft_solver
 from softmode.scenes.splat_scene import SplatScene
 from softmode.scenes.table_scene import TableScene
 from softmode.splats.camera import SplatCamera
