@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
 import newton
@@ -23,44 +23,24 @@ class Scene(Protocol):
     session runs. Recorders and the browser tool read scenes.
     """
 
-    @property
-    def model(self) -> newton.Model:
-        """The model."""
-        ...
+    model: newton.Model
+    """The model."""
+    state: newton.State
+    """Where everything is."""
+    control: newton.Control
+    """What drives joints, pins and regions."""
+    objects: tuple[SoftObject, ...]
+    """The soft objects of a world, in the order of their instances."""
+    grips: tuple[Grips, ...]
+    """Grips of each object, that pull and hold it while the scene runs; none if it was made without slots."""
+    splats: BoundSplats | None
+    """The splats of the objects as cameras see them; None without cameras."""
+    cameras: dict[tuple[int, int], SplatCamera]
+    """The cameras by the width and height of their pictures [px]."""
 
     @property
     def solver(self) -> Solver:
         """What moves it."""
-        ...
-
-    @property
-    def state(self) -> newton.State:
-        """Where everything is."""
-        ...
-
-    @property
-    def control(self) -> newton.Control:
-        """What drives joints, pins and regions."""
-        ...
-
-    @property
-    def objects(self) -> Sequence[SoftObject]:
-        """The soft objects of a world, in the order of their instances."""
-        ...
-
-    @property
-    def grips(self) -> Sequence[Grips]:
-        """Grips of each object, that pull and hold it while the scene runs; none if it was made without slots."""
-        ...
-
-    @property
-    def splats(self) -> BoundSplats | None:
-        """The splats of the objects as cameras see them; None without cameras."""
-        ...
-
-    @property
-    def cameras(self) -> Mapping[tuple[int, int], SplatCamera]:
-        """The cameras by the width and height of their pictures [px]."""
         ...
 
     def step(self) -> None:

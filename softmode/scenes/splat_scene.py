@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import newton
 import numpy as np
@@ -13,7 +13,6 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softmode.deformables.materials.material import Material
-from softmode.deformables.model.authoring import NAMESPACE
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
@@ -22,7 +21,6 @@ from softmode.objects.placed import Placed
 from softmode.scenes.binding import BoundSplats
 from softmode.scenes.capture import capture_graph, capture_step, require_even
 from softmode.scenes.fixture import Fixture, add_fixture
-from softmode.scenes.host import host
 from softmode.scenes.scene import cameras_by_size
 from softmode.splats.camera import CameraOptions, SplatCamera
 from softmode.splats.pinhole import PinholeCamera
@@ -33,7 +31,6 @@ class FrameSink(Protocol):
 
     def add(self, frame: NDArray[np.uint8], rate: int, /) -> None:
         """Add a picture, shape (height, width, 3), of a film with ``rate`` pictures per second."""
-        ...
 
 
 FOAM = Material(youngs_modulus=1.0e5, density=250.0)
@@ -116,10 +113,11 @@ class SplatScene:
             instance = placed.add_to(builder, material=placed.object.material or FOAM)
             if grip_slots:
                 add_grip_slots(builder, instance, grip_slots)
-        self.model = builder.finalize(device=device)
+        self.model: Any = builder.finalize(device=device)  # Any: it carries the attributes of soft bodies
         bodies = {id(thing.body): thing.body for thing in self.objects}
         self.solver = SolverReduced(self.model, list(bodies.values()), options=options)
-        self.state, self._scratch, self.control = self.model.state(), self.model.state(), self.model.control()
+        self.state: Any = self.model.state()
+        self._scratch, self.control = self.model.state(), self.model.control()
         self.grips = tuple(
             Grips(self.solver, i, slot_count=grip_slots, options=grip_options)
             for i in range(len(self.objects) if grip_slots else 0)
@@ -207,13 +205,13 @@ class SplatScene:
 
     def surface(self, index: int) -> NDArray[np.float64]:
         """Return the surface samples of an object [m], shape (surface_count, 3)."""
-        start = int(getattr(self.model, NAMESPACE).particle_start.numpy()[index])
+        start = int(self.model.softmode.particle_start.numpy()[index])
         count = self.objects[index].body.surface_count
-        return host(self.state.particle_q)[start : start + count].astype(np.float64)
+        return self.state.particle_q.numpy()[start : start + count].astype(np.float64)
 
     def kinetic_energy(self) -> float:
         """Return the kinetic energy of all objects, rho V / 2 sum_k |dq_k/dt|^2 [J]; the functions are orthonormal."""
-        start, qd = getattr(self.model, NAMESPACE).function_start.numpy(), getattr(self.state, NAMESPACE).qd.numpy()
+        start, qd = self.model.softmode.function_start.numpy(), self.state.softmode.qd.numpy()
         total = 0.0
         for placed, first in zip(self.placed, start, strict=True):
             body = placed.body

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import newton
 import numpy as np
@@ -189,7 +188,7 @@ class TableScene:
         self.solver = SolverCoupledReduced(model, bodies, options=config.solver, rigid=rigid)
         self.state: Any = model.state()
         self._scratch: Any = model.state()
-        self.control = model.control()
+        self.control: Any = model.control()
         for state in (self.state, self._scratch):
             newton.eval_fk(model, model.joint_q, model.joint_qd, state)
         self.controller = ArmController(model, self.arm, config.control)
@@ -258,24 +257,15 @@ class TableScene:
     def reset_worlds(self) -> None:
         """Put arm and objects of the worlds in `world_mask` back, objects where `place_position` says; capturable."""
         worlds, data, state = self.world_count, self.model.softmode, self.state
-        control: Any = self.control
         wp.copy(self._solver_mask, self.world_mask, count=worlds)
         self.solver.reset(state, self._solver_mask)
+        place = (self.world_mask, self.place_position, self.place_yaw)
         for o, linear in enumerate(self._linear):
             wp.launch(
                 kernels.place_objects,
                 dim=(worlds, linear.shape[0]),
-                inputs=[
-                    data.function_start,
-                    len(self.objects),
-                    o,
-                    linear,
-                    self.world_mask,
-                    self.place_position,
-                    self.place_yaw,
-                    data.scale,
-                ],
-                outputs=[state.softmode.q, state.softmode.qd, control.softmode.q_driven],
+                inputs=[data.function_start, len(self.objects), o, linear, *place, data.scale],
+                outputs=[state.softmode.q, state.softmode.qd, self.control.softmode.q_driven],
                 device=self.device,
             )
         self.solver.reduced.update_particles(state)

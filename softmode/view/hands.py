@@ -10,7 +10,7 @@ from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.tools.grips import Grip, Grips
 from softmode.errors import ConfigError
 from softmode.scenes.scene import Scene
-from softmode.view.live_types import DragView, Hit, LiveOptions, PinView, finite_vector, vector3
+from softmode.view.live_types import DragView, Hit, LiveOptions, PinView, finite_vector
 
 KeptPin = tuple[Grip, NDArray[np.float64], NDArray[np.float64]]
 """A pin with its position [m] and rotation, a quaternion xyzw."""
@@ -83,7 +83,7 @@ class Hands:
         if self._drag is None:
             raise ConfigError("nothing is dragged", hint="call begin_drag with a hit of pick")
         index, grip, offset = self._drag
-        self._grips(index).aim(grip, vector3("point", point) - offset)
+        self._grips(index).aim(grip, finite_vector("point", point) - offset)
 
     def end_drag(self) -> None:
         """Stop pulling."""
@@ -126,7 +126,7 @@ class Hands:
         if wxyz is not None:
             w, x, y, z = unit_quaternion(wxyz)
             turn = (x, y, z, w)
-        self._grips(index).aim(grip, vector3("position", position), turn)
+        self._grips(index).aim(grip, finite_vector("position", position), turn)
 
     def unpin(self, pin: int) -> None:
         """Let a region go."""

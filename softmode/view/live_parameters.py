@@ -16,7 +16,7 @@ from softmode.deformables.solver.parameters import PARAMETER_LIMITS, set_paramet
 from softmode.errors import ConfigError
 from softmode.scenes.host import host
 from softmode.scenes.scene import Scene
-from softmode.view.live_types import LiveParameters, vector3
+from softmode.view.live_types import LiveParameters, finite_vector
 
 LIMITS = {name: PARAMETER_LIMITS[name] for name in ("youngs_modulus", "poissons_ratio", "density", "friction")}
 """Closed ranges of the parameters that other quantities follow, and"""
@@ -40,7 +40,7 @@ def checked(gravity: float | ArrayLike | None, values: dict[str, float | None]) 
         chosen[name] = float(value)
     if gravity is not None:
         downwards = isinstance(gravity, int | float | np.number)
-        vector = vector3("gravity", (0.0, 0.0, -float(gravity)) if downwards else gravity)  # type: ignore[arg-type]
+        vector = finite_vector("gravity", (0.0, 0.0, -float(gravity)) if downwards else gravity)  # type: ignore[arg-type]
         if np.linalg.norm(vector) > GRAVITY_MAX:
             raise ConfigError(f"gravity must be at most {GRAVITY_MAX:g} m/s^2, got {gravity!r}")
         chosen["gravity"] = tuple((vector + 0.0).tolist())

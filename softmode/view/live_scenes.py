@@ -1,10 +1,14 @@
-"""What a live session runs: one object that hangs or falls, or an environment; both take blocks of captured steps."""
+"""What a live session runs: one object that hangs or falls, or an environment; both take blocks of captured steps.
+
+Both have the same face: a scene, whose grips a person uses; `step` takes a block; `over` says when the next episode is
+to begin; `marker_place` where the splats of a goal are.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Protocol, get_args
+from typing import Any, get_args
 
 import numpy as np
 import warp as wp
@@ -19,7 +23,6 @@ from softmode.objects.config import ObjectConfig
 from softmode.objects.placed import Placed
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.fixture import Fixture
-from softmode.scenes.scene import Scene
 from softmode.scenes.splat_scene import SplatScene
 from softmode.scenes.table_scene import TableScene
 from softmode.splats.pinhole import PinholeCamera
@@ -30,55 +33,6 @@ BLOCK_STEPS = 2
 """Physics steps of a block of an object without an environment; even, there and back between two states."""
 HELD_PART = 0.12
 """Part of its height by which a hanging object is held."""
-
-
-class LiveScene(Protocol):
-    """A scene that a session runs block by block, and what there is to tell of it."""
-
-    block_dt: float
-    """Simulated time of a block [s]."""
-    block_steps: int
-    """Physics steps of a block."""
-    marker: Splats | None
-    """Splats that mark a goal, to be put where `marker_place` says."""
-    viewpoints: Sequence[PinholeCamera]
-    """Cameras that show the scene well, if any are known."""
-    terms: dict[str, float]
-    """Terms of the reward in the last block."""
-    success: bool
-    """Whether the task counts as solved."""
-    episode: int
-    """Episodes begun."""
-
-    @property
-    def scene(self) -> Scene:
-        """Model, solver, state, objects and their grips."""
-        ...
-
-    @property
-    def source(self) -> ObjectConfig | None:
-        """What the first object is, None if that is not known."""
-        ...
-
-    def over(self, *, busy: bool) -> bool:
-        """Return whether the next episode is to begin; while a person is busy only a failure ends one."""
-        ...
-
-    def step(self) -> None:
-        """Take a block."""
-        ...
-
-    def reset(self) -> None:
-        """Start over; grips have been let go."""
-        ...
-
-    def marker_place(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the marker's centres before they are placed [m] (M, 3), and its pose: position, quaternion xyzw."""
-        ...
-
-    def close(self) -> None:
-        """Let go of what is held open."""
-        ...
 
 
 def grip_slots(options: LiveOptions) -> int:
@@ -276,3 +230,7 @@ class EnvScene:
     def close(self) -> None:
         """Close the environment."""
         self._env.close()
+
+
+LiveScene = ObjectScene | EnvScene
+"""What a session runs."""

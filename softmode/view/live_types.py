@@ -167,7 +167,7 @@ class LiveStatus:
 Vector = NDArray[np.float64]
 
 
-def finite_vector(name: str, value: ArrayLike, count: int) -> Vector:
+def finite_vector(name: str, value: ArrayLike, count: int = 3) -> Vector:
     """Return finite numbers as float64.
 
     Args:
@@ -185,8 +185,3 @@ def finite_vector(name: str, value: ArrayLike, count: int) -> Vector:
     if numbers.shape != (count,) or not np.isfinite(numbers).all():
         raise ConfigError(f"{name} must be {'three' if count == 3 else 'four'} finite numbers, got {value!r}")
     return numbers
-
-
-def vector3(name: str, value: ArrayLike) -> Vector:
-    """Return three finite numbers as float64; raises a ConfigError that names them if they are not."""
-    return finite_vector(name, value, 3)

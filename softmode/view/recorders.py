@@ -6,7 +6,6 @@ import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 import newton
 import numpy as np
@@ -21,31 +20,12 @@ from softmode.scenes.scene import Scene
 from softmode.splats.camera import CameraOptions, SplatCamera
 from softmode.splats.pinhole import PinholeCamera
 from softmode.view.live_recording import LiveRecording
-from softmode.view.live_types import vector3
+from softmode.view.live_types import finite_vector
 from softmode.view.picture import LivePicture
 from softmode.viz.film import Film
 
 RECORD_HZ = 30
 """Frames per simulated second."""
-
-
-class Recorder(Protocol):
-    """What takes frames until it is finished or discarded."""
-
-    path: Path
-    count: int
-
-    def add(self, time: float, state: newton.State) -> None:
-        """Take a frame at a time [s]; the picture has been updated."""
-        ...
-
-    def finish(self) -> None:
-        """Put the file in place."""
-        ...
-
-    def discard(self) -> None:
-        """Leave nothing behind."""
-        ...
 
 
 class CoordinateRecorder:
@@ -136,6 +116,10 @@ class UsdRecorder:
         """Nothing was written that is not whole."""
 
 
+Recorder = CoordinateRecorder | FilmRecorder | UsdRecorder
+"""What takes frames until it is finished, which puts the file in place, or discarded, which leaves nothing."""
+
+
 def make_recorder(path: Path, scene: Scene, picture: LivePicture, camera: Callable[[], PinholeCamera]) -> Recorder:
     """Return what records a scene to a file of that kind.
 
@@ -187,7 +171,7 @@ def live_camera(
         lens = {"fx": x * shown.fx, "fy": y * shown.fy, "cx": x * shown.cx, "cy": y * shown.cy}
         return replace(shown, name="live", width=edge, height=edge, **lens)
     middle, reach = bounds.mean(axis=0), float(np.linalg.norm(bounds[1] - bounds[0]))
-    eye = middle + reach * np.array([0.9, -1.3, 0.5]) if position is None else vector3("position", position)
-    at = middle if target is None else vector3("target", target)
+    eye = middle + reach * np.array([0.9, -1.3, 0.5]) if position is None else finite_vector("position", position)
+    at = middle if target is None else finite_vector("target", target)
     (x, y, z), (u, v, w) = eye.tolist(), at.tolist()
     return PinholeCamera.look_at("live", position=(x, y, z), target=(u, v, w), width=edge, height=edge, fov_y=0.7)

@@ -40,7 +40,7 @@ from softmode.view.live_types import (
     PinView,
     SceneName,
     SplatPicture,
-    vector3,
+    finite_vector,
 )
 from softmode.view.pace import Pace
 from softmode.view.picture import LivePicture
@@ -285,7 +285,7 @@ class LiveSession:
         Raises:
             ConfigError: If they are not finite, or the direction is zero.
         """
-        start, way = vector3("origin", origin), vector3("direction", direction)
+        start, way = finite_vector("origin", origin), finite_vector("direction", direction)
         length = float(np.linalg.norm(way))
         if length < 1e-12:
             raise ConfigError("direction is zero", hint="give the direction of the ray")

@@ -98,44 +98,6 @@ class Moment:
     """Value of the timeline "sim_time" [s]."""
 
 
-class Source(Protocol):
-    """What a logger reads."""
-
-    model: newton.Model
-    name: str
-    """Name of the recording."""
-
-    @property
-    def solver(self) -> Solver:
-        """What moves the soft bodies."""
-        ...
-
-    @property
-    def objects(self) -> Sequence[SoftObject | None]:
-        """The soft bodies of a world, None for one without splats."""
-        ...
-
-    def moment(self, state: newton.State | None, time: float | None) -> Moment:
-        """Return the present moment."""
-        ...
-
-    def cameras(self) -> Sequence[SplatCamera]:
-        """Return the cameras, with pictures of the present moment."""
-        ...
-
-    def marker(self, world: int) -> Splats | None:
-        """Return the splats that mark a goal."""
-        ...
-
-    def scalars(self, world: int) -> Numbers:
-        """Return numbers by path."""
-        ...
-
-    def remarks(self, world: int) -> Sequence[tuple[str, str]]:
-        """Return lines of text with their level."""
-        ...
-
-
 class SceneSource:
     """A :class:`RerunScene`."""
 
@@ -237,6 +199,10 @@ class TaskSource:
         return {
             name: " ".join(f"{v:.3g}" for v in np.atleast_1d(values[table.columns(name)])) for name in table.parameters
         }
+
+
+Source = SceneSource | TaskSource
+"""What a logger reads: model, solver and objects, the present moment, pictures, the marker of a goal, numbers, text."""
 
 
 def solver_scalars(solver: Solver, world: int) -> Numbers:
