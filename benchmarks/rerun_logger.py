@@ -29,13 +29,14 @@ from softmode.viz.rerun_logger import RerunLogger, RerunOptions
 
 def many_splats(count: int) -> SoftObject:
     """Return the plush with as many splats as asked for, each a jittered copy of one of its own."""
-    thing, rng = load(size=0.08), np.random.default_rng(0)
-    pick = rng.integers(thing.splats.count, size=count)
-    source = thing.splats.subset(pick) if count <= thing.splats.count else None
-    arrays = {name: getattr(thing.splats, name)[pick] for name in ("quats", "scales", "opacities", "sh")}
-    means = thing.splats.means[pick] + 0.3 * thing.splats.scales[pick] * rng.normal(size=(count, 3))
+    thing, rng = load(size=0.08, material=Material(youngs_modulus=3.0e4, density=250.0)), np.random.default_rng(0)
+    rest = thing.visible_splats
+    pick = rng.integers(rest.count, size=count)
+    source = rest.subset(pick) if count <= rest.count else None
+    arrays = {name: getattr(rest, name)[pick] for name in ("quats", "scales", "opacities", "sh")}
+    means = rest.means[pick] + 0.3 * rest.scales[pick] * rng.normal(size=(count, 3))
     splats = source if source is not None else Splats(means=means.astype(np.float32), **arrays, name="many")
-    return replace(thing, splats=splats, material=Material(youngs_modulus=3.0e4, density=250.0))
+    return replace(thing, splats=splats)
 
 
 def measure(record: Callable[[], None], step: Callable[[], None], frames: int) -> tuple[float, float]:

@@ -42,7 +42,7 @@ class Deformed:
     def __init__(self, file: str | None = None, *, mode_count: int = 16) -> None:
         """Reduce the object and fit the coordinates of each world."""
         self.thing = load(file, build=BuildOptions(mode_count=mode_count))
-        splats = self.thing.splats
+        splats = self.thing.visible_splats
         x = splats.means.astype(np.float64)
         self.height = float(np.ptp(x[:, 2]))
         motions = [x]
@@ -69,7 +69,7 @@ class Deformed:
             fov_y=2.0 * math.atan(1.0 / 3.0),
         )
         views = ViewArrays.from_cameras([camera] * self.worlds, world=range(self.worlds), background=(0.85, 0.88, 0.92))
-        rasterizer = SplatRasterizer(self.thing.splats.count, self.worlds, size, size)
+        rasterizer = SplatRasterizer(self.thing.visible_splats.count, self.worlds, size, size)
         rasterizer.render(self.bound.arrays, views)
         return np.clip(rasterizer.rgb.numpy(), 0.0, 1.0)
 

@@ -7,7 +7,6 @@ Run: ``python examples/drop_a_splat.py [FILE] [--size 0.1] [--video out/drop_a_s
 """
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 import newton
@@ -30,7 +29,7 @@ class Drop:
 
     def __init__(self, file: str | None, *, size: float, edge: int) -> None:
         """Reduce the object and hang it 1.5 sizes over the table."""
-        self.thing = replace(load(file, size=size), material=FOAM)
+        self.thing = load(file, size=size, material=FOAM)
         self.fall = 1.5 * size
         world = newton.ModelBuilder()
         world.default_shape_cfg.mu = 0.8

@@ -70,8 +70,7 @@ def make_scene(splat: str | None, seed: int, height: int, device: str | None) ->
         stuff = Material(youngs_modulus=modulus, poissons_ratio=0.35, density=250.0, friction=0.3)
         shown = thing.visible_splats
         dyed = replace(shown, sh=np.roll(shown.sh, i // 2, axis=2))  # red, green and blue change places
-        toy = replace(thing, material=stuff).recolored(dyed)
-        placed.append(Placed(object=toy, position=place, rotation=turn))
+        placed.append(Placed(object=replace(thing, material=stuff, splats=dyed), position=place, rotation=turn))
     eye, target, width = (0.18, -1.6, 0.75), (0.0, 0.0, 0.54), height // 40 * 24
     camera = PinholeCamera.look_at("film", position=eye, target=target, width=width, height=height, fov_y=0.70)
     light = CameraOptions(light_direction=(-0.2, 0.7, -0.7), mesh_samples=4, splat_shadow=ShadowOptions(cells=200))

@@ -61,10 +61,10 @@ def make_scene(splat: str | None, seed: int, size: int, device: str | None) -> S
         turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()
         modulus = float(np.exp(rng.uniform(np.log(3.0e4), np.log(3.0e5))))
         stuff = Material(youngs_modulus=modulus, poissons_ratio=0.35, density=250.0)
-        toy = replace(thing, material=stuff)
-        if name.endswith("bear"):  # red, green and blue change places
-            shown = thing.visible_splats
-            toy = toy.recolored(replace(shown, sh=np.roll(shown.sh, i, axis=2)))
+        shown = thing.visible_splats
+        if name.endswith("bear"):
+            shown = replace(shown, sh=np.roll(shown.sh, i, axis=2))  # red, green and blue change places
+        toy = replace(thing, material=stuff, splats=shown)
         placed.append(Placed(object=toy, position=place, rotation=turn))
     eye, target = (0.38, -0.28, 0.46), (0.0, 0.0, 0.085)
     camera = PinholeCamera.look_at("film", position=eye, target=target, width=size, height=size, fov_y=0.72)

@@ -15,6 +15,7 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.cache import cached_body
+from softmode.deformables.materials.material import Material
 from softmode.objects.config import ObjectConfig
 from softmode.objects.object_file import file_kind, read_object, surface_cover
 from softmode.objects.soft_object import SoftObject
@@ -34,13 +35,18 @@ Progress = Callable[[str, float], None] | bool | None
 
 
 def load(
-    source: Source | str | os.PathLike[str] | None = None, *, progress: Progress = None, **options: Any
+    source: Source | str | os.PathLike[str] | None = None,
+    *,
+    material: Material | None = None,
+    progress: Progress = None,
+    **options: Any,
 ) -> SoftObject:
     """Return a soft object: read or make its splats, build or recall its body.
 
     Args:
         source: A configuration; a file of splats, of a point cloud, of a mesh or of a body, or an OpenUSD stage with
             any of these; a body; splats or a mesh (also of trimesh) in memory; None for the built-in plush.
+        material: What it is made of; None for what its file says.
         progress: Passed to :func:`softmode.deformables.build.build_body.build_body`.
         options: Fields of `ObjectConfig`, such as ``size=0.08``; they replace those of a configuration. A body takes
             only ``contact_radius``.
@@ -54,13 +60,17 @@ def load(
         TypeError: If the source is none of these, or there is no such option.
     """
     if isinstance(source, ReducedBody):
-        found = SoftObject(body=source, **options)
-        return found if found.splats is not None else replace(found, splats=surface_cover(source))
+        return SoftObject(body=source, splats=surface_cover(source), material=material, **options)
     config = object_config(source, **options)
     if config.body is not None:
         found = read_object(config.body)
-        splats = found.splats or surface_cover(found.body)
-        return replace(found, splats=splats, contact_radius=config.contact_radius, config=config)
+        return replace(
+            found,
+            splats=found.splats or surface_cover(found.body),
+            material=material or found.material,
+            contact_radius=config.contact_radius,
+            config=config,
+        )
     parts = object_source(config)
 
     def build() -> ReducedBody:
@@ -77,7 +87,7 @@ def load(
     body = cached_body((RECIPE, *parts.key, may_turn(config), config.surface_count, config.build, *clamp), build)
     turn = np.array(json.loads(str(body.provenance["turn"])))
     splats = splats_of_body(parts.splats, body, turn)
-    return SoftObject(body=body, splats=splats, contact_radius=config.contact_radius, config=config)
+    return SoftObject(body=body, splats=splats, material=material, contact_radius=config.contact_radius, config=config)
 
 
 def object_config(source: Source | str | os.PathLike[str] | None, **options: Any) -> ObjectConfig:

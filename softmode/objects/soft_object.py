@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -69,13 +69,3 @@ class SoftObject:
     def _averages(self) -> tuple[Array, Array]:
         splats = self.visible_splats
         return average_basis(lambda x: self.body.evaluate(x)[0], splats.means, splats.covariances())
-
-    def recolored(self, splats: Splats) -> SoftObject:
-        """Return the object with its splats in other colours, which moves nothing and averages nothing anew.
-
-        Args:
-            splats: Its splats, of the same centres and shapes.
-        """
-        made = replace(self, splats=splats)
-        made.__dict__["_averages"] = self._averages
-        return made

@@ -38,7 +38,7 @@ def make_scene(cube: SoftObject, *places: tuple[float, float, float], **given) -
     world = newton.ModelBuilder()
     world.add_ground_plane()
     red = replace(cube, material=STUFF)
-    green = red.recolored(replace(cube.visible_splats, sh=cube.visible_splats.sh[:, :, [1, 0, 2]]))
+    green = replace(red, splats=replace(cube.visible_splats, sh=cube.visible_splats.sh[:, :, [1, 0, 2]]))
     things = [Placed(object=green if i % 2 else red, position=p) for i, p in enumerate(places)]
     return SplatScene(world, things, dt=DT, **given)
 

@@ -17,7 +17,8 @@ import pytest
 pytest.importorskip("pxr", reason="needs the extra [usd]")
 
 from softmode.errors import AssetError, ConfigError, MissingExtraError, StorageError
-from softmode.usd import PlacedBody, UsdExportOptions, add_usd, write_usd, writer
+from softmode.objects import Placed, SoftObject
+from softmode.usd import UsdExportOptions, add_usd, write_usd, writer
 from softmode.usd.handles import handles_from_coordinates
 from tests.usd.export_scenes import (
     KINDS,
@@ -37,12 +38,10 @@ Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade = (
 EPSILON = float(np.finfo(np.float32).eps)
 
 
-def placed(kind: str = "affine", *, coefficients: int = 1) -> PlacedBody:
+def placed(kind: str = "affine", *, coefficients: int = 1) -> Placed:
     """Return a bar of an odd material at an odd place."""
-    return PlacedBody(
-        body=small_body(kind),
-        material=MATERIAL,
-        splats=small_splats(coefficients),
+    return Placed(
+        object=SoftObject(body=small_body(kind), material=MATERIAL, splats=small_splats(coefficients)),
         name="toy",
         position=(0.1, -0.2, 0.3),
         rotation=TURN,
@@ -64,7 +63,7 @@ def test_round_trip_is_exact(tmp_path: Path, kind: str, suffix: str, coefficient
     write_usd(tmp_path / f"toy.{suffix}", toy)
     (found,) = add_usd(newton.ModelBuilder(), tmp_path / f"toy.{suffix}").bodies.values()
     assert_same(found.body, toy.body)
-    assert found.material == MATERIAL and found.notes == ()
+    assert found.material == MATERIAL and found.object.notes == ()
     assert found.splats is not None and toy.splats is not None
     assert_same_splats(found.splats, toy.splats)
     np.testing.assert_allclose(found.position, toy.position, rtol=1e-15)

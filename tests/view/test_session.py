@@ -11,7 +11,7 @@ from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, lift_scene
 from softmode.errors import AssetError, ConfigError
-from softmode.objects.soft_object import ObjectConfig, load_object
+from softmode.objects import ObjectConfig, load
 from softmode.splats.formats import write_splats
 from softmode.view.live_recording import LiveRecording
 from softmode.view.live_types import LiveOptions
@@ -190,7 +190,7 @@ def test_pick_finds_the_material_point_of_a_deformed_body(hanging):
     hanging.begin_drag(side(hanging))
     hanging.drag_to(hanging.centre() + np.array([0.05, -0.03, 0.02]))
     settle(hanging)
-    body = load_object(BOX).body
+    body = load(BOX).body
     hit = hanging.pick(hanging.drag().point + np.array([0.0, -1.0, 0.0]), (0.0, 1.0, 0.0))
     x = hit.rest_point + body.evaluate(hit.rest_point[None])[0][0] @ hanging._coordinates("q")
     assert np.linalg.norm(hit.rest_point - x) > 0.1 * SIZE
@@ -391,7 +391,7 @@ def test_handles_change_while_it_moves():
     settle(live, 10)
     before, rest, speed = live.surface(), session().surface(), live._coordinates("qd")
     pins, elapsed = live.pins(), live.status().time
-    body = load_object(BOX).body
+    body = load(BOX).body
     momentum = body.mean_basis @ speed
     live.set_handles(8)
     assert live.parameters.handles == 8 and live.drag() is None
@@ -519,7 +519,7 @@ def test_recordings_that_cannot_be(hanging, tmp_path):
 
 def test_objects_come_from_files(tmp_path):
     """A splat file, a mesh file and a saved body make sessions; a saved body has its own size and handles."""
-    thing = load_object(BOX)
+    thing = load(BOX)
     body = tmp_path / "box.npz"
     thing.body.save(body)
     live = LiveSession.from_object(body, options=PATIENT)
