@@ -59,7 +59,7 @@ class Deformed:
 
     def draw(self, size: int) -> np.ndarray:
         """Draw every world from the front, shape (world, size, size, 3)."""
-        distance = DISTANCE * float(np.ptp(self.thing.splats.means, axis=0).max())
+        distance = DISTANCE * float(np.ptp(self.thing.visible_splats.means, axis=0).max())
         camera = PinholeCamera.look_at(
             "front",
             position=(distance, 0.0, 0.0),

@@ -83,7 +83,9 @@ def main(arguments: list[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
     drop = Drop(given.file, size=given.size, edge=128 if given.short else 480)
-    print(f"{drop.thing.splats.count} splats, {1e3 * drop.weight / GRAVITY:.1f} g, falls {100 * drop.fall:.0f} cm")
+    print(
+        f"{drop.thing.visible_splats.count} splats, {1e3 * drop.weight / GRAVITY:.1f} g, falls {100 * drop.fall:.0f} cm"
+    )
     with Film(given.video) as film:
         rows = drop.run(film, 60)
         film.publish()
