@@ -16,7 +16,8 @@ from softmode.lazy import lazy_names
 
 ROOT = Path(__file__).resolve().parents[1]
 LAZY = tuple(
-    f"softmode.{name}" for name in ("deformables", "splats", "usd", "learning", "viz", "view", "demonstrations")
+    f"softmode.{name}"
+    for name in ("deformables", "splats", "usd", "learning", "viz", "view", "demonstrations", "scenes")
 )
 """Packages whose names are imported when they are first used."""
 
