@@ -240,10 +240,10 @@ def camera_picture(folder: Path, painter: Painter, body: ReducedBody) -> None:
     q[4] += (0.0, 0.005, 0.0)
     found = painter.draw(q)
     picture, axes = figure(4, height=2.7)
-    means = painter.arrays.means.numpy()[0]
+    means = painter.bound.arrays.means.numpy()[0]
     front = np.argsort(means @ np.array([0.21, -0.12, 0.08]))
     side = np.array([0.12, 0.21, 0.0]) / np.hypot(0.12, 0.21)
-    colors = np.clip(0.5 + 0.28209479177387814 * painter.arrays.sh.numpy()[0][:, 0], 0.0, 1.0)
+    colors = np.clip(0.5 + 0.28209479177387814 * painter.bound.arrays.sh.numpy()[0][:, 0], 0.0, 1.0)
     axes[0, 0].scatter(means[front] @ side, means[front, 2], s=4, c=colors[front], lw=0)
     axes[0, 0].set_aspect("equal")
     seen = found["alpha"] > 0.5

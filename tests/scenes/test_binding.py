@@ -87,7 +87,7 @@ def test_other_bodies_are_refused(cube: SoftObject) -> None:
 
 
 def test_a_scene_of_fixtures_with_cameras_of_two_sizes(cube: SoftObject) -> None:
-    """Fixtures alone make a scene: the cube rests on the box; each camera draws it in its own size; a reset lifts it."""
+    """Fixtures alone make a scene: the cube rests on the box; each camera draws in its own size; a reset lifts it."""
     eye = {"position": (0.3, -0.2, 0.2), "target": (0.0, 0.0, 0.03)}
     cameras = [PinholeCamera.look_at(name, width=n, height=n, **eye) for name, n in (("small", 32), ("large", 64))]
     floor = Fixture(label="floor", size=(0.2, 0.2, 0.05), position=(0.0, 0.0, -0.05))

@@ -193,7 +193,7 @@ def test_pick_finds_the_material_point_of_a_deformed_body(hanging):
     settle(hanging)
     body = load(BOX).body
     hit = hanging.pick(hanging.drag().point + np.array([0.0, -1.0, 0.0]), (0.0, 1.0, 0.0))
-    x = hit.rest_point + body.evaluate(hit.rest_point[None])[0][0] @ hanging._coordinates("q")
+    x = hit.rest_point + body.evaluate(hit.rest_point[None])[0][0] @ coordinates(hanging._scene, "q")
     assert np.linalg.norm(hit.rest_point - x) > 0.1 * SIZE
     np.testing.assert_allclose(x, hit.point, atol=5e-3 * SIZE)
 
