@@ -49,13 +49,13 @@ class BoundSplats:
         model: A model with soft bodies, the same in every world; None for states of a single body on their own.
         objects: The soft bodies of a world in the order in which they were added, at least one; None for a body that is
             not shown.
-        worlds: Which worlds; all of them if None. Without a model, each is a state.
+        worlds: Which worlds; all of them if None. Without a model: which states, the first if None.
         others: Splats behind those of the objects, which `update` leaves where they are: a marker, rigid toys.
         sh_degree: Highest degree of the colours, 0 to 3; None for that of the splats.
         device: Warp device where there is no model.
 
     Raises:
-        ConfigError: If the model has other soft bodies, or nothing has splats.
+        ConfigError: If the model has other soft bodies, nothing has splats, or there is no model for several objects.
     """
 
     def __init__(
@@ -73,8 +73,10 @@ class BoundSplats:
         shown = [thing for thing in objects if thing is not None and thing.splats is not None]
         if model is not None:
             starts = _function_starts(model, len(objects), worlds)
+        elif len(shown) == len(objects) == 1:
+            starts = np.array([0] if worlds is None else worlds)[:, None] * shown[0].body.function_count
         else:
-            starts = np.array(worlds)[:, None] * shown[0].body.function_count
+            raise ConfigError(f"there are {len(objects)} objects and no model", hint="give one object that has splats")
         parts = [*(thing.visible_splats for thing in shown), *others]
         self.arrays = SplatArrays.from_splats(parts, world_count=len(starts), sh_degree=sh_degree, device=device)
         """The splats as they are, for cameras and rasterisers."""

@@ -81,9 +81,11 @@ def test_states_without_a_model_are_the_same(cube: SoftObject) -> None:
 
 
 def test_other_bodies_are_refused(cube: SoftObject) -> None:
-    """As many objects as the model has soft bodies in a world."""
+    """As many objects as the model has soft bodies in a world; one where there is no model."""
     with pytest.raises(ConfigError, match="objects names 1 soft bodies, the model has 4 in 2 worlds"):
         BoundSplats(two_cubes(cube, 2)[0], [cube])
+    with pytest.raises(ConfigError, match="2 objects and no model"):
+        BoundSplats(None, [cube, cube])
 
 
 def test_a_scene_of_fixtures_with_cameras_of_two_sizes(cube: SoftObject) -> None:
