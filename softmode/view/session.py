@@ -244,8 +244,8 @@ class LiveSession:
 
     def surface(self, object_index: int = 0) -> NDArray[np.float64]:
         """Return the surface samples of an object as they are now [m], shape (S, 3)."""
-        start = int(getattr(self._scene.model, NAMESPACE).particle_start.numpy()[object_index])
         count = self._object(object_index).body.surface_count
+        start = int(getattr(self._scene.model, NAMESPACE).particle_start.numpy()[object_index])
         return host(self._scene.state.particle_q)[start : start + count].astype(np.float64)
 
     def centre(self, object_index: int = 0) -> NDArray[np.float64]:
