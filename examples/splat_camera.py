@@ -63,16 +63,14 @@ class Scene:
         for _ in range(60):
             solver.step(self.state, after, control, None, DT)
             solver.step(after, self.state, control, None, DT)
-        part = RigidSplats(splats=figure, body="toy", hide_meshes=True)
-        self.toy = RigidSplatsSkin(model, [part])
+        self.toy = RigidSplatsSkin(model, [RigidSplats(splats=figure, body="toy", hide_meshes=True)])
         self.bound = BoundSplats(model, [soft], others=self.toy.objects)
         look, up = PinholeCamera.look_at, (1.0, 0.0, 0.0)
         fixed = look("fixed", position=(0.85, -0.25, 0.25), target=(0.46, 0.015, 0.03), fov_y=0.48)
         wrist = look("wrist", body="link7", position=(0.1, 0.0, 0.03), target=(0.02, 0.0, 0.3), up=up, fov_y=1.0)
         options, median = CameraOptions(segmentation=True, mesh_samples=4), RasterizerOptions(median_depth=True)
-        both = fixed, wrist
         splats, given = self.bound.arrays, {"options": options, "rasterizer_options": median, "randomization": DRAWN}
-        self.camera = SplatCamera(model, splats, both, **given)
+        self.camera = SplatCamera(model, splats, (fixed, wrist), **given)
         self.bound.update(self.state)
         self.toy.launch(self.state, splats)
         self.camera.randomize()
@@ -108,13 +106,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--short", action="store_true", help="two worlds, not four")
     camera = (scene := Scene(2 if parser.parse_args().short else 4)).camera
-    pictures = [camera.images(name).numpy() for name in ("fixed", "wrist")]
     depth, seen = (camera.images("fixed", output).numpy()[..., None] for output in ("depth", "segmentation"))
-    pictures.append(np.where(depth > 0.0, 510.0 * np.clip(1.0 - depth, 0.0, 0.5), 0.0) * np.ones(3))
-    pictures.append((seen + 1) * np.array([97, 61, 151]) % 256)
+    gray = np.where(depth > 0.0, 510.0 * np.clip(1.0 - depth, 0.0, 0.5), 0.0) * np.ones(3)
+    pictures = [*(camera.images(name).numpy() for name in ("fixed", "wrist")), gray, (seen + 1) * (97, 61, 151) % 256]
     Path("out").mkdir(exist_ok=True)
-    sheet = np.hstack([np.vstack(list(column)) for column in pictures])
-    Image.fromarray(sheet.astype(np.uint8)).save("out/splat_camera.png")
+    sheet = np.hstack([np.vstack(list(column)) for column in pictures]).astype(np.uint8)
+    Image.fromarray(sheet).save("out/splat_camera.png")
     print(f"out/splat_camera.png: {camera.world_count} worlds from fixed and wrist cameras, depth, segmentation")
     test_final(scene)
 
