@@ -22,7 +22,7 @@ import softmode  # noqa: F401  (registers the environments)
 from softmode.deformables.materials.material import Material
 from softmode.learning.players import policy_factory
 from softmode.objects import Placed, SoftObject, load
-from softmode.scenes.splat_scene import SplatScene
+from softmode.scenes import SplatScene
 from softmode.splats import Splats
 from softmode.viz.rerun_logger import RerunLogger, RerunOptions
 
@@ -56,9 +56,9 @@ def drop(thing: SoftObject, frames: int, options: RerunOptions, path: Path) -> t
     builder.add_ground_plane()
     place = Placed(object=thing, position=(0.0, 0.0, thing.height + 0.05))
     scene, frame = SplatScene(builder, [place]), iter(range(frames + 1))
-    scene.advance()  # compiles
+    scene.step()  # compiles
     with RerunLogger(path, scene, options=options) as log:
-        return measure(lambda: log.record(scene.state, time=next(frame) / 30.0), scene.advance, frames)
+        return measure(lambda: log.record(scene.state, time=next(frame) / 30.0), scene.step, frames)
 
 
 def lift(frames: int, options: RerunOptions, path: Path) -> tuple[float, float]:

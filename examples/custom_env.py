@@ -20,7 +20,7 @@ from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.task import Segment, Task, TaskConfig
 from softmode.objects import ObjectConfig
-from softmode.scenes.table_scene import TableSceneConfig
+from softmode.scenes import TableSceneConfig
 from softmode.viz import Film
 
 # ----------------------------------------------------------------------------------------------------------------------

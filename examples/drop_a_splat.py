@@ -14,8 +14,8 @@ import numpy as np
 import warp as wp
 
 from softmode.deformables import Material, status_reasons
-from softmode.objects import ObjectConfig, Placed, load
-from softmode.scenes.splat_scene import SplatScene
+from softmode.objects import Placed, load
+from softmode.scenes import SplatScene
 from softmode.splats import CameraOptions, PinholeCamera, ShadowOptions
 from softmode.viz import Film
 
@@ -29,7 +29,7 @@ class Drop:
 
     def __init__(self, file: str | None, *, size: float, edge: int) -> None:
         """Reduce the object and hang it 1.5 sizes over the table."""
-        self.thing = load(ObjectConfig(splat=file, size=size), material=FOAM)
+        self.thing = load(file, size=size, material=FOAM)
         self.fall = 1.5 * size
         world = newton.ModelBuilder()
         world.default_shape_cfg.mu = 0.8
@@ -52,7 +52,7 @@ class Drop:
         rows, frame_dt = [(0.0, *self.measure())], DT * STEPS
         for k in range(frames):
             film.add(self.scene.draw(), round(1.0 / frame_dt))
-            self.scene.advance()
+            self.scene.step()
             rows.append(((k + 1) * frame_dt, *self.measure()))
         return np.array(rows)
 

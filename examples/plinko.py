@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from softmode.deformables import BuildOptions, Material, SolverReducedOptions
 from softmode.objects import ObjectConfig, Placed, load
-from softmode.scenes.splat_scene import Record, SplatScene
+from softmode.scenes import Record, SplatScene
 from softmode.splats import CameraOptions, PinholeCamera, ShadowOptions
 from softmode.viz import Film
 
@@ -68,8 +68,8 @@ def make_scene(splat: str | None, seed: int, height: int, device: str | None) ->
         turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()
         modulus = float(np.exp(rng.uniform(np.log(3.0e4), np.log(3.0e5))))
         stuff = Material(youngs_modulus=modulus, poissons_ratio=0.35, density=250.0, friction=0.3)
-        rest = thing.visible_splats
-        dyed = replace(rest, sh=np.roll(rest.sh, i // 2, axis=2))  # red, green and blue change places
+        shown = thing.visible_splats
+        dyed = replace(shown, sh=np.roll(shown.sh, i // 2, axis=2))  # red, green and blue change places
         placed.append(Placed(object=replace(thing, material=stuff, splats=dyed), position=place, rotation=turn))
     eye, target, width = (0.18, -1.6, 0.75), (0.0, 0.0, 0.54), height // 40 * 24
     camera = PinholeCamera.look_at("film", position=eye, target=target, width=width, height=height, fov_y=0.70)

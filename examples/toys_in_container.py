@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from softmode.deformables import BuildOptions, Material, SolverReducedOptions
 from softmode.objects import ObjectConfig, Placed, load
-from softmode.scenes.splat_scene import Record, SplatScene
+from softmode.scenes import Record, SplatScene
 from softmode.splats import CameraOptions, PinholeCamera, ShadowOptions
 from softmode.viz import Film
 
@@ -57,13 +57,14 @@ def make_scene(splat: str | None, seed: int, size: int, device: str | None) -> S
     placed = []
     for i, name in enumerate(FALLING):
         thing, (layer, cell) = things[name], divmod(i, len(LAYER))
-        rest = thing.visible_splats
-        dyed = replace(rest, sh=np.roll(rest.sh, i, axis=2))  # red, green and blue change places
         place = (*LAYER[cell], 0.17 + 0.13 * layer + (0.04 if cell == 0 else 0.0))
         turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()
         modulus = float(np.exp(rng.uniform(np.log(3.0e4), np.log(3.0e5))))
         stuff = Material(youngs_modulus=modulus, poissons_ratio=0.35, density=250.0)
-        toy = replace(thing, material=stuff, splats=dyed if name.endswith("bear") else rest)
+        shown = thing.visible_splats
+        if name.endswith("bear"):
+            shown = replace(shown, sh=np.roll(shown.sh, i, axis=2))  # red, green and blue change places
+        toy = replace(thing, material=stuff, splats=shown)
         placed.append(Placed(object=toy, position=place, rotation=turn))
     eye, target = (0.38, -0.28, 0.46), (0.0, 0.0, 0.085)
     camera = PinholeCamera.look_at("film", position=eye, target=target, width=size, height=size, fov_y=0.72)

@@ -169,7 +169,7 @@ def play(options: Play) -> int:
             f"youngs-modulus must be a finite number > 0, got {options.youngs_modulus}", hint="give it in Pa, like 2e5"
         )
     if options.rerun is not None:
-        from softmode.viz.rerun_logger import check_target
+        from softmode.viz.rerun_stream import check_target
 
         check_target(options.rerun)
     if options.usd is not None:

@@ -22,7 +22,7 @@ from softmode.deformables.model.authoring import MATERIAL_FIELDS, body_key
 from softmode.errors import ConfigError, SolverDiverged
 from softmode.objects.placed import Placed
 from softmode.objects.stage_scene import shortest
-from softmode.scenes.skinned_splats import SkinnedSplats
+from softmode.scenes.binding import splats_of_states
 from softmode.splats.formats.usd import set_splat_column, splat_columns
 from softmode.stages import tokens
 from softmode.stages.openusd import Layer, Stage
@@ -297,7 +297,7 @@ class UsdAnimation:
         prim = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath(f"{path}/Splats"))
         turning = placed.splats.sh_degree > 0
         near, waiting = placed.splats.quats, 0.0
-        for code, splats in zip(codes, SkinnedSplats(placed.body, placed.splats).frames(local), strict=True):
+        for code, splats in zip(codes, splats_of_states(placed.object, local), strict=True):
             columns = splat_columns(splats, near=near)
             near = columns["orientations"]
             del columns["opacities"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import tempfile
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from softmode.errors import AssetError, ConfigError
 from softmode.objects.soft_object import SoftObject
 from softmode.objects.stage_bundle import body_of
-from softmode.scenes.skinned_splats import SkinnedSplats
+from softmode.scenes.binding import splats_of_states
 from softmode.splats.formats.usd import splats_from_prim
 from softmode.splats.splats import MAX_SPLATS, Splats
 from softmode.stages import process
@@ -37,12 +36,6 @@ class PlayedBody:
     coordinates: Array
     """Reduced coordinates in the world, as in `state.softmode.q` [m], shape (F, n, 3)."""
 
-    @cached_property
-    def _skinned(self) -> SkinnedSplats:
-        if self.object.splats is None:
-            raise ConfigError(f"{self.path} has no splats", hint="record it with an object that has")
-        return SkinnedSplats(self.object.body, self.object.splats)
-
     def splats_at(self, frame: int) -> Splats:
         """Return its splats in the world in one frame.
 
@@ -51,7 +44,7 @@ class PlayedBody:
         """
         if not -len(self.times) <= frame < len(self.times):
             raise ConfigError(f"frame is {frame}, there are {len(self.times)}")
-        return next(self._skinned.frames(self.coordinates[frame][None]))
+        return next(splats_of_states(self.object, self.coordinates[frame][None]))
 
     def points_at(self, frame: int) -> Array:
         """Return its surface samples in the world in one frame [m], shape (S, 3)."""

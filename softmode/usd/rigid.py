@@ -8,7 +8,7 @@ import newton
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.scenes.scene_meshes import SceneMesh, scene_meshes
+from softmode.scenes.meshes import SceneMesh, scene_meshes
 from softmode.splats.splats import rotations_from_quats
 from softmode.stages.openusd import Stage
 from softmode.usd.openusd import openusd

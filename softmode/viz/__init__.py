@@ -12,7 +12,8 @@ from softmode.lazy import lazy_names
 if TYPE_CHECKING:
     from softmode.viz.body_picture import write_body_picture
     from softmode.viz.film import Film
-    from softmode.viz.rerun_logger import RerunLogger, RerunOptions
+    from softmode.viz.rerun_logger import RerunLogger
+    from softmode.viz.rerun_options import RerunOptions
     from softmode.viz.rerun_sources import RerunScene
 
 __all__ = [
@@ -28,7 +29,7 @@ __getattr__, __dir__ = lazy_names(
     {
         "Film": ".film",
         "RerunLogger": ".rerun_logger",
-        "RerunOptions": ".rerun_logger",
+        "RerunOptions": ".rerun_options",
         "RerunScene": ".rerun_sources",
         "write_body_picture": ".body_picture",
     },
