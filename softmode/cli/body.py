@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from softmode.errors import AssetError, ConfigError
+from softmode.errors import ConfigError
+from softmode.files import check_place
 
 if TYPE_CHECKING:
     from softmode.deformables.body.reduced_body import ReducedBody
@@ -243,10 +243,6 @@ def _check_target(path: Path, suffix: str, source: Path) -> None:
     """Refuse a file that cannot be written, or that is the source, before any work is done."""
     if path.suffix.lower() != suffix:
         raise ConfigError(f"out {path} is no {suffix} file", hint=f"name it like toy{suffix}")
-    folder = path.absolute().parent
-    if not folder.is_dir():
-        raise AssetError(f"{path}: there is no folder {folder}", hint="make the folder first")
-    if path.is_dir() or not os.access(folder, os.W_OK):
-        raise AssetError(f"{path}: cannot be written there", hint="choose another name or folder")
+    check_place(path, "file", make_folders=False)
     if path.exists() and source.exists() and path.samefile(source):
         raise ConfigError(f"{path} is the file that is read", hint="choose another name with --out")

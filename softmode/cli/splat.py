@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from pathlib import Path
 from typing import Literal
 
 from softmode.errors import AssetError, ConfigError
+from softmode.files import check_place
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -145,8 +145,4 @@ def _check_target(path: Path) -> None:
             f"splat file {path}: cannot write {path.suffix or '(no suffix)'!r}",
             hint=f"name it like toy.ply; writable are {', '.join(WRITABLE)}",
         )
-    folder = path.absolute().parent
-    if not folder.is_dir():
-        raise AssetError(f"splat file {path}: there is no folder {folder}", hint="make the folder first")
-    if path.is_dir() or not os.access(folder, os.W_OK):
-        raise AssetError(f"splat file {path}: cannot be written there", hint="choose another name or folder")
+    check_place(path, "splat file", make_folders=False)

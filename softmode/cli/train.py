@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from softmode.cli.common import quiet_warp
-from softmode.errors import ConfigError, StorageError
+from softmode.errors import ConfigError
 from softmode.learning.players import require_torch
 
 
@@ -152,13 +152,7 @@ class Export:
         if self.out.exists():
             raise ConfigError(f"{self.out} exists", hint="remove it, or write another file")
         load_policy(self.checkpoint)  # refuses a file whose actor does not fit its header
-        try:
-            self.out.parent.mkdir(parents=True, exist_ok=True)
-            write_checkpoint(policy_only(read_checkpoint(self.checkpoint)), self.out)
-        except OSError as error:
-            raise StorageError(
-                f"{self.out} cannot be written ({error.strerror or error})", hint="choose another folder"
-            ) from error
+        write_checkpoint(policy_only(read_checkpoint(self.checkpoint)), self.out)
         print(f"{self.out}: {self.out.stat().st_size / 1e3:.0f} kB")
         return 0
 

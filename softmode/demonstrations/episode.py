@@ -14,7 +14,8 @@ from softmode.demonstrations import schema
 from softmode.demonstrations.pictures import FilmWriter, encode_png
 from softmode.demonstrations.schema import INDEX_FEATURES, Feature
 from softmode.demonstrations.statistics import PictureStatistics, Statistics, number_statistics
-from softmode.errors import ConfigError, StorageError
+from softmode.errors import ConfigError
+from softmode.files import storage_errors
 
 
 class Episode:
@@ -59,10 +60,8 @@ class Episode:
     def _film(self, name: str) -> FilmWriter:
         """Return the film of a camera."""
         if name not in self.films:
-            try:
+            with storage_errors(self._stage, hint="free some space"):
                 self._stage.mkdir(exist_ok=True)
-            except OSError as error:
-                raise StorageError(f"{self._stage} cannot be made: {error.strerror}", hint="free some space") from error
             height, width, _ = self._features[name].shape
             self.films[name] = FilmWriter(self._stage / f"{name}.mp4", height, width, self._fps)
         return self.films[name]

@@ -16,6 +16,7 @@ from softmode.deformables.body.regions import Region
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.errors import AssetError, ConfigError
+from softmode.files import read_arrays
 from softmode.objects.soft_object import ObjectConfig, object_source, read_cropped, shown_splats, standing_quadrature
 from softmode.splats.formats import READABLE
 from softmode.splats.point_cloud import ply_kind
@@ -68,13 +69,8 @@ def file_kind(path: str | Path) -> FileKind:
         raise AssetError(f"file {file}: no such file", hint="check the path")
     suffix = file.suffix.lower()
     if suffix == ".npz":
-        try:
-            with np.load(file, allow_pickle=False) as stored:
-                return "points" if "points" in stored.files and "header" not in stored.files else "body"
-        except Exception as error:  # whatever a damaged archive leads zipfile, zlib and numpy to
-            raise AssetError(
-                f"file {file}: damaged or not an .npz ({type(error).__name__}: {error})", hint="build or write it again"
-            ) from error
+        found = read_arrays(file, ("points", "header"), hint="build or write it again")
+        return "points" if set(found) == {"points"} else "body"
     if suffix == ".ply":
         found = ply_kind(file)
         return "splat" if found == "splats" else "mesh" if found == "mesh" else "points"

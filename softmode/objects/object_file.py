@@ -6,7 +6,6 @@ import os
 
 import numpy as np
 
-from softmode.deformables.body.file import read_beside, write_body
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.errors import AssetError
 from softmode.splats.point_cloud import splats_from_points
@@ -26,7 +25,7 @@ def write_object(path: str | os.PathLike[str], body: ReducedBody, splats: Splats
         splats: Its splats in the body frame; None writes the body alone, as `ReducedBody.save` does.
     """
     fields = {} if splats is None else {f"splats.{name}": getattr(splats, name) for name in _FIELDS}
-    write_body(body, path, beside=fields)
+    body.save(path, beside=fields)
 
 
 def read_object(path: str | os.PathLike[str]) -> tuple[ReducedBody, Splats | None]:
@@ -42,8 +41,7 @@ def read_object(path: str | os.PathLike[str]) -> tuple[ReducedBody, Splats | Non
         from softmode.objects.stage_asset import read_usd_body
 
         return read_usd_body(path)
-    body = ReducedBody.load(path)
-    stored = read_beside(path, "splats.")
+    body, stored = ReducedBody.load_with(path)
     if not stored:
         return body, None
     missing = {f"splats.{name}" for name in _FIELDS} ^ set(stored)

@@ -27,7 +27,7 @@ from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.deformables.solver.energies import SoftEnergies
 from softmode.deformables.tools.sensing import ContactSensor
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
-from softmode.errors import ConfigError, MissingExtraError
+from softmode.errors import ConfigError, MissingExtraError, StorageError
 from softmode.learning.players import policy_factory
 from softmode.objects.soft_object import ObjectConfig, load_object
 from softmode.scenes.deformed_splats import DeformedSplats, splat_axes
@@ -384,7 +384,7 @@ def test_bad_input_is_refused(falling: Any, env: Any, tmp_path: Path, monkeypatc
         with pytest.raises(ConfigError, match=next(iter(given))):
             RerunOptions(**given)
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match="cannot be written"):
+    with pytest.raises(StorageError, match="cannot be written"):
         RerunLogger(tmp_path / "file" / "a.rrd", source)
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(MissingExtraError, match=r"softmode\[viz\]"):

@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from softmode.deformables.body.file import FORMAT_VERSION
-from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.body.reduced_body import FORMAT_VERSION, ReducedBody
 from softmode.errors import AssetError, ConfigError
 
 

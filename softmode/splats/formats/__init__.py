@@ -103,7 +103,8 @@ def write_splats(path: str | os.PathLike[str], splats: Splats, *, up: UpAxis = "
             is up and take "+z" only.
 
     Raises:
-        AssetError: If the suffix names no writable format, or the file cannot be written.
+        AssetError: If the suffix names no writable format.
+        StorageError: If the file cannot be written.
         ConfigError: If `up` is no axis, or not "+z" for OpenUSD.
         MissingExtraError: If OpenUSD is to be written without the extra `[usd]`.
     """

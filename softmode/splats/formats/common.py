@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import struct
 import zipfile
 import zlib
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from softmode.errors import AssetError
-from softmode.files import atomic_write
 from softmode.splats.splats import MAX_SPLATS, SH_DC
 
 REEXPORT = "The file is damaged or incomplete: copy or export it again"
@@ -48,18 +46,6 @@ def typed_errors(name: str) -> Iterator[None]:
         raise AssetError(f"splat file {name}: cannot be read ({error})", hint=REEXPORT) from error
     except (ValueError, OverflowError, MemoryError, Image.DecompressionBombError) as error:
         raise AssetError(f"splat file {name}: holds invalid data ({error})", hint=REEXPORT) from error
-
-
-@contextlib.contextmanager
-def atomic_splat_file(path: str | os.PathLike[str]) -> Iterator[Any]:
-    """Yield a binary file that takes the place of `path` when complete; what fails raises AssetError."""
-    try:
-        with atomic_write(path) as file:
-            yield file
-    except OSError as error:
-        raise AssetError(
-            f"splat file {path}: cannot be written ({error})", hint="Check the folder and its permissions"
-        ) from error
 
 
 def check_count(count: int, name: str) -> int:

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.errors import AssetError
+from softmode.files import whole_file
 from softmode.splats.formats.common import (
     REEXPORT,
-    atomic_splat_file,
     exp_scales,
     quats_from_smallest_three,
     sh_from_colors,
@@ -116,7 +116,7 @@ def write_compressed_ply(path: str | os.PathLike[str], splats: Splats) -> None:
         splats: What to write, in its own frame.
 
     Raises:
-        AssetError: If the file cannot be written.
+        StorageError: If the file cannot be written.
     """
     starts = np.arange(0, splats.count, _CHUNK)
     row = np.arange(splats.count) // _CHUNK
@@ -155,7 +155,7 @@ def write_compressed_ply(path: str | os.PathLike[str], splats: Splats) -> None:
     lines += [f"element vertex {splats.count}", *(f"property uint {name}" for name in _PACKED)]
     if rest.shape[1]:
         lines += [f"element sh {splats.count}", *(f"property uchar f_rest_{i}" for i in range(rest.shape[1]))]
-    with atomic_splat_file(path) as file:
+    with whole_file(path, "splat file", make_folders=False) as file:
         file.write("\n".join([*lines, "end_header\n"]).encode("ascii"))
         file.write(chunk.astype("<f4").tobytes())
         file.write(vertex.astype("<u4").tobytes())

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.errors import AssetError
+from softmode.files import whole_file
 from softmode.splats.formats.common import (
     REEXPORT,
-    atomic_splat_file,
     check_count,
     exp_scales,
     read_exactly,
@@ -184,7 +184,7 @@ def write_ply(path: str | os.PathLike[str], splats: Splats) -> None:
         splats: What to write, in its own frame.
 
     Raises:
-        AssetError: If the file cannot be written.
+        StorageError: If the file cannot be written.
     """
     opacity = np.clip(splats.opacities.astype(np.float64), 1e-6, 1.0 - 1e-6)
     rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(splats.count, -1)
@@ -202,6 +202,6 @@ def write_ply(path: str | os.PathLike[str], splats: Splats) -> None:
         table[name] = column
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {splats.count}"]
     header = "\n".join([*lines, *(f"property float {name}" for name in named), "end_header\n"])
-    with atomic_splat_file(path) as file:
+    with whole_file(path, "splat file", make_folders=False) as file:
         file.write(header.encode("ascii"))
         file.write(table.tobytes())

@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.errors import AssetError, ConfigError, MissingExtraError
+from softmode.files import whole_file
 from softmode.splats.formats.common import (
     FREE_BYTES,
     MAX_RATIO,
     REEXPORT,
-    atomic_splat_file,
     check_count,
     exp_scales,
     quats_from_smallest_three,
@@ -239,7 +239,8 @@ def write_spz(path: str | os.PathLike[str], splats: Splats, *, version: Literal[
         version: 3 (gzip; the one that nearly every viewer reads) or 4 (Zstandard).
 
     Raises:
-        AssetError: If the file cannot be written, or a coordinate exceeds the format's 8388607 m.
+        AssetError: If a coordinate exceeds the format's 8388607 m.
+        StorageError: If the file cannot be written.
         ConfigError: If the version is neither 3 nor 4.
         MissingExtraError: If version 4 is asked for without Zstandard.
     """
@@ -274,7 +275,7 @@ def write_spz(path: str | os.PathLike[str], splats: Splats, *, version: Literal[
         frames = [zstd.compress(array) for array in arrays]
         table = b"".join(_ENTRY.pack(len(f), len(a)) for f, a in zip(frames, arrays, strict=True))
         packed = _HEADER_4.pack(*fields, len(arrays), _HEADER_4.size) + table + b"".join(frames)
-    with atomic_splat_file(path) as file:
+    with whole_file(path, "splat file", make_folders=False) as file:
         file.write(packed)
 
 

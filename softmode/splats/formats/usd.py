@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.errors import AssetError, ConfigError, MissingExtraError
-from softmode.splats.formats.common import REEXPORT, atomic_splat_file, typed_errors
+from softmode.files import whole_file
+from softmode.splats.formats.common import REEXPORT, typed_errors
 from softmode.splats.splats import MAX_SPLATS, Splats, UpAxis, rotate_sh, up_rotation
 from softmode.stages import process
 
@@ -178,7 +179,7 @@ def write_usd(path: str | os.PathLike[str], splats: Splats | Sequence[Splats], *
         fps: Frames per second of an animation.
 
     Raises:
-        AssetError: If the file cannot be written.
+        StorageError: If the file cannot be written.
         ConfigError: If there are no frames, they differ in count or degree, or `fps` is not positive.
         MissingExtraError: If the extra `[usd]` is not installed.
     """
@@ -194,7 +195,7 @@ def write_usd(path: str | os.PathLike[str], splats: Splats | Sequence[Splats], *
     if suffix not in (".usd", ".usda", ".usdc"):
         raise AssetError(f"splat file {path}: cannot write {suffix!r}", hint="Name a .usdc, .usda or .usd file")
     process.pxr_folder()
-    with atomic_splat_file(path) as file, tempfile.TemporaryDirectory() as folder:
+    with whole_file(path, "splat file", make_folders=False) as file, tempfile.TemporaryDirectory() as folder:
         scratch = os.path.join(folder, "splats" + suffix)
         if not _build_layer(frames, fps).Export(scratch):
             raise OSError("OpenUSD could not write it")
