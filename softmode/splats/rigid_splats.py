@@ -38,7 +38,7 @@ class RigidSplats:
 
     def in_body(self) -> Splats:
         """Return the splats in the frame of the body, view-dependent colour turned along."""
-        return self.splats.transformed(rotation=rotations_from_quats([self.quat])[0], translation=self.position)
+        return self.splats.transformed(rotation=rotations_from_quats(self.quat), translation=self.position)
 
 
 class RigidSplatsSkin:

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from softmode.errors import AssetError, ConfigError
 from softmode.splats.principal_axes import axes_of_covariances, axes_of_gradients, nearest_rotations
@@ -178,7 +179,7 @@ class Splats:
         means = scale * self.means.astype(np.float64) @ matrix.T + np.asarray(translation, dtype=np.float64)
         quats, sh = self.quats, self.sh
         if rotation is not None:
-            quats = multiply_quats(quat_from_rotation(matrix), self.quats)
+            quats = multiply_quats(quats_from_rotations(matrix), self.quats)
             sh = rotate_sh(self.sh, matrix)
         return replace(self, means=means, quats=quats, scales=self.scales * np.float32(scale), sh=sh)
 
@@ -285,40 +286,13 @@ def up_rotation(up: UpAxis) -> NDArray[np.float64]:
 
 
 def rotations_from_quats(quats: ArrayLike) -> NDArray[np.float64]:
-    """Return rotation matrices, shape (N, 3, 3), of quaternions xyzw, shape (N, 4); normalises them."""
-    q = np.asarray(quats, dtype=np.float64)
-    x, y, z, w = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
+    """Return rotation matrices, shape (..., 3, 3), of quaternions xyzw of any length, shape (..., 4)."""
+    return Rotation.from_quat(np.asarray(quats, dtype=np.float64)).as_matrix()
 
 
 def quats_from_rotations(rotations: ArrayLike) -> NDArray[np.float64]:
-    """Return unit quaternions xyzw, shape (N, 4), of proper rotation matrices, shape (N, 3, 3).
-
-    Takes the largest of the four squared components as pivot, so no rotation is ill-conditioned.
-    """
-    m = np.asarray(rotations, dtype=np.float64)
-    d = np.diagonal(m, axis1=1, axis2=2)
-    trace = d.sum(axis=1)
-    squares = np.concatenate([1 - trace[:, None] + 2 * d, 1 + trace[:, None]], axis=1)
-    outer = np.empty((len(m), 4, 4))
-    for i in range(4):
-        outer[:, i, i] = squares[:, i]
-    for i, j in ((0, 1), (0, 2), (1, 2)):
-        outer[:, i, j] = outer[:, j, i] = m[:, i, j] + m[:, j, i]
-    for i, (j, k) in enumerate(((2, 1), (0, 2), (1, 0))):
-        outer[:, i, 3] = outer[:, 3, i] = m[:, j, k] - m[:, k, j]
-    row = outer[np.arange(len(m)), squares.argmax(axis=1)]
-    return row / np.linalg.norm(row, axis=1, keepdims=True)
-
-
-def quat_from_rotation(rotation: ArrayLike) -> NDArray[np.float64]:
-    """Return the unit quaternion xyzw, shape (4,), of one proper rotation matrix."""
-    return quats_from_rotations(np.asarray(rotation, dtype=np.float64)[None])[0]
+    """Return unit quaternions xyzw, shape (..., 4), of proper rotation matrices, shape (..., 3, 3)."""
+    return Rotation.from_matrix(np.asarray(rotations, dtype=np.float64)).as_quat()
 
 
 def multiply_quats(left: ArrayLike, right: ArrayLike) -> NDArray[np.float64]:

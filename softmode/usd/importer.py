@@ -28,7 +28,7 @@ from softmode.objects.stage_asset import colored_mesh
 from softmode.objects.stage_bundle import body_of
 from softmode.objects.stage_scene import UsdDeformable, UsdScene, open_scene
 from softmode.splats.mesh_samples import sample_mesh
-from softmode.splats.splats import Splats, quat_from_rotation
+from softmode.splats.splats import Splats, quats_from_rotations
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -160,7 +160,7 @@ def add_usd(
             _build(deformable, build_options or BuildOptions(), material, surface_count, splat_count, progress)
             for deformable in scene.deformables
         ]
-        options["xform"] = wp.transform(wp.vec3(*shift), wp.quat(*quat_from_rotation(turn)))
+        options["xform"] = wp.transform(wp.vec3(*shift), wp.quat(*quats_from_rotations(turn)))
         rest = _add_rest(builder, os.path.join(folder, "rest.usdc"), str(path), options)
     bodies = {}
     for made in ready:

@@ -63,7 +63,7 @@ class LivePicture:
                 first_splat=int(self.first[i]),
             )
         if self._marker is not None:
-            turn = rotations_from_quats(marker_pose[None, 3:])[0]
+            turn = rotations_from_quats(marker_pose[3:])
             at: Any = slice(int(self.first[-2]), int(self.first[-1]))
             C = turn @ self._marker @ turn.T
             six = C.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]

@@ -1,4 +1,10 @@
-"""GMRES for the linear systems of all instances at once, preconditioned by the solver's float32 Cholesky factor."""
+"""GMRES for the linear systems of all instances at once, preconditioned by the solver's float32 Cholesky factor.
+
+Warp's own (`warp.optim.linear.gmres`) reaches the same gradients to 1e-12, but runs whole cycles, where a system here
+stops after any vector: 15 products with H a step at its best cycle length instead of 4, and 3.2 times the time of
+`backward` (8.3 against 2.6 ms a step of the bar of benchmarks/gradients.py on a core). It also goes on with all systems
+until the worst has converged, so that a world of a batch would not have the bits of a single world.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any
