@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
+from softmode.cli.common import short_name
 from softmode.errors import ConfigError
 from softmode.files import check_place
 
@@ -16,13 +17,6 @@ if TYPE_CHECKING:
     from softmode.deformables.build.report import BodyReport
     from softmode.objects.object_build import StifferBox
     from softmode.splats.splats import Splats
-
-
-def _short(name: str) -> Any:
-    """Return what gives an option a short name; evaluated when tyro reads the annotation, not on import."""
-    import tyro
-
-    return tyro.conf.arg(aliases=[name])
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,7 +65,7 @@ class _Asset:
 class BodyBuild(_Asset):
     """Build the body of a splat file, mesh or point cloud and save it with its splats."""
 
-    out: Annotated[Path | None, _short("-o")] = None
+    out: Annotated[Path | None, short_name("-o")] = None
     """Body file to write, FILE.npz beside the file if omitted; `softmode play --object`, `body show` and `body check`
     take it, and `ReducedBody.load` reads it."""
 
@@ -96,7 +90,7 @@ class BodyBuild(_Asset):
 class BodyShow(_Asset):
     """Draw a body: soft modes, skinning weights, cubature, kernels, spectra, report."""
 
-    out: Annotated[Path | None, _short("-o")] = None
+    out: Annotated[Path | None, short_name("-o")] = None
     """Picture to write, FILE.png beside the file if omitted."""
     youngs_modulus: float = 1.0e5
     """Young's modulus for the frequencies [Pa]."""

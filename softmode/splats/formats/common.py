@@ -26,6 +26,17 @@ MAX_RATIO = 1032
 """Largest ratio of unpacked to packed bytes that a reader accepts: what deflate can reach at most."""
 
 
+def unreadable(path: object, problem: str, hint: str = REEXPORT) -> AssetError:
+    """Return the error of a splat file that cannot be read.
+
+    Args:
+        path: The file.
+        problem: What is wrong.
+        hint: The remedy.
+    """
+    return AssetError(f"splat file {path}: {problem}", hint=hint)
+
+
 @contextlib.contextmanager
 def typed_errors(name: str) -> Iterator[None]:
     """Turn what the file system and the decoders raise on damaged input into AssetError."""
@@ -43,16 +54,15 @@ def typed_errors(name: str) -> Iterator[None]:
         RuntimeError,
         SyntaxError,
     ) as error:
-        raise AssetError(f"splat file {name}: cannot be read ({error})", hint=REEXPORT) from error
+        raise unreadable(name, f"cannot be read ({error})") from error
     except (ValueError, OverflowError, MemoryError, Image.DecompressionBombError) as error:
-        raise AssetError(f"splat file {name}: holds invalid data ({error})", hint=REEXPORT) from error
+        raise unreadable(name, f"holds invalid data ({error})") from error
 
 
 def check_count(count: int, name: str) -> int:
     """Return the declared number of splats if a reader may allocate for it."""
     if not 0 < count <= MAX_SPLATS:
-        raise AssetError(
-            f"splat file {name}: {count} splats, expected 1 to {MAX_SPLATS}", hint="Export the asset again, decimated"
+        raise unreadable(name, f"{count} splats, expected 1 to {MAX_SPLATS}", hint="Export the asset again, decimated"
         )
     return count
 
@@ -61,7 +71,7 @@ def read_exactly(file: Any, size: int, path: Path) -> bytes:
     """Return the next `size` bytes of a file whose size has been checked."""
     data = file.read(size)
     if len(data) != size:
-        raise AssetError(f"splat file {path}: shrank while it was read", hint="Read it again when nothing writes to it")
+        raise unreadable(path, "shrank while it was read", hint="Read it again when nothing writes to it")
     return data
 
 

@@ -11,9 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from softmode.errors import AssetError
 from softmode.files import whole_file
-from softmode.splats.formats.common import REEXPORT, check_count, read_exactly, sh_from_colors
+from softmode.splats.formats.common import check_count, read_exactly, sh_from_colors, unreadable
 from softmode.splats.splats import SH_DC, Splats
 
 _RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("wxyz", "u1", 4)])
@@ -29,7 +28,7 @@ def read_splat(path: str | os.PathLike[str]) -> Splats:
     with open(file_path, "rb") as file:
         size = os.fstat(file.fileno()).st_size
         if size % _RECORD.itemsize:
-            raise AssetError(f"splat file {file_path}: {size} bytes are no multiple of 32", hint=REEXPORT)
+            raise unreadable(file_path, f"{size} bytes are no multiple of 32")
         count = check_count(size // _RECORD.itemsize, str(file_path))
         table = np.frombuffer(read_exactly(file, count * _RECORD.itemsize, file_path), dtype=_RECORD)
     wxyz = (table["wxyz"].astype(np.float64) - 128.0) / 128.0
