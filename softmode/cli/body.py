@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from softmode.checks import require_fields
 from softmode.cli.common import short_name
 from softmode.errors import ConfigError
 from softmode.files import check_place
@@ -102,9 +103,7 @@ class BodyShow(_Asset):
         stem = self.file.parent.name if self.file.name == "meta.json" else self.file.stem
         out = self.out if self.out is not None else self.file.with_name(f"{stem}.png")
         _check_target(out, ".png", self.file)
-        for name in ("youngs_modulus", "density"):
-            if not 0.0 < getattr(self, name) < float("inf"):
-                raise ConfigError(f"{name} must be a finite number > 0, got {getattr(self, name)}")
+        require_fields(self, ("youngs_modulus", "density"), above=0.0)
         from softmode.cli.common import quiet_warp
         from softmode.viz.body_picture import mode_frequencies, write_body_picture
 

@@ -9,13 +9,17 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+from softmode.checks import require_number
 from softmode.cli.common import BuildBar, bar_interval, quiet_warp, warp_device
 from softmode.envs.catalogue import config_class, registered_id
 from softmode.errors import ConfigError, MaterialError
 from softmode.learning.players import POLICIES, check_policy, policy_factory, policy_file
 from softmode.viz.film import Film
+
+if TYPE_CHECKING:
+    import gymnasium as gym
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -67,14 +71,10 @@ def play(options: Play) -> int:
     """Play episodes; see :class:`Play`."""
     check_policy(options.policy)
     registered_id(options.env)
-    if options.episodes < 1:
-        raise ConfigError(f"episodes must be at least 1, got {options.episodes}", hint="give a count like 3")
-    if options.seed < 0:
-        raise ConfigError(f"seed must not be negative, got {options.seed}", hint="give a whole number like 0")
-    if options.youngs_modulus is not None and not 0.0 < options.youngs_modulus < float("inf"):
-        raise MaterialError(
-            f"youngs-modulus must be a finite number > 0, got {options.youngs_modulus}", hint="give it in Pa, like 2e5"
-        )
+    require_number("episodes", options.episodes, at_least=1, hint="give a count like 3")
+    require_number("seed", options.seed, at_least=0, hint="give a whole number like 0")
+    if (modulus := options.youngs_modulus) is not None:
+        require_number("youngs-modulus", modulus, above=0.0, hint="give it in Pa, like 2e5", error=MaterialError)
     if options.rerun is not None:
         from softmode.viz.rerun_logger import check_target
 
@@ -141,7 +141,7 @@ def _play(options: Play, film: Film | None) -> int:
 
 
 @contextlib.contextmanager
-def _recorders(options: Play, env: Any) -> Iterator[list[Any]]:
+def _recorders(options: Play, env: gym.Env) -> Iterator[list[Any]]:
     """Yield what records the state of the environment after every step, each publishing its file at the end."""
     with contextlib.ExitStack() as stack:
         logs: list[Any] = []

@@ -6,7 +6,8 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-from softmode.errors import AssetError, ConfigError
+from softmode.checks import require_number
+from softmode.errors import AssetError
 from softmode.files import check_place
 
 
@@ -37,10 +38,9 @@ class SplatFromMesh:
         """Sample, fit, write; return the exit code."""
         out = self.out if self.out is not None else self.mesh.with_name(f"{self.mesh.stem}_splats.ply")
         _check_target(out)
-        if self.size is not None and not 0.0 < self.size < float("inf"):
-            raise ConfigError(f"size must be a finite number > 0, got {self.size}", hint="give it in metres, like 0.08")
-        if self.count < 1:
-            raise ConfigError(f"count must be at least 1, got {self.count}", hint="give a number of splats like 10000")
+        if self.size is not None:
+            require_number("size", self.size, above=0.0, hint="give it in metres, like 0.08")
+        require_number("count", self.count, at_least=1, hint="give a number of splats like 10000")
 
         from tqdm import tqdm
 

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
+from softmode.checks import require_number
 from softmode.cli.common import quiet_warp
 from softmode.errors import ConfigError
 from softmode.learning.players import require_torch
@@ -117,8 +118,7 @@ class Evaluate:
         from softmode.learning.environments import make_vector_env
         from softmode.learning.policy import evaluate, load_policy
 
-        if self.num_envs < 1:
-            raise ConfigError(f"num_envs must be at least 1, got {self.num_envs}", hint="give a count like 16")
+        require_number("num_envs", self.num_envs, at_least=1, hint="give a count like 16")
         policy = load_policy(self.policy, self.device)
         options = {**policy.env_options, **parse_env_options(self.env_options)}
         if self.obs_type is not None:

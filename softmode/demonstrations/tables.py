@@ -30,7 +30,7 @@ def write_table(path: Path, tables: Sequence[Any]) -> Path:
     return path
 
 
-def write_json(path: Path, content: Any) -> Path:
+def write_json(path: Path, content: Mapping[str, Any]) -> Path:
     """Write a JSON file."""
     path.write_text(json.dumps(content, indent=4, ensure_ascii=False, allow_nan=False), encoding="utf-8")
     return path

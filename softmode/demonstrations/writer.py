@@ -92,7 +92,7 @@ class DatasetWriter:
         self._films_done = -1  # number of the last film
         self._root, self._is_new, self._lock = self.folder, False, None
         self._made: list[Path] = []
-        self._episode: Any = None
+        self._episode: Episode
         try:
             with storage_errors(f"dataset {self.folder}", hint="choose another folder"):
                 exists = self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir()))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from softmode.checks import require_number
 from softmode.errors import AssetError, ConfigError
 from softmode.splats.principal_axes import axes_of_covariances, axes_of_gradients, nearest_rotations
 
@@ -150,8 +151,7 @@ class Splats:
 
     def with_sh_degree(self, degree: int) -> Splats:
         """Return the splats with the spherical harmonics cut to `degree` (no more than they have)."""
-        if not 0 <= degree <= 3:
-            raise ConfigError(f"degree must be 0, 1, 2 or 3, got {degree}")
+        require_number("degree", degree, at_least=0, at_most=3)
         return replace(self, sh=self.sh[:, : (degree + 1) ** 2])
 
     def transformed(
@@ -174,8 +174,7 @@ class Splats:
         proper = matrix.shape == (3, 3) and np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-5)
         if not (proper and np.linalg.det(matrix) > 0.0):
             raise ConfigError("rotation must be a proper (3, 3) rotation matrix", hint="Pass scale as its own argument")
-        if not (np.isfinite(scale) and scale > 0.0):
-            raise ConfigError(f"scale must be positive and finite, got {scale}")
+        require_number("scale", scale, above=0.0)
         means = scale * self.means.astype(np.float64) @ matrix.T + np.asarray(translation, dtype=np.float64)
         quats, sh = self.quats, self.sh
         if rotation is not None:

@@ -15,6 +15,9 @@ from softmode.deformables.gradients import krylov_kernels as kernels
 from softmode.deformables.model.lane_kernels import vec8, vec8d
 from softmode.deformables.solver.solver_reduced import SolverReduced
 
+Apply = Callable[[wp.array, wp.array, wp.array], None]
+"""Writes the product of the matrix and a direction: active worlds, direction, product."""
+
 
 class Gmres:
     """Solves A x = b for every instance of a solver, A given by its products.
@@ -29,7 +32,7 @@ class Gmres:
         """Allocate everything once."""
         self.solver, self.cycle_length, self.cycle_max = solver, cycle_length, cycle_max
         self.device, count, length = solver.model.device, solver.instance_count, cycle_length
-        k: Any = kernels.Krylov()
+        k = kernels.Krylov()
         k.active, k.running, k.column, k.count = (self._zeros((count,), int) for _ in range(4))
         k.world_running, k.any_running = self._zeros((solver.world_count,), int), self._zeros((1,), int)
         k.target, k.error = (self._zeros((count,), wp.float64) for _ in range(2))
@@ -43,16 +46,16 @@ class Gmres:
         self._krylov = k
 
     @property
-    def error(self) -> Any:
+    def error(self) -> wp.array:
         """|b - A x| / |b| of the last solution, per instance."""
         return self._krylov.error
 
     @property
-    def product_count(self) -> Any:
+    def product_count(self) -> wp.array:
         """Products with A that the last solution took, per instance."""
         return self._krylov.count
 
-    def solve(self, apply: Callable[[Any, Any, Any], None], right: Any, solution: Any, *, tolerance: float) -> None:
+    def solve(self, apply: Apply, right: wp.array, solution: wp.array, *, tolerance: float) -> None:
         """Solve until |b - A x| <= tolerance |b| or the restarts are used up.
 
         Args:
@@ -88,10 +91,10 @@ class Gmres:
             if not int(k.any_running.numpy()[0]):
                 break
 
-    def _zeros(self, shape: Sequence[int], dtype: Any) -> Any:
+    def _zeros(self, shape: Sequence[int], dtype: type) -> Any:
         return wp.zeros(tuple(shape), dtype=dtype, device=self.device)
 
-    def _launch(self, kernel: Any, inputs: list[Any], outputs: Sequence[Any]) -> None:
+    def _launch(self, kernel: Callable[..., None], inputs: list[Any], outputs: Sequence[Any]) -> None:
         """Launch one team of threads per instance."""
         team = self.solver.team
         dim = (self.solver.instance_count, team)

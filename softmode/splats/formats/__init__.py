@@ -84,7 +84,9 @@ def read_splats(path: str | os.PathLike[str]) -> Splats:
             raise unreadable(file, "no such file", hint="Check the path")
         reader = _READERS.get(file.suffix.lower())
         if reader is None:
-            raise unreadable(file, f"unknown kind {file.suffix.lower() or '(no suffix)'!r}",
+            raise unreadable(
+                file,
+                f"unknown kind {file.suffix.lower() or '(no suffix)'!r}",
                 hint=f"Readable are {', '.join(READABLE)}; convert others with SuperSplat or splat-transform",
             )
         return reader(file)
@@ -110,7 +112,9 @@ def write_splats(path: str | os.PathLike[str], splats: Splats, *, up: UpAxis = "
     file = Path(path)
     suffix = next((known for known in _WRITERS if file.name.lower().endswith(known)), None)
     if suffix is None:
-        raise unreadable(file, f"cannot write {file.suffix.lower() or '(no suffix)'!r}",
+        raise unreadable(
+            file,
+            f"cannot write {file.suffix.lower() or '(no suffix)'!r}",
             hint=f"Writable are {', '.join(WRITABLE)}",
         )
     if up != "+z":

@@ -8,7 +8,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,12 +62,11 @@ def typed_errors(name: str) -> Iterator[None]:
 def check_count(count: int, name: str) -> int:
     """Return the declared number of splats if a reader may allocate for it."""
     if not 0 < count <= MAX_SPLATS:
-        raise unreadable(name, f"{count} splats, expected 1 to {MAX_SPLATS}", hint="Export the asset again, decimated"
-        )
+        raise unreadable(name, f"{count} splats, expected 1 to {MAX_SPLATS}", hint="Export the asset again, decimated")
     return count
 
 
-def read_exactly(file: Any, size: int, path: Path) -> bytes:
+def read_exactly(file: BinaryIO, size: int, path: Path) -> bytes:
     """Return the next `size` bytes of a file whose size has been checked."""
     data = file.read(size)
     if len(data) != size:

@@ -90,7 +90,9 @@ _SH_CODES[[0, 255]] = -4.0, 4.0
 def _require_columns(table: NDArray[Any], names: list[str], kind: str, element: str, path: str) -> None:
     """Raise an AssetError unless the table has exactly these columns, all of this type."""
     if sorted(table.dtype.names or ()) != sorted(names) or any(table.dtype[name] != np.dtype(kind) for name in names):
-        raise unreadable(path, f"element {element!r} of a compressed .ply has unexpected properties",
+        raise unreadable(
+            path,
+            f"element {element!r} of a compressed .ply has unexpected properties",
             hint="Convert it with splat-transform to an ordinary .ply",
         )
 

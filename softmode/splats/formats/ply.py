@@ -75,7 +75,9 @@ def read_ply(path: str | os.PathLike[str]) -> Splats:
             ["chunk", "vertex"],
             ["chunk", "vertex", "sh"],
         ):
-            raise unreadable(file_path, f"elements {[element.name for element in elements][:8]}, expected 'vertex', or "
+            raise unreadable(
+                file_path,
+                f"elements {[element.name for element in elements][:8]}, expected 'vertex', or "
                 "'chunk', 'vertex' and 'sh'",
                 hint="Only splat .ply files can be read; sample a mesh with `softmode splat from-mesh`",
             )
@@ -84,8 +86,9 @@ def read_ply(path: str | os.PathLike[str]) -> Splats:
             _check_columns(vertex, str(file_path))
         declared, size = offset + sum(element.size for element in elements), os.fstat(file.fileno()).st_size
         if size != declared:
-            raise unreadable(file_path, f"header declares {vertex.count} splats and {declared} bytes, the file holds "
-                f"{size}")
+            raise unreadable(
+                file_path, f"header declares {vertex.count} splats and {declared} bytes, the file holds {size}"
+            )
         file.seek(offset)
         tables = {
             element.name: np.frombuffer(read_exactly(file, element.size, file_path), dtype=element.dtype)
@@ -142,12 +145,13 @@ def _parse_header(head: bytes, name: str) -> tuple[list[_Element], int]:
                 raise unreadable(name, f"property {words[2][:80]} is declared twice")
             elements[-1].properties.append((words[2], _PLY_TYPES[words[1]]))
         else:
-            raise unreadable(name, f"unreadable header line {line[:80]!r}",
+            raise unreadable(
+                name,
+                f"unreadable header line {line[:80]!r}",
                 hint="Splat files hold scalar properties only; a mesh .ply is no splat file",
             )
     if form != "binary_little_endian":
-        raise unreadable(name, f"format {form or 'missing'!r}, expected binary_little_endian", hint="Export as binary"
-        )
+        raise unreadable(name, f"format {form or 'missing'!r}, expected binary_little_endian", hint="Export as binary")
     return elements, match.end()
 
 
@@ -156,7 +160,9 @@ def _check_columns(vertex: _Element, name: str) -> None:
     names = {field for field, _ in vertex.properties}
     missing = [field for field in _PLY_COLUMNS if field not in names]
     if missing:
-        raise unreadable(name, f"properties {', '.join(missing)} are missing",
+        raise unreadable(
+            name,
+            f"properties {', '.join(missing)} are missing",
             hint="Only splat .ply files (f_dc, opacity, scale, rot) can be read; a point cloud or a mesh is none",
         )
     rest = {field for field in names if field.startswith("f_rest_")}

@@ -58,10 +58,12 @@ _Reader = Callable[[str, int], bytes]
 """Return the bytes of a named member, refusing more than the given number."""
 
 
-def _check_member(name: Any, source: str) -> str:
+def _check_member(name: object, source: str) -> str:
     """Return the name if it is a plain file name, so that no member leads out of the asset."""
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.\-]{0,127}", name):
-        raise unreadable(source, f"member name {str(name)[:80]!r} is not a plain file name",
+        raise unreadable(
+            source,
+            f"member name {str(name)[:80]!r} is not a plain file name",
             hint="Members must lie beside meta.json; do not trust this file",
         )
     return name
@@ -73,7 +75,9 @@ def _folder_reader(folder: Path, meta: str = "meta.json") -> _Reader:
     def read(name: str, limit: int) -> bytes:
         file = folder / (meta if name == "meta.json" else name)
         if not file.is_file():
-            raise unreadable(folder / meta, f"member {name} is missing",
+            raise unreadable(
+                folder / meta,
+                f"member {name} is missing",
                 hint="Copy the whole folder, with all .webp files",
             )
         with open(file, "rb") as stream:
@@ -94,11 +98,12 @@ def _archive_reader(archive: zipfile.ZipFile, source: str) -> _Reader:
         except KeyError:
             raise unreadable(source, f"member {name} is missing") from None
         if info.file_size > limit:
-            raise unreadable(source, f"member {name} larger than {limit} bytes", hint="Decimate the asset first"
-            )
+            raise unreadable(source, f"member {name} larger than {limit} bytes", hint="Decimate the asset first")
         if info.file_size > max(FREE_BYTES, _ARCHIVE_RATIO * info.compress_size):
-            raise unreadable(source, f"member {name} unpacks from {info.compress_size} to {info.file_size} bytes, "
-                "which no image does")
+            raise unreadable(
+                source,
+                f"member {name} unpacks from {info.compress_size} to {info.file_size} bytes, which no image does",
+            )
         with archive.open(info) as stream:
             return stream.read(limit)
 
@@ -166,8 +171,7 @@ def _decode(source: str, read: _Reader) -> Splats:
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise unreadable(source, f"meta.json is no JSON ({error})") from error
     if "version" not in meta or meta["version"].value != 2:
-        raise unreadable(source, "not SOG version 2", hint="Convert it with splat-transform to SOG v2 or to .ply"
-        )
+        raise unreadable(source, "not SOG version 2", hint="Convert it with splat-transform to SOG v2 or to .ply")
     count = meta["count"].integer(1, MAX_SPLATS)
     file_bytes = image_bytes = 0
 
@@ -177,14 +181,18 @@ def _decode(source: str, read: _Reader) -> Splats:
         size = _webp_size(data)
         # The header is judged before any decoder sees the data: an image may not unpack to more than its splats need.
         if not low <= size[0] * size[1] <= high or (width is not None and size[0] != width):
-            raise unreadable(source, f"image {name} is {size[0]} x {size[1]} pixels, expected "
+            raise unreadable(
+                source,
+                f"image {name} is {size[0]} x {size[1]} pixels, expected "
                 + (f"{width} wide and " if width else "")
-                + f"{low} to {high} pixels of lossless WebP for {count} splats")
+                + f"{low} to {high} pixels of lossless WebP for {count} splats",
+            )
         # A single colour packs without bound; together, the images of real splats pack by less than ten.
         file_bytes, image_bytes = file_bytes + len(data), image_bytes + 4 * size[0] * size[1]
         if image_bytes > max(FREE_BYTES, MAX_RATIO * file_bytes):
-            raise unreadable(source, f"images of {file_bytes} bytes cannot hold the {count} splats that meta.json "
-                "declares")
+            raise unreadable(
+                source, f"images of {file_bytes} bytes cannot hold the {count} splats that meta.json declares"
+            )
         with Image.open(io.BytesIO(data), formats=["WEBP"]) as picture:
             if picture.size != size:
                 raise unreadable(source, f"image {name} contradicts its header")

@@ -92,12 +92,15 @@ def _check_header(fields: tuple[Any, ...], versions: range, packed_size: int, pa
     if magic != _MAGIC:
         raise unreadable(path, "no SPZ header")
     if version not in versions:
-        raise unreadable(path, f"SPZ version {version}, expected {versions[0]} to {versions[-1]}",
+        raise unreadable(
+            path,
+            f"SPZ version {version}, expected {versions[0]} to {versions[-1]}",
             hint="Convert it with splat-transform to a newer SPZ or to .ply",
         )
     if degree > 4 or fractional_bits > 30:
-        raise unreadable(path, f"spherical-harmonic degree {degree} and {fractional_bits} fractional bits, expected "
-            "at most 4 and 30")
+        raise unreadable(
+            path, f"spherical-harmonic degree {degree} and {fractional_bits} fractional bits, expected at most 4 and 30"
+        )
     header = _Header(
         version=version,
         count=check_count(count, path),
@@ -122,9 +125,12 @@ def _unpack_gzip(data: bytes, path: str) -> tuple[_Header, dict[str, memoryview]
     allowed = expected + (_EXTENSION_LIMIT if header.flags & _EXTENDED else 0)
     body = stream.decompress(stream.unconsumed_tail, allowed + 1)
     if not expected <= len(body) <= allowed or not stream.eof or stream.unused_data:
-        raise unreadable(path, f"header declares {header.count} splats, {expected} bytes unpacked, the file holds "
+        raise unreadable(
+            path,
+            f"header declares {header.count} splats, {expected} bytes unpacked, the file holds "
             f"{'more than ' if len(body) > allowed else ''}{min(len(body), allowed)}"
-            + ("" if stream.eof and not stream.unused_data else ", or does not end where its gzip stream ends"))
+            + ("" if stream.eof and not stream.unused_data else ", or does not end where its gzip stream ends"),
+        )
     view, start, arrays = memoryview(body), 0, {}
     for name, size in sizes.items():
         arrays[name] = view[start : start + size]
@@ -233,7 +239,9 @@ def write_spz(path: str | os.PathLike[str], splats: Splats, *, version: Literal[
     reach = max(float(np.abs(splats.means).max()), 2.0**-30)
     fractional_bits = min(20, int(np.floor(np.log2((2**23 - 1) / reach))))
     if fractional_bits < 0:
-        raise unreadable(path, f"a coordinate of {reach:.3g} m exceeds the 8388607 m of SPZ",
+        raise unreadable(
+            path,
+            f"a coordinate of {reach:.3g} m exceeds the 8388607 m of SPZ",
             hint="Move the splats to the origin or write .ply",
         )
     fixed = np.rint(splats.means.astype(np.float64) * 2.0**fractional_bits).astype("<i4")

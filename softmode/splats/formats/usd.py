@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from softmode.checks import require_number
 from softmode.errors import AssetError, ConfigError, MissingExtraError
 from softmode.files import whole_file
 from softmode.splats.formats.common import REEXPORT, typed_errors, unreadable
@@ -63,7 +64,9 @@ def _read_stage(file: Path, time_code: float | None) -> Splats:
         answer = process.ask(request, name=f"splat file {file}")
     stage = answer.described
     if not stage["prims"]:
-        raise unreadable(file, "holds no visible ParticleField3DGaussianSplat prim",
+        raise unreadable(
+            file,
+            "holds no visible ParticleField3DGaussianSplat prim",
             hint="Export the splats as such, or check that the prim is not invisible or in an unloaded payload",
         )
     parts: list[Splats] = []
@@ -188,8 +191,7 @@ def write_usd(path: str | os.PathLike[str], splats: Splats | Sequence[Splats], *
             "an animation needs at least one frame, and the same number of splats and degree in all",
             hint="Deform one set of rest splats",
         )
-    if not (np.isfinite(fps) and fps > 0.0):
-        raise ConfigError(f"fps must be positive and finite, got {fps}")
+    require_number("fps", fps, above=0.0)
     suffix = Path(path).suffix.lower()
     if suffix not in (".usd", ".usda", ".usdc"):
         raise unreadable(path, f"cannot write {suffix!r}", hint="Name a .usdc, .usda or .usd file")
