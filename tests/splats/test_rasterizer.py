@@ -397,7 +397,7 @@ def test_refuses_sizes_out_of_range(arguments: Any, message: str) -> None:
 @pytest.mark.parametrize("options", [{"near": 0.0}, {"near": -1.0}, {"near": float("nan")}, {"dilation": -0.1}])
 def test_refuses_options_out_of_range(options: Any) -> None:
     """Near planes behind the camera and negative variances."""
-    with pytest.raises(ConfigError, match="near is"):
+    with pytest.raises(ConfigError, match=next(iter(options))):
         RasterizerOptions(**options)
 
 
