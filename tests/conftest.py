@@ -91,6 +91,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     """Leave out the files that `make test-fast` takes no test of: it need not import them."""
     file = collection_path.relative_to(_TESTS).as_posix() if collection_path.is_relative_to(_TESTS) else ""
     return True if config.option.markexpr == "fast" and file.endswith(".py") and file not in _FAST else None
+
+
 PLAYBOT = _TESTS.parents[1] / "shared" / "data" / "splats" / "playbot" / "4_0" / "meta.json"
 """A trained capture, SOG v2: a robot hovering over a patch of ground, with two loose hands. PLAYBOT by Stephane Agullo,
 CC-BY-4.0."""
