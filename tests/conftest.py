@@ -36,7 +36,7 @@ _FAST = {
     "deformables/test_skinning_adjoint.py": "matches_central_differences",
     "deformables/test_solver_reduced.py": "step_equals_dense_reference free_fall captured_graph_equals_eager",
     "deformables/test_static_response.py": "axial_response_is_that_of_a_hanging_bar",
-    "demonstrations/test_format.py": "info data_table",
+    "demonstrations/test_format.py": "info data_table episodes_table",
     "documentation/test_prose.py": "",
     "envs/test_objects.py": "part_is_chosen_by_its_rule a_tilted_box_lies_down_on_its_nearest_face",
     "envs/test_primitives.py": "solid_has_the_closed_form_volume_area_and_bounds",
