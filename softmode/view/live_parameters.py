@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.solver.parameters import PARAMETER_LIMITS, set_parameters
 from softmode.errors import ConfigError
 from softmode.view.live_scenes import LiveScene
@@ -57,7 +58,7 @@ def apply(scene: LiveScene, given: dict[str, Any]) -> None:
             getattr(data, name).fill_(given[name])
     if "gravity" in given:
         scene.model.set_gravity(given["gravity"])
-        if hasattr(scene.solver, "reduced"):  # a coupled solver, whose MuJoCo keeps its own
+        if isinstance(scene.solver, SolverCoupledReduced):  # its MuJoCo keeps a gravity of its own
             scene.solver.rigid.notify_model_changed(newton.ModelFlags.MODEL_PROPERTIES)
 
 

@@ -79,7 +79,7 @@ class LiveSession:
         scene = self._scene
         self._picture = LivePicture(scene.objects, scene.model, scene.marker)
         self._energies = SoftEnergies(scene.solver)
-        self._reduced = getattr(scene.solver, "reduced", scene.solver)
+        self._solver = scene.solver
         self._meshes: tuple[Any, ...] | None = None
         self._block_seconds = 0.0
         self._begin()
@@ -89,7 +89,7 @@ class LiveSession:
         self._time, self._debt, self._bits, self._stale = 0.0, 0.0, 0, True
         self._passed: deque[tuple[float, float]] = deque()
         self._hands.take_up(self._scene)
-        self._reduced.status.zero_()
+        self._solver.status.zero_()
 
     @classmethod
     def from_object(
@@ -233,7 +233,7 @@ class LiveSession:
     @property
     def size(self) -> float:
         """Diagonal of the first object's bounding box at rest [m]."""
-        return float(self._reduced.instances.size.numpy()[0])
+        return float(self._solver.view.instances.size.numpy()[0])
 
     def bounds(self) -> NDArray[np.float64]:
         """Return the corners of a box around what is worth seeing at the start [m], shape (2, 3)."""
@@ -512,7 +512,7 @@ class LiveSession:
         state.softmode.dt_before.zero_()
         if state.body_q is not None and recording.body_q.shape[1] == state.body_q.shape[0]:
             state.body_q.assign(recording.body_q[index])
-        self._reduced.update_particles(state)
+        self._solver.update_particles(state)
         self._stale = True
 
     def stop_recording(self) -> Path:
@@ -540,14 +540,14 @@ class LiveSession:
         for grips in scene.grips:
             grips.begin_frame(count * scene.block_steps)
         self._bits, taken = 0, 0
-        self._reduced.status.zero_()
+        self._solver.status.zero_()
         for _ in range(count):
             if scene.over(busy=self._hands.busy):
                 self.reset()
                 continue
             clock = time.perf_counter()
             scene.run()
-            self._bits |= int(self._reduced.status.numpy()[0])  # waits for the device
+            self._bits |= int(self._solver.status.numpy()[0])  # waits for the device
             spent = time.perf_counter() - clock
             self._block_seconds = spent if self._block_seconds == 0.0 else 0.8 * self._block_seconds + 0.2 * spent
             taken += 1
@@ -580,7 +580,7 @@ class LiveSession:
         state.softmode.q.assign(found[:, :3])
         state.softmode.qd.assign(found[:, 3:])
         state.softmode.dt_before.zero_()
-        self._reduced.update_particles(state)
+        self._solver.update_particles(state)
 
     def _coordinates(self, name: str, object_index: int = 0) -> NDArray[np.float64]:
         """Return coordinates "q" or velocities "qd" of an object, shape (n, 3)."""

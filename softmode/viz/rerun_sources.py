@@ -184,16 +184,15 @@ class TaskSource:
 
 def solver_scalars(solver: Any, world: int) -> dict[str, float | Sequence[float]]:
     """Return iterations of the last step and the status bits of a world."""
-    reduced = getattr(solver, "reduced", solver)
     return {
-        "solver/iterations": float(reduced.iteration.numpy()[world]),
-        "solver/status": float(reduced.status.numpy()[world]),
+        "solver/iterations": float(solver.iteration.numpy()[world]),
+        "solver/status": float(solver.status.numpy()[world]),
     }
 
 
 def solver_remarks(solver: Any, world: int) -> list[tuple[str, str]]:
     """Return the names of the status bits that are set."""
-    reasons = status_reasons(int(getattr(solver, "reduced", solver).status.numpy()[world]))
+    reasons = status_reasons(int(solver.status.numpy()[world]))
     return [("WARN", f"solver: {', '.join(reasons)}")] if reasons else []
 
 

@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
+from softmode.deformables.model.namespaces import NAMESPACE, soft
 from softmode.deformables.model.struct_kernels import mat23d
 from softmode.errors import ConfigError
 
-NAMESPACE = "softmode"
 _INSTANCE = f"{NAMESPACE}:instance"
 _FUNCTION = f"{NAMESPACE}:function"
 _PIN = f"{NAMESPACE}:pin"
@@ -261,7 +261,12 @@ def scales_of(builder: newton.ModelBuilder) -> list[float]:
 
 
 def drive_regions(
-    model: Any, control: Any, instance: int, body: ReducedBody, matrices: np.ndarray, translations: np.ndarray
+    model: newton.Model,
+    control: newton.Control,
+    instance: int,
+    body: ReducedBody,
+    matrices: np.ndarray,
+    translations: np.ndarray,
 ) -> None:
     """Say where the exact regions of a body shall be at the end of the next step.
 
@@ -277,8 +282,8 @@ def drive_regions(
             frame, shape (region_count, 3, 3).
         translations: Vector t of each region [m], shape (region_count, 3).
     """
-    data = getattr(model, NAMESPACE)
+    data = soft(model)
     q = body.driven_affine(float(data.scale.numpy()[instance]) * np.asarray(matrices, float), translations)
     start = int(data.function_start.numpy()[instance])
-    target = getattr(control, NAMESPACE).q_driven
+    target = soft(control).q_driven
     target[start : start + len(q)].assign(q)
