@@ -58,8 +58,9 @@ class BlockCholesky:
 
         Sets ``indefinite`` where a pivot had to be raised.
         """
-        parts = (self.block_count // self.pattern.shape[1], self.pattern)
-        self._launch(self._factor, active, self.block_count, *parts, self.team, self.width, self.matrix, self.unit)
+        parts = (self.block_count // self.pattern.shape[1], self.pattern, self.team, self.width)
+        system = (self.matrix, self.unit, self.diagonal, self.indefinite)
+        self._launch(self._factor, active, self.block_count, *parts, *system)
 
     def solve(self, active: wp.array, column: int, tail: wp.array, tail_count: int) -> wp.array:
         """Return x of U x = y - Y tail, shape (system_count, N / 8) of 8-vectors.
