@@ -1,8 +1,10 @@
 """Two-way contact with MuJoCo: derivatives of the joint potential, momentum, squeeze force, batching, faults."""
 
+import mujoco_warp
 import newton
 import numpy as np
 import pytest
+from newton.solvers import SolverMuJoCo
 
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
@@ -468,3 +470,26 @@ def test_options_reach_the_soft_solve():
     scene, _ = impact(1.0, options=SolverReducedOptions(iteration_max=1))
     scene.step(3)
     assert scene.reduced.iteration.numpy()[0] == 1
+
+
+def test_private_names_of_the_rigid_solver_are_checked(monkeypatch):
+    """A rigid solver without them gets a warning when the solver is built, and whole steps: the same step to 1e-5."""
+    scene, _ = impact(1.0)
+    while np.abs(scene.reduced.instance_force.numpy()).max() < 1.0:
+        scene.step()
+    rigid = SolverMuJoCo(scene.model, njmax=64, nconmax=32)
+    rigid._use_speculative_contacts = None  # type: ignore[assignment]
+    with pytest.warns(RuntimeWarning, match="two whole MuJoCo steps"):
+        whole = SolverCoupledReduced(scene.model, scene.bodies, rigid=rigid)
+    assert callable(scene.solver.rigid._mujoco_warp_step)  # the known names are there, and give the faster path
+    taken, step = [], mujoco_warp.step2
+    monkeypatch.setattr(mujoco_warp, "step2", lambda *given: (taken.append(1), step(*given))[1])
+    out = [scene.model.state() for _ in range(2)]
+    whole.step(scene.state, out[0], scene.control, None, scene.dt)
+    assert not taken
+    scene.solver.step(scene.state, out[1], scene.control, None, scene.dt)
+    assert taken
+    for name in ("joint_qd", "body_q"):
+        one, other = (getattr(state, name).numpy() for state in out)
+        np.testing.assert_allclose(one, other, atol=1e-5)
+    np.testing.assert_allclose(out[0].softmode.q.numpy(), out[1].softmode.q.numpy(), atol=1e-7)

@@ -28,6 +28,7 @@ from softmode.deformables.model.struct_kernels import (
     Rigid,
     first_coupled,
     interpolate_change,
+    p_wave_modulus,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -125,9 +126,7 @@ def stiffness_per_area(instances: Instances, i: int, partner_mass: float, partne
     """
     if instances.contact_stiffness[i] > 0.0:
         return instances.contact_stiffness[i]
-    E = instances.youngs_modulus[i]
-    nu = instances.poissons_ratio[i]
-    wave = E * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
+    wave = p_wave_modulus(instances.youngs_modulus[i], instances.poissons_ratio[i])
     mass = float(instances.mass[i])
     if partner_mass > 0.0:
         mass *= partner_mass / (mass + partner_mass)

@@ -9,10 +9,11 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from softmode.checks import require_number
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.namespaces import NAMESPACE, soft
-from softmode.deformables.model.struct_kernels import mat23d
+from softmode.deformables.model.struct_kernels import mat23d, p_wave_modulus
 from softmode.errors import ConfigError
 
 _INSTANCE = f"{NAMESPACE}:instance"
@@ -82,9 +83,15 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
 
 
 def bulk_stiffness(body: ReducedBody, youngs_modulus: float, poissons_ratio: float, scale: float = 1.0) -> float:
-    """Return twenty times the stiffness per area [Pa/m] of the bulk: the P-wave modulus over the size."""
-    nu = poissons_ratio
-    wave = youngs_modulus * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
+    """Return twenty times the stiffness per area [Pa/m] of the bulk: the P-wave modulus over the size.
+
+    Args:
+        body: The body.
+        youngs_modulus: E [Pa].
+        poissons_ratio: nu.
+        scale: Size over that of ``body``.
+    """
+    wave = p_wave_modulus(float(youngs_modulus), float(poissons_ratio))
     return 20.0 * wave / (scale * float(np.linalg.norm(np.ptp(body.bounds, axis=0))))
 
 
@@ -148,16 +155,10 @@ def add_reduced_body(
         if np.shape(value) != (3,) or not np.isfinite(value).all():
             raise ConfigError(f"{name} must be three finite numbers, got {value!r}")
     stiffness = contact_stiffness_per_area or 0.0
-    if not 0.0 <= stiffness < np.inf:
-        raise ConfigError(f"contact_stiffness_per_area must be a finite number >= 0 [Pa/m], got {stiffness!r}")
-    if not 0.0 <= contact_radius < np.inf:
-        raise ConfigError(f"contact_radius must be a finite number >= 0 [m], got {contact_radius!r}")
-
-    if not SCALE_MIN <= scale <= SCALE_MAX:
-        raise ConfigError(
-            f"scale must lie in [{SCALE_MIN}, {SCALE_MAX}], got {scale!r}", hint="build the body at that size instead"
-        )
-
+    require_number("contact_stiffness_per_area", stiffness, at_least=0.0, unit="[Pa/m]")
+    require_number("contact_radius", contact_radius, at_least=0.0, unit="[m]")
+    hint = "build the body at that size instead"
+    require_number("scale", scale, at_least=SCALE_MIN, at_most=SCALE_MAX, hint=hint)
     s = float(np.float32(scale))  # as the model stores it
     omega = np.asarray(angular_velocity, float)
     spin = np.array([[0, -omega[2], omega[1]], [omega[2], 0, -omega[0]], [-omega[1], omega[0], 0]])

@@ -237,6 +237,12 @@ def sample_area(scale: float, area: float):
 
 
 @wp.func
+def p_wave_modulus(youngs_modulus: float, poissons_ratio: float):
+    """Return E (1 - nu) / ((1 + nu) (1 - 2 nu)) [Pa], the stiffness of a layer; callable on the host too."""
+    return youngs_modulus * (1.0 - poissons_ratio) / ((1.0 + poissons_ratio) * (1.0 - 2.0 * poissons_ratio))
+
+
+@wp.func
 def blocks_of(function_count: int):
     """Return the number of blocks that hold so many functions."""
     return (function_count + 7) / 8

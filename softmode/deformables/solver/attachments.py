@@ -13,6 +13,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from softmode.checks import require_number
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.model.authoring import NAMESPACE, add_pins, body_key, bulk_stiffness
 from softmode.errors import ConfigError
@@ -85,8 +86,7 @@ def attach(
     modulus, ratio = (float(_column(builder, name)[instance]) for name in ("youngs_modulus", "poissons_ratio"))
     s = float(_column(builder, "scale")[instance])
     per_area = bulk_stiffness(body, modulus, ratio, s) if stiffness is None else stiffness
-    if not 0.0 < per_area < np.inf:
-        raise ConfigError(f"stiffness must be a finite number > 0 [Pa/m], got {stiffness!r}")
+    require_number("stiffness", per_area, above=0.0, unit="[Pa/m]")
     if region is not None:
         X, pins = _region_pins(body, region, modulus)
         pins = s * pins  # kappa of the larger region is less by s^2, its volume more by s^3

@@ -15,14 +15,19 @@ SHARED_WIDTH = 88
 """most columns, the right-hand ones included: static shared memory ends at 48 kB."""
 
 
+def _sized(snippet: str) -> str:
+    """Return CUDA source with the sizes of the shared system in the places of their names."""
+    return snippet.replace("SHARED_SIZE", str(SHARED_SIZE)).replace("SHARED_WIDTH", str(SHARED_WIDTH))
+
+
 @wp.func_native(
-    snippet="""
+    snippet=_sized("""
 #if defined(__CUDA_ARCH__)
     // mode 0: assemble A, load B, factor, write U^-T B back; mode 1: solve with the factor that is there
-    __shared__ __align__(16) float A[72 * 88];
-    __shared__ __align__(16) float D[72 * 8];
-    __shared__ float right[72];
-    const int stride = 88;
+    __shared__ __align__(16) float A[SHARED_SIZE * SHARED_WIDTH];
+    __shared__ __align__(16) float D[SHARED_SIZE * 8];
+    __shared__ float right[SHARED_SIZE];
+    const int stride = SHARED_WIDTH;
     const int N = size;
     const int W = width;
     float* g = (float*)scalars.data + (size_t)i * N * W;
@@ -187,7 +192,7 @@ SHARED_WIDTH = 88
         __syncthreads();
     }
 #endif
-"""
+""")
 )
 def shared_system(
     mode: int,
