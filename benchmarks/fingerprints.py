@@ -106,12 +106,15 @@ def run(*words: str) -> str:
 
 
 def digest_of_arrays(path: Path) -> str:
-    """Return a hash of the arrays of an .npz, name by name."""
+    """Return a hash of the arrays of an .npz, name by name, and of its header without times and paths."""
     found = hashlib.sha256()
     with np.load(path) as file:
         for name in sorted(file.files):
             found.update(name.encode())
-            found.update(np.ascontiguousarray(file[name]).tobytes())
+            if name == "header":
+                found.update(" ".join(sorted(json.loads(file[name].tobytes()))).encode())
+            else:
+                found.update(np.ascontiguousarray(file[name]).tobytes())
     return found.hexdigest()
 
 

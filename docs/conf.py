@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import importlib.util
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,15 @@ from docutils.utils.math import MathError
 from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx.util.logging import getLogger
 
+sys.path.insert(0, str(Path(__file__).parent / "inventories"))
+from make_inventories import PROJECTS
+
 project = "softmode"
 author = "the softmode authors"
 copyright = "the softmode authors, Apache-2.0"
 release = importlib.metadata.version("softmode")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.intersphinx", "sphinx.ext.napoleon"]
 exclude_patterns = ["_build"]
 
 myst_enable_extensions = ["dollarmath", "amsmath"]
@@ -46,8 +50,13 @@ autodoc_mock_imports = [name for name in _EXTRAS if importlib.util.find_spec(nam
 napoleon_numpy_docstring = False
 napoleon_use_rtype = False
 
+# Links to other projects, from inventories that lie in the repository: nothing is fetched.
+intersphinx_mapping = {name: (other.url, f"inventories/{name}.inv") for name, other in PROJECTS.items()}
+
 html_theme = "furo"
 html_title = "softmode"
+html_logo = "images/logo.svg"
+html_favicon = "images/favicon.svg"
 html_copy_source = False
 html_show_sphinx = False
 html_theme_options = {"navigation_with_keys": True}

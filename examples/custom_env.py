@@ -22,7 +22,7 @@ from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.task import Segment, Task, TaskConfig
 from softmode.objects.soft_object import ObjectConfig
 from softmode.scenes.table_scene import TableSceneConfig
-from softmode.viz.film import Film
+from softmode.viz import Film
 
 # ----------------------------------------------------------------------------------------------------------------------
 RADIUS, HEIGHT = 0.02, 0.12  # of the post [m]

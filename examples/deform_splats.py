@@ -15,11 +15,9 @@ import numpy as np
 import warp as wp
 from PIL import Image
 
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.skinning.skin_splats import SkinSplats
+from softmode.deformables import BuildOptions, SkinSplats
 from softmode.objects.soft_object import ObjectConfig, load_object
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
+from softmode.splats import PinholeCamera, SplatArrays, SplatRasterizer, ViewArrays
 
 SIZE, DISTANCE = 128, 2.4
 """Edge of the pictures [px]; distance of the camera in sizes of the object."""

@@ -13,14 +13,11 @@ import newton
 import numpy as np
 import warp as wp
 
-from softmode.deformables.materials.material import Material
-from softmode.deformables.model.status import status_reasons
+from softmode.deformables import Material, status_reasons
 from softmode.objects.soft_object import ObjectConfig, load_object
 from softmode.scenes.splat_scene import PlacedObject, SplatScene
-from softmode.splats.camera import CameraOptions
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.shadow import ShadowOptions
-from softmode.viz.film import Film
+from softmode.splats import CameraOptions, PinholeCamera, ShadowOptions
+from softmode.viz import Film
 
 GRAVITY, DT, STEPS = 9.81, 1.0 / 960.0, 32
 """Gravity [m/s^2]; physics step [s], and steps of a frame: implicit steps that are long eat the bounce."""

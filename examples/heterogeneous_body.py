@@ -18,18 +18,19 @@ import numpy as np
 import warp as wp
 from PIL import Image
 
-from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.body.regions import Region
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
-from softmode.deformables.materials.material import Material
-from softmode.deformables.skinning.skin_splats import average_basis
-from softmode.deformables.solver.solver_reduced import SolverReducedOptions
+from softmode.deformables import (
+    BuildOptions,
+    Material,
+    ReducedBody,
+    Region,
+    SolverReducedOptions,
+    average_basis,
+    build_body,
+    quadrature_from_box,
+)
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.splat_scene import PlacedObject, SplatScene
-from softmode.splats import Splats
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats import PinholeCamera, Splats
 
 LENGTH, CLAMP, EDGE, CORE = 0.32, 0.04, 0.04, 0.02
 """The bar and what of it is clamped; edges of its section and of its core [m]."""

@@ -17,7 +17,7 @@ import warp as wp
 import softmode  # noqa: F401  (registers the environments)
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
-from softmode.viz.film import Film
+from softmode.viz import Film
 
 GRAVITY = 9.81
 

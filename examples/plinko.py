@@ -15,15 +15,11 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.materials.material import Material
-from softmode.deformables.solver.solver_reduced import SolverReducedOptions
+from softmode.deformables import BuildOptions, Material, SolverReducedOptions
 from softmode.objects.soft_object import ObjectConfig, load_object
 from softmode.scenes.splat_scene import PlacedObject, Record, SplatScene
-from softmode.splats.camera import CameraOptions
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.shadow import ShadowOptions
-from softmode.viz.film import Film
+from softmode.splats import CameraOptions, PinholeCamera, ShadowOptions
+from softmode.viz import Film
 
 WIDTH, TALL, GAP, PANE, PEG, BIN, WALL = 0.60, 0.56, 0.09, 0.02, 0.012, 0.14, 0.006
 """Width and half height of the board, room in it, thickness of a pane, radius of a peg, height of the

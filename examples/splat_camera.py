@@ -18,18 +18,20 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 from PIL import Image
 
-from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
-from softmode.deformables.materials.material import Material
-from softmode.deformables.model.authoring import add_reduced_body
-from softmode.deformables.skinning.skin_splats import SkinSplats
+from softmode.deformables import Material, SkinSplats, SolverCoupledReduced, add_reduced_body
 from softmode.objects.soft_object import ObjectConfig, load_object
 from softmode.robots import add_arm
-from softmode.splats import make_plush
-from softmode.splats.camera import CameraOptions, SplatCamera
-from softmode.splats.camera_randomization import CameraRandomization
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.rasterizer import RasterizerOptions, SplatArrays
-from softmode.splats.rigid_splats import RigidSplats, RigidSplatsSkin
+from softmode.splats import (
+    CameraOptions,
+    CameraRandomization,
+    PinholeCamera,
+    RasterizerOptions,
+    RigidSplats,
+    RigidSplatsSkin,
+    SplatArrays,
+    SplatCamera,
+    make_plush,
+)
 
 DT, DROP, PLUSH, TOY = 1.0 / 240.0, 0.01, (0.42, -0.05), (0.5, 0.05)
 """Step [s], height of the fall [m], where the two stand on the table [m]."""

@@ -15,15 +15,11 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.materials.material import Material
-from softmode.deformables.solver.solver_reduced import SolverReducedOptions
+from softmode.deformables import BuildOptions, Material, SolverReducedOptions
 from softmode.objects.soft_object import ObjectConfig, load_object
 from softmode.scenes.splat_scene import PlacedObject, Record, SplatScene
-from softmode.splats.camera import CameraOptions
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.shadow import ShadowOptions
-from softmode.viz.film import Film
+from softmode.splats import CameraOptions, PinholeCamera, ShadowOptions
+from softmode.viz import Film
 
 HALF, HEIGHT, WALL = 0.11, 0.12, 0.012
 """Half width of the container inside, height and thickness of its walls [m]."""

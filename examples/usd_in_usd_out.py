@@ -15,7 +15,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
+from softmode.deformables import SolverCoupledReduced
 from softmode.usd import PlacedBody, UsdAnimation, UsdImport, add_usd, read_animation, write_usd
 
 DT, STEPS, GRAVITY, BLOCK = 1.0 / 240.0, 8, 9.81, 0.3  # [s], per frame, [m/s^2], [kg]

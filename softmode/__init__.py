@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from gymnasium.envs.registration import register, registry
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 ENVIRONMENTS = {
     "softmode/LiftSoft-v0": "Pick a soft object from a table and hold it at a goal.",
