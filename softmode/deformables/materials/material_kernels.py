@@ -15,7 +15,6 @@ from enum import IntEnum
 import warp as wp
 
 from softmode.deformables.materials.singular_value_kernels import singular_values
-from softmode.deformables.model.declare import struct
 
 wp.set_module_options({"enable_backward": False})
 
@@ -38,7 +37,7 @@ class MaterialModel(IntEnum):
     """Neo-Hookean with ln J: infinite energy at J <= 0, so that a body never inverts, nor starts inverted."""
 
 
-@struct
+@wp.struct
 class MaterialParameters:
     """Material of one instance as the kernels read it."""
 
