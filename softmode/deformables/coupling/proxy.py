@@ -12,7 +12,6 @@ pass lags by a step and gains energy where contact is stiff or bodies are light;
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import newton
 import numpy as np
@@ -22,6 +21,7 @@ from newton.solvers.experimental.coupled import CouplingInterface  # pyright: ig
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.coupling import proxy_kernels as kernels
 from softmode.deformables.model.authoring import MATERIAL_FIELDS
+from softmode.deformables.model.declare import WRENCH
 from softmode.deformables.model.namespaces import soft
 from softmode.deformables.model.rigid_dofs import RigidDofs
 from softmode.deformables.model.tables import body_world, starts_of
@@ -67,8 +67,7 @@ class SolverReducedProxy(ReducedSolver, CouplingInterface):
         """Tie the rigid bodies into the solve; see the class."""
         self.reduced = SolverReduced(model, bodies, options=options, rigid=_free_bodies(model))
         super().__init__(model, self.reduced.tables)
-        vector: Any = wp.spatial_vector
-        self.impulse = wp.zeros(model.body_count, dtype=vector, device=model.device)
+        self.impulse = wp.zeros(model.body_count, dtype=WRENCH, device=model.device)
         """Contact impulse on every rigid body since the coupler's last pass began [N s, N m s]."""
         self.start: dict[str, wp.array] | None = None
         """The soft state at the start of the step, where passes may be repeated."""
@@ -160,7 +159,7 @@ class SolverReducedProxy(ReducedSolver, CouplingInterface):
     def coupling_rewind_proxy_body(
         self,
         body_local_to_proxy_global: wp.array,
-        state: Any,
+        state: newton.State,
         coupling_forces: wp.array,
         body_gravity_acceleration: wp.array,
         dt: float,
@@ -172,8 +171,8 @@ class SolverReducedProxy(ReducedSolver, CouplingInterface):
         self.impulse.zero_()
 
     def coupling_prepare_proxy_contacts(
-        self, state: Any, contacts: Any, *, contacts_freshly_detected: bool = False
-    ) -> Any:
+        self, state: newton.State, contacts: newton.Contacts | None, *, contacts_freshly_detected: bool = False
+    ) -> newton.Contacts | None:
         """Leave the contacts alone: the solver finds its own."""
         return contacts
 
@@ -183,9 +182,9 @@ class SolverReducedProxy(ReducedSolver, CouplingInterface):
         out_body_f: wp.array,
         *,
         body_qd_before: wp.array,
-        state: Any,
-        state_out: Any,
-        contacts: Any,
+        state: newton.State,
+        state_out: newton.State,
+        contacts: newton.Contacts | None,
         dt: float,
     ) -> None:
         """Return the contact wrenches on the proxies, means over the substeps."""

@@ -33,6 +33,7 @@ from newton.solvers import SolverBase, SolverMuJoCo
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.coupling import coupling_kernels as kernels
 from softmode.deformables.coupling.rigid_solver import second_half
+from softmode.deformables.model.declare import WRENCH
 from softmode.deformables.model.rigid_dofs import RigidDofs
 from softmode.deformables.model.tables import allocate, host, present
 from softmode.deformables.solver import rigid_row_kernels as rows
@@ -43,8 +44,6 @@ from softmode.deformables.solver.reduced_solver import ReducedSolver
 from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.deformables.solver.step_checks import check_step
 from softmode.errors import ConfigError
-
-_VECTOR: Any = wp.spatial_vector
 
 
 class SolverCoupledReduced(ReducedSolver):
@@ -89,11 +88,11 @@ class SolverCoupledReduced(ReducedSolver):
         dofs = _joint_dofs(model, row_max=self.rigid.mjw_data.efc.type.shape[1])
         self.reduced = SolverReduced(model, bodies, options=options, rigid=dofs)
         super().__init__(model, self.reduced.tables)
-        device, count, vector = model.device, model.joint_dof_count, _VECTOR
+        device, count = model.device, model.joint_dof_count
         self.predicted_state = model.state()
         self._from_forces_on = second_half(self.rigid)
-        self._joint_S = wp.zeros(count, dtype=vector, device=device)
-        self._body_f = wp.zeros(model.body_count, dtype=vector, device=device)
+        self._joint_S = wp.zeros(count, dtype=WRENCH, device=device)
+        self._body_f = wp.zeros(model.body_count, dtype=WRENCH, device=device)
         self._damping = wp.zeros(count, dtype=float, device=device)
         self._any_coupled, self._any_pushed = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
         self._pushed = wp.zeros(self.world_count, dtype=int, device=device)
@@ -200,7 +199,7 @@ class SolverCoupledReduced(ReducedSolver):
         contacts: newton.Contacts | None,
         dt: float,
         *,
-        observables: Any = None,
+        observables: CoupledObservables | None = None,
     ) -> None:
         """Advance soft and rigid bodies by ``dt`` [s].
 

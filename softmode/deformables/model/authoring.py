@@ -239,7 +239,7 @@ def add_pins(
         )
     if not (np.isfinite(k).all() and (k >= 0).all() and np.isfinite(X).all() and np.isfinite(T).all()):
         raise ConfigError("stiffness must be finite and >= 0 [N/m], points and targets finite [m]")
-    scales = scales_of(builder)
+    scales = attribute_values(builder, "scale")
     s = scales[instance] if 0 <= instance < len(scales) else 1.0  # the solver refuses an instance that is not there
     builder.add_custom_values_batch(
         [
@@ -255,9 +255,9 @@ def add_pins(
     )
 
 
-def scales_of(builder: newton.ModelBuilder) -> list[float]:
-    """Return the scales of the bodies that a builder holds so far."""
-    values: Any = builder.custom_attributes[f"{NAMESPACE}:scale"].values
+def attribute_values(builder: newton.ModelBuilder, name: str) -> list[Any]:
+    """Return the values of an attribute of soft bodies that a builder holds so far."""
+    values: Any = builder.custom_attributes[f"{NAMESPACE}:{name}"].values
     return list(values.values() if isinstance(values, dict) else values or [])
 
 

@@ -8,6 +8,9 @@ import warp as wp
 Kernel = Callable[..., object]
 """A ``wp.kernel``, which a type checker takes for the function that it was made of."""
 
+WRENCH: Any = wp.spatial_vector
+"""Type of a force with a torque, which Warp's stubs take for a function."""
+
 
 class Struct:
     """A struct to a type checker, which knows no array of two axes: it has attributes, of whatever type."""

@@ -14,7 +14,7 @@ def allocate(
     struct: type[Table],
     axes: str | Mapping[str, str],
     sizes: Mapping[str, int],
-    device: Any,
+    device: wp.Device,
     *,
     fill: Mapping[str, float] | None = None,
     given: Mapping[str, Any] | None = None,

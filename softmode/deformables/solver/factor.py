@@ -1,7 +1,5 @@
 """Storage and launches of batched linear systems: block Cholesky factorisation and solve, see ``factor_kernels``."""
 
-from typing import Any
-
 import numpy as np
 import warp as wp
 
@@ -21,7 +19,9 @@ class BlockCholesky:
         part_count: Equal parts that a system is made of; ``relation`` says which are related.
     """
 
-    def __init__(self, system_world: wp.array, size: int, column_count: int, device: Any, part_count: int = 1) -> None:
+    def __init__(
+        self, system_world: wp.array, size: int, column_count: int, device: wp.Device, part_count: int = 1
+    ) -> None:
         """Allocate everything once."""
         self.system_world = system_world
         self.system_count = system_world.shape[0]

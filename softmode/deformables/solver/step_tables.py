@@ -14,7 +14,7 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.contact.detection_kernels import Shapes
 from softmode.deformables.contact.pairs import SoftPairs
 from softmode.deformables.contact.shape_tables import candidate_shapes, shape_table
-from softmode.deformables.model.declare import Kernel, launch, launch_teams
+from softmode.deformables.model.declare import WRENCH, Kernel, launch, launch_teams
 from softmode.deformables.model.lane_kernels import team_size, vec8
 from softmode.deformables.model.layout import Layout, lay_out, lay_out_bases, lay_out_instances
 from softmode.deformables.model.namespaces import SoftModel, soft
@@ -42,7 +42,6 @@ CUDA_THREADS = 2**16
 ONE_LAUNCH_BLOCKS = 5
 """Blocks of eight functions up to which a body is small enough for a team of threads on CUDA."""
 
-_WRENCH: Any = wp.spatial_vector
 _POINTS = {"": "instance point", "hessian": "instance 6 point"}
 _MOTION = {"": "instance unknown", "rate": "instance"}
 _SAMPLES = {
@@ -238,7 +237,7 @@ def allocate_tables(
         near=wp.zeros_like(candidate),
         pairs=pairs,
         system=system,
-        body_wrench=wp.zeros(max(model.body_count, 1), dtype=_WRENCH, device=device),
+        body_wrench=wp.zeros(max(model.body_count, 1), dtype=WRENCH, device=device),
         instance_force=wp.zeros(count, dtype=wp.vec3d, device=device),
         parameter_flags=wp.zeros(count, dtype=int, device=device),
         every_world=wp.full(layout.world_count + 1, True, dtype=bool, device=device),
