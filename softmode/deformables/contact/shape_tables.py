@@ -133,7 +133,7 @@ def shape_table(model: newton.Model) -> tuple[Shapes, list[Any]]:
     return shapes, alive
 
 
-def _name(model: newton.Model, shape: int) -> str:
+def _name(model: newton.Model, shape: int | np.integer) -> str:
     """Return how to call a shape in a message."""
     return f"shape {shape} ({model.shape_label[shape]!r})"
 
