@@ -124,7 +124,7 @@ def print_impact(ratio: float, speed: float) -> None:
         scene.step()
         p, _, e = totals(scene, twin)
         error = np.abs(p - momentum).max() / np.abs(momentum).max()
-        rows.append([error, e / energy - 1.0, -1e3 * min(scene.reduced.samples.gap.numpy()[0, :, 0].min(), 0.0)])
+        rows.append([error, e / energy - 1.0, -1e3 * min(scene.reduced.view.samples.gap.numpy()[0, :, 0].min(), 0.0)])
     error, gain, depth = np.max(rows, axis=0)
     print(f"impact {ratio:g} {speed} m/s: |dp| {error:.1e}, energy {gain:+.1e}, {depth:.2f} mm deep", flush=True)
 
@@ -140,8 +140,8 @@ def print_lift(youngs_modulus: float) -> None:
 
     def watched(*arguments: Any) -> None:
         step(*arguments)
-        touched = soft.samples.shape.numpy()[0] >= 0
-        depth.append(-1e3 * np.where(touched, soft.samples.gap.numpy()[0], 0.0).min())
+        touched = soft.view.samples.shape.numpy()[0] >= 0
+        depth.append(-1e3 * np.where(touched, soft.view.samples.gap.numpy()[0], 0.0).min())
         iterations.append(int(soft.iteration.numpy()[0]))
 
     def eager(actions: np.ndarray) -> None:
@@ -154,7 +154,7 @@ def print_lift(youngs_modulus: float) -> None:
         observation, _, terminated, truncated, info = env.step(policy(observation))
         if terminated or truncated:
             break
-    size = 1e3 * float(soft.layout.size[0])
+    size = 1e3 * float(soft.view.layout.size[0])
     print(
         f"LiftSoft E {youngs_modulus:.0e}: {len(depth)} steps, at most {max(depth):.2f} mm deep, mean "
         f"{np.mean(depth):.2f} mm, body {size:.0f} mm; {np.mean(iterations):.2f} iterations; {info.get('is_success')}",

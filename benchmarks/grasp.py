@@ -18,6 +18,8 @@ import warp as wp
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_splats
+from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient, solve
+from softmode.deformables.solver.minimise import check_convergence
 from softmode.envs.scripted import ScriptedLift
 from softmode.envs.tasks.lift_soft.task import LiftSoftEnv
 from softmode.splats import make_plush
@@ -64,38 +66,37 @@ def print_substep(env: LiftSoftEnv, repeats: int, iterations: float) -> None:
     scene = env.scene
     solver, dt, device = scene.solver, scene.dt, scene.device
     soft, state, scratch = solver.reduced, scene.state, scene._scratch
-    blank = soft.progress.active
+    blank = soft.tables.newton.active
     blank.fill_(1)
     whole = measure(lambda: solver.step(state, scratch, scene.control, None, dt), repeats, device)
-    print(f"substep: {whole:.3f} ms, {iterations:.2f} Newton iterations, {int(soft.entries.count.numpy()[0])} contacts")
+    print(
+        f"substep: {whole:.3f} ms, {iterations:.2f} Newton iterations, "
+        f"{int(soft.view.constraints.count.numpy()[0])} contacts"
+    )
 
     def renewed(stage: Callable[[], None]) -> None:
-        soft.progress.renew.fill_(1)
+        soft.tables.newton.refresh.fill_(1)
         stage()
-        soft.progress.renew.zero_()
+        soft.tables.newton.refresh.zero_()
 
     stages: dict[str, Callable[[], None]] = {
         "MuJoCo step (two per substep)": lambda: solver.rigid.step(state, scratch, scene.control, None, dt),
         "Jacobian, mass matrix": lambda: solver._linearise(state, dt),
         "begin": lambda: soft.begin(state, scene.control, dt),
         "detect contacts": lambda: soft.detect(state, scene.control, dt, prescribed=False),
-        "evaluate with Hessian (once or twice)": lambda: renewed(
-            lambda: soft._evaluate(blank, soft.q, soft.rigid.r, dt, derivatives=True)
-        ),
-        "evaluate with gradient (per iteration)": lambda: soft._evaluate(
-            blank, soft.q, soft.rigid.r, dt, derivatives=True
-        ),
-        "evaluate energy (per trial)": lambda: soft._evaluate(blank, soft.q, soft.rigid.r, dt, derivatives=False),
-        "sum potential (per evaluation)": lambda: soft._judge_iterate(dt),
-        "gather gradient (per iteration)": lambda: soft._gather_gradient(dt),
-        "assemble with stiffness (once or twice)": lambda: renewed(lambda: soft._assemble(dt)),
-        "assemble (per iteration)": lambda: soft._assemble(dt),
-        "factor and solve (per iteration)": soft._solve,
+        "evaluate with Hessian (once or twice)": lambda: renewed(lambda: evaluate(soft.tables, dt, derivatives=True)),
+        "evaluate with gradient (per iteration)": lambda: evaluate(soft.tables, dt, derivatives=True),
+        "evaluate energy (per trial)": lambda: evaluate(soft.tables, dt, derivatives=False),
+        "sum potential (per evaluation)": lambda: check_convergence(soft.tables, dt),
+        "gather gradient (per iteration)": lambda: gather_gradient(soft.tables, dt),
+        "assemble with stiffness (once or twice)": lambda: renewed(lambda: assemble(soft.tables, dt)),
+        "assemble (per iteration)": lambda: assemble(soft.tables, dt),
+        "factor and solve (per iteration)": lambda: solve(soft.tables),
         "finish": lambda: soft.finish(scratch, dt),
     }
     for name, stage in stages.items():
         blank.fill_(1)
-        soft.progress.renew.zero_()
+        soft.tables.newton.refresh.zero_()
         milliseconds = measure(stage, repeats, device)
         print(f"  {name:<44}{milliseconds:8.3f} ms  {milliseconds / whole:6.1%}")
     frame = measure(scene.control_step, max(repeats // 10, 5), device)

@@ -27,6 +27,9 @@ from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
+from softmode.deformables.solver.evaluate import assemble, gather_gradient, solve
+from softmode.deformables.solver.evaluate import evaluate as evaluate_step
+from softmode.deformables.solver.minimise import accept_step, check_convergence, start_line_search
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 
 SIZE = (5.0, 1.0, 1.0)
@@ -125,18 +128,18 @@ class Beam:
 
     def report_stages(self, repeats: int) -> None:
         """Print the time of every stage, each captured on its own."""
-        solver, (state, other), progress = self.solver, self.states, self.solver.progress
+        solver, (state, other), progress = self.solver, self.states, self.solver.tables.newton
 
         def stage(run: Callable[[], None], *, renewed: bool = False) -> Callable[[], None]:
             def prepared() -> None:
                 progress.active.fill_(1)
-                progress.renew.fill_(int(renewed))
+                progress.refresh.fill_(int(renewed))
                 run()
 
             return prepared
 
         def evaluate(derivatives: bool) -> Callable[[], None]:
-            return lambda: solver._evaluate(progress.active, solver.q, solver.rigid.r, DT, derivatives=derivatives)
+            return lambda: evaluate_step(solver.tables, DT, derivatives=derivatives)
 
         stages = {
             "two fills (in every row below)": stage(lambda: None),
@@ -145,14 +148,14 @@ class Beam:
             "evaluate with Hessian": stage(evaluate(True), renewed=True),
             "evaluate with gradient": stage(evaluate(True)),
             "evaluate energy": stage(evaluate(False)),
-            "gather gradient": stage(lambda: solver._gather_gradient(DT)),
-            "judge iterate": stage(lambda: solver._judge_iterate(DT)),
-            "assemble with stiffness": stage(lambda: solver._assemble(DT), renewed=True),
-            "assemble": stage(lambda: solver._assemble(DT)),
-            "factor": stage(lambda: solver.system.factor(progress.active)),
-            "factor and solve": stage(solver._solve),
-            "begin search": stage(lambda: solver._begin_search(DT)),
-            "finish iteration": stage(lambda: solver._finish_iteration(DT)),
+            "gather gradient": stage(lambda: gather_gradient(solver.tables, DT)),
+            "check convergence": stage(lambda: check_convergence(solver.tables, DT)),
+            "assemble with stiffness": stage(lambda: assemble(solver.tables, DT), renewed=True),
+            "assemble": stage(lambda: assemble(solver.tables, DT)),
+            "factor": stage(lambda: solver.tables.system.factor(progress.active)),
+            "factor and solve": stage(lambda: solve(solver.tables)),
+            "start line search": stage(lambda: start_line_search(solver.tables, DT)),
+            "accept step": stage(lambda: accept_step(solver.tables, DT)),
             "finish": stage(lambda: solver.finish(other, DT)),
         }
         for name, run in stages.items():

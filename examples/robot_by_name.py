@@ -81,7 +81,7 @@ class Lift:
         for k in range(round(duration / DT / 2)):
             self.command(2 * k * DT)
             wp.capture_launch(self.graph)
-            status |= int(self.solver.reduced.status.numpy()[0])
+            status |= int(self.solver.status.numpy()[0])
             if (k + 1) % 25 == 0:
                 wrench, state = self.solver.body_wrench.numpy(), self.states[0]
                 press = 1000.0 * (state.joint_q.numpy()[-2:] - self.target[-2:])

@@ -273,7 +273,7 @@ def info_arrays(task: Task, *, final: bool = False) -> dict[str, Any]:
     }
     vector: Any = task.final_observation if final else task.observation
     info["finger_force"] = vector[:, task.segments["finger_force"][0]]
-    info["solver_status"] = task.final_status if final else task.scene.solver.reduced.status
+    info["solver_status"] = task.final_status if final else task.scene.solver.status
     info["end_reason"] = task.end
     return info
 

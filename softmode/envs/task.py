@@ -288,7 +288,7 @@ class Task:
         self.terms = zeros(max(len(self.term_names), 1))
         self.metrics, self.final_metrics = (zeros(max(len(self.metric_names), 1)) for _ in range(2))
         self.final_parameters = wp.zeros_like(self.table.values)
-        self.final_status = wp.zeros_like(self.scene.solver.reduced.status)
+        self.final_status = wp.zeros_like(self.scene.solver.status)
         self._never, self._fresh = zeros(dtype=wp.bool), zeros(dtype=wp.bool)
         self.any_done = wp.zeros(1, dtype=int, device=device)
         instances = worlds * len(self.scene.objects)
@@ -540,7 +540,7 @@ class Task:
                 wp.copy(self.final_metrics, self.metrics)
                 wp.copy(self.final_success, self.success)
                 wp.copy(self.final_parameters, self.table.values)
-                wp.copy(self.final_status, scene.solver.reduced.status)
+                wp.copy(self.final_status, scene.solver.status)
                 wp.copy(self._fresh, self.done)
                 self._restart(self._fresh)
                 self._observe()
@@ -564,7 +564,7 @@ class Task:
                 fresh,
                 self.limit,
                 bits.WORLD_NOT_FINITE,
-                scene.solver.reduced.status,
+                scene.solver.status,
                 self.finite,
                 scene.object_position,
                 scene.soft.height - FALL,

@@ -221,9 +221,9 @@ class SplatScene:
 
     def soft_overlap(self) -> float:
         """Return how deep the surface of an object was inside another at the start of the last step [m]."""
-        if self.solver.pairs is None:
+        pairs = self.solver.view.pairs
+        if pairs is None:
             return 0.0
-        pairs = self.solver.pairs.table
         count = np.array([thing.body.surface_count for thing in self.objects])
         found = pairs.near.numpy().astype(bool)[:, None] & (np.arange(pairs.gap.shape[1]) < count[:, None])
         gap = np.where(found[:, :, None] & (pairs.other.numpy() >= 0), pairs.gap.numpy(), 0.0)

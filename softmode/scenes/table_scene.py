@@ -269,7 +269,7 @@ class TableScene:
                 outputs=[state.softmode.q, state.softmode.qd, self.control.softmode.q_driven],
                 device=self.device,
             )
-        self.solver.reduced.update_particles(state)
+        self.solver.update_particles(state)
         self.controller.reset(state, self.world_mask)
         self.controller.write_targets(self.control)
         self.observe()
@@ -299,7 +299,7 @@ class TableScene:
     def control_step(self) -> None:
         """Move the command by `actions`, run the substeps, observe; capturable."""
         config = self.config
-        self.solver.reduced.status.zero_()
+        self.solver.status.zero_()
         self.controller.command(self.actions, self.state)
         for substep in range(config.substeps):
             self.controller.write_targets(self.control, (substep + 1) / config.substeps)
@@ -356,7 +356,7 @@ class TableScene:
     @property
     def status(self) -> np.ndarray:
         """Status bits of the last control step per world, see :mod:`softmode.deformables.model.status`."""
-        return self.solver.reduced.status.numpy()
+        return self.solver.status.numpy()
 
     @property
     def status_reasons(self) -> tuple[tuple[str, ...], ...]:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.model.authoring import NAMESPACE
-from softmode.scenes.host import soft_solver
 from softmode.scenes.scene import Scene
 
 Array = NDArray[np.float64]
@@ -45,4 +44,4 @@ def carry_over(scene: Scene, old: ReducedBody, q: Array, qd: Array) -> None:
     state.q.assign(found[:, :3])
     state.qd.assign(found[:, 3:])
     state.dt_before.zero_()
-    soft_solver(scene.solver).update_particles(scene.state)
+    scene.solver.update_particles(scene.state)

@@ -13,7 +13,6 @@ from softmode.checks import require_number
 from softmode.deformables.model.authoring import NAMESPACE
 from softmode.errors import AssetError, ConfigError
 from softmode.files import read_arrays
-from softmode.scenes.host import soft_solver
 from softmode.scenes.scene import Scene
 
 _FORMAT = "softmode live recording 1"
@@ -72,7 +71,7 @@ class LiveRecording:
         poses = scene.state.body_q
         if poses is not None and self.body_q.shape[1] == poses.shape[0]:
             poses.assign(self.body_q[index])
-        soft_solver(scene.solver).update_particles(scene.state)
+        scene.solver.update_particles(scene.state)
 
     def save(self, path: Path) -> None:
         """Write it to a file."""

@@ -22,7 +22,7 @@ from softmode.deformables.solver.energies import SoftEnergies
 from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
 from softmode.objects.soft_object import SoftObject
-from softmode.scenes.host import host, soft_solver
+from softmode.scenes.host import host
 from softmode.scenes.meshes import SceneMesh, scene_meshes
 from softmode.view import live_parameters
 from softmode.view.coordinates import carry_over, coordinates
@@ -74,7 +74,7 @@ class LiveSession:
         self._scene = scene = self._live.scene
         self._picture = LivePicture(scene.objects, scene.model, self._live.marker)
         self._energies = SoftEnergies(scene.solver)
-        self._reduced = soft_solver(scene.solver)
+        self._solver = scene.solver
         self._meshes: tuple[SceneMesh, ...] | None = None
         self._pace = Pace(self._live.block_dt, self.options.budget)
         self._begin()
@@ -84,7 +84,7 @@ class LiveSession:
         self._time, self._bits, self._stale = 0.0, 0, True
         self._pace.begin()
         self._hands.take_up(self._scene)
-        self._reduced.status.zero_()
+        self._solver.status.zero_()
 
     @classmethod
     def from_object(
@@ -218,7 +218,7 @@ class LiveSession:
     @property
     def size(self) -> float:
         """Diagonal of the first object's bounding box at rest [m]."""
-        return float(self._reduced.instances.size.numpy()[0])
+        return float(self._solver.view.instances.size.numpy()[0])
 
     def bounds(self) -> NDArray[np.float64]:
         """Return the corners of a box around what is worth seeing at the start [m], shape (2, 3)."""
@@ -498,14 +498,14 @@ class LiveSession:
         for grips in self._scene.grips:
             grips.begin_frame(count * live.block_steps)
         self._bits, taken = 0, 0
-        self._reduced.status.zero_()
+        self._solver.status.zero_()
         for _ in range(count):
             if live.over(busy=self._hands.busy):
                 self.reset()
                 continue
             clock = time.perf_counter()
             live.step()
-            self._bits |= int(self._reduced.status.numpy()[0])  # waits for the device
+            self._bits |= int(self._solver.status.numpy()[0])  # waits for the device
             self._pace.took(time.perf_counter() - clock)
             taken += 1
             self._time += live.block_dt

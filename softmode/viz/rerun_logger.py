@@ -16,7 +16,7 @@ from softmode.deformables.solver.energies import SoftEnergies
 from softmode.deformables.tools.sensing import ContactSensor
 from softmode.errors import ConfigError
 from softmode.scenes.binding import BoundSplats, SplatFrame
-from softmode.scenes.host import host, soft_solver
+from softmode.scenes.host import host
 from softmode.scenes.meshes import distinct, scene_meshes, scene_poses
 from softmode.splats.camera import SplatCamera
 from softmode.splats.splats import Splats
@@ -113,7 +113,7 @@ class RerunLogger:
     def _prepare(self) -> None:
         """Write meshes, places of the worlds and the layout; allocate what reads the device."""
         source, rr, options = self._source, self._rr, self.options
-        model, reduced = source.model, soft_solver(source.solver)
+        model, seen = source.model, source.solver.view
         self._stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._meshes, self._paths = {}, {}
         for place, w in enumerate(self.worlds):
@@ -122,7 +122,7 @@ class RerunLogger:
                 self._stream.log(f"{self._prefix[w]}scene", rr.Transform3D(translation=shift), static=True)
             self._meshes[w] = scene_meshes(model, world=w, plane_extent=options.plane_extent)
             self._write_meshes(w)
-        layout = reduced.layout
+        layout = seen.layout
         instances = range(int(layout.instance_start[0]), int(layout.instance_start[1]))
         self._starts = {w: int(layout.instance_start[w]) for w in self.worlds}
         self._soft = _distinct([layout.bodies[layout.asset[i]].name for i in instances])
@@ -134,7 +134,7 @@ class RerunLogger:
             self._splats = BoundSplats(model, objects, worlds=self.worlds, sh_degree=0)
         self._energies = SoftEnergies(source.solver)
         self._samples = {
-            (w, o): (int(reduced.instances.particle_start.numpy()[i]), int(reduced.instances.sample_count.numpy()[i]))
+            (w, o): (int(seen.instances.particle_start.numpy()[i]), int(seen.instances.sample_count.numpy()[i]))
             for w in self.worlds
             for o, i in enumerate(range(self._starts[w], self._starts[w] + len(self._soft)))
         }

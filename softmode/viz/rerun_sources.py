@@ -14,7 +14,7 @@ import warp as wp
 from softmode.deformables.model.status import status_reasons
 from softmode.errors import ConfigError
 from softmode.objects.soft_object import SoftObject
-from softmode.scenes.host import Solver, soft_solver
+from softmode.scenes.host import Solver
 from softmode.scenes.splat_scene import SplatScene
 from softmode.scenes.table_scene import TableScene
 from softmode.splats.camera import SplatCamera
@@ -207,16 +207,15 @@ Source = SceneSource | TaskSource
 
 def solver_scalars(solver: Solver, world: int) -> Numbers:
     """Return iterations of the last step and the status bits of a world."""
-    reduced = soft_solver(solver)
     return {
-        "solver/iterations": float(reduced.iteration.numpy()[world]),
-        "solver/status": float(reduced.status.numpy()[world]),
+        "solver/iterations": float(solver.iteration.numpy()[world]),
+        "solver/status": float(solver.status.numpy()[world]),
     }
 
 
 def solver_remarks(solver: Solver, world: int) -> list[tuple[str, str]]:
     """Return the names of the status bits that are set."""
-    reasons = status_reasons(int(soft_solver(solver).status.numpy()[world]))
+    reasons = status_reasons(int(solver.status.numpy()[world]))
     return [("WARN", f"solver: {', '.join(reasons)}")] if reasons else []
 
 

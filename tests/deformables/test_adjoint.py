@@ -17,7 +17,7 @@ from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model.authoring import add_pins, add_reduced_body
 from softmode.deformables.model.rigid_dofs import RigidDofs
-from softmode.deformables.solver.solver_reduced import SolverReducedOptions
+from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.deformables.tools.markers import Markers
 from softmode.errors import ConfigError, SolverDiverged
 from tests.scenes import GRAVITY, Scene, cube
@@ -230,7 +230,7 @@ def test_field_of_moduli():
     gradients = case.gradients()
     field = gradients["log_modulus"][0]
     assert field.sum() == pytest.approx(MATERIAL.youngs_modulus * gradients["youngs_modulus"][0], rel=1e-6)
-    array = case.scene.reduced.basis.stiffness_scale
+    array = case.scene.reduced.view.basis.stiffness_scale
     half, losses, h = case.body.points[:, 0] > 0.0, [], 2.0**-9
     for factor in (-1.0, 1.0):
         array.assign(np.where(half, 1.0 + factor * h, 1.0).astype(np.float32))
@@ -364,7 +364,7 @@ def test_gradient_through_sliding_contact():
     loss = np.zeros((steps + 1, *q.shape))
     loss[-1] = weight
     run()
-    assert scene.reduced.entries.count.numpy()[0] > 0
+    assert scene.reduced.view.constraints.count.numpy()[0] > 0
     gradients = adjoint.backward(loss_q=loss).numpy()
     assert float((gradients["qd"] * direction).sum()) == pytest.approx(central(run, 1e-4), rel=1e-4)
     assert gradients["friction"][0] == pytest.approx(central(rub, 2.0**-10), rel=1e-3)
@@ -429,9 +429,9 @@ def test_refuses_what_it_cannot_do():
         add_reduced_body(world, cube())
 
     scene = Scene(populate, [cube()])
-    scene.reduced.attach_rigid(RigidDofs(scene.model, 1, np.ones(1, int), np.zeros(1, int)))
+    joints = RigidDofs(scene.model, 1, np.ones(1, int), np.zeros(1, int))
     with pytest.raises(ConfigError, match="joint dofs"):
-        AdjointReduced(scene.reduced, 1)
+        AdjointReduced(SolverReduced(scene.model, scene.bodies, rigid=joints), 1)
 
 
 # -- PyTorch -----------------------------------------------------------------------------------------------------------

@@ -173,9 +173,9 @@ def test_pins_of_a_prescribed_link_stay_on_their_circle():
     state.body_qd.assign(np.array([[0.0, 0.0, 0.0, 0.0, turn / scene.dt, 0.0]], np.float32))
     solver.begin(state, scene.control, scene.dt)
     solver.detect(state, scene.control, scene.dt, prescribed=True)
-    count = solver.instances.pin_count.numpy()[0]
-    points = solver.basis.row_point.numpy()[-count:]
-    target = points - solver.entries.offset.numpy()[0, :count]  # the body is where it was put: x_n = X
+    count = solver.view.instances.pin_count.numpy()[0]
+    points = solver.view.basis.row_point.numpy()[-count:]
+    target = points - solver.view.constraints.offset.numpy()[0, :count]  # the body is where it was put: x_n = X
     circle = link + (points - link) @ rotation((0, 1, 0), turn).T
     np.testing.assert_allclose(target, circle, atol=1e-6)
     assert np.linalg.norm(circle - points, axis=1).min() > 1e-3
@@ -185,10 +185,10 @@ def test_held_body_does_not_touch_its_link():
     """The shapes of the link a body is fixed to are not in contact with it, until it is released."""
     scene, attachment = joined(gap=-0.01)
     scene.step()
-    assert scene.reduced.entries.count.numpy()[0] == attachment.count
+    assert scene.reduced.view.constraints.count.numpy()[0] == attachment.count
     scene.reduced.release(attachment)
     scene.step()
-    assert scene.reduced.entries.count.numpy()[0] > attachment.count
+    assert scene.reduced.view.constraints.count.numpy()[0] > attachment.count
 
 
 def test_errors():

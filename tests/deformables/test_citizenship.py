@@ -118,7 +118,7 @@ def test_any_flag_renews_masses(flag):
     run = Run(SolverReduced, batch(2))
     run.model.softmode.density.assign(np.array([200.0, 400.0], np.float32))
     run.solver.notify_model_changed(flag)
-    np.testing.assert_allclose(run.solver.instances.mass.numpy(), np.array([200.0, 400.0]) * cube().volume)
+    np.testing.assert_allclose(run.solver.view.instances.mass.numpy(), np.array([200.0, 400.0]) * cube().volume)
 
 
 PARAMETERS = {

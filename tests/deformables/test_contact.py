@@ -38,7 +38,7 @@ def test_mesh_contact_is_not_lost_when_deep():
     scene.reduced.begin(scene.state, scene.control, scene.dt)
     scene.reduced.detect(scene.state, scene.control, scene.dt, prescribed=True)
     bottom = cube().surface_points[:, 2] < -0.49 * EDGE
-    assert scene.reduced.entries.count.numpy()[0] >= bottom.sum()
+    assert scene.reduced.view.constraints.count.numpy()[0] >= bottom.sum()
 
 
 # -- potentials --------------------------------------------------------------------------------------------------------
@@ -138,7 +138,7 @@ def test_rest_far_from_the_origin(offset):
 
 def stiffness_per_area(scene, instance=0):
     """Return the contact stiffness per area [Pa/m] of the contacts of the last step, the largest."""
-    entries, basis = scene.reduced.entries, scene.reduced.basis
+    entries, basis = scene.reduced.view.constraints, scene.reduced.view.basis
     count = int(entries.count.numpy()[instance])
     area = basis.row_area.numpy()[entries.row.numpy()[instance, :count]]
     return float((entries.stiffness.numpy()[instance, :count] / area).max())
@@ -150,7 +150,7 @@ def test_stiffness_and_size_of_the_penalty():
     scene = on_shape(lambda w: w.add_ground_plane(), height=0.0, material=material)
     settle(scene, 400)
     kappa = stiffness_per_area(scene)
-    eps = float(scene.reduced.instances.smoothing.numpy()[0])
+    eps = float(scene.reduced.view.instances.smoothing.numpy()[0])
     pressure = scene.mass() * GRAVITY / EDGE**2
     p = np.sqrt(2 * eps * pressure / kappa)
     p = p if p < eps else pressure / kappa + eps / 2
@@ -220,7 +220,7 @@ def test_fast_impact_of_light_and_heavy_boxes(ratio):
     depth = []
     for _ in range(60):
         scene.step()
-        depth.append(-float(scene.reduced.samples.gap.numpy()[0, :, 0].min()))
+        depth.append(-float(scene.reduced.view.samples.gap.numpy()[0, :, 0].min()))
         p, _, e = totals(scene, twin)
         assert np.abs(p - momentum).max() <= 1e-5 * np.abs(momentum).max()
         assert e <= (1.0 + 1e-6) * energy
@@ -310,7 +310,7 @@ def contacts_after_one_step(populate_shape, position):
 
     scene = Scene(populate, [body], dt=0.001)
     scene.step()
-    return int(scene.reduced.entries.count.numpy()[0])
+    return int(scene.reduced.view.constraints.count.numpy()[0])
 
 
 def test_mesh_away_from_its_own_origin_is_found():
@@ -341,7 +341,7 @@ def test_spinning_shape_is_found_in_time():
     twist[0, 5] = omega
     scene.state.body_qd.assign(twist)
     scene.step()
-    assert scene.reduced.entries.count.numpy()[0] > 0
+    assert scene.reduced.view.constraints.count.numpy()[0] > 0
 
 
 def test_bounded_plane_ends_where_it_ends():
@@ -364,7 +364,7 @@ def test_shapes_of_other_worlds_are_not_touched():
     solver = SolverReduced(model, [body])
     first, second = model.state(), model.state()
     solver.step(first, second, None, None, 0.001)
-    counts = solver.entries.count.numpy()
+    counts = solver.view.constraints.count.numpy()
     assert counts[0] > 0 and counts[1] == 0
 
 
@@ -374,7 +374,7 @@ def test_overflow_is_reported():
     scene = on_shape(lambda w: w.add_ground_plane(), height=-0.001, options=options)
     scene.step()
     assert scene.reduced.status.numpy()[0] & bits.WORLD_CONTACT_OVERFLOW
-    assert scene.reduced.entries.count.numpy()[0] == 8
+    assert scene.reduced.view.constraints.count.numpy()[0] == 8
     assert scene.reduced.instance_force.numpy()[0, 2] > 0.0
 
 
@@ -400,7 +400,7 @@ def test_worlds_in_contact_are_independent():
 def test_overlap_at_the_start_is_pushed_out_slowly():
     """A cube placed half in the ground leaves by at most OVERLAP of its size in a step, plus a tenth as it unbends."""
     scene = on_shape(lambda w: w.add_ground_plane(), height=-0.5 * EDGE)
-    size = float(scene.reduced.instances.size.numpy()[0])
+    size = float(scene.reduced.view.instances.size.numpy()[0])
     fastest = 0.0
     for _ in range(60):
         scene.step()

@@ -1,9 +1,10 @@
 """Two-way contact with MuJoCo: derivatives of the joint potential, momentum, squeeze force, batching, faults."""
 
+import mujoco_warp
 import newton
 import numpy as np
 import pytest
-import warp as wp
+from newton.solvers import SolverMuJoCo
 
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
@@ -11,6 +12,8 @@ from softmode.deformables.model import status as bits
 from softmode.deformables.model.authoring import add_pins, add_reduced_body
 from softmode.deformables.model.lane_kernels import from_blocks, to_blocks
 from softmode.deformables.solver import assembly_kernels
+from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient
+from softmode.deformables.solver.minimise import check_convergence
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.errors import ConfigError
 from tests import reference
@@ -60,16 +63,16 @@ class Potential:
             scene.step()
         scene.step()  # reads the contacts of a step that starts in contact
         self.n = scene.body().function_count
-        self.q = from_blocks(self.solver.q.numpy()[0], self.n)
-        self.r = self.solver.rigid.r.numpy()[0].copy()
+        self.q = from_blocks(self.solver.tables.arrays.q.numpy()[0], self.n)
+        self.r = self.solver.tables.rigid.table.r.numpy()[0].copy()
 
     def put(self, u):
         """Write u into the solver and ask for a fresh elastic Hessian."""
         solver = self.solver
-        solver.progress.renew.fill_(1)
+        solver.tables.newton.refresh.fill_(1)
         q = u[: 3 * self.n].reshape(1, -1, 3)
-        solver.q.assign(to_blocks(q, solver.layout.block_count))
-        solver.rigid.r.assign(u[None, 3 * self.n :])
+        solver.tables.arrays.q.assign(to_blocks(q, solver.view.layout.block_count))
+        solver.tables.rigid.table.r.assign(u[None, 3 * self.n :])
 
     @property
     def u(self):
@@ -80,41 +83,46 @@ class Potential:
         """Return E(u) with the normal forces of friction as they were last renewed."""
         solver, dt = self.solver, self.scene.dt
         self.put(u)
-        solver.progress.active.fill_(1)
-        solver._evaluate(solver.progress.active, solver.q, solver.rigid.r, dt, derivatives=False)
-        solver.progress.iteration.zero_()
-        solver._judge_iterate(dt)
-        return float(solver.progress.potential.numpy()[0])
+        solver.tables.newton.active.fill_(1)
+        evaluate(solver.tables, dt, derivatives=False)
+        solver.tables.newton.iteration.zero_()
+        check_convergence(solver.tables, dt)
+        return float(solver.tables.newton.potential.numpy()[0])
 
     def gradient(self, u):
         """Return dE/du; renews the normal forces of friction."""
         solver, dt = self.solver, self.scene.dt
         self.put(u)
-        solver.progress.active.fill_(1)
-        solver._evaluate(solver.progress.active, solver.q, solver.rigid.r, dt, derivatives=True)
-        solver._gather_gradient(dt)
-        solver._assemble(dt)
+        solver.tables.newton.active.fill_(1)
+        evaluate(solver.tables, dt, derivatives=True)
+        gather_gradient(solver.tables, dt)
+        assemble(solver.tables, dt)
         return np.concatenate(
-            [from_blocks(solver.gradient.numpy()[0], self.n).ravel(), solver.rigid.gradient.numpy()[0]]
+            [
+                from_blocks(solver.tables.arrays.gradient.numpy()[0], self.n).ravel(),
+                solver.tables.rigid.table.gradient.numpy()[0],
+            ]
         )
 
     def matrix(self):
         """Return the assembled d2E/du2, unknowns in the order of u."""
         solver, n = self.solver, self.n
-        system = solver.system.matrix.numpy()[0]
+        system = solver.tables.system.matrix.numpy()[0]
         system = system.reshape(len(system), -1).astype(float)
-        index = (np.arange(3)[None, :] * solver.stride + np.arange(n)[:, None]).ravel()  # component- to point-major
-        size = 3 * solver.stride
+        index = (
+            np.arange(3)[None, :] * solver.view.layout.stride + np.arange(n)[:, None]
+        ).ravel()  # component- to point-major
+        size = 3 * solver.view.layout.stride
         upper = np.triu(system[:, :size])
         K = (upper + np.triu(upper, 1).T)[np.ix_(index, index)]
         C = system[index, size : size + len(self.r)]
-        return np.block([[K, C], [C.T, solver.rigid.matrix.numpy()[0]]])
+        return np.block([[K, C], [C.T, solver.tables.rigid.table.matrix.numpy()[0]]])
 
 
 def test_gradient_of_the_incremental_potential():
     """dE/du equals central differences of E, u = (q, r), with contact, friction, pins, viscosity and rigid dofs."""
     potential = Potential(impact(1.0, offset=(0.02, 0.01), pins=True)[0])
-    assert potential.solver.entries.count.numpy()[0] > 4 + 5
+    assert potential.solver.view.constraints.count.numpy()[0] > 4 + 5
     rng = np.random.default_rng(0)
     u = potential.u + 1e-5 * rng.normal(size=potential.u.size)
     gradient = potential.gradient(u)
@@ -161,10 +169,10 @@ def test_jacobians_move_the_shape():
     solver, scene = potential.solver, potential.scene
     u = potential.u
     gradient = potential.gradient(u)[3 * potential.n :]
-    inertia = solver.rigid.inertia.numpy()[0]
-    contact = gradient - inertia @ (potential.r - solver.rigid.predicted.numpy()[0])
-    count = solver.entries.count.numpy()[0]
-    force, arm = solver.entries.force.numpy()[0, :count], solver.entries.arm.numpy()[0, :count]
+    inertia = solver.tables.rigid.table.inertia.numpy()[0]
+    contact = gradient - inertia @ (potential.r - solver.tables.rigid.table.predicted.numpy()[0])
+    count = solver.view.constraints.count.numpy()[0]
+    force, arm = solver.view.constraints.force.numpy()[0, :count], solver.view.constraints.arm.numpy()[0, :count]
     expected = np.concatenate([force.sum(axis=0), np.cross(arm, force).sum(axis=0)])
     # arms are float32 differences of world positions near 0.1 m
     np.testing.assert_allclose(contact, expected, atol=1e-5 * np.abs(force).sum() * EDGE + 1e-6 * np.abs(force).sum())
@@ -250,18 +258,16 @@ def test_reactions_are_equal_and_opposite():
 
 def solve_condensed(scene, S, M, right):
     """Return the solution of S x = right by the solver's kernels, S being condensed from S + Y^T Y >= M."""
-    solver, device = scene.reduced, scene.model.device
-    rigid, n = solver.rigid, len(S)
+    solver = scene.reduced
+    rigid, n = solver.tables.rigid.table, len(S)
     rigid.count.fill_(n)
     rigid.inertia.assign(M[None])
-    solver.bound_pivots()
+    solver.tables.launch_teams(assembly_kernels.bound_pivots, 1, solver.tables.team, rigid)
     rigid.matrix.assign(S[None])
     rigid.pivot_min.assign(rigid.pivot_floor)
     rigid.direction.assign(right[None])
-    solver.progress.active.fill_(1)
-    wp.launch(
-        assembly_kernels.solve_rigid, (1, 1), inputs=[solver.progress.active, 1], outputs=[rigid.table], device=device
-    )
+    solver.tables.newton.active.fill_(1)
+    solver.tables.launch_teams(assembly_kernels.solve_rigid, 1, solver.tables.newton.active, solver.tables.team, rigid)
     return rigid.direction.numpy()[0]
 
 
@@ -280,7 +286,7 @@ def test_rigid_solve():
     expected = np.linalg.solve(M + contact, right)
     rounding = 8 * np.finfo(float).eps * np.linalg.cond(M + contact) * np.linalg.norm(expected)
     np.testing.assert_allclose(solve_condensed(scene, M + contact, M, right), expected, rtol=0.0, atol=rounding)
-    np.testing.assert_allclose(scene.reduced.rigid.pivot_floor.numpy()[0], pivots, rtol=1e-12)
+    np.testing.assert_allclose(scene.reduced.tables.rigid.table.pivot_floor.numpy()[0], pivots, rtol=1e-12)
     noise = rng.normal(size=(6, 6))
     S = contact + 10.0 * (noise + noise.T)  # float32's rounding of 1e6 and more
     assert np.linalg.eigvalsh(S)[0] < -1.0
@@ -464,3 +470,26 @@ def test_options_reach_the_soft_solve():
     scene, _ = impact(1.0, options=SolverReducedOptions(iteration_max=1))
     scene.step(3)
     assert scene.reduced.iteration.numpy()[0] == 1
+
+
+def test_private_names_of_the_rigid_solver_are_checked(monkeypatch):
+    """A rigid solver without them gets a warning when the solver is built, and whole steps: the same step to 1e-5."""
+    scene, _ = impact(1.0)
+    while np.abs(scene.reduced.instance_force.numpy()).max() < 1.0:
+        scene.step()
+    rigid = SolverMuJoCo(scene.model, njmax=64, nconmax=32)
+    rigid._use_speculative_contacts = None  # type: ignore[assignment]
+    with pytest.warns(RuntimeWarning, match="two whole MuJoCo steps"):
+        whole = SolverCoupledReduced(scene.model, scene.bodies, rigid=rigid)
+    assert callable(scene.solver.rigid._mujoco_warp_step)  # the known names are there, and give the faster path
+    taken, step = [], mujoco_warp.step2
+    monkeypatch.setattr(mujoco_warp, "step2", lambda *given: (taken.append(1), step(*given))[1])
+    out = [scene.model.state() for _ in range(2)]
+    whole.step(scene.state, out[0], scene.control, None, scene.dt)
+    assert not taken
+    scene.solver.step(scene.state, out[1], scene.control, None, scene.dt)
+    assert taken
+    for name in ("joint_qd", "body_q"):
+        one, other = (getattr(state, name).numpy() for state in out)
+        np.testing.assert_allclose(one, other, atol=1e-5)
+    np.testing.assert_allclose(out[0].softmode.q.numpy(), out[1].softmode.q.numpy(), atol=1e-7)

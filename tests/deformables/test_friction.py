@@ -55,7 +55,7 @@ def test_what_does_not_press_does_not_hold():
         lambda world: add_reduced_body(world, cube(), position=position), [cube()], gravity=(GRAVITY, 0, 0), ground=MU
     )
     scene.step()
-    assert scene.reduced.entries.count.numpy()[0] > 0
+    assert scene.reduced.view.constraints.count.numpy()[0] > 0
     np.testing.assert_allclose(scene.momentum()[0] / scene.mass(), [GRAVITY * scene.dt, 0.0, 0.0], rtol=1e-6)
     assert scene.reduced.iteration.numpy()[0] <= 2
 
@@ -158,7 +158,7 @@ def test_force_stays_in_the_cone():
     seen = 0
     for _ in range(60):
         scene.step()
-        entries = scene.reduced.entries
+        entries = scene.reduced.view.constraints
         count = int(entries.count.numpy()[0])
         f, n = entries.force.numpy()[0, :count], entries.normal.numpy()[0, :count]
         normal = (f * n).sum(axis=1)
@@ -264,7 +264,7 @@ def test_stick_is_the_return_map():
     """After a step in which everything slides, the memory is mu f_n / k_t long, along the slip."""
     scene, along = incline(1.5)
     scene.step(40)
-    entries = scene.reduced.entries
+    entries = scene.reduced.view.constraints
     count = int(entries.count.numpy()[0])
     f, k = entries.force.numpy()[0, :count], entries.stick.numpy()[0, :count]
     shapes, points = memory(scene)

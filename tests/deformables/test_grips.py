@@ -81,7 +81,7 @@ def test_a_pull_is_a_spring_and_moves_what_a_constant_force_does():
     grips.aim(pull, goal)
     scene.step(250)
     force, moved = grips.force(pull), grips.points(pull, scene.state)[0]
-    size, mass = float(scene.reduced.instances.size.numpy()[0]), scene.mass()
+    size, mass = float(scene.reduced.view.instances.size.numpy()[0]), scene.mass()
     k = min(0.25 * 1.0e5 * size, mass * 250.0**2)
     np.testing.assert_allclose(force, k * (goal - moved), rtol=1e-5, atol=1e-5 * np.linalg.norm(force))
     assert np.linalg.norm(moved - start) > 1e-3

@@ -149,7 +149,7 @@ def test_bodies_of_one_world_move_as_alone():
     for i, scene in enumerate(alone):
         start = scene.q()
         scene.step(count)
-        tolerance = count * both.reduced.instances.tolerance.numpy()[i]
+        tolerance = count * both.reduced.view.instances.tolerance.numpy()[i]
         assert np.linalg.norm(both.q(i) - scene.q()) <= tolerance
         assert np.linalg.norm(both.q(i) - start) > 10 * tolerance  # a motion worth the name
     np.testing.assert_array_equal(both.q(0)[: clamped().driven_count], alone[0].q()[: clamped().driven_count])
@@ -167,7 +167,7 @@ def test_driving_one_body_leaves_the_others():
     still, moved = scenes
     assert np.abs(moved.q(1) - still.q(1)).max() > 0.01
     # the free cube of the same world shares the line search
-    assert np.linalg.norm(moved.q(2) - still.q(2)) <= 5 * still.reduced.instances.tolerance.numpy()[2]
+    assert np.linalg.norm(moved.q(2) - still.q(2)) <= 5 * still.reduced.view.instances.tolerance.numpy()[2]
     for world in (0, 2):
         assert_same_bits(moved.motion(world), still.motion(world))
 
@@ -180,7 +180,7 @@ def test_driving_one_body_leaves_the_others():
 def test_each_of_several_worlds_equals_itself_alone(merge, options):
     """World i of a model whose worlds hold different bodies equals a model of that world alone, bit for bit."""
     together = MixedScene(WORLDS, merge=merge, options=options)
-    assert together.reduced.layout.instance_world.tolist() == [0, 1, 1, 2]
+    assert together.reduced.view.layout.instance_world.tolist() == [0, 1, 1, 2]
     together.step(10)
     for w, populate in enumerate(WORLDS):
         alone = MixedScene([populate], options=options)
@@ -196,7 +196,7 @@ def test_particles_of_worlds_that_differ():
     scene = MixedScene(WORLDS)
     scene.step(10)
     x = scene.state.particle_q.numpy()
-    start = scene.reduced.instances.particle_start.numpy()
+    start = scene.reduced.view.instances.particle_start.numpy()
     assert len(x) == sum(scene.body(i).surface_count for i in range(4))
     for i in range(4):
         body = scene.body(i)

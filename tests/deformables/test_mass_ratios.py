@@ -20,7 +20,7 @@ MASS = 1000.0 * EDGE**3 * 0.3
 
 def deepest(scene):
     """Return how deep surface samples were inside shapes at the start of the last step [m]."""
-    samples = scene.reduced.samples
+    samples = scene.reduced.view.samples
     gap = samples.gap.numpy()[samples.shape.numpy() >= 0]
     return -min(0.0, gap.min(initial=0.0))
 
@@ -104,9 +104,9 @@ def test_solve_foresees_what_mujoco_does(rigid, height, cone, jacobian):
         scene.step()
         if solver.any_pushed.numpy()[0]:
             velocity = scene.state.joint_qd.numpy()
-            error = max(error, np.abs(solver.reduced.rigid.r.numpy()[0] / scene.dt - velocity).max())
+            error = max(error, np.abs(solver.reduced.tables.rigid.table.r.numpy()[0] / scene.dt - velocity).max())
             change = max(change, np.abs(velocity - solver.predicted_state.joint_qd.numpy()).max())
-            rows = max(rows, int(solver.reduced.rigid.row_count.numpy()[0]))
+            rows = max(rows, int(solver.reduced.tables.rigid.table.row_count.numpy()[0]))
     assert rows > 0
     assert change > 0.01
     assert error <= 1e-3 * change
@@ -119,7 +119,7 @@ def test_solve_foresees_what_mujoco_does(rigid, height, cone, jacobian):
 def test_derivatives_of_the_rows(rigid, height, cone):
     """The gradient over r is a central difference of the potential; the rows' matrix one of their gradient, and PSD."""
     potential = Potential(standing(rigid, height, cone=cone))
-    assert potential.solver.rigid.row_count.numpy()[0] > 0
+    assert potential.solver.tables.rigid.table.row_count.numpy()[0] > 0
     n, m, dt = 3 * potential.n, len(potential.r), potential.scene.dt
     rng = np.random.default_rng(0)
     u = potential.u.copy()
@@ -133,7 +133,7 @@ def test_derivatives_of_the_rows(rigid, height, cone):
         noise = 16 * np.finfo(float).eps * max(abs(potential.value(u)), 1e-3) / step
         assert slope == pytest.approx(gradient @ d, rel=1e-4, abs=noise + 1e-4 * np.linalg.norm(gradient[n:]))
     potential.gradient(u)
-    rigid = potential.solver.rigid
+    rigid = potential.solver.tables.rigid.table
     count = rigid.row_count.numpy()[0]
     rows = rigid.row_jacobian.numpy()[0, :count].T @ rigid.row_coupling.numpy()[0, :count]
     np.testing.assert_allclose(rows, rows.T, atol=1e-6 * np.abs(rows).max())
@@ -144,7 +144,7 @@ def test_derivatives_of_the_rows(rigid, height, cone):
 
 def row_gradient(potential, u, step, j):
     """Return the central difference over r_j of the rows' share of the gradient."""
-    rigid, n = potential.solver.rigid, 3 * potential.n
+    rigid, n = potential.solver.tables.rigid.table, 3 * potential.n
     shares = []
     for sign in (1.0, -1.0):
         moved = u.copy()
@@ -334,7 +334,7 @@ def workshop(world_count=1):
 def test_several_articulations_in_a_world():
     """Gripper, container and flap are all pushed by what touches them: weight on the container, torque on the flap."""
     scene = workshop()
-    dofs = scene.reduced.rigid
+    dofs = scene.reduced.tables.rigid.table
     assert sorted(dofs.articulation_dof_count.numpy()) == [1, 3, 6]
     flap = len(scene.model.body_mass.numpy()) - 1
     scene.step(15)
@@ -392,7 +392,7 @@ def test_untouched_world_among_touched():
     assert list(scene.solver.pushed.numpy()) == [1, 0]
     np.testing.assert_array_equal(scene.state.body_q.numpy()[1], state.body_q.numpy()[1])
     np.testing.assert_array_equal(scene.state.body_qd.numpy()[1], state.body_qd.numpy()[1])
-    assert list(scene.reduced.rigid.count.numpy()) == [6, 0]
+    assert list(scene.reduced.tables.rigid.table.count.numpy()) == [6, 0]
 
 
 # -- errors ------------------------------------------------------------------------------------------------------------

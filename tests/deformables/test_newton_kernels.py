@@ -1,5 +1,7 @@
 """Newton's iteration in one launch does what the launches per phase do; a carried stiffness only saves time."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import warp as wp
@@ -15,7 +17,7 @@ def grasp(device: str, *, one_launch: bool, shared: bool = False, worlds: int = 
     """Lower the open gripper over the object, close it until both fingers press, and return where everything is."""
     scene = TableScene(rl_scene(), world_count=worlds, device=device)
     reduced = scene.solver.reduced
-    reduced.one_launch, reduced.shared = one_launch, shared
+    reduced.tables = dataclasses.replace(reduced.tables, one_launch=one_launch, shared=shared)
     for step in range(32):
         height = scene.controller.target_position.numpy()[0, 2]
         down = np.clip((scene.soft.height - height) / 0.015, -1.0, 1.0)

@@ -18,6 +18,8 @@ from softmode.deformables.model import status as bits
 from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
 from softmode.deformables.model.lane_kernels import from_blocks, to_blocks
 from softmode.deformables.solver.attachments import attach
+from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient
+from softmode.deformables.solver.minimise import check_convergence
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from tests import reference
 from tests.deformables.test_driven import held_bar
@@ -60,7 +62,7 @@ def detect(scene):
     solver = scene.reduced
     solver.begin(scene.state, scene.control, scene.dt)
     solver.detect(scene.state, scene.control, scene.dt, prescribed=True)
-    return solver.pairs.table
+    return solver.view.pairs
 
 
 def found(scene):
@@ -68,7 +70,7 @@ def found(scene):
     table = detect(scene)
     other, gap, normal, nearest = (getattr(table, n).numpy() for n in ("other", "gap", "normal", "nearest"))
     near = table.near.numpy()
-    count = scene.reduced.instances.sample_count.numpy()
+    count = scene.reduced.view.instances.sample_count.numpy()
     return [
         (i, s, int(other[i, s, slot]), gap[i, s, slot], normal[i, s, slot], int(nearest[i, s, slot]))
         for i in np.flatnonzero(near)
@@ -104,9 +106,9 @@ def test_surfaces_equal_the_twin(seed):
     scene = deformed(seed)
     surfaces = [surface(scene, i) for i in range(2)]
     rows = found(scene)
-    table = scene.reduced.pairs.table
+    table = scene.reduced.view.pairs
     normals = table.surface_normal.numpy()
-    margin = scene.reduced.instances.margin.numpy()
+    margin = scene.reduced.view.instances.margin.numpy()
     for i in range(2):
         np.testing.assert_allclose(normals[i, : len(surfaces[i].normals)], surfaces[i].normals, atol=8 * FLOAT32)
     touching = {(i, s): rest for i, s, *rest in rows}
@@ -131,8 +133,8 @@ def test_dynamic_rows_equal_the_twin(seed):
     scene = deformed(seed)
     surfaces = [surface(scene, i) for i in range(2)]
     detect(scene)
-    table = scene.reduced.pairs.table
-    rows, margin = scene.reduced.basis.row.numpy(), scene.reduced.instances.margin.numpy()
+    table = scene.reduced.view.pairs
+    rows, margin = scene.reduced.view.basis.row.numpy(), scene.reduced.view.instances.margin.numpy()
     counts, samples = table.count.numpy(), table.sample.numpy()
     assert counts.min() > 5
     for i in range(2):
@@ -154,8 +156,8 @@ def test_dynamic_rows_reproduce_the_touched_point():
     F, a = rotation((1, 0, 1), 0.1) @ np.diag([1.1, 0.95, 1.05]), np.array([0.0, 0.0, -0.002])
     scene.set(q=scene.body().affine(F, a))
     rows = found(scene)
-    table = scene.reduced.pairs.table
-    dynamic, samples = scene.reduced.basis.row.numpy(), table.sample.numpy()
+    table = scene.reduced.view.pairs
+    dynamic, samples = scene.reduced.view.basis.row.numpy(), table.sample.numpy()
     coordinates = scene.q(0) + scene.body().linear_coordinates[:, :3]  # of x itself
     A, b = rng.normal(size=(3, 3)), rng.normal(size=3)
     constant = scene.body().mean_basis  # basis is orthonormal to mass: these are the coordinates of 1
@@ -222,64 +224,64 @@ class Potential:
             scene.step()
         scene.step()
         solver = self.solver
-        self.counts = solver.instances.function_count.numpy()
+        self.counts = solver.view.instances.function_count.numpy()
         self.starts = np.concatenate([[0], np.cumsum(3 * self.counts)])
-        parts = [from_blocks(solver.q.numpy()[i], n).ravel() for i, n in enumerate(self.counts)]
-        rigid = solver.rigid.r.numpy()[0] if solver.rigid.count_max else np.zeros(0)
+        parts = [from_blocks(solver.tables.arrays.q.numpy()[i], n).ravel() for i, n in enumerate(self.counts)]
+        rigid = solver.tables.rigid.table.r.numpy()[0] if solver.tables.rigid.count_max else np.zeros(0)
         self.u = np.concatenate([*parts, rigid])
 
     def put(self, u):
         """Write u into the solver and ask for a fresh elastic Hessian."""
-        solver, blocks = self.solver, self.solver.layout.block_count
-        solver.progress.renew.fill_(1)
+        solver, blocks = self.solver, self.solver.view.layout.block_count
+        solver.tables.newton.refresh.fill_(1)
         parts = [u[a : a + 3 * n].reshape(-1, 3) for a, n in zip(self.starts, self.counts, strict=False)]
-        solver.q.assign(np.stack([to_blocks(part, blocks) for part in parts]))
-        if solver.rigid.count_max:
-            solver.rigid.r.assign(u[None, self.starts[-1] :])
+        solver.tables.arrays.q.assign(np.stack([to_blocks(part, blocks) for part in parts]))
+        if solver.tables.rigid.count_max:
+            solver.tables.rigid.table.r.assign(u[None, self.starts[-1] :])
 
     def _evaluate(self, u, derivatives):
         solver = self.solver
         self.put(u)
-        solver.progress.active.fill_(1)
-        solver._evaluate(solver.progress.active, solver.q, solver.rigid.r, self.scene.dt, derivatives=derivatives)
+        solver.tables.newton.active.fill_(1)
+        evaluate(solver.tables, self.scene.dt, derivatives=derivatives)
 
     def value(self, u):
         """Return E(u) with the normal forces of friction as they were last renewed."""
         self._evaluate(u, False)
-        self.solver.progress.iteration.zero_()
-        self.solver._judge_iterate(self.scene.dt)
-        return float(self.solver.progress.potential.numpy()[0])
+        self.solver.tables.newton.iteration.zero_()
+        check_convergence(self.solver.tables, self.scene.dt)
+        return float(self.solver.tables.newton.potential.numpy()[0])
 
     def gradient(self, u):
         """Return dE/du; renews the normal forces of friction and assembles the matrix."""
         solver = self.solver
-        solver.progress.iteration.fill_(1)
+        solver.tables.newton.iteration.fill_(1)
         self._evaluate(u, True)
-        solver._gather_gradient(self.scene.dt)
-        solver._assemble(self.scene.dt)
-        parts = [from_blocks(solver.gradient.numpy()[i], n).ravel() for i, n in enumerate(self.counts)]
-        return np.concatenate([*parts, solver.rigid.gradient.numpy()[0][: len(u) - self.starts[-1]]])
+        gather_gradient(solver.tables, self.scene.dt)
+        assemble(solver.tables, self.scene.dt)
+        parts = [from_blocks(solver.tables.arrays.gradient.numpy()[i], n).ravel() for i, n in enumerate(self.counts)]
+        return np.concatenate([*parts, solver.tables.rigid.table.gradient.numpy()[0][: len(u) - self.starts[-1]]])
 
     def matrix(self):
         """Return the assembled d2E/du2, what is between the bodies included, unknowns in the order of u."""
-        solver, stride = self.solver, self.solver.stride
-        system = solver.system.matrix.numpy()[0]
+        solver, stride = self.solver, self.solver.view.layout.stride
+        system = solver.tables.system.matrix.numpy()[0]
         system = system.reshape(len(system), -1).astype(float)
-        starts = 8 * solver.instances.system_block.numpy()
+        starts = 8 * solver.view.instances.system_block.numpy()
         order = np.arange(3) * stride
         index = np.concatenate(
             [start + (order + np.arange(n)[:, None]).ravel() for start, n in zip(starts, self.counts, strict=True)]
         )
         size = len(system)
         # parts that do not touch are neither read nor written
-        parts, part = solver.part_count, size // solver.part_count
-        related = solver.system.pattern.numpy()[0] + np.eye(parts)
+        parts, part = solver.view.layout.part_count, size // solver.view.layout.part_count
+        related = solver.tables.system.pattern.numpy()[0] + np.eye(parts)
         upper = np.triu(system[:, :size] * np.kron(related, np.ones((part, part))))
         K = (upper + np.triu(upper, 1).T)[np.ix_(index, index)]
-        if not solver.rigid.count_max:
+        if not solver.tables.rigid.count_max:
             return K
-        C = system[index, size : size + solver.rigid.count_max]
-        return np.block([[K, C], [C.T, solver.rigid.matrix.numpy()[0]]])
+        C = system[index, size : size + solver.tables.rigid.count_max]
+        return np.block([[K, C], [C.T, solver.tables.rigid.table.matrix.numpy()[0]]])
 
 
 def pile(friction=0.5, *, rigid=True, viscosity=None):
@@ -304,7 +306,7 @@ def pile(friction=0.5, *, rigid=True, viscosity=None):
 def test_gradient_of_the_potential_of_a_world(rigid):
     """dE/du equals central differences of E over the unknowns of three bodies and the rigid ones."""
     potential = Potential(pile(rigid=rigid))
-    assert (potential.solver.entries.pair_count.numpy() > 5).all()
+    assert (potential.solver.view.constraints.pair_count.numpy() > 5).all()
     rng = np.random.default_rng(0)
     u = potential.u + 1e-6 * rng.normal(size=potential.u.size)
     gradient = potential.gradient(u)
@@ -622,7 +624,7 @@ def test_contact_radius():
         replay()
     points = [surface(scene, i).points[:, 2] for i in range(2)]
     # the load presses each contact in by its stiffness and smoothing
-    sink = 2.0 * scene.mass() * GRAVITY / (5.0e7 * EDGE**2) + float(scene.reduced.instances.smoothing.numpy()[0])
+    sink = 2.0 * scene.mass() * GRAVITY / (5.0e7 * EDGE**2) + float(scene.reduced.view.instances.smoothing.numpy()[0])
     assert points[0].min() == pytest.approx(radii[0], abs=sink)
     assert points[1].min() - points[0].max() == pytest.approx(sum(radii), abs=2 * sink)
 
@@ -664,7 +666,7 @@ def test_at_rest_nothing_touches_itself(body):
     scene = Scene(populate, [shape])
     assert not [row for row in found(scene) if row[3] <= 0.0]
     scene.step(3)
-    assert np.abs(scene.reduced.entries.force.numpy()).max() == 0.0
+    assert np.abs(scene.reduced.view.constraints.force.numpy()).max() == 0.0
     assert np.abs(scene.qd()).max() < 1e-6
 
 
@@ -704,7 +706,7 @@ def test_ring_squeezed_shut(self_contact):
     force = scene.reduced.instance_force.numpy()[0]
     if self_contact:
         assert -2e-3 < tips(scene) < 1e-3
-        assert scene.reduced.entries.pair_count.numpy()[0] > 0
+        assert scene.reduced.view.constraints.pair_count.numpy()[0] > 0
     else:
         assert tips(scene) < -4e-3
     np.testing.assert_array_equal(force, 0.0)  # what a body does to itself is no force on it
@@ -735,8 +737,8 @@ def shut_ring(dt):
         scene.step()
         p, L = scene.momentum()
         assert scene.kinetic_energy() + twin.elastic_energy(scene.q()) <= (1.0 + 1e-4) * e0
-        count = scene.reduced.entries.count.numpy()[0]
-        force = np.abs(scene.reduced.entries.force.numpy()[0, :count]).max(initial=0.0)
+        count = scene.reduced.view.constraints.count.numpy()[0]
+        force = np.abs(scene.reduced.view.constraints.force.numpy()[0, :count]).max(initial=0.0)
         out.append([np.abs(p - p0).max() / scale, np.abs(L - L0).max() / (0.05 * scale), force, -tips(scene)])
     return np.max(out, axis=0) * (1, 1, 1, -1)
 
@@ -786,7 +788,7 @@ def test_world_of_eight_equals_single_world():
     for w in range(8):
         fling(batch, w, w)
     batch.step(15)
-    assert (batch.reduced.entries.pair_count.numpy().reshape(8, 3).max(axis=1) > 0).all()
+    assert (batch.reduced.view.constraints.pair_count.numpy().reshape(8, 3).max(axis=1) > 0).all()
     assert len({batch.q(3 * w).tobytes() for w in range(8)}) == 8
     for w in range(0, 8, 3):
         alone = crowd()
@@ -804,7 +806,7 @@ def test_captured_graph_equals_eager():
     for _ in range(10):
         replay()
     fresh.step(20)
-    assert (fresh.reduced.entries.pair_count.numpy() > 0).any()
+    assert (fresh.reduced.view.constraints.pair_count.numpy() > 0).any()
     np.testing.assert_array_equal(scene.state.softmode.q.numpy(), fresh.state.softmode.q.numpy())
 
 
@@ -857,7 +859,7 @@ def test_capacity(contact_max):
     assert scene.reduced.status.numpy()[0] & bits.WORLD_CONTACT_OVERFLOW
     assert np.abs(force).max() > 0.1
     np.testing.assert_array_equal(force[0], -force[1])
-    assert scene.reduced.entries.count.numpy().max() <= contact_max
+    assert scene.reduced.view.constraints.count.numpy().max() <= contact_max
     np.testing.assert_allclose(scene.momentum(0)[0] + scene.momentum(1)[0], 0.0, atol=1e-8)
 
 
@@ -866,8 +868,8 @@ def test_soft_contact_may_be_left_out():
     scene = two(
         cube(), cube(), (0.0, 0.0, 0.11), velocity=(0, 0, -1.0), options=SolverReducedOptions(soft_contact=False)
     )
-    assert scene.reduced.pairs is None
-    assert scene.reduced.part_count == 1
+    assert scene.reduced.view.pairs is None
+    assert scene.reduced.view.layout.part_count == 1
     scene.step(30)
     np.testing.assert_allclose(scene.momentum(1)[0], [0.0, 0.0, -scene.mass()], atol=1e-5)
 
@@ -910,10 +912,10 @@ def test_worlds_of_different_numbers_of_bodies():
     batch = Mixed(piles)
     batch.step(30)
     assert not batch.reduced.status.numpy().any()
-    starts = batch.reduced.layout.instance_start
+    starts = batch.reduced.view.layout.instance_start
     for w, populate in enumerate(piles):
         alone = Mixed([populate])
         alone.step(30)
         for i in range(starts[w + 1] - starts[w]):
             np.testing.assert_array_equal(batch.q(starts[w] + i), alone.q(i))
-    assert (batch.reduced.entries.pair_count.numpy()[1:] > 0).all()
+    assert (batch.reduced.view.constraints.pair_count.numpy()[1:] > 0).all()

@@ -39,14 +39,14 @@ def falling(material=None, scale=1.0, **options):
 
 def everything(scene):
     """Return copies of all that a step reads or writes, by instance or particle."""
-    state, model, instances = scene.state, scene.model, scene.reduced.instances
+    state, model, instances = scene.state, scene.model, scene.reduced.view.instances
     arrays = {name: getattr(state.softmode, name) for name in ("q", "qd", "q_before", "qd_before", "dt_before")}
     arrays |= {name: getattr(state, name) for name in ("particle_q", "particle_qd")}
     arrays |= {name: getattr(model, name) for name in ("particle_mass", "particle_inv_mass", "particle_radius")}
     arrays |= {name: getattr(model.softmode, name) for name in GIVEN}
     names = ("mass", "inertia", "size", "area", "tolerance", "margin", "smoothing")
     arrays |= {f"instance {name}": getattr(instances, name) for name in names}
-    arrays |= {"force": scene.reduced.instance_force, "tolerance": scene.reduced.rigid_tolerance}
+    arrays |= {"force": scene.reduced.instance_force, "tolerance": scene.reduced.view.rigid_tolerance}
     return {name: array.numpy().copy() for name, array in arrays.items()}
 
 
@@ -142,7 +142,7 @@ def test_values_out_of_range(name):
     np.testing.assert_array_equal(flags.numpy(), [bit] * 5 + [0])
     expected = np.array([low, high, before, high, low, GIVEN[name]], np.float32)
     np.testing.assert_array_equal(getattr(scene.model.softmode, name).numpy(), expected)
-    assert np.isfinite(scene.reduced.instances.mass.numpy()).all()
+    assert np.isfinite(scene.reduced.view.instances.mass.numpy()).all()
     set_parameters(scene.solver, **{name: device([GIVEN[name]] * 6)})
     assert not flags.numpy().any()
     scene.solver.reset(scene.state)
@@ -196,7 +196,7 @@ def test_coupled_worlds_and_shape_friction():
         scene.solver.step(scene.state, scene.next_state, scene.control, None, scene.dt)
     wp.capture_launch(capture.graph)
     np.testing.assert_array_equal(flags.numpy(), [0, PARAMETER_FLAGS["friction"], 0])
-    entries = scene.reduced.entries
+    entries = scene.reduced.view.constraints
     count, body = entries.count.numpy(), entries.body.numpy()
     for w, expected in enumerate((np.sqrt(0.2 * 0.4), 0.0, np.sqrt(0.8 * 0.8))):
         fingertip = body[w, : count[w]] >= 0

@@ -55,7 +55,7 @@ def test_pivots_of_the_inertia():
     """The free bodies' part of the linear system is bounded below by the Cholesky pivots of their inertia / dt^2."""
     run = box_on_cube()
     run.replay()
-    rigid = run.solver.solver("soft").rigid
+    rigid = run.solver.solver("soft").tables.rigid.table
     pivots = np.diag(np.linalg.cholesky(rigid.inertia.numpy()[0])) ** 2
     np.testing.assert_allclose(rigid.pivot_floor.numpy()[0], pivots, rtol=1e-12)
     assert pivots.min() > 0.0
@@ -125,7 +125,7 @@ def test_parameters_reach_the_entry():
     run.model.softmode.youngs_modulus.fill_(2.0e4)
     run.model.softmode.density.fill_(700.0)
     run.solver.notify_model_changed(newton.ModelFlags.MODEL_PROPERTIES)
-    assert soft.instances.mass.numpy()[0] == pytest.approx(700.0 * volume)
+    assert soft.view.instances.mass.numpy()[0] == pytest.approx(700.0 * volume)
     for _ in range(125):
         run.replay()
     soft_height = run.state.body_q.numpy()[0, 2]
@@ -238,5 +238,5 @@ def test_out_of_place_entry():
 def test_palm_without_shapes_is_no_proxy():
     """Only the listed bodies are unknowns: two fingers make twelve."""
     run = Coupled("proxy x1", [gripper_world(Material())], dt=0.004, gravity=GRAVITY, ground=0.8)
-    assert run.solver.solver("soft").rigid.count.numpy().tolist() == [12]
+    assert run.solver.solver("soft").tables.rigid.table.count.numpy().tolist() == [12]
     assert run.points().shape[2] == 3 and HELD == run.worlds[0].soft.edge

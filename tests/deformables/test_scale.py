@@ -15,6 +15,8 @@ from softmode.deformables.model.authoring import add_pins, add_reduced_body, dri
 from softmode.deformables.model.lane_kernels import from_blocks
 from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.deformables.solver.attachments import attach
+from softmode.deformables.solver.evaluate import assemble, gather_gradient
+from softmode.deformables.solver.evaluate import evaluate as evaluate_step
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.deformables.tools.markers import Markers
 from softmode.deformables.tools.sensing import ContactSensor, SurfacePressure
@@ -132,13 +134,15 @@ def test_masses_and_sizes():
     two = Scene(lambda world: add_reduced_body(world, cube(), scale=1.3), [cube()])
     powers = {"mass": 3, "area": 2, "size": 1, "tolerance": 1, "margin": 1, "smoothing": 1, "inertia": 2}
     for name, power in powers.items():
-        first, second = (getattr(x.reduced.instances, name).numpy()[0] for x in (one, two))
+        first, second = (getattr(x.reduced.view.instances, name).numpy()[0] for x in (one, two))
         assert second == pytest.approx(s**power * first, rel=4 * FLOAT32), name
     for name, power in (("particle_mass", 3), ("particle_inv_mass", -3), ("particle_radius", 1)):
         first, second = (getattr(x.model, name).numpy() for x in (one, two))
         np.testing.assert_allclose(second, s**power * first, rtol=8 * FLOAT32)
     assert two.model.particle_mass.numpy().sum() == pytest.approx(two.mass(), rel=1e-5)
-    assert two.reduced.rigid_tolerance.numpy()[0] == pytest.approx(s * one.reduced.rigid_tolerance.numpy()[0], rel=1e-6)
+    assert two.reduced.view.rigid_tolerance.numpy()[0] == pytest.approx(
+        s * one.reduced.view.rigid_tolerance.numpy()[0], rel=1e-6
+    )
 
 
 def evaluate(scene, q):
@@ -147,21 +151,21 @@ def evaluate(scene, q):
     scene.set(q=q)
     solver.begin(scene.state, scene.control, scene.dt)
     solver.detect(scene.state, scene.control, scene.dt, prescribed=True)
-    for flag in (solver.progress.active, solver.progress.renew):
+    for flag in (solver.tables.newton.active, solver.tables.newton.refresh):
         flag.fill_(1)
-    solver.progress.project.zero_()
-    blocks = solver.motion.q_start
-    solver._evaluate(solver.progress.active, blocks, solver.rigid.r, scene.dt, derivatives=True)
-    wp.copy(solver.q, blocks)
-    solver._gather_gradient(scene.dt)
-    solver._assemble(scene.dt)
-    force = from_blocks(solver.gradient_chunk.numpy()[0].sum(axis=0), n)
-    upper = solver.stiffness.numpy()[0].sum(axis=0)
-    size, stride = 3 * solver.stride, solver.stride
+    solver.tables.newton.project.zero_()
+    blocks = solver.view.motion.q_start
+    wp.copy(solver.tables.arrays.q, blocks)
+    evaluate_step(solver.tables, scene.dt, derivatives=True)
+    gather_gradient(solver.tables, scene.dt)
+    assemble(solver.tables, scene.dt)
+    force = from_blocks(solver.tables.arrays.gradient_chunk.numpy()[0].sum(axis=0), n)
+    upper = solver.tables.arrays.stiffness.numpy()[0].sum(axis=0)
+    size, stride = 3 * solver.view.layout.stride, solver.view.layout.stride
     matrix = np.triu(upper.reshape(size, size).astype(float))
     matrix = matrix + matrix.T - np.diag(np.diag(matrix))
     keep = np.concatenate([axis * stride + np.arange(n) for axis in range(3)])
-    return float(solver.points.energy.numpy()[0].sum()), force, matrix[np.ix_(keep, keep)]
+    return float(solver.view.points.energy.numpy()[0].sum()), force, matrix[np.ix_(keep, keep)]
 
 
 def deformed(s, seed=0):
@@ -212,7 +216,7 @@ def test_recovery_from_a_point(s):
     scene = Scene(lambda world: add_reduced_body(world, cube(), material=material, scale=s), [cube()], dt=0.01)
     scene.set(q=cube().affine(0.01 * np.eye(3)))
     scene.step(150)
-    np.testing.assert_allclose(scene.reduced.points.volume_ratio.numpy(), 1.0, atol=1e-3)
+    np.testing.assert_allclose(scene.reduced.view.points.volume_ratio.numpy(), 1.0, atol=1e-3)
     x, X = particles(scene), stored(s) * cube().surface_points
     far = np.linalg.norm(x[:, None] - x, axis=2).max()
     assert far == pytest.approx(np.linalg.norm(X[:, None] - X, axis=2).max(), rel=1e-3)
@@ -330,7 +334,7 @@ def test_a_stack_and_self_contact():
     for scene in scenes:
         scene.step(40)
     x, twin = (particles(scene) for scene in scenes)
-    assert scenes[0].reduced.entries.pair_count.numpy().min() > 3
+    assert scenes[0].reduced.view.constraints.pair_count.numpy().min() > 3
     np.testing.assert_allclose(x, twin, atol=1e-5 * EDGE)
 
 
@@ -352,8 +356,11 @@ def test_ring_squeezed_shut():
         for k in range(30):
             scene.control.softmode.pin_target.assign(s * (X + min(k / 20, 1.0) * pull))
             scene.step()
-    assert scenes[0].reduced.entries.pair_count.numpy()[0] > 0
-    assert scenes[0].reduced.entries.pair_count.numpy()[0] == scenes[1].reduced.entries.pair_count.numpy()[0]
+    assert scenes[0].reduced.view.constraints.pair_count.numpy()[0] > 0
+    assert (
+        scenes[0].reduced.view.constraints.pair_count.numpy()[0]
+        == scenes[1].reduced.view.constraints.pair_count.numpy()[0]
+    )
     x, twin = (particles(scene) for scene in scenes)
     np.testing.assert_allclose(x, twin, atol=1e-5 * s * EDGE)
 

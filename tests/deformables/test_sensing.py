@@ -127,7 +127,7 @@ def test_grasp():
     assert pressure.total_area.numpy()[0] == pytest.approx(seen["total_area"].sum())
     np.testing.assert_allclose(integral(pressure), pressure.total_force.numpy()[0], atol=64 * FLOAT32 * scale)
 
-    entries = scene.reduced.entries
+    entries = scene.reduced.view.constraints
     count = entries.count.numpy()[0]
     body, q = scene.body(), scene.next_state.softmode.q.numpy()  # the start of the last step
     row = entries.row.numpy()[0, :count]

@@ -307,7 +307,7 @@ def test_hull_of_an_open_mesh():
     solver = solver_with(lambda w: w.add_shape_convex_hull(-1, mesh=opened()))
     box = np.array([0.2, 0.2, 0.2])
     x = points_about(count=300)
-    d, _ = query(KIND.CONVEX_MESH, (1.0, 1.0, 1.0), x, mesh=int(solver.shapes.source.numpy()[0]))
+    d, _ = query(KIND.CONVEX_MESH, (1.0, 1.0, 1.0), x, mesh=int(solver.tables.shapes.source.numpy()[0]))
     np.testing.assert_allclose(d, reference.distance_box(x.astype(float), box), atol=16 * FLOAT32)
 
 

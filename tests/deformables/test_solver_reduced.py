@@ -10,6 +10,7 @@ from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model import status as bits
 from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
 from softmode.deformables.model.lane_kernels import from_blocks, to_blocks
+from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.errors import ConfigError
 from tests import reference
@@ -56,11 +57,11 @@ def evaluate_at(scene, q):
     scene.set(q=q, qd=np.zeros_like(q))
     solver.begin(scene.state, scene.control, scene.dt)
     solver.detect(scene.state, scene.control, scene.dt, prescribed=True)
-    solver.progress.active.fill_(1)
-    solver._evaluate(solver.progress.active, solver.q, solver.rigid.r, scene.dt, derivatives=True)
-    solver._gather_gradient(scene.dt)
-    solver._assemble(scene.dt)
-    return solver.points.energy.numpy()[0].sum(), from_blocks(solver.gradient.numpy()[0], len(q))
+    solver.tables.newton.active.fill_(1)
+    evaluate(solver.tables, scene.dt, derivatives=True)
+    gather_gradient(solver.tables, scene.dt)
+    assemble(solver.tables, scene.dt)
+    return solver.view.points.energy.numpy()[0].sum(), from_blocks(solver.tables.arrays.gradient.numpy()[0], len(q))
 
 
 # -- identities --------------------------------------------------------------------------------------------------------
@@ -240,12 +241,12 @@ def test_inner_forces_have_no_resultant():
     solver, n = scene.reduced, body.function_count
     start, q = deformed(body, 0.01), deformed(body, 0.02, seed=1)
     evaluate_at(scene, start)  # sets q_n
-    solver.q.assign(to_blocks(q[None], solver.layout.block_count))
-    solver._evaluate(solver.progress.active, solver.q, solver.rigid.r, scene.dt, derivatives=True)
-    solver._gather_gradient(scene.dt)
-    solver._assemble(scene.dt)
+    solver.tables.arrays.q.assign(to_blocks(q[None], solver.view.layout.block_count))
+    evaluate(solver.tables, scene.dt, derivatives=True)
+    gather_gradient(solver.tables, scene.dt)
+    assemble(solver.tables, scene.dt)
     inertia = scene.mass() / scene.dt**2 * (q - start)
-    forces = from_blocks(solver.gradient.numpy()[0], n) - inertia
+    forces = from_blocks(solver.tables.arrays.gradient.numpy()[0], n) - inertia
     size = np.abs(forces).max()
     assert np.abs(body.mean_basis @ forces).max() <= 1e-6 * size  # gradients of a constant, float32
     y = q + body.linear_coordinates[:, :3]
@@ -470,7 +471,7 @@ def test_bodies_with_different_function_counts():
         alone.set(q=q, qd=qd)
         alone.step(5)
         # Not bitwise: one line search and one stopping test serve all bodies of a world.
-        assert np.linalg.norm(both.q(i) - alone.q()) <= 5 * both.reduced.instances.tolerance.numpy()[i]
+        assert np.linalg.norm(both.q(i) - alone.q()) <= 5 * both.reduced.view.instances.tolerance.numpy()[i]
 
 
 def test_masked_reset():

@@ -227,7 +227,7 @@ def test_shape_is_found_in_its_own_world_only(name):
     solver = SolverReduced(model, [body])
     first, second = model.state(), model.state()
     solver.step(first, second, None, None, 0.001)
-    counts = solver.entries.count.numpy()
+    counts = solver.view.constraints.count.numpy()
     assert counts[1] > 0 and counts[0] == counts[2] == 0
 
 
@@ -243,7 +243,7 @@ def test_far_shape_is_culled(name):
 
     scene = Scene(populate, [body])
     scene.step()
-    assert not scene.reduced.near.numpy().any()
+    assert not scene.reduced.tables.near.numpy().any()
 
 
 # -- the body's inside -------------------------------------------------------------------------------------------------

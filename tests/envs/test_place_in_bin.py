@@ -279,7 +279,7 @@ def test_worlds_equal_single_environments(env: PlaceInBinEnv) -> None:
             observation, reward, *_ = env.step(action)
             np.testing.assert_array_equal(observation, history[k + 1][world])
             assert np.float32(reward) == rewards[k][world]
-            pairs += int(env.scene.solver.reduced.pairs.table.count.numpy().sum())
+            pairs += int(env.scene.solver.view.pairs.count.numpy().sum())
     assert pairs > 0
     moved = seen(env, observation, "other_offsets") - seen(env, history[0][1], "other_offsets")
     assert np.abs(moved).max() > 1e-4

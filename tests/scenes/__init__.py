@@ -125,11 +125,11 @@ class Scene:
 
     def _slice(self, instance: int) -> slice:
         start = int(self.reduced.parameters.function_start.numpy()[instance])
-        return slice(start, start + int(self.reduced.instances.function_count.numpy()[instance]))
+        return slice(start, start + int(self.reduced.view.instances.function_count.numpy()[instance]))
 
     def body(self, instance: int = 0) -> ReducedBody:
         """Return the asset of an instance."""
-        return self.bodies[self.reduced.layout.asset[instance]]
+        return self.bodies[self.reduced.view.layout.asset[instance]]
 
     def q(self, instance: int = 0) -> np.ndarray:
         """Return coordinates (n, 3) [m]."""
@@ -157,7 +157,7 @@ class Scene:
 
     def mass(self, instance: int = 0) -> float:
         """Return the mass of an instance [kg]."""
-        return float(self.reduced.instances.mass.numpy()[instance])
+        return float(self.reduced.view.instances.mass.numpy()[instance])
 
     def centre(self, instance: int = 0) -> np.ndarray:
         """Return the centre of mass [m]."""

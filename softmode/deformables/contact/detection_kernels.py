@@ -1,7 +1,7 @@
 """Detection of contact between surface samples and the rigid shapes of the Newton model, once per step.
 
 Every sample is tested against the shapes near its body; gap, normal and lever arm are frozen for the step and become
-*entries*, the point constraints of the step (see ``contact`` for their energy): first the pins of the instance, then
+*point constraints* of the step (see ``contact`` for their energy): first the pins of the instance, then
 its contacts in sample order.
 
 The queries are ours because Newton's public ``sdf_*`` functions come without their gradients, and because its soft
@@ -19,15 +19,16 @@ from softmode.deformables.contact.shape_query_kernels import (
     query_heightfield,
     query_shape,
 )
+from softmode.deformables.model.declare import struct
 from softmode.deformables.model.lane_kernels import barrier
 from softmode.deformables.model.status import WORLD_CONTACT_OVERFLOW
 from softmode.deformables.model.struct_kernels import (
     OVERLAP,
     SLOTS,
     Basis,
-    Entries,
     Instances,
     Motion,
+    PointConstraints,
     Rigid,
     Samples,
     interpolate,
@@ -43,7 +44,7 @@ OPPOSED = wp.constant(0.3)
 """Cosine beyond which a direction counts as against a normal."""
 
 
-@wp.struct
+@struct
 class Shapes:
     """The rigid shapes of the model and where their bodies are at the start of the step."""
 
@@ -89,13 +90,13 @@ def bound_samples(
     samples: Samples,
 ):
     """Bound the samples of an instance, grown by margin and drift."""
-    i, lane = wp.tid()
+    i, member = wp.tid()
     lower = wp.vec3(1.0e30)
     upper = wp.vec3(-1.0e30)
     drift_lower = wp.vec3(1.0e30)
     drift_upper = wp.vec3(-1.0e30)
     reach = float(0.0)
-    for s in range(lane, instances.sample_count[i], team):
+    for s in range(member, instances.sample_count[i], team):
         x = wp.vec3(samples.position[i, s])
         drift = samples.drift[i, s]
         lower = wp.min(lower, x)
@@ -103,12 +104,12 @@ def bound_samples(
         drift_lower = wp.min(drift_lower, drift)
         drift_upper = wp.max(drift_upper, drift)
         reach = wp.max(reach, wp.length(drift))
-    samples.reach[i, lane, 0] = lower - wp.vec3(2.0 * reach)
-    samples.reach[i, lane, 1] = upper + wp.vec3(2.0 * reach)
-    samples.reach[i, lane, 2] = drift_lower
-    samples.reach[i, lane, 3] = drift_upper
+    samples.reach[i, member, 0] = lower - wp.vec3(2.0 * reach)
+    samples.reach[i, member, 1] = upper + wp.vec3(2.0 * reach)
+    samples.reach[i, member, 2] = drift_lower
+    samples.reach[i, member, 3] = drift_upper
     barrier()
-    if lane != 0:
+    if member != 0:
         return
     lower = samples.reach[i, 0, 0]
     upper = samples.reach[i, 0, 1]
@@ -388,7 +389,7 @@ def rank_contacts(
     i: int,
     begin: int,
     end: int,
-    lane: int,
+    member: int,
     team: int,
 ):
     """Return where a thread writes what touches and what is close of its samples, and how many there are in all.
@@ -404,14 +405,14 @@ def rank_contacts(
                     touching += 1
                 else:
                     close += 1
-    tally[i, lane, 0] = touching
-    tally[i, lane, 1] = close
+    tally[i, member, 0] = touching
+    tally[i, member, 1] = close
     barrier()
     at_touching = int(0)
     at_close = int(0)
     total = int(0)
     for k in range(team):
-        if k < lane:
+        if k < member:
             at_touching += tally[i, k, 0]
             at_close += tally[i, k, 1]
         at_close += tally[i, k, 0]
@@ -425,7 +426,7 @@ def gather_contacts(
     basis: Basis,
     shapes: Shapes,
     samples: Samples,
-    entry_max: int,
+    constraint_max: int,
     prescribed: int,
     stick_ratio: wp.float64,
     team: int,
@@ -434,29 +435,29 @@ def gather_contacts(
     stick_shape: wp.array[wp.vec2i],  # (particle_count,), see ``stick_kernels``
     stick_point: wp.array[mat23d],
     # Out:
-    entries: Entries,
+    constraints: PointConstraints,
     status: wp.array[int],
 ):
     """Compact the slots of an instance behind its pins, in sample order: touching contacts first, then near ones.
 
     Each thread of a team counts its own run of samples, then writes where the counts before it end.
     """
-    i, lane = wp.tid()
+    i, member = wp.tid()
     count = instances.sample_count[i]
-    begin = lane * count / team
-    end = (lane + 1) * count / team
-    at_touching, at_close, total = rank_contacts(samples.shape, samples.gap, samples.tally, i, begin, end, lane, team)
+    begin = member * count / team
+    end = (member + 1) * count / team
+    at_touching, at_close, total = rank_contacts(samples.shape, samples.gap, samples.tally, i, begin, end, member, team)
     at_touching += instances.pin_count[i]
     at_close += instances.pin_count[i]
     total += instances.pin_count[i]
-    if lane == 0:
-        entries.count[i] = wp.min(total, entry_max)
-        if total > entry_max:
+    if member == 0:
+        constraints.count[i] = wp.min(total, constraint_max)
+        if total > constraint_max:
             wp.atomic_or(status, instances.world[i], WORLD_CONTACT_OVERFLOW)
     for s in range(begin, end):
         for slot in range(SLOTS):
             shape = samples.shape[i, s, slot]
-            samples.entry[i, s, slot] = -1
+            samples.constraint[i, s, slot] = -1
             if shape < 0:
                 continue
             gap = wp.max(samples.gap[i, s, slot], -wp.float64(OVERLAP * instances.size[i]))
@@ -466,9 +467,9 @@ def gather_contacts(
                 at_touching += 1
             else:
                 at_close += 1
-            if e >= entry_max:
+            if e >= constraint_max:
                 continue
-            samples.entry[i, s, slot] = e
+            samples.constraint[i, s, slot] = e
             # of unit length in float64: what is left of the gap in the slip must not count against the stick range
             normal = wp.normalize(wp.vec3d(samples.normal[i, s, slot]))
             # both bodies feel the force at the sample, not the shape at its own surface: a pair of forces on two
@@ -483,13 +484,13 @@ def gather_contacts(
                     twist = shapes.body_qd[body]
                     drift = dt * wp.spatial_top(twist) + turn(dt * wp.spatial_bottom(twist), arm)
             row = instances.row_start[i] + s
-            entries.row[i, e] = row
-            entries.dof_begin[i, e] = 0
-            entries.dof_end[i, e] = 0
-            entries.shape[i, e] = shape
-            entries.body[i, e] = body
-            entries.arm[i, e] = arm
-            entries.normal[i, e] = normal
+            constraints.row[i, e] = row
+            constraints.dof_begin[i, e] = 0
+            constraints.dof_end[i, e] = 0
+            constraints.shape[i, e] = shape
+            constraints.body[i, e] = body
+            constraints.arm[i, e] = arm
+            constraints.normal[i, e] = normal
             partner_mass = float(0.0)
             if body >= 0 and prescribed == 0:
                 partner_mass = shapes.body_mass[body]
@@ -506,11 +507,11 @@ def gather_contacts(
                 prescribed,
             )
             # d enters as offset + displacement, with the gap along the normal and the shape's own motion taken off
-            entries.offset[i, e] = gap * normal + slip - wp.vec3d(drift)
-            entries.anchor[i, e] = anchor
-            entries.stick[i, e] = stick_ratio * stiffness
-            entries.stiffness[i, e] = stiffness
-            entries.friction[i, e] = wp.float64(wp.sqrt(instances.friction[i] * shapes.friction[shape]))
+            constraints.offset[i, e] = gap * normal + slip - wp.vec3d(drift)
+            constraints.anchor[i, e] = anchor
+            constraints.stick[i, e] = stick_ratio * stiffness
+            constraints.stiffness[i, e] = stiffness
+            constraints.friction[i, e] = wp.float64(wp.sqrt(instances.friction[i] * shapes.friction[shape]))
 
 
 @wp.kernel
@@ -526,16 +527,16 @@ def gather_pins(
     prescribed: int,
     dt: float,
     # Out:
-    entries: Entries,
+    constraints: PointConstraints,
 ):
-    """Write the pins of an instance as its first entries: offset = x_n - target."""
+    """Write the pins of an instance as its first constraints: offset = x_n - target."""
     i, e = wp.tid()
     if e >= instances.pin_count[i]:
         return
     pin = instances.pin_start[i] + e
     row = first_row + pin
     x = basis.row_point[row] + interpolate(basis.row, row, motion.q_start, i, instances.function_count[i])
-    entries.row[i, e] = row
+    constraints.row[i, e] = row
     body = pin_body[pin]
     target = pin_target[pin]
     if body >= 0:
@@ -547,39 +548,39 @@ def gather_pins(
         if prescribed != 0:
             twist = shapes.body_qd[body]
             target += wp.vec3d(dt * wp.spatial_top(twist) + turn(dt * wp.spatial_bottom(twist), arm))
-        entries.arm[i, e] = arm
-    entries.dof_begin[i, e] = 0
-    entries.dof_end[i, e] = 0
-    entries.shape[i, e] = -1
-    entries.body[i, e] = body
-    entries.offset[i, e] = x - target
-    entries.stiffness[i, e] = wp.float64(wp.max(pin_stiffness[pin], 0.0))
+        constraints.arm[i, e] = arm
+    constraints.dof_begin[i, e] = 0
+    constraints.dof_end[i, e] = 0
+    constraints.shape[i, e] = -1
+    constraints.body[i, e] = body
+    constraints.offset[i, e] = x - target
+    constraints.stiffness[i, e] = wp.float64(wp.max(pin_stiffness[pin], 0.0))
 
 
 @wp.kernel
-def entry_jacobians(
+def constraint_jacobians(
     instances: Instances,
     rigid: Rigid,
     # In and out:
-    entries: Entries,
+    constraints: PointConstraints,
 ):
     """Compute the motion of the rigid body at each contact or pin per unit joint motion: J_v - arm x J_w."""
     i, e = wp.tid()
     w = instances.world[i]
-    if e >= entries.count[i] or rigid.count[w] == 0:
+    if e >= constraints.count[i] or rigid.count[w] == 0:
         return
-    body = entries.body[i, e]
+    body = constraints.body[i, e]
     if body < 0:
         return
     a = rigid.body_articulation[body]
     if a < 0:
         return
     begin = rigid.articulation_dof_start[a] - rigid.dof_start[w]
-    entries.dof_begin[i, e] = begin
-    entries.dof_end[i, e] = begin + rigid.articulation_dof_count[a]
+    constraints.dof_begin[i, e] = begin
+    constraints.dof_end[i, e] = begin + rigid.articulation_dof_count[a]
     r = 6 * rigid.body_link[body]
     J = rigid.jacobian
     for local in range(rigid.articulation_dof_count[a]):
         linear = wp.vec3(J[a, r, local], J[a, r + 1, local], J[a, r + 2, local])
         angular = wp.vec3(J[a, r + 3, local], J[a, r + 4, local], J[a, r + 5, local])
-        entries.jacobian[i, e, begin + local] = linear + wp.cross(angular, entries.arm[i, e])
+        constraints.jacobian[i, e, begin + local] = linear + wp.cross(angular, constraints.arm[i, e])

@@ -7,7 +7,7 @@ memory of a sample is, per slot, the shape it sticks to and a point in that shap
 import warp as wp
 
 from softmode.deformables.contact.detection_kernels import Shapes, shape_frame
-from softmode.deformables.model.struct_kernels import SLOTS, Entries, Instances, Samples, in_mask, mat23d
+from softmode.deformables.model.struct_kernels import SLOTS, Instances, PointConstraints, Samples, in_mask, mat23d
 
 wp.set_module_options({"enable_backward": False})
 
@@ -17,7 +17,7 @@ def remember_slip(
     instances: Instances,
     shapes: Shapes,
     samples: Samples,
-    entries: Entries,
+    constraints: PointConstraints,
     prescribed: int,
     # State out:
     stick_shape_out: wp.array[wp.vec2i],
@@ -35,27 +35,27 @@ def remember_slip(
     stuck = wp.vec2i(-1, -1)
     points = mat23d()
     for slot in range(SLOTS):
-        e = samples.entry[i, s, slot]
+        e = samples.constraint[i, s, slot]
         if e < 0:
             continue
-        limit = entries.friction[i, e] * entries.normal_force[i, e]
-        if not (limit > wp.float64(0.0)) or entries.stick[i, e] == wp.float64(0.0):
+        limit = constraints.friction[i, e] * constraints.normal_force[i, e]
+        if not (limit > wp.float64(0.0)) or constraints.stick[i, e] == wp.float64(0.0):
             continue
-        shape = entries.shape[i, e]
+        shape = constraints.shape[i, e]
         origin, rotation = shape_frame(shapes, shape)
-        total = entries.slip[i, e]
-        stretch = entries.stick[i, e] * wp.length(total)
+        total = constraints.slip[i, e]
+        stretch = constraints.stick[i, e] * wp.length(total)
         if not wp.isfinite(stretch + limit):
             continue
         elastic = total
         if stretch > limit:
             elastic = limit / stretch * total
-        point = entries.anchor[i, e]
+        point = constraints.anchor[i, e]
         if prescribed != 0:
             point = wp.quat_rotate_inv(rotation, elastic)
         elif stretch > limit:
-            n = entries.normal[i, e]
-            before = entries.offset[i, e] - wp.dot(n, entries.offset[i, e]) * n
+            n = constraints.normal[i, e]
+            before = constraints.offset[i, e] - wp.dot(n, constraints.offset[i, e]) * n
             slid = samples.position[i, s] - before + total - elastic
             point = wp.quat_rotate_inv(rotation, slid - origin)
         stuck[slot] = shape

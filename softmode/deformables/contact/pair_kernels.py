@@ -16,16 +16,17 @@ has to close before,
 t the nearest sample: exact where the body moves affinely. Force and reaction then act on one point, and neither the
 normal force nor friction turns the two bodies together.
 
-A pair of a sample and a surface becomes an entry of each of the two bodies (``contact``), with normal and offset of
+A pair of a sample and a surface becomes a point constraint of each of the two bodies, with normal and offset of
 opposite sign and one half of the energy, so that both feel the same force. Their rows are the sample's row, and a
-*dynamic row*, the touched material above, written behind the static ones. A pair within one body is one entry whose row
-is the difference.
+*dynamic row*, the touched material above, written behind the static ones. A pair within one body is one constraint
+whose row is the difference.
 """
 
 import warp as wp
 
 from softmode.deformables.contact.detection_kernels import rank_contacts
 from softmode.deformables.contact.penalty_kernels import stiffness_per_area
+from softmode.deformables.model.declare import struct
 from softmode.deformables.model.deformation_kernels import displacement_gradient
 from softmode.deformables.model.lane_kernels import vec8
 from softmode.deformables.model.status import WORLD_CONTACT_OVERFLOW
@@ -33,10 +34,10 @@ from softmode.deformables.model.struct_kernels import (
     OVERLAP,
     SLOTS,
     Basis,
-    Entries,
     Instances,
     Motion,
-    Progress,
+    NewtonState,
+    PointConstraints,
     Samples,
     mat23d,
     sample_area,
@@ -75,7 +76,7 @@ VOLUME_RATIO_MIN = wp.constant(wp.float64(1.0e-2))
 """det F / s^3 below which F^-1 is kept from growing."""
 
 
-@wp.struct
+@struct
 class Pairs:
     """Surfaces at the start of the step and the pairs that touch, shape (instance_count, sample_max) where not said."""
 
@@ -90,14 +91,14 @@ class Pairs:
     normal: wp.array3d[wp.vec3d]  # (..., SLOTS), outward from the other body
     nearest: wp.array3d[int]  # (..., SLOTS), its nearest sample
     tally: wp.array3d[int]  # (instance_count, team, 2), scratch of the list
-    held: wp.array3d[int]  # (..., SLOTS), the entry it became, -1 for none
+    held: wp.array3d[int]  # (..., SLOTS), the point constraint it became, -1 for none
     count: wp.array[int]  # (instance_count,)
     sample: wp.array2d[int]  # (instance_count, pair_max): sample * SLOTS + slot
-    entry: wp.array2d[int]  # (instance_count, pair_max), -1 where dropped
-    mirror: wp.array2d[int]  # (instance_count, pair_max), entry of the other body
+    constraint: wp.array2d[int]  # (instance_count, pair_max), -1 where dropped
+    mirror: wp.array2d[int]  # (instance_count, pair_max), constraint of the other body
 
 
-@wp.struct
+@struct
 class Patch:
     """The surface of a body near a point."""
 
@@ -143,7 +144,7 @@ def meets(instances: Instances, samples: Samples, i: int, j: int):
 @wp.kernel
 def mark_near(
     instances: Instances,
-    progress: Progress,
+    state: NewtonState,
     samples: Samples,
     # Out:
     pairs: Pairs,
@@ -152,7 +153,7 @@ def mark_near(
     i = wp.tid()
     w = instances.world[i]
     near = instances.self_contact[i]
-    for j in range(progress.instance_start[w], progress.instance_start[w + 1]):
+    for j in range(state.instance_start[w], state.instance_start[w + 1]):
         if j != i and meets(instances, samples, i, j):
             near = 1
     pairs.near[i] = near
@@ -304,7 +305,7 @@ def search_radius(instances: Instances, samples: Samples, pairs: Pairs, i: int, 
 def find_pairs(
     instances: Instances,
     basis: Basis,
-    progress: Progress,
+    state: NewtonState,
     samples: Samples,
     # In and out:
     pairs: Pairs,
@@ -325,7 +326,7 @@ def find_pairs(
     first = wp.float64(1.0e30)
     second = wp.float64(1.0e30)
     w = instances.world[i]
-    for j in range(progress.instance_start[w], progress.instance_start[w + 1]):
+    for j in range(state.instance_start[w], state.instance_start[w + 1]):
         radius = wp.float64(search_radius(instances, samples, pairs, i, s, j))
         if radius > wp.float64(0.0):
             best = wp.float64(1.0e30)
@@ -379,15 +380,15 @@ def compact_pairs(
 
     Each thread of a team counts its own run of samples, then writes where the counts before it end.
     """
-    i, lane = wp.tid()
+    i, member = wp.tid()
     if pairs.near[i] == 0:
-        if lane == 0:
+        if member == 0:
             pairs.count[i] = 0
         return
-    begin = lane * instances.sample_count[i] / team
-    end = (lane + 1) * instances.sample_count[i] / team
-    at_touching, at_close, total = rank_contacts(pairs.other, pairs.gap, pairs.tally, i, begin, end, lane, team)
-    if lane == 0:
+    begin = member * instances.sample_count[i] / team
+    end = (member + 1) * instances.sample_count[i] / team
+    at_touching, at_close, total = rank_contacts(pairs.other, pairs.gap, pairs.tally, i, begin, end, member, team)
+    if member == 0:
         pairs.count[i] = wp.min(total, pairs.sample.shape[1])
         if total > pairs.sample.shape[1]:
             wp.atomic_or(status, instances.world[i], WORLD_CONTACT_OVERFLOW)
@@ -407,19 +408,19 @@ def compact_pairs(
 
 @wp.kernel
 def accept_pairs(
-    progress: Progress,
-    entry_max: int,
+    state: NewtonState,
+    constraint_max: int,
     # In and out:
     pairs: Pairs,
-    entries: Entries,
+    constraints: PointConstraints,
     status: wp.array[int],
 ):
-    """Give each pair its two entries, or none: a force without its reaction must not be. What touches comes first."""
+    """Give each pair its two constraints, or none: no force without its reaction. What touches comes first."""
     w = wp.tid()
-    first = progress.instance_start[w]
-    end = progress.instance_start[w + 1]
+    first = state.instance_start[w]
+    end = state.instance_start[w + 1]
     for i in range(first, end):
-        entries.pair_count[i] = 0
+        constraints.pair_count[i] = 0
     for turn in range(2):
         for i in range(first, end):
             for k in range(pairs.count[i]):
@@ -428,18 +429,18 @@ def accept_pairs(
                 if (pairs.gap[i, s, slot] > wp.float64(0.0)) != (turn == 1):
                     continue
                 j = pairs.other[i, s, slot]
-                pairs.entry[i, k] = -1
+                pairs.constraint[i, k] = -1
                 pairs.mirror[i, k] = -1
-                if entries.count[i] >= entry_max or entries.count[j] >= entry_max:
+                if constraints.count[i] >= constraint_max or constraints.count[j] >= constraint_max:
                     status[w] = status[w] | WORLD_CONTACT_OVERFLOW
                     continue
-                pairs.entry[i, k] = entries.count[i]
-                entries.count[i] = entries.count[i] + 1
-                entries.pair_count[i] = entries.pair_count[i] + 1
+                pairs.constraint[i, k] = constraints.count[i]
+                constraints.count[i] = constraints.count[i] + 1
+                constraints.pair_count[i] = constraints.pair_count[i] + 1
                 if j != i:
-                    pairs.mirror[i, k] = entries.count[j]
-                    entries.count[j] = entries.count[j] + 1
-                    entries.pair_count[j] = entries.pair_count[j] + 1
+                    pairs.mirror[i, k] = constraints.count[j]
+                    constraints.count[j] = constraints.count[j] + 1
+                    constraints.pair_count[j] = constraints.pair_count[j] + 1
 
 
 @wp.kernel
@@ -448,7 +449,7 @@ def write_pairs(
     basis: Basis,
     motion: Motion,
     samples: Samples,
-    progress: Progress,
+    state: NewtonState,
     stick_ratio: wp.float64,
     stick_partner: wp.array[wp.vec2i],  # (particle_count,), see ``stick_kernels``
     stick_slip: wp.array[mat23d],  # (particle_count,) [m]
@@ -456,11 +457,11 @@ def write_pairs(
     # In and out:
     pairs: Pairs,
     # Out:
-    entries: Entries,
+    constraints: PointConstraints,
 ):
-    """Write the entries of a pair and its dynamic row."""
+    """Write the constraints of a pair and its dynamic row."""
     i, k = wp.tid()
-    if k >= pairs.count[i] or pairs.entry[i, k] < 0:
+    if k >= pairs.count[i] or pairs.constraint[i, k] < 0:
         return
     s = pairs.sample[i, k] / SLOTS
     slot = pairs.sample[i, k] % SLOTS
@@ -511,34 +512,34 @@ def write_pairs(
     offset = wp.max(pairs.gap[i, s, slot], deepest) * n
     particle = instances.particle_start[i] + s
     for before in range(SLOTS):
-        if stick_partner[particle][before] == j - progress.instance_start[instances.world[i]]:
+        if stick_partner[particle][before] == j - state.instance_start[instances.world[i]]:
             slip = wp.vec3d()
             for axis in range(3):
                 slip[axis] = stick_slip[particle][before, axis]
             slip = gradient_at(instances, basis, motion, i, s) * slip
             offset += slip - wp.dot(n, slip) * n
-    pairs.held[i, s, slot] = pairs.entry[i, k]
+    pairs.held[i, s, slot] = pairs.constraint[i, k]
     for side in range(2):
         a = i
-        e = pairs.entry[i, k]
+        e = pairs.constraint[i, k]
         direction = wp.float64(1.0)
         if side == 1:
             a = j
             e = pairs.mirror[i, k]
             direction = wp.float64(-1.0)
         if e >= 0:
-            entries.shape[a, e] = -1
-            entries.body[a, e] = -1
-            entries.dof_begin[a, e] = 0
-            entries.dof_end[a, e] = 0
-            entries.row[a, e] = wp.where(side == 1 or j == i, row, own)
-            entries.partner[a, e] = wp.where(j == i, -1, wp.where(side == 1, i, j))
-            entries.partner_row[a, e] = wp.where(side == 1, own, row)
-            entries.normal[a, e] = direction * n
-            entries.offset[a, e] = direction * offset
-            entries.stiffness[a, e] = stiffness
-            entries.stick[a, e] = stick_ratio * stiffness
-            entries.friction[a, e] = friction
+            constraints.shape[a, e] = -1
+            constraints.body[a, e] = -1
+            constraints.dof_begin[a, e] = 0
+            constraints.dof_end[a, e] = 0
+            constraints.row[a, e] = wp.where(side == 1 or j == i, row, own)
+            constraints.partner[a, e] = wp.where(j == i, -1, wp.where(side == 1, i, j))
+            constraints.partner_row[a, e] = wp.where(side == 1, own, row)
+            constraints.normal[a, e] = direction * n
+            constraints.offset[a, e] = direction * offset
+            constraints.stiffness[a, e] = stiffness
+            constraints.stick[a, e] = stick_ratio * stiffness
+            constraints.friction[a, e] = friction
 
 
 @wp.kernel
@@ -546,9 +547,9 @@ def remember_pairs(
     instances: Instances,
     basis: Basis,
     motion: Motion,
-    progress: Progress,
+    state: NewtonState,
     pairs: Pairs,
-    entries: Entries,
+    constraints: PointConstraints,
     # State out:
     stick_partner_out: wp.array[wp.vec2i],
     stick_slip_out: wp.array[mat23d],
@@ -568,14 +569,14 @@ def remember_pairs(
             e = pairs.held[i, s, slot]
         if e < 0:
             continue
-        limit = entries.friction[i, e] * entries.normal_force[i, e]
-        total = entries.slip[i, e]
-        stretch = entries.stick[i, e] * wp.length(total)
+        limit = constraints.friction[i, e] * constraints.normal_force[i, e]
+        total = constraints.slip[i, e]
+        stretch = constraints.stick[i, e] * wp.length(total)
         if not (limit > wp.float64(0.0) and stretch > wp.float64(0.0) and wp.isfinite(stretch + limit)):
             continue
         F = gradient_at(instances, basis, motion, i, s)
         elastic = clamped_inverse(F, instances.scale[i]) * (wp.min(wp.float64(1.0), limit / stretch) * total)
-        partner[slot] = pairs.other[i, s, slot] - progress.instance_start[instances.world[i]]
+        partner[slot] = pairs.other[i, s, slot] - state.instance_start[instances.world[i]]
         for axis in range(3):
             slips[slot, axis] = elastic[axis]
     particle = instances.particle_start[i] + s

@@ -1,6 +1,6 @@
-"""Contact of soft bodies with each other and with themselves: buffers and launches, see ``pair_kernels``."""
+"""Contact of soft bodies with each other and with themselves: tables and launches, see ``pair_kernels``."""
 
-from typing import Any
+from __future__ import annotations
 
 import numpy as np
 import warp as wp
@@ -8,95 +8,109 @@ from scipy.spatial import KDTree
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.contact import pair_kernels as kernels
-from softmode.deformables.model.lane_kernels import LANES, team_size, vec8
+from softmode.deformables.model.declare import Kernel, launch, launch_teams
+from softmode.deformables.model.lane_kernels import team_size
 from softmode.deformables.model.layout import Layout
-from softmode.deformables.model.struct_kernels import SLOTS
+from softmode.deformables.model.namespaces import SoftState
+from softmode.deformables.model.struct_kernels import (
+    SLOTS,
+    Basis,
+    Instances,
+    Motion,
+    NewtonState,
+    PointConstraints,
+    Samples,
+)
+from softmode.deformables.model.tables import allocate
+
+_AXES = {
+    "": "instance sample slot",
+    "near count": "instance",
+    "surface_normal": "instance sample",
+    "sample constraint mirror": "instance pair",
+    "tally": "instance team 2",
+}
 
 
 class SoftPairs:
-    """Finds which soft bodies touch and writes their entries; does nothing in worlds where none are near.
+    """Finds which soft bodies touch and writes their point constraints; does nothing in worlds where none are near.
 
     Args:
-        model: Finalised model.
-        layout: Its layout; rows of surface gradients and dynamic rows are added to the basis.
-        pair_max: Pairs per instance at most.
+        layout: Layout of the model, which says how many contacts there may be.
+        instances: Its instances.
+        basis: Their bases, with the rows that contact between soft bodies writes.
         stick_ratio: Tangential over normal stiffness of a contact that sticks; 0 for friction without memory.
         spacing: Of the surface samples of each instance [m], shape (instance_count,).
+        device: Where the tables lie.
     """
 
-    def __init__(self, model: Any, layout: Layout, pair_max: int, stick_ratio: float, spacing: wp.array) -> None:
-        """Allocate everything once."""
-        self.model, self.layout, self.stick_ratio = model, layout, stick_ratio
-        self.device, count, sample_max = model.device, layout.instance_count, layout.sample_max
-        pairs: Any = kernels.Pairs()
-        pairs.first_row = layout.basis.row.shape[0]
-        pairs.spacing = spacing
-        table = np.concatenate([neighbours(body) for body in layout.bodies])
-        pairs.neighbour = wp.array(table, dtype=int, device=self.device)
-        pairs.surface_normal = self._zeros((count, sample_max), wp.vec3)
-        pairs.thickness = wp.array(
-            np.concatenate([thickness(b) for b in layout.bodies]), dtype=float, device=self.device
-        )
-        self.team = team_size(self.device)
-        pairs.tally = self._zeros((count, self.team, 2), int)
-        shape = (count, sample_max, SLOTS)
-        pairs.other, pairs.nearest, pairs.held = (self._zeros(shape, int) for _ in range(3))
-        pairs.gap, pairs.normal = self._zeros(shape, wp.float64), self._zeros(shape, wp.vec3d)
-        pairs.near, pairs.count = (self._zeros((count,), int) for _ in range(2))
-        pairs.sample, pairs.entry, pairs.mirror = (self._zeros((count, pair_max), int) for _ in range(3))
-        self.table = pairs
-        self._extend_basis(count * pair_max)
-
-    def _zeros(self, shape: tuple[int, ...], dtype: Any) -> Any:
-        return wp.zeros(shape, dtype=dtype, device=self.device)
-
-    def _extend_basis(self, dynamic_count: int) -> None:
-        """Add normals and gradients at the samples, and room for the dynamic rows."""
-        basis, bodies = self.layout.basis, self.layout.bodies
-        blocks = basis.row.shape[1]
-        gradients = np.zeros((sum(body.surface_count for body in bodies), blocks * LANES, 3), np.float32)
-        start = 0
-        for body in bodies:
-            rows = slice(start, start + body.surface_count)
-            gradients[rows, : body.function_count] = body.evaluate(body.surface_points)[1]
-            start += body.surface_count
-        gradients = gradients.reshape(start, blocks, LANES, 3).transpose(1, 0, 3, 2)
-        basis.row_gradient = wp.array(np.ascontiguousarray(gradients), dtype=vec8, device=self.device)
-        normals = np.concatenate([body.surface_normals for body in bodies]).astype(np.float32)
-        basis.row_normal = wp.array(normals, dtype=wp.vec3, device=self.device)
-        rows = self._zeros((basis.row.shape[0] + dynamic_count, blocks), vec8)
-        wp.copy(rows, basis.row, count=basis.row.size)
-        basis.row = rows
+    def __init__(
+        self,
+        layout: Layout,
+        instances: Instances,
+        basis: Basis,
+        stick_ratio: float,
+        spacing: wp.array,
+        device: wp.Device,
+    ) -> None:
+        """Allocate the tables."""
+        self.layout, self.instances, self.basis, self.device = layout, instances, basis, device
+        self.stick_ratio, self.team = stick_ratio, team_size(device)
+        sizes = {
+            "instance": layout.instance_count,
+            "sample": layout.sample_max,
+            "slot": SLOTS,
+            "pair": layout.pair_max,
+            "team": self.team,
+        }
+        given = {
+            "first_row": basis.row.shape[0] - layout.instance_count * layout.pair_max,
+            "spacing": spacing,
+            "neighbour": np.concatenate([neighbours(body) for body in layout.bodies]),
+            "thickness": np.concatenate([thickness(body) for body in layout.bodies]),
+        }
+        self.table = allocate(kernels.Pairs, _AXES, sizes, device, given=given)
 
     def detect(
-        self, motion: Any, samples: Any, progress: Any, memory: Any, entries: Any, *, entry_max: int, dt: float
+        self,
+        motion: Motion,
+        samples: Samples,
+        state: NewtonState,
+        memory: SoftState,
+        constraints: PointConstraints,
+        *,
+        dt: float,
     ) -> None:
-        """Find the pairs of this step, ``samples`` being placed and bounded, and append them to the entries.
+        """Find the pairs of this step and append them to the constraints.
 
-        ``memory`` are the attributes of the state, with what sticks.
+        Args:
+            motion: Motion of the step.
+            samples: Surface samples, placed and bounded.
+            state: Where Newton's iteration stands.
+            memory: What sticks, as the state of the step says.
+            constraints: Point constraints of the step.
+            dt: Step [s].
         """
-        layout, pairs = self.layout, self.table
-        instances, basis = layout.instances, layout.basis
-        every = samples.position.shape
-        self._launch(kernels.mark_near, layout.instance_count, [instances, progress, samples], [pairs])
-        self._launch(kernels.place_surface, every, [instances, basis, motion, samples], [pairs])
-        self._launch(kernels.find_pairs, every, [instances, basis, progress, samples], [pairs])
-        dim = (layout.instance_count, self.team)
-        self._launch(kernels.compact_pairs, dim, [instances, self.team], [pairs, progress.status], self.team)
-        self._launch(kernels.accept_pairs, layout.world_count, [progress, entry_max], [pairs, entries, progress.status])
-        stick = [wp.float64(self.stick_ratio), memory.stick_partner, memory.stick_slip, dt]
-        tables = [instances, basis, motion, samples, progress, *stick]
-        self._launch(kernels.write_pairs, pairs.sample.shape, tables, [pairs, entries])
+        pairs, instances, basis = self.table, self.instances, self.basis
+        every, count, constraint_max = samples.position.shape, self.layout.instance_count, constraints.row.shape[1]
+        self._launch(kernels.mark_near, count, instances, state, samples, pairs)
+        self._launch(kernels.place_surface, every, instances, basis, motion, samples, pairs)
+        self._launch(kernels.find_pairs, every, instances, basis, state, samples, pairs)
+        launch_teams(self.device, kernels.compact_pairs, count, self.team, instances, self.team, pairs, state.status)
+        found = (pairs, constraints, state.status)
+        self._launch(kernels.accept_pairs, self.layout.world_count, state, constraint_max, *found)
+        stick = (wp.float64(self.stick_ratio), memory.stick_partner, memory.stick_slip, dt)
+        tables = (instances, basis, motion, samples, state, *stick)
+        self._launch(kernels.write_pairs, pairs.sample.shape, *tables, pairs, constraints)
 
-    def remember(self, motion: Any, progress: Any, entries: Any, memory: Any) -> None:
-        """Write what sticks at the end of the step into the attributes of the state."""
-        layout = self.layout
-        tables = [layout.instances, layout.basis, motion, progress, self.table, entries]
-        out = [memory.stick_partner, memory.stick_slip]
-        self._launch(kernels.remember_pairs, self.table.surface_normal.shape, tables, out)
+    def remember(self, motion: Motion, state: NewtonState, constraints: PointConstraints, memory: SoftState) -> None:
+        """Write what sticks at the end of the step into the state ``memory``; arguments as for :meth:`detect`."""
+        tables = (self.instances, self.basis, motion, state, self.table, constraints)
+        out = (memory.stick_partner, memory.stick_slip)
+        self._launch(kernels.remember_pairs, self.table.surface_normal.shape, *tables, *out)
 
-    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any], block_dim: int = 256) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, block_dim=block_dim, device=self.device)
+    def _launch(self, kernel: Kernel, dim: int | tuple[int, ...], *arguments: object) -> None:
+        launch(self.device, kernel, dim, *arguments)
 
 
 def thickness(body: ReducedBody) -> np.ndarray:

@@ -17,16 +17,18 @@ doi:10.1145/3386569.3392425, eq. 13), mu f_n f0(|d_t|), which creeps.
 
 import warp as wp
 
+from softmode.deformables.model.declare import kernel_over
 from softmode.deformables.model.lane_kernels import vec8d
 from softmode.deformables.model.struct_kernels import (
     Basis,
-    Entries,
     Instances,
     Motion,
-    Progress,
+    NewtonState,
+    PointConstraints,
     Rigid,
     first_coupled,
     interpolate_change,
+    p_wave_modulus,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -124,9 +126,7 @@ def stiffness_per_area(instances: Instances, i: int, partner_mass: float, partne
     """
     if instances.contact_stiffness[i] > 0.0:
         return instances.contact_stiffness[i]
-    E = instances.youngs_modulus[i]
-    nu = instances.poissons_ratio[i]
-    wave = E * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
+    wave = p_wave_modulus(instances.youngs_modulus[i], instances.poissons_ratio[i])
     mass = float(instances.mass[i])
     if partner_mass > 0.0:
         mass *= partner_mass / (mass + partner_mass)
@@ -135,11 +135,11 @@ def stiffness_per_area(instances: Instances, i: int, partner_mass: float, partne
 
 
 @wp.func
-def evaluate_entry(
+def evaluate_constraint(
     instances: Instances,
     basis: Basis,
     motion: Motion,
-    progress: Progress,
+    state: NewtonState,
     rigid: Rigid,
     stick_range: wp.float64,  # eps of the friction potential for this step [m]
     # State in:
@@ -148,116 +148,98 @@ def evaluate_entry(
     r: wp.array2d[wp.float64],
     derivatives: int,
     # In and out:
-    entries: Entries,
+    constraints: PointConstraints,
     i: int,
     e: int,
 ):
     """Evaluate pins and contacts at displacement d = sum_k b_k (q_k - q_nk) - J r, less that of a soft partner.
 
-    A contact of two soft bodies is an entry of each, which has one half of its energy and all of its force.
+    A contact of two soft bodies is a constraint of each, which has one half of its energy and all of its force.
     """
     w = instances.world[i]
-    if selected[w] == 0 or e >= entries.count[i]:
+    if selected[w] == 0 or e >= constraints.count[i]:
         return
-    d = interpolate_change(basis.row, entries.row[i, e], q, motion.q_start, i, instances.function_count[i])
+    d = interpolate_change(basis.row, constraints.row[i, e], q, motion.q_start, i, instances.function_count[i])
     smoothing = instances.smoothing[i]
     share = wp.float64(1.0)
-    if e >= entries.count[i] - entries.pair_count[i]:
-        j = entries.partner[i, e]
+    if e >= constraints.count[i] - constraints.pair_count[i]:
+        j = constraints.partner[i, e]
         if j >= 0:
             d -= interpolate_change(
-                basis.row, entries.partner_row[i, e], q, motion.q_start, j, instances.function_count[j]
+                basis.row, constraints.partner_row[i, e], q, motion.q_start, j, instances.function_count[j]
             )
             smoothing = wp.min(smoothing, instances.smoothing[j])
             share = wp.float64(0.5)
-    for k in range(entries.dof_begin[i, e], entries.dof_end[i, e]):
-        d -= r[w, k] * wp.vec3d(entries.jacobian[i, e, k])
-    stiffness = entries.stiffness[i, e]
+    for k in range(constraints.dof_begin[i, e], constraints.dof_end[i, e]):
+        d -= r[w, k] * wp.vec3d(constraints.jacobian[i, e, k])
+    stiffness = constraints.stiffness[i, e]
     identity = wp.identity(n=3, dtype=wp.float64)
     H = stiffness * identity
     if e < instances.pin_count[i]:
-        x = entries.offset[i, e] + d
-        entries.energy[i, e] = wp.float64(0.5) * stiffness * wp.length_sq(x)
-        entries.force[i, e] = -stiffness * x
+        x = constraints.offset[i, e] + d
+        constraints.energy[i, e] = wp.float64(0.5) * stiffness * wp.length_sq(x)
+        constraints.force[i, e] = -stiffness * x
     else:
-        n = entries.normal[i, e]
-        total = entries.offset[i, e] + d
+        n = constraints.normal[i, e]
+        total = constraints.offset[i, e] + d
         psi, slope, curvature = normal_potential(-wp.dot(n, total), wp.float64(smoothing))
-        if derivatives != 0 and progress.iteration[w] <= progress.friction_lag:
+        if derivatives != 0 and state.iteration[w] <= state.friction_lag:
             held = slope
-            if progress.iteration[w] == 0:
+            if state.iteration[w] == 0:
                 # in an impact the first guess lies far too deep: friction of such a force would be too stiff to solve
                 deep = wp.float64(smoothing) - wp.float64(2.0) * wp.min(
-                    wp.dot(n, entries.offset[i, e]), wp.float64(0.0)
+                    wp.dot(n, constraints.offset[i, e]), wp.float64(0.0)
                 )
                 _psi, most, _curvature = normal_potential(deep, wp.float64(smoothing))
                 held = wp.min(slope, most)
-            entries.normal_force[i, e] = stiffness * held
-        normal_force = entries.normal_force[i, e]
+            constraints.normal_force[i, e] = stiffness * held
+        normal_force = constraints.normal_force[i, e]
         # offset = gap n + memory - drift of the shape: the tangential part is the slip
         t = total - wp.dot(n, total) * n
         y = wp.length(t)
-        limit = entries.friction[i, e] * normal_force
-        stick = entries.stick[i, e]
+        limit = constraints.friction[i, e] * normal_force
+        stick = constraints.stick[i, e]
         f0, secant, tangent = slip_potential(y, limit, stick, stick_range)
-        entries.slip[i, e] = t
-        entries.energy[i, e] = share * (stiffness * psi + f0)
-        entries.force[i, e] = stiffness * slope * n - secant * t
+        constraints.slip[i, e] = t
+        constraints.energy[i, e] = share * (stiffness * psi + f0)
+        constraints.force[i, e] = stiffness * slope * n - secant * t
         # f0 is concave in y^2, so the quadratic of the secant's curvature lies above it and its steps cannot overshoot,
         # from however far away; the potential's own curvature along the slip converges faster once the state is close
         N = wp.outer(n, n)
         H = stiffness * curvature * N + secant * (identity - N)
-        if progress.exact[w] != 0 and y > wp.float64(1.0e-9) * stick_range:
+        if state.exact[w] != 0 and y > wp.float64(1.0e-9) * stick_range:
             H += (tangent - secant) / (y * y) * wp.outer(t, t)
     if derivatives != 0:
-        entries.hessian[i, e] = wp.mat33(H)
-        for k in range(entries.dof_begin[i, e], entries.dof_end[i, e]):
-            entries.coupling[i, e, k] = wp.mat33(H) * entries.jacobian[i, e, k]
+        constraints.hessian[i, e] = wp.mat33(H)
+        for k in range(constraints.dof_begin[i, e], constraints.dof_end[i, e]):
+            constraints.coupling[i, e, k] = wp.mat33(H) * constraints.jacobian[i, e, k]
 
 
-@wp.kernel
-def evaluate_entries(
-    instances: Instances,
-    basis: Basis,
-    motion: Motion,
-    progress: Progress,
-    rigid: Rigid,
-    stick_range: wp.float64,  # eps of the friction potential for this step [m]
-    # State in:
-    selected: wp.array[int],
-    q: wp.array2d[vec8d],
-    r: wp.array2d[wp.float64],
-    derivatives: int,
-    # In and out:
-    entries: Entries,
-):
-    """Launch :func:`evaluate_entry`."""
-    i, e = wp.tid()
-    evaluate_entry(instances, basis, motion, progress, rigid, stick_range, selected, q, r, derivatives, entries, i, e)
+evaluate_constraints = kernel_over(evaluate_constraint, "evaluate_constraints", "i", "e")
 
 
 @wp.kernel
 def sum_reactions(
     instances: Instances,
-    progress: Progress,
-    entries: Entries,
+    state: NewtonState,
+    constraints: PointConstraints,
     # Out:
     body_wrench_out: wp.array[wp.spatial_vector],  # (body_count,) on the rigid bodies, about their COM [N, N m]
     instance_force_out: wp.array[wp.vec3d],  # (instance_count,) total contact force on the body [N]
 ):
     """Sum the forces of contacts and links per rigid body (equal and opposite), of contacts per instance, in order."""
     w = wp.tid()
-    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
+    for i in range(state.instance_start[w], state.instance_start[w + 1]):
         total = wp.vec3d()
-        for e in range(first_coupled(instances, i), entries.count[i]):
-            f = entries.force[i, e]
-            paired = e >= entries.count[i] - entries.pair_count[i]
-            if e >= instances.pin_count[i] and not (paired and entries.partner[i, e] < 0):
+        for e in range(first_coupled(instances, i), constraints.count[i]):
+            f = constraints.force[i, e]
+            paired = e >= constraints.count[i] - constraints.pair_count[i]
+            if e >= instances.pin_count[i] and not (paired and constraints.partner[i, e] < 0):
                 total += f  # a contact of the body with itself is none of the world's business
-            body = entries.body[i, e]
+            body = constraints.body[i, e]
             if body >= 0:
                 reaction = -wp.vec3(f)
                 body_wrench_out[body] = body_wrench_out[body] + wp.spatial_vector(
-                    reaction, wp.cross(entries.arm[i, e], reaction)
+                    reaction, wp.cross(constraints.arm[i, e], reaction)
                 )
         instance_force_out[i] = total

@@ -6,6 +6,8 @@ A bounded plane and a heightfield are the tops of solids that go down without en
 import warp as wp
 from newton import GeoType
 
+from softmode.deformables.model.declare import struct
+
 wp.set_module_options({"enable_backward": False})
 
 PLANE = int(GeoType.PLANE)
@@ -34,7 +36,7 @@ SUPPORTED_SHAPES = (
 """Shape types a soft body can touch."""
 
 
-@wp.struct
+@struct
 class SurfaceQuery:
     """Distance of a point to a shape, in the frame of the shape."""
 
@@ -42,7 +44,7 @@ class SurfaceQuery:
     normal: wp.vec3  # outward, unit
 
 
-@wp.struct
+@struct
 class Heightfields:
     """The heightfields of the model as Newton stores them: rows along Y, columns along X, split along (1, 1)."""
 

@@ -7,20 +7,22 @@ import numpy as np
 import warp as wp
 from newton import GeoType
 
+from softmode.deformables.contact.detection_kernels import Shapes
 from softmode.deformables.contact.shape_query_kernels import SUPPORTED_SHAPES, Heightfields
 from softmode.deformables.model.layout import Layout
+from softmode.deformables.model.tables import allocate, host
 from softmode.errors import ConfigError
 
 MESHES = (GeoType.MESH, GeoType.CONVEX_MESH)
 
 
-def solid_shapes(model: Any) -> np.ndarray:
+def solid_shapes(model: newton.Model) -> np.ndarray:
     """Return which shapes collide with particles, shape (shape_count,).
 
     Raises:
         ConfigError: If one of them has a form whose distance cannot be queried, or a friction that is not >= 0.
     """
-    flags, kinds, scale = model.shape_flags.numpy(), model.shape_type.numpy(), model.shape_scale.numpy()
+    flags, kinds, scale = host(model.shape_flags), host(model.shape_type), host(model.shape_scale)
     solid = (flags & int(newton.ShapeFlags.COLLIDE_PARTICLES)) != 0
     for shape in np.flatnonzero(solid & ~np.isin(kinds, [int(kind) for kind in SUPPORTED_SHAPES])):
         raise ConfigError(
@@ -28,7 +30,7 @@ def solid_shapes(model: Any) -> np.ndarray:
             hint="put a mesh or primitives (newton.ModelBuilder.approximate_meshes makes convex parts) in its place, "
             "or clear its COLLIDE_PARTICLES flag (ShapeConfig.has_particle_collision)",
         )
-    friction = model.shape_material_mu.numpy()
+    friction = host(model.shape_material_mu)
     for shape in np.flatnonzero(solid & ~((friction >= 0.0) & np.isfinite(friction))):
         raise ConfigError(
             f"{_name(model, shape)} has friction {friction[shape]:g}, expected a finite number >= 0",
@@ -50,7 +52,7 @@ def solid_shapes(model: Any) -> np.ndarray:
     return solid
 
 
-def mesh_sources(model: Any, solid: np.ndarray) -> tuple[wp.array, list[Any]]:
+def mesh_sources(model: newton.Model, solid: np.ndarray) -> tuple[wp.array, list[Any]]:
     """Return the Warp meshes that contact queries, and what keeps them alive.
 
     A convex mesh stands for its hull, as in Newton. Replicas share their mesh, which is looked at once.
@@ -62,16 +64,16 @@ def mesh_sources(model: Any, solid: np.ndarray) -> tuple[wp.array, list[Any]]:
     Raises:
         ConfigError: If a triangle mesh is not closed: it has no inside, and thus no side to be pushed out at.
     """
-    kinds, source = model.shape_type.numpy(), model.shape_source_ptr.numpy()
+    kinds, source = host(model.shape_type), host(model.shape_source_ptr)
     hulls: dict[int, Any] = {}
     closed: set[int] = set()
     for shape in np.flatnonzero(solid & (kinds == int(GeoType.CONVEX_MESH))):
-        mesh = model.shape_source[shape]
+        mesh: Any = model.shape_source[shape]
         if id(mesh) not in hulls:
             hulls[id(mesh)] = mesh.compute_convex_hull()
         source[shape] = hulls[id(mesh)].finalize(device=model.device)
     for shape in np.flatnonzero(solid & (kinds == int(GeoType.MESH))):
-        mesh = model.shape_source[shape]
+        mesh: Any = model.shape_source[shape]
         if id(mesh) not in closed and not is_closed(mesh.vertices, mesh.indices):
             raise ConfigError(
                 f"{_name(model, shape)} is a triangle mesh that is not closed, so it has no inside",
@@ -105,24 +107,38 @@ def is_closed(vertices: np.ndarray, indices: np.ndarray) -> bool:
     return len(counts) > 0 and bool((counts % 2 == 0).all())
 
 
-def heightfields(model: Any) -> Any:
+def heightfields(model: newton.Model) -> Heightfields:
     """Copy the heightfields of a model into :class:`softmode.deformables.contact.shape_query_kernels.Heightfields`."""
-    table, device = model.heightfield_data.numpy(), model.device
-    fields = Heightfields()
-    fields.index, fields.elevation = model.shape_heightfield_index, model.heightfield_elevations
-    grid = np.stack([table[name] for name in ("data_offset", "nrow", "ncol")], axis=-1)
-    extent = np.stack([table[name] for name in ("hx", "hy", "min_z", "max_z")], axis=-1)
-    fields.grid = wp.array(grid, dtype=wp.vec3i, device=device)
-    fields.extent = wp.array(extent, dtype=wp.vec4, device=device)
-    return fields
+    table = host(model.heightfield_data)
+    given = {
+        "index": model.shape_heightfield_index,
+        "elevation": model.heightfield_elevations,
+        "grid": np.stack([table[name] for name in ("data_offset", "nrow", "ncol")], axis=-1),
+        "extent": np.stack([table[name] for name in ("hx", "hy", "min_z", "max_z")], axis=-1),
+    }
+    return allocate(Heightfields, "", {}, model.device, given=given)
 
 
-def _name(model: Any, shape: Any) -> str:
+def shape_table(model: newton.Model) -> tuple[Shapes, list[Any]]:
+    """Return what contact reads of the model's shapes, and what keeps its meshes alive."""
+    shapes, alive = Shapes(), []
+    if model.shape_count:
+        shapes.kind, shapes.scale = model.shape_type, model.shape_scale
+        shapes.source, alive = mesh_sources(model, solid_shapes(model))
+        shapes.margin, shapes.friction = model.shape_margin, model.shape_material_mu
+        shapes.lower, shapes.upper = model.shape_collision_aabb_lower, model.shape_collision_aabb_upper
+        shapes.body, shapes.transform = model.shape_body, model.shape_transform
+        shapes.fields = heightfields(model)
+    shapes.body_com, shapes.body_mass = model.body_com, model.body_mass
+    return shapes, alive
+
+
+def _name(model: newton.Model, shape: int | np.integer) -> str:
     """Return how to call a shape in a message."""
     return f"shape {shape} ({model.shape_label[shape]!r})"
 
 
-def candidate_shapes(model: Any, layout: Layout) -> np.ndarray:
+def candidate_shapes(model: newton.Model, layout: Layout) -> np.ndarray:
     """List, per instance, the shapes of its world that collide with particles; -1 pads.
 
     Raises:
@@ -131,9 +147,9 @@ def candidate_shapes(model: Any, layout: Layout) -> np.ndarray:
     instance_count, world_count = layout.instance_count, layout.world_count
     if model.shape_count == 0:
         return np.full((instance_count, 1), -1)
-    worlds = model.shape_world.numpy()
+    worlds = host(model.shape_world)
     solid = solid_shapes(model)
-    moving = solid & (model.shape_body.numpy() >= 0) & (worlds == -1)
+    moving = solid & (host(model.shape_body) >= 0) & (worlds == -1)
     if world_count > 1 and moving.any():
         raise ConfigError(
             f"shape {np.flatnonzero(moving)[0]} belongs to a body outside all worlds; every world would push it",

@@ -3,7 +3,8 @@
 import newton
 import warp as wp
 
-from softmode.deformables.model.struct_kernels import Entries, Instances, Progress, Rigid, first_coupled
+from softmode.deformables.model.declare import struct
+from softmode.deformables.model.struct_kernels import Instances, NewtonState, PointConstraints, Rigid, first_coupled
 
 wp.set_module_options({"enable_backward": False})
 
@@ -24,8 +25,8 @@ IMMOVABLE = wp.constant(wp.float64(1.0e9))
 @wp.kernel
 def find_coupled(
     instances: Instances,
-    progress: Progress,
-    entries: Entries,
+    state: NewtonState,
+    constraints: PointConstraints,
     dof_count: wp.array[int],
     # Out:
     rigid: Rigid,
@@ -34,9 +35,9 @@ def find_coupled(
     """Let the joint dofs take part in the worlds in which a soft body is near a rigid one that moves."""
     w = wp.tid()
     coupled = int(0)
-    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
-        for e in range(first_coupled(instances, i), entries.count[i]):
-            body = entries.body[i, e]
+    for i in range(state.instance_start[w], state.instance_start[w + 1]):
+        for e in range(first_coupled(instances, i), constraints.count[i]):
+            body = constraints.body[i, e]
             if body >= 0:
                 if rigid.body_articulation[body] >= 0:
                     coupled = 1
@@ -80,7 +81,7 @@ def keep_prediction(
         corrected[width * e + c] = predicted[width * e + c]
 
 
-@wp.struct
+@struct
 class Inertia:
     """What the mass matrix of the articulations is made of."""
 

@@ -12,7 +12,6 @@ pass lags by a step and gains energy where contact is stiff or bodies are light;
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import newton
 import numpy as np
@@ -21,9 +20,16 @@ from newton.solvers.experimental.coupled import CouplingInterface  # pyright: ig
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.coupling import proxy_kernels as kernels
-from softmode.deformables.model.authoring import MATERIAL_FIELDS, NAMESPACE
+from softmode.deformables.model.authoring import MATERIAL_FIELDS
+from softmode.deformables.model.declare import WRENCH
+from softmode.deformables.model.namespaces import soft
 from softmode.deformables.model.rigid_dofs import RigidDofs
-from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
+from softmode.deformables.model.tables import body_world, starts_of
+from softmode.deformables.solver.detect import differentiate_constraints
+from softmode.deformables.solver.observables import ReducedObservables
+from softmode.deformables.solver.options import SolverReducedOptions
+from softmode.deformables.solver.reduced_solver import ReducedSolver
+from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.deformables.solver.step_checks import check_step
 from softmode.errors import ConfigError
 
@@ -31,8 +37,8 @@ LIVE_FIELDS = ("material_model", *MATERIAL_FIELDS, "contact_stiffness", "scale")
 """Attributes of ``model.softmode`` that may change at run time and that a view copies."""
 
 
-class SolverReducedProxy(SolverReduced, CouplingInterface):
-    """:class:`SolverReduced` whose rigid bodies are free and take part in the solve, for Newton's couplers.
+class SolverReducedProxy(ReducedSolver, CouplingInterface):
+    """A :class:`SolverReduced` whose rigid bodies are free and take part in the solve, for Newton's couplers.
 
     Use it as ``SolverCoupledProxy.Entry("soft", lambda view: SolverReducedProxy(view, bodies), in_place=True,
     particles=range(model.particle_count))``. Newton's couplers neither distribute nor collect states of custom
@@ -59,11 +65,9 @@ class SolverReducedProxy(SolverReduced, CouplingInterface):
         self, model: newton.Model, bodies: Sequence[ReducedBody], *, options: SolverReducedOptions | None = None
     ) -> None:
         """Tie the rigid bodies into the solve; see the class."""
-        super().__init__(model, bodies, options=options)
-        view: Any = model
-        vector: Any = wp.spatial_vector
-        self.attach_rigid(_free_bodies(view, self.world_count))
-        self.impulse = wp.zeros(view.body_count, dtype=vector, device=view.device)
+        self.reduced = SolverReduced(model, bodies, options=options, rigid=_free_bodies(model))
+        super().__init__(model, self.reduced.tables)
+        self.impulse = wp.zeros(model.body_count, dtype=WRENCH, device=model.device)
         """Contact impulse on every rigid body since the coupler's last pass began [N s, N m s]."""
         self.start: dict[str, wp.array] | None = None
         """The soft state at the start of the step, where passes may be repeated."""
@@ -78,7 +82,7 @@ class SolverReducedProxy(SolverReduced, CouplingInterface):
         contacts: newton.Contacts | None,
         dt: float,
         *,
-        observables: Any = None,
+        observables: ReducedObservables | None = None,
     ) -> None:
         """Advance soft bodies and free rigid bodies by ``dt`` [s]; only contact and ``state_in.body_f`` act on these.
 
@@ -92,22 +96,23 @@ class SolverReducedProxy(SolverReduced, CouplingInterface):
             raise ConfigError(
                 "a coupler loses the soft coordinates between two states of an entry", hint="pass Entry(in_place=True)"
             )
-        model, count = self.model, self.model.body_count
-        inertia = [model.body_inv_mass, model.body_mass, model.body_inertia, model.body_inv_inertia]
-        motion = [state_in.body_q, state_in.body_qd, state_in.body_f]
+        model, count, t = self.model, self.model.body_count, self.tables
         if count:
-            inputs = [model.body_world, *inertia, *motion, wp.float64(dt)]
-            self._launch(kernels.predict_bodies, count, inputs, [self.rigid.table])
-        self.begin(state_in, control, dt)
-        self.detect(state_in, control, dt, prescribed=False)
-        self.bound_pivots()
-        self.differentiate_entries()
-        self.minimise(dt)
-        self.finish(state_out, dt)
+            inertia = (model.body_inv_mass, model.body_mass, model.body_inertia, model.body_inv_inertia)
+            motion = (state_in.body_q, state_in.body_qd, state_in.body_f, wp.float64(dt))
+            t.launch(kernels.predict_bodies, count, model.body_world, *inertia, *motion, t.rigid.table)
+        self.reduced.advance(state_in, state_out, self.parameters, dt, couple=lambda: differentiate_constraints(t))
         if count:
-            inputs = [model.body_world, model.body_com, self.rigid.table, self.body_wrench, float(dt), state_in.body_q]
-            self._launch(kernels.move_bodies, count, inputs, [state_out.body_q, state_out.body_qd, self.impulse])
-        self.report(observables)
+            moved = (t.rigid.table, self.body_wrench, float(dt), state_in.body_q)
+            out = (state_out.body_q, state_out.body_qd, self.impulse)
+            t.launch(kernels.move_bodies, count, model.body_world, model.body_com, *moved, *out)
+        self.reduced.report(observables)
+
+    def reset(
+        self, state: newton.State, world_mask: wp.array | None = None, flags: newton.StateFlags | None = None
+    ) -> None:
+        """Reset the soft bodies; see :meth:`softmode.deformables.solver.solver_reduced.SolverReduced.reset`."""
+        self.reduced.reset(state, world_mask, flags)
 
     def notify_model_changed(self, flags: int) -> None:
         """Follow changes of the model; a coupler's view holds copies of the parameters, which are taken anew.
@@ -116,17 +121,12 @@ class SolverReducedProxy(SolverReduced, CouplingInterface):
         """
         parent = getattr(self.model, "parent", None)
         if parent is not None:
-            given = getattr(parent, NAMESPACE)
+            given = soft(parent)
             for name in filter(lambda name: hasattr(given, name), LIVE_FIELDS):
-                own: Any = getattr(self.parameters, name)
-                source: Any = getattr(given, name)
+                own, source = getattr(self.parameters, name), getattr(given, name)
                 if own.ptr != source.ptr:
                     wp.copy(own, source)
-        super().notify_model_changed(flags)
-
-    def _control(self, control: newton.Control | None) -> Any:
-        """Return the targets that the view holds."""
-        return self.parameters
+        self.reduced.notify_model_changed(flags)
 
     # -- what a coupler asks for --------------------------------------------------------------------------------------
 
@@ -134,16 +134,16 @@ class SolverReducedProxy(SolverReduced, CouplingInterface):
         """Prepare to start passes again from the state at the start of the step."""
         self.coupled = True
         if enabled:
-            state = vars(getattr(self.model.state(), NAMESPACE))
+            state = vars(soft(self.model.state()))
             self.start = {name: value for name, value in state.items() if isinstance(value, wp.array)}
 
     def coupling_notify_input_state_update(
-        self, state: Any, flags: int, *, iteration_restart: bool = False, dt: float = 0.0
+        self, state: newton.State, flags: int, *, iteration_restart: bool = False, dt: float = 0.0
     ) -> None:
         """Keep the soft state when a step begins, and put it back when a further pass does."""
         if self.start is None or dt == 0.0 or not int(flags) & int(newton.StateFlags.PARTICLE_Q):
             return
-        data = getattr(state, NAMESPACE)
+        data = soft(state)
         for name, kept in self.start.items():
             current = getattr(data, name)
             wp.copy(current, kept) if iteration_restart else wp.copy(kept, current)
@@ -159,7 +159,7 @@ class SolverReducedProxy(SolverReduced, CouplingInterface):
     def coupling_rewind_proxy_body(
         self,
         body_local_to_proxy_global: wp.array,
-        state: Any,
+        state: newton.State,
         coupling_forces: wp.array,
         body_gravity_acceleration: wp.array,
         dt: float,
@@ -171,8 +171,8 @@ class SolverReducedProxy(SolverReduced, CouplingInterface):
         self.impulse.zero_()
 
     def coupling_prepare_proxy_contacts(
-        self, state: Any, contacts: Any, *, contacts_freshly_detected: bool = False
-    ) -> Any:
+        self, state: newton.State, contacts: newton.Contacts | None, *, contacts_freshly_detected: bool = False
+    ) -> newton.Contacts | None:
         """Leave the contacts alone: the solver finds its own."""
         return contacts
 
@@ -182,16 +182,16 @@ class SolverReducedProxy(SolverReduced, CouplingInterface):
         out_body_f: wp.array,
         *,
         body_qd_before: wp.array,
-        state: Any,
-        state_out: Any,
-        contacts: Any,
+        state: newton.State,
+        state_out: newton.State,
+        contacts: newton.Contacts | None,
         dt: float,
     ) -> None:
         """Return the contact wrenches on the proxies, means over the substeps."""
         count = self.model.body_count
         if count:
-            inputs = [body_local_to_proxy_global, self.impulse, float(dt)]
-            self._launch(kernels.harvest_wrenches, count, inputs, [out_body_f])
+            inputs = (body_local_to_proxy_global, self.impulse, float(dt), out_body_f)
+            self.tables.launch(kernels.harvest_wrenches, count, *inputs)
 
     def coupling_eval_effective_mass(
         self, endpoint_kind: wp.array, endpoint_index: wp.array, endpoint_local_pos: wp.array, out: wp.array
@@ -199,34 +199,26 @@ class SolverReducedProxy(SolverReduced, CouplingInterface):
         """Evaluate the mass that a surface sample, or a body, shows to a force: 3 / tr(J M^-1 J^T) [kg]."""
         super().coupling_eval_effective_mass(endpoint_kind, endpoint_index, endpoint_local_pos, out)
         particle = int(CouplingInterface.EndpointKind.PARTICLE)
-        inputs = [self.instances, self.basis, particle, endpoint_kind, endpoint_index]
-        self._launch(kernels.sample_masses, out.shape[0], inputs, [out])
+        inputs = (self.tables.instances, self.tables.basis, particle, endpoint_kind, endpoint_index, out)
+        self.tables.launch(kernels.sample_masses, out.shape[0], *inputs)
 
     def coupling_supports_inertial_property_refresh(self) -> bool:
         """Say that masses and inertia are read in every step."""
         return True
 
 
-def _free_bodies(model: Any, world_count: int) -> RigidDofs:
+def _free_bodies(model: newton.Model) -> RigidDofs:
     """Give every rigid body six dofs, its velocity and angular velocity about its centre of mass."""
-    count = model.body_count
-    world = np.maximum(model.body_world.numpy()[:count], 0) if count else np.zeros(0, int)
+    count, world, worlds = model.body_count, body_world(model), max(model.world_count, 1)
     if (np.diff(world) < 0).any():
         raise ConfigError("rigid bodies are not ordered by world", hint="add bodies to one world before the next")
-    counts = 6 * np.bincount(world, minlength=world_count)
-    dofs = RigidDofs(model, world_count, counts, np.concatenate([[0], np.cumsum(counts)[:-1]]))
-    if count:
-        # each body is a tree of its own, with one link that its six dofs move as they are
-        first = 6 * np.arange(count)
-        each = {
-            "body_articulation": np.arange(count),
-            "body_link": np.zeros(count, int),
-            "articulation_dof_start": first,
-            "articulation_dof_count": np.full(count, 6),
-        }
-        arrays = {name: wp.array(values, dtype=int, device=model.device) for name, values in each.items()}
-        arrays["jacobian"] = wp.array(np.tile(np.eye(6), (count, 1, 1)), dtype=float, device=model.device)
-        for name, array in arrays.items():
-            setattr(dofs, name, array)
-            setattr(dofs.table, name, array)
-    return dofs
+    counts = 6 * np.bincount(world, minlength=worlds)
+    # each body is a tree of its own, with one link that its six dofs move as they are
+    alone = {
+        "body_articulation": np.arange(count),
+        "body_link": np.zeros(count, int),
+        "articulation_dof_start": 6 * np.arange(count),
+        "articulation_dof_count": np.full(count, 6),
+        "jacobian": np.tile(np.eye(6), (count, 1, 1)),
+    }
+    return RigidDofs(model, worlds, counts, starts_of(counts), given=alone if count else None)

@@ -28,7 +28,9 @@ from softmode.deformables.gradients.krylov import Gmres
 from softmode.deformables.model.authoring import NAMESPACE
 from softmode.deformables.model.lane_kernels import vec8d
 from softmode.deformables.model.status import WORLD_NOT_FINITE
-from softmode.deformables.model.struct_kernels import Entries, Points
+from softmode.deformables.model.struct_kernels import PointConstraints, Points
+from softmode.deformables.solver.detect import adapt
+from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient
 from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.deformables.solver.step_kernels import sum_forces
 from softmode.errors import ConfigError, SolverDiverged
@@ -36,7 +38,7 @@ from softmode.errors import ConfigError, SolverDiverged
 Array = NDArray[np.float64]
 
 _ENTRY = ("row", "normal", "offset", "stiffness", "friction")
-"""What a step's point constraints are made of, besides their count: members of the solver's ``Entries``."""
+"""What a step's point constraints are made of, besides their count: members of the solver's ``PointConstraints``."""
 _SUMS = ("youngs_modulus", "poissons_ratio", "viscosity", "friction", "density", "mass_damping")
 
 
@@ -128,17 +130,17 @@ class AdjointReduced:
 
     def __init__(self, solver: SolverReduced, step_max: int, *, options: AdjointOptions | None = None) -> None:
         """Allocate the record and the work space."""
-        if solver.rigid.count_max:
+        if solver.tables.rigid.count_max:
             raise ConfigError(
                 "the step solves for joint dofs, whose solver has no derivative",
                 hint="use SolverReduced with prescribed rigid bodies",
             )
-        if solver.pairs is not None:
+        if solver.tables.pairs is not None:
             raise ConfigError(
                 "contact between soft bodies has no derivative",
                 hint="use SolverReducedOptions(soft_contact=False), or one body per world",
             )
-        if solver.instances.link_pin_count.numpy().any():
+        if solver.tables.instances.link_pin_count.numpy().any():
             raise ConfigError("pins that follow a rigid body have no derivative", hint="pin to the world (link=-1)")
         if solver.model.shape_count and solver.options.stick_ratio > 0.0:
             raise ConfigError(
@@ -146,10 +148,10 @@ class AdjointReduced:
                 hint="use SolverReducedOptions(stick_ratio=0.0), friction smoothed over stick_velocity",
             )
         self.solver, self.options, self.step_max = solver, options or AdjointOptions(), step_max
-        self.device, layout = solver.model.device, solver.layout
+        self.device, layout = solver.model.device, solver.tables.layout
         self.instances, self.total = layout.instance_count, int(solver.parameters.q.shape[0])
         self.pin_total = int(solver.parameters.pin_target.shape[0]) if layout.pin_max else 0
-        self.entry_max = solver.entry_max if solver.model.shape_count else layout.pin_max
+        self.entry_max = solver.view.constraint_max if solver.model.shape_count else layout.pin_max
         self.generation = 0
         """Number of records begun."""
         self.dt: list[float] = []
@@ -158,9 +160,9 @@ class AdjointReduced:
         states, entries = (step_max + 2, self.total), (self.instances, max(self.entry_max, 1))
         self._q, self._qd = self._zeros(states, wp.vec3d), self._zeros(states, wp.vec3d)
         self._dt_before = self._zeros((step_max + 1, self.instances), wp.float64)
-        self._force, self._costate = (self._zeros((step_max, *solver.functions), vec8d) for _ in range(2))
+        self._force, self._costate = (self._zeros((step_max, *solver.tables.unknowns), vec8d) for _ in range(2))
         self._entry_count = self._zeros((step_max, self.instances), int)
-        kinds = {name: getattr(solver.entries, name).dtype for name in _ENTRY}
+        kinds = {name: getattr(solver.tables.constraints, name).dtype for name in _ENTRY}
         self._entry = {name: self._zeros((step_max, *entries), kind) for name, kind in kinds.items()}
 
         points = (self.instances, layout.point_max)
@@ -170,14 +172,14 @@ class AdjointReduced:
         self._step.entry_hessian = self._zeros(entries, wp.mat33d)
         self._points = Points()
         self._points.stress = self._step.point
-        self._constraints = Entries()
-        self._constraints.count, self._constraints.row = solver.entries.count, solver.entries.row
+        self._constraints = PointConstraints()
+        self._constraints.count, self._constraints.row = solver.tables.constraints.count, solver.tables.constraints.row
         self._constraints.force = self._step.entry
         self._gmres = Gmres(solver, cycle_length=self.options.cycle_length, cycle_max=self.options.cycle_max)
-        self._driven = self._zeros(solver.functions, vec8d)
+        self._driven = self._zeros(solver.tables.unknowns, vec8d)
         self._state = solver.model.state()
         self._resolution = wp.array(
-            1.0e-9 * layout.size * solver.instances.scale.numpy(), dtype=wp.float64, device=self.device
+            1.0e-9 * layout.size * solver.tables.instances.scale.numpy(), dtype=wp.float64, device=self.device
         )
 
     @property
@@ -219,7 +221,7 @@ class AdjointReduced:
         solver = self.solver
         solver.begin(state_in, control, dt)
         if force is not None:
-            self._launch(kernels.add_force, self._blocks, [solver.instances, force], [solver.motion])
+            self._launch(kernels.add_force, self._blocks, [solver.tables.instances, force], [solver.tables.motion])
         solver.detect(state_in, control, dt, prescribed=True)
         solver.minimise(dt)
         solver.finish(state_out, dt)
@@ -235,7 +237,7 @@ class AdjointReduced:
         if t == self.step_max:
             raise ConfigError(f"{t} steps are recorded, the most there is room for", hint="raise step_max")
         self._copy_state(state, t + 1)
-        wp.copy(self._force[t], solver.motion.force)
+        wp.copy(self._force[t], solver.tables.motion.force)
         for stored, values in self._entries(t):
             wp.copy(stored, values)
         self.dt.append(float(dt))
@@ -249,7 +251,7 @@ class AdjointReduced:
 
     def _entries(self, t: int) -> list[tuple[Any, Any]]:
         """Return pairs of what is stored of the point constraints of step t and where the solver has it."""
-        entries, width = self.solver.entries, self.entry_max
+        entries, width = self.solver.tables.constraints, self.entry_max
         pairs = [(self._entry_count[t], entries.count)]
         if width:
             pairs += [(stored[t], getattr(entries, name)[:, :width]) for name, stored in self._entry.items()]
@@ -281,39 +283,41 @@ class AdjointReduced:
         if steps == 0:
             raise ConfigError("no step is recorded", hint="call start and step first")
         q_bar, qd_bar = self._cotangent("loss_q", loss_q), self._cotangent("loss_qd", loss_qd)
-        points = (self.instances, solver.layout.point_max)
+        points = (self.instances, solver.tables.layout.point_max)
         field = {name: self._zeros(points, wp.float64) for name in ("log_modulus", "poissons_ratio", "viscosity")}
         friction = self._zeros((self.instances, entry), wp.float64)
         sums = kernels.Sums()
-        sums.mass, sums.mass_damping, sums.gravity = (self._zeros(solver.functions, vec8d) for _ in range(3))
+        sums.mass, sums.mass_damping, sums.gravity = (self._zeros(solver.tables.unknowns, vec8d) for _ in range(3))
         pin_target = self._zeros((steps, max(self.pin_total, 1)), wp.vec3d)
         pin_stiffness = self._zeros((max(self.pin_total, 1),), wp.float64)
         residual, error = (self._zeros((steps, self.instances), wp.float64) for _ in range(2))
-        tables = [solver.instances, solver.basis]
+        tables = [solver.tables.instances, solver.tables.basis]
 
         for t in reversed(range(steps)):
             now, before, earlier = ([q_bar[row], qd_bar[row]] for row in (t + 2, t + 1, t))
             costate, dt = self._costate[t], wp.float64(self.dt[t])
             self._restore(t)
             self._measure(t, residual[t])
-            self._launch(kernels.add_velocity, solver.functions, [solver.motion, now[1], dt], [now[0]])
+            self._launch(kernels.add_velocity, solver.tables.unknowns, [solver.tables.motion, now[1], dt], [now[0]])
             self._solve(t, now[0], costate)
             wp.copy(error[t], self._gmres.error)
             self._launch(kernels.accumulate_points, points, [*tables, costate, dt], [*field.values(), self._step])
             if self.entry_max:
                 constraints = [pin_stiffness, friction, pin_target[t], self._step]
                 dim = (self.instances, self.entry_max)
-                self._launch(kernels.accumulate_entries, dim, [*tables, solver.entries, costate], constraints)
-            self._sum_points(solver.progress.active)
+                self._launch(
+                    kernels.accumulate_entries, dim, [*tables, solver.tables.constraints, costate], constraints
+                )
+            self._sum_points(solver.tables.newton.active)
             self._launch(
                 kernels.propagate,
-                solver.functions,
+                solver.tables.unknowns,
                 [
                     *tables,
-                    solver.motion,
-                    solver.gradient_chunk,
+                    solver.tables.motion,
+                    solver.tables.arrays.gradient_chunk,
                     solver.model.gravity,
-                    solver.q,
+                    solver.tables.arrays.q,
                     costate,
                     self._driven,
                     dt,
@@ -328,7 +332,7 @@ class AdjointReduced:
         self._launch(
             kernels.sum_gradients,
             self.instances,
-            [solver.instances, solver.parameters.density, *gathered],
+            [solver.tables.instances, solver.parameters.density, *gathered],
             [*totals.values(), gravity],
         )
         return ReducedGradients(
@@ -347,7 +351,7 @@ class AdjointReduced:
     def _cotangent(self, name: str, values: wp.array | ArrayLike | None) -> Any:
         """Return dL/dq or dL/dv in blocks, with a row of zeros for the state before the record."""
         shape = (self.step_count + 1, self.total)
-        out = self._zeros((self.step_count + 2, *self.solver.functions), vec8d)
+        out = self._zeros((self.step_count + 2, *self.solver.tables.unknowns), vec8d)
         if values is None:
             return out
         if not isinstance(values, wp.array):
@@ -357,14 +361,14 @@ class AdjointReduced:
             values = wp.array(host, dtype=wp.vec3d, device=self.device)
         if values.shape != shape or values.dtype != wp.vec3d:
             raise ConfigError(f"{name}: expected vec3d {shape}, got {values.dtype} {values.shape}")
-        self._launch(kernels.pack, (shape[0], *self._blocks), [self.solver.instances, values], [out[1:]])
+        self._launch(kernels.pack, (shape[0], *self._blocks), [self.solver.tables.instances, values], [out[1:]])
         return out
 
     def _unpack(self, blocks: Any) -> Any:
         """Return blocks (T, ...) as vec3d (T, N)."""
         out = self._zeros((blocks.shape[0], self.total), wp.vec3d)
-        dim = (blocks.shape[0], self.instances, self.solver.stride)
-        self._launch(kernels.unpack, dim, [self.solver.instances, blocks], [out])
+        dim = (blocks.shape[0], self.instances, self.solver.tables.layout.stride)
+        self._launch(kernels.unpack, dim, [self.solver.tables.instances, blocks], [out])
         return out
 
     def _restore(self, t: int) -> None:
@@ -376,39 +380,50 @@ class AdjointReduced:
             wp.copy(getattr(data, f"{name}_before"), rows[t])
         wp.copy(data.dt_before, self._dt_before[t])
         solver.begin(self._state, None, dt)
-        wp.copy(solver.motion.force, self._force[t])
-        end = solver.q.reshape((1, *solver.functions))
-        self._launch(kernels.pack, (1, *self._blocks), [solver.instances, self._q[t + 2 : t + 3]], [end])
+        wp.copy(solver.tables.motion.force, self._force[t])
+        end = solver.tables.arrays.q.reshape((1, *solver.tables.unknowns))
+        self._launch(kernels.pack, (1, *self._blocks), [solver.tables.instances, self._q[t + 2 : t + 3]], [end])
         for stored, values in self._entries(t):
             wp.copy(values, stored)
-        solver.adapt(dt)
-        progress = solver.progress
-        for flag in (progress.active, progress.renew, progress.exact):
+        adapt(solver.tables, dt)
+        progress = solver.tables.newton
+        for flag in (progress.active, progress.refresh, progress.exact):
             flag.fill_(1)
         progress.project.zero_()
         progress.iteration.zero_()
-        solver._evaluate(progress.active, solver.q, solver.rigid.r, dt, derivatives=True)
-        solver._gather_gradient(dt)
-        solver._assemble(dt)
-        solver.system.factor(progress.active)
+        evaluate(solver.tables, dt, derivatives=True)
+        gather_gradient(solver.tables, dt)
+        assemble(solver.tables, dt)
+        solver.tables.system.factor(progress.active)
 
     def _measure(self, t: int, residual: wp.array) -> None:
         """Measure the residual of the restored step and linearise it."""
         solver, dt = self.solver, self.dt[t]
-        step = [solver.instances, solver.motion, solver.entries, self._resolution]
+        step = [solver.tables.instances, solver.tables.motion, solver.tables.constraints, self._resolution]
         self._launch(
             kernels.measure_residual,
             self.instances,
-            [*step, solver.q, solver.gradient, solver.gradient_chunk, wp.float64(dt)],
+            [
+                *step,
+                solver.tables.arrays.q,
+                solver.tables.arrays.gradient,
+                solver.tables.arrays.gradient_chunk,
+                wp.float64(dt),
+            ],
             [residual],
         )
-        tables = [solver.instances, solver.basis, solver.motion]
-        points = (self.instances, solver.layout.point_max)
-        self._launch(kernels.place_points, points, [*tables, solver.q], [self._step])
+        tables = [solver.tables.instances, solver.tables.basis, solver.tables.motion]
+        points = (self.instances, solver.tables.layout.point_max)
+        self._launch(kernels.place_points, points, [*tables, solver.tables.arrays.q], [self._step])
         if self.entry_max:
             stick_range = wp.float64(solver.options.stick_velocity * dt)
             dim = (self.instances, self.entry_max)
-            self._launch(kernels.place_entries, dim, [*tables, solver.entries, stick_range, solver.q], [self._step])
+            self._launch(
+                kernels.place_entries,
+                dim,
+                [*tables, solver.tables.constraints, stick_range, solver.tables.arrays.q],
+                [self._step],
+            )
 
     def _solve(self, t: int, right: wp.array, solution: wp.array) -> None:
         """Solve H_t^T solution = right at the free functions; leave H_t^T solution at the driven ones."""
@@ -421,24 +436,29 @@ class AdjointReduced:
     def _apply(self, t: int, active: wp.array, direction: wp.array, product: wp.array) -> None:
         """Write H_t^T direction in active worlds to ``product`` and, for the driven functions, to ``_driven``."""
         solver, dt = self.solver, wp.float64(self.dt[t])
-        tables, points = [solver.instances, solver.basis], (self.instances, solver.layout.point_max)
+        tables, points = (
+            [solver.tables.instances, solver.tables.basis],
+            (self.instances, solver.tables.layout.point_max),
+        )
         self._launch(kernels.apply_points, points, [*tables, active, direction, dt], [self._step])
         if self.entry_max:
             dim = (self.instances, self.entry_max)
-            self._launch(kernels.apply_entries, dim, [*tables, solver.entries, active, direction], [self._step])
+            self._launch(
+                kernels.apply_entries, dim, [*tables, solver.tables.constraints, active, direction], [self._step]
+            )
         self._sum_points(active)
         self._launch(
             kernels.sum_product,
-            solver.functions,
-            [*tables, solver.motion, active, solver.gradient_chunk, direction, dt],
+            solver.tables.unknowns,
+            [*tables, solver.tables.motion, active, solver.tables.arrays.gradient_chunk, direction, dt],
             [product, self._driven],
         )
 
     def _sum_points(self, active: wp.array) -> None:
         """Sum what stands at the points, less what stands at the entries, into the solver's chunks."""
-        solver, chunk = self.solver, self.solver.gradient_chunk
-        dim = (self.instances, chunk.shape[1], solver.layout.block_count)
-        tables = [solver.instances, solver.basis, self._points, self._constraints]
+        solver, chunk = self.solver, self.solver.tables.arrays.gradient_chunk
+        dim = (self.instances, chunk.shape[1], solver.tables.layout.block_count)
+        tables = [solver.tables.instances, solver.tables.basis, self._points, self._constraints]
         self._launch(sum_forces, dim, [*tables, active, chunk.shape[1]], [chunk])
 
     def _check(self, residual: Array, error: Array) -> None:
@@ -462,7 +482,7 @@ class AdjointReduced:
 
     @property
     def _blocks(self) -> tuple[int, int]:
-        return self.instances, self.solver.layout.block_count
+        return self.instances, self.solver.tables.layout.block_count
 
     def _zeros(self, shape: Sequence[int], dtype: type) -> Any:
         return wp.zeros(tuple(shape), dtype=dtype, device=self.device)

@@ -11,7 +11,14 @@ from softmode.deformables.materials.hessian_kernels import stress_derivative
 from softmode.deformables.materials.material_kernels import green_strain, hooke_stress, stress
 from softmode.deformables.model.deformation_kernels import displacement_gradient, elastic_gradient
 from softmode.deformables.model.lane_kernels import LANES, free_part, vec8d
-from softmode.deformables.model.struct_kernels import Basis, Entries, Instances, Motion, interpolate, interpolate_change
+from softmode.deformables.model.struct_kernels import (
+    Basis,
+    Instances,
+    Motion,
+    PointConstraints,
+    interpolate,
+    interpolate_change,
+)
 from softmode.deformables.solver.step_kernels import material_of
 
 wp.set_module_options({"enable_backward": False})
@@ -117,7 +124,7 @@ def place_entries(
     instances: Instances,
     basis: Basis,
     motion: Motion,
-    entries: Entries,
+    entries: PointConstraints,
     stick_range: wp.float64,
     q: wp.array2d[vec8d],
     # Out:
@@ -153,7 +160,7 @@ def place_entries(
 def measure_residual(
     instances: Instances,
     motion: Motion,
-    entries: Entries,
+    entries: PointConstraints,
     resolution: wp.array[wp.float64],  # (instance_count,), motion [m] whose inertia is no force worth naming
     q: wp.array2d[vec8d],
     gradient: wp.array2d[vec8d],
@@ -219,7 +226,7 @@ def apply_points(
 def apply_entries(
     instances: Instances,
     basis: Basis,
-    entries: Entries,
+    entries: PointConstraints,
     active: wp.array[int],
     direction: wp.array2d[vec8d],
     # Out:
@@ -336,7 +343,7 @@ def accumulate_points(
 def accumulate_entries(
     instances: Instances,
     basis: Basis,
-    entries: Entries,
+    entries: PointConstraints,
     costate: wp.array2d[vec8d],
     # In and out:
     pin_stiffness: wp.array[wp.float64],  # (pin_count,)

@@ -36,13 +36,16 @@ class Gmres:
         k.active, k.running, k.column, k.count = (self._zeros((count,), int) for _ in range(4))
         k.world_running, k.any_running = self._zeros((solver.world_count,), int), self._zeros((1,), int)
         k.target, k.error = (self._zeros((count,), wp.float64) for _ in range(2))
-        k.basis = self._zeros((length + 1, *solver.functions), vec8d)
+        k.basis = self._zeros((length + 1, *solver.tables.unknowns), vec8d)
         k.triangle = self._zeros((count, length, length), wp.float64)
         k.rotation, k.tail = self._zeros((count, length), wp.vec2d), self._zeros((count, length + 1), wp.float64)
-        k.search, k.product = (self._zeros(solver.functions, vec8d) for _ in range(2))
-        k.factored, k.diagonal = solver.system.matrix, solver.system.diagonal
-        k.pattern = solver.system.pattern
-        k.work, k.rows = self._zeros(solver.functions, vec8), self._zeros((count, 3 * solver.stride), float)
+        k.search, k.product = (self._zeros(solver.tables.unknowns, vec8d) for _ in range(2))
+        k.factored, k.diagonal = solver.tables.system.matrix, solver.tables.system.diagonal
+        k.pattern = solver.tables.system.pattern
+        k.work, k.rows = (
+            self._zeros(solver.tables.unknowns, vec8),
+            self._zeros((count, 3 * solver.tables.layout.stride), float),
+        )
         self._krylov = k
 
     @property
@@ -74,13 +77,13 @@ class Gmres:
 
         def begin(first: bool) -> None:
             clear()
-            inputs = [self.solver.instances, wp.float64(tolerance), int(first), self.solver.team, right]
+            inputs = [self.solver.tables.instances, wp.float64(tolerance), int(first), self.solver.tables.team, right]
             self._launch(kernels.begin_cycle, inputs, [k, solution])
 
         def extend() -> None:
             apply(k.world_running, k.search, k.product)
             clear()
-            inputs = [self.solver.instances, self.cycle_length, self.solver.team]
+            inputs = [self.solver.tables.instances, self.cycle_length, self.solver.tables.team]
             self._launch(kernels.extend_cycle, inputs, [k, solution])
 
         begin(first=True)
@@ -96,6 +99,6 @@ class Gmres:
 
     def _launch(self, kernel: Callable[..., None], inputs: list[Any], outputs: Sequence[Any]) -> None:
         """Launch one team of threads per instance."""
-        team = self.solver.team
+        team = self.solver.tables.team
         dim = (self.solver.instance_count, team)
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=list(outputs), block_dim=team, device=self.device)

@@ -9,7 +9,7 @@ import warp as wp
 
 from softmode.deformables.model.lane_kernels import LANES, barrier, free_part, team_sum, vec8, vec8d
 from softmode.deformables.model.struct_kernels import Instances
-from softmode.deformables.solver.factor import back_substitute
+from softmode.deformables.solver.factor_kernels import back_substitute
 
 wp.set_module_options({"enable_backward": False})
 

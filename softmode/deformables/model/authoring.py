@@ -9,12 +9,13 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from softmode.checks import require_number
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
-from softmode.deformables.model.struct_kernels import mat23d
+from softmode.deformables.model.namespaces import NAMESPACE, soft
+from softmode.deformables.model.struct_kernels import mat23d, p_wave_modulus
 from softmode.errors import ConfigError
 
-NAMESPACE = "softmode"
 _INSTANCE = f"{NAMESPACE}:instance"
 _FUNCTION = f"{NAMESPACE}:function"
 _PIN = f"{NAMESPACE}:pin"
@@ -82,9 +83,15 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
 
 
 def bulk_stiffness(body: ReducedBody, youngs_modulus: float, poissons_ratio: float, scale: float = 1.0) -> float:
-    """Return twenty times the stiffness per area [Pa/m] of the bulk: the P-wave modulus over the size."""
-    nu = poissons_ratio
-    wave = youngs_modulus * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
+    """Return twenty times the stiffness per area [Pa/m] of the bulk: the P-wave modulus over the size.
+
+    Args:
+        body: The body.
+        youngs_modulus: E [Pa].
+        poissons_ratio: nu.
+        scale: Size over that of ``body``.
+    """
+    wave = p_wave_modulus(float(youngs_modulus), float(poissons_ratio))
     return 20.0 * wave / (scale * float(np.linalg.norm(np.ptp(body.bounds, axis=0))))
 
 
@@ -148,16 +155,10 @@ def add_reduced_body(
         if np.shape(value) != (3,) or not np.isfinite(value).all():
             raise ConfigError(f"{name} must be three finite numbers, got {value!r}")
     stiffness = contact_stiffness_per_area or 0.0
-    if not 0.0 <= stiffness < np.inf:
-        raise ConfigError(f"contact_stiffness_per_area must be a finite number >= 0 [Pa/m], got {stiffness!r}")
-    if not 0.0 <= contact_radius < np.inf:
-        raise ConfigError(f"contact_radius must be a finite number >= 0 [m], got {contact_radius!r}")
-
-    if not SCALE_MIN <= scale <= SCALE_MAX:
-        raise ConfigError(
-            f"scale must lie in [{SCALE_MIN}, {SCALE_MAX}], got {scale!r}", hint="build the body at that size instead"
-        )
-
+    require_number("contact_stiffness_per_area", stiffness, at_least=0.0, unit="[Pa/m]")
+    require_number("contact_radius", contact_radius, at_least=0.0, unit="[m]")
+    hint = "build the body at that size instead"
+    require_number("scale", scale, at_least=SCALE_MIN, at_most=SCALE_MAX, hint=hint)
     s = float(np.float32(scale))  # as the model stores it
     omega = np.asarray(angular_velocity, float)
     spin = np.array([[0, -omega[2], omega[1]], [omega[2], 0, -omega[0]], [-omega[1], omega[0], 0]])
@@ -238,7 +239,7 @@ def add_pins(
         )
     if not (np.isfinite(k).all() and (k >= 0).all() and np.isfinite(X).all() and np.isfinite(T).all()):
         raise ConfigError("stiffness must be finite and >= 0 [N/m], points and targets finite [m]")
-    scales = scales_of(builder)
+    scales = attribute_values(builder, "scale")
     s = scales[instance] if 0 <= instance < len(scales) else 1.0  # the solver refuses an instance that is not there
     builder.add_custom_values_batch(
         [
@@ -254,14 +255,19 @@ def add_pins(
     )
 
 
-def scales_of(builder: newton.ModelBuilder) -> list[float]:
-    """Return the scales of the bodies that a builder holds so far."""
-    values: Any = builder.custom_attributes[f"{NAMESPACE}:scale"].values
+def attribute_values(builder: newton.ModelBuilder, name: str) -> list[Any]:
+    """Return the values of an attribute of soft bodies that a builder holds so far."""
+    values: Any = builder.custom_attributes[f"{NAMESPACE}:{name}"].values
     return list(values.values() if isinstance(values, dict) else values or [])
 
 
 def drive_regions(
-    model: Any, control: Any, instance: int, body: ReducedBody, matrices: np.ndarray, translations: np.ndarray
+    model: newton.Model,
+    control: newton.Control,
+    instance: int,
+    body: ReducedBody,
+    matrices: np.ndarray,
+    translations: np.ndarray,
 ) -> None:
     """Say where the exact regions of a body shall be at the end of the next step.
 
@@ -277,8 +283,8 @@ def drive_regions(
             frame, shape (region_count, 3, 3).
         translations: Vector t of each region [m], shape (region_count, 3).
     """
-    data = getattr(model, NAMESPACE)
+    data = soft(model)
     q = body.driven_affine(float(data.scale.numpy()[instance]) * np.asarray(matrices, float), translations)
     start = int(data.function_start.numpy()[instance])
-    target = getattr(control, NAMESPACE).q_driven
+    target = soft(control).q_driven
     target[start : start + len(q)].assign(q)

@@ -30,7 +30,7 @@ def pad(count: int) -> int:
     return -(-count // LANES) * LANES
 
 
-def team_size(device: Any) -> int:
+def team_size(device: wp.Device) -> int:
     """Return how many threads share one system on a device."""
     return TEAM if wp.get_device(device).is_cuda else 1
 

@@ -1,23 +1,29 @@
-"""Where everything stands in the solver's arrays: bases one after another, instances ordered by world, pins, shapes."""
+"""Where everything stands in the solver's arrays: bases one after another, instances ordered by world, pins."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
+import newton
 import numpy as np
-import warp as wp
+from numpy.typing import NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.model.authoring import CONTACT_FIELDS, MATERIAL_FIELDS, NAMESPACE, body_key
+from softmode.deformables.model.authoring import CONTACT_FIELDS, MATERIAL_FIELDS, body_key
 from softmode.deformables.model.inner_offsets import inner_offsets
-from softmode.deformables.model.lane_kernels import LANES, pad, vec8, vec8d
+from softmode.deformables.model.lane_kernels import LANES, pad
+from softmode.deformables.model.namespaces import SoftModel, soft
 from softmode.deformables.model.struct_kernels import Basis, Instances
+from softmode.deformables.model.tables import allocate, starts_of
 from softmode.errors import ConfigError
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """Sizes and tables of a model with reduced bodies."""
+    """Counts of a model with reduced bodies."""
 
     bodies: tuple[ReducedBody, ...]
     """The distinct bodies."""
@@ -27,23 +33,10 @@ class Layout:
     """World per instance."""
     instance_start: np.ndarray
     """First instance of each world, and the end: shape (world_count + 1,)."""
-    block_count: int
-    """Blocks of eight functions per component, enough for the largest body."""
-    point_max: int
-    """Cubature points of the largest body."""
-    sample_max: int
-    """Surface samples of the largest body."""
-    pin_max: int
-    """Pins of the instance with the most."""
-    first_pin_row: int
-    """Row of the first pin in ``basis.row``."""
-    size: np.ndarray
-    """Diagonal of the bounding box of each instance's asset [m]."""
-    basis: Any
-    """The bases, a :class:`softmode.deformables.model.struct_kernels.Basis`."""
-    instances: Any
-    """Offsets, counts and parameters, :class:`softmode.deformables.model.struct_kernels.Instances`; scale and what
-    follows from it are filled in by :class:`softmode.deformables.model.sizes.Sizes`."""
+    pin_count: np.ndarray
+    """Pins per instance."""
+    pair_max: int
+    """Contacts that the samples of an instance may have with soft bodies; 0 where soft bodies never touch."""
 
     @property
     def instance_count(self) -> int:
@@ -55,14 +48,59 @@ class Layout:
         """Number of worlds."""
         return len(self.instance_start) - 1
 
+    @cached_property
+    def block_count(self) -> int:
+        """Blocks of eight functions per component, enough for the largest body."""
+        return pad(max(body.function_count for body in self.bodies)) // LANES
 
-def lay_out(model: Any, bodies: Sequence[ReducedBody]) -> Layout:
-    """Build the tables of a model.
+    @property
+    def stride(self) -> int:
+        """Functions of an instance with their padding."""
+        return LANES * self.block_count
+
+    @cached_property
+    def point_max(self) -> int:
+        """Cubature points of the largest body."""
+        return max(body.point_count for body in self.bodies)
+
+    @cached_property
+    def sample_max(self) -> int:
+        """Surface samples of the largest body."""
+        return max(body.surface_count for body in self.bodies)
+
+    @cached_property
+    def pin_max(self) -> int:
+        """Pins of the instance with the most."""
+        return int(self.pin_count.max(initial=0))
+
+    @cached_property
+    def first_pin_row(self) -> int:
+        """Row of the first pin in ``basis.row``."""
+        return sum(body.surface_count for body in self.bodies)
+
+    @cached_property
+    def part_count(self) -> int:
+        """Bodies that share a linear system: all of a world where soft bodies may touch each other, else one."""
+        return int(np.diff(self.instance_start).max()) if self.pair_max else 1
+
+    @cached_property
+    def size(self) -> Array:
+        """Diagonal of the bounding box of each instance's asset [m]."""
+        return np.array([_size(body) for body in self.bodies])[self.asset]
+
+
+def lay_out(model: newton.Model, bodies: Sequence[ReducedBody], *, pair_max: int = 0) -> Layout:
+    """Find where the bodies of a model stand.
+
+    Args:
+        model: Finalised model.
+        bodies: Its bodies, in any order.
+        pair_max: Contacts that the samples of an instance may have with soft bodies, in worlds where some may touch.
 
     Raises:
         ConfigError: If an instance uses a body that is not given, or instances or pins are out of order.
     """
-    data = getattr(model, NAMESPACE)
+    data = soft(model)
     keys = {body_key(body): a for a, body in enumerate(bodies)}
     wanted = data.body_key.numpy()
     missing = [int(k) for k in wanted if int(k) not in keys]
@@ -79,86 +117,98 @@ def lay_out(model: Any, bodies: Sequence[ReducedBody]) -> Layout:
     if (np.diff(world) < 0).any():
         raise ConfigError("instances are not ordered by world", hint="add bodies to one world before the next")
     counts = np.bincount(world, minlength=max(model.world_count, 1))
-    stride = pad(max(body.function_count for body in bodies))
-
-    pin_rows, pin_points, pin_count = _pins(model, bodies, asset, stride)
-    device = model.device
-    basis = _basis(bodies, stride, pin_rows, pin_points, device)
-    instances = Instances()
-    ends = {
-        "point_start": [body.point_count for body in bodies],
-        "row_start": [body.surface_count for body in bodies],
-    }
-    per_instance = {name: np.concatenate([[0], np.cumsum(sizes)[:-1]])[asset] for name, sizes in ends.items()}
-    per_instance |= {
-        "world": world,
-        "asset": asset,
-        "function_count": np.array([body.function_count for body in bodies])[asset],
-        "driven_count": np.array([body.driven_count for body in bodies])[asset],
-        "point_count": np.array([body.point_count for body in bodies])[asset],
-        "sample_count": np.array([body.surface_count for body in bodies])[asset],
-        "pin_count": pin_count,
-        "pin_start": np.concatenate([[0], np.cumsum(pin_count)[:-1]]),
-        "link_pin_count": _link_pins(model, pin_count),
-    }
-    for name, values in per_instance.items():
-        setattr(instances, name, wp.array(values, dtype=int, device=device))
-    for name in ("function_start", "particle_start", "material_model", *CONTACT_FIELDS, *MATERIAL_FIELDS):
-        if name != "density":
-            setattr(instances, name, getattr(data, name))
+    crowded = bool((counts > 1).any()) or bool(data.self_contact.numpy().any())
     return Layout(
         bodies=tuple(bodies),
         asset=asset,
         instance_world=world,
-        instance_start=np.concatenate([[0], np.cumsum(counts)]),
-        block_count=stride // LANES,
-        point_max=max(body.point_count for body in bodies),
-        sample_max=max(body.surface_count for body in bodies),
-        pin_max=int(pin_count.max(initial=0)),
-        first_pin_row=sum(body.surface_count for body in bodies),
-        size=np.array([_size(body) for body in bodies])[asset],
-        basis=basis,
-        instances=instances,
+        instance_start=np.append(starts_of(counts), len(world)),
+        pin_count=_pin_count(data, len(asset)),
+        pair_max=pair_max if crowded else 0,
     )
 
 
-def _basis(
-    bodies: Sequence[ReducedBody], stride: int, pin_rows: np.ndarray, pin_points: np.ndarray, device: Any
-) -> Any:
-    """Concatenate the bases of all bodies, padded to ``stride`` functions, in blocks of eight."""
-    gradient = np.concatenate([_padded(body.grad_basis, stride) for body in bodies])
-    gradient = gradient.reshape(len(gradient), -1, LANES, 3).transpose(1, 0, 3, 2)
-    row = np.concatenate([*(_padded(body.surface_basis, stride) for body in bodies), pin_rows])
-    mean = np.concatenate([_padded(body.mean_basis[None], stride) for body in bodies])
+def lay_out_instances(model: newton.Model, layout: Layout) -> Instances:
+    """Allocate where each instance finds its data; what follows from scale and density is computed later."""
+    data, bodies, asset = soft(model), layout.bodies, layout.asset
+    counts = {
+        name: np.array([getattr(body, of) for body in bodies])
+        for name, of in (
+            ("function_count", "function_count"),
+            ("driven_count", "driven_count"),
+            ("point_count", "point_count"),
+            ("sample_count", "surface_count"),
+        )
+    }
+    given: dict[str, Any] = {name: count[asset] for name, count in counts.items()}
+    given |= {
+        "world": layout.instance_world,
+        "asset": asset,
+        "point_start": starts_of(counts["point_count"])[asset],
+        "row_start": starts_of(counts["sample_count"])[asset],
+        "pin_count": layout.pin_count,
+        "pin_start": starts_of(layout.pin_count),
+        "link_pin_count": np.zeros(len(asset), int),
+    }
+    if layout.pin_max:
+        followers = data.pin_instance.numpy()[data.pin_body.numpy() >= 0]
+        given["link_pin_count"] = np.bincount(followers, minlength=len(asset))
+    for name in ("function_start", "particle_start", "material_model", *CONTACT_FIELDS, *MATERIAL_FIELDS):
+        if name != "density":
+            given[name] = getattr(data, name)
+    return allocate(Instances, "instance", {"instance": len(asset)}, model.device, given=given)
 
-    def joined(name: str) -> np.ndarray:
+
+def lay_out_bases(model: newton.Model, layout: Layout) -> Basis:
+    """Concatenate the bases of all bodies, padded to whole blocks of eight functions.
+
+    Behind the rows of samples and pins are those that contact between soft bodies writes.
+    """
+    bodies, stride, device = layout.bodies, LANES * layout.block_count, model.device
+
+    def joined(name: str) -> Array:
         return np.concatenate([getattr(body, name) for body in bodies])
 
-    def table(values: np.ndarray, dtype: Any, kind: Any = None) -> wp.array:
-        return wp.array(np.ascontiguousarray(values, dtype=kind), dtype=dtype, device=device)
+    def padded(values: Sequence[np.ndarray]) -> np.ndarray:
+        return np.concatenate([_padded(v, stride) for v in values])
 
-    basis = Basis()
-    basis.gradient = basis.gradient_across = table(gradient, vec8, np.float32)
-    if wp.get_device(device).is_cuda:
-        basis.gradient_across = table(gradient.transpose(1, 2, 0, 3), vec8, np.float32).transpose((2, 0, 1))
-    basis.point_weight = table(joined("weights"), wp.float64)
-    basis.stiffness_scale = table(joined("stiffness_scale"), float, np.float32)
-    basis.mean = table(mean.reshape(len(bodies), -1, LANES), vec8d)
+    def across(gradients: Array) -> Array:
+        """Return gradients (rows, functions, 3) as (block_count, rows, 3) blocks."""
+        return gradients.reshape(len(gradients), -1, LANES, 3).transpose(1, 0, 3, 2)
+
+    def blocks(values: Array) -> Array:
+        return values.reshape(len(values), -1, LANES)
+
+    pin_rows, pin_points = _pins(model, layout, stride)
+    dynamic = np.zeros((layout.instance_count * layout.pair_max, stride))
     linear = np.zeros((len(bodies), stride, 4))
     for a, body in enumerate(bodies):
         linear[a, : body.function_count] = body.linear_coordinates
-    basis.linear = table(linear, wp.vec4d)
-    basis.row = table(row.reshape(len(row), -1, LANES), vec8, np.float32)
-    basis.row_point = table(np.concatenate([joined("surface_points"), pin_points]), wp.vec3d)
     inner = [inner_offsets(body.surface_points, body.surface_normals, _size(body)) for body in bodies]
-    inner_row = [
+    inner_rows = [
         body.evaluate(body.surface_points + offset)[0] - body.surface_basis
         for body, offset in zip(bodies, inner, strict=True)
     ]
-    inner_row = np.concatenate([_padded(values, stride) for values in inner_row])
-    basis.inner_row = table(inner_row.reshape(len(inner_row), -1, LANES), vec8, np.float32)
-    basis.inner_point = table(np.concatenate(inner), wp.vec3d)
-    basis.row_area = table(np.append(joined("surface_areas"), np.zeros(len(pin_points))), float, np.float32)
+    gradient = across(padded([body.grad_basis for body in bodies]))
+    given: dict[str, Any] = {
+        "gradient": gradient,
+        "point_weight": joined("weights"),
+        "stiffness_scale": joined("stiffness_scale"),
+        "mean": blocks(padded([body.mean_basis[None] for body in bodies])),
+        "linear": linear,
+        "row": blocks(np.concatenate([padded([body.surface_basis for body in bodies]), pin_rows, dynamic])),
+        "row_point": np.concatenate([joined("surface_points"), pin_points]),
+        "row_area": np.append(joined("surface_areas"), np.zeros(len(pin_points))),
+        "inner_row": blocks(padded(inner_rows)),
+        "inner_point": np.concatenate(inner),
+    }
+    if device.is_cuda:
+        given["gradient_across"] = gradient.transpose(1, 2, 0, 3)
+    if layout.pair_max:
+        given["row_normal"] = joined("surface_normals")
+        given["row_gradient"] = across(padded([body.evaluate(body.surface_points)[1] for body in bodies]))
+    basis = allocate(Basis, {"": "1", "row_gradient gradient_across": "1 1 1"}, {}, device, given=given)
+    basis.gradient_across = basis.gradient_across.transpose((2, 0, 1)) if device.is_cuda else basis.gradient
     return basis
 
 
@@ -174,36 +224,29 @@ def _padded(values: np.ndarray, stride: int) -> np.ndarray:
     return np.pad(np.asarray(values, float), widths)
 
 
-def _pins(
-    model: Any, bodies: Sequence[ReducedBody], asset: np.ndarray, stride: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Evaluate the basis at the pins; return rows, rest points, and the number of pins per instance."""
-    data = getattr(model, NAMESPACE)
+def _pin_count(data: SoftModel, instance_count: int) -> np.ndarray:
+    """Return the number of pins of each instance."""
     owner = data.pin_instance.numpy() if hasattr(data, "pin_instance") else np.zeros(0, int)
-    points = data.pin_point.numpy().reshape(-1, 3) if len(owner) else np.zeros((0, 3))
-    if len(owner) and (owner.min() < 0 or owner.max() >= len(asset)):
+    if len(owner) and (owner.min() < 0 or owner.max() >= instance_count):
         raise ConfigError(
             "a pin belongs to an instance that does not exist", hint="pass what add_reduced_body returned"
         )
-    counts = np.bincount(owner, minlength=len(asset)) if len(owner) else np.zeros(len(asset), int)
     if (np.diff(owner) < 0).any():
         raise ConfigError("pins are not ordered by instance", hint="add the pins of one body before the next")
-    rows = np.zeros((len(owner), stride))
-    known: dict[tuple[int, bytes], np.ndarray] = {}
-    for i in range(len(asset)):
-        mine = slice(counts[:i].sum(), counts[: i + 1].sum())
-        key = (int(asset[i]), points[mine].tobytes())
-        if counts[i] and key not in known:
-            known[key] = _padded(bodies[asset[i]].evaluate(points[mine])[0], stride)
-        if counts[i]:
+    return np.bincount(owner, minlength=instance_count)
+
+
+def _pins(model: newton.Model, layout: Layout, stride: int) -> tuple[np.ndarray, np.ndarray]:
+    """Evaluate the basis at the pins; return rows and rest points."""
+    counts = layout.pin_count
+    rows = np.zeros((int(counts.sum()), stride))
+    points = soft(model).pin_point.numpy().reshape(-1, 3) if len(rows) else np.zeros((0, 3))
+    known: dict[tuple[int, bytes], Array] = {}
+    for a, start, count in zip(layout.asset, starts_of(counts), counts, strict=True):
+        mine = slice(start, start + count)
+        key = (int(a), points[mine].tobytes())
+        if count and key not in known:
+            known[key] = _padded(layout.bodies[a].evaluate(points[mine])[0], stride)
+        if count:
             rows[mine] = known[key]
-    return rows, points, counts
-
-
-def _link_pins(model: Any, pin_count: np.ndarray) -> np.ndarray:
-    """Return how many pins of each instance follow a rigid body."""
-    data = getattr(model, NAMESPACE)
-    if not pin_count.any():
-        return np.zeros(len(pin_count), int)
-    followers = data.pin_instance.numpy()[data.pin_body.numpy() >= 0]
-    return np.bincount(followers, minlength=len(pin_count))
+    return rows, points

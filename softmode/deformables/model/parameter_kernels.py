@@ -2,13 +2,14 @@
 
 import warp as wp
 
+from softmode.deformables.model.declare import struct
 from softmode.deformables.model.struct_kernels import Instances, in_mask
 
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.struct
-class RestSizes:
+@struct
+class RestQuantities:
     """What has a size, at scale 1."""
 
     volume: wp.array[wp.float64]  # (instance_count,) [m^3]
@@ -21,7 +22,7 @@ class RestSizes:
     radius: wp.array[float]  # (particle_count,)
 
 
-@wp.struct
+@struct
 class Parameters:
     """Parameters of the bodies, (instance_count,)."""
 
@@ -33,8 +34,8 @@ class Parameters:
 
 
 @wp.kernel
-def derive_sizes(
-    rest: RestSizes,
+def derive_quantities(
+    rest: RestQuantities,
     scale: wp.array[float],  # (instance_count,), as the model has it
     density: wp.array[float],  # [kg/m^3]
     instance_world: wp.array[int],
@@ -78,7 +79,7 @@ def derive_tolerances(
 
 @wp.kernel
 def derive_particles(
-    rest: RestSizes,
+    rest: RestQuantities,
     instances: Instances,
     instance_world: wp.array[int],
     world_mask: wp.array[wp.bool],

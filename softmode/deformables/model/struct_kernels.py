@@ -9,6 +9,7 @@ from typing import Any
 
 import warp as wp
 
+from softmode.deformables.model.declare import struct
 from softmode.deformables.model.lane_kernels import sum8d, vec8, vec8d
 
 OVERLAP = wp.constant(0.05)
@@ -20,7 +21,7 @@ vec6 = wp.types.vector(length=6, dtype=float)
 mat23d: Any = wp.types.matrix(shape=(SLOTS, 3), dtype=wp.float64)
 
 
-@wp.struct
+@struct
 class Basis:
     """The bases of all bodies, one after another; *rows* are the points at which functions are evaluated."""
 
@@ -39,7 +40,7 @@ class Basis:
     inner_point: wp.array[wp.vec3d]  # (sample_total,) [m]
 
 
-@wp.struct
+@struct
 class Instances:
     """Where each instance finds its data, and its parameters."""
 
@@ -77,7 +78,7 @@ class Instances:
     self_contact: wp.array[int]  # whether the body may touch itself
 
 
-@wp.struct
+@struct
 class Motion:
     """The step's data per unknown, shape (instance_count, 3 block_count) where not said."""
 
@@ -90,7 +91,7 @@ class Motion:
     rate: wp.array[wp.float64]  # (instance_count,), c: 1 implicit Euler, 3/2 BDF2
 
 
-@wp.struct
+@struct
 class Points:
     """Results at the cubature points."""
 
@@ -100,13 +101,13 @@ class Points:
     volume_ratio: wp.array2d[float]  # (instance_count, point_max), J
 
 
-@wp.struct
-class Entries:
+@struct
+class PointConstraints:
     """Point constraints of an instance: pins, contacts with shapes in sample order, contacts with soft bodies."""
 
     count: wp.array[int]  # (instance_count,)
     pair_count: wp.array[int]  # (instance_count,), the last of them: contacts with soft bodies
-    row: wp.array2d[int]  # (instance_count, entry_max)
+    row: wp.array2d[int]  # (instance_count, constraint_max)
     shape: wp.array2d[int]  # -1 for a pin
     body: wp.array2d[int]  # rigid body on the other side: of the shape, or that a pin follows; -1 for none
     partner: wp.array2d[int]  # the other instance, of a contact between two soft bodies; -1 within one
@@ -125,11 +126,11 @@ class Entries:
     hessian: wp.array2d[wp.mat33]  # [N/m]
     dof_begin: wp.array2d[int]  # the rigid unknowns that move the shape; an empty range where none does
     dof_end: wp.array2d[int]
-    jacobian: wp.array3d[wp.vec3]  # (instance_count, entry_max, rigid_max), motion of the shape per such unknown
+    jacobian: wp.array3d[wp.vec3]  # (instance_count, constraint_max, rigid_max), motion of the shape per such unknown
     coupling: wp.array3d[wp.vec3]  # hessian times jacobian
 
 
-@wp.struct
+@struct
 class Rigid:
     """Joint dofs that are unknowns of the solve, r = dt * joint velocity; see ``rigid_dofs``."""
 
@@ -163,16 +164,16 @@ class Rigid:
     row_coupling: wp.array3d[wp.float64]  # second derivative times Jacobian / dt^2
 
 
-@wp.struct
-class Progress:
+@struct
+class NewtonState:
     """Where Newton's iteration stands in each world, shape (world_count,) where not said."""
 
     instance_start: wp.array[int]  # (world_count + 1,)
     active: wp.array[int]
     searching: wp.array[int]
     last: wp.array[int]  # whether every body moves less than its tolerance in this iteration
-    touching: wp.array[int]  # whether a body of the world is near a shape
-    renew: wp.array[int]  # whether the elastic Hessian is to be evaluated
+    in_contact: wp.array[int]  # whether a body of the world is near a shape
+    refresh: wp.array[int]  # whether the elastic Hessian is to be evaluated
     project: wp.array[int]  # whether it is projected to positive semidefinite; Newton's own converges faster
     failures: wp.array[int]  # how often Newton's own was indefinite in this step
     exact: wp.array[int]  # whether friction takes its own curvature
@@ -182,34 +183,34 @@ class Progress:
     slope: wp.array[wp.float64]  # [J]
     step_length: wp.array[wp.float64]
     reached: wp.array[wp.float64]  # potential after a full step, while a longer one is tried [J]
-    kept: wp.array[int]  # whether the elastic Hessian in memory is Newton's own, of some iterate
-    kept_q: wp.array2d[vec8d]  # (instance_count, 3 block_count), that iterate [m], and
-    kept_for: wp.array[vec6]  # (instance_count,), what else it is made of: see ``hessian_recipe``
+    cached: wp.array[int]  # whether the elastic Hessian in memory is Newton's own, of some iterate
+    cached_q: wp.array2d[vec8d]  # (instance_count, 3 block_count), that iterate [m], and
+    cached_key: wp.array[vec6]  # (instance_count,), what else it is made of: see ``hessian_key``
     friction_lag: int  # iterations during which the normal force of friction follows the contact
     any_active: wp.array[int]  # (1,)
     any_searching: wp.array[int]  # (1,)
 
 
 @wp.func
-def has_contacts(instances: Instances, entries: Entries, i: int):
-    """Return whether an instance is near a shape: its entries are more than its pins."""
-    return entries.count[i] > instances.pin_count[i]
+def has_contacts(instances: Instances, constraints: PointConstraints, i: int):
+    """Return whether an instance is near a shape: its constraints are more than its pins."""
+    return constraints.count[i] > instances.pin_count[i]
 
 
 @wp.func
-def pushes(instances: Instances, entries: Entries, i: int):
+def pushes(instances: Instances, constraints: PointConstraints, i: int):
     """Return whether an instance may push another body: it is near a shape or fixed to a rigid body."""
-    return instances.link_pin_count[i] > 0 or has_contacts(instances, entries, i)
+    return instances.link_pin_count[i] > 0 or has_contacts(instances, constraints, i)
 
 
 @wp.func
 def first_coupled(instances: Instances, i: int):
-    """Return the first entry of an instance that may push a rigid body: a pin only where some pin follows a body."""
+    """Return an instance's first constraint that may push a rigid body: a pin only where some pin follows a body."""
     return wp.where(instances.link_pin_count[i] > 0, 0, instances.pin_count[i])
 
 
 @wp.func
-def hessian_recipe(instances: Instances, i: int, dt: float):
+def hessian_key(instances: Instances, i: int, dt: float):
     """Return what the elastic Hessian of an instance depends on besides its coordinates."""
     return vec6(
         float(instances.material_model[i]),
@@ -233,6 +234,12 @@ def in_mask(world: int, world_mask: wp.array[wp.bool]):
 def sample_area(scale: float, area: float):
     """Return the area [m^2] that a surface sample of the asset has on a body of some scale."""
     return scale * scale * area
+
+
+@wp.func
+def p_wave_modulus(youngs_modulus: float, poissons_ratio: float):
+    """Return E (1 - nu) / ((1 + nu) (1 - 2 nu)) [Pa], the stiffness of a layer; callable on the host too."""
+    return youngs_modulus * (1.0 - poissons_ratio) / ((1.0 + poissons_ratio) * (1.0 - 2.0 * poissons_ratio))
 
 
 @wp.func
@@ -273,7 +280,7 @@ def interpolate_change(
     return wp.vec3d(sum8d(x), sum8d(y), sum8d(z))
 
 
-@wp.struct
+@struct
 class Samples:
     """Surface samples at the start of the step, shape (instance_count, sample_max), and what they found."""
 
@@ -282,10 +289,10 @@ class Samples:
     shape: wp.array3d[int]  # (..., SLOTS), -1 where empty
     gap: wp.array3d[wp.float64]  # (..., SLOTS) [m]
     normal: wp.array3d[wp.vec3]  # (..., SLOTS)
-    entry: wp.array3d[int]  # (..., SLOTS), the entry it became, -1 for none
+    constraint: wp.array3d[int]  # (..., SLOTS), the point constraint it became, -1 for none
     lower: wp.array[wp.vec3]  # (instance_count,) bounds, grown by margin and drift [m]
     upper: wp.array[wp.vec3]
     drift_lower: wp.array[wp.vec3]  # (instance_count,) bounds of the drift [m]
     drift_upper: wp.array[wp.vec3]
     reach: wp.array3d[wp.vec3]  # (instance_count, team, 4), scratch of the bounds
-    tally: wp.array3d[int]  # (instance_count, team, 2), scratch of the entries
+    tally: wp.array3d[int]  # (instance_count, team, 2), scratch of the contacts' order

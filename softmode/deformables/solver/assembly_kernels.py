@@ -5,14 +5,15 @@ Unknowns of one instance are ordered component-major in blocks of eight, see ``t
 
 import warp as wp
 
+from softmode.deformables.model.declare import kernel_over
 from softmode.deformables.model.lane_kernels import LANES, barrier, free_part, vec8, vec8d
 from softmode.deformables.model.struct_kernels import (
     Basis,
-    Entries,
     Instances,
     Motion,
+    NewtonState,
+    PointConstraints,
     Points,
-    Progress,
     Rigid,
     first_coupled,
     has_contacts,
@@ -51,12 +52,12 @@ def block_task(task: int, block_count: int):
         return wp.where(pair < 2, pair + 1, 4), rest / block_count, rest % block_count
     triangle = (square + block_count) / 2
     diagonal = (task - 3 * square) / triangle
-    lanes = int((task - 3 * square) % triangle)
+    columns = int((task - 3 * square) % triangle)
     rows = int(0)
-    while lanes >= block_count - rows:
-        lanes -= block_count - rows
+    while columns >= block_count - rows:
+        columns -= block_count - rows
         rows += 1
-    return wp.where(diagonal == 0, 0, wp.where(diagonal == 1, 3, 5)), rows, rows + lanes
+    return wp.where(diagonal == 0, 0, wp.where(diagonal == 1, 3, 5)), rows, rows + columns
 
 
 @wp.func
@@ -65,7 +66,7 @@ def stiffness_block(
     basis: Basis,
     points: Points,
     active: wp.array[int],
-    renew: wp.array[int],
+    refresh: wp.array[int],
     chunk_count: int,
     # Out:
     stiffness_out: wp.array4d[vec8],  # (instance_count, chunk_count, 3 stride, 3 block_count), upper triangle
@@ -74,10 +75,10 @@ def stiffness_block(
     task: int,
 ):
     """Assemble 8x8 blocks of sum_p grad b^T C grad b over one chunk of the points."""
-    if active[instances.world[i]] == 0 or renew[instances.world[i]] == 0:
+    if active[instances.world[i]] == 0 or refresh[instances.world[i]] == 0:
         return
     block_count = basis.row.shape[1]
-    pair, rows, lanes = block_task(task, block_count)
+    pair, rows, columns = block_task(task, block_count)
     c, d = block_pair(pair)
     a0 = vec8()
     a1 = vec8()
@@ -90,12 +91,12 @@ def stiffness_block(
     first = instances.point_start[i]
     count = instances.point_count[i]
     n = instances.function_count[i]
-    if LANES * rows < n and LANES * lanes < n:
+    if LANES * rows < n and LANES * columns < n:
         for p in range(chunk * count / chunk_count, (chunk + 1) * count / chunk_count):
             C = points.hessian[i, pair, p]
-            gx = basis.gradient_across[lanes, first + p, 0]
-            gy = basis.gradient_across[lanes, first + p, 1]
-            gz = basis.gradient_across[lanes, first + p, 2]
+            gx = basis.gradient_across[columns, first + p, 0]
+            gy = basis.gradient_across[columns, first + p, 1]
+            gz = basis.gradient_across[columns, first + p, 2]
             ux = C[0, 0] * gx + C[0, 1] * gy + C[0, 2] * gz
             uy = C[1, 0] * gx + C[1, 1] * gy + C[1, 2] * gz
             uz = C[2, 0] * gx + C[2, 1] * gy + C[2, 2] * gz
@@ -127,7 +128,7 @@ def stiffness_block(
             a6 = a6 + r[6] * uz
             a7 = a7 + r[7] * uz
     row = LANES * (c * block_count + rows)
-    column = d * block_count + lanes
+    column = d * block_count + columns
     stiffness_out[i, chunk, row, column] = a0
     stiffness_out[i, chunk, row + 1, column] = a1
     stiffness_out[i, chunk, row + 2, column] = a2
@@ -138,20 +139,7 @@ def stiffness_block(
     stiffness_out[i, chunk, row + 7, column] = a7
 
 
-@wp.kernel
-def assemble_stiffness(
-    instances: Instances,
-    basis: Basis,
-    points: Points,
-    active: wp.array[int],
-    renew: wp.array[int],
-    chunk_count: int,
-    # Out:
-    stiffness_out: wp.array4d[vec8],  # (instance_count, chunk_count, 3 stride, 3 block_count), upper triangle
-):
-    """Launch :func:`stiffness_block`."""
-    i, chunk, task = wp.tid()
-    stiffness_block(instances, basis, points, active, renew, chunk_count, stiffness_out, i, chunk, task)
+assemble_stiffness = kernel_over(stiffness_block, "assemble_stiffness", "i", "chunk", "task")
 
 
 @wp.kernel
@@ -164,8 +152,8 @@ def assemble_pins(
     pins_out: wp.array3d[vec8],  # (instance_count, stride, block_count), upper triangle
 ):
     """Assemble 8x8 blocks of sum_e k_e b b^T over the pins: the same for x, y and z, and constant."""
-    i, rows, lanes = wp.tid()
-    if lanes < rows:
+    i, rows, columns = wp.tid()
+    if columns < rows:
         return
     a0 = vec8()
     a1 = vec8()
@@ -177,7 +165,7 @@ def assemble_pins(
     a7 = vec8()
     for e in range(instances.pin_start[i], instances.pin_start[i] + instances.pin_count[i]):
         b = wp.max(pin_stiffness[e], 0.0) * basis.row[first_row + e, rows]
-        v = basis.row[first_row + e, lanes]
+        v = basis.row[first_row + e, columns]
         a0 = a0 + b[0] * v
         a1 = a1 + b[1] * v
         a2 = a2 + b[2] * v
@@ -187,14 +175,14 @@ def assemble_pins(
         a6 = a6 + b[6] * v
         a7 = a7 + b[7] * v
     row = LANES * rows
-    pins_out[i, row, lanes] = a0
-    pins_out[i, row + 1, lanes] = a1
-    pins_out[i, row + 2, lanes] = a2
-    pins_out[i, row + 3, lanes] = a3
-    pins_out[i, row + 4, lanes] = a4
-    pins_out[i, row + 5, lanes] = a5
-    pins_out[i, row + 6, lanes] = a6
-    pins_out[i, row + 7, lanes] = a7
+    pins_out[i, row, columns] = a0
+    pins_out[i, row + 1, columns] = a1
+    pins_out[i, row + 2, columns] = a2
+    pins_out[i, row + 3, columns] = a3
+    pins_out[i, row + 4, columns] = a4
+    pins_out[i, row + 5, columns] = a5
+    pins_out[i, row + 6, columns] = a6
+    pins_out[i, row + 7, columns] = a7
 
 
 @wp.func
@@ -223,14 +211,14 @@ def matrix_row(
     first = instances.system_block[i]
     for column in range(member, 3 * block_count, team):
         d = column / block_count
-        lanes = column % block_count
+        columns = column % block_count
         if LANES * column + 7 >= row:
             value = stiffness[i, 0, row, column]
             for chunk in range(1, stiffness.shape[1]):
                 value = value + stiffness[i, chunk, row, column]
             if c == d and instances.pin_count[i] > 0:
-                value = value + pins[i, k, lanes]
-            value = free_part(value, wp.where(k < driven, LANES, driven - LANES * lanes))
+                value = value + pins[i, k, columns]
+            value = free_part(value, wp.where(k < driven, LANES, driven - LANES * columns))
             if row / LANES == column:
                 # the padding behind the functions carries inertia alone
                 rate = motion.rate[i] / dt
@@ -241,29 +229,14 @@ def matrix_row(
             matrix_out[instances.system[i], LANES * first + row, first + column] = value
 
 
-@wp.kernel
-def assemble_matrix(
-    instances: Instances,
-    basis: Basis,
-    motion: Motion,
-    active: wp.array[int],
-    stiffness: wp.array4d[vec8],
-    pins: wp.array3d[vec8],
-    dt: wp.float64,
-    team: int,
-    # Out:
-    matrix_out: wp.array3d[vec8],  # (system_count, N, ...), upper triangle
-):
-    """Launch :func:`matrix_row`."""
-    i, row, member = wp.tid()
-    matrix_row(instances, basis, motion, active, stiffness, pins, dt, team, matrix_out, i, row, member)
+assemble_matrix = kernel_over(matrix_row, "assemble_matrix", "i", "row", "member")
 
 
 @wp.func
 def contact_block(
     instances: Instances,
     basis: Basis,
-    entries: Entries,
+    constraints: PointConstraints,
     active: wp.array[int],
     # In and out:
     matrix: wp.array3d[vec8],  # (system_count, N, ...), upper triangle
@@ -271,10 +244,10 @@ def contact_block(
     task: int,
 ):
     """Add the contacts, sum_e b^T H b, to 8x8 blocks; driven unknowns stay put."""
-    if active[instances.world[i]] == 0 or not has_contacts(instances, entries, i):
+    if active[instances.world[i]] == 0 or not has_contacts(instances, constraints, i):
         return
     block_count = basis.row.shape[1]
-    pair, rows, lanes = block_task(task, block_count)
+    pair, rows, columns = block_task(task, block_count)
     c, d = block_pair(pair)
     driven = instances.driven_count[i]
     a0 = vec8()
@@ -285,10 +258,10 @@ def contact_block(
     a5 = vec8()
     a6 = vec8()
     a7 = vec8()
-    for e in range(instances.pin_count[i], entries.count[i]):
-        r = entries.row[i, e]
+    for e in range(instances.pin_count[i], constraints.count[i]):
+        r = constraints.row[i, e]
         b = free_part(basis.row[r, rows], driven - LANES * rows)
-        v = entries.hessian[i, e][c, d] * free_part(basis.row[r, lanes], driven - LANES * lanes)
+        v = constraints.hessian[i, e][c, d] * free_part(basis.row[r, columns], driven - LANES * columns)
         a0 = a0 + b[0] * v
         a1 = a1 + b[1] * v
         a2 = a2 + b[2] * v
@@ -299,7 +272,7 @@ def contact_block(
         a7 = a7 + b[7] * v
     first = instances.system_block[i]
     row = LANES * (first + c * block_count + rows)
-    column = first + d * block_count + lanes
+    column = first + d * block_count + columns
     i = instances.system[i]
     matrix[i, row, column] = matrix[i, row, column] + a0
     matrix[i, row + 1, column] = matrix[i, row + 1, column] + a1
@@ -311,25 +284,14 @@ def contact_block(
     matrix[i, row + 7, column] = matrix[i, row + 7, column] + a7
 
 
-@wp.kernel
-def add_contacts(
-    instances: Instances,
-    basis: Basis,
-    entries: Entries,
-    active: wp.array[int],
-    # In and out:
-    matrix: wp.array3d[vec8],  # (system_count, N, ...), upper triangle
-):
-    """Launch :func:`contact_block`."""
-    i, task = wp.tid()
-    contact_block(instances, basis, entries, active, matrix, i, task)
+add_contacts = kernel_over(contact_block, "add_contacts", "i", "task")
 
 
 @wp.func
 def column_block(
     instances: Instances,
     basis: Basis,
-    entries: Entries,
+    constraints: PointConstraints,
     active: wp.array[int],
     gradient: wp.array2d[vec8d],
     rigid: Rigid,
@@ -351,39 +313,24 @@ def column_block(
     if j == rigid_count:
         value = vec8(-gradient[i, rows])
     elif j < rigid.count[instances.world[i]]:
-        for e in range(first_coupled(instances, i), entries.count[i]):
-            if j < entries.dof_begin[i, e] or j >= entries.dof_end[i, e]:
+        for e in range(first_coupled(instances, i), constraints.count[i]):
+            if j < constraints.dof_begin[i, e] or j >= constraints.dof_end[i, e]:
                 continue
-            value = value - entries.coupling[i, e, j][c] * basis.row[entries.row[i, e], b]
+            value = value - constraints.coupling[i, e, j][c] * basis.row[constraints.row[i, e], b]
         value = free_part(value, instances.driven_count[i] - LANES * b)
     for a in range(LANES):
         row = LANES * (instances.system_block[i] + rows) + a
         matrix_out[instances.system[i], row, size + j] = value[a]
 
 
-@wp.kernel
-def assemble_columns(
-    instances: Instances,
-    basis: Basis,
-    entries: Entries,
-    active: wp.array[int],
-    gradient: wp.array2d[vec8d],
-    rigid: Rigid,
-    rigid_count: int,
-    size: int,  # N
-    # Out:
-    matrix_out: wp.array3d[float],  # (system_count, N, N + ...)
-):
-    """Launch :func:`column_block`."""
-    i, rows, j = wp.tid()
-    column_block(instances, basis, entries, active, gradient, rigid, rigid_count, size, matrix_out, i, rows, j)
+assemble_columns = kernel_over(column_block, "assemble_columns", "i", "rows", "j")
 
 
 @wp.func
 def rigid_entry(
     instances: Instances,
-    entries: Entries,
-    progress: Progress,
+    constraints: PointConstraints,
+    state: NewtonState,
     # In and out:
     rigid: Rigid,
     w: int,
@@ -391,15 +338,15 @@ def rigid_entry(
     l: int,
 ):
     """Compute gradient and Hessian of the rigid dofs: M_eff/dt^2 (r - r_predicted) + sum_e J_e^T f_e, and the rows."""
-    if progress.active[w] == 0 or j >= rigid.count[w] or l > j:
+    if state.active[w] == 0 or j >= rigid.count[w] or l > j:
         return
-    first = progress.instance_start[w]
-    end = progress.instance_start[w + 1]
+    first = state.instance_start[w]
+    end = state.instance_start[w + 1]
     h = rigid.inertia[w, j, l]
     for i in range(first, end):
-        for e in range(first_coupled(instances, i), entries.count[i]):
-            if l >= entries.dof_begin[i, e] and j < entries.dof_end[i, e]:
-                h += wp.float64(wp.dot(entries.jacobian[i, e, j], entries.coupling[i, e, l]))
+        for e in range(first_coupled(instances, i), constraints.count[i]):
+            if l >= constraints.dof_begin[i, e] and j < constraints.dof_end[i, e]:
+                h += wp.float64(wp.dot(constraints.jacobian[i, e, j], constraints.coupling[i, e, l]))
     for k in range(rigid.row_count[w]):
         h += wp.float64(rigid.row_jacobian[w, k, j]) * rigid.row_coupling[w, k, l]
     rigid.matrix[w, j, l] = h
@@ -409,30 +356,20 @@ def rigid_entry(
         for k in range(rigid.count[w]):
             g += rigid.inertia[w, j, k] * (rigid.r[w, k] - rigid.predicted[w, k])
         for i in range(first, end):
-            for e in range(first_coupled(instances, i), entries.count[i]):
-                if j >= entries.dof_begin[i, e] and j < entries.dof_end[i, e]:
-                    g += wp.dot(wp.vec3d(entries.jacobian[i, e, j]), entries.force[i, e])
+            for e in range(first_coupled(instances, i), constraints.count[i]):
+                if j >= constraints.dof_begin[i, e] and j < constraints.dof_end[i, e]:
+                    g += wp.dot(wp.vec3d(constraints.jacobian[i, e, j]), constraints.force[i, e])
         for k in range(rigid.row_count[w]):
             g += wp.float64(rigid.row_jacobian[w, k, j]) * rigid.row_force[w, k]
         rigid.gradient[w, j] = g
 
 
-@wp.kernel
-def assemble_rigid(
-    instances: Instances,
-    entries: Entries,
-    progress: Progress,
-    # In and out:
-    rigid: Rigid,
-):
-    """Launch :func:`rigid_entry`."""
-    w, j, l = wp.tid()
-    rigid_entry(instances, entries, progress, rigid, w, j, l)
+assemble_rigid = kernel_over(rigid_entry, "assemble_rigid", "w", "j", "l")
 
 
 @wp.func
 def condensed_entry(
-    progress: Progress,
+    state: NewtonState,
     system_start: wp.array[int],  # (world_count + 1,)
     rigid_max: int,
     factored: wp.array3d[vec8],  # [U | Y | y], Y = U^-T C, y = U^-T (-g)
@@ -444,7 +381,7 @@ def condensed_entry(
 ):
     """Subtract the bodies: S = R - sum_i Y_i^T Y_i and s = -g_r - sum_i Y_i^T y_i."""
     # column l = rigid_count is the right-hand side; of the matrix only the lower triangle is read
-    if progress.active[w] == 0 or j >= rigid.count[w] or l > rigid.count[w] or (l > j and l < rigid.count[w]):
+    if state.active[w] == 0 or j >= rigid.count[w] or l > rigid.count[w] or (l > j and l < rigid.count[w]):
         return
     row_count = factored.shape[1]
     first = row_count / LANES
@@ -466,23 +403,12 @@ def condensed_entry(
     rigid.matrix[w, j, l] = value
 
 
-@wp.kernel
-def condense(
-    progress: Progress,
-    system_start: wp.array[int],  # (world_count + 1,)
-    rigid_max: int,
-    factored: wp.array3d[vec8],  # [U | Y | y], Y = U^-T C, y = U^-T (-g)
-    # In and out:
-    rigid: Rigid,
-):
-    """Launch :func:`condensed_entry`."""
-    w, j, l = wp.tid()
-    condensed_entry(progress, system_start, rigid_max, factored, rigid, w, j, l)
+condense = kernel_over(condensed_entry, "condense", "w", "j", "l")
 
 
 @wp.func
 def factor_rigid(
-    matrix: wp.array3d[wp.float64], pivot_min: wp.array2d[wp.float64], w: int, n: int, lane: int, team: int
+    matrix: wp.array3d[wp.float64], pivot_min: wp.array2d[wp.float64], w: int, n: int, member: int, team: int
 ):
     """Replace the matrix of a world by its lower Cholesky factor; a team shares the rows below the pivot.
 
@@ -494,7 +420,7 @@ def factor_rigid(
         pivot = matrix[w, a, a]
         for s in range(a):
             pivot -= matrix[w, a, s] * matrix[w, a, s]
-        for b in range(a + 1 + lane, n, team):
+        for b in range(a + 1 + member, n, team):
             value = matrix[w, b, a]
             for s in range(a):
                 value -= matrix[w, b, s] * matrix[w, a, s]
@@ -505,9 +431,9 @@ def factor_rigid(
             pivot = wp.max(pivot, matrix[w, b, a] * matrix[w, b, a] / wp.max(matrix[w, b, b], pivot_min[w, b]))
         pivot = wp.sqrt(pivot)
         barrier()
-        if lane == 0:
+        if member == 0:
             matrix[w, a, a] = pivot
-        for b in range(a + 1 + lane, n, team):
+        for b in range(a + 1 + member, n, team):
             matrix[w, b, a] = matrix[w, b, a] / pivot
         barrier()
 
@@ -523,15 +449,15 @@ def bound_pivots(
     The condensed matrix is the inertia plus something positive semidefinite, so its pivots, the reciprocals of the last
     diagonal entries of the leading blocks' inverses, are not smaller.
     """
-    w, lane = wp.tid()
+    w, member = wp.tid()
     n = rigid.count[w]
-    for a in range(lane, n, team):
+    for a in range(member, n, team):
         rigid.pivot_floor[w, a] = wp.float64(1.0e-12) * rigid.inertia[w, a, a]
         for b in range(a + 1):
             rigid.matrix[w, a, b] = rigid.inertia[w, a, b]
     barrier()
-    factor_rigid(rigid.matrix, rigid.pivot_floor, w, n, lane, team)
-    for a in range(lane, n, team):
+    factor_rigid(rigid.matrix, rigid.pivot_floor, w, n, member, team)
+    for a in range(member, n, team):
         rigid.pivot_floor[w, a] = rigid.matrix[w, a, a] * rigid.matrix[w, a, a]
 
 
@@ -542,14 +468,14 @@ def solve_rigid_team(
     # In and out: ``matrix`` and ``direction`` are overwritten by the factor and the solution
     rigid: Rigid,
     w: int,
-    lane: int,
+    member: int,
 ):
     """Solve S x = s by Cholesky. Pivots that rounding put below those of the inertia are raised to them."""
     if active[w] == 0:
         return
     n = rigid.count[w]
-    factor_rigid(rigid.matrix, rigid.pivot_min, w, n, lane, team)
-    if lane != 0:
+    factor_rigid(rigid.matrix, rigid.pivot_min, w, n, member, team)
+    if member != 0:
         return
     for a in range(n):
         value = rigid.direction[w, a]
@@ -564,23 +490,14 @@ def solve_rigid_team(
         rigid.direction[w, a] = value / rigid.matrix[w, a, a]
 
 
-@wp.kernel
-def solve_rigid(
-    active: wp.array[int],
-    team: int,
-    # In and out: ``matrix`` and ``direction`` are overwritten by the factor and the solution
-    rigid: Rigid,
-):
-    """Launch :func:`solve_rigid_team`."""
-    w, lane = wp.tid()
-    solve_rigid_team(active, team, rigid, w, lane)
+solve_rigid = kernel_over(solve_rigid_team, "solve_rigid", "w", "member")
 
 
 @wp.kernel
 def relate_pairs(
     instances: Instances,
-    progress: Progress,
-    entries: Entries,
+    state: NewtonState,
+    constraints: PointConstraints,
     # Out:
     relation: wp.array3d[int],  # (world_count, part_count, part_count)
 ):
@@ -588,35 +505,35 @@ def relate_pairs(
     w, part = wp.tid()
     for other in range(relation.shape[2]):
         relation[w, part, other] = 0
-    i = progress.instance_start[w] + part
-    if i >= progress.instance_start[w + 1]:
+    i = state.instance_start[w] + part
+    if i >= state.instance_start[w + 1]:
         return
     relation[w, part, part] = 1
-    for e in range(entries.count[i] - entries.pair_count[i], entries.count[i]):
-        j = entries.partner[i, e]
+    for e in range(constraints.count[i] - constraints.pair_count[i], constraints.count[i]):
+        j = constraints.partner[i, e]
         if j >= 0:
-            relation[w, part, j - progress.instance_start[w]] = 1
+            relation[w, part, j - state.instance_start[w]] = 1
 
 
 @wp.kernel
 def place_parts(
     instances: Instances,
-    progress: Progress,
+    state: NewtonState,
     place: wp.array2d[int],  # (world_count, part_count)
     part_blocks: int,
 ):
     """Say where each body stands in the system of its world: writes ``instances.system_block``."""
     i = wp.tid()
     w = instances.world[i]
-    instances.system_block[i] = part_blocks * place[w, i - progress.instance_start[w]]
+    instances.system_block[i] = part_blocks * place[w, i - state.instance_start[w]]
 
 
 @wp.kernel
 def assemble_pairs(
     instances: Instances,
     basis: Basis,
-    entries: Entries,
-    progress: Progress,
+    constraints: PointConstraints,
+    state: NewtonState,
     relation: wp.array3d[int],  # (world_count, part_count, part_count), its fill included
     # In and out:
     matrix: wp.array3d[vec8],  # (world_count, N, ...), upper triangle
@@ -626,10 +543,10 @@ def assemble_pairs(
     part_count = relation.shape[1]
     part = both / part_count
     other = both % part_count
-    if progress.active[w] == 0 or other == part or relation[w, part, other] == 0:
+    if state.active[w] == 0 or other == part or relation[w, part, other] == 0:
         return
-    i = progress.instance_start[w] + part
-    j = progress.instance_start[w] + other
+    i = state.instance_start[w] + part
+    j = state.instance_start[w] + other
     if instances.system_block[i] > instances.system_block[j]:
         return
     block_count = basis.row.shape[1]
@@ -637,7 +554,7 @@ def assemble_pairs(
     c = pair / 3
     d = pair % 3
     rows = (task / block_count) % block_count
-    lanes = task % block_count
+    columns = task % block_count
     a0 = vec8()
     a1 = vec8()
     a2 = vec8()
@@ -646,11 +563,13 @@ def assemble_pairs(
     a5 = vec8()
     a6 = vec8()
     a7 = vec8()
-    for e in range(entries.count[i] - entries.pair_count[i], entries.count[i]):
-        if entries.partner[i, e] == j:
-            b = free_part(basis.row[entries.row[i, e], rows], instances.driven_count[i] - LANES * rows)
-            v = free_part(basis.row[entries.partner_row[i, e], lanes], instances.driven_count[j] - LANES * lanes)
-            v = entries.hessian[i, e][c, d] * v
+    for e in range(constraints.count[i] - constraints.pair_count[i], constraints.count[i]):
+        if constraints.partner[i, e] == j:
+            b = free_part(basis.row[constraints.row[i, e], rows], instances.driven_count[i] - LANES * rows)
+            v = free_part(
+                basis.row[constraints.partner_row[i, e], columns], instances.driven_count[j] - LANES * columns
+            )
+            v = constraints.hessian[i, e][c, d] * v
             a0 = a0 - b[0] * v
             a1 = a1 - b[1] * v
             a2 = a2 - b[2] * v
@@ -660,7 +579,7 @@ def assemble_pairs(
             a6 = a6 - b[6] * v
             a7 = a7 - b[7] * v
     row = LANES * (instances.system_block[i] + c * block_count + rows)
-    column = instances.system_block[j] + d * block_count + lanes
+    column = instances.system_block[j] + d * block_count + columns
     matrix[w, row, column] = a0
     matrix[w, row + 1, column] = a1
     matrix[w, row + 2, column] = a2

@@ -13,8 +13,9 @@ import newton
 import numpy as np
 import warp as wp
 
+from softmode.checks import require_number
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.model.authoring import NAMESPACE, add_pins, body_key, bulk_stiffness
+from softmode.deformables.model.authoring import NAMESPACE, add_pins, attribute_values, body_key, bulk_stiffness
 from softmode.errors import ConfigError
 
 
@@ -40,7 +41,7 @@ def attach(
     box: tuple[Sequence[float], Sequence[float]] | None = None,
     points: np.ndarray | None = None,
     stiffness: float | None = None,
-    link_pose: Any = None,
+    link_pose: wp.transform | None = None,
 ) -> Attachment:
     """Fix a part of a soft body to a rigid body or to the world, where both are now.
 
@@ -72,7 +73,7 @@ def attach(
         raise ConfigError("attach needs exactly one of region, box and points")
     if not -1 <= link < builder.body_count:
         raise ConfigError(f"link must be a rigid body of the builder or -1, got {link}; it has {builder.body_count}")
-    keys = _column(builder, "body_key") if f"{NAMESPACE}:body_key" in builder.custom_attributes else []
+    keys = attribute_values(builder, "body_key") if f"{NAMESPACE}:body_key" in builder.custom_attributes else []
     if not 0 <= instance < len(keys):
         raise ConfigError(
             f"instance must be the index of a soft body of the builder, got {instance}; it has {len(keys)}",
@@ -82,11 +83,10 @@ def attach(
         raise ConfigError(
             f"instance {instance} is not of body {body.name!r}", hint="pass the body that add_reduced_body was given"
         )
-    modulus, ratio = (float(_column(builder, name)[instance]) for name in ("youngs_modulus", "poissons_ratio"))
-    s = float(_column(builder, "scale")[instance])
+    modulus, ratio = (float(attribute_values(builder, name)[instance]) for name in ("youngs_modulus", "poissons_ratio"))
+    s = float(attribute_values(builder, "scale")[instance])
     per_area = bulk_stiffness(body, modulus, ratio, s) if stiffness is None else stiffness
-    if not 0.0 < per_area < np.inf:
-        raise ConfigError(f"stiffness must be a finite number > 0 [Pa/m], got {stiffness!r}")
+    require_number("stiffness", per_area, above=0.0, unit="[Pa/m]")
     if region is not None:
         X, pins = _region_pins(body, region, modulus)
         pins = s * pins  # kappa of the larger region is less by s^2, its volume more by s^3
@@ -109,7 +109,7 @@ def attach(
         raise ConfigError(
             f"the attachment of body {body.name!r} holds no point", hint=f"its surface spans {low} to {high} [m]"
         )
-    first = _column(builder, "pin_instance").count(instance)
+    first = attribute_values(builder, "pin_instance").count(instance)
     pose: Any = wp.transform_identity()
     if link >= 0:
         pose = builder.body_q[link] if link_pose is None else link_pose
@@ -135,13 +135,9 @@ def _region_pins(body: ReducedBody, name: str, youngs_modulus: float) -> tuple[n
     return body.region_points[rows], stiffness * youngs_modulus * body.region_weights[rows]
 
 
-def _column(builder: newton.ModelBuilder, name: str) -> list[Any]:
-    """Return the values of an attribute that a builder holds so far."""
-    values: Any = builder.custom_attributes[f"{NAMESPACE}:{name}"].values
-    return list(values.values() if isinstance(values, dict) else values or [])
-
-
 def _coordinates(builder: newton.ModelBuilder, instance: int, body: ReducedBody) -> np.ndarray:
     """Return the initial coordinates of an instance [m], shape (function_count, 3)."""
-    start = _column(builder, "function_start")[instance]
-    return np.array([[float(x) for x in q] for q in _column(builder, "q")[start : start + body.function_count]])
+    start = attribute_values(builder, "function_start")[instance]
+    return np.array(
+        [[float(x) for x in q] for q in attribute_values(builder, "q")[start : start + body.function_count]]
+    )

@@ -1,14 +1,11 @@
 """Energies of soft bodies: kinetic, elastic, gravitational, evaluated where the solver evaluates them."""
 
-from typing import Any
-
 import newton
 import warp as wp
 
-from softmode.deformables.model.authoring import NAMESPACE
+from softmode.deformables.model.namespaces import soft
 from softmode.deformables.solver import energy_kernels as kernels
-from softmode.deformables.solver.solver_reduced import SolverReduced
-from softmode.errors import ConfigError
+from softmode.deformables.solver.reduced_solver import ReducedSolver, require_reduced
 
 
 class SoftEnergies:
@@ -30,31 +27,16 @@ class SoftEnergies:
         ConfigError: If the solver has no soft bodies.
     """
 
-    def __init__(self, solver: Any) -> None:
+    def __init__(self, solver: ReducedSolver) -> None:
         """Allocate the energies."""
-        reduced = getattr(solver, "reduced", solver)
-        if not isinstance(reduced, SolverReduced):
-            raise ConfigError(
-                f"solver is a {type(solver).__name__}", hint="pass a SolverReduced or a SolverCoupledReduced"
-            )
-        self._solver: Any = reduced
+        self._tables = tables = require_reduced(solver).tables
         self.kinetic, self.elastic, self.gravitational = (
-            wp.zeros(reduced.instance_count, dtype=wp.float64, device=reduced.model.device) for _ in range(3)
+            wp.zeros(tables.layout.instance_count, dtype=wp.float64, device=tables.model.device) for _ in range(3)
         )
 
     def update(self, state: newton.State) -> None:
         """Evaluate the energies of a state of the solver's model."""
-        reduced, data = self._solver, getattr(state, NAMESPACE)
-        common = {"dim": reduced.instance_count, "device": reduced.model.device}
-        wp.launch(
-            kernels.sum_kinetic_and_gravitational,
-            inputs=[reduced.instances, reduced.basis, reduced.model.gravity, data.q, data.qd],
-            outputs=[self.kinetic, self.gravitational],
-            **common,
-        )
-        wp.launch(
-            kernels.sum_elastic,
-            inputs=[reduced.instances, reduced.basis, data.q],
-            outputs=[self.elastic],
-            **common,
-        )
+        t, data, count = self._tables, soft(state), len(self.kinetic)
+        bodies, out = (t.instances, t.basis), (self.kinetic, self.gravitational)
+        t.launch(kernels.sum_kinetic_and_gravitational, count, *bodies, t.model.gravity, data.q, data.qd, *out)
+        t.launch(kernels.sum_elastic, count, *bodies, data.q, self.elastic)

@@ -1,338 +1,11 @@
-"""Batched block Cholesky factorisation and solve with right-hand columns, on CPU and CUDA alike.
-
-Each system is a dense symmetric positive definite matrix A (N x N) with M extra columns B appended: [A | B]. The
-factorisation A = U^T U runs row block by row block and carries B along, so that it ends as [U | U^-T B]: the forward
-substitution of every right-hand side, and the half of a Schur complement, come with it.
-
-A system may be made of equal *parts*, the bodies of a world, most of which have nothing to do with each other: a
-pattern says which blocks of parts are not zero, its fill included; the others are neither read nor written. The order
-of the parts is chosen anew for each pattern, by least degree (:meth:`BlockCholesky.order_parts`): half the work of a
-fixed order for a heap of 13 bodies.
-
-Rows are stored as 8-wide vectors. Measured on one CPU core (112 x 256 x 112 product, AVX-512): arithmetic on
-``wp.types.vector(length=8)`` or 16 reaches 50-150 Gflop/s where ``wp.tile_matmul`` reaches 9, because Warp's CPU tiles
-are scalar loops. On CUDA a team of threads shares a system, each with columns of its own, in one launch: with eight
-columns per thread instead one H200 needs ten times as long for a single system of 192 unknowns, twice for 4,096.
-"""
-
-from typing import Any
+"""Storage and launches of batched linear systems: block Cholesky factorisation and solve, see ``factor_kernels``."""
 
 import numpy as np
 import warp as wp
 
-from softmode.deformables.model.lane_kernels import LANES, TEAM, barrier, mat88, pad, sum8, vec8
-
-__all__ = ["LANES", "BlockCholesky", "pad", "vec8"]
-
-wp.set_module_options({"enable_backward": False})
-
-
-@wp.func
-def related(pattern: wp.array3d[int], i: int, part: int, other: int):
-    """Return whether the block of two parts, or of a part and the right-hand columns behind them, is not zero."""
-    return part == other or other >= pattern.shape[1] or pattern[i, part, other] != 0
-
-
-@wp.func
-def factor_system(
-    # Selection:
-    system_world: wp.array[int],  # (system_count,)
-    active: wp.array[int],  # (world_count,)
-    block_count: int,
-    part_blocks: int,  # blocks of rows per part
-    pattern: wp.array3d[int],  # (system_count, part_count, part_count), upper triangle
-    team: int,
-    width: int,
-    # In and out, the same memory in blocks of eight columns, and in units of ``width`` = 8 (vec8) or 1 (float) columns:
-    matrix: wp.array3d[vec8],  # (system_count, N, (N + M) / 8)
-    unit: wp.array3d[Any],  # (system_count, N, (N + M) / width)
-    # Out:
-    diagonal_out: wp.array2d[vec8],  # (system_count, N): diagonal blocks of U with inverse pivots
-    indefinite_out: wp.array[int],  # (system_count,), 1 where a pivot had to be raised
-    i: int,
-    lane: int,
-):
-    """Factor row block by row block: subtract what is above (left-looking), then solve with the diagonal block."""
-    if active[system_world[i]] == 0:
-        return
-    total = unit.shape[2]
-    indefinite = int(0)
-    for block in range(block_count):
-        first = LANES * block
-        part = block / part_blocks
-        for l in range(first / width + lane, total, team):
-            other = width * l / (LANES * part_blocks)
-            if not related(pattern, i, part, other):
-                continue
-            r0 = unit[i, first, l]
-            r1 = unit[i, first + 1, l]
-            r2 = unit[i, first + 2, l]
-            r3 = unit[i, first + 3, l]
-            r4 = unit[i, first + 4, l]
-            r5 = unit[i, first + 5, l]
-            r6 = unit[i, first + 6, l]
-            r7 = unit[i, first + 7, l]
-            # one flat loop: inside a second one the sums do not stay in registers, and cost seven times as much on CPU
-            above = int(0)
-            while above < block:
-                before = above / part_blocks
-                if not (related(pattern, i, before, part) and related(pattern, i, before, other)):
-                    above = part_blocks * (before + 1)
-                    continue
-                for a in range(8):
-                    s = LANES * above + a
-                    u = matrix[i, s, block]
-                    v = unit[i, s, l]
-                    r0 = r0 - u[0] * v
-                    r1 = r1 - u[1] * v
-                    r2 = r2 - u[2] * v
-                    r3 = r3 - u[3] * v
-                    r4 = r4 - u[4] * v
-                    r5 = r5 - u[5] * v
-                    r6 = r6 - u[6] * v
-                    r7 = r7 - u[7] * v
-                above += 1
-            unit[i, first, l] = r0
-            unit[i, first + 1, l] = r1
-            unit[i, first + 2, l] = r2
-            unit[i, first + 3, l] = r3
-            unit[i, first + 4, l] = r4
-            unit[i, first + 5, l] = r5
-            unit[i, first + 6, l] = r6
-            unit[i, first + 7, l] = r7
-        barrier()
-        # every thread factors its own copy of the diagonal block (inverse pivots): cheaper than waiting for one
-        U = mat88()
-        for a in range(8):
-            row = matrix[i, first + a, block]
-            floor = wp.max(1.0e-6 * wp.abs(row[a]), 1.0e-30)
-            for s in range(a):
-                factor = U[s, a]
-                for b in range(8):
-                    row[b] -= factor * U[s, b]
-            if row[a] < floor:
-                indefinite = 1
-            inverse = 1.0 / wp.sqrt(wp.max(row[a], floor))
-            for b in range(8):
-                U[a, b] = inverse * row[b]
-            U[a, a] = inverse
-            if lane == 0:
-                diagonal = vec8()
-                for b in range(8):
-                    diagonal[b] = U[a, b]
-                diagonal_out[i, first + a] = diagonal
-        for l in range((first + LANES) / width + lane, total, team):
-            if not related(pattern, i, part, width * l / (LANES * part_blocks)):
-                continue
-            x0 = U[0, 0] * unit[i, first, l]
-            x1 = U[1, 1] * (unit[i, first + 1, l] - U[0, 1] * x0)
-            x2 = U[2, 2] * (unit[i, first + 2, l] - U[0, 2] * x0 - U[1, 2] * x1)
-            x3 = unit[i, first + 3, l] - U[0, 3] * x0 - U[1, 3] * x1 - U[2, 3] * x2
-            x3 = U[3, 3] * x3
-            x4 = unit[i, first + 4, l] - U[0, 4] * x0 - U[1, 4] * x1 - U[2, 4] * x2 - U[3, 4] * x3
-            x4 = U[4, 4] * x4
-            x5 = unit[i, first + 5, l] - U[0, 5] * x0 - U[1, 5] * x1 - U[2, 5] * x2 - U[3, 5] * x3 - U[4, 5] * x4
-            x5 = U[5, 5] * x5
-            x6 = unit[i, first + 6, l] - U[0, 6] * x0 - U[1, 6] * x1 - U[2, 6] * x2 - U[3, 6] * x3 - U[4, 6] * x4
-            x6 = U[6, 6] * (x6 - U[5, 6] * x5)
-            x7 = unit[i, first + 7, l] - U[0, 7] * x0 - U[1, 7] * x1 - U[2, 7] * x2 - U[3, 7] * x3 - U[4, 7] * x4
-            x7 = U[7, 7] * (x7 - U[5, 7] * x5 - U[6, 7] * x6)
-            unit[i, first, l] = x0
-            unit[i, first + 1, l] = x1
-            unit[i, first + 2, l] = x2
-            unit[i, first + 3, l] = x3
-            unit[i, first + 4, l] = x4
-            unit[i, first + 5, l] = x5
-            unit[i, first + 6, l] = x6
-            unit[i, first + 7, l] = x7
-        barrier()
-    if lane == 0:
-        indefinite_out[i] = indefinite
-
-
-@wp.kernel
-def _factor(
-    # Selection:
-    system_world: wp.array[int],  # (system_count,)
-    active: wp.array[int],  # (world_count,)
-    block_count: int,
-    part_blocks: int,  # blocks of rows per part
-    pattern: wp.array3d[int],  # (system_count, part_count, part_count), upper triangle
-    team: int,
-    width: int,
-    # In and out, the same memory in blocks of eight columns, and in units of ``width`` = 8 (vec8) or 1 (float) columns:
-    matrix: wp.array3d[vec8],  # (system_count, N, (N + M) / 8)
-    unit: wp.array3d[Any],  # (system_count, N, (N + M) / width)
-    # Out:
-    diagonal_out: wp.array2d[vec8],  # (system_count, N): diagonal blocks of U with inverse pivots
-    indefinite_out: wp.array[int],  # (system_count,), 1 where a pivot had to be raised
-):
-    """Launch :func:`factor_system`."""
-    i, lane = wp.tid()
-    factor_system(
-        system_world,
-        active,
-        block_count,
-        part_blocks,
-        pattern,
-        team,
-        width,
-        matrix,
-        unit,
-        diagonal_out,
-        indefinite_out,
-        i,
-        lane,
-    )
-
-
-@wp.func
-def back_substitute(
-    matrix: wp.array3d[vec8],
-    diagonal: wp.array2d[vec8],
-    pattern: wp.array3d[int],
-    right: wp.array2d[float],
-    solution: wp.array2d[vec8],
-    i: int,
-    lane: int,
-    team: int,
-):
-    """Solve U x = right of system i from the last row up; overwrites ``right`` and ends with a barrier."""
-    block_count = solution.shape[1]
-    part_blocks = block_count / pattern.shape[1]
-    for step in range(block_count):
-        block = block_count - 1 - step
-        first = LANES * block
-        x = vec8()
-        for reverse in range(8):
-            a = 7 - reverse
-            value = right[i, first + a]
-            d = diagonal[i, first + a]
-            for b in range(8):
-                if b > a:
-                    value -= d[b] * x[b]
-            x[a] = value * d[a]
-        if lane == 0:
-            solution[i, block] = x
-        for row in range(lane, first, team):
-            if related(pattern, i, row / (LANES * part_blocks), block / part_blocks):
-                right[i, row] = right[i, row] - sum8(wp.cw_mul(matrix[i, row, block], x))
-        barrier()
-
-
-@wp.func
-def solve_system(
-    # Selection:
-    system_world: wp.array[int],
-    active: wp.array[int],
-    block_count: int,
-    column: int,
-    team: int,
-    # Factor:
-    matrix: wp.array3d[vec8],  # (system_count, N, (N + M) / 8)
-    diagonal: wp.array2d[vec8],  # (system_count, N)
-    pattern: wp.array3d[int],
-    # Schur correction:
-    tail: wp.array2d[wp.float64],  # (world_count, tail_count): unknowns already known
-    tail_count: int,
-    # Scratch:
-    right: wp.array2d[float],  # (system_count, N)
-    # Out:
-    solution_out: wp.array2d[vec8],  # (system_count, N / 8)
-    i: int,
-    lane: int,
-):
-    """Solve U x = y - Y t from the last row up; y is right-hand column ``column``, Y the ``tail_count`` first ones."""
-    world = system_world[i]
-    if active[world] == 0:
-        return
-    for row in range(lane, LANES * block_count, team):
-        value = matrix[i, row, block_count + column / 8][column % 8]
-        for j in range(tail_count):
-            value -= matrix[i, row, block_count + j / 8][j % 8] * float(tail[world, j])
-        right[i, row] = value
-    barrier()
-    back_substitute(matrix, diagonal, pattern, right, solution_out, i, lane, team)
-
-
-@wp.kernel
-def _solve(
-    # Selection:
-    system_world: wp.array[int],
-    active: wp.array[int],
-    block_count: int,
-    column: int,
-    team: int,
-    # Factor:
-    matrix: wp.array3d[vec8],  # (system_count, N, (N + M) / 8)
-    diagonal: wp.array2d[vec8],  # (system_count, N)
-    pattern: wp.array3d[int],
-    # Schur correction:
-    tail: wp.array2d[wp.float64],  # (world_count, tail_count): unknowns already known
-    tail_count: int,
-    # Scratch:
-    right: wp.array2d[float],  # (system_count, N)
-    # Out:
-    solution_out: wp.array2d[vec8],  # (system_count, N / 8)
-):
-    """Launch :func:`solve_system`."""
-    i, lane = wp.tid()
-    solve_system(
-        system_world,
-        active,
-        block_count,
-        column,
-        team,
-        matrix,
-        diagonal,
-        pattern,
-        tail,
-        tail_count,
-        right,
-        solution_out,
-        i,
-        lane,
-    )
-
-
-@wp.kernel
-def _order_parts(
-    # In and out:
-    relation: wp.array3d[int],  # (system_count, part_count, part_count), symmetric
-    # Out:
-    place: wp.array2d[int],  # (system_count, part_count)
-    pattern: wp.array3d[int],  # (system_count, part_count, part_count), upper triangle
-):
-    """Eliminate the part with the fewest relations, the first of them, until none is left.
-
-    What is related to it becomes related to each other: the fill. Parts that do not exist come last.
-    """
-    i = wp.tid()
-    count = pattern.shape[1]
-    for part in range(count):
-        place[i, part] = -1
-    for step in range(count):
-        best = int(-1)
-        least = 2 * count
-        for part in range(count):
-            if place[i, part] < 0:
-                degree = wp.where(relation[i, part, part] != 0, 0, count)
-                for other in range(count):
-                    if place[i, other] < 0 and other != part and relation[i, part, other] != 0:
-                        degree += 1
-                if degree < least:
-                    least = degree
-                    best = part
-        place[i, best] = step
-        for part in range(count):
-            if place[i, part] < 0 and relation[i, best, part] != 0:
-                for other in range(count):
-                    if place[i, other] < 0 and relation[i, best, other] != 0:
-                        relation[i, part, other] = 1
-    for part in range(count):
-        for other in range(count):
-            if place[i, part] < place[i, other]:
-                pattern[i, place[i, part], place[i, other]] = relation[i, part, other]
+from softmode.deformables.model.declare import Kernel, launch, launch_teams
+from softmode.deformables.model.lane_kernels import LANES, TEAM, pad, vec8
+from softmode.deformables.solver import factor_kernels as kernels
 
 
 class BlockCholesky:
@@ -346,7 +19,9 @@ class BlockCholesky:
         part_count: Equal parts that a system is made of; ``relation`` says which are related.
     """
 
-    def __init__(self, system_world: wp.array, size: int, column_count: int, device: Any, part_count: int = 1) -> None:
+    def __init__(
+        self, system_world: wp.array, size: int, column_count: int, device: wp.Device, part_count: int = 1
+    ) -> None:
         """Allocate everything once."""
         self.system_world = system_world
         self.system_count = system_world.shape[0]
@@ -368,7 +43,7 @@ class BlockCholesky:
         self.team, self.width, self.unit = 1, LANES, self.matrix
         if wp.get_device(device).is_cuda:
             self.team, self.width, self.unit = min(-(-LANES * total // TEAM) * TEAM, 8 * TEAM), 1, self.scalars
-        self._factor = wp.overload(_factor, {"unit": self.unit})
+        self._factor = wp.overload(kernels.factor, {"unit": self.unit})
         self.indefinite = wp.zeros(self.system_count, dtype=int, device=device)
         self.diagonal = wp.zeros((self.system_count, size), dtype=vec8, device=device)
         self.right = wp.zeros((self.system_count, size), dtype=float, device=device)
@@ -376,26 +51,30 @@ class BlockCholesky:
 
     def order_parts(self) -> None:
         """Choose ``place`` for the parts related by ``relation``; complete both that and ``pattern`` by the fill."""
-        tables = [self.relation, self.place, self.pattern]
-        wp.launch(_order_parts, dim=self.system_count, inputs=tables, device=self.device)
+        launch(self.device, kernels.order_parts, self.system_count, self.relation, self.place, self.pattern)
 
     def factor(self, active: wp.array) -> None:
         """Replace [A | B] by [U | U^-T B] in the active worlds; only the upper triangle of A is read.
 
         Sets ``indefinite`` where a pivot had to be raised.
         """
-        parts = [self.block_count // self.pattern.shape[1], self.pattern]
-        selection = [self.system_world, active, self.block_count, *parts, self.team, self.width]
-        self._launch(self._factor, [*selection, self.matrix, self.unit], [self.diagonal, self.indefinite])
+        parts = (self.block_count // self.pattern.shape[1], self.pattern, self.team, self.width)
+        system = (self.matrix, self.unit, self.diagonal, self.indefinite)
+        self._launch(self._factor, active, self.block_count, *parts, *system)
 
     def solve(self, active: wp.array, column: int, tail: wp.array, tail_count: int) -> wp.array:
-        """Return x of U x = y - Y tail, shape (system_count, N / 8) of 8-vectors."""
-        selection = [self.system_world, active, self.block_count, column, self.team]
-        system = [self.matrix, self.diagonal, self.pattern, tail, tail_count, self.right]
-        self._launch(_solve, [*selection, *system], [self.solution])
+        """Return x of U x = y - Y tail, shape (system_count, N / 8) of 8-vectors.
+
+        Args:
+            active: Whether each world's systems are solved, shape (world_count,).
+            column: Right-hand column y.
+            tail: Unknowns already known, shape (world_count, tail_count); Y are the first right-hand columns.
+            tail_count: How many.
+        """
+        system = (self.matrix, self.diagonal, self.pattern, tail, tail_count, self.right)
+        self._launch(kernels.solve, active, self.block_count, column, self.team, *system, self.solution)
         return self.solution
 
-    def _launch(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
+    def _launch(self, kernel: Kernel, active: wp.array, *arguments: object) -> None:
         """Launch one team per system."""
-        dim = (self.system_count, self.team)
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, block_dim=self.team, device=self.device)
+        launch_teams(self.device, kernel, self.system_count, self.team, self.system_world, active, *arguments)

@@ -9,9 +9,18 @@ from typing import Any
 
 import warp as wp
 
-from softmode.deformables.contact.penalty_kernels import evaluate_entry
+from softmode.deformables.contact.penalty_kernels import evaluate_constraint
+from softmode.deformables.model.declare import struct
 from softmode.deformables.model.lane_kernels import LANES, barrier, vec8, vec8d
-from softmode.deformables.model.struct_kernels import Basis, Entries, Instances, Motion, Points, Progress, Rigid
+from softmode.deformables.model.struct_kernels import (
+    Basis,
+    Instances,
+    Motion,
+    NewtonState,
+    PointConstraints,
+    Points,
+    Rigid,
+)
 from softmode.deformables.solver.assembly_kernels import (
     column_block,
     condensed_entry,
@@ -21,10 +30,10 @@ from softmode.deformables.solver.assembly_kernels import (
     solve_rigid_team,
     stiffness_block,
 )
-from softmode.deformables.solver.factor import factor_system, solve_system
+from softmode.deformables.solver.factor_kernels import factor_system, solve_system
 from softmode.deformables.solver.fused_system_kernels import shared_system, sum_forces_of
 from softmode.deformables.solver.rigid_row_kernels import evaluate_row
-from softmode.deformables.solver.search_kernels import begin_world_search, finish_world, judge_world, judge_world_trial
+from softmode.deformables.solver.search_kernels import accept_step, check_convergence, check_trial, start_line_search
 from softmode.deformables.solver.step_kernels import evaluate_point, gradient_block, sum_force_block
 
 wp.set_module_options({"enable_backward": False})
@@ -33,7 +42,7 @@ TEAM = 96
 """Threads that share a world on CUDA."""
 
 
-@wp.struct
+@struct
 class NewtonOptions:
     """How the iteration goes, see ``SolverReducedOptions``."""
 
@@ -41,8 +50,8 @@ class NewtonOptions:
     force_tolerance: wp.float64
     stick_range: wp.float64  # [m]
     step_length_min: wp.float64
-    renewal: int
-    renewal_distance: float
+    refresh_interval: int
+    refresh_distance: float
     rigid_max: int  # joint dofs that there is room for
     gradient_chunks: int
     stiffness_chunks: int
@@ -51,7 +60,7 @@ class NewtonOptions:
     dt: wp.float64
 
 
-@wp.struct
+@struct
 class NewtonArrays:
     """What the phases hand on, see ``SolverReduced``."""
 
@@ -80,55 +89,55 @@ def minimise_worlds(
     basis: Basis,
     motion: Motion,
     points: Points,
-    entries: Entries,
+    constraints: PointConstraints,
     rigid: Rigid,
-    progress: Progress,
+    state: NewtonState,
     options: NewtonOptions,
     arrays: NewtonArrays,
     unit: wp.array3d[Any],  # the systems in units of ``factor_width`` columns
     team: int,
 ):
     """Minimise the incremental potential of every world by Newton with a line search."""
-    w, lane = wp.tid()
+    w, member = wp.tid()
     dt = options.dt
-    begin = progress.instance_start[w]
-    end = progress.instance_start[w + 1]
+    begin = state.instance_start[w]
+    end = state.instance_start[w + 1]
     blocks = basis.row.shape[1]
     n = rigid.count[w]
     tasks = 3 * blocks * blocks + 3 * (blocks * blocks + blocks) / 2
     trial = int(0)
-    while progress.active[w] != 0:
+    while state.active[w] != 0:
         if trial == 0:
             for i in range(begin, end):
-                for e in range(lane, 3 * blocks, team):
+                for e in range(member, 3 * blocks, team):
                     arrays.q_trial[i, e] = arrays.q[i, e]
-            for j in range(lane, n, team):
+            for j in range(member, n, team):
                 rigid.trial[w, j] = rigid.r[w, j]
             barrier()
         # one copy of this code serves iterates and trials
         for i in range(begin, end):
-            for p in range(lane, instances.point_count[i], team):
+            for p in range(member, instances.point_count[i], team):
                 evaluate_point(
-                    instances, basis, motion, progress.active, arrays.q_trial, dt, 1 - trial, progress, points, i, p
+                    instances, basis, motion, state.active, arrays.q_trial, dt, 1 - trial, state, points, i, p
                 )
-            for e in range(lane, entries.count[i], team):
-                evaluate_entry(
+            for e in range(member, constraints.count[i], team):
+                evaluate_constraint(
                     instances,
                     basis,
                     motion,
-                    progress,
+                    state,
                     rigid,
                     options.stick_range,
-                    progress.active,
+                    state.active,
                     arrays.q_trial,
                     rigid.trial,
                     1 - trial,
-                    entries,
+                    constraints,
                     i,
                     e,
                 )
-        for k in range(lane, rigid.row_count[w], team):
-            evaluate_row(progress.active, rigid.trial, dt, 1 - trial, rigid, w, k)
+        for k in range(member, rigid.row_count[w], team):
+            evaluate_row(state.active, rigid.trial, dt, 1 - trial, rigid, w, k)
         barrier()
         if trial == 0:
             for i in range(begin, end):
@@ -136,25 +145,25 @@ def minimise_worlds(
                     sum_forces_of(
                         points.stress,
                         basis.gradient_across,
-                        entries.row,
-                        entries.force,
-                        entries.count[i],
+                        constraints.row,
+                        constraints.force,
+                        constraints.count[i],
                         basis.row,
                         instances.point_start[i],
                         instances.point_count[i],
                         arrays.gradient_chunk,
                         i,
-                        lane,
+                        member,
                         team,
                     )
                 else:
-                    for t in range(lane, options.gradient_chunks * blocks, team):
+                    for t in range(member, options.gradient_chunks * blocks, team):
                         sum_force_block(
                             instances,
                             basis,
                             points,
-                            entries,
-                            progress.active,
+                            constraints,
+                            state.active,
                             options.gradient_chunks,
                             arrays.gradient_chunk,
                             i,
@@ -162,12 +171,12 @@ def minimise_worlds(
                             t % blocks,
                         )
                 barrier()
-                for e in range(lane, 3 * blocks, team):
+                for e in range(member, 3 * blocks, team):
                     gradient_block(
                         instances,
                         basis,
                         motion,
-                        progress.active,
+                        state.active,
                         arrays.gradient_chunk,
                         arrays.q,
                         dt,
@@ -177,11 +186,11 @@ def minimise_worlds(
                         e,
                     )
             barrier()
-            judge_world(
+            check_convergence(
                 instances,
                 motion,
                 points,
-                entries,
+                constraints,
                 rigid,
                 team,
                 options.iteration_max,
@@ -189,21 +198,21 @@ def minimise_worlds(
                 arrays.gradient,
                 arrays.q,
                 dt,
-                progress,
+                state,
                 w,
-                lane,
+                member,
             )
             barrier()
-            if progress.active[w] != 0:
+            if state.active[w] != 0:
                 for i in range(begin, end):
-                    if progress.renew[w] != 0:
-                        for t in range(lane, options.stiffness_chunks * tasks, team):
+                    if state.refresh[w] != 0:
+                        for t in range(member, options.stiffness_chunks * tasks, team):
                             stiffness_block(
                                 instances,
                                 basis,
                                 points,
-                                progress.active,
-                                progress.renew,
+                                state.active,
+                                state.refresh,
                                 options.stiffness_chunks,
                                 arrays.stiffness,
                                 i,
@@ -213,12 +222,12 @@ def minimise_worlds(
                         barrier()
                     if options.shared == 0:
                         columns = 3 * blocks
-                        for t in range(lane, 3 * LANES * blocks * columns, team):
+                        for t in range(member, 3 * LANES * blocks * columns, team):
                             matrix_row(
                                 instances,
                                 basis,
                                 motion,
-                                progress.active,
+                                state.active,
                                 arrays.stiffness,
                                 arrays.pins,
                                 dt,
@@ -229,14 +238,14 @@ def minimise_worlds(
                                 t % columns,
                             )
                         barrier()
-                        for t in range(lane, tasks, team):
-                            contact_block(instances, basis, entries, progress.active, arrays.matrix, i, t)
-                    for t in range(lane, 3 * blocks * (options.rigid_max + 1), team):
+                        for t in range(member, tasks, team):
+                            contact_block(instances, basis, constraints, state.active, arrays.matrix, i, t)
+                    for t in range(member, 3 * blocks * (options.rigid_max + 1), team):
                         column_block(
                             instances,
                             basis,
-                            entries,
-                            progress.active,
+                            constraints,
+                            state.active,
                             arrays.gradient,
                             rigid,
                             options.rigid_max,
@@ -246,8 +255,8 @@ def minimise_worlds(
                             t / (options.rigid_max + 1),
                             t % (options.rigid_max + 1),
                         )
-                for t in range(lane, n * n, team):
-                    rigid_entry(instances, entries, progress, rigid, w, t / n, t % n)
+                for t in range(member, n * n, team):
+                    rigid_entry(instances, constraints, state, rigid, w, t / n, t % n)
                 barrier()
                 inertia = float(0.0)
                 if options.shared != 0:
@@ -258,9 +267,9 @@ def minimise_worlds(
                         0,
                         arrays.stiffness,
                         inertia,
-                        entries.row,
-                        entries.hessian,
-                        entries.count[begin],
+                        constraints.row,
+                        constraints.hessian,
+                        constraints.count[begin],
                         basis.row,
                         arrays.scalars,
                         LANES * arrays.direction.shape[1],
@@ -272,13 +281,13 @@ def minimise_worlds(
                         arrays.direction,
                         arrays.system_start[w],
                         w,
-                        lane,
+                        member,
                         team,
                     )
                 for s in range(arrays.system_start[w], arrays.system_start[w + 1 - options.shared]):
                     factor_system(
                         arrays.system_world,
-                        progress.active,
+                        state.active,
                         3 * blocks,
                         3 * blocks,
                         arrays.pattern,
@@ -289,13 +298,13 @@ def minimise_worlds(
                         arrays.diagonal,
                         arrays.indefinite,
                         s,
-                        lane,
+                        member,
                     )
                 barrier()
                 if n > 0:
-                    for t in range(lane, n * (n + 1), team):
+                    for t in range(member, n * (n + 1), team):
                         condensed_entry(
-                            progress,
+                            state,
                             arrays.system_start,
                             options.rigid_max,
                             arrays.matrix,
@@ -305,16 +314,16 @@ def minimise_worlds(
                             t % (n + 1),
                         )
                     barrier()
-                    solve_rigid_team(progress.active, team, rigid, w, lane)
+                    solve_rigid_team(state.active, team, rigid, w, member)
                     barrier()
                 if options.shared != 0:
                     shared_system(
                         1,
                         arrays.stiffness,
                         inertia,
-                        entries.row,
-                        entries.hessian,
-                        entries.count[begin],
+                        constraints.row,
+                        constraints.hessian,
+                        constraints.count[begin],
                         basis.row,
                         arrays.scalars,
                         LANES * arrays.direction.shape[1],
@@ -326,13 +335,13 @@ def minimise_worlds(
                         arrays.direction,
                         arrays.system_start[w],
                         w,
-                        lane,
+                        member,
                         team,
                     )
                 for s in range(arrays.system_start[w], arrays.system_start[w + 1 - options.shared]):
                     solve_system(
                         arrays.system_world,
-                        progress.active,
+                        state.active,
                         3 * blocks,
                         options.rigid_max,
                         team,
@@ -344,12 +353,12 @@ def minimise_worlds(
                         arrays.right,
                         arrays.direction,
                         s,
-                        lane,
+                        member,
                     )
                 barrier()
-                begin_world_search(
+                start_line_search(
                     instances,
-                    entries,
+                    constraints,
                     rigid,
                     arrays.rigid_tolerance,
                     options.stick_range,
@@ -357,48 +366,48 @@ def minimise_worlds(
                     arrays.gradient,
                     arrays.direction,
                     arrays.indefinite,
-                    progress,
+                    state,
                     w,
-                    lane,
+                    member,
                 )
         else:
-            judge_world_trial(
+            check_trial(
                 instances,
                 motion,
                 points,
-                entries,
+                constraints,
                 rigid,
                 team,
                 options.step_length_min,
                 arrays.q_trial,
                 dt,
-                progress,
+                state,
                 w,
-                lane,
+                member,
             )
         barrier()
-        if progress.active[w] != 0:
-            trial = progress.searching[w]
+        if state.active[w] != 0:
+            trial = state.searching[w]
             if trial != 0:
-                alpha = progress.step_length[w]
+                alpha = state.step_length[w]
                 for i in range(begin, end):
-                    for e in range(lane, 3 * blocks, team):
+                    for e in range(member, 3 * blocks, team):
                         arrays.q_trial[i, e] = arrays.q[i, e] + alpha * vec8d(arrays.direction[i, e])
-                for j in range(lane, n, team):
+                for j in range(member, n, team):
                     rigid.trial[w, j] = rigid.r[w, j] + alpha * rigid.direction[w, j]
                 barrier()
             else:
-                finish_world(
+                accept_step(
                     instances,
                     rigid,
                     team,
-                    options.renewal,
-                    options.renewal_distance,
+                    options.refresh_interval,
+                    options.refresh_distance,
                     float(dt),
                     arrays.direction,
                     arrays.q,
-                    progress,
+                    state,
                     w,
-                    lane,
+                    member,
                 )
                 barrier()

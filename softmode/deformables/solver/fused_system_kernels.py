@@ -15,14 +15,19 @@ SHARED_WIDTH = 88
 """most columns, the right-hand ones included: static shared memory ends at 48 kB."""
 
 
+def _sized(snippet: str) -> str:
+    """Return CUDA source with the sizes of the shared system in the places of their names."""
+    return snippet.replace("SHARED_SIZE", str(SHARED_SIZE)).replace("SHARED_WIDTH", str(SHARED_WIDTH))
+
+
 @wp.func_native(
-    snippet="""
+    snippet=_sized("""
 #if defined(__CUDA_ARCH__)
     // mode 0: assemble A, load B, factor, write U^-T B back; mode 1: solve with the factor that is there
-    __shared__ __align__(16) float A[72 * 88];
-    __shared__ __align__(16) float D[72 * 8];
-    __shared__ float right[72];
-    const int stride = 88;
+    __shared__ __align__(16) float A[SHARED_SIZE * SHARED_WIDTH];
+    __shared__ __align__(16) float D[SHARED_SIZE * 8];
+    __shared__ float right[SHARED_SIZE];
+    const int stride = SHARED_WIDTH;
     const int N = size;
     const int W = width;
     float* g = (float*)scalars.data + (size_t)i * N * W;
@@ -30,7 +35,7 @@ SHARED_WIDTH = 88
         const float* K = (const float*)stiffness.data + (size_t)i * stiffness.shape[1] * N * N;
         const int quads = N / 4;
         #pragma unroll 4
-        for (int t = lane; t < N * quads; t += team) {
+        for (int t = member; t < N * quads; t += team) {
             const int row = t / quads;
             const int first = 4 * (t - row * quads);
             if (first >= (row & ~7)) {
@@ -48,23 +53,23 @@ SHARED_WIDTH = 88
             }
         }
         #pragma unroll 4
-        for (int t = lane; t < N * (W - N); t += team) {
+        for (int t = member; t < N * (W - N); t += team) {
             const int row = t / (W - N);
             const int at = N + t - row * (W - N);
             A[row * stride + at] = g[row * W + at];
         }
         __syncthreads();
         const int blocks = N / 24;
-        const int* rows = (const int*)entry_row.data + (size_t)i * entry_row.shape[1];
-        const float* H = (const float*)entry_hessian.data + (size_t)i * entry_hessian.shape[1] * 9;
+        const int* rows = (const int*)constraint_row.data + (size_t)i * constraint_row.shape[1];
+        const float* H = (const float*)constraint_hessian.data + (size_t)i * constraint_hessian.shape[1] * 9;
         const float* basis = (const float*)basis_row.data;
         // half blocks, 4 x 8: of the components (c, d), rows 4 k of the functions, columns 8 m
-        for (int t = lane; t < 9 * 2 * blocks * blocks; t += team) {
+        for (int t = member; t < 9 * 2 * blocks * blocks; t += team) {
             const int c = t / (6 * blocks * blocks);
             const int d = (t / (2 * blocks * blocks)) % 3;
             const int k = (t / blocks) % (2 * blocks);
             const int m = t % blocks;
-            if (c > d || (c == d && m < k / 2) || entry_count == 0) continue;
+            if (c > d || (c == d && m < k / 2) || constraint_count == 0) continue;
             float sum[4][8];
             #pragma unroll
             for (int a = 0; a < 4; ++a) {
@@ -72,7 +77,7 @@ SHARED_WIDTH = 88
                 for (int b = 0; b < 8; ++b) sum[a][b] = 0.0f;
             }
             #pragma unroll 4
-            for (int e = 0; e < entry_count; ++e) {
+            for (int e = 0; e < constraint_count; ++e) {
                 const float* r = basis + (size_t)rows[e] * 8 * blocks;
                 const float h = H[9 * e + 3 * c + d];
                 const float4 u = *(const float4*)&r[4 * k];
@@ -98,7 +103,7 @@ SHARED_WIDTH = 88
         __syncthreads();
         int bad = 0;
         for (int first = 0; first < N; first += 8) {
-            for (int l = first + lane; l < W; l += team) {
+            for (int l = first + member; l < W; l += team) {
                 float r[8];
                 #pragma unroll
                 for (int a = 0; a < 8; ++a) r[a] = A[(first + a) * stride + l];
@@ -133,14 +138,14 @@ SHARED_WIDTH = 88
                 for (int b = a; b < 8; ++b) U[a][b] = inverse * row[b];
                 U[a][a] = inverse;
             }
-            if (lane == 0) {
+            if (member == 0) {
                 #pragma unroll
                 for (int a = 0; a < 8; ++a) {
                     #pragma unroll
                     for (int b = a; b < 8; ++b) D[(first + a) * 8 + b] = U[a][b];
                 }
             }
-            for (int l = first + 8 + lane; l < W; l += team) {
+            for (int l = first + 8 + member; l < W; l += team) {
                 float x[8];
                 #pragma unroll
                 for (int a = 0; a < 8; ++a) {
@@ -154,11 +159,11 @@ SHARED_WIDTH = 88
             }
             __syncthreads();
         }
-        if (lane == 0) indefinite.data[i] = bad;
+        if (member == 0) indefinite.data[i] = bad;
         return;
     }
     const double* t = (const double*)tail.data + (size_t)world * tail.shape[1];
-    for (int row = lane; row < N; row += team) {
+    for (int row = member; row < N; row += team) {
         float value = A[row * stride + N + column];
         for (int j = 0; j < tail_count; ++j) value -= A[row * stride + N + j] * (float)t[j];
         right[row] = value;
@@ -174,11 +179,11 @@ SHARED_WIDTH = 88
             for (int b = a + 1; b < 8; ++b) value -= D[(first + a) * 8 + b] * x[b];
             x[a] = value * D[(first + a) * 8 + a];
         }
-        if (lane == 0) {
+        if (member == 0) {
             #pragma unroll
             for (int a = 0; a < 8; ++a) out[first + a] = x[a];
         }
-        for (int row = lane; row < first; row += team) {
+        for (int row = member; row < first; row += team) {
             float value = right[row];
             #pragma unroll
             for (int b = 0; b < 8; ++b) value -= A[row * stride + first + b] * x[b];
@@ -187,15 +192,15 @@ SHARED_WIDTH = 88
         __syncthreads();
     }
 #endif
-"""
+""")
 )
 def shared_system(
     mode: int,
     stiffness: wp.array4d[vec8],  # (instance_count, chunk_count, size, size / 8), upper triangle
     inertia: float,
-    entry_row: wp.array2d[int],
-    entry_hessian: wp.array2d[wp.mat33],
-    entry_count: int,
+    constraint_row: wp.array2d[int],
+    constraint_hessian: wp.array2d[wp.mat33],
+    constraint_count: int,
     basis_row: wp.array2d[vec8],
     scalars: wp.array3d[float],  # (system_count, size, width), from column ``size`` on B, and after mode 0 U^-T B
     size: int,
@@ -207,7 +212,7 @@ def shared_system(
     solution: wp.array2d[vec8],  # (system_count, size / 8)
     i: int,
     world: int,
-    lane: int,
+    member: int,
     team: int,
 ) -> None:
     """Assemble and factor system ``i`` (mode 0), later solve it (mode 1). CUDA only, one body per world, no pins."""
@@ -220,11 +225,11 @@ def shared_system(
     const int blocks = basis_row.shape[1];
     const int n = 8 * blocks;
     const double* P = (const double*)stress.data + (size_t)i * stress.shape[1] * 9;
-    const double* F = (const double*)entry_force.data + (size_t)i * entry_force.shape[1] * 3;
-    const int* rows = (const int*)entry_row.data + (size_t)i * entry_row.shape[1];
+    const double* F = (const double*)constraint_force.data + (size_t)i * constraint_force.shape[1] * 3;
+    const int* rows = (const int*)constraint_row.data + (size_t)i * constraint_row.shape[1];
     const float* basis = (const float*)basis_row.data;
     double* out = (double*)chunk.data + (size_t)i * chunk.shape[1] * 3 * n;
-    for (int t = lane; t < 3 * n; t += team) {
+    for (int t = member; t < 3 * n; t += team) {
         const int axis = t / n;
         const int k = t - axis * n;
         // points in memory one after another, three rows of n functions each
@@ -237,7 +242,7 @@ def shared_system(
             value += P[9 * p + 3 * axis + 2] * (double)G[3 * n * p + 2 * n];
         }
         #pragma unroll 8
-        for (int e = 0; e < entry_count; ++e) value -= F[3 * e + axis] * (double)basis[(size_t)rows[e] * n + k];
+        for (int e = 0; e < constraint_count; ++e) value -= F[3 * e + axis] * (double)basis[(size_t)rows[e] * n + k];
         out[t] = value;
     }
 #endif
@@ -246,16 +251,16 @@ def shared_system(
 def sum_forces_of(
     stress: wp.array2d[wp.mat33d],  # (instance_count, point_max)
     gradient: wp.array3d[vec8],  # ``basis.gradient_across``, on CUDA with blocks side by side
-    entry_row: wp.array2d[int],
-    entry_force: wp.array2d[wp.vec3d],
-    entry_count: int,
+    constraint_row: wp.array2d[int],
+    constraint_force: wp.array2d[wp.vec3d],
+    constraint_count: int,
     basis_row: wp.array2d[vec8],
     first_point: int,
     point_count: int,
     chunk: wp.array3d[vec8d],  # (instance_count, 1, 3 block_count)
     i: int,
-    lane: int,
+    member: int,
     team: int,
 ) -> None:
-    """Sum V P grad b_k over the points, less b_k f over the entries, a thread per unknown. CUDA only."""
+    """Sum V P grad b_k over the points, less b_k f over the constraints, a thread per unknown. CUDA only."""
     ...

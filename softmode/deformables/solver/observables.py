@@ -8,7 +8,8 @@ import newton
 import warp as wp
 from newton.solvers import SolverBase
 
-from softmode.deformables.model.authoring import NAMESPACE
+from softmode.deformables.model.declare import WRENCH
+from softmode.deformables.model.namespaces import NAMESPACE
 
 
 class ReducedObservableKind(SolverBase.ObservableKind):
@@ -25,15 +26,13 @@ REDUCED_KINDS = frozenset({ReducedObservableKind.BODY_SOFT_CONTACT_F, ReducedObs
 RIGID_KINDS = frozenset({SolverBase.ObservableKind.BODY_QDD, SolverBase.ObservableKind.BODY_PARENT_F})
 """What the joint solve passes on from its rigid solver."""
 
-_WRENCH: Any = wp.spatial_vector
-
 
 @dataclass(eq=False)
 class ReducedObservables(SolverBase.Observables):
     """Arrays that a step fills, allocated by ``solver.observables``."""
 
     body_soft_contact_f: wp.array | None = SolverBase.Observables.field(  # noqa: RUF009
-        dtype=_WRENCH, frequency=newton.Model.AttributeFrequency.BODY
+        dtype=WRENCH, frequency=newton.Model.AttributeFrequency.BODY
     )
     """Wrench about the centre of mass of each rigid body [N, N m], shape (body_count,)."""
     instance_contact_f: wp.array | None = SolverBase.Observables.field(  # noqa: RUF009

@@ -8,7 +8,8 @@ import warp as wp
 
 from softmode.deformables.model import parameter_kernels as kernels
 from softmode.deformables.model.authoring import SCALE_MAX, SCALE_MIN
-from softmode.deformables.solver.solver_reduced import SolverReduced
+from softmode.deformables.model.tables import host
+from softmode.deformables.solver.reduced_solver import ReducedSolver, require_reduced
 from softmode.errors import ConfigError
 
 PARAMETER_LIMITS: dict[str, tuple[float, float]] = {
@@ -24,7 +25,7 @@ PARAMETER_FLAGS = {name: 1 << k for k, name in enumerate(PARAMETER_LIMITS)} | {"
 
 
 def set_parameters(
-    solver: Any,
+    solver: ReducedSolver,
     world_mask: wp.array | None = None,
     *,
     youngs_modulus: wp.array | None = None,
@@ -56,7 +57,7 @@ def set_parameters(
     Raises:
         ConfigError: If an array has another shape or type or lies on another device, or the mask has.
     """
-    reduced = _reduced(solver)
+    tables = require_reduced(solver).tables
     given, parameters = kernels.Parameters(), kernels.Parameters()
     named = {
         "youngs_modulus": youngs_modulus,
@@ -66,27 +67,18 @@ def set_parameters(
         "scale": scale,
     }
     for name, values in named.items():
-        own = getattr(reduced.parameters, name)
+        own = getattr(tables.parameters, name)
         setattr(parameters, name, own)
         setattr(given, name, own if values is None else _checked(name, values, own))
-    limits = [wp.vec2(*pair) for pair in PARAMETER_LIMITS.values()]
-    mask = reduced.checked_mask(world_mask)
-    wp.launch(
-        kernels.write_parameters,
-        dim=reduced.instance_count,
-        inputs=[
-            reduced.instances,
-            given,
-            *limits,
-            PARAMETER_FLAGS["held_scale"],
-            reduced.parameters.instance_world,
-            mask,
-        ],
-        outputs=[parameters, reduced.parameter_flags],
-        device=reduced.model.device,
+    limits = [wp.vec2(*PARAMETER_LIMITS[name]) for name in named]
+    mask = solver.checked_mask(world_mask)
+    masked = (PARAMETER_FLAGS["held_scale"], tables.parameters.instance_world, mask)
+    out = (parameters, tables.parameter_flags)
+    tables.launch(
+        kernels.write_parameters, tables.layout.instance_count, tables.instances, given, *limits, *masked, *out
     )
-    reduced.refresh(mask)
-    return reduced.parameter_flags
+    solver.refresh(mask)
+    return tables.parameter_flags
 
 
 class ShapeFriction:
@@ -105,11 +97,11 @@ class ShapeFriction:
             added after ``replicate``, has one friction for all.
     """
 
-    def __init__(self, solver: Any, shapes: Sequence[int]) -> None:
+    def __init__(self, solver: ReducedSolver, shapes: Sequence[int]) -> None:
         """Find the shapes of every world."""
-        self._reduced = reduced = _reduced(solver)
-        model, worlds = reduced.model, reduced.world_count
-        owner = model.shape_world.numpy()[: model.shape_count] if model.shape_count else np.zeros(0, int)
+        self._solver = require_reduced(solver)
+        model, worlds = solver.model, solver.world_count
+        owner = host(model.shape_world)[: model.shape_count] if model.shape_count else np.zeros(0, int)
         chosen, table = [int(s) for s in shapes], []
         for w in range(worlds):
             mine = np.flatnonzero((owner == w) | ((owner < 0) & (worlds == 1)))
@@ -135,32 +127,11 @@ class ShapeFriction:
         Raises:
             ConfigError: As :func:`set_parameters`.
         """
-        reduced = self._reduced
-        like: Any = self._flags
-        values = _checked("friction", friction, like)
-        mask = reduced.checked_mask(world_mask)
-        wp.launch(
-            kernels.write_shape_friction,
-            dim=reduced.world_count,
-            inputs=[
-                self._shape,
-                values,
-                wp.vec2(*PARAMETER_LIMITS["friction"]),
-                PARAMETER_FLAGS["friction"],
-                mask,
-            ],
-            outputs=[reduced.model.shape_material_mu, self._flags],
-            device=reduced.model.device,
-        )
+        values, mask = _checked("friction", friction, self._flags), self._solver.checked_mask(world_mask)
+        given = (self._shape, values, wp.vec2(*PARAMETER_LIMITS["friction"]), PARAMETER_FLAGS["friction"], mask)
+        out = (self._solver.model.shape_material_mu, self._flags)
+        self._solver.tables.launch(kernels.write_shape_friction, self._solver.world_count, *given, *out)
         return self._flags
-
-
-def _reduced(solver: Any) -> SolverReduced:
-    """Return the reduced solver itself or inside a coupled one."""
-    reduced = getattr(solver, "reduced", solver)
-    if not isinstance(reduced, SolverReduced):
-        raise ConfigError(f"solver is a {type(solver).__name__}", hint="pass a SolverReduced or a SolverCoupledReduced")
-    return reduced
 
 
 def _checked(name: str, values: Any, like: Any) -> wp.array:

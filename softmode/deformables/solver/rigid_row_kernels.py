@@ -12,6 +12,7 @@ that opens a contact meets nothing once it is open, and one that closes a row wh
 
 import warp as wp
 
+from softmode.deformables.model.declare import kernel_over, struct
 from softmode.deformables.model.struct_kernels import Rigid
 
 wp.set_module_options({"enable_backward": False})
@@ -26,7 +27,7 @@ MEMBER = wp.constant(-1)
 """Kind of the rows of an elliptic cone behind its first."""
 
 
-@wp.struct
+@struct
 class MujocoRows:
     """Constraint rows of mujoco_warp after a step, its ``Data.efc`` and what it refers to."""
 
@@ -48,7 +49,7 @@ class MujocoRows:
     dof: wp.array2d[int]  # (world_count, nv), Newton's dof of each of MuJoCo's, -1 for none
 
 
-@wp.struct
+@struct
 class TurnedJoints:
     """Free and ball joints, whose velocities MuJoCo keeps in other frames than Newton."""
 
@@ -308,15 +309,4 @@ def evaluate_row(
                 rigid.row_coupling[w, k, j] = curvature / (dt * dt) * wp.float64(rigid.row_jacobian[w, k, j])
 
 
-@wp.kernel
-def evaluate_rows(
-    selected: wp.array[int],
-    r: wp.array2d[wp.float64],
-    dt: wp.float64,
-    derivatives: int,
-    # In and out:
-    rigid: Rigid,
-):
-    """Launch :func:`evaluate_row`."""
-    w, k = wp.tid()
-    evaluate_row(selected, r, dt, derivatives, rigid, w, k)
+evaluate_rows = kernel_over(evaluate_row, "evaluate_rows", "w", "k")

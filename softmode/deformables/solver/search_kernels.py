@@ -2,18 +2,19 @@
 
 import warp as wp
 
+from softmode.deformables.model.declare import kernel_over
 from softmode.deformables.model.lane_kernels import barrier, team_sum, vec8, vec8d
 from softmode.deformables.model.status import WORLD_ITERATION_LIMIT, WORLD_NO_DESCENT, WORLD_NOT_FINITE
 from softmode.deformables.model.struct_kernels import (
     Basis,
-    Entries,
     Instances,
     Motion,
+    NewtonState,
+    PointConstraints,
     Points,
-    Progress,
     Rigid,
     has_contacts,
-    hessian_recipe,
+    hessian_key,
     pushes,
 )
 
@@ -40,52 +41,52 @@ Newton's steps halve the penetration, and double ones end it."""
 
 @wp.func
 def potential_share(
-    progress: Progress,
+    state: NewtonState,
     instances: Instances,
     motion: Motion,
     points: Points,
-    entries: Entries,
+    constraints: PointConstraints,
     rigid: Rigid,
     q: wp.array2d[vec8d],
     r: wp.array2d[wp.float64],
     dt: wp.float64,
     w: int,
-    lane: int,
+    member: int,
     team: int,
 ):
     """Return one thread's share of the incremental potential of a world [J], in a fixed order."""
     half = wp.float64(0.5)
     total = wp.float64(0.0)
-    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
+    for i in range(state.instance_start[w], state.instance_start[w + 1]):
         c = motion.rate[i]
         inertial = half * instances.mass[i] * c * c / (dt * dt)
         damping = half * instances.mass[i] * wp.float64(instances.mass_damping[i]) * c / dt
-        for e in range(lane, q.shape[1], team):
+        for e in range(member, q.shape[1], team):
             x = q[i, e]
             away = x - motion.q_inertial[i, e]
             moved = x - motion.q_rate[i, e]
             step = x - motion.q_start[i, e]
             total += inertial * wp.dot(away, away) + damping * wp.dot(moved, moved) - wp.dot(motion.force[i, e], step)
-        for p in range(lane, instances.point_count[i], team):
+        for p in range(member, instances.point_count[i], team):
             total += points.energy[i, p]
-        for e in range(lane, entries.count[i], team):
-            total += entries.energy[i, e]
-    for j in range(lane, rigid.count[w], team):
+        for e in range(member, constraints.count[i], team):
+            total += constraints.energy[i, e]
+    for j in range(member, rigid.count[w], team):
         for l in range(rigid.count[w]):
             total += (
                 half * (r[w, j] - rigid.predicted[w, j]) * rigid.inertia[w, j, l] * (r[w, l] - rigid.predicted[w, l])
             )
-    for k in range(lane, rigid.row_count[w], team):
+    for k in range(member, rigid.row_count[w], team):
         total += rigid.row_energy[w, k]
     return total
 
 
 @wp.func
-def judge_world(
+def check_convergence(
     instances: Instances,
     motion: Motion,
     points: Points,
-    entries: Entries,
+    constraints: PointConstraints,
     rigid: Rigid,
     team: int,
     iteration_max: int,
@@ -95,92 +96,58 @@ def judge_world(
     q: wp.array2d[vec8d],
     dt: wp.float64,
     # In and out:
-    progress: Progress,
+    state: NewtonState,
     w: int,
-    lane: int,
+    member: int,
 ):
     """Sum the potential; stop a world whose last step was small and whose residual is small near its contacts.
 
     The second condition matters in contact: within a step's tolerance friction goes from one side of its cone to the
     other, and a residual is momentum that the other body receives and this one does not.
     """
-    if progress.active[w] == 0:
+    if state.active[w] == 0:
         return
-    share = potential_share(progress, instances, motion, points, entries, rigid, q, rigid.r, dt, w, lane, team)
+    share = potential_share(state, instances, motion, points, constraints, rigid, q, rigid.r, dt, w, member, team)
     potential = team_sum(share)
-    done = progress.last[w]
-    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
-        if done == 1 and progress.iteration[w] > 0 and pushes(instances, entries, i):
+    done = state.last[w]
+    for i in range(state.instance_start[w], state.instance_start[w + 1]):
+        if done == 1 and state.iteration[w] > 0 and pushes(instances, constraints, i):
             residual = wp.float64(0.0)
             external = wp.float64(0.0)
             scale = wp.float64(0.0)
-            for e in range(lane, q.shape[1], team):
+            for e in range(member, q.shape[1], team):
                 residual += wp.dot(gradient[i, e], gradient[i, e])
                 external += wp.dot(motion.force[i, e], motion.force[i, e])
-            for e in range(lane, entries.count[i], team):
-                scale += wp.length(entries.force[i, e])
+            for e in range(member, constraints.count[i], team):
+                scale += wp.length(constraints.force[i, e])
             residual = team_sum(residual)
             scale = wp.sqrt(team_sum(external)) + team_sum(scale)
             floor = wp.float64(1.0e-5) * instances.mass[i] * wp.float64(instances.tolerance[i]) / (dt * dt)
             if not (wp.sqrt(residual) <= force_tolerance * scale + floor):
                 done = 0
-    if lane != 0:
+    if member != 0:
         return
-    progress.potential[w] = potential
+    state.potential[w] = potential
     if wp.isnan(potential):
-        progress.active[w] = 0
-        progress.status[w] = progress.status[w] | WORLD_NOT_FINITE
+        state.active[w] = 0
+        state.status[w] = state.status[w] | WORLD_NOT_FINITE
         return
-    if progress.iteration[w] == 0:
+    if state.iteration[w] == 0:
         return
     if done == 1:
-        progress.active[w] = 0
-    elif progress.iteration[w] >= iteration_max:
-        progress.active[w] = 0
-        progress.status[w] = progress.status[w] | WORLD_ITERATION_LIMIT
+        state.active[w] = 0
+    elif state.iteration[w] >= iteration_max:
+        state.active[w] = 0
+        state.status[w] = state.status[w] | WORLD_ITERATION_LIMIT
 
 
-@wp.kernel
-def judge_iterate(
-    instances: Instances,
-    motion: Motion,
-    points: Points,
-    entries: Entries,
-    rigid: Rigid,
-    team: int,
-    iteration_max: int,
-    force_tolerance: wp.float64,
-    # State in:
-    gradient: wp.array2d[vec8d],
-    q: wp.array2d[vec8d],
-    dt: wp.float64,
-    # In and out:
-    progress: Progress,
-):
-    """Launch :func:`judge_world`."""
-    w, lane = wp.tid()
-    judge_world(
-        instances,
-        motion,
-        points,
-        entries,
-        rigid,
-        team,
-        iteration_max,
-        force_tolerance,
-        gradient,
-        q,
-        dt,
-        progress,
-        w,
-        lane,
-    )
+check_iterates = kernel_over(check_convergence, "check_iterates", "w", "member")
 
 
 @wp.func
-def begin_world_search(
+def start_line_search(
     instances: Instances,
-    entries: Entries,
+    constraints: PointConstraints,
     rigid: Rigid,
     rigid_tolerance: wp.array[float],  # (world_count,) [m or rad]
     stick_range: wp.float64,  # [m]
@@ -190,9 +157,9 @@ def begin_world_search(
     direction: wp.array2d[vec8],
     indefinite: wp.array[int],  # (system_count,)
     # In and out:
-    progress: Progress,
+    state: NewtonState,
     w: int,
-    lane: int,
+    member: int,
 ):
     """Compute the slope g . d of each active world and start its line search at alpha = 1.
 
@@ -201,89 +168,59 @@ def begin_world_search(
     A step below the tolerance (in contact, far below the stick range too) is taken in full: there the change of the
     potential drowns in rounding.
     """
-    if progress.active[w] == 0:
-        if lane == 0:
-            progress.searching[w] = 0
+    if state.active[w] == 0:
+        if member == 0:
+            state.searching[w] = 0
         return
     slope = wp.float64(0.0)
     last = int(1)
     unsound = int(0)
-    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
-        if progress.project[w] == 0 and indefinite[instances.system[i]] != 0:
+    for i in range(state.instance_start[w], state.instance_start[w + 1]):
+        if state.project[w] == 0 and indefinite[instances.system[i]] != 0:
             unsound = 1
         moved = wp.float64(0.0)
-        for e in range(lane, gradient.shape[1], team):
+        for e in range(member, gradient.shape[1], team):
             d = vec8d(direction[i, e])
             slope += wp.dot(gradient[i, e], d)
             moved += wp.dot(d, d)
         moved = team_sum(moved)
         limit = wp.float64(instances.tolerance[i])
-        if has_contacts(instances, entries, i):
+        if has_contacts(instances, constraints, i):
             limit = wp.min(limit, wp.float64(0.1) * stick_range)
         if not (wp.sqrt(moved) <= limit):
             last = 0
     slope = team_sum(slope)
-    if lane != 0:
+    if member != 0:
         return
-    progress.searching[w] = 0
+    state.searching[w] = 0
     for j in range(rigid.count[w]):
         slope += rigid.gradient[w, j] * rigid.direction[w, j]
         # dofs that take part are in contact: a light body moves where the soft one stays
         limit = wp.min(wp.float64(rigid_tolerance[w]), wp.float64(0.01) * stick_range)
         if not (wp.abs(rigid.direction[w, j]) <= limit):
             last = 0
-    progress.slope[w] = slope
-    progress.step_length[w] = wp.float64(1.0)
-    progress.last[w] = last
+    state.slope[w] = slope
+    state.step_length[w] = wp.float64(1.0)
+    state.last[w] = last
     if unsound == 1:
-        progress.step_length[w] = wp.float64(0.0)
-        progress.last[w] = 0
-        progress.failures[w] = progress.failures[w] + 1
-    elif last == 1 and progress.project[w] != 0 and progress.iteration[w] < PROJECTED_ITERATIONS:
+        state.step_length[w] = wp.float64(0.0)
+        state.last[w] = 0
+        state.failures[w] = state.failures[w] + 1
+    elif last == 1 and state.project[w] != 0 and state.iteration[w] < PROJECTED_ITERATIONS:
         # too stiff a matrix takes small steps: that says nothing of the distance to the minimum
-        progress.last[w] = 0
+        state.last[w] = 0
     elif last == 0:
-        progress.searching[w] = 1
-        wp.atomic_max(progress.any_searching, 0, 1)
+        state.searching[w] = 1
+        wp.atomic_max(state.any_searching, 0, 1)
 
 
-@wp.kernel
-def begin_search(
-    instances: Instances,
-    entries: Entries,
-    rigid: Rigid,
-    rigid_tolerance: wp.array[float],  # (world_count,) [m or rad]
-    stick_range: wp.float64,  # [m]
-    team: int,
-    # State in:
-    gradient: wp.array2d[vec8d],
-    direction: wp.array2d[vec8],
-    indefinite: wp.array[int],  # (system_count,)
-    # In and out:
-    progress: Progress,
-):
-    """Launch :func:`begin_world_search`."""
-    w, lane = wp.tid()
-    begin_world_search(
-        instances,
-        entries,
-        rigid,
-        rigid_tolerance,
-        stick_range,
-        team,
-        gradient,
-        direction,
-        indefinite,
-        progress,
-        w,
-        lane,
-    )
+start_line_searches = kernel_over(start_line_search, "start_line_searches", "w", "member")
 
 
 @wp.kernel
 def trial_functions(
     instances: Instances,
-    progress: Progress,
+    state: NewtonState,
     q: wp.array2d[vec8d],
     direction: wp.array2d[vec8],
     # Out:
@@ -292,30 +229,30 @@ def trial_functions(
     """Set q_trial = q + alpha dq."""
     i, e = wp.tid()
     w = instances.world[i]
-    if progress.searching[w] == 0:
+    if state.searching[w] == 0:
         return
-    q_out[i, e] = q[i, e] + progress.step_length[w] * vec8d(direction[i, e])
+    q_out[i, e] = q[i, e] + state.step_length[w] * vec8d(direction[i, e])
 
 
 @wp.kernel
 def trial_rigid(
-    progress: Progress,
+    state: NewtonState,
     # In and out:
     rigid: Rigid,
 ):
     """Set r_trial = r + alpha dr."""
     w, j = wp.tid()
-    if progress.searching[w] == 0 or j >= rigid.count[w]:
+    if state.searching[w] == 0 or j >= rigid.count[w]:
         return
-    rigid.trial[w, j] = rigid.r[w, j] + progress.step_length[w] * rigid.direction[w, j]
+    rigid.trial[w, j] = rigid.r[w, j] + state.step_length[w] * rigid.direction[w, j]
 
 
 @wp.func
-def judge_world_trial(
+def check_trial(
     instances: Instances,
     motion: Motion,
     points: Points,
-    entries: Entries,
+    constraints: PointConstraints,
     rigid: Rigid,
     team: int,
     step_length_min: wp.float64,
@@ -323,195 +260,162 @@ def judge_world_trial(
     q: wp.array2d[vec8d],
     dt: wp.float64,
     # In and out:
-    progress: Progress,
+    state: NewtonState,
     w: int,
-    lane: int,
+    member: int,
 ):
     """Accept a trial that lowers the potential enough (Armijo, up to rounding) or halve the step; give up if short.
 
     Where a full step has lowered it by more than a quadratic would have, take the better of that and twice the step.
     """
-    if progress.searching[w] == 0:
+    if state.searching[w] == 0:
         return
-    share = potential_share(progress, instances, motion, points, entries, rigid, q, rigid.trial, dt, w, lane, team)
+    share = potential_share(state, instances, motion, points, constraints, rigid, q, rigid.trial, dt, w, member, team)
     trial = team_sum(share)
-    if lane != 0:
+    if member != 0:
         return
-    potential = progress.potential[w]
+    potential = state.potential[w]
     rounding = wp.float64(1.0e-12) * wp.abs(potential)
-    alpha = progress.step_length[w]
+    alpha = state.step_length[w]
     if alpha > wp.float64(1.0):
-        progress.searching[w] = 0
-        if not (trial < progress.reached[w]):
-            progress.step_length[w] = wp.float64(1.0)
+        state.searching[w] = 0
+        if not (trial < state.reached[w]):
+            state.step_length[w] = wp.float64(1.0)
         return
-    if alpha == wp.float64(1.0) and trial < potential + EXTENDED_DECREASE * progress.slope[w] - rounding:
-        progress.reached[w] = trial
-        progress.step_length[w] = wp.float64(2.0)
-        wp.atomic_max(progress.any_searching, 0, 1)
+    if alpha == wp.float64(1.0) and trial < potential + EXTENDED_DECREASE * state.slope[w] - rounding:
+        state.reached[w] = trial
+        state.step_length[w] = wp.float64(2.0)
+        wp.atomic_max(state.any_searching, 0, 1)
         return
-    if trial <= potential + SUFFICIENT_DECREASE * alpha * progress.slope[w] + rounding:
-        progress.searching[w] = 0
+    if trial <= potential + SUFFICIENT_DECREASE * alpha * state.slope[w] + rounding:
+        state.searching[w] = 0
         return
     alpha *= wp.float64(0.5)
     if alpha < step_length_min:
         alpha = wp.float64(0.0)
-        progress.searching[w] = 0
+        state.searching[w] = 0
     else:
-        wp.atomic_max(progress.any_searching, 0, 1)
-    progress.step_length[w] = alpha
+        wp.atomic_max(state.any_searching, 0, 1)
+    state.step_length[w] = alpha
 
 
-@wp.kernel
-def judge_trial(
-    instances: Instances,
-    motion: Motion,
-    points: Points,
-    entries: Entries,
-    rigid: Rigid,
-    team: int,
-    step_length_min: wp.float64,
-    # State in:
-    q: wp.array2d[vec8d],
-    dt: wp.float64,
-    # In and out:
-    progress: Progress,
-):
-    """Launch :func:`judge_world_trial`."""
-    w, lane = wp.tid()
-    judge_world_trial(instances, motion, points, entries, rigid, team, step_length_min, q, dt, progress, w, lane)
+check_trials = kernel_over(check_trial, "check_trials", "w", "member")
 
 
 @wp.func
-def renewal_limit(instances: Instances, i: int, renewal_distance: float, dt: float):
-    """Return how far a body may move, in strain and rotation, before its elastic Hessian is renewed [m], rms."""
+def refresh_limit(instances: Instances, i: int, refresh_distance: float, dt: float):
+    """Return how far a body may move, in strain and rotation, before its elastic Hessian is refreshed [m], rms."""
     inertia = instances.inertia[i] / (dt * dt * instances.youngs_modulus[i])
-    return wp.float64(wp.min(renewal_distance, INERTIA_SHARE * inertia) * instances.size[i])
+    return wp.float64(wp.min(refresh_distance, INERTIA_SHARE * inertia) * instances.size[i])
 
 
 @wp.kernel
-def keep_hessians(
+def reuse_hessians(
     instances: Instances,
     basis: Basis,
-    renewal_distance: float,  # in sizes
+    refresh_distance: float,  # in sizes
     dt: float,
     team: int,
     q: wp.array2d[vec8d],
     # In and out:
-    progress: Progress,
+    state: NewtonState,
 ):
     """Start with the elastic Hessian of the step before where no body has bent or turned since.
 
     The distance leaves out the translation: the basis is mass-orthonormal, so that its coordinates are the basis' mean.
     """
-    w, lane = wp.tid()
-    keep = progress.kept[w]
-    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
+    w, member = wp.tid()
+    keep = state.cached[w]
+    for i in range(state.instance_start[w], state.instance_start[w + 1]):
         stride = q.shape[1] / 3
         moved = wp.float64(0.0)
         mean = wp.vec3d()
-        for e in range(lane, q.shape[1], team):
-            d = q[i, e] - progress.kept_q[i, e]
+        for e in range(member, q.shape[1], team):
+            d = q[i, e] - state.cached_q[i, e]
             moved += wp.dot(d, d)
             mean[e / stride] = mean[e / stride] + wp.dot(d, basis.mean[instances.asset[i], e % stride])
         for axis in range(3):
             part = team_sum(mean[axis])
             mean[axis] = part
         moved = team_sum(moved) - wp.length_sq(mean)
-        limit = renewal_limit(instances, i, renewal_distance, dt)
-        if not (moved <= limit * limit) or not (progress.kept_for[i] == hessian_recipe(instances, i, dt)):
+        limit = refresh_limit(instances, i, refresh_distance, dt)
+        if not (moved <= limit * limit) or not (state.cached_key[i] == hessian_key(instances, i, dt)):
             keep = 0
-    if lane == 0:
-        progress.renew[w] = 1 - keep
+    if member == 0:
+        state.refresh[w] = 1 - keep
 
 
 @wp.func
-def finish_world(
+def accept_step(
     instances: Instances,
     rigid: Rigid,
     team: int,
-    renewal: int,
-    renewal_distance: float,  # in sizes
+    refresh_interval: int,
+    refresh_distance: float,  # in sizes
     dt: float,
     # State in:
     direction: wp.array2d[vec8],
     # In and out:
     q: wp.array2d[vec8d],
-    progress: Progress,
+    state: NewtonState,
     w: int,
-    lane: int,
+    member: int,
 ):
-    """Take the accepted step; say whether the stiffness is to be renewed and how friction is to be linearised.
+    """Take the accepted step; say whether the stiffness is to be refreshed and how friction is to be linearised.
 
     A world that touches nothing is done with a step below the tolerance; near contacts the residual decides.
     """
-    if progress.active[w] == 0:
+    if state.active[w] == 0:
         return
-    alpha = progress.step_length[w]
-    renewed = progress.renew[w]
+    alpha = state.step_length[w]
+    refreshed = state.refresh[w]
     far = int(0)
     away = int(0)
-    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
+    for i in range(state.instance_start[w], state.instance_start[w + 1]):
         moved = wp.float64(0.0)
-        for e in range(lane, q.shape[1], team):
+        for e in range(member, q.shape[1], team):
             d = vec8d(direction[i, e])
             moved += wp.dot(d, d)
-            if renewed != 0:
-                progress.kept_q[i, e] = q[i, e]
+            if refreshed != 0:
+                state.cached_q[i, e] = q[i, e]
             if alpha > wp.float64(0.0):
                 q[i, e] = q[i, e] + alpha * d
         moved = team_sum(moved)
-        if alpha * wp.sqrt(moved) > renewal_limit(instances, i, renewal_distance, dt):
+        if alpha * wp.sqrt(moved) > refresh_limit(instances, i, refresh_distance, dt):
             far = 1
-        if renewed != 0 and lane == 0:
-            progress.kept_for[i] = hessian_recipe(instances, i, dt)
+        if refreshed != 0 and member == 0:
+            state.cached_key[i] = hessian_key(instances, i, dt)
         if alpha * wp.sqrt(moved) > wp.float64(PROJECTED_DISTANCE * instances.size[i]):
             away = 1
-    for j in range(lane, rigid.count[w], team):
+    for j in range(member, rigid.count[w], team):
         if alpha > wp.float64(0.0):
             rigid.r[w, j] = rigid.r[w, j] + alpha * rigid.direction[w, j]
     barrier()
-    if lane != 0:
+    if member != 0:
         return
-    progress.iteration[w] = progress.iteration[w] + 1
-    if renewed != 0:
-        progress.kept[w] = 1 - progress.project[w]
-    stale = progress.renew[w] == 0 or progress.project[w] == 0
-    progress.renew[w] = far
-    slow = progress.iteration[w] >= 2 * renewal
-    if slow or progress.iteration[w] % renewal == 0 or alpha == wp.float64(0.0):
-        progress.renew[w] = 1
+    state.iteration[w] = state.iteration[w] + 1
+    if refreshed != 0:
+        state.cached[w] = 1 - state.project[w]
+    stale = state.refresh[w] == 0 or state.project[w] == 0
+    state.refresh[w] = far
+    slow = state.iteration[w] >= 2 * refresh_interval
+    if slow or state.iteration[w] % refresh_interval == 0 or alpha == wp.float64(0.0):
+        state.refresh[w] = 1
     if alpha == wp.float64(0.0) or (slow and away == 1):
-        progress.project[w] = 1
-    elif progress.project[w] != 0 and away == 0 and progress.failures[w] < FAILURES:
-        progress.project[w] = 0
-        progress.renew[w] = 1
-    progress.exact[w] = 0
+        state.project[w] = 1
+    elif state.project[w] != 0 and away == 0 and state.failures[w] < FAILURES:
+        state.project[w] = 0
+        state.refresh[w] = 1
+    state.exact[w] = 0
     if alpha >= wp.float64(1.0):
-        progress.exact[w] = 1
-    if alpha == wp.float64(0.0) and progress.last[w] == 0 and not stale:
-        progress.active[w] = 0
-        progress.status[w] = progress.status[w] | WORLD_NO_DESCENT
-    elif progress.last[w] == 1 and progress.touching[w] == 0:
-        progress.active[w] = 0
+        state.exact[w] = 1
+    if alpha == wp.float64(0.0) and state.last[w] == 0 and not stale:
+        state.active[w] = 0
+        state.status[w] = state.status[w] | WORLD_NO_DESCENT
+    elif state.last[w] == 1 and state.in_contact[w] == 0:
+        state.active[w] = 0
     else:
-        wp.atomic_max(progress.any_active, 0, 1)
+        wp.atomic_max(state.any_active, 0, 1)
 
 
-@wp.kernel
-def finish_iteration(
-    instances: Instances,
-    rigid: Rigid,
-    team: int,
-    renewal: int,
-    renewal_distance: float,  # in sizes
-    dt: float,
-    # State in:
-    direction: wp.array2d[vec8],
-    # In and out:
-    q: wp.array2d[vec8d],
-    progress: Progress,
-):
-    """Launch :func:`finish_world`."""
-    w, lane = wp.tid()
-    finish_world(instances, rigid, team, renewal, renewal_distance, dt, direction, q, progress, w, lane)
+accept_steps = kernel_over(accept_step, "accept_steps", "w", "member")

@@ -2,13 +2,16 @@
 
 from typing import Any
 
-import numpy as np
+import newton
 
-from softmode.deformables.model.authoring import NAMESPACE
+from softmode.checks import require_number
+from softmode.deformables.model.namespaces import NAMESPACE, SoftControl, soft
 from softmode.errors import ConfigError
 
 
-def check_step(model: Any, state_in: Any, state_out: Any, control: Any, dt: float) -> None:
+def check_step(
+    model: newton.Model, state_in: newton.State, state_out: newton.State, control: newton.Control | None, dt: float
+) -> None:
     """Refuse what kernels would read beyond its end or turn into NaN; looks at shapes alone, so it may be captured.
 
     Args:
@@ -21,9 +24,8 @@ def check_step(model: Any, state_in: Any, state_out: Any, control: Any, dt: floa
     Raises:
         ConfigError: If ``dt`` is not finite and positive, or a state or the control belongs to another model.
     """
-    if not 0.0 < dt < np.inf:
-        raise ConfigError(f"dt must be a finite number > 0 [s], got {dt!r}", hint="take a step of 1 to 30 ms")
-    own = getattr(model, NAMESPACE)
+    require_number("dt", dt, above=0.0, unit="[s]", hint="take a step of 1 to 30 ms")
+    own = soft(model)
     takes: list[tuple[str, Any]] = [("state_in", state_in), ("state_out", state_out)]
     if control is not None:
         takes.append(("control", control))
@@ -51,7 +53,7 @@ def check_step(model: Any, state_in: Any, state_out: Any, control: Any, dt: floa
 _MAKER = {"state_in": "model.state()", "state_out": "model.state()", "control": "model.control()"}
 
 
-def _pin_count(data: Any) -> int:
+def _pin_count(data: SoftControl) -> int:
     """Return the number of pin targets; without pins a model has no such array."""
     targets = getattr(data, "pin_target", None)
     return 0 if targets is None else len(targets)

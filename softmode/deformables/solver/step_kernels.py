@@ -27,16 +27,17 @@ from softmode.deformables.materials.material_kernels import (
     lame,
     stress,
 )
+from softmode.deformables.model.declare import kernel_over
 from softmode.deformables.model.deformation_kernels import elastic_gradient
 from softmode.deformables.model.lane_kernels import LANES, team_sum, vec8d
 from softmode.deformables.model.status import WORLD_COLLAPSED, WORLD_NOT_FINITE
 from softmode.deformables.model.struct_kernels import (
     Basis,
-    Entries,
     Instances,
     Motion,
+    NewtonState,
+    PointConstraints,
     Points,
-    Progress,
     Rigid,
     blocks_of,
     has_contacts,
@@ -164,9 +165,9 @@ def begin_step(
 
 
 @wp.kernel
-def touch(
+def fall_back_to_euler(
     instances: Instances,
-    entries: Entries,
+    constraints: PointConstraints,
     dt: wp.float64,
     # In and out:
     motion: Motion,
@@ -177,7 +178,7 @@ def touch(
     force changes its momentum by another amount.
     """
     i, e = wp.tid()
-    if not pushes(instances, entries, i):
+    if not pushes(instances, constraints, i):
         return
     motion.rate[i] = wp.float64(1.0)
     motion.q_rate[i, e] = motion.q_start[i, e]
@@ -186,31 +187,31 @@ def touch(
 
 @wp.kernel
 def begin_newton(
-    progress: Progress,
+    state: NewtonState,
     instances: Instances,
-    entries: Entries,
+    constraints: PointConstraints,
 ):
     """Start Newton's iteration in every world."""
     w = wp.tid()
-    touching = int(0)
-    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
-        if pushes(instances, entries, i):
-            touching = 1
-    progress.touching[w] = touching
-    progress.active[w] = 1
-    progress.renew[w] = 1
-    progress.project[w] = 0
-    progress.failures[w] = 0
-    progress.exact[w] = 0
-    progress.iteration[w] = 0
-    progress.any_active[0] = 1
+    in_contact = int(0)
+    for i in range(state.instance_start[w], state.instance_start[w + 1]):
+        if pushes(instances, constraints, i):
+            in_contact = 1
+    state.in_contact[w] = in_contact
+    state.active[w] = 1
+    state.refresh[w] = 1
+    state.project[w] = 0
+    state.failures[w] = 0
+    state.exact[w] = 0
+    state.iteration[w] = 0
+    state.any_active[0] = 1
 
 
 @wp.kernel
 def extrapolate(
     instances: Instances,
     motion: Motion,
-    entries: Entries,
+    constraints: PointConstraints,
     dt: wp.float64,
     # In and out:
     q: wp.array2d[vec8d],
@@ -222,7 +223,7 @@ def extrapolate(
     inertia: there a start up the elastic valley costs more iterations than it saves.
     """
     i, e = wp.tid()
-    if has_contacts(instances, entries, i):
+    if has_contacts(instances, constraints, i):
         return
     change = wp.float64(0.0)
     moved = wp.float64(0.0)
@@ -256,7 +257,7 @@ def evaluate_point(
     q: wp.array2d[vec8d],
     dt: wp.float64,
     derivatives: int,
-    progress: Progress,
+    state: NewtonState,
     # Out:
     points: Points,
     i: int,
@@ -281,8 +282,8 @@ def evaluate_point(
     if derivatives != 0:
         points.stress[i, p] = s * weight * stress(parameters, G, G_start, dt)
         points.volume_ratio[i, p] = float(wp.float64(1.0) + determinant_minus_one(G))
-    if derivatives != 0 and progress.renew[instances.world[i]] != 0:
-        C = float(weight) * hessian(parameters, G, G_start, dt, progress.project[instances.world[i]])
+    if derivatives != 0 and state.refresh[instances.world[i]] != 0:
+        C = float(weight) * hessian(parameters, G, G_start, dt, state.project[instances.world[i]])
         for pair in range(6):
             r = 3 * pair
             points.hessian[i, pair, p] = wp.mat33(
@@ -290,23 +291,7 @@ def evaluate_point(
             )
 
 
-@wp.kernel
-def evaluate_points(
-    instances: Instances,
-    basis: Basis,
-    motion: Motion,
-    # State in:
-    selected: wp.array[int],  # (world_count,)
-    q: wp.array2d[vec8d],
-    dt: wp.float64,
-    derivatives: int,
-    progress: Progress,
-    # Out:
-    points: Points,
-):
-    """Launch :func:`evaluate_point`."""
-    i, p = wp.tid()
-    evaluate_point(instances, basis, motion, selected, q, dt, derivatives, progress, points, i, p)
+evaluate_points = kernel_over(evaluate_point, "evaluate_points", "i", "p")
 
 
 @wp.func
@@ -314,7 +299,7 @@ def sum_force_block(
     instances: Instances,
     basis: Basis,
     points: Points,
-    entries: Entries,
+    constraints: PointConstraints,
     active: wp.array[int],
     chunk_count: int,
     # Out:
@@ -323,7 +308,7 @@ def sum_force_block(
     chunk: int,
     b: int,
 ):
-    """Sum V P grad b_k over one chunk of the points, less b_k f over one chunk of the entries."""
+    """Sum V P grad b_k over one chunk of the points, less b_k f over one chunk of the constraints."""
     if active[instances.world[i]] == 0 or LANES * b >= instances.function_count[i]:
         return
     stride = basis.row.shape[1]
@@ -346,10 +331,10 @@ def sum_force_block(
         z = z + P[2, 0] * gx
         z = z + P[2, 1] * gy
         z = z + P[2, 2] * gz
-    count = entries.count[i]
+    count = constraints.count[i]
     for e in range(chunk * count / chunk_count, (chunk + 1) * count / chunk_count):
-        f = entries.force[i, e]
-        value = vec8d(basis.row[entries.row[i, e], b])
+        f = constraints.force[i, e]
+        value = vec8d(basis.row[constraints.row[i, e], b])
         x = x - f[0] * value
         y = y - f[1] * value
         z = z - f[2] * value
@@ -358,20 +343,7 @@ def sum_force_block(
     chunk_out[i, chunk, 2 * stride + b] = z
 
 
-@wp.kernel
-def sum_forces(
-    instances: Instances,
-    basis: Basis,
-    points: Points,
-    entries: Entries,
-    active: wp.array[int],
-    chunk_count: int,
-    # Out:
-    chunk_out: wp.array3d[vec8d],  # (instance_count, chunk_count, 3 block_count) [N]
-):
-    """Launch :func:`sum_force_block`."""
-    i, chunk, b = wp.tid()
-    sum_force_block(instances, basis, points, entries, active, chunk_count, chunk_out, i, chunk, b)
+sum_forces = kernel_over(sum_force_block, "sum_forces", "i", "chunk", "b")
 
 
 @wp.func
@@ -410,29 +382,14 @@ def gradient_block(
     reaction_out[i, e] = reaction
 
 
-@wp.kernel
-def sum_gradient(
-    instances: Instances,
-    basis: Basis,
-    motion: Motion,
-    active: wp.array[int],
-    chunk: wp.array3d[vec8d],
-    q: wp.array2d[vec8d],
-    dt: wp.float64,
-    # Out:
-    gradient_out: wp.array2d[vec8d],  # [N]; zero for driven functions
-    reaction_out: wp.array2d[vec8d],  # [N]; what holds the driven functions, zero for the others
-):
-    """Launch :func:`gradient_block`."""
-    i, e = wp.tid()
-    gradient_block(instances, basis, motion, active, chunk, q, dt, gradient_out, reaction_out, i, e)
+sum_gradient = kernel_over(gradient_block, "sum_gradient", "i", "e")
 
 
 @wp.kernel
 def end_step(
     instances: Instances,
     motion: Motion,
-    entries: Entries,
+    constraints: PointConstraints,
     # State in:
     status: wp.array[int],
     q: wp.array2d[vec8d],
@@ -474,7 +431,7 @@ def end_step(
     q_before_out[out] = before
     qd_before_out[out] = qd_before
     if k == 0:
-        fresh = failed or has_contacts(instances, entries, i)
+        fresh = failed or has_contacts(instances, constraints, i)
         dt_before_out[i] = wp.where(fresh, wp.float64(0.0), dt)
 
 
@@ -488,30 +445,30 @@ def check_state(
     # State in:
     q: wp.array2d[vec8d],
     # In and out:
-    progress: Progress,
+    state: NewtonState,
 ):
     """Flag a world whose unknowns are not all finite, or one of whose bodies has collapsed."""
-    w, lane = wp.tid()
+    w, member = wp.tid()
     total = wp.float64(0.0)
-    if lane == 0:
+    if member == 0:
         for j in range(rigid.count[w]):
             total += wp.abs(rigid.r[w, j])
     collapsed = float(0.0)
-    for i in range(progress.instance_start[w], progress.instance_start[w + 1]):
-        for e in range(lane, 3 * stride, team):
+    for i in range(state.instance_start[w], state.instance_start[w + 1]):
+        for e in range(member, 3 * stride, team):
             total += wp.dot(q[i, e], q[i, e])
         share = 1.0 / (COLLAPSED_SHARE * float(instances.point_count[i]))
         flat = float(0.0)
-        for p in range(lane, instances.point_count[i], team):
+        for p in range(member, instances.point_count[i], team):
             if points.volume_ratio[i, p] < COLLAPSED_RATIO:
                 flat += share
         collapsed = wp.max(collapsed, float(team_sum(wp.float64(flat))))
     total = team_sum(total)
-    if lane == 0:
+    if member == 0:
         if not wp.isfinite(total):
-            progress.status[w] = progress.status[w] | WORLD_NOT_FINITE
+            state.status[w] = state.status[w] | WORLD_NOT_FINITE
         if collapsed > 1.0:
-            progress.status[w] = progress.status[w] | WORLD_COLLAPSED
+            state.status[w] = state.status[w] | WORLD_COLLAPSED
 
 
 @wp.kernel
@@ -619,17 +576,17 @@ def reset_worlds(
     status_out: wp.array[int],
     instance_force_out: wp.array[wp.vec3d],
     body_wrench_out: wp.array[wp.spatial_vector],
-    entry_count_out: wp.array[int],
+    count_out: wp.array[int],
     pair_count_out: wp.array[int],
-    kept_out: wp.array[int],
+    cached_out: wp.array[int],
 ):
-    """Clear what the masked worlds report: status, entries, contact force on bodies, wrench on rigid bodies."""
+    """Clear what the masked worlds report: status, constraints, contact force on bodies, wrench on rigid bodies."""
     i = wp.tid()
     if i < instance_world.shape[0] and in_mask(instance_world[i], world_mask):
         status_out[instances.world[i]] = 0
         instance_force_out[i] = wp.vec3d()
-        entry_count_out[i] = 0
+        count_out[i] = 0
         pair_count_out[i] = 0
-        kept_out[instances.world[i]] = 0
+        cached_out[instances.world[i]] = 0
     if i < body_world.shape[0] and in_mask(body_world[i], world_mask):
         body_wrench_out[i] = wp.spatial_vector()

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from softmode.deformables.model.declare import struct
 from softmode.deformables.model.lane_kernels import LANES
 from softmode.deformables.model.struct_kernels import Basis, Instances, blocks_of
 
@@ -12,7 +13,7 @@ PULL = wp.constant(1)
 HOLD = wp.constant(2)
 
 
-@wp.struct
+@struct
 class GripTable:
     """The grips of one body and their points; a point is a pin whose rest point changes at run time."""
 
@@ -27,7 +28,7 @@ class GripTable:
     share: wp.array[float]  # (slot_max,), part of the grip's stiffness
 
 
-@wp.struct
+@struct
 class GripStrength:
     """How stiff grips are, in terms of the body that they hold; see ``GripOptions``."""
 

@@ -9,17 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import newton
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from softmode.checks import require_fields, require_number
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.model.authoring import NAMESPACE, add_pins
-from softmode.deformables.model.lane_kernels import LANES
-from softmode.deformables.solver.solver_reduced import SolverReduced
+from softmode.deformables.model.authoring import add_pins
+from softmode.deformables.model.namespaces import soft
+from softmode.deformables.model.tables import allocate
+from softmode.deformables.solver.reduced_solver import ReducedSolver, require_reduced
 from softmode.deformables.tools import grip_kernels as kernels
 from softmode.errors import ConfigError
 
@@ -46,9 +47,7 @@ class GripOptions:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        for name, value in vars(self).items():
-            if not 0.0 < value < np.inf:
-                raise ConfigError(f"{name} must be a finite number > 0, got {value!r}")
+        require_fields(self, vars(self), above=0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,8 +75,7 @@ def add_grip_slots(builder: newton.ModelBuilder, instance: int, count: int) -> N
     Raises:
         ConfigError: If the count is below 1.
     """
-    if count < 1:
-        raise ConfigError(f"count must be at least 1, got {count}", hint="give the points gripped at a time")
+    require_number("count", count, at_least=1, hint="give the points gripped at a time")
     add_pins(builder, instance, np.zeros((count, 3)), stiffness=0.0)
 
 
@@ -100,7 +98,7 @@ class Grips:
 
     def __init__(
         self,
-        solver: Any,
+        solver: ReducedSolver,
         instance: int,
         *,
         slot_count: int,
@@ -108,10 +106,10 @@ class Grips:
         options: GripOptions | None = None,
     ) -> None:
         """Find the slots and take them out of use."""
-        self.solver: SolverReduced = getattr(solver, "reduced", solver)
-        reduced, layout = self.solver, self.solver.layout
+        self.solver = require_reduced(solver)
+        self._view, self._tables = solver.view, solver.tables
+        layout, instances, device = self._view.layout, self._view.instances, solver.model.device
         self.instance, self.slot_count, self.grip_max = instance, slot_count, grip_max
-        instances = reduced.instances
         pins = int(instances.pin_count.numpy()[instance]) if 0 <= instance < layout.instance_count else 0
         if not 0 < slot_count <= pins:
             raise ConfigError(
@@ -119,29 +117,21 @@ class Grips:
             )
         self.first_slot = pins - slot_count
         self.body: ReducedBody = layout.bodies[layout.asset[instance]]
-        self._pin = int(instances.pin_start.numpy()[instance]) + self.first_slot
-        if reduced.parameters.pin_stiffness.numpy()[self._pin : self._pin + slot_count].any():
+        first = int(instances.pin_start.numpy()[instance]) + self.first_slot
+        if solver.parameters.pin_stiffness.numpy()[first : first + slot_count].any():
             raise ConfigError("the last pins of the instance are no slots", hint="add slots after its other pins")
-        device: Any = reduced.model.device
-        self.strength: Any = kernels.GripStrength()
+        self.strength = kernels.GripStrength()
         for name, value in vars(options or GripOptions()).items():
             setattr(self.strength, name, float(value))
-        self.table: Any = kernels.GripTable()
-        self.table.kind = wp.zeros(grip_max, dtype=int, device=device)
-        for name in ("position", "goal_position"):
-            setattr(self.table, name, wp.zeros(grip_max, dtype=wp.vec3d, device=device))
-        for name in ("rotation", "goal_rotation"):
-            setattr(self.table, name, wp.full(grip_max, wp.quatd(*_IDENTITY), dtype=wp.quatd, device=device))
-        self.table.remaining = wp.zeros(1, dtype=int, device=device)
-        self.table.grip = wp.zeros(slot_count, dtype=int, device=device)
-        self.table.offset = wp.zeros(slot_count, dtype=wp.vec3d, device=device)
-        self.table.share = wp.zeros(slot_count, dtype=float, device=device)
+        axes, turns = {"": "grip", "remaining": "1", "grip offset share": "slot"}, ("rotation", "goal_rotation")
+        sizes, identity = {"grip": grip_max, "slot": slot_count}, np.tile(_IDENTITY, (grip_max, 1))
+        self.table = allocate(kernels.GripTable, axes, sizes, device, given=dict.fromkeys(turns, identity))
         self._held: dict[int, Grip] = {}
         self._write_slots()
 
     # -- in the step --------------------------------------------------------------------------------------------------
 
-    def apply(self, state: Any, control: Any, dt: float) -> None:
+    def apply(self, state: newton.State, control: newton.Control, dt: float) -> None:
         """Move the grips and say where their points shall be at the end of the step from `state`; capturable.
 
         Args:
@@ -149,26 +139,12 @@ class Grips:
             control: Control of the step; it carries the targets.
             dt: Physics step [s].
         """
-        reduced, device = self.solver, self.solver.model.device
-        wp.launch(kernels.move_grips, dim=self.grip_max, inputs=[self.table], device=device)
-        wp.launch(
-            kernels.write_pins,
-            dim=self.slot_count,
-            inputs=[
-                reduced.instances,
-                reduced.basis,
-                reduced.model.gravity,
-                self.strength,
-                self.instance,
-                self.first_slot,
-                reduced.layout.first_pin_row,
-                wp.float64(dt),
-                getattr(state, NAMESPACE).q,
-                self.table,
-            ],
-            outputs=[reduced.parameters.pin_stiffness, getattr(control, NAMESPACE).pin_target],
-            device=device,
-        )
+        t, first = self._tables, (self.instance, self.first_slot, self._view.layout.first_pin_row)
+        t.launch(kernels.move_grips, self.grip_max, self.table)
+        bodies, out = (t.instances, t.basis), (t.parameters.pin_stiffness, soft(control).pin_target)
+        now = (wp.float64(dt), soft(state).q, self.table)
+        gravity = t.model.gravity
+        t.launch(kernels.write_pins, self.slot_count, *bodies, gravity, self.strength, *first, *now, *out)
 
     # -- between launches ---------------------------------------------------------------------------------------------
 
@@ -177,7 +153,7 @@ class Grips:
         """The grips by number, in the order of their slots."""
         return dict(self._held)
 
-    def take(self, rest_points: ArrayLike, state: Any, *, pulls: bool = False) -> int:
+    def take(self, rest_points: ArrayLike, state: newton.State, *, pulls: bool = False) -> int:
         """Take hold of points of the body where they are now.
 
         Args:
@@ -268,7 +244,7 @@ class Grips:
         place, turn = place or self.table.position, turn or self.table.rotation
         return place.numpy()[grip].astype(np.float64), turn.numpy()[grip].astype(np.float64)
 
-    def points(self, grip: int, state: Any) -> Array:
+    def points(self, grip: int, state: newton.State) -> Array:
         """Return where the points of a grip are [m], shape (n, 3)."""
         held = self._checked(grip)
         return held.rest_points + held.rows @ self._coordinates(state)
@@ -286,7 +262,7 @@ class Grips:
         first = self.first_slot
         for number, held in self._held.items():
             if number == grip:
-                rows: Any = self.solver.entries.force[self.instance]
+                rows = self._view.constraints.force[self.instance]
                 return rows.numpy()[first : first + len(held.offsets)].sum(axis=0)
             first += len(held.offsets)
         self._checked(grip)
@@ -299,10 +275,10 @@ class Grips:
             raise ConfigError(f"there is no grip {grip}", hint=f"there are {sorted(self._held)}")
         return self._held[grip]
 
-    def _coordinates(self, state: Any) -> Array:
+    def _coordinates(self, state: newton.State) -> Array:
         """Return the reduced coordinates of the instance [m], shape (n, 3)."""
-        start = int(self.solver.instances.function_start.numpy()[self.instance])
-        q: Any = getattr(state, NAMESPACE).q[start : start + self.body.function_count]
+        start = int(self._view.instances.function_start.numpy()[self.instance])
+        q = soft(state).q[start : start + self.body.function_count]
         return q.numpy().astype(np.float64)
 
     def _set_poses(self, grip: int, position: Array, rotation: Sequence[float] = _IDENTITY) -> None:
@@ -318,25 +294,19 @@ class Grips:
 
     def _write_slots(self) -> None:
         """Write the points of all grips, one after another, into the tables of pins."""
-        reduced, table = self.solver, self.table
+        table = self.table
         kind = np.zeros(self.grip_max, np.int32)
         owner, share = np.zeros(self.slot_count, np.int32), np.zeros(self.slot_count, np.float32)
         rest, offset = np.zeros((self.slot_count, 3)), np.zeros((self.slot_count, 3))
-        width = reduced.basis.row.shape[1] * LANES
-        rows = np.zeros((self.slot_count, width), np.float32)
+        rows = np.zeros((self.slot_count, self.body.function_count), np.float32)
         at = 0
         for number, grip in self._held.items():
             mine = slice(at, at + len(grip.offsets))
             kind[number] = int(kernels.PULL) if grip.pulls else int(kernels.HOLD)
             owner[mine], share[mine] = number, 1.0 / len(grip.offsets)
             rest[mine], offset[mine] = grip.rest_points, grip.offsets
-            rows[mine, : grip.rows.shape[1]] = grip.rows
+            rows[mine] = grip.rows
             at = mine.stop
         for array, values in ((table.kind, kind), (table.grip, owner), (table.share, share), (table.offset, offset)):
             array.assign(values)
-        row = reduced.layout.first_pin_row + self._pin
-        reduced.basis.row[row : row + self.slot_count].assign(rows.reshape(self.slot_count, -1, LANES))
-        reduced.basis.row_point[row : row + self.slot_count].assign(rest)
-        reduced.parameters.pin_stiffness[self._pin : self._pin + self.slot_count].assign(np.zeros(self.slot_count))
-        count = reduced.instances.pin_count
-        count[self.instance : self.instance + 1].assign(np.array([self.first_slot + at], np.int32))
+        self.solver.write_pins(self.instance, self.first_slot, rows, rest, self.first_slot + at)

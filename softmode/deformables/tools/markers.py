@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softmode.deformables.solver.solver_reduced import SolverReduced
+from softmode.deformables.solver.reduced_solver import ReducedSolver
 
 Array = NDArray[np.float64]
 
@@ -17,9 +17,9 @@ class Markers:
         instance: The body.
     """
 
-    def __init__(self, solver: SolverReduced, points: ArrayLike, *, instance: int = 0) -> None:
+    def __init__(self, solver: ReducedSolver, points: ArrayLike, *, instance: int = 0) -> None:
         """Evaluate the basis once."""
-        body = solver.bodies[solver.layout.asset[instance]]
+        body = solver.bodies[solver.view.layout.asset[instance]]
         self.points = np.atleast_2d(np.asarray(points, dtype=np.float64))
         self.basis = body.evaluate(self.points)[0]
         """Functions at the points, shape (K, n)."""

@@ -8,16 +8,19 @@ Forces are the means over the step, of the time at its end; points and levers ar
 applies them. Frames are the world's.
 """
 
+from __future__ import annotations
+
 import difflib
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
-from typing import Any
 
 import numpy as np
 import warp as wp
 
+from softmode.deformables.model.tables import allocate, host
 from softmode.deformables.solver.attachments import Attachment
-from softmode.deformables.solver.solver_reduced import SolverReduced
+from softmode.deformables.solver.reduced_solver import ReducedSolver, require_reduced
+from softmode.deformables.solver.step_view import StepView
 from softmode.deformables.tools import sensing_kernels as kernels
 from softmode.errors import ConfigError
 
@@ -53,15 +56,19 @@ class ContactSensor:
     """
 
     def __init__(
-        self, solver: Any, bodies: str | Sequence[str | int] | None = None, *, soft: Sequence[int] | None = None
+        self,
+        solver: ReducedSolver,
+        bodies: str | Sequence[str | int] | None = None,
+        *,
+        soft: Sequence[int] | None = None,
     ) -> None:
         """Find the links and allocate the readings."""
-        self._solver = reduced = _reduced(solver)
-        device, worlds = reduced.model.device, reduced.world_count
-        starts, count = _body_ranges(reduced)
-        labels = reduced.model.body_label[starts[0] : starts[0] + count]
+        self._tables, self._view = require_reduced(solver).tables, solver.view
+        device, worlds = solver.model.device, solver.world_count
+        starts, count = _body_ranges(solver)
+        labels = solver.model.body_label[starts[0] : starts[0] + count]
         self.bodies = _matching(labels, bodies)
-        self.soft = _soft_bodies(reduced, soft)
+        self.soft = _soft_bodies(self._view, soft)
         local = np.array(self.bodies)[None]
         self._link_body = wp.array(np.where(local < 0, -1, local + starts[:, None]), dtype=int, device=device)
         self._soft = wp.array(self.soft, dtype=int, device=device)
@@ -79,14 +86,9 @@ class ContactSensor:
 
     def update(self) -> None:
         """Read the contacts of the last step."""
-        reduced, (worlds, links) = self._solver, self.total_force.shape
-        wp.launch(
-            kernels.read_contacts,
-            dim=(worlds, links, len(self.soft) + 1),
-            inputs=[*_step(reduced), self._link_body, self._soft],
-            outputs=[self._matrix, self._total],
-            device=reduced.model.device,
-        )
+        dim = (*self.total_force.shape, len(self.soft) + 1)
+        given = (self._link_body, self._soft, self._matrix, self._total)
+        self._tables.launch(kernels.read_contacts, dim, *self._view.last_step(), *given)
 
 
 class SurfacePressure:
@@ -117,59 +119,40 @@ class SurfacePressure:
         ConfigError: If a world has no such soft body, or worlds differ in it.
     """
 
-    def __init__(self, solver: Any, soft: int = 0) -> None:
+    def __init__(self, solver: ReducedSolver, soft: int = 0) -> None:
         """Allocate the samples."""
-        self._solver = reduced = _reduced(solver)
-        (self.soft,) = _soft_bodies(reduced, [soft])
-        layout, device, worlds = reduced.layout, reduced.model.device, reduced.world_count
+        self._tables, self._view = require_reduced(solver).tables, solver.view
+        view = self._view
+        (self.soft,) = _soft_bodies(view, [soft])
+        layout, device, worlds = view.layout, solver.model.device, solver.world_count
         assets = layout.asset[layout.instance_start[:-1] + soft]
         if np.ptp(assets):
             raise ConfigError(f"soft body {soft} is not the same in every world", hint="replicate one builder")
         self.area = layout.bodies[assets[0]].surface_areas.copy()
         shape, vector = (worlds, len(self.area)), wp.vec3d
         self._normal_force, self._friction = (wp.zeros(shape, dtype=vector, device=device) for _ in range(2))
-        pairs = reduced.pairs
+        pairs = view.pairs
         self._surface_normal = (
-            pairs.table.surface_normal if pairs is not None else wp.zeros((1, 1), dtype=wp.vec3, device=device)
+            pairs.surface_normal if pairs is not None else wp.zeros((1, 1), dtype=wp.vec3, device=device)
         )
-        self._sample = wp.zeros((worlds, reduced.entry_max), dtype=int, device=device)
+        self._sample = wp.zeros((worlds, view.constraint_max), dtype=int, device=device)
         self.pressure = wp.zeros(shape, dtype=float, device=device)
         self.traction, self.normal = (wp.zeros(shape, dtype=wp.vec3, device=device) for _ in range(2))
-        self._patch = patch = kernels.Patch()
-        for name in ("force", "friction", "torque", "position", "normal"):
-            setattr(patch, name, wp.zeros(worlds, dtype=wp.vec3, device=device))
-        patch.area = wp.zeros(worlds, dtype=float, device=device)
+        self._patch = patch = allocate(kernels.Patch, "world", {"world": worlds}, device)
         self.total_force, self.total_force_friction, self.total_torque = patch.force, patch.friction, patch.torque
         self.total_position, self.total_normal, self.total_area = patch.position, patch.normal, patch.area
 
     def update(self) -> None:
         """Read the contacts of the last step."""
-        reduced, device = self._solver, self._solver.model.device
-        step, sums = [*_step(reduced), self.soft], [self._normal_force, self._friction]
+        view, launch = self._view, self._tables.launch
+        step, sums = (*view.last_step(), self.soft), (self._normal_force, self._friction)
         for array in sums:
             array.zero_()
-        wp.launch(
-            kernels.find_samples,
-            dim=self._sample.shape,
-            inputs=[*step, reduced.samples.position, self._surface_normal],
-            outputs=[self._sample],
-            device=device,
-        )
-        wp.launch(
-            kernels.gather_pressure,
-            dim=reduced.world_count,
-            inputs=[*step, self._sample, *sums],
-            outputs=[self._patch],
-            device=device,
-        )
-        start = reduced.progress.instance_start
-        wp.launch(
-            kernels.spread_pressure,
-            dim=self.pressure.shape,
-            inputs=[reduced.instances, reduced.basis, start, self.soft, *sums],
-            outputs=[self.pressure, self.traction, self.normal],
-            device=device,
-        )
+        surface = (view.samples.position, self._surface_normal, self._sample)
+        launch(kernels.find_samples, self._sample.shape, *step, *surface)
+        launch(kernels.gather_pressure, self._sample.shape[0], *step, self._sample, *sums, self._patch)
+        bodies, out = (view.instances, view.basis, view.instance_start), (self.pressure, self.traction, self.normal)
+        launch(kernels.spread_pressure, self.pressure.shape, *bodies, self.soft, *sums, *out)
 
 
 class ForceTorqueSensor:
@@ -187,21 +170,22 @@ class ForceTorqueSensor:
         ConfigError: If there is no attachment, or a world has no such soft body or pins.
     """
 
-    def __init__(self, solver: Any, attachments: Sequence[Attachment]) -> None:
+    def __init__(self, solver: ReducedSolver, attachments: Sequence[Attachment]) -> None:
         """Allocate the readings."""
-        self._solver = reduced = _reduced(solver)
+        self._tables, self._view = require_reduced(solver).tables, solver.view
+        view = self._view
         self.attachments = tuple(attachments)
         if not self.attachments:
             raise ConfigError("attachments is empty", hint="pass what attach returned")
-        _soft_bodies(reduced, sorted({a.instance for a in self.attachments}))
-        pins = reduced.instances.pin_count.numpy()
+        _soft_bodies(view, sorted({a.instance for a in self.attachments}))
+        pins = view.instances.pin_count.numpy()
         for a in self.attachments:
-            if (pins[reduced.layout.instance_start[:-1] + a.instance] < a.first + a.count).any():
+            if (pins[view.layout.instance_start[:-1] + a.instance] < a.first + a.count).any():
                 raise ConfigError(
                     f"soft body {a.instance} has no pins {a.first}..{a.first + a.count - 1}",
                     hint="pass attachments of this model",
                 )
-        device, shape = reduced.model.device, (reduced.world_count, len(self.attachments))
+        device, shape = solver.model.device, (solver.world_count, len(self.attachments))
         self._where = [
             wp.array([getattr(a, name) for a in self.attachments], dtype=int, device=device)
             for name in ("instance", "first", "count")
@@ -210,43 +194,23 @@ class ForceTorqueSensor:
 
     def update(self) -> None:
         """Read the pins of the last step."""
-        wp.launch(
-            kernels.read_attachments,
-            dim=self.force.shape,
-            inputs=[*_step(self._solver), *self._where],
-            outputs=[self.force, self.torque],
-            device=self._solver.model.device,
-        )
+        given = (*self._view.last_step(), *self._where, self.force, self.torque)
+        self._tables.launch(kernels.read_attachments, self.force.shape, *given)
 
 
-def _reduced(solver: Any) -> SolverReduced:
-    """Return the reduced solver itself or inside a coupled one."""
-    reduced = getattr(solver, "reduced", solver)
-    if not isinstance(reduced, SolverReduced):
-        raise ConfigError(f"solver is a {type(solver).__name__}", hint="pass a SolverReduced or a SolverCoupledReduced")
-    return reduced
-
-
-def _step(reduced: SolverReduced) -> list[Any]:
-    """Return what a sensor reads of the last step."""
-    return [reduced.instances, reduced.basis, reduced.motion, reduced.entries, reduced.progress.instance_start]
-
-
-def _readings(shape: tuple[int, int, int], device: Any) -> Any:
+def _readings(shape: tuple[int, int, int], device: wp.Device) -> kernels.Readings:
     """Return readings of zero."""
-    readings = kernels.Readings()
-    for name in ("force", "friction", "torque", "position", "normal"):
-        setattr(readings, name, wp.zeros(shape, dtype=wp.vec3, device=device))
-    readings.area = wp.zeros(shape, dtype=float, device=device)
-    return readings
+    return allocate(
+        kernels.Readings, "world link soft", dict(zip(("world", "link", "soft"), shape, strict=True)), device
+    )
 
 
-def _body_ranges(reduced: SolverReduced) -> tuple[np.ndarray, int]:
+def _body_ranges(solver: ReducedSolver) -> tuple[np.ndarray, int]:
     """Return the first rigid body of each world, and how many every world has at least."""
-    model, worlds = reduced.model, reduced.world_count
+    model, worlds = solver.model, solver.world_count
     if worlds == 1:
         return np.zeros(1, int), model.body_count
-    starts = model.body_world_start.numpy()[: worlds + 1]
+    starts = host(model.body_world_start)[: worlds + 1]
     return starts[:-1], int(np.diff(starts).min())
 
 
@@ -273,9 +237,9 @@ def _matching(labels: Sequence[str], wanted: str | Sequence[str | int] | None) -
     return tuple(chosen)
 
 
-def _soft_bodies(reduced: SolverReduced, wanted: Sequence[int] | None) -> tuple[int, ...]:
+def _soft_bodies(view: StepView, wanted: Sequence[int] | None) -> tuple[int, ...]:
     """Return the indices of soft bodies that exist in every world."""
-    least = int(np.diff(reduced.layout.instance_start).min())
+    least = view.bodies_per_world()
     chosen = tuple(range(least)) if wanted is None else tuple(int(s) for s in wanted)
     if not chosen or len(set(chosen)) < len(chosen) or min(chosen) < 0 or max(chosen) >= least:
         raise ConfigError(

@@ -2,12 +2,13 @@
 
 import warp as wp
 
+from softmode.deformables.model.declare import struct
 from softmode.deformables.model.lane_kernels import sum8d
 from softmode.deformables.model.struct_kernels import (
     Basis,
-    Entries,
     Instances,
     Motion,
+    PointConstraints,
     blocks_of,
     interpolate,
     sample_area,
@@ -16,7 +17,7 @@ from softmode.deformables.model.struct_kernels import (
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.struct
+@struct
 class Readings:
     """What a contact sensor reads, shape (world_count, link_count, soft_count); world frame."""
 
@@ -28,7 +29,7 @@ class Readings:
     area: wp.array3d[float]  # [m^2]
 
 
-@wp.struct
+@struct
 class Patch:
     """Contact of one soft body with everything, shape (world_count,); world frame."""
 
@@ -41,38 +42,38 @@ class Patch:
 
 
 @wp.func
-def point_of(instances: Instances, basis: Basis, motion: Motion, entries: Entries, i: int, e: int):
-    """Return where an entry was at the start of the step [m]: both bodies feel the force there.
+def point_of(instances: Instances, basis: Basis, motion: Motion, constraints: PointConstraints, i: int, e: int):
+    """Return where a constraint was at the start of the step [m]: both bodies feel the force there.
 
     Where a sample of another soft body touches this one, the row is a mean of rows and its place that of the sample.
     """
-    row = entries.row[i, e]
+    row = constraints.row[i, e]
     k = i
     if row >= basis.row_point.shape[0]:
-        row = entries.partner_row[i, e]
-        k = entries.partner[i, e]
+        row = constraints.partner_row[i, e]
+        k = constraints.partner[i, e]
     return basis.row_point[row] + interpolate(basis.row, row, motion.q_start, k, instances.function_count[k])
 
 
 @wp.func
-def is_internal(entries: Entries, i: int, e: int):
-    """Return whether an entry is a contact of a body with itself, which puts no force on it."""
-    return e >= entries.count[i] - entries.pair_count[i] and entries.partner[i, e] < 0
+def is_internal(constraints: PointConstraints, i: int, e: int):
+    """Return whether a constraint is a contact of a body with itself, which puts no force on it."""
+    return e >= constraints.count[i] - constraints.pair_count[i] and constraints.partner[i, e] < 0
 
 
 @wp.func
-def normal_part(entries: Entries, i: int, e: int):
+def normal_part(constraints: PointConstraints, i: int, e: int):
     """Return n . f [N], or 0 where the step failed."""
-    value = wp.dot(entries.normal[i, e], entries.force[i, e])
+    value = wp.dot(constraints.normal[i, e], constraints.force[i, e])
     return wp.where(wp.isfinite(value), value, wp.float64(0.0))
 
 
 @wp.func
-def first_of_sample(entries: Entries, first: int, i: int, e: int):
-    """Return whether no earlier entry is the same sample pressed by the same body: its area counts once."""
+def first_of_sample(constraints: PointConstraints, first: int, i: int, e: int):
+    """Return whether no earlier constraint is the same sample pressed by the same body: its area counts once."""
     for k in range(first, e):
-        same = entries.row[i, k] == entries.row[i, e] and entries.body[i, k] == entries.body[i, e]
-        if same and entries.shape[i, k] >= 0 and normal_part(entries, i, k) > wp.float64(0.0):
+        same = constraints.row[i, k] == constraints.row[i, e] and constraints.body[i, k] == constraints.body[i, e]
+        if same and constraints.shape[i, k] >= 0 and normal_part(constraints, i, k) > wp.float64(0.0):
             return False
     return True
 
@@ -88,7 +89,7 @@ def read_contacts(
     instances: Instances,
     basis: Basis,
     motion: Motion,
-    entries: Entries,
+    constraints: PointConstraints,
     instance_start: wp.array[int],  # (world_count + 1,)
     link_body: wp.array2d[int],  # (world_count, link_count), -1 for all fixed shapes
     soft: wp.array[int],  # (soft_count,), body within its world
@@ -113,17 +114,17 @@ def read_contacts(
     area = wp.float64(0.0)
     for i in range(begin, end):
         first = instances.pin_count[i]
-        for e in range(first, entries.count[i]):
-            # entries without a shape are contacts of soft bodies with each other
-            if entries.body[i, e] != body or entries.shape[i, e] < 0:
+        for e in range(first, constraints.count[i]):
+            # constraints without a shape are contacts of soft bodies with each other
+            if constraints.body[i, e] != body or constraints.shape[i, e] < 0:
                 continue
-            f = entries.force[i, e]
+            f = constraints.force[i, e]
             if not wp.isfinite(wp.length_sq(f)):
                 continue
-            n = entries.normal[i, e]
-            pressing = normal_part(entries, i, e)
-            x = point_of(instances, basis, motion, entries, i, e)
-            arm = wp.vec3d(entries.arm[i, e])
+            n = constraints.normal[i, e]
+            pressing = normal_part(constraints, i, e)
+            x = point_of(instances, basis, motion, constraints, i, e)
+            arm = wp.vec3d(constraints.arm[i, e])
             if body < 0:
                 arm = x
             force -= f
@@ -133,8 +134,8 @@ def read_contacts(
                 weight += pressing
                 position += pressing * x
                 normal += pressing * n
-                if first_of_sample(entries, first, i, e):
-                    area += wp.float64(sample_area(instances.scale[i], basis.row_area[entries.row[i, e]]))
+                if first_of_sample(constraints, first, i, e):
+                    area += wp.float64(sample_area(instances.scale[i], basis.row_area[constraints.row[i, e]]))
     position = mean_of(position, weight)
     normal = wp.normalize(normal)
     if column < soft.shape[0]:
@@ -158,7 +159,7 @@ def read_attachments(
     instances: Instances,
     basis: Basis,
     motion: Motion,
-    entries: Entries,
+    constraints: PointConstraints,
     instance_start: wp.array[int],
     soft: wp.array[int],  # (attachment_count,)
     first_pin: wp.array[int],
@@ -172,14 +173,14 @@ def read_attachments(
     i = instance_start[w] + soft[a]
     force = wp.vec3d()
     torque = wp.vec3d()
-    for e in range(first_pin[a], wp.min(first_pin[a] + pin_count[a], entries.count[i])):
-        f = entries.force[i, e]
+    for e in range(first_pin[a], wp.min(first_pin[a] + pin_count[a], constraints.count[i])):
+        f = constraints.force[i, e]
         if not wp.isfinite(wp.length_sq(f)):
             continue
-        arm = wp.vec3d(entries.arm[i, e])
-        if entries.body[i, e] < 0:
+        arm = wp.vec3d(constraints.arm[i, e])
+        if constraints.body[i, e] < 0:
             # the offset of a pin is its soft end less its target
-            arm = point_of(instances, basis, motion, entries, i, e) - entries.offset[i, e]
+            arm = point_of(instances, basis, motion, constraints, i, e) - constraints.offset[i, e]
         force -= f
         torque -= wp.cross(arm, f)
     force_out[w, a] = wp.vec3(force)
@@ -191,26 +192,26 @@ def find_samples(
     instances: Instances,
     basis: Basis,
     motion: Motion,
-    entries: Entries,
+    constraints: PointConstraints,
     instance_start: wp.array[int],
     soft: int,
     position: wp.array2d[wp.vec3d],  # (instance_count, sample_max), samples at the start of the step [m]
     surface_normal: wp.array2d[wp.vec3],  # and their normals, outward
     # Out:
-    sample_out: wp.array2d[int],  # (world_count, entry_max)
+    sample_out: wp.array2d[int],  # (world_count, constraint_max)
 ):
     """Find the sample of each contact: its own, or the nearest that faces the sample of another soft body."""
     w, e = wp.tid()
     i = instance_start[w] + soft
-    if e < instances.pin_count[i] or e >= entries.count[i] or is_internal(entries, i, e):
+    if e < instances.pin_count[i] or e >= constraints.count[i] or is_internal(constraints, i, e):
         return
-    found = entries.row[i, e] - instances.row_start[i]
-    if entries.row[i, e] >= basis.row_point.shape[0]:
-        x = point_of(instances, basis, motion, entries, i, e)
+    found = constraints.row[i, e] - instances.row_start[i]
+    if constraints.row[i, e] >= basis.row_point.shape[0]:
+        x = point_of(instances, basis, motion, constraints, i, e)
         nearest = wp.float64(1.0e30)
         for s in range(instances.sample_count[i]):
             distance = wp.length_sq(position[i, s] - x)
-            if wp.dot(surface_normal[i, s], wp.vec3(entries.normal[i, e])) > -0.5:
+            if wp.dot(surface_normal[i, s], wp.vec3(constraints.normal[i, e])) > -0.5:
                 distance += wp.float64(1.0e10)  # only where none faces it
             if distance < nearest:
                 nearest = distance
@@ -223,10 +224,10 @@ def gather_pressure(
     instances: Instances,
     basis: Basis,
     motion: Motion,
-    entries: Entries,
+    constraints: PointConstraints,
     instance_start: wp.array[int],
     soft: int,
-    sample: wp.array2d[int],  # (world_count, entry_max)
+    sample: wp.array2d[int],  # (world_count, constraint_max)
     # In and out, zero before:
     normal_force: wp.array2d[wp.vec3d],  # (world_count, sample_count) [N]
     friction: wp.array2d[wp.vec3d],  # (world_count, sample_count) [N]
@@ -249,13 +250,13 @@ def gather_pressure(
     normal = wp.vec3d()
     weight = wp.float64(0.0)
     area = wp.float64(0.0)
-    for e in range(instances.pin_count[i], entries.count[i]):
-        f = entries.force[i, e]
-        if is_internal(entries, i, e) or not wp.isfinite(wp.length_sq(f)):
+    for e in range(instances.pin_count[i], constraints.count[i]):
+        f = constraints.force[i, e]
+        if is_internal(constraints, i, e) or not wp.isfinite(wp.length_sq(f)):
             continue
-        n = entries.normal[i, e]
-        pressing = normal_part(entries, i, e)
-        x = point_of(instances, basis, motion, entries, i, e)
+        n = constraints.normal[i, e]
+        pressing = normal_part(constraints, i, e)
+        x = point_of(instances, basis, motion, constraints, i, e)
         total += f
         tangential += f - pressing * n
         torque += wp.cross(x - centre, f)

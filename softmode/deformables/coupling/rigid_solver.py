@@ -1,0 +1,50 @@
+"""MuJoCo's step in two halves: what the joint solve needs of ``SolverMuJoCo`` that has no public name yet."""
+
+import warnings
+from collections.abc import Callable, Generator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+
+from newton.solvers import SolverMuJoCo
+
+
+def second_half(rigid: SolverMuJoCo) -> Callable[[], AbstractContextManager[None]]:
+    """Return contexts within which ``rigid.step`` starts from MuJoCo's forces on, after a whole step from that state.
+
+    Positions, inertia and constraint rows are then those of the whole step: MuJoCo's own split of a step, in
+    ``mujoco_warp.step1`` and ``step2``. Newton offers none; a public hook would be an argument of
+    ``SolverMuJoCo.step`` that says from which stage on MuJoCo computes, or a method that calls ``step2`` alone. Until
+    then this function alone touches two private names of ``SolverMuJoCo``: the method ``_mujoco_warp_step``, replaced
+    while a context lasts, and the flag ``_use_speculative_contacts``, with which that method does more than a step.
+    Both are checked here, once; without them, and with integrators or options whose step has no such halves, a context
+    changes nothing and the whole step is taken again.
+
+    Warns:
+        RuntimeWarning: If this version of Newton has not the names.
+    """
+    import mujoco_warp
+
+    speculative = getattr(rigid, "_use_speculative_contacts", None)
+    if not callable(getattr(rigid, "_mujoco_warp_step", None)) or not isinstance(speculative, bool):
+        warnings.warn(
+            "this version of Newton steps MuJoCo in another way than the one that softmode knows; steps in which soft "
+            "bodies push rigid ones take two whole MuJoCo steps",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+        return nullcontext
+
+    @contextmanager
+    def from_forces_on() -> Generator[None]:
+        model, known = rigid.mjw_model, mujoco_warp.IntegratorType
+        sleeps = bool(model.opt.enableflags & mujoco_warp.EnableBit.SLEEP)
+        in_halves = model.opt.integrator in (known.EULER, known.IMPLICIT, known.IMPLICITFAST)
+        whole = sleeps or not in_halves or speculative
+        if not whole:
+            vars(rigid)["_mujoco_warp_step"] = lambda: mujoco_warp.step2(model, rigid.mjw_data)
+        try:
+            yield
+        finally:
+            if not whole:
+                del vars(rigid)["_mujoco_warp_step"]
+
+    return from_forces_on

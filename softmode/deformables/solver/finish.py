@@ -1,0 +1,78 @@
+"""Last phase of a step: write the state, remember where contacts stick, and sum what they put on the bodies."""
+
+import newton
+import warp as wp
+
+from softmode.deformables.contact import friction_memory_kernels as memory_kernels
+from softmode.deformables.contact import penalty_kernels
+from softmode.deformables.model.namespaces import soft
+from softmode.deformables.solver import attachment_kernels
+from softmode.deformables.solver import step_kernels as kernels
+from softmode.deformables.solver.step_tables import StepTables
+
+
+def finish(tables: StepTables, state: newton.State, dt: float, *, prescribed: bool) -> None:
+    """Write coordinates, velocities and particles, and sum the contact reactions.
+
+    Args:
+        tables: Tables of the step.
+        state: State at its end, which is written.
+        dt: Step [s].
+        prescribed: As for :func:`softmode.deformables.solver.detect.detect`.
+    """
+    t, out, layout, q = tables, soft(state), tables.layout, tables.arrays.q
+    blocks, worlds = layout.block_count, layout.world_count
+    t.launch_teams(kernels.check_state, worlds, t.instances, t.points, t.rigid.table, t.team, blocks, q, t.newton)
+    t.launch(
+        kernels.end_step,
+        (layout.instance_count, layout.stride),
+        *(t.instances, t.motion, t.constraints, t.newton.status, q, blocks, wp.float64(dt)),
+        *(out.q, out.qd, out.q_before, out.qd_before, out.dt_before),
+    )
+    if t.model.shape_count:
+        sticking = (t.instances, t.shapes, t.samples, t.constraints, int(prescribed))
+        t.launch(memory_kernels.remember_slip, t.samples.position.shape, *sticking, out.stick_shape, out.stick_point)
+    if t.pairs is not None:
+        t.pairs.remember(t.motion, t.newton, t.constraints, out)
+    t.body_wrench.zero_()
+    reactions = (t.body_wrench, t.instance_force)
+    t.launch(penalty_kernels.sum_reactions, worlds, t.instances, t.newton, t.constraints, *reactions)
+    move_particles(t, state)
+
+
+def move_particles(tables: StepTables, state: newton.State) -> None:
+    """Move the surface particles of ``state`` to where its reduced coordinates put them."""
+    t, data = tables, soft(state)
+    particles = (state.particle_q, state.particle_qd)
+    t.launch(kernels.skin_samples, t.samples.position.shape, t.instances, t.basis, data.q, data.qd, *particles)
+
+
+def reset(tables: StepTables, state: newton.State, world_mask: wp.array, flags: newton.StateFlags | int) -> None:
+    """Put the bodies of the chosen worlds back to the model's initial state and clear what those worlds report.
+
+    Args:
+        tables: Tables of the step.
+        state: State to reset in place.
+        world_mask: Boolean mask of shape (world_count + 1,).
+        flags: ``newton.StateFlags``; coordinates are reset with PARTICLE_Q, velocities with PARTICLE_QD.
+    """
+    t, initial, out, every = tables, tables.parameters, soft(state), tables.samples.position.shape
+    count, world = t.layout.instance_count, t.parameters.instance_world
+    chosen = (int(flags) & int(newton.StateFlags.PARTICLE_Q), int(flags) & int(newton.StateFlags.PARTICLE_QD))
+    t.launch(
+        kernels.reset_functions,
+        (count, t.layout.stride),
+        *(t.instances, t.basis, initial.placed_scale, world, world_mask, *chosen),
+        *(initial.q, initial.qd, out.q, out.qd, out.dt_before),
+    )
+    t.launch(memory_kernels.forget_slip, every, t.instances, world, world_mask, out.stick_shape, out.stick_partner)
+    t.launch(
+        kernels.reset_worlds,
+        max(count, t.model.body_count),
+        *(t.instances, world, t.model.body_world, world_mask, t.newton.status),
+        *(t.instance_force, t.body_wrench, t.constraints.count, t.constraints.pair_count, t.newton.cached),
+    )
+    if t.layout.pin_max:
+        dim = (count, t.layout.pin_max)
+        t.launch(attachment_kernels.hold_all_pins, dim, t.instances, world, world_mask, initial.pin_stiffness)
+    move_particles(t, state)

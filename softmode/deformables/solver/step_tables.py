@@ -1,0 +1,248 @@
+"""The tables of a step, allocated once: what every phase reads and writes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.contact.detection_kernels import Shapes
+from softmode.deformables.contact.pairs import SoftPairs
+from softmode.deformables.contact.shape_tables import candidate_shapes, shape_table
+from softmode.deformables.model.declare import WRENCH, Kernel, launch, launch_teams
+from softmode.deformables.model.lane_kernels import team_size, vec8
+from softmode.deformables.model.layout import Layout, lay_out, lay_out_bases, lay_out_instances
+from softmode.deformables.model.namespaces import SoftModel, soft
+from softmode.deformables.model.rigid_dofs import RigidDofs
+from softmode.deformables.model.scaled_quantities import ScaledQuantities
+from softmode.deformables.model.struct_kernels import (
+    SLOTS,
+    Basis,
+    Instances,
+    Motion,
+    NewtonState,
+    PointConstraints,
+    Points,
+    Samples,
+)
+from softmode.deformables.model.tables import allocate
+from softmode.deformables.solver import fused_newton_kernels as fused
+from softmode.deformables.solver.factor import BlockCholesky
+from softmode.deformables.solver.fused_system_kernels import SHARED_SIZE, SHARED_WIDTH
+from softmode.deformables.solver.options import SolverReducedOptions
+from softmode.deformables.solver.systems import join_systems
+
+CUDA_THREADS = 2**16
+"""Threads that keep a GPU busy: sums over points are split until there are about so many."""
+ONE_LAUNCH_BLOCKS = 5
+"""Blocks of eight functions up to which a body is small enough for a team of threads on CUDA."""
+
+_POINTS = {"": "instance point", "hessian": "instance 6 point"}
+_MOTION = {"": "instance unknown", "rate": "instance"}
+_SAMPLES = {
+    "position drift": "instance sample",
+    "shape gap normal constraint": "instance sample slot",
+    "lower upper drift_lower drift_upper": "instance",
+    "reach": "instance team 4",
+    "tally": "instance team 2",
+}
+_CONSTRAINTS = {
+    "": "instance constraint",
+    "count pair_count": "instance",
+    "jacobian coupling": "instance constraint rigid",
+}
+_NEWTON = {"": "world", "cached_q": "instance unknown", "cached_key": "instance", "any_active any_searching": "1"}
+_ARRAYS = {
+    "": "instance unknown",
+    "gradient_chunk": "instance gradient_chunk unknown",
+    "stiffness": "instance stiffness_chunk row unknown",
+    "pins": "pin_instance pin_row pin_block",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class StepTables:
+    """What the phases of a step read and write, one owner per solver; allocated once and never replaced."""
+
+    model: newton.Model
+    """The model."""
+    options: SolverReducedOptions
+    """How the step is solved."""
+    layout: Layout
+    """Counts, and which body is where."""
+    instances: Instances
+    """Where instances find their data, and their parameters."""
+    basis: Basis
+    """The bases of all bodies."""
+    scaled: ScaledQuantities
+    """What follows from density and scale."""
+    motion: Motion
+    """The motion of the step per unknown."""
+    points: Points
+    """Results at the cubature points."""
+    samples: Samples
+    """Surface samples and what they found."""
+    constraints: PointConstraints
+    """Pins and contacts."""
+    newton: NewtonState
+    """Where Newton's iteration stands."""
+    arrays: fused.NewtonArrays
+    """Iterates, gradient, Hessian and the linear systems."""
+    rigid: RigidDofs
+    """Joint dofs that take part in the solve."""
+    shapes: Shapes
+    """The rigid shapes."""
+    meshes: list[Any]
+    """What keeps the meshes of ``shapes`` alive."""
+    candidate: wp.array
+    """Shapes that each instance may touch, int (instance_count, candidate_max); -1 pads."""
+    near: wp.array
+    """Which of them are near in this step, likewise."""
+    pairs: SoftPairs | None
+    """Contact between soft bodies, None where there is never any."""
+    system: BlockCholesky
+    """The linear systems."""
+    body_wrench: wp.array
+    """Contact wrench on every rigid body about its centre of mass [N, N m], (body_count,)."""
+    instance_force: wp.array
+    """Contact force on every soft body [N], vec3d (instance_count,)."""
+    parameter_flags: wp.array
+    """What :func:`softmode.deformables.solver.parameters.set_parameters` had to clamp, int (instance_count,)."""
+    every_world: wp.array
+    """The mask that selects all worlds, bool (world_count + 1,)."""
+    team: int
+    """Threads that share one system."""
+    one_launch: bool
+    """Whether a team of threads takes a world through all of its Newton iterations in one launch."""
+    fused_kernel: Kernel
+    """The kernel of that launch."""
+    shared: bool
+    """Whether the systems of that launch are assembled and solved in shared memory."""
+
+    @property
+    def parameters(self) -> SoftModel:
+        """Parameters, initial state and targets of the soft bodies, ``model.softmode``."""
+        return soft(self.model)
+
+    @property
+    def unknowns(self) -> tuple[int, int]:
+        """Shape of an array over the unknowns in blocks of eight."""
+        return self.layout.instance_count, 3 * self.layout.block_count
+
+    @property
+    def pin_arrays(self) -> tuple[wp.array | None, wp.array | None]:
+        """Which rigid bodies the pins follow and how stiffly, None where there are no pins."""
+        return getattr(self.parameters, "pin_body", None), getattr(self.parameters, "pin_stiffness", None)
+
+    def launch(self, kernel: Kernel, dim: int | Sequence[int], *arguments: object, block_dim: int = 256) -> None:
+        """Launch a kernel on the model's device; see :func:`softmode.deformables.model.declare.launch`."""
+        launch(self.model.device, kernel, dim, *arguments, block_dim=block_dim)
+
+    def launch_teams(self, kernel: Kernel, count: int, *arguments: object) -> None:
+        """Launch one team of threads per world or instance, each in a block of its own."""
+        launch_teams(self.model.device, kernel, count, self.team, *arguments)
+
+
+def allocate_tables(
+    model: newton.Model, bodies: Sequence[ReducedBody], options: SolverReducedOptions, rigid: RigidDofs
+) -> StepTables:
+    """Allocate everything that the steps of a model need.
+
+    Args:
+        model: Finalised model that holds reduced bodies.
+        bodies: Its bodies, in any order.
+        options: How a step is solved.
+        rigid: Joint dofs that take part in the solve.
+
+    Raises:
+        ConfigError: If a body of the model is not among ``bodies``, or a shape cannot be touched.
+    """
+    device = model.device
+    layout = lay_out(model, bodies, pair_max=options.contact_max // 2 if options.soft_contact else 0)
+    instances, basis = lay_out_instances(model, layout), lay_out_bases(model, layout)
+    scaled = ScaledQuantities(
+        model,
+        layout,
+        instances,
+        tolerance=options.tolerance,
+        margin=options.contact_margin,
+        smoothing=options.contact_smoothing,
+    )
+    candidate = wp.array(candidate_shapes(model, layout), dtype=int, device=device)
+    shapes, meshes = shape_table(model)
+    pairs = None
+    if layout.pair_max:
+        pairs = SoftPairs(layout, instances, basis, options.stick_ratio, scaled.spacing, device)
+    system_start, system = join_systems(layout, instances, rigid.count_max + 1, device)
+
+    blocks, count, square = layout.block_count, layout.instance_count, 3 * layout.block_count**2
+    one_launch = device.is_cuda and layout.part_count == 1 and blocks <= ONE_LAUNCH_BLOCKS
+    one_each = count == layout.world_count and layout.pin_max == 0
+    driven = any(body.driven_count for body in layout.bodies)
+    small = one_launch and one_each and not driven and 3 * layout.stride <= SHARED_SIZE
+
+    def chunks(threads: int, tasks: int) -> int:
+        """Return into how many parts sums over points are split where a kernel has so many threads, a body tasks."""
+        if not device.is_cuda:
+            return 1
+        return int(np.clip(fused.TEAM // tasks if one_launch else CUDA_THREADS // threads, 1, 16))
+
+    sizes = {
+        "instance": count,
+        "world": layout.world_count,
+        "unknown": 3 * blocks,
+        "row": 3 * layout.stride,
+        "point": layout.point_max,
+        "sample": layout.sample_max,
+        "slot": SLOTS,
+        "team": team_size(device),
+        "constraint": options.contact_max + layout.pin_max,
+        "rigid": rigid.count_max,
+        "gradient_chunk": 1 if small else chunks(count * blocks, blocks),
+        "stiffness_chunk": chunks(count * square, square + (square + 3 * blocks) // 2),
+        "pin_instance": count if layout.pin_max else 1,
+        "pin_row": layout.stride if layout.pin_max else 1,
+        "pin_block": blocks if layout.pin_max else 1,
+    }
+    given = {"instance_start": layout.instance_start, "friction_lag": options.friction_lag}
+    of_system = {
+        "rigid_tolerance": scaled.rigid_tolerance,
+        "system_start": system_start,
+        "direction": system.solution if layout.part_count == 1 else wp.zeros((count, 3 * blocks), vec8, device=device),
+    }
+    for name in ("system_world", "matrix", "scalars", "pattern", "diagonal", "indefinite", "right"):
+        of_system[name] = getattr(system, name)
+    return StepTables(
+        model=model,
+        options=options,
+        layout=layout,
+        instances=instances,
+        basis=basis,
+        scaled=scaled,
+        motion=allocate(Motion, _MOTION, sizes, device, fill={"rate": 1}),
+        points=allocate(Points, _POINTS, sizes, device, fill={"volume_ratio": 1}),
+        samples=allocate(Samples, _SAMPLES, sizes, device, fill={"constraint": -1}),
+        constraints=allocate(PointConstraints, _CONSTRAINTS, sizes, device),
+        newton=allocate(NewtonState, _NEWTON, sizes, device, given=given),
+        arrays=allocate(fused.NewtonArrays, _ARRAYS, sizes, device, given=of_system),
+        rigid=rigid,
+        shapes=shapes,
+        meshes=meshes,
+        candidate=candidate,
+        near=wp.zeros_like(candidate),
+        pairs=pairs,
+        system=system,
+        body_wrench=wp.zeros(max(model.body_count, 1), dtype=WRENCH, device=device),
+        instance_force=wp.zeros(count, dtype=wp.vec3d, device=device),
+        parameter_flags=wp.zeros(count, dtype=int, device=device),
+        every_world=wp.full(layout.world_count + 1, True, dtype=bool, device=device),
+        team=sizes["team"],
+        one_launch=one_launch,
+        fused_kernel=wp.overload(fused.minimise_worlds, {"unit": system.unit}),
+        shared=small and system.scalars.shape[2] <= SHARED_WIDTH,
+    )
