@@ -18,7 +18,7 @@ import warp as wp
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_splats
-from softmode.envs.scripted import ScriptedLift
+from softmode.envs.tasks.lift_soft.scripted import ScriptedLift
 from softmode.envs.tasks.lift_soft.task import LiftSoftEnv
 from softmode.splats import make_plush
 

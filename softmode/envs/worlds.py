@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from softmode.envs.soft_env import info_arrays, observation_arrays, render_worlds
+from softmode.envs.results import info_arrays, map_tree, observation_arrays, render_worlds
 from softmode.envs.task import Task
 from softmode.errors import SoftmodeError, WorkerError
 
@@ -188,7 +188,7 @@ def _serve(pipe: Any, task_class: type[Task], arguments: dict[str, Any]) -> None
                 return
             try:
                 value = getattr(worlds, name)(*given)
-                answer = (True, _to_numpy(worlds.result() if name in ("reset", "step") else value))
+                answer = (True, map_tree(_on_host, worlds.result() if name in ("reset", "step") else value))
             except Exception as error:
                 answer = (False, _portable(error))
             pipe.send(answer)
@@ -206,8 +206,6 @@ def _portable(error: Exception) -> Exception:
     )
 
 
-def _to_numpy(tree: Any) -> Any:
-    """Return a tree of arrays as numpy arrays."""
-    if isinstance(tree, dict):
-        return {name: _to_numpy(value) for name, value in tree.items()}
-    return tree.numpy() if isinstance(tree, wp.array) else tree
+def _on_host(value: Any) -> Any:
+    """Return a Warp array as a NumPy array, and anything else as it is."""
+    return value.numpy() if isinstance(value, wp.array) else value

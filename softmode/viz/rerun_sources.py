@@ -10,8 +10,9 @@ import newton
 import numpy as np
 
 from softmode.deformables.model.status import status_reasons
-from softmode.envs.soft_env import info_arrays
-from softmode.envs.task import EndReason, Task
+from softmode.envs.end_reason import EndReason
+from softmode.envs.results import info_arrays
+from softmode.envs.task import Task
 from softmode.errors import ConfigError
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.splat_scene import SplatScene

@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from softmode.envs.task import EndReason
+from softmode.envs.end_reason import EndReason
+from softmode.envs.structs import filled
 from softmode.envs.tasks.shape_soft import kernels
+from softmode.envs.tasks.shape_soft.config import ShapeSoftConfig
 from softmode.errors import ConfigError
-
-if TYPE_CHECKING:
-    from softmode.envs.tasks.shape_soft.task import ShapeSoftConfig
 
 POINTS = 12
 """Points of a goal."""
 
 
-def reward_arguments(config: ShapeSoftConfig) -> list[Any]:
+def reward_rules(config: ShapeSoftConfig) -> kernels.Rules:
     """Return what the reward depends on beside the goals."""
-    return [int(config.reward == "sparse"), config.reward_length, config.goal_tolerance]
+    return filled(kernels.Rules, config, point_count=POINTS, sparse=int(config.reward == "sparse"))
 
 
 class GoalMethods:
@@ -30,10 +29,8 @@ class GoalMethods:
 
     config: ShapeSoftConfig
 
-    @property
-    def task_device(self) -> Any:
-        """Device on which rewards of numpy arrays are computed: that of the task."""
-        raise NotImplementedError
+    device: wp.Device
+    """Device on which rewards of numpy arrays are computed: that of the task."""
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> Any:
         """Return the reward of a step that led to `achieved_goal`, bit for bit that of the step on the same device.
@@ -60,7 +57,7 @@ class GoalMethods:
                 hint=f"give both the same shape (..., {size})",
             )
         if not hasattr(pair[0], "detach"):
-            goals = [wp.array(goal.reshape(-1, size), dtype=float, device=self.task_device) for goal in pair]
+            goals = [wp.array(goal.reshape(-1, size), dtype=float, device=self.device) for goal in pair]
             return self._launch(goals).numpy().reshape(leading)[()]
         with _torch_stream(pair[0]):
             goals = [wp.from_torch(goal.detach().float().reshape(-1, size).contiguous()) for goal in pair]
@@ -70,7 +67,7 @@ class GoalMethods:
         """Compute the reward of each row."""
         device = goals[0].device
         reward = wp.zeros(goals[0].shape[0], dtype=float, device=device)
-        inputs = [*goals, POINTS, *reward_arguments(self.config)]
+        inputs = [*goals, reward_rules(self.config)]
         wp.launch(kernels.compute_reward, dim=reward.shape[0], inputs=inputs, outputs=[reward], device=device)
         return reward
 
