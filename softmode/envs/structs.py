@@ -9,7 +9,10 @@ from typing import Any, Protocol
 class StructType(Protocol):
     """What ``wp.struct`` makes of a class."""
 
-    vars: Mapping[str, object]
+    @property
+    def vars(self) -> Mapping[str, object]:
+        """The fields by name."""
+        ...
 
     def __call__(self) -> Any:
         """Return a struct with fields of zeros."""

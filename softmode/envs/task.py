@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import gymnasium as gym
 import numpy as np
@@ -125,9 +125,7 @@ class Task:
         self.build()
         self.reset()
         self._step()  # compiles what the graph needs
-        with wp.ScopedCapture(device=self.device) as capture:
-            self._step()
-        self.graph = capture.graph
+        self.graph = captured(self._step, self.device)
         """The step as a captured graph."""
 
     def column(self, segment: str) -> int:
@@ -158,12 +156,13 @@ class Task:
         self.any_done = wp.zeros(1, dtype=int, device=device)
         scene, instances = self.scene, worlds * len(self.scene.objects)
         self._material = wp.zeros((len(MATERIAL), instances), dtype=float, device=device)
+        self._materials = {name: cast(wp.array, self._material[k]) for k, name in enumerate(MATERIAL)}
         columns = [self.table.column(name) for name in MATERIAL]
         self._material_columns = wp.array(columns, dtype=int, device=device)
         self._solver_mask = wp.zeros(worlds + 1, dtype=wp.bool, device=device)
         self._low = wp.array(self.low, dtype=float, device=device)
         self._high = wp.array(self.high, dtype=float, device=device)
-        self.state: WorldState = filled(
+        self.state = filled(
             WorldState,
             scene,
             scene.controller,
@@ -175,7 +174,7 @@ class Task:
             stride=len(scene.objects),
         )
         """What the kernels of a task read."""
-        self.result: StepResult = filled(StepResult, self, marker_place=scene.marker_place)
+        self.result = filled(StepResult, self, marker_place=scene.marker_place)
         """What they write."""
         self._arm = filled(kernels.ArmState, scene.controller, scene.state)
         self._episode = filled(kernels.Episode, self)
@@ -356,7 +355,7 @@ class Task:
         mask, values = scene.world_mask, self._material
         self.launch(kernels.spread_materials, [self.state, self._material_columns], [values], values.shape[1])
         wp.copy(self._solver_mask, mask, count=self.world_count)
-        set_parameters(scene.solver, self._solver_mask, **{name: values[k] for k, name in enumerate(MATERIAL)})
+        set_parameters(scene.solver, self._solver_mask, **self._materials)
         self.place()
         scene.reset_worlds()
         for camera in scene.cameras.values():
@@ -464,3 +463,11 @@ class Task:
         if self.obs_type == "pixels_agent_pos":
             spaces["agent_pos"] = self.layout.space(slice(0, self.agent_size))
         return spaces["pixels"] if list(spaces) == ["pixels"] else gym.spaces.Dict(spaces)
+
+
+def captured(launches: Callable[[], None], device: wp.Device) -> wp.Graph:
+    """Return what a function launches as a graph."""
+    with wp.ScopedCapture(device=device) as capture:
+        launches()
+    assert capture.graph is not None
+    return capture.graph

@@ -14,7 +14,7 @@ import warp as wp
 from softmode.envs.arguments import checked_device
 from softmode.envs.reward_kernels import TOUCH_FORCE
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.task import Task
+from softmode.envs.task import Task, captured
 from softmode.errors import ConfigError
 
 Actions = Literal["random", "grasp"]
@@ -199,9 +199,7 @@ def stage_times(task: Task, repeats: int = 20) -> dict[str, float]:
         parts["camera"] = task.draw_pictures
     graphs: dict[str, wp.Graph] = {"whole step": task.graph}
     for name, part in parts.items():
-        with wp.ScopedCapture(device=task.device) as capture:
-            part()
-        graphs[name] = capture.graph
+        graphs[name] = captured(part, task.device)
     spent: dict[str, list[float]] = {name: [] for name in graphs}
     for _ in range(repeats + 2):  # in turn, so that all see the same states
         for name, graph in graphs.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,13 +13,16 @@ from softmode.envs.end_reason import EndReason
 from softmode.envs.structs import filled
 from softmode.envs.tasks.shape_soft import kernels
 from softmode.envs.tasks.shape_soft.config import ShapeSoftConfig
+from softmode.envs.tensors import Tensor
 from softmode.errors import ConfigError
 
+Goals = np.ndarray | Tensor
+Infos = Mapping[str, Any] | Sequence[Mapping[str, Any]] | np.ndarray | None
 POINTS = 12
 """Points of a goal."""
 
 
-def reward_rules(config: ShapeSoftConfig) -> kernels.Rules:
+def reward_rules(config: ShapeSoftConfig) -> Any:
     """Return what the reward depends on beside the goals."""
     return filled(kernels.Rules, config, point_count=POINTS, sparse=int(config.reward == "sparse"))
 
@@ -32,7 +35,7 @@ class GoalMethods:
     device: wp.Device
     """Device on which rewards of numpy arrays are computed: that of the task."""
 
-    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> Any:
+    def compute_reward(self, achieved_goal: Goals, desired_goal: Goals, info: Infos = None) -> Any:
         """Return the reward of a step that led to `achieved_goal`, bit for bit that of the step on the same device.
 
         Args:
@@ -48,7 +51,7 @@ class GoalMethods:
         """
         size = 3 * POINTS
         pair: tuple[Any, ...] = (achieved_goal, desired_goal)
-        if not all(hasattr(goal, "detach") for goal in pair):
+        if not all(isinstance(goal, Tensor) for goal in pair):
             pair = tuple(np.asarray(goal, np.float32) for goal in pair)
         leading = tuple(pair[0].shape[:-1])
         if any(tuple(goal.shape) != (*leading, size) for goal in pair):
@@ -56,7 +59,7 @@ class GoalMethods:
                 f"goals have shapes {tuple(pair[0].shape)} and {tuple(pair[1].shape)}",
                 hint=f"give both the same shape (..., {size})",
             )
-        if not hasattr(pair[0], "detach"):
+        if not isinstance(pair[0], Tensor):
             goals = [wp.array(goal.reshape(-1, size), dtype=float, device=self.device) for goal in pair]
             return self._launch(goals).numpy().reshape(leading)[()]
         with _torch_stream(pair[0]):
@@ -71,7 +74,7 @@ class GoalMethods:
         wp.launch(kernels.compute_reward, dim=reward.shape[0], inputs=inputs, outputs=[reward], device=device)
         return reward
 
-    def compute_terminated(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> Any:
+    def compute_terminated(self, achieved_goal: Goals, desired_goal: Goals, info: Infos = None) -> Any:
         """Return whether the episode ended by a failure, which `info` (one or a sequence) knows; goals end none."""
         if isinstance(info, Mapping):
             return _failed(info)
@@ -79,7 +82,7 @@ class GoalMethods:
             return np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
         return np.array([_failed(one) for one in info])
 
-    def compute_truncated(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> Any:
+    def compute_truncated(self, achieved_goal: Goals, desired_goal: Goals, info: Infos = None) -> Any:
         """Return False: the time limit is not the task's."""
         return np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
 
