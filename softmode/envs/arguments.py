@@ -10,7 +10,7 @@ from typing import get_args
 import gymnasium as gym
 import numpy as np
 import warp as wp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from softmode.checks import require_choice
 from softmode.envs.task_config import ObservationType, TaskConfig
@@ -109,7 +109,7 @@ def checked_options(options: Mapping[str, object] | None) -> dict[str, object]:
     return dict(options or {})
 
 
-def checked_actions(actions: ArrayLike, space: gym.Space) -> NDArray[np.float32]:
+def checked_actions(actions: object, space: gym.Space) -> NDArray[np.float32]:
     """Return actions as an array.
 
     Raises:

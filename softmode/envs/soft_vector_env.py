@@ -13,7 +13,7 @@ import warp as wp
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from softmode.checks import require_choice
 from softmode.deformables.build.build_body import Progress
@@ -32,6 +32,7 @@ from softmode.envs.parameters import check_options
 from softmode.envs.results import map_tree
 from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
+from softmode.envs.tensors import Tensor, host_array
 from softmode.envs.worlds import LocalWorlds, RemoteWorlds
 from softmode.errors import ConfigError, MissingExtraError
 
@@ -188,7 +189,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             self._results = [worlds.result() for worlds in self._worlds]
             return self._gather("observation"), self._masked(self._gather("info"), self._everywhere())
 
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+    def step(self, actions: ArrayLike | Tensor) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Advance every world by one control step.
 
         Args:
@@ -257,13 +258,11 @@ class SoftVectorEnv(gym.vector.VectorEnv):
 
     # -- arguments ----------------------------------------------------------------------------------------------------
 
-    def _checked_mask(self, mask: Any) -> NDArray[np.bool_]:
+    def _checked_mask(self, mask: object) -> NDArray[np.bool_]:
         """Return which worlds a reset concerns."""
         if mask is None:
             return np.ones(self.num_envs, bool)
-        if hasattr(mask, "cpu"):
-            mask = mask.cpu()
-        mask = np.asarray(mask)
+        mask = host_array(mask) if isinstance(mask, Tensor) else np.asarray(mask)
         if mask.dtype != bool or mask.shape != (self.num_envs,) or not mask.any():
             raise ConfigError(
                 f"reset_mask is {mask.dtype} of shape {mask.shape}",
@@ -273,7 +272,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             raise ConfigError("the first reset is partial", hint="call reset() for all worlds once")
         return mask
 
-    def _seeds(self, seed: Any, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    def _seeds(self, seed: object, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
         """Return the seed of every world's draws, -1 where they go on."""
         first = self._random is None
         if seed is None:
@@ -296,7 +295,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
                 seeds[i] = world_seed(self._random[i])
         return seeds
 
-    def _assign_tensors(self, actions: Any) -> None:
+    def _assign_tensors(self, actions: object) -> None:
         """Copy a tensor of actions to the task, on the device."""
         import torch
 

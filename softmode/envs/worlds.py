@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
@@ -85,7 +86,7 @@ class RemoteWorlds:
 
     def __init__(self, task_class: type[Task], arguments: dict[str, Any]) -> None:
         """Start the child; `connect` waits until it is built."""
-        context: Any = multiprocessing.get_context()
+        context = multiprocessing.get_context()
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(
             target=_serve, args=(theirs, task_class, {**arguments, "progress": None}), daemon=True
@@ -137,7 +138,7 @@ class RemoteWorlds:
             self._process.terminate()
         self._pipe.close()
 
-    def _send(self, name: str, *arguments: Any) -> None:
+    def _send(self, name: str, *arguments: object) -> None:
         """Send a call; the answer to an earlier one that an error or an interruption left there is thrown away."""
         if self._pending:
             with contextlib.suppress(SoftmodeError):
@@ -170,7 +171,7 @@ class RemoteWorlds:
         )
 
 
-def _serve(pipe: Any, task_class: type[Task], arguments: dict[str, Any]) -> None:
+def _serve(pipe: Connection, task_class: type[Task], arguments: dict[str, Any]) -> None:
     """Build the worlds and do what the parent says until it hangs up."""
     try:
         with wp.ScopedDevice("cpu"):
@@ -206,6 +207,6 @@ def _portable(error: Exception) -> Exception:
     )
 
 
-def _on_host(value: Any) -> Any:
+def _on_host(value: object) -> object:
     """Return a Warp array as a NumPy array, and anything else as it is."""
     return value.numpy() if isinstance(value, wp.array) else value

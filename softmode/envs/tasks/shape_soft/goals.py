@@ -92,7 +92,7 @@ def _failed(info: Mapping[str, Any]) -> bool:
     return bool(info.get("end_reason", EndReason.RUNNING) > EndReason.TIME_LIMIT)
 
 
-def _torch_stream(tensor: Any) -> Any:
+def _torch_stream(tensor: Any) -> contextlib.AbstractContextManager[object]:
     """Return the context in which kernels wait for what torch does on the device of a tensor."""
     if not tensor.is_cuda:
         return contextlib.nullcontext()
