@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from softmode.envs.end_reason import EndReason
     from softmode.envs.observation import Segment
     from softmode.envs.parameters import Parameter
-    from softmode.envs.rl_scene import rl_scene
+    from softmode.envs.presets import rl_scene
     from softmode.envs.scripted import scripted_policy
     from softmode.envs.soft_env import SoftEnv
     from softmode.envs.soft_vector_env import SoftVectorEnv
@@ -77,7 +77,7 @@ _HOME = {
     "end_reason": "EndReason",
     "observation": "Segment",
     "parameters": "Parameter",
-    "rl_scene": "rl_scene",
+    "presets": "rl_scene",
     "scripted": "scripted_policy",
     "soft_env": "SoftEnv",
     "soft_vector_env": "SoftVectorEnv",

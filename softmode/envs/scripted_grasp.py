@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.envs.reward_kernels import TOUCH_FORCE
-from softmode.envs.scripted_policy import ScriptedPolicy, Vector
+from softmode.envs.scripted_base import ScriptedPolicy, Vector
 
 
 class ScriptedGrasp(ScriptedPolicy):

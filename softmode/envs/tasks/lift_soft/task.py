@@ -10,7 +10,7 @@ from softmode.checks import require_fields, require_numbers
 from softmode.envs.markers import sphere_marker
 from softmode.envs.observation import Segment
 from softmode.envs.parameters import Parameter
-from softmode.envs.rl_scene import rl_scene
+from softmode.envs.presets import rl_scene
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.structs import filled

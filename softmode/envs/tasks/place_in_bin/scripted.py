@@ -6,8 +6,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from softmode.envs.scripted_base import ScriptedPolicy, Vector, bounded
 from softmode.envs.scripted_grasp import ScriptedGrasp
-from softmode.envs.scripted_policy import ScriptedPolicy, Vector, bounded
 from softmode.envs.tasks.place_in_bin.kernels import Metric
 from softmode.envs.tasks.place_in_bin.task import PlaceInBin
 

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.envs.scripted_policy import ScriptedPolicy
+from softmode.envs.scripted_base import ScriptedPolicy
 from softmode.envs.tasks.press_soft.kernels import Metric
 from softmode.envs.tasks.press_soft.task import PressSoft
 

@@ -13,7 +13,7 @@ from softmode.envs.cameras import square_camera
 from softmode.envs.markers import sphere_marker
 from softmode.envs.observation import Segment
 from softmode.envs.parameters import Parameter
-from softmode.envs.rl_scene import RL_SOLVER
+from softmode.envs.presets import RL_SOLVER
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.structs import filled

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.envs.scripted_policy import ScriptedPolicy, Vector, half_turn
+from softmode.envs.scripted_base import ScriptedPolicy, Vector, half_turn
 from softmode.envs.tasks.push_soft.task import PushSoft
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from softmode.checks import require_choice, require_fields, require_number, require_range
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
-from softmode.envs.rl_scene import RL_SOLVER
+from softmode.envs.presets import RL_SOLVER
 from softmode.envs.task_config import TaskConfig
 from softmode.errors import ConfigError
 from softmode.objects.soft_object import ObjectConfig

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.envs.scripted_policy import ScriptedPolicy, bounded, half_turn
+from softmode.envs.scripted_base import ScriptedPolicy, bounded, half_turn
 from softmode.envs.tasks.shape_soft.task import ShapeSoft
 
 
