@@ -1,6 +1,7 @@
 # softmode: set-up, tests and the demo. Needs python3 >= 3.11 and make; everything is installed into .venv.
 #   make demo            the arm lifts a soft object; writes out/lift.mp4
-#   make test            the fast tests (what CI runs)
+#   make test-fast       a sharp minute: a few tests of every room
+#   make test            all tests but the slow ones (what CI runs, after make lint)
 #   make dist            sdist and wheel in dist/; make smoke installs the wheel into an environment of its own and steps
 SHELL  := /bin/bash
 PYTHON ?= python3
@@ -24,7 +25,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 unexport VIRTUAL_ENV
 
 .DEFAULT_GOAL := help
-.PHONY: help lock resolve demo test test-slow lint docs dist smoke bench accuracy baselines clean coupling
+.PHONY: help lock resolve demo test test-fast test-slow lint docs dist smoke bench accuracy baselines clean coupling
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -65,16 +66,20 @@ resolve: $(VENV)/.created  ## check that all extras resolve to wheels on every s
 demo: $(VENV)/.demo  ## play the scripted lift and write out/lift.mp4
 	$(BIN)/softmode play softmode/LiftSoft-v0 --policy scripted --video out/lift.mp4 $(ARGS)
 
-test: $(VENV)/.dev  ## run the fast tests
+test-fast: $(VENV)/.dev  ## run a few quick tests of every room
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal -m fast $(ARGS)
+
+test: $(VENV)/.dev  ## run all tests but the slow ones
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
 
 test-slow: $(VENV)/.dev  ## run all tests, slow ones included
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist loadfile -m 'slow or not slow' $(ARGS)
 
-lint: $(VENV)/.dev  ## ruff and pyright
+lint: $(VENV)/.dev  ## ruff, pyright, and words that may not come back
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
+	$(BIN)/python -m pytest tests/test_words.py
 
 dist: $(VENV)/.dev  ## build sdist and wheel
 	rm -rf dist

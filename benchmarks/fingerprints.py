@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -50,7 +51,7 @@ COMMANDS = (
 
 def episode(task: str) -> dict[str, str]:
     """Return hashes of what 200 steps of seeded random actions show, episode after episode."""
-    env = gym.make(f"softmode/{task}-v0", obs_type="pixels_agent_pos", render_mode="rgb_array", device="cpu")
+    env: Any = gym.make(f"softmode/{task}-v0", obs_type="pixels_agent_pos", render_mode="rgb_array", device="cpu")
     numbers, pictures, frames = (hashlib.sha256() for _ in range(3))
 
     def see(observation: dict[str, np.ndarray]) -> None:
@@ -79,7 +80,7 @@ def scripted(task: str) -> str:
     """Return a hash of a scripted episode: every whole observation and reward."""
     import importlib
 
-    env = gym.make(f"softmode/{task}-v0", device="cpu")
+    env: Any = gym.make(f"softmode/{task}-v0", device="cpu")
     for module in ("softmode.envs.scripted",):
         policy = importlib.import_module(module).scripted_policy
     numbers = hashlib.sha256()
@@ -106,12 +107,15 @@ def run(*words: str) -> str:
 
 
 def digest_of_arrays(path: Path) -> str:
-    """Return a hash of the arrays of an .npz, name by name."""
+    """Return a hash of the arrays of an .npz, name by name, and of its header without times and paths."""
     found = hashlib.sha256()
     with np.load(path) as file:
         for name in sorted(file.files):
             found.update(name.encode())
-            found.update(np.ascontiguousarray(file[name]).tobytes())
+            if name == "header":
+                found.update(" ".join(sorted(json.loads(file[name].tobytes()))).encode())
+            else:
+                found.update(np.ascontiguousarray(file[name]).tobytes())
     return found.hexdigest()
 
 

@@ -21,9 +21,8 @@ import warp as wp
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReduced
-from softmode.objects import presets
-from softmode.objects.soft_object import load_object
-from tests.envs.test_primitives import hang, heavy_elastica
+from softmode.objects import load, presets
+from tests.objects.test_primitives import hang, heavy_elastica
 from tests.scenes import GRAVITY
 
 DT = 1.0 / 240.0
@@ -41,7 +40,7 @@ ROPES = (
 def step_time(name: str) -> str:
     """Return the table row of a preset."""
     clock = time.process_time()
-    thing, material = load_object(getattr(presets, name), False), getattr(presets, f"{name}_MATERIAL")
+    thing, material = load(getattr(presets, name), progress=False), getattr(presets, f"{name}_MATERIAL")
     seconds = time.process_time() - clock
     world = newton.ModelBuilder()
     add_reduced_body(world, thing.body, material=material, position=(0.0, 0.0, thing.height))
@@ -61,7 +60,7 @@ def step_time(name: str) -> str:
         wp.capture_launch(graph)
         times.append(0.5e3 * (time.perf_counter() - clock))
     body = thing.body
-    sizes = f"{body.function_count} | {body.point_count} | {body.surface_count} | {thing.splats.count}"
+    sizes = f"{body.function_count} | {body.point_count} | {body.surface_count} | {thing.visible_splats.count}"
     return f"| {name} | {sizes} | {seconds:.2f} | {min(times):.2f} |"
 
 
@@ -69,23 +68,23 @@ def main() -> None:
     """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--load", type=float, default=2.5, help="w (L/2)^3 / (E I) of the rope")
-    load = parser.parse_args().load
+    pull = parser.parse_args().load
     wp.config.log_level = wp.LOG_WARNING
     print("| preset | functions | points | samples | splats | build [s] | ms per step |\n|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         os.environ["SOFTMODE_CACHE"] = folder
-        load_object(presets.CUBE, False)  # imports what builds need
+        load(presets.CUBE, progress=False)  # imports what builds need
         for name in ("BEAM", "CUBE", "PAD", "ROPE"):
             os.environ["SOFTMODE_CACHE"] = os.path.join(folder, name)
             print(step_time(name), flush=True)
         half, radius = 0.5 * presets.ROPE.extents[0], 0.5 * presets.ROPE.extents[1]  # type: ignore[index]
-        modulus = 1000.0 * GRAVITY * 4.0 * half**3 / (load * radius**2)
+        modulus = 1000.0 * GRAVITY * 4.0 * half**3 / (pull * radius**2)
         material = replace(presets.ROPE_MATERIAL, youngs_modulus=modulus, density=1000.0)
-        exact = half * heavy_elastica(load)[0]
+        exact = half * heavy_elastica(pull)[0]
         print(f"\nelastica: {exact / half:.3f} of half the length")
         print("| handles | modes | rank tolerance | functions | drop over the elastica's |\n|---|---|---|---|---|")
         for build in ROPES:
-            thing = load_object(replace(presets.ROPE, build=build), False)
+            thing = load(replace(presets.ROPE, build=build), progress=False)
             drop = float(np.asarray(hang(thing, material, half))[0])
             row = f"{build.handles} | {build.mode_count} | {build.rank_tolerance:g} | {thing.body.function_count}"
             print(f"| {row} | {drop / exact:.3f} |", flush=True)

@@ -20,24 +20,23 @@ import numpy as np
 
 import softmode  # noqa: F401  (registers the environments)
 from softmode.deformables.materials.material import Material
-from softmode.deformables.skinning.skin_splats import average_basis
 from softmode.learning.players import policy_factory
-from softmode.objects.soft_object import ObjectConfig, SoftObject, load_object
-from softmode.scenes.splat_scene import PlacedObject, SplatScene
+from softmode.objects import Placed, SoftObject, load
+from softmode.scenes import SplatScene
 from softmode.splats import Splats
 from softmode.viz.rerun_logger import RerunLogger, RerunOptions
 
 
 def many_splats(count: int) -> SoftObject:
     """Return the plush with as many splats as asked for, each a jittered copy of one of its own."""
-    thing, rng = load_object(ObjectConfig(size=0.08)), np.random.default_rng(0)
-    pick = rng.integers(thing.splats.count, size=count)
-    source = thing.splats.subset(pick) if count <= thing.splats.count else None
-    arrays = {name: getattr(thing.splats, name)[pick] for name in ("quats", "scales", "opacities", "sh")}
-    means = thing.splats.means[pick] + 0.3 * thing.splats.scales[pick] * rng.normal(size=(count, 3))
+    thing, rng = load(size=0.08, material=Material(youngs_modulus=3.0e4, density=250.0)), np.random.default_rng(0)
+    rest = thing.visible_splats
+    pick = rng.integers(rest.count, size=count)
+    source = rest.subset(pick) if count <= rest.count else None
+    arrays = {name: getattr(rest, name)[pick] for name in ("quats", "scales", "opacities", "sh")}
+    means = rest.means[pick] + 0.3 * rest.scales[pick] * rng.normal(size=(count, 3))
     splats = source if source is not None else Splats(means=means.astype(np.float32), **arrays, name="many")
-    basis, grad_basis = average_basis(lambda x: thing.body.evaluate(x)[0], splats.means, splats.covariances())
-    return replace(thing, splats=splats, basis=basis, grad_basis=grad_basis)
+    return replace(thing, splats=splats)
 
 
 def measure(record: Callable[[], None], step: Callable[[], None], frames: int) -> tuple[float, float]:
@@ -55,15 +54,11 @@ def drop(thing: SoftObject, frames: int, options: RerunOptions, path: Path) -> t
     """Record a toy that falls on the ground and bounces."""
     builder = newton.ModelBuilder()
     builder.add_ground_plane()
-    place = PlacedObject(
-        thing=thing,
-        position=(0.0, 0.0, thing.height + 0.05),
-        material=Material(youngs_modulus=3.0e4, density=250.0),
-    )
+    place = Placed(object=thing, position=(0.0, 0.0, thing.height + 0.05))
     scene, frame = SplatScene(builder, [place]), iter(range(frames + 1))
-    scene.advance()  # compiles
+    scene.step()  # compiles
     with RerunLogger(path, scene, options=options) as log:
-        return measure(lambda: log.record(scene.state, time=next(frame) / 30.0), scene.advance, frames)
+        return measure(lambda: log.record(scene.state, time=next(frame) / 30.0), scene.step, frames)
 
 
 def lift(frames: int, options: RerunOptions, path: Path) -> tuple[float, float]:

@@ -30,7 +30,7 @@ from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.skinning.skin_splats import STRETCH_LIMIT, SkinSplats, average_basis
-from softmode.objects.soft_object import ObjectConfig, load_object
+from softmode.objects import ObjectConfig, load
 from softmode.splats import Splats
 from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
@@ -408,8 +408,9 @@ def main() -> None:
     values = body_values(bar_body())
     measure("bar 16 modes", exact[:4], ties(values), bar, sample_bar(0.0007), pictures=arguments.pictures)
     if arguments.splat:
-        thing = load_object(ObjectConfig(splat=arguments.splat, size=0.25, build=BuildOptions(mode_count=16)))
-        high = float(np.ptp(thing.splats.means[:, 2]))
+        thing = load(ObjectConfig(splat=arguments.splat, size=0.25, build=BuildOptions(mode_count=16)))
+        splats = thing.visible_splats
+        high = float(np.ptp(splats.means[:, 2]))
         loose: list[Case] = [
             ("rest", rest),
             ("bend 90", upright(bend(np.pi / 2, high))),
@@ -420,7 +421,12 @@ def main() -> None:
         ]
         values = body_values(thing.body)
         measure(
-            "file 16 modes", loose, ties(values), thing.splats, scatter(thing.splats, 32), pictures=arguments.pictures
+            "file 16 modes",
+            loose,
+            ties(values),
+            splats,
+            scatter(splats, 32),
+            pictures=arguments.pictures,
         )
 
 

@@ -23,10 +23,9 @@ import warp as wp
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReduced
-from softmode.objects.soft_object import ObjectConfig, load_object
+from softmode.objects import Placed, load
 from softmode.splats import Splats, make_plush
 from softmode.usd import (
-    PlacedBody,
     UsdAnimation,
     UsdAnimationOptions,
     UsdExportOptions,
@@ -42,16 +41,16 @@ FULL = UsdExportOptions()
 BARE = UsdExportOptions(weights="none", kaolin=False)
 
 
-def toy_with(count: int) -> PlacedBody:
+def toy_with(count: int) -> Placed:
     """Return the plush with a number of splats, in the air."""
-    thing = load_object(ObjectConfig(size=0.08))
+    thing = load(size=0.08)
     splats = make_plush(count=count)
     low, high = splats.bounds()
     scale = 0.08 / float((high - low).max())
     centre = np.array([*(0.5 * (low + high))[:2], low[2]])
     shown = splats.transformed(translation=-scale * centre, scale=scale).transformed(translation=-thing.body.offset)
-    material = Material(youngs_modulus=2e4)
-    return PlacedBody(body=thing.body, splats=shown, material=material, position=(0.0, 0.0, 0.1), name="toy")
+    toy = dataclasses.replace(thing, splats=shown, material=Material(youngs_modulus=2e4))
+    return Placed(object=toy, position=(0.0, 0.0, 0.1), name="toy")
 
 
 def coloured(splats: Splats, degree: int) -> Splats:

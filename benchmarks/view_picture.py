@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-from softmode.objects.soft_object import ObjectConfig
+from softmode.objects import ObjectConfig
 from tests.view.serving import served
 from tests.view.test_browser import CHROMIUM, FLAGS, project
 

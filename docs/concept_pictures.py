@@ -24,11 +24,12 @@ from softmode.deformables.build.quadrature import quadrature_from_splats
 from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
-from softmode.deformables.skinning.skin_splats import SkinSplats, average_basis
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
+from softmode.objects import SoftObject
+from softmode.scenes import BoundSplats
 from softmode.splats import Splats, make_plush
 from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
+from softmode.splats.rasterizer import RasterizerOptions, SplatRasterizer, ViewArrays
 
 Array = NDArray[np.float64]
 
@@ -43,22 +44,18 @@ class Painter:
     def __init__(self, body: ReducedBody, splats: Splats) -> None:
         """Tie the splats (in the body frame) to the body."""
         self.rest = splats
-        self.arrays = SplatArrays.from_splats([splats])
-        covariances = splats.covariances()
-        basis, slope = average_basis(lambda x: body.evaluate(x)[0], splats.means, covariances)
-        self.skin = SkinSplats(splats.means, covariances, basis, slope)
-        self.start = wp.zeros(1, dtype=wp.int32)
+        self.bound = BoundSplats(None, [SoftObject(body=body, splats=splats)], worlds=[0])
         self.rasterizer = SplatRasterizer(splats.count, 1, SIZE, SIZE, options=RasterizerOptions())
 
     def draw(
         self, q: Array, *, target: float = 0.0, fov_y: float = 0.42, colors: Array | None = None
     ) -> dict[str, NDArray[Any]]:
         """Return rgb, alpha and depth of the splats at coordinates q (n, 3), looking at a height [m]."""
-        shown = self.arrays
+        shown = self.bound.arrays
         if colors is not None:
             sh = (colors[:, None] - 0.5) / 0.28209479177387814  # the constant harmonic
             shown.sh.assign(np.ascontiguousarray(sh[None], dtype=np.float32))
-        self.skin.launch(wp.array(q, dtype=wp.vec3d), self.start, shown.means, shown.covariances)
+        self.bound.move(wp.array(q, dtype=wp.vec3d))
         eye = PinholeCamera.look_at(
             "eye",
             position=(0.21, -0.12, target + 0.08),
@@ -243,10 +240,10 @@ def camera_picture(folder: Path, painter: Painter, body: ReducedBody) -> None:
     q[4] += (0.0, 0.005, 0.0)
     found = painter.draw(q)
     picture, axes = figure(4, height=2.7)
-    means = painter.arrays.means.numpy()[0]
+    means = painter.bound.arrays.means.numpy()[0]
     front = np.argsort(means @ np.array([0.21, -0.12, 0.08]))
     side = np.array([0.12, 0.21, 0.0]) / np.hypot(0.12, 0.21)
-    colors = np.clip(0.5 + 0.28209479177387814 * painter.arrays.sh.numpy()[0][:, 0], 0.0, 1.0)
+    colors = np.clip(0.5 + 0.28209479177387814 * painter.bound.arrays.sh.numpy()[0][:, 0], 0.0, 1.0)
     axes[0, 0].scatter(means[front] @ side, means[front, 2], s=4, c=colors[front], lw=0)
     axes[0, 0].set_aspect("equal")
     seen = found["alpha"] > 0.5

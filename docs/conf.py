@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 import importlib.util
 import re
@@ -13,6 +14,8 @@ import numpy.typing
 from docutils import nodes
 from docutils.utils.math import MathError
 from docutils.utils.math.latex2mathml import tex2mathml
+from sphinx.ext.autodoc.mock import mock
+from sphinx.pycode import ModuleAnalyzer
 from sphinx.util.logging import getLogger
 
 sys.path.insert(0, str(Path(__file__).parent / "inventories"))
@@ -23,7 +26,14 @@ author = "the softmode authors"
 copyright = "the softmode authors, Apache-2.0"
 release = importlib.metadata.version("softmode")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.intersphinx", "sphinx.ext.napoleon"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.intersphinx",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+]
 exclude_patterns = ["_build"]
 
 myst_enable_extensions = ["dollarmath", "amsmath"]
@@ -50,6 +60,10 @@ autodoc_mock_imports = [name for name in _EXTRAS if importlib.util.find_spec(nam
 napoleon_numpy_docstring = False
 napoleon_use_rtype = False
 
+default_role = "code"  # what stands in single backticks is code, as in Markdown
+toc_object_entries_show_parents = "hide"
+add_module_names = False
+
 # Links to other projects, from inventories that lie in the repository: nothing is fetched.
 intersphinx_mapping = {name: (other.url, f"inventories/{name}.inv") for name, other in PROJECTS.items()}
 
@@ -63,6 +77,8 @@ html_theme_options = {"navigation_with_keys": True}
 html_math_renderer = "mathml"  # set in the page itself: a reader needs no network either
 
 _DESCRIPTIONS: dict[str, list[str]] = {}
+_PUBLIC: dict[str, str] = {}
+"""The public path of what lives in a module, by module and name."""
 
 
 def _keep(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
@@ -86,6 +102,55 @@ def _restore(app: Any, what: str, name: str, obj: Any, options: Any, lines: list
         lines[:] = _DESCRIPTIONS.pop(name)
 
 
+def _face(name: str) -> dict[str, Any]:
+    """Return the public names of a package, and what they are; names are imported with missing extras mocked."""
+    module = importlib.import_module(name)
+    with mock(autodoc_mock_imports):
+        return {public: getattr(module, public) for public in getattr(module, "__all__", ())}
+
+
+def _constant(package: str, name: str, value: Any) -> list[str]:
+    """Return the entry of a constant, described by the string below it in its own module."""
+    homes = [home for home in sorted(sys.modules) if home.startswith(f"{package}.")]
+    for home in homes:
+        if vars(sys.modules[home]).get(name) is value:
+            text = ModuleAnalyzer.for_module(home).find_attr_docs().get(("", name))
+            if text:
+                return [f".. py:data:: {name}", "", *(f"   {line}" for line in text)]
+    raise LookupError(f"{package}.{name} has no description")
+
+
+def _reference(match: re.Match[str]) -> str:
+    """Return a block of the reference: the table of a package's names, or the entries of those listed or of all."""
+    kind, package, listed = match.groups()
+    public = _face(package)
+    lines = ["```{eval-rst}", f".. currentmodule:: {package}", ""]
+    if kind == "summary":
+        lines += [".. autosummary::", "   :nosignatures:", ""]
+        return "\n".join([*lines, *(f"   {name}" for name, value in public.items() if callable(value)), "```"])
+    for name in listed.split() or public:
+        if callable(public[name]):
+            lines.append(f".. auto{'class' if isinstance(public[name], type) else 'function'}:: {name}")
+        else:
+            lines += _constant(package, name, public[name])
+    return "\n".join([*lines, "```"])
+
+
+def _resolve(app: Any, env: Any, node: Any, shown: Any) -> Any:
+    """Link a name that a docstring gives by its module to where its package offers it."""
+    if not _PUBLIC:
+        for package in app.srcdir.joinpath("api").glob("*.md"):
+            face = f"softmode.{package.stem}"
+            for name, value in _face(face).items():
+                _PUBLIC[f"{getattr(value, '__module__', '')}.{getattr(value, '__qualname__', '')}"] = f"{face}.{name}"
+    target = node.get("reftarget", "")
+    for end in (target, target.rpartition(".")[0]):
+        if end in _PUBLIC and node.get("refdomain") == "py":
+            place = _PUBLIC[end] + target[len(end) :]
+            return env.get_domain("py").resolve_xref(env, node["refdoc"], app.builder, "obj", place, node, shown)
+    return None
+
+
 def _read(app: Any, page: str, source: list[str]) -> None:
     """Adapt a page to the site: links called after their files, as is right elsewhere, get the titles of their pages.
 
@@ -95,6 +160,7 @@ def _read(app: Any, page: str, source: list[str]) -> None:
         folder = Path(app.srcdir)
         lines = source[0].splitlines()
         source[0] = "\n".join(line for line in lines if not line.endswith("*") or list(folder.glob(f"{line}.md")))
+    source[0] = re.sub(r"^```\{(summary|entries)\} (\S+)\n(.*?)^```$", _reference, source[0], flags=re.M | re.S)
     source[0] = re.sub(r"\[[\w/]+\.md\]\(([^)]+\.md)\)", r"[](\1)", source[0])
 
 
@@ -143,4 +209,5 @@ def setup(app: Any) -> None:
     app.connect("autodoc-process-docstring", _restore, priority=600)
     app.connect("autodoc-process-signature", _shorten)
     app.connect("source-read", _read)
+    app.connect("missing-reference", _resolve)
     app.add_html_math_renderer("mathml", inline_renderers=(_inline_math, None), block_renderers=(_block_math, None))

@@ -19,9 +19,8 @@ import torch
 from torch import nn
 
 import softmode
-from softmode.demonstrations import Dataset, DatasetWriter, read_dataset
-from softmode.demonstrations.recording import environment_features, record_episodes
-from softmode.learning.players import policy_factory
+from softmode.demonstrations import Dataset, DatasetWriter, environment_features, read_dataset, record_episodes
+from softmode.learning import policy_factory
 
 KEYS = ("observation.state", "observation.environment_state", "action")
 CHUNK, PLAYED, NOISE = 8, 4, 0.3  # actions predicted at once, those of them played, pushes while recording

@@ -1,7 +1,6 @@
 """A new task in 60 lines: knock over a soft post. Observations, pictures, random draws, vectors and tensors come free.
 
 What stands between the two rules is the task: what is on the table, what is rewarded, when it is solved.
-
 Run: ``python examples/custom_env.py [--short]``; writes ``out/custom_env.mp4``
 """
 
@@ -16,9 +15,9 @@ import warp as wp
 from gymnasium.utils.env_checker import check_env
 
 from softmode.envs import Segment, SoftEnv, SoftVectorEnv, Task, TaskConfig, check_vector_env, rl_scene
-from softmode.objects.soft_object import ObjectConfig
-from softmode.scenes.table_scene import TableSceneConfig
-from softmode.viz.film import Film
+from softmode.objects import ObjectConfig
+from softmode.scenes import TableSceneConfig
+from softmode.viz import Film
 
 # ----------------------------------------------------------------------------------------------------------------------
 RADIUS, HEIGHT = 0.02, 0.12  # of the post [m]
@@ -54,6 +53,7 @@ class Topple(Task):
     """Knock over a soft post. Reward terms: ``reach`` (0..1), ``fall`` (0..3)."""
 
     config_class, term_names, metric_names = ToppleConfig, ("reach", "fall"), ("upright",)
+    config: ToppleConfig
 
     def object_segments(self) -> tuple[Segment, ...]:
         """Add a number to the observation."""

@@ -15,11 +15,10 @@ import numpy as np
 import warp as wp
 from PIL import Image
 
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.skinning.skin_splats import SkinSplats
-from softmode.objects.soft_object import ObjectConfig, load_object
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
+from softmode.deformables import BuildOptions
+from softmode.objects import load
+from softmode.scenes import BoundSplats
+from softmode.splats import PinholeCamera, SplatRasterizer, ViewArrays
 
 SIZE, DISTANCE = 128, 2.4
 """Edge of the pictures [px]; distance of the camera in sizes of the object."""
@@ -42,8 +41,8 @@ class Deformed:
 
     def __init__(self, file: str | None = None, *, mode_count: int = 16) -> None:
         """Reduce the object and fit the coordinates of each world."""
-        self.thing = load_object(ObjectConfig(splat=file, build=BuildOptions(mode_count=mode_count)))
-        splats = self.thing.splats
+        self.thing = load(file, build=BuildOptions(mode_count=mode_count))
+        splats = self.thing.visible_splats
         x = splats.means.astype(np.float64)
         self.height = float(np.ptp(x[:, 2]))
         motions = [x]
@@ -55,19 +54,12 @@ class Deformed:
         self.misfit = np.sqrt((misfit**2).sum(axis=2).mean(axis=0)) / self.height
         q = fitted.reshape(len(fitted), -1, 3).transpose(1, 0, 2)  # (world, function, xyz)
         self.worlds = len(q)
-        self.arrays = SplatArrays.from_splats([splats], world_count=self.worlds)
-        skin = SkinSplats(splats.means, splats.covariances(), self.thing.basis, self.thing.grad_basis)
-        skin.launch(
-            wp.array(q.reshape(-1, 3), dtype=wp.vec3d),
-            wp.array(np.arange(self.worlds) * q.shape[1], dtype=wp.int32),
-            self.arrays.means,
-            self.arrays.covariances,
-            rotations=self.arrays.rotations,
-        )
+        self.bound = BoundSplats(None, [self.thing], worlds=range(self.worlds))
+        self.bound.move(wp.array(q.reshape(-1, 3), dtype=wp.vec3d))
 
     def draw(self, size: int) -> np.ndarray:
         """Draw every world from the front, shape (world, size, size, 3)."""
-        distance = DISTANCE * float(np.ptp(self.thing.splats.means, axis=0).max())
+        distance = DISTANCE * float(np.ptp(self.thing.visible_splats.means, axis=0).max())
         camera = PinholeCamera.look_at(
             "front",
             position=(distance, 0.0, 0.0),
@@ -77,8 +69,8 @@ class Deformed:
             fov_y=2.0 * math.atan(1.0 / 3.0),
         )
         views = ViewArrays.from_cameras([camera] * self.worlds, world=range(self.worlds), background=(0.85, 0.88, 0.92))
-        rasterizer = SplatRasterizer(self.thing.splats.count, self.worlds, size, size)
-        rasterizer.render(self.arrays, views)
+        rasterizer = SplatRasterizer(self.thing.visible_splats.count, self.worlds, size, size)
+        rasterizer.render(self.bound.arrays, views)
         return np.clip(rasterizer.rgb.numpy(), 0.0, 1.0)
 
 

@@ -18,7 +18,7 @@ from scipy import stats
 
 import softmode  # noqa: F401  (registers the environments)
 from softmode.envs import LiftSoftConfig
-from softmode.splats.camera_randomization import CameraRandomization
+from softmode.splats import CameraRandomization
 
 COLUMNS, GRAVITY = 4, 9.81
 RANGES: dict[str, tuple[float, float]] = {

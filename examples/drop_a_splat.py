@@ -13,14 +13,11 @@ import newton
 import numpy as np
 import warp as wp
 
-from softmode.deformables.materials.material import Material
-from softmode.deformables.model.status import status_reasons
-from softmode.objects.soft_object import ObjectConfig, load_object
-from softmode.scenes.splat_scene import PlacedObject, SplatScene
-from softmode.splats.camera import CameraOptions
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.shadow import ShadowOptions
-from softmode.viz.film import Film
+from softmode.deformables import Material, status_reasons
+from softmode.objects import Placed, load
+from softmode.scenes import SplatScene
+from softmode.splats import CameraOptions, PinholeCamera, ShadowOptions
+from softmode.viz import Film
 
 GRAVITY, DT, STEPS = 9.81, 1.0 / 960.0, 32
 """Gravity [m/s^2]; physics step [s], and steps of a frame: implicit steps that are long eat the bounce."""
@@ -32,13 +29,13 @@ class Drop:
 
     def __init__(self, file: str | None, *, size: float, edge: int) -> None:
         """Reduce the object and hang it 1.5 sizes over the table."""
-        self.thing = load_object(ObjectConfig(splat=file, size=size))
+        self.thing = load(file, size=size, material=FOAM)
         self.fall = 1.5 * size
         world = newton.ModelBuilder()
         world.default_shape_cfg.mu = 0.8
         below = wp.transform((0.0, 0.0, -0.05), wp.quat_identity())
         world.add_shape_box(-1, xform=below, hx=9.0, hy=9.0, hz=0.05, color=(0.66, 0.68, 0.70), label="table")
-        placed = PlacedObject(thing=self.thing, position=(0.0, 0.0, self.fall + self.thing.height), material=FOAM)
+        placed = Placed(object=self.thing, position=(0.0, 0.0, self.fall + self.thing.height))
         eye, target = (4.2 * size, -1.6 * size, 1.8 * size), (0.0, 0.0, 1.05 * size)
         camera = PinholeCamera.look_at("film", position=eye, target=target, width=edge, height=edge, fov_y=0.66)
         light = CameraOptions(mesh_samples=4, splat_shadow=ShadowOptions(cells=48))
@@ -55,7 +52,7 @@ class Drop:
         rows, frame_dt = [(0.0, *self.measure())], DT * STEPS
         for k in range(frames):
             film.add(self.scene.draw(), round(1.0 / frame_dt))
-            self.scene.advance()
+            self.scene.step()
             rows.append(((k + 1) * frame_dt, *self.measure()))
         return np.array(rows)
 
@@ -86,7 +83,9 @@ def main(arguments: list[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
     drop = Drop(given.file, size=given.size, edge=128 if given.short else 480)
-    print(f"{drop.thing.splats.count} splats, {1e3 * drop.weight / GRAVITY:.1f} g, falls {100 * drop.fall:.0f} cm")
+    print(
+        f"{drop.thing.visible_splats.count} splats, {1e3 * drop.weight / GRAVITY:.1f} g, falls {100 * drop.fall:.0f} cm"
+    )
     with Film(given.video) as film:
         rows = drop.run(film, 60)
         film.publish()

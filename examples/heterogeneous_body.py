@@ -18,18 +18,10 @@ import numpy as np
 import warp as wp
 from PIL import Image
 
-from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.body.regions import Region
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
-from softmode.deformables.materials.material import Material
-from softmode.deformables.skinning.skin_splats import average_basis
-from softmode.deformables.solver.solver_reduced import SolverReducedOptions
-from softmode.objects.soft_object import SoftObject
-from softmode.scenes.splat_scene import PlacedObject, SplatScene
-from softmode.splats import Splats
-from softmode.splats.pinhole import PinholeCamera
+from softmode.deformables import BuildOptions, Material, Region, SolverReducedOptions, build_body, quadrature_from_box
+from softmode.objects import Placed, SoftObject
+from softmode.scenes import SplatScene
+from softmode.splats import PinholeCamera, Splats
 
 LENGTH, CLAMP, EDGE, CORE = 0.32, 0.04, 0.04, 0.02
 """The bar and what of it is clamped; edges of its section and of its core [m]."""
@@ -41,18 +33,14 @@ def in_core(x: np.ndarray) -> np.ndarray:
     return np.abs(x[:, 1:]).max(axis=1) < 0.5 * CORE
 
 
-def make_bar(ratio: float) -> ReducedBody:
-    """Build a bar along x whose core is `ratio` times as stiff as its shell."""
+def make_bar(ratio: float) -> SoftObject:
+    """Build a bar along x whose core is `ratio` times as stiff; splats show a milky shell, and a core that is red."""
     wide = float("inf")
     root = Region(name="root", box=((-wide,) * 3, (-0.5 * LENGTH + CLAMP, wide, wide)))
     quadrature = quadrature_from_box((LENGTH, EDGE, EDGE), point_count=16000)  # 12 across
     options = BuildOptions(mode_count=3, handles="quadratic", cubature_count=512, poissons_ratio=0.3)
     field = np.where(in_core(quadrature.points), ratio, 1.0)
-    return build_body(quadrature, options, regions=(root,), stiffness_scale=field)
-
-
-def dressed(body: ReducedBody, ratio: float) -> SoftObject:
-    """Give a bar splats that show what is inside: a milky shell around a core, red where that is stiff."""
+    body = build_body(quadrature, options, regions=(root,), stiffness_scale=field)
     rng = np.random.default_rng(0)
     means = rng.uniform(-0.5, 0.5, (40000, 3)) * (LENGTH, EDGE, EDGE) - body.offset
     core = in_core(means + body.offset)
@@ -64,13 +52,13 @@ def dressed(body: ReducedBody, ratio: float) -> SoftObject:
         opacities=np.where(core & (ratio > 1.0), 0.8, 0.07),
         sh=((colors - 0.5) / 0.28209479177387814)[:, None],
     )
-    return SoftObject(body, splats, *average_basis(lambda x: body.evaluate(x)[0], means, splats.covariances()), 0.0)
-
-
-def settle(bars: list[SoftObject], gravity: tuple[float, ...], edge: int = 0) -> tuple[list, list]:
-    """Let both bars come to rest; return the mean displacement of their free ends [m] and, with `edge`, a picture."""
     material = Material(youngs_modulus=MODULUS, poissons_ratio=0.3, density=DENSITY)
-    placed = [PlacedObject(thing=bar, position=(0.0, 0.1 * k, 0.0), material=material) for k, bar in enumerate(bars)]
+    return SoftObject(body=body, splats=splats, material=material)
+
+
+def settle(bars: list[SoftObject], gravity: tuple[float, float, float], edge: int = 0) -> tuple[list, list]:
+    """Let both bars come to rest; return the mean displacement of their free ends [m] and, with `edge`, a picture."""
+    placed = [Placed(object=bar, position=(0.0, 0.1 * k, 0.0)) for k, bar in enumerate(bars)]
     view, size = {"position": (0.30, -0.60, 0.10), "target": (0.0, 0.03, -0.08), "fov_y": 0.45}, max(edge, 64)
     camera = PinholeCamera.look_at("bars", width=size, height=size // 2, **view)
     cameras, exact = [camera] * bool(edge), SolverReducedOptions(tolerance=1.0e-8)
@@ -80,7 +68,7 @@ def settle(bars: list[SoftObject], gravity: tuple[float, ...], edge: int = 0) ->
     scene = SplatScene(wall, placed, cameras=cameras, dt=0.1, options=exact)
     scene.model.set_gravity(gravity)
     for _ in range(20):
-        scene.advance()
+        scene.step()
     moved = []
     for k, body in enumerate(bar.body for bar in bars):
         end = body.surface_points[:, 0] > body.surface_points[:, 0].max() - 1.0e-6
@@ -105,7 +93,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--short", action="store_true", help="a small picture")
     given = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
-    bars = [dressed(make_bar(ratio), ratio) for ratio in (1.0, given.ratio)]
+    bars = [make_bar(ratio) for ratio in (1.0, given.ratio)]
     small = 0.01 * GRAVITY
     (soft, stiff), _ = settle(bars, (small, 0.0, 0.0))
     stretch = soft[0] / stiff[0]

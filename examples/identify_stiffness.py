@@ -15,14 +15,18 @@ import newton
 import numpy as np
 import warp as wp
 
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
-from softmode.deformables.gradients.adjoint import AdjointReduced
-from softmode.deformables.materials.material import Material
-from softmode.deformables.model.authoring import add_pins, add_reduced_body
-from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
-from softmode.deformables.tools.markers import Markers
+from softmode.deformables import (
+    AdjointReduced,
+    BuildOptions,
+    Markers,
+    Material,
+    SolverReduced,
+    SolverReducedOptions,
+    add_pins,
+    add_reduced_body,
+    build_body,
+    quadrature_from_box,
+)
 
 TRUE_MODULUS = 2.0e5
 """What is to be found [Pa]."""

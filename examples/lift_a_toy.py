@@ -16,7 +16,7 @@ import warp as wp
 
 import softmode  # noqa: F401  (registers the environments)
 from softmode.envs import LiftSoftConfig, scripted_policy
-from softmode.viz.film import Film
+from softmode.viz import Film
 
 GRAVITY = 9.81
 

@@ -15,15 +15,11 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.materials.material import Material
-from softmode.deformables.solver.solver_reduced import SolverReducedOptions
-from softmode.objects.soft_object import ObjectConfig, load_object
-from softmode.scenes.splat_scene import PlacedObject, Record, SplatScene
-from softmode.splats.camera import CameraOptions
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.shadow import ShadowOptions
-from softmode.viz.film import Film
+from softmode.deformables import BuildOptions, Material, SolverReducedOptions
+from softmode.objects import ObjectConfig, Placed, load
+from softmode.scenes import Record, SplatScene
+from softmode.splats import CameraOptions, PinholeCamera, ShadowOptions
+from softmode.viz import Film
 
 WIDTH, TALL, GAP, PANE, PEG, BIN, WALL = 0.60, 0.56, 0.09, 0.02, 0.012, 0.14, 0.006
 """Width and half height of the board, room in it, thickness of a pane, radius of a peg, height of the
@@ -65,15 +61,16 @@ def make_scene(splat: str | None, seed: int, height: int, device: str | None) ->
     world, rng = newton.ModelBuilder(), np.random.default_rng(seed)
     add_board(world)
     configs = (replace(TOYS[0], splat=splat), *TOYS[1:]) if splat else TOYS
-    things, placed = [load_object(config) for config in configs], []
+    things, placed = [load(config) for config in configs], []
     for i in range(18):
         thing, (row, column) = things[(i + i // 6) % 3], divmod(i, 6)
         place = (0.09 * (column - 2.5) + rng.uniform(-0.005, 0.005), 0.0, 0.80 + 0.11 * row)
         turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()
         modulus = float(np.exp(rng.uniform(np.log(3.0e4), np.log(3.0e5))))
         stuff = Material(youngs_modulus=modulus, poissons_ratio=0.35, density=250.0, friction=0.3)
-        dyed = replace(thing.splats, sh=np.roll(thing.splats.sh, i // 2, axis=2))  # red, green and blue change places
-        placed.append(PlacedObject(thing=thing, position=place, rotation=turn, material=stuff, splats=dyed))
+        shown = thing.visible_splats
+        dyed = replace(shown, sh=np.roll(shown.sh, i // 2, axis=2))  # red, green and blue change places
+        placed.append(Placed(object=replace(thing, material=stuff, splats=dyed), position=place, rotation=turn))
     eye, target, width = (0.18, -1.6, 0.75), (0.0, 0.0, 0.54), height // 40 * 24
     camera = PinholeCamera.look_at("film", position=eye, target=target, width=width, height=height, fov_y=0.70)
     light = CameraOptions(light_direction=(-0.2, 0.7, -0.7), mesh_samples=4, splat_shadow=ShadowOptions(cells=200))

@@ -17,10 +17,16 @@ import numpy as np
 import warp as wp
 
 import softmode
-from softmode.demonstrations import Dataset, DatasetWriter, read_dataset
-from softmode.demonstrations.recording import environment_features, observation_columns, record_episodes
-from softmode.learning.players import policy_factory
-from softmode.viz.film import Film
+from softmode.demonstrations import (
+    Dataset,
+    DatasetWriter,
+    environment_features,
+    observation_columns,
+    read_dataset,
+    record_episodes,
+)
+from softmode.learning import policy_factory
+from softmode.viz import Film
 
 ENV, OUT, SEED, ASIDE = "softmode/PushSoft-v0", Path("out/record_and_replay"), 100, 0.03
 

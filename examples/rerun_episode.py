@@ -17,7 +17,7 @@ from rerun.chunk import RrdReader
 
 import softmode  # noqa: F401  (registers the environments)
 from softmode.envs import scripted_policy
-from softmode.viz.rerun_logger import RerunLogger, RerunOptions
+from softmode.viz import RerunLogger, RerunOptions
 
 GRAVITY = 9.81
 

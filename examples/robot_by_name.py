@@ -15,12 +15,14 @@ import numpy as np
 import warp as wp
 
 from softmode import robots
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
-from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
-from softmode.deformables.materials.material import Material
-from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables import (
+    BuildOptions,
+    Material,
+    SolverCoupledReduced,
+    add_reduced_body,
+    build_body,
+    quadrature_from_box,
+)
 
 EDGE, GRAVITY, DT = 0.04, 9.81, 0.004
 RAISE = {"left\\elbow": -0.12, "left\\wrist_angle": 0.12}

@@ -15,8 +15,7 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
-from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
-from softmode.deformables.tools.sensing import ContactSensor, SurfacePressure
+from softmode.deformables import ContactSensor, SolverCoupledReduced, SurfacePressure
 from softmode.robots import add_arm, add_soft_fingertips
 
 DT, GRAVITY, MASS, HALF, PLACE, LIFT = 0.004, 9.81, 0.15, 0.03, (0.45, 0.0), 0.1

@@ -18,18 +18,20 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 from PIL import Image
 
-from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
-from softmode.deformables.materials.material import Material
-from softmode.deformables.model.authoring import add_reduced_body
-from softmode.deformables.skinning.skin_splats import SkinSplats
-from softmode.objects.soft_object import ObjectConfig, load_object
+from softmode.deformables import Material, SolverCoupledReduced, add_reduced_body
+from softmode.objects import load
 from softmode.robots import add_arm
-from softmode.splats import make_plush
-from softmode.splats.camera import CameraOptions, SplatCamera
-from softmode.splats.camera_randomization import CameraRandomization
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.rasterizer import RasterizerOptions, SplatArrays
-from softmode.splats.rigid_splats import RigidSplats, RigidSplatsSkin
+from softmode.scenes import BoundSplats
+from softmode.splats import (
+    CameraOptions,
+    CameraRandomization,
+    PinholeCamera,
+    RasterizerOptions,
+    RigidSplats,
+    RigidSplatsSkin,
+    SplatCamera,
+    make_plush,
+)
 
 DT, DROP, PLUSH, TOY = 1.0 / 240.0, 0.01, (0.42, -0.05), (0.5, 0.05)
 """Step [s], height of the fall [m], where the two stand on the table [m]."""
@@ -41,7 +43,7 @@ class Scene:
 
     def __init__(self, worlds: int) -> None:
         """Build model and solver, let everything fall, and draw a view per world."""
-        soft, figure = load_object(ObjectConfig()), make_plush(2000, height=0.07)
+        soft, figure = load(), make_plush(2000, height=0.07)
         figure = figure.transformed(translation=-figure.bounds().mean(axis=0))
         figure = replace(figure, sh=figure.sh[:, :, ::-1])  # red and blue swapped
         world, half = newton.ModelBuilder(), 0.5 * np.ptp(figure.bounds(), axis=0)
@@ -61,18 +63,15 @@ class Scene:
         for _ in range(60):
             solver.step(self.state, after, control, None, DT)
             solver.step(after, self.state, control, None, DT)
-        part = RigidSplats(splats=figure, body="toy", hide_meshes=True)
-        self.toy, rest = RigidSplatsSkin(model, [part]), soft.splats
-        self.plush = SkinSplats(rest.means, rest.covariances(), soft.basis, soft.grad_basis)
-        self.splats = splats = SplatArrays.from_splats([rest, *self.toy.objects], world_count=worlds)
+        self.toy = RigidSplatsSkin(model, [RigidSplats(splats=figure, body="toy", hide_meshes=True)])
+        self.bound = BoundSplats(model, [soft], others=self.toy.objects)
         look, up = PinholeCamera.look_at, (1.0, 0.0, 0.0)
         fixed = look("fixed", position=(0.85, -0.25, 0.25), target=(0.46, 0.015, 0.03), fov_y=0.48)
         wrist = look("wrist", body="link7", position=(0.1, 0.0, 0.03), target=(0.02, 0.0, 0.3), up=up, fov_y=1.0)
         options, median = CameraOptions(segmentation=True, mesh_samples=4), RasterizerOptions(median_depth=True)
-        both = fixed, wrist
-        self.camera = SplatCamera(model, splats, both, options=options, rasterizer_options=median, randomization=DRAWN)
-        q, start = self.state.softmode.q, model.softmode.function_start
-        self.plush.launch(q, start, splats.means, splats.covariances, rotations=splats.rotations)
+        splats, given = self.bound.arrays, {"options": options, "rasterizer_options": median, "randomization": DRAWN}
+        self.camera = SplatCamera(model, splats, (fixed, wrist), **given)
+        self.bound.update(self.state)
         self.toy.launch(self.state, splats)
         self.camera.randomize()
         self.camera.render(self.state)
@@ -88,7 +87,7 @@ class Scene:
 def test_final(scene: Scene) -> None:
     """Both toys stand, one of them rigid; every view of every world sees plush, toy and table where they are."""
     camera, pixel = scene.camera, 0.005  # [m], seen at grazing angles
-    toys = scene.splats.means.numpy()[:, scene.plush.count :]
+    toys = scene.bound.arrays.means.numpy()[:, scene.bound.columns[1]]
     solids = scene.state.particle_q.numpy().reshape(camera.world_count, -1, 3), toys
     assert all(np.abs(solid[..., 2].min(axis=1)).max() < 2e-3 for solid in solids)
     rest, now = (np.linalg.norm(np.diff(x, axis=-2), axis=-1) for x in (scene.toy.objects[0].means, toys))
@@ -107,13 +106,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--short", action="store_true", help="two worlds, not four")
     camera = (scene := Scene(2 if parser.parse_args().short else 4)).camera
-    pictures = [camera.images(name).numpy() for name in ("fixed", "wrist")]
     depth, seen = (camera.images("fixed", output).numpy()[..., None] for output in ("depth", "segmentation"))
-    pictures.append(np.where(depth > 0.0, 510.0 * np.clip(1.0 - depth, 0.0, 0.5), 0.0) * np.ones(3))
-    pictures.append((seen + 1) * np.array([97, 61, 151]) % 256)
+    gray = np.where(depth > 0.0, 510.0 * np.clip(1.0 - depth, 0.0, 0.5), 0.0) * np.ones(3)
+    pictures = [*(camera.images(name).numpy() for name in ("fixed", "wrist")), gray, (seen + 1) * (97, 61, 151) % 256]
     Path("out").mkdir(exist_ok=True)
-    sheet = np.hstack([np.vstack(list(column)) for column in pictures])
-    Image.fromarray(sheet.astype(np.uint8)).save("out/splat_camera.png")
+    sheet = np.hstack([np.vstack(list(column)) for column in pictures]).astype(np.uint8)
+    Image.fromarray(sheet).save("out/splat_camera.png")
     print(f"out/splat_camera.png: {camera.world_count} worlds from fixed and wrist cameras, depth, segmentation")
     test_final(scene)
 

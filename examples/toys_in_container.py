@@ -15,15 +15,11 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.materials.material import Material
-from softmode.deformables.solver.solver_reduced import SolverReducedOptions
-from softmode.objects.soft_object import ObjectConfig, load_object
-from softmode.scenes.splat_scene import PlacedObject, Record, SplatScene
-from softmode.splats.camera import CameraOptions
-from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.shadow import ShadowOptions
-from softmode.viz.film import Film
+from softmode.deformables import BuildOptions, Material, SolverReducedOptions
+from softmode.objects import ObjectConfig, Placed, load
+from softmode.scenes import Record, SplatScene
+from softmode.splats import CameraOptions, PinholeCamera, ShadowOptions
+from softmode.viz import Film
 
 HALF, HEIGHT, WALL = 0.11, 0.12, 0.012
 """Half width of the container inside, height and thickness of its walls [m]."""
@@ -57,17 +53,19 @@ def make_scene(splat: str | None, seed: int, size: int, device: str | None) -> S
     configs = {name: replace(toy, surface_count=150, build=BUILD) for name, toy in TOYS.items()}
     if splat:
         configs["bear"] = replace(configs["bear"], splat=splat)
-    things = {name: load_object(config) for name, config in configs.items()}
+    things = {name: load(config) for name, config in configs.items()}
     placed = []
     for i, name in enumerate(FALLING):
         thing, (layer, cell) = things[name], divmod(i, len(LAYER))
-        dyed = replace(thing.splats, sh=np.roll(thing.splats.sh, i, axis=2))  # red, green and blue change places
         place = (*LAYER[cell], 0.17 + 0.13 * layer + (0.04 if cell == 0 else 0.0))
         turn = Rotation.from_quat(rng.normal(size=4)).as_matrix()
         modulus = float(np.exp(rng.uniform(np.log(3.0e4), np.log(3.0e5))))
         stuff = Material(youngs_modulus=modulus, poissons_ratio=0.35, density=250.0)
-        splats = dyed if name.endswith("bear") else None
-        placed.append(PlacedObject(thing=thing, position=place, rotation=turn, material=stuff, splats=splats))
+        shown = thing.visible_splats
+        if name.endswith("bear"):
+            shown = replace(shown, sh=np.roll(shown.sh, i, axis=2))  # red, green and blue change places
+        toy = replace(thing, material=stuff, splats=shown)
+        placed.append(Placed(object=toy, position=place, rotation=turn))
     eye, target = (0.38, -0.28, 0.46), (0.0, 0.0, 0.085)
     camera = PinholeCamera.look_at("film", position=eye, target=target, width=size, height=size, fov_y=0.72)
     light = CameraOptions(mesh_samples=4, splat_shadow=ShadowOptions(cells=160))

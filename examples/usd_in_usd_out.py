@@ -15,8 +15,9 @@ import newton
 import numpy as np
 import warp as wp
 
-from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
-from softmode.usd import PlacedBody, UsdAnimation, UsdImport, add_usd, read_animation, write_usd
+from softmode.deformables import SolverCoupledReduced
+from softmode.objects import Placed
+from softmode.usd import UsdAnimation, UsdImport, add_usd, read_animation, write_usd
 
 DT, STEPS, GRAVITY, BLOCK = 1.0 / 240.0, 8, 9.81, 0.3  # [s], per frame, [m/s^2], [kg]
 CORNERS = [(x, y, z) for z in (-0.03, 0.03) for y in (-0.08, 0.08) for x in (-0.08, 0.08)]
@@ -68,8 +69,7 @@ def simulate(path: Path, out: Path, frames: int) -> tuple[Any, UsdImport, np.nda
     solver = SolverCoupledReduced(model, found.reduced_bodies)
     state, after = model.state(), model.state()
     newton.eval_fk(model, model.joint_q, model.joint_qd, state)
-    placed = [PlacedBody(body=body.body, splats=body.splats) for body in found.bodies.values()]
-    with UsdAnimation(out, model, placed) as film:
+    with UsdAnimation(out, model, list(found.bodies.values())) as film:
         for _ in range(frames):
             film.record(state)
             for _ in range(STEPS // 2):
@@ -108,7 +108,7 @@ def main(arguments: list[str] | None = None) -> None:
     stage.write_text(STAGE)
     solver, found, points, height = simulate(stage, film, frames)
     (cushion,) = found.bodies.values()
-    write_usd(kept, PlacedBody(body=cushion.body, material=cushion.material, splats=cushion.splats, name="Cushion"))
+    write_usd(kept, Placed(object=cushion.object, name="Cushion"))
     for file in (stage, film, kept):
         print(f"{file}: {1e-3 * file.stat().st_size:.0f} kB")
     test_final(solver, found, points, height, film, kept)

@@ -1,4 +1,4 @@
-"""Settings of the whole test run: where compiled kernels are kept, and which tests need a GPU."""
+"""Settings of the whole test run: where compiled kernels are kept, which tests need a GPU, a trained capture."""
 
 from __future__ import annotations
 
@@ -8,13 +8,110 @@ from pathlib import Path
 import pytest
 
 # Before the first import of warp: the cache lies in the checkout, so that a run leaves nothing outside it.
-_CACHE = Path(__file__).resolve().parents[1] / ".cache"
+_TESTS = Path(__file__).resolve().parent
+_CACHE = _TESTS.parent / ".cache"
 os.environ.setdefault("WARP_CACHE_PATH", str(_CACHE / "warp"))
 os.environ.setdefault("SOFTMODE_CACHE", str(_CACHE / "softmode"))
 
+_FAST = {
+    "deformables/test_adjoint.py": "gradient_by_a_parameter",
+    "deformables/test_attachments.py": "free_fall_of_a_joined_pair",
+    "deformables/test_body.py": "affine_closure gradients_of_quadratic_handles file_round_trip_is_exact",
+    "deformables/test_contact.py": "potentials cube_at_rest_carries_its_weight",
+    "deformables/test_coupling.py": "gradient_of_the_incremental_potential rigid_solve squeeze_equals_drive",
+    "deformables/test_cubature.py": "stress_is_that_of_the_reference volume_weights_and_count",
+    "deformables/test_eigenmodes.py": "box_eigenvalues gradient_energy_is_the_eigenvalue",
+    "deformables/test_energies.py": "uniform_stretch",
+    "deformables/test_factor.py": "solve back_substitution_with_known_unknowns",
+    "deformables/test_friction.py": "stick_potential slides_above_the_cone",
+    "deformables/test_grips.py": "a_pull_adds_its_force_times_dt_to_the_momentum",
+    "deformables/test_materials.py": "stress_is_the_gradient hessian_is_the_projected_derivative singular_values",
+    "deformables/test_pairs.py": "gradient_of_the_potential_of_a_world",
+    "deformables/test_quadrature.py": "box_is_integrated_exactly sphere_and_capsule_have_closed_form_moments",
+    "deformables/test_regions.py": "identities_hold_with_regions",
+    "deformables/test_rkpm.py": "partition_of_unity_and_linear_reproduction gradient_matches_finite_differences",
+    "deformables/test_sensing.py": "torque_turns_the_body",
+    "deformables/test_shape_queries.py": "distance normal_is_gradient",
+    "deformables/test_skinning.py": "matches_numpy affine_motion_is_exact",
+    "deformables/test_skinning_adjoint.py": "matches_central_differences",
+    "deformables/test_solver_reduced.py": "step_equals_dense_reference free_fall captured_graph_equals_eager",
+    "deformables/test_static_response.py": "axial_response_is_that_of_a_hanging_bar",
+    "demonstrations/test_format.py": "info data_table",
+    "documentation/test_prose.py": "",
+    "envs/test_objects.py": "part_is_chosen_by_its_rule a_tilted_box_lies_down_on_its_nearest_face",
+    "envs/test_primitives.py": "solid_has_the_closed_form_volume_area_and_bounds",
+    "envs/test_push_soft.py": "observation_says_where_to_go reward_is_the_sum_of_its_terms",
+    "envs/test_splat_scene.py": "kinetic_energy_of_free_fall_is_the_work_of_gravity",
+    "envs/test_table_scene.py": "configuration_is_checked",
+    "learning/test_checkpoints.py": "round_trip",
+    "learning/test_policy.py": "the_interval_is_wilsons",
+    "learning/test_ppo.py": "adam_is_adam densities_are_those_of_a_gaussian moments_are_those_of_all_samples",
+    "learning/test_rollout.py": "advantage_is_the_sum_of_discounted_errors statistics_count_whole_episodes",
+    "robots/test_arm.py": "closed_form_reaches_the_pose builds_bodies_joints_and_pads",
+    "robots/test_control.py": "measured_pose_is_newtons pose_steps_are_tracked",
+    "splats/test_camera.py": "splats_and_meshes_land_on_the_same_pixel_and_depth",
+    "splats/test_deformed.py": "covariance_is_f_sigma_ft",
+    "splats/test_formats.py": "ply_round_trip sog_decodes_every_attribute",
+    "splats/test_formats_quantised.py": "compressed_ply_decodes_every_attribute spz_decodes_every_attribute",
+    "splats/test_pinhole.py": "",
+    "splats/test_rasterizer.py": "matches_dense_reference",
+    "splats/test_rasterizer_adjoint.py": "direction_of_sight",
+    "splats/test_splats.py": "",
+    "test_checks.py": "",
+    "test_cli.py": "list_envs_names_every_environment wrong_usage_exits_with_two",
+    "test_faces.py": "",
+    "test_import.py": "",
+    "test_layers.py": "",
+    "test_words.py": "",
+    "usd/test_export_bundle.py": "",
+    "usd/test_import_newton.py": "units_of_everything",
+    "view/test_session.py": "time_passes_as_told pick_meets_the_near_face",
+    "viz/test_scene_meshes.py": "bounds_and_volume",
+}
+"""Tests of `make test-fast`: quick ones of every room, by file; all of a file where none is named."""
+
+
+def _is_fast(item: pytest.Item) -> bool:
+    """Return whether `make test-fast` runs a test; slow parameters of one are left out.
+
+    Raises:
+        pytest.UsageError: If the table names a test of the item's file that is not there.
+    """
+    names = _FAST.get(item.path.relative_to(_TESTS).as_posix())
+    if names is None or not isinstance(item, pytest.Function):
+        return False
+    for name in names.split():
+        if not hasattr(item.module, f"test_{name}"):
+            raise pytest.UsageError(f"tests/conftest.py names test_{name}, which {item.path.name} does not have")
+    wanted = not names or item.function.__name__.removeprefix("test_") in names.split()
+    return wanted and not item.get_closest_marker("slow")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out the files that `make test-fast` takes no test of: it need not import them."""
+    file = collection_path.relative_to(_TESTS).as_posix() if collection_path.is_relative_to(_TESTS) else ""
+    return True if config.option.markexpr == "fast" and file.endswith(".py") and file not in _FAST else None
+PLAYBOT = _TESTS.parents[1] / "shared" / "data" / "splats" / "playbot" / "4_0" / "meta.json"
+"""A trained capture, SOG v2: a robot hovering over a patch of ground, with two loose hands. PLAYBOT by Stephane Agullo,
+CC-BY-4.0."""
+
+
+@pytest.fixture(scope="session")
+def playbot() -> Path:
+    """Return the trained capture, or skip."""
+    if not PLAYBOT.is_file():
+        pytest.skip(f"the trained capture {PLAYBOT} is not there")
+    return PLAYBOT
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip tests marked `gpu` where no CUDA device is found."""
+    """Mark the tests of `make test-fast`; skip tests marked `gpu` where no CUDA device is found."""
+    gone = [file for file in _FAST if not (_TESTS / file).is_file()]
+    if gone:
+        raise pytest.UsageError(f"tests/conftest.py names files that are not there: {', '.join(gone)}")
+    for item in items:
+        if _is_fast(item):
+            item.add_marker("fast")
     marked = [item for item in items if item.get_closest_marker("gpu")]
     if not marked:
         return

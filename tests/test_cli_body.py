@@ -20,9 +20,8 @@ from softmode.deformables.build.cubature import POISSON_RATIO
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.errors import AssetError, ConfigError
-from softmode.objects.object_build import config_of_file, file_kind
-from softmode.objects.object_file import read_object, surface_cover, write_object
-from softmode.objects.soft_object import ObjectConfig, load_object
+from softmode.objects import ObjectConfig, load, surface_cover, write_object
+from softmode.objects.object_file import file_kind, read_object
 from softmode.splats import Splats, make_plush, write_ply
 from softmode.splats.point_cloud import splats_from_points
 from softmode.viz.body_picture import mode_frequencies
@@ -85,7 +84,8 @@ def test_build_writes_a_body_with_its_splats(
     said = capsys.readouterr().out
     assert f"to {out}" in said and "warning" not in said and "broken" not in said
     assert listing(tmp_path) == ["toy.npz"]
-    body, splats = read_object(out)
+    found = read_object(out)
+    body, splats = found.body, found.splats
     assert ReducedBody.load(out).fingerprint == body.fingerprint
     assert splats is not None and splats.count >= 400
     assert np.ptp(body.bounds, axis=0).max() == pytest.approx(0.06, rel=0.02)
@@ -153,8 +153,8 @@ def test_show_draws_modes_weights_and_spectra(assets: Path, tmp_path: Path, caps
     assert all(np.abs(c[:, :rest] - columns[0][:, :rest]).mean() > 3.0 for c in columns[1:])
     red, _, blue = np.moveaxis(picture, 2, 0)
     assert (red > blue + 80).sum() > 1000 and (blue > red + 60).sum() > 1000  # the two ends of the weights
-    body, splats = read_object(_built(assets, tmp_path, "box.obj"))
-    assert splats is not None and mode_frequencies(body, youngs_modulus=1e5, density=300.0)[0] > 0.0
+    found = read_object(_built(assets, tmp_path, "box.obj"))
+    assert found.splats is not None and mode_frequencies(found.body, youngs_modulus=1e5, density=300.0)[0] > 0.0
 
 
 def _built(assets: Path, folder: Path, name: str) -> Path:
@@ -203,8 +203,9 @@ def test_first_frequency_of_a_beam() -> None:
 def test_object_is_loaded_as_it_was_built(assets: Path, tmp_path: Path) -> None:
     """`ObjectConfig(body=...)` gives the same arrays, bit by bit, at the height at which it stands."""
     out = _built(assets, tmp_path, "cloud.npz")
-    body, splats = read_object(out)
-    thing = load_object(ObjectConfig(body=out, contact_radius=0.002))
+    found = read_object(out)
+    body, splats = found.body, found.splats
+    thing = load(ObjectConfig(body=out, contact_radius=0.002))
     assert splats is not None
     for name in ("means", "quats", "scales", "opacities", "sh"):
         np.testing.assert_array_equal(getattr(thing.splats, name), getattr(splats, name))
@@ -212,10 +213,10 @@ def test_object_is_loaded_as_it_was_built(assets: Path, tmp_path: Path) -> None:
     assert thing.height == pytest.approx(0.002 - body.surface_points[:, 2].min())
     again = tmp_path / "again.npz"
     write_object(again, body, splats)
-    assert read_object(again)[0].fingerprint == body.fingerprint
+    assert read_object(again).body.fingerprint == body.fingerprint
     body.save(tmp_path / "bare.npz")  # a body without splats is shown by its surface samples
-    bare = load_object(ObjectConfig(body=tmp_path / "bare.npz"))
-    np.testing.assert_allclose(bare.splats.means, surface_cover(body).means)
+    bare = load(ObjectConfig(body=tmp_path / "bare.npz"))
+    np.testing.assert_allclose(bare.visible_splats.means, surface_cover(body).means)
     for given in ({"splat": "a.ply"}, {"mesh": "a.obj"}, {"clamped_height": 0.01}):
         with pytest.raises(ConfigError):
             ObjectConfig(body=out, **given)
@@ -312,7 +313,7 @@ def test_damaged_bodies_are_typed_errors(
     DAMAGE[kind](file)
     with pytest.raises(AssetError, match=r"toy\.npz"):
         file_kind(file)
-        load_object(config_of_file(file))
+        load(file)
     assert main(["body", "check", str(file)]) == 2
     error = [line for line in capsys.readouterr().err.splitlines() if line.startswith("softmode: error: ")]
     assert len(error) == 1 and "toy.npz" in error[0] and ". " in error[0]

@@ -146,8 +146,10 @@ def _load(options: _Asset) -> tuple[ReducedBody, Splats, Quadrature | None]:
     """Return a body with its splats: read, or built from its asset, then also with what it was built from."""
     from softmode.deformables.build.functions import RANK_TOLERANCE
     from softmode.deformables.build.options import BuildOptions
-    from softmode.objects.object_build import build_object, config_of_file, file_kind
-    from softmode.objects.object_file import read_object, surface_cover
+    from softmode.objects.config import ObjectConfig
+    from softmode.objects.loader import load
+    from softmode.objects.object_build import build_object
+    from softmode.objects.object_file import file_kind
 
     kind = file_kind(options.file)
     if kind == "body":
@@ -161,8 +163,8 @@ def _load(options: _Asset) -> tuple[ReducedBody, Splats, Quadrature | None]:
                 f"{options.file} is a body already{': --' + ', --'.join(given) if given else ''}",
                 hint="give the file that it was built from",
             )
-        body, splats = read_object(options.file)
-        return body, surface_cover(body) if splats is None else splats, None
+        found = load(options.file)
+        return found.body, found.visible_splats, None
     if kind == "mesh" and (options.crop is not None or options.part != "thickest"):
         raise ConfigError(f"{options.file} is a mesh; crop and part are for splats", hint="leave them out")
     build = BuildOptions(
@@ -174,9 +176,11 @@ def _load(options: _Asset) -> tuple[ReducedBody, Splats, Quadrature | None]:
         cubature_count=options.points,
         seed=options.seed,
     )
-    config = config_of_file(
+    found, quadrature = build_object(
         options.file,
-        **({} if options.size is None else {"size": options.size}),
+        regions=[_region(text) for text in options.region],
+        stiffness=[_stiffer(text) for text in options.stiffness],
+        size=ObjectConfig.size if options.size is None else options.size,
         up=options.up,
         crop=options.crop,
         part=options.part,
@@ -185,10 +189,7 @@ def _load(options: _Asset) -> tuple[ReducedBody, Splats, Quadrature | None]:
         splat_count=options.splats,
         build=build,
     )
-    regions = [_region(text) for text in options.region]
-    stiffness = [_stiffer(text) for text in options.stiffness]
-    built = build_object(config, regions=regions, stiffness=stiffness)
-    return built.body, built.splats, built.quadrature
+    return found.body, found.visible_splats, quadrature
 
 
 def _report(body: ReducedBody, splats: Splats, quadrature: Quadrature | None) -> BodyReport:

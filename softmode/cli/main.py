@@ -169,7 +169,7 @@ def play(options: Play) -> int:
             f"youngs-modulus must be a finite number > 0, got {options.youngs_modulus}", hint="give it in Pa, like 2e5"
         )
     if options.rerun is not None:
-        from softmode.viz.rerun_logger import check_target
+        from softmode.viz.rerun_stream import check_target
 
         check_target(options.rerun)
     if options.usd is not None:
@@ -288,7 +288,7 @@ def _play_episode(
 def _task_config(options: Play, trained: dict[str, Any]) -> Any:
     """Turn the options that concern the object into a configuration, else as that of a trained policy."""
     from softmode.learning.config_values import config_of
-    from softmode.objects.soft_object import ObjectConfig
+    from softmode.objects.config import ObjectConfig
 
     base = config_of(config_class(options.env), trained)
     scene = base.scene

@@ -1,1 +1,154 @@
-"""Reduced deformables: the build on the host, the step on the device."""
+"""Reduced deformables: the build on the host, the step on the device.
+
+This is the public path of the core. Names are imported when they are first used.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from softmode.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from softmode.deformables.body.reduced_body import ReducedBody
+    from softmode.deformables.body.regions import Region
+    from softmode.deformables.build.build_body import build_body
+    from softmode.deformables.build.cache import cached_body
+    from softmode.deformables.build.eigenmodes import Eigenmodes, solve_eigenmodes
+    from softmode.deformables.build.occupancy import Occupancy, fill_splats
+    from softmode.deformables.build.options import BuildOptions
+    from softmode.deformables.build.quadrature import (
+        quadrature_from_box,
+        quadrature_from_capsule,
+        quadrature_from_points,
+        quadrature_from_sphere,
+        quadrature_from_splats,
+    )
+    from softmode.deformables.build.quadrature_grid import Quadrature
+    from softmode.deformables.build.quadrature_implicit import quadrature_from_implicit
+    from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
+    from softmode.deformables.build.reduced_stiffness import elastic_modes
+    from softmode.deformables.build.report import BodyReport, report_body
+    from softmode.deformables.coupling.proxy import SolverReducedProxy
+    from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
+    from softmode.deformables.gradients.adjoint import AdjointOptions, AdjointReduced, ReducedGradients
+    from softmode.deformables.gradients.adjoint_torch import rollout
+    from softmode.deformables.materials.material import Material
+    from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
+    from softmode.deformables.model.status import status_reasons
+    from softmode.deformables.skinning.skin_splats import SkinSplats, average_basis
+    from softmode.deformables.skinning.skinning_adjoint import AdjointSkinning
+    from softmode.deformables.solver.attachments import Attachment, attach
+    from softmode.deformables.solver.energies import SoftEnergies
+    from softmode.deformables.solver.parameters import PARAMETER_FLAGS, ShapeFriction, set_parameters
+    from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
+    from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
+    from softmode.deformables.tools.markers import Markers
+    from softmode.deformables.tools.sensing import ContactSensor, ForceTorqueSensor, SurfacePressure
+
+__all__ = [
+    "PARAMETER_FLAGS",
+    "AdjointOptions",
+    "AdjointReduced",
+    "AdjointSkinning",
+    "Attachment",
+    "BodyReport",
+    "BuildOptions",
+    "ContactSensor",
+    "Eigenmodes",
+    "ForceTorqueSensor",
+    "GripOptions",
+    "Grips",
+    "Markers",
+    "Material",
+    "Occupancy",
+    "Quadrature",
+    "ReducedBody",
+    "ReducedGradients",
+    "Region",
+    "ShapeFriction",
+    "SkinSplats",
+    "SoftEnergies",
+    "SolverCoupledReduced",
+    "SolverReduced",
+    "SolverReducedOptions",
+    "SolverReducedProxy",
+    "SurfacePressure",
+    "add_grip_slots",
+    "add_pins",
+    "add_reduced_body",
+    "attach",
+    "average_basis",
+    "build_body",
+    "cached_body",
+    "elastic_modes",
+    "fill_splats",
+    "quadrature_from_box",
+    "quadrature_from_capsule",
+    "quadrature_from_implicit",
+    "quadrature_from_mesh",
+    "quadrature_from_points",
+    "quadrature_from_sphere",
+    "quadrature_from_splats",
+    "register_custom_attributes",
+    "report_body",
+    "rollout",
+    "set_parameters",
+    "solve_eigenmodes",
+    "status_reasons",
+]
+
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "PARAMETER_FLAGS": ".solver.parameters",
+        "AdjointOptions": ".gradients.adjoint",
+        "AdjointReduced": ".gradients.adjoint",
+        "AdjointSkinning": ".skinning.skinning_adjoint",
+        "Attachment": ".solver.attachments",
+        "BodyReport": ".build.report",
+        "BuildOptions": ".build.options",
+        "ContactSensor": ".tools.sensing",
+        "Eigenmodes": ".build.eigenmodes",
+        "ForceTorqueSensor": ".tools.sensing",
+        "GripOptions": ".tools.grips",
+        "Grips": ".tools.grips",
+        "Markers": ".tools.markers",
+        "Material": ".materials.material",
+        "Occupancy": ".build.occupancy",
+        "Quadrature": ".build.quadrature_grid",
+        "ReducedBody": ".body.reduced_body",
+        "ReducedGradients": ".gradients.adjoint",
+        "Region": ".body.regions",
+        "ShapeFriction": ".solver.parameters",
+        "SkinSplats": ".skinning.skin_splats",
+        "SoftEnergies": ".solver.energies",
+        "SolverCoupledReduced": ".coupling.solver_coupled",
+        "SolverReduced": ".solver.solver_reduced",
+        "SolverReducedOptions": ".solver.solver_reduced",
+        "SolverReducedProxy": ".coupling.proxy",
+        "SurfacePressure": ".tools.sensing",
+        "add_grip_slots": ".tools.grips",
+        "add_pins": ".model.authoring",
+        "add_reduced_body": ".model.authoring",
+        "attach": ".solver.attachments",
+        "average_basis": ".skinning.skin_splats",
+        "build_body": ".build.build_body",
+        "cached_body": ".build.cache",
+        "elastic_modes": ".build.reduced_stiffness",
+        "fill_splats": ".build.occupancy",
+        "quadrature_from_box": ".build.quadrature",
+        "quadrature_from_capsule": ".build.quadrature",
+        "quadrature_from_implicit": ".build.quadrature_implicit",
+        "quadrature_from_mesh": ".build.quadrature_mesh",
+        "quadrature_from_points": ".build.quadrature",
+        "quadrature_from_sphere": ".build.quadrature",
+        "quadrature_from_splats": ".build.quadrature",
+        "register_custom_attributes": ".model.authoring",
+        "report_body": ".build.report",
+        "rollout": ".gradients.adjoint_torch",
+        "set_parameters": ".solver.parameters",
+        "solve_eigenmodes": ".build.eigenmodes",
+        "status_reasons": ".model.status",
+    },
+)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from softmode.checks import require_choice
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import ObjectConfig
+from softmode.objects.config import ObjectConfig
 
 CONTROL_MODES = ("pose_delta", "joint_delta")
 RENDER_MODES = ("rgb_array",)

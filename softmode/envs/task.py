@@ -70,6 +70,8 @@ class Task:
     """Names of the reward's terms."""
     metric_names: ClassVar[tuple[str, ...]] = ()
     """Names of the figures in info."""
+    end_reasons: ClassVar[type[EndReason]] = EndReason
+    """What the numbers in `end` mean."""
     scripted_policy: ClassVar[Callable[[Any], Callable[[Any], Any]] | None] = None
     """Makes the policy that `--policy scripted` plays, from observation to action, for an environment."""
     point_count: ClassVar[int] = 16

@@ -100,7 +100,7 @@ def splats_from_mesh(
     *,
     count: int = 10_000,
     options: FitOptions | None = None,
-    device: Any = None,
+    device: wp.DeviceLike = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> MeshFit:
     """Cover a mesh with splats and fit them to its pictures.
@@ -150,7 +150,7 @@ def splats_from_mesh(
 
 
 def _pictures(
-    mesh: ColoredMesh, count: int, options: FitOptions, rng: np.random.Generator, device: Any
+    mesh: ColoredMesh, count: int, options: FitOptions, rng: np.random.Generator, device: wp.DeviceLike
 ) -> ReferenceViews:
     """Draw the mesh, whose bounding sphere has radius one, from all around."""
     size, focal = options.size, 0.5 * options.size / np.tan(0.5 * FIELD_OF_VIEW)
@@ -169,13 +169,13 @@ class _Fit:
         device: Warp device.
     """
 
-    def __init__(self, splats: Splats, spacing: float, options: FitOptions, device: Any) -> None:
+    def __init__(self, splats: Splats, spacing: float, options: FitOptions, device: wp.DeviceLike) -> None:
         """Upload the parameters."""
         self.options, self.spacing, self.device = options, spacing, wp.get_device(device)
         self.count = count = splats.count
         opacity = np.clip(splats.opacities.astype(np.float64), 0.01, 0.99)
 
-        def upload(array: NDArray[Any], dtype: Any) -> wp.array:
+        def upload(array: NDArray[Any], dtype: type) -> wp.array:
             return wp.array(array.astype(np.float32), dtype=dtype, device=self.device)
 
         self.parameters = (

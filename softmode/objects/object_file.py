@@ -1,18 +1,23 @@
-"""Files of soft objects: a body with the splats that show it, one .npz that `ReducedBody.load` reads as well."""
+"""Files of soft objects: a body with its splats, one .npz that `ReducedBody.load` reads too; what a file holds."""
 
 from __future__ import annotations
 
 import os
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from softmode.deformables.body.file import read_beside, write_body
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.errors import AssetError
-from softmode.splats.point_cloud import splats_from_points
+from softmode.objects.soft_object import SoftObject
+from softmode.splats.formats import READABLE
+from softmode.splats.point_cloud import ply_kind, splats_from_points
 from softmode.splats.splats import Splats
 from softmode.stages import tokens
 
+FileKind = Literal["splat", "points", "mesh", "body"]
 _FIELDS = ("means", "quats", "scales", "opacities", "sh")
 _LIGHT = np.array([0.37, 0.29, 0.88])
 
@@ -29,11 +34,11 @@ def write_object(path: str | os.PathLike[str], body: ReducedBody, splats: Splats
     write_body(body, path, beside=fields)
 
 
-def read_object(path: str | os.PathLike[str]) -> tuple[ReducedBody, Splats | None]:
+def read_object(path: str | os.PathLike[str]) -> SoftObject:
     """Read a file written by `write_object` or `ReducedBody.save`, or a stage with one body from `usd.write_usd`.
 
     Returns:
-        The body, and its splats in the body frame, or None if the file has none.
+        The body, with its splats in the body frame if the file has any.
 
     Raises:
         AssetError: If the file is missing, damaged, foreign, or of another version.
@@ -45,11 +50,40 @@ def read_object(path: str | os.PathLike[str]) -> tuple[ReducedBody, Splats | Non
     body = ReducedBody.load(path)
     stored = read_beside(path, "splats.")
     if not stored:
-        return body, None
+        return SoftObject(body=body)
     missing = {f"splats.{name}" for name in _FIELDS} ^ set(stored)
     if missing:
         raise AssetError(f"body file {path}: {sorted(missing)} do not match", hint="Build the body again.")
-    return body, Splats(**{name: stored[f"splats.{name}"] for name in _FIELDS}, name=f"body file {path}")
+    fields = {name: stored[f"splats.{name}"] for name in _FIELDS}
+    return SoftObject(body=body, splats=Splats(**fields, name=f"body file {path}"))
+
+
+def file_kind(path: str | os.PathLike[str]) -> FileKind:
+    """Return what a file is, by its suffix and, for .ply, .npz and OpenUSD, its contents.
+
+    Raises:
+        AssetError: If it is missing or cannot be read.
+    """
+    file = Path(path)
+    if not file.exists():
+        raise AssetError(f"file {file}: no such file", hint="check the path")
+    suffix = file.suffix.lower()
+    if suffix == ".npz":
+        try:
+            with np.load(file, allow_pickle=False) as stored:
+                return "points" if "points" in stored.files and "header" not in stored.files else "body"
+        except Exception as error:  # whatever a damaged archive leads zipfile, zlib and numpy to
+            raise AssetError(
+                f"file {file}: damaged or not an .npz ({type(error).__name__}: {error})", hint="build or write it again"
+            ) from error
+    if suffix == ".ply":
+        found = ply_kind(file)
+        return "splat" if found == "splats" else "mesh" if found == "mesh" else "points"
+    if suffix in tokens.SUFFIXES:
+        from softmode.objects.stage_asset import asset_kind
+
+        return asset_kind(file)
+    return "splat" if file.is_dir() or suffix in READABLE else "mesh"
 
 
 def surface_cover(body: ReducedBody, color: tuple[float, float, float] = (0.55, 0.63, 0.75)) -> Splats:

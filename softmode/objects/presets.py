@@ -7,7 +7,7 @@ makes it a third too stiff at nu = 0.3, and the default rank tolerance drops fun
 
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
-from softmode.objects.soft_object import ObjectConfig
+from softmode.objects.config import ObjectConfig
 
 BEAM = ObjectConfig(
     shape="box",

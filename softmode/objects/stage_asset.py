@@ -8,13 +8,12 @@ from typing import Literal
 
 import numpy as np
 
-from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.errors import AssetError
+from softmode.objects.soft_object import SoftObject
 from softmode.objects.stage_bundle import body_of
 from softmode.objects.stage_geometry import SurfaceMesh, mesh_surface, tet_surface
 from softmode.objects.stage_scene import parts_of, read_usd_scene, stage_frame
 from softmode.splats.colored_mesh import ColoredMesh
-from softmode.splats.splats import Splats
 from softmode.stages import process
 
 
@@ -33,11 +32,11 @@ def asset_kind(path: str | os.PathLike[str]) -> Literal["body", "splat", "mesh"]
     return "body" if stage["body_count"] else "splat" if stage["splat_count"] else "mesh"
 
 
-def read_usd_body(path: str | os.PathLike[str]) -> tuple[ReducedBody, Splats | None]:
-    """Read the body that softmode wrote into a stage, as it is, and its splats in the body frame.
+def read_usd_body(path: str | os.PathLike[str]) -> SoftObject:
+    """Read the body that softmode wrote into a stage, as it is, with its splats and material.
 
     Args:
-        path: A stage with one such body; its place, scale and material are not asked for.
+        path: A stage with one such body; its place and scale are not asked for.
 
     Raises:
         AssetError: If the file is damaged, or holds no or several such bodies.
@@ -48,7 +47,9 @@ def read_usd_body(path: str | os.PathLike[str]) -> tuple[ReducedBody, Splats | N
         raise AssetError(
             f"OpenUSD file {path}: holds {len(found)} bodies of softmode", hint="Write one with softmode.usd.write_usd"
         )
-    return body_of(found[0].bundle, f"OpenUSD file {path}: {found[0].path}"), found[0].splats
+    body = body_of(found[0].bundle, f"OpenUSD file {path}: {found[0].path}")
+    material = found[0].material(body.volume * found[0].scale ** 3)
+    return SoftObject(body=body, splats=found[0].splats, material=material, notes=found[0].notes)
 
 
 def read_usd_mesh(path: str | os.PathLike[str]) -> ColoredMesh:
@@ -67,7 +68,7 @@ def read_usd_mesh(path: str | os.PathLike[str]) -> ColoredMesh:
     answer = _ask(path, geometry=True)
     frame = stage_frame(answer.described, name)
     surfaces = []
-    try:
+    with process.invalid_data(name):
         for prim in answer.described["meshes"]:
             where, parts = f"{name}: {prim['path']}", parts_of(prim, answer.arrays, frame)
             matrix = frame.matrix(prim["matrix"])
@@ -78,10 +79,6 @@ def read_usd_mesh(path: str | os.PathLike[str]) -> ColoredMesh:
             else:
                 tets = tet_surface(parts, matrix[:3, :3], where)
                 surfaces.append(SurfaceMesh(tets.vertices + matrix[:3, 3], tets.faces, tets.colors))
-    except (TypeError, IndexError, KeyError, ValueError, OverflowError) as error:
-        if isinstance(error, AssetError):
-            raise
-        raise AssetError(f"{name}: holds invalid data ({error})", hint=process.REEXPORT) from error
     if not surfaces:
         raise AssetError(f"{name}: holds no visible mesh", hint="Export splats, or a closed Mesh that is visible")
     return colored_mesh(surfaces, name)

@@ -177,13 +177,9 @@ def scene_from_answer(answer: process.Answer, name: str) -> UsdScene:
     """
     stage = answer.described
     frame = stage_frame(stage, name)
-    try:
+    with process.invalid_data(name):
         bodies = tuple(_deformable(body, answer.arrays, frame, name) for body in stage["bodies"])
         scenery = [_splats(prim, answer.arrays, frame, np.eye(4), name) for prim in stage["scenery"]]
-    except (TypeError, IndexError, KeyError, ValueError, OverflowError) as error:
-        if isinstance(error, AssetError):
-            raise
-        raise AssetError(f"{name}: holds invalid data ({error})", hint=process.REEXPORT) from error
     return UsdScene(
         file=name.removeprefix("OpenUSD file "),
         deformables=bodies,

@@ -254,6 +254,7 @@ def add_arm(
     bodies: list[int] = []
     joints: list[int] = []
     shapes: list[int] = []
+    added: list[int] = []
     coord_start, dof_start = builder.joint_coord_count, builder.joint_dof_count
     weight = {"mujoco:gravcomp": 1.0} if arm.gravity_compensation else {}
 

@@ -1,1 +1,58 @@
-"""Scenes: a model with its solver, states, objects and cameras, and a captured step."""
+"""Scenes: a model with its solver, state, objects and cameras, and a captured step.
+
+Names are imported when they are first used.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from softmode.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from softmode.scenes.binding import BoundSplats, SplatFrame, splats_of_states
+    from softmode.scenes.capture import capture_graph, capture_step
+    from softmode.scenes.fixture import Fixture, add_fixture
+    from softmode.scenes.meshes import SceneMesh, scene_meshes, scene_poses
+    from softmode.scenes.scene import Scene
+    from softmode.scenes.splat_scene import Record, SplatScene
+    from softmode.scenes.table_scene import TableScene, TableSceneConfig
+
+__all__ = [
+    "BoundSplats",
+    "Fixture",
+    "Record",
+    "Scene",
+    "SceneMesh",
+    "SplatFrame",
+    "SplatScene",
+    "TableScene",
+    "TableSceneConfig",
+    "add_fixture",
+    "capture_graph",
+    "capture_step",
+    "scene_meshes",
+    "scene_poses",
+    "splats_of_states",
+]
+
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "BoundSplats": ".binding",
+        "Fixture": ".fixture",
+        "Record": ".splat_scene",
+        "Scene": ".scene",
+        "SceneMesh": ".meshes",
+        "SplatFrame": ".binding",
+        "SplatScene": ".splat_scene",
+        "TableScene": ".table_scene",
+        "TableSceneConfig": ".table_scene",
+        "add_fixture": ".fixture",
+        "capture_graph": ".capture",
+        "capture_step": ".capture",
+        "scene_meshes": ".meshes",
+        "scene_poses": ".meshes",
+        "splats_of_states": ".binding",
+    },
+)

@@ -9,14 +9,14 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def principal_axes(
-    covariance: wp.array2d[vec6],  # (world_count, splat_count), xx xy xz yy yz zz [m^2]
+    covariance: wp.array[vec6],  # (splat_count,), xx xy xz yy yz zz [m^2]
     # Out:
-    scale_out: wp.array2d[wp.vec3],  # standard deviations [m]
-    quat_out: wp.array2d[wp.quat],  # principal frame to world
+    scale_out: wp.array[wp.vec3],  # standard deviations [m]
+    quat_out: wp.array[wp.quat],  # principal frame to world
 ):
     """Find R and s with R diag(s^2) R^T = Sigma; in float64, as thin splats have variances that float32 would lose."""
-    w, i = wp.tid()
-    c = covariance[w, i]
+    i = wp.tid()
+    c = covariance[i]
     xy = wp.float64(c[1])
     xz = wp.float64(c[2])
     yz = wp.float64(c[4])
@@ -24,9 +24,9 @@ def principal_axes(
     if wp.determinant(axes) < wp.float64(0.0):
         axes = -axes
     zero = wp.float64(0.0)
-    scale_out[w, i] = wp.vec3(
+    scale_out[i] = wp.vec3(
         float(wp.sqrt(wp.max(variance[0], zero))),
         float(wp.sqrt(wp.max(variance[1], zero))),
         float(wp.sqrt(wp.max(variance[2], zero))),
     )
-    quat_out[w, i] = wp.quat(wp.quat_from_matrix(axes))
+    quat_out[i] = wp.quat(wp.quat_from_matrix(axes))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import newton
@@ -13,16 +13,17 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softmode.deformables.materials.material import Material
-from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.model.status import status_reasons
-from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
+from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import SoftObject
+from softmode.objects.placed import Placed
+from softmode.scenes.binding import BoundSplats
+from softmode.scenes.capture import capture_graph, capture_step, require_even
+from softmode.scenes.fixture import Fixture, add_fixture
+from softmode.scenes.scene import cameras_by_size
 from softmode.splats.camera import CameraOptions, SplatCamera
 from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.rasterizer import SplatArrays
-from softmode.splats.splats import Splats
 
 
 class FrameSink(Protocol):
@@ -30,23 +31,10 @@ class FrameSink(Protocol):
 
     def add(self, frame: NDArray[np.uint8], rate: int, /) -> None:
         """Add a picture, shape (height, width, 3), of a film with ``rate`` pictures per second."""
-        ...
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlacedObject:
-    """A soft object at its place."""
-
-    thing: SoftObject
-    """The object; several places may share one."""
-    position: tuple[float, float, float]
-    """Where its centre of mass starts [m]."""
-    rotation: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
-    """How it is turned, shape (3, 3)."""
-    material: Material = field(default_factory=lambda: Material(youngs_modulus=1.0e5, density=250.0))
-    """What it is made of."""
-    splats: Splats | None = None
-    """Its splats in other colours; None for those of the object."""
+FOAM = Material(youngs_modulus=1.0e5, density=250.0)
+"""What objects are made of that do not say it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,16 +64,18 @@ class Record:
 
 
 class SplatScene:
-    """One world of soft objects and fixed shapes. Time and pictures are captured in graphs.
+    """A scene of one's own: soft objects among fixed shapes in one world. Time and pictures are captured in graphs.
 
     Args:
-        fixtures: Builder with the shapes that do not move (body -1); it is added to.
+        fixtures: The shapes that do not move; or a builder with such shapes (body -1), to which the objects are added.
         objects: The soft objects.
-        cameras: Cameras of one size; none draws nothing.
+        cameras: What to draw; none draws nothing.
         dt: Physics step [s].
         steps_per_frame: Physics steps of a frame; even.
         options: How the soft step is solved.
         camera_options: Light and background.
+        grip_slots: Points of each object that may be gripped while the scene runs; see :attr:`grips`.
+        grip_options: How stiff such grips are.
         device: Warp device; the default one if None.
 
     Raises:
@@ -94,73 +84,73 @@ class SplatScene:
 
     def __init__(
         self,
-        fixtures: newton.ModelBuilder,
-        objects: Sequence[PlacedObject],
+        fixtures: newton.ModelBuilder | Sequence[Fixture],
+        objects: Sequence[Placed],
         *,
         cameras: Sequence[PinholeCamera] = (),
         dt: float = 1.0 / 240.0,
         steps_per_frame: int = 8,
         options: SolverReducedOptions | None = None,
         camera_options: CameraOptions | None = None,
-        device: Any = None,
+        grip_slots: int = 0,
+        grip_options: GripOptions | None = None,
+        device: wp.DeviceLike = None,
     ) -> None:
-        """Build model, solver, skins and camera."""
+        """Build model, solver, splats and cameras."""
         if not objects:
-            raise ConfigError("objects is empty", hint="give at least one PlacedObject")
-        if steps_per_frame < 2 or steps_per_frame % 2:
-            raise ConfigError(f"steps_per_frame must be even and at least 2, got {steps_per_frame}")
-        self.objects, self.dt, self.steps_per_frame = tuple(objects), dt, steps_per_frame
-        for placed in self.objects:
-            add_reduced_body(
-                fixtures,
-                placed.thing.body,
-                material=placed.material,
-                position=placed.position,
-                rotation=placed.rotation,
-            )
-        self.model: Any = fixtures.finalize(device=device)
-        bodies = {id(placed.thing.body): placed.thing.body for placed in self.objects}
+            raise ConfigError("objects is empty", hint="give at least one Placed")
+        require_even("steps_per_frame", steps_per_frame)
+        self.placed, self.dt, self.steps_per_frame = tuple(objects), dt, steps_per_frame
+        self.objects = tuple(placed.object for placed in self.placed)
+        """The soft objects; :attr:`placed` says where they start."""
+        if isinstance(fixtures, newton.ModelBuilder):
+            builder = fixtures
+        else:
+            builder = newton.ModelBuilder()
+            for fixture in fixtures:
+                add_fixture(builder, fixture)
+        for placed in self.placed:
+            instance = placed.add_to(builder, material=placed.object.material or FOAM)
+            if grip_slots:
+                add_grip_slots(builder, instance, grip_slots)
+        self.model: Any = builder.finalize(device=device)  # Any: it carries the attributes of soft bodies
+        bodies = {id(thing.body): thing.body for thing in self.objects}
         self.solver = SolverReduced(self.model, list(bodies.values()), options=options)
-        self.state, self._scratch = self.model.state(), self.model.state()
-        self._step_graph: Any = None
-        self._frame_graph: Any = None
-        self._build_camera(cameras, camera_options)
-
-    def _build_camera(self, cameras: Sequence[PinholeCamera], options: CameraOptions | None) -> None:
-        """Upload the splats, tie each object's to its body, make the camera."""
-        self.camera: SplatCamera | None = None
-        if not cameras:
-            return
-        device = self.model.device
-        shown = [placed.splats or placed.thing.splats for placed in self.objects]
-        self.splats = SplatArrays.from_splats(shown, device=device)
-        self._skins = [
-            SkinSplats(s.means, s.covariances(), p.thing.basis, p.thing.grad_basis, device=device)
-            for s, p in zip(shown, self.objects, strict=True)
-        ]
-        self._first = np.concatenate([[0], np.cumsum([s.count for s in shown])]).tolist()
-        self.camera = SplatCamera(self.model, self.splats, cameras, options=options)
+        self.state: Any = self.model.state()
+        self._scratch, self.control = self.model.state(), self.model.control()
+        self.grips = tuple(
+            Grips(self.solver, i, slot_count=grip_slots, options=grip_options)
+            for i in range(len(self.objects) if grip_slots else 0)
+        )
+        """Grips of each object, that pull and hold it while the scene runs; none without slots."""
+        self.splats = BoundSplats(self.model, self.objects) if cameras else None
+        """The splats of the objects as cameras see them; None without cameras."""
+        self.cameras: dict[tuple[int, int], SplatCamera] = {}
+        """The cameras by the width and height of their pictures [px]."""
+        if self.splats is not None:
+            self.cameras = cameras_by_size(self.model, self.splats, cameras, options=camera_options)
+        self._step_graph: wp.Graph | None = None
+        self._draw_graph: wp.Graph | None = None
 
     # -- time and pictures --------------------------------------------------------------------------------------------
 
-    def advance(self) -> None:
+    def step(self) -> None:
         """Take the physics steps of one frame."""
         if self._step_graph is None:
-            start = self.model.state()
-            start.assign(self.state)
-            self._two_steps()  # compiles
-            with wp.ScopedCapture(device=self.model.device) as capture:
-                for _ in range(self.steps_per_frame // 2):
-                    self._two_steps()
-            self._step_graph = capture.graph
-            self.state.assign(start)
-            self.solver.status.zero_()
+            self._step_graph = capture_step(self, self._steps)
         wp.capture_launch(self._step_graph)
 
-    def _two_steps(self) -> None:
+    def _steps(self) -> None:
         """Step there and back between the two states."""
-        self.solver.step(self.state, self._scratch, None, None, self.dt)
-        self.solver.step(self._scratch, self.state, None, None, self.dt)
+        for _ in range(self.steps_per_frame // 2):
+            for first, second in ((self.state, self._scratch), (self._scratch, self.state)):
+                for grips in self.grips:
+                    grips.apply(first, self.control, self.dt)
+                self.solver.step(first, second, self.control, None, self.dt)
+
+    def reset(self) -> None:
+        """Put the objects back where they were placed, at rest."""
+        self.solver.reset(self.state)
 
     def draw(self, name: str | None = None) -> NDArray[np.uint8]:
         """Return the picture of a camera, the first if no name is given, shape (height, width, 3).
@@ -168,30 +158,23 @@ class SplatScene:
         Raises:
             ConfigError: If the scene has no such camera.
         """
-        if self.camera is None:
+        known = {camera.name: drawn for drawn in self.cameras.values() for camera in drawn.cameras}
+        if not known:
             raise ConfigError("the scene has no camera", hint="pass cameras to SplatScene")
-        if self._frame_graph is None:
-            self._draw(self.camera)
-            with wp.ScopedCapture(device=self.model.device) as capture:
-                self._draw(self.camera)
-            self._frame_graph = capture.graph
-        wp.capture_launch(self._frame_graph)
-        return self.camera.images(name or self.camera.cameras[0].name).numpy()[0].copy()
+        name = next(iter(known)) if name is None else name
+        if name not in known:
+            raise ConfigError(f"no camera {name!r}, there are {sorted(known)}")
+        if self._draw_graph is None:
+            self._draw_graph = capture_graph(self._draw, self.model.device)
+        wp.capture_launch(self._draw_graph)
+        return known[name].images(name).numpy()[0].copy()
 
-    def _draw(self, camera: SplatCamera) -> None:
-        """Deform the splats of every object and draw."""
-        start: Any = self.model.softmode.function_start
-        q, splats = self.state.softmode.q, self.splats
-        for i, skin in enumerate(self._skins):
-            skin.launch(
-                q,
-                start[i : i + 1],
-                splats.means,
-                splats.covariances,
-                rotations=splats.rotations,
-                first_splat=self._first[i],
-            )
-        camera.render(self.state)
+    def _draw(self) -> None:
+        """Move the splats and draw every camera."""
+        assert self.splats is not None
+        self.splats.update(self.state)
+        for camera in self.cameras.values():
+            camera.render(self.state)
 
     def record(self, film: FrameSink, frame_count: int, depth: Callable[[SplatScene], float]) -> Record:
         """Film the scene's first camera, measuring after every frame; the film is not published yet.
@@ -205,7 +188,7 @@ class SplatScene:
         for _ in range(frame_count):
             film.add(self.draw(), round(1.0 / (self.dt * self.steps_per_frame)))
             clock = time.perf_counter()
-            self.advance()
+            self.step()
             peak = max(peak, self.kinetic_energy())  # reads back, so that the clock sees the end of the step
             seconds += time.perf_counter() - clock
             deepest, overlap = max(deepest, depth(self)), max(overlap, self.soft_overlap())
@@ -223,16 +206,16 @@ class SplatScene:
     def surface(self, index: int) -> NDArray[np.float64]:
         """Return the surface samples of an object [m], shape (surface_count, 3)."""
         start = int(self.model.softmode.particle_start.numpy()[index])
-        count = self.objects[index].thing.body.surface_count
+        count = self.objects[index].body.surface_count
         return self.state.particle_q.numpy()[start : start + count].astype(np.float64)
 
     def kinetic_energy(self) -> float:
         """Return the kinetic energy of all objects, rho V / 2 sum_k |dq_k/dt|^2 [J]; the functions are orthonormal."""
         start, qd = self.model.softmode.function_start.numpy(), self.state.softmode.qd.numpy()
         total = 0.0
-        for placed, first in zip(self.objects, start, strict=True):
-            body = placed.thing.body
-            mass = placed.material.density * body.volume
+        for placed, first in zip(self.placed, start, strict=True):
+            body = placed.body
+            mass = (placed.object.material or FOAM).density * body.volume
             total += 0.5 * mass * float((qd[first : first + body.function_count] ** 2).sum())
         return total
 
@@ -241,7 +224,7 @@ class SplatScene:
         if self.solver.pairs is None:
             return 0.0
         pairs = self.solver.pairs.table
-        count = np.array([placed.thing.body.surface_count for placed in self.objects])
+        count = np.array([thing.body.surface_count for thing in self.objects])
         found = pairs.near.numpy().astype(bool)[:, None] & (np.arange(pairs.gap.shape[1]) < count[:, None])
         gap = np.where(found[:, :, None] & (pairs.other.numpy() >= 0), pairs.gap.numpy(), 0.0)
         return float(max(-gap.min(), 0.0))

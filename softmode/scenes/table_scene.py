@@ -2,66 +2,38 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import newton
 import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
+from softmode.checks import require_number
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body, register_custom_attributes
 from softmode.deformables.model.status import status_reasons
-from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import ObjectConfig, SoftObject, load_object
+from softmode.objects.config import ObjectConfig
+from softmode.objects.loader import Progress, load
+from softmode.objects.soft_object import SoftObject
 from softmode.robots.arm import ArmDescription, add_arm
 from softmode.robots.control import ArmController, ArmControlOptions
 from softmode.scenes import table_kernels as kernels
+from softmode.scenes.binding import BoundSplats
+from softmode.scenes.capture import capture_graph, capture_step, require_even
+from softmode.scenes.fixture import Fixture, add_fixture
+from softmode.scenes.scene import cameras_by_size
 from softmode.splats.camera import CameraOptions, SplatCamera
 from softmode.splats.camera_randomization import CameraRandomization
 from softmode.splats.pinhole import PinholeCamera
-from softmode.splats.rasterizer import RasterizerOptions, SplatArrays
 from softmode.splats.splats import Splats
 
 GAP = 2.0e-4
 """Height over the table at which objects are put down [m]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Fixture:
-    """A rigid shape that stays where it is: a wall of a bin, a peg."""
-
-    label: str
-    """Name of the shape."""
-    shape: Literal["box", "sphere", "capsule", "cylinder"] = "box"
-    """Its kind; capsules and cylinders stand along z."""
-    size: tuple[float, ...]
-    """Half extents of a box, radius of a sphere, radius and half height of the others [m]."""
-    position: tuple[float, float, float]
-    """Its centre [m]; the table's top is z = 0."""
-    yaw: float = 0.0
-    """Rotation about the vertical [rad]."""
-    color: tuple[float, float, float] = (0.62, 0.62, 0.60)
-    """Its colour, sRGB."""
-    friction: float = 0.8
-    """Coulomb coefficient."""
-
-    def __post_init__(self) -> None:
-        """Check kind and size."""
-        counts = {"box": 3, "sphere": 1, "capsule": 2, "cylinder": 2}
-        if self.shape not in counts:
-            raise ConfigError(f"fixture {self.label!r} is a {self.shape!r}", hint=f"use one of {', '.join(counts)}")
-        if len(self.size) != counts[self.shape] or not all(0.0 < x < np.inf for x in self.size):
-            raise ConfigError(
-                f"fixture {self.label!r} has size {self.size}",
-                hint=f"give {counts[self.shape]} positive lengths [m] for a {self.shape}",
-            )
-        if not np.isfinite(self.position).all():
-            raise ConfigError(f"fixture {self.label!r} stands at {self.position}", hint="give finite coordinates [m]")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,14 +73,10 @@ class TableSceneConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        if self.substeps < 2 or self.substeps % 2:
-            raise ConfigError(f"substeps must be even and at least 2, got {self.substeps}")
-        if not 1.0 <= self.control_hz <= 1000.0:
-            raise ConfigError(f"control_hz must lie in 1..1000, got {self.control_hz}")
-        if not self.table_friction >= 0.0:
-            raise ConfigError(f"table_friction must be >= 0, got {self.table_friction}")
-        if not 0 <= self.grip_slots <= 4096:
-            raise ConfigError(f"grip_slots must lie in 0..4096, got {self.grip_slots}")
+        require_even("substeps", self.substeps)
+        require_number("control_hz", self.control_hz, at_least=1.0, at_most=1000.0)
+        require_number("table_friction", self.table_friction, at_least=0.0)
+        require_number("grip_slots", self.grip_slots, at_least=0, at_most=4096)
 
 
 class TableScene:
@@ -134,8 +102,8 @@ class TableScene:
         camera_options: CameraOptions | None = None,
         camera_randomization: CameraRandomization | None = None,
         marker: Splats | None = None,
-        device: Any = None,
-        progress: Any = None,
+        device: wp.DeviceLike = None,
+        progress: Progress = None,
     ) -> None:
         """Build model, solvers and controller, and capture the control step."""
         if world_count < 1:
@@ -145,7 +113,7 @@ class TableScene:
         self.device = wp.get_device(device)
         self.dt = 1.0 / (config.control_hz * config.substeps)
         kinds = (config.object, *config.others)
-        loaded = {kind: load_object(kind, progress) for kind in dict.fromkeys(kinds)}
+        loaded = {kind: load(kind, progress=progress) for kind in dict.fromkeys(kinds)}
         self.objects: tuple[SoftObject, ...] = tuple(loaded[kind] for kind in kinds)
         """The soft objects of a world; their instances follow each other, world by world."""
         self._build_model()
@@ -154,9 +122,21 @@ class TableScene:
         """Where the marker is drawn, transform, shape (world_count,)."""
         self.marker_place.fill_(wp.transform_identity())
         self._marker = marker
-        self._build_cameras(cameras, camera_options, camera_randomization)
-        self._graph: Any = None
-        self._camera_graphs: dict[tuple[int, int], Any] = {}
+        self.splats: BoundSplats | None = None
+        """The splats of the objects, then those of the marker, as cameras see them; None without cameras."""
+        self.cameras: dict[tuple[int, int], SplatCamera] = {}
+        """The cameras by the width and height of their pictures [px]."""
+        if cameras:
+            self.splats = BoundSplats(self.model, self.objects, others=() if marker is None else (marker,))
+            self.cameras = cameras_by_size(
+                self.model, self.splats, cameras, options=camera_options, randomization=camera_randomization
+            )
+            if marker is not None:
+                self.marker_points = wp.array(marker.means[None], dtype=wp.vec3, device=self.device)
+                """Centres of the marker's splats from `marker_place` [m], shape (1 or world_count, splats); a task may
+                put an array of its own here before the first picture, to change the marker's shape."""
+        self._graph: wp.Graph | None = None
+        self._camera_graphs: dict[tuple[int, int], wp.Graph] = {}
         self.reset()
 
     @property
@@ -166,7 +146,7 @@ class TableScene:
 
     @property
     def marker(self) -> Splats | None:
-        """Splats that mark a place in pictures, as they were given; the last ones of `splat_arrays`."""
+        """Splats that mark a place in pictures, as they were given; the last ones of `splats`."""
         return self._marker
 
     # -- construction -------------------------------------------------------------------------------------------------
@@ -176,19 +156,15 @@ class TableScene:
         config = self.config
         world = newton.ModelBuilder()
         self.arm = add_arm(world, config.arm)
-        shape = newton.ModelBuilder.ShapeConfig(mu=config.table_friction, has_shape_collision=True)
-        world.add_shape_box(
-            -1,
-            xform=wp.transform((0.35, 0.0, -0.03), wp.quat_identity()),
-            hx=0.5,
-            hy=0.6,
-            hz=0.03,
-            cfg=shape,
-            color=(0.42, 0.48, 0.54),
+        table = Fixture(
             label="table",
+            size=(0.5, 0.6, 0.03),
+            position=(0.35, 0.0, -0.03),
+            color=(0.42, 0.48, 0.54),
+            friction=config.table_friction,
         )
-        for fixture in config.fixtures:
-            _add_fixture(world, fixture)
+        for fixture in (table, *config.fixtures):
+            add_fixture(world, fixture)
         for thing, kind in zip(self.objects, (config.object, *config.others), strict=True):
             instance = add_reduced_body(
                 world,
@@ -213,7 +189,7 @@ class TableScene:
         self.solver = SolverCoupledReduced(model, bodies, options=config.solver, rigid=rigid)
         self.state: Any = model.state()
         self._scratch: Any = model.state()
-        self.control = model.control()
+        self.control: Any = model.control()
         for state in (self.state, self._scratch):
             newton.eval_fk(model, model.joint_q, model.joint_qd, state)
         self.controller = ArmController(model, self.arm, config.control)
@@ -243,45 +219,6 @@ class TableScene:
         """Where `reset_worlds` puts the centre of mass of each object [m], shape (world_count * objects,)."""
         self.place_yaw = wp.zeros(instances, dtype=wp.float64, device=device)
         """Its rotation about the vertical [rad]."""
-
-    def _build_cameras(
-        self,
-        cameras: Sequence[PinholeCamera],
-        options: CameraOptions | None,
-        randomization: CameraRandomization | None,
-    ) -> None:
-        """Make one SplatCamera per image size; they share the splats."""
-        self.cameras: dict[tuple[int, int], SplatCamera] = {}
-        if not cameras:
-            return
-        stride, starts = len(self.objects), self.model.softmode.function_start.numpy()
-        self._skins = []
-        first = 0
-        for o, thing in enumerate(self.objects):
-            skin = SkinSplats(
-                thing.splats.means, thing.splats.covariances(), thing.basis, thing.grad_basis, device=self.device
-            )
-            start = wp.array(np.ascontiguousarray(starts[o::stride]), dtype=int, device=self.device)
-            self._skins.append((skin, start, first))
-            first += thing.splats.count
-        drawn = [thing.splats for thing in self.objects]
-        if self._marker is not None:
-            self._marker_first = first
-            self.marker_points = wp.array(self._marker.means[None], dtype=wp.vec3, device=self.device)
-            """Centres of the marker's splats from `marker_place` [m], shape (1 or world_count, splats); a task may put
-            an array of its own here before the first picture, to change the marker's shape."""
-            drawn.append(self._marker)
-        self.splat_arrays = SplatArrays.from_splats(drawn, world_count=self.world_count, device=self.device)
-        for size in sorted({(camera.width, camera.height) for camera in cameras}):
-            mine = [camera for camera in cameras if (camera.width, camera.height) == size]
-            self.cameras[size] = SplatCamera(
-                self.model,
-                self.splat_arrays,
-                mine,
-                options=options,
-                rasterizer_options=RasterizerOptions(),
-                randomization=randomization,
-            )
 
     # -- time ---------------------------------------------------------------------------------------------------------
 
@@ -321,24 +258,15 @@ class TableScene:
     def reset_worlds(self) -> None:
         """Put arm and objects of the worlds in `world_mask` back, objects where `place_position` says; capturable."""
         worlds, data, state = self.world_count, self.model.softmode, self.state
-        control: Any = self.control
         wp.copy(self._solver_mask, self.world_mask, count=worlds)
         self.solver.reset(state, self._solver_mask)
+        place = (self.world_mask, self.place_position, self.place_yaw)
         for o, linear in enumerate(self._linear):
             wp.launch(
                 kernels.place_objects,
                 dim=(worlds, linear.shape[0]),
-                inputs=[
-                    data.function_start,
-                    len(self.objects),
-                    o,
-                    linear,
-                    self.world_mask,
-                    self.place_position,
-                    self.place_yaw,
-                    data.scale,
-                ],
-                outputs=[state.softmode.q, state.softmode.qd, control.softmode.q_driven],
+                inputs=[data.function_start, len(self.objects), o, linear, *place, data.scale],
+                outputs=[state.softmode.q, state.softmode.qd, self.control.softmode.q_driven],
                 device=self.device,
             )
         self.solver.reduced.update_particles(state)
@@ -355,28 +283,18 @@ class TableScene:
             modulus[w * len(self.objects) : (w + 1) * len(self.objects)] = checked
         array.assign(modulus)
 
-    def step(self, actions: np.ndarray) -> None:
+    def step(self, actions: np.ndarray | None = None) -> None:
         """Advance one control step.
 
         Args:
-            actions: Actions in [-1, 1], shape (world_count, action_size).
+            actions: Actions in [-1, 1], shape (world_count, action_size); None for those of the step before.
         """
-        self.actions.assign(np.asarray(actions, np.float32).reshape(self.actions.shape))
+        if actions is not None:
+            self.actions.assign(np.asarray(actions, np.float32).reshape(self.actions.shape))
         if self._graph is None:
-            self._graph = self._capture_control_step()
+            self._graph = capture_step(self, self.control_step)
+            self.controller.reset(self.state)
         wp.capture_launch(self._graph)
-
-    def _capture_control_step(self) -> Any:
-        """Compile what a control step needs, then record it; leaves the state as it was."""
-        saved = self.model.state()
-        saved.assign(self.state)
-        self.control_step()
-        with wp.ScopedCapture(device=self.device) as capture:
-            self.control_step()
-        self.state.assign(saved)
-        self.solver.reduced.progress.kept.zero_()
-        self.controller.reset(self.state)
-        return capture.graph
 
     def control_step(self) -> None:
         """Move the command by `actions`, run the substeps, observe; capturable."""
@@ -399,14 +317,7 @@ class TableScene:
             wp.launch(
                 kernels.observe_objects,
                 dim=worlds,
-                inputs=[
-                    data.function_start,
-                    len(self.objects),
-                    o,
-                    mean_basis,
-                    state.softmode.q,
-                    state.softmode.qd,
-                ],
+                inputs=[data.function_start, len(self.objects), o, mean_basis, state.softmode.q, state.softmode.qd],
                 outputs=[self.object_position, self.object_velocity],
                 device=self.device,
             )
@@ -422,34 +333,23 @@ class TableScene:
         """Draw every camera of one image size and return it; its arrays are overwritten by the next frame."""
         camera = self.cameras[size]
         if size not in self._camera_graphs:
-            self.draw(camera)
-            with wp.ScopedCapture(device=self.device) as capture:
-                self.draw(camera)
-            self._camera_graphs[size] = capture.graph
+            self._camera_graphs[size] = capture_graph(lambda: self.draw(camera), self.device)
         wp.capture_launch(self._camera_graphs[size])
         return camera
 
     def draw(self, camera: SplatCamera) -> None:
-        """Deform the splats and draw one frame; capturable after a first frame."""
-        state, arrays = self.state, self.splat_arrays
-        for skin, start, first in self._skins:
-            skin.launch(
-                state.softmode.q,
-                start,
-                arrays.means,
-                arrays.covariances,
-                rotations=arrays.rotations,
-                first_splat=first,
-            )
-        if self._marker is not None:
-            wp.launch(
-                kernels.place_marker,
-                dim=(self.world_count, self._marker.count),
-                inputs=[self.marker_points, self.marker_place, self._marker_first],
-                outputs=[arrays.means],
-                device=self.device,
-            )
-        camera.render(state)
+        """Move the splats and draw one frame; capturable after a first frame."""
+        if self.splats is not None:
+            self.splats.update(self.state)
+            if self._marker is not None:
+                wp.launch(
+                    kernels.place_marker,
+                    dim=(self.world_count, self._marker.count),
+                    inputs=[self.marker_points, self.marker_place, self.splats.columns[-1].start],
+                    outputs=[self.splats.arrays.means],
+                    device=self.device,
+                )
+        camera.render(self.state)
 
     # -- reading ------------------------------------------------------------------------------------------------------
 
@@ -462,20 +362,3 @@ class TableScene:
     def status_reasons(self) -> tuple[tuple[str, ...], ...]:
         """Names of those bits per world."""
         return tuple(status_reasons(int(bits)) for bits in self.status)
-
-
-def _add_fixture(world: newton.ModelBuilder, fixture: Fixture) -> None:
-    """Add a rigid shape that belongs to the world."""
-    half = 0.5 * fixture.yaw
-    place = wp.transform(fixture.position, wp.quat(0.0, 0.0, float(np.sin(half)), float(np.cos(half))))
-    shape = newton.ModelBuilder.ShapeConfig(mu=fixture.friction, has_shape_collision=True)
-    given: dict[str, Any] = {"xform": place, "cfg": shape, "color": fixture.color, "label": fixture.label}
-    size = fixture.size
-    if fixture.shape == "box":
-        world.add_shape_box(-1, hx=size[0], hy=size[1], hz=size[2], **given)
-    elif fixture.shape == "sphere":
-        world.add_shape_sphere(-1, radius=size[0], **given)
-    elif fixture.shape == "capsule":
-        world.add_shape_capsule(-1, radius=size[0], half_height=size[1], **given)
-    else:
-        world.add_shape_cylinder(-1, radius=size[0], half_height=size[1], **given)

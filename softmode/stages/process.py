@@ -6,6 +6,7 @@ gigabytes or run for minutes. All of that ends the child and becomes an AssetErr
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import json
 import os
@@ -14,6 +15,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -64,6 +66,21 @@ class Answer:
     """Nested dicts and lists; integers under the names of arrays number them."""
     arrays: list[NDArray[Any]]
     """The arrays, each with the shape that OpenUSD gave it."""
+
+
+@contextlib.contextmanager
+def invalid_data(name: str) -> Iterator[None]:
+    """Turn what contradictory data leads Python and numpy to into an AssetError that names the file.
+
+    Args:
+        name: The file as messages call it.
+    """
+    try:
+        yield
+    except AssetError:
+        raise
+    except (TypeError, IndexError, KeyError, ValueError, OverflowError) as error:
+        raise AssetError(f"{name}: holds invalid data ({error})", hint=REEXPORT) from error
 
 
 def pxr_folder() -> str:

@@ -1,45 +1,25 @@
 """OpenUSD: stages with soft bodies, in and out; needs the extra `[usd]`.
 
-Names are loaded when first used: the reader of splat files shares a module with this package and nothing else, and the
-process that opens untrusted stages must start in no time.
+Names are imported when they are first used.
 """
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from softmode.lazy import lazy_names
 
 if TYPE_CHECKING:
     from softmode.objects.stage_scene import UsdDeformable, UsdScene, read_usd_scene
     from softmode.usd.animation import UsdAnimation, UsdAnimationOptions
-    from softmode.usd.importer import UsdBody, UsdImport, add_usd
-    from softmode.usd.placed import PlacedBody
+    from softmode.usd.importer import UsdImport, add_usd
     from softmode.usd.playback import PlayedBody, UsdPlayback, read_animation
     from softmode.usd.writer import UsdExportOptions, write_usd
 
-_HOME = {
-    "PlacedBody": "placed",
-    "PlayedBody": "playback",
-    "UsdAnimation": "animation",
-    "UsdAnimationOptions": "animation",
-    "UsdBody": "importer",
-    "UsdDeformable": "scene",
-    "UsdExportOptions": "writer",
-    "UsdImport": "importer",
-    "UsdPlayback": "playback",
-    "UsdScene": "scene",
-    "add_usd": "importer",
-    "read_animation": "playback",
-    "read_usd_scene": "scene",
-    "write_usd": "writer",
-}
-
 __all__ = [
-    "PlacedBody",
     "PlayedBody",
     "UsdAnimation",
     "UsdAnimationOptions",
-    "UsdBody",
     "UsdDeformable",
     "UsdExportOptions",
     "UsdImport",
@@ -51,9 +31,20 @@ __all__ = [
     "write_usd",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    """Load a public name from its module."""
-    if name in _HOME:
-        return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "PlayedBody": ".playback",
+        "UsdAnimation": ".animation",
+        "UsdAnimationOptions": ".animation",
+        "UsdDeformable": "softmode.objects.stage_scene",
+        "UsdExportOptions": ".writer",
+        "UsdImport": ".importer",
+        "UsdPlayback": ".playback",
+        "UsdScene": "softmode.objects.stage_scene",
+        "add_usd": ".importer",
+        "read_animation": ".playback",
+        "read_usd_scene": "softmode.objects.stage_scene",
+        "write_usd": ".writer",
+    },
+)

@@ -20,13 +20,14 @@ from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model.authoring import MATERIAL_FIELDS, body_key
 from softmode.errors import ConfigError, SolverDiverged
+from softmode.objects.placed import Placed
 from softmode.objects.stage_scene import shortest
-from softmode.scenes.skinned_splats import SkinnedSplats
+from softmode.scenes.binding import splats_of_states
 from softmode.splats.formats.usd import set_splat_column, splat_columns
 from softmode.stages import tokens
+from softmode.stages.openusd import Layer, Stage
 from softmode.usd.handles import handles_from_coordinates, local_coordinates, rigid_motion
 from softmode.usd.openusd import check_stage, openusd, whole_stage
-from softmode.usd.placed import PlacedBody
 from softmode.usd.rigid import RigidMeshes
 from softmode.usd.writer import (
     UsdExportOptions,
@@ -99,7 +100,7 @@ class UsdAnimation:
         self,
         path: str | Path,
         model: Any,
-        bodies: Sequence[PlacedBody],
+        bodies: Sequence[Placed],
         *,
         world: int = 0,
         options: UsdAnimationOptions | None = None,
@@ -118,11 +119,11 @@ class UsdAnimation:
             raise ConfigError(
                 f"bodies: got {[placed.body.name for placed in bodies]}, world {world} holds {len(found)} soft bodies"
                 + (", others or in another order" if len(found) == len(bodies) else ""),
-                hint="pass a PlacedBody for each add_reduced_body, in that order",
+                hint="pass a Placed for each add_reduced_body, in that order",
             )
         self._starts = data.function_start.numpy()[self._instances].tolist()
         self._bodies = tuple(bodies)
-        self._placed: tuple[PlacedBody, ...] = ()
+        self._placed: tuple[Placed, ...] = ()
         self._meshes = RigidMeshes(model, world) if self.options.rigid_meshes else None
         self._live: Any = None
         self._times: list[float] = []
@@ -130,7 +131,7 @@ class UsdAnimation:
 
     @classmethod
     def of_env(
-        cls, path: str | Path, env: Any, *, world: int = 0, options: UsdAnimationOptions | None = None
+        cls, path: str | Path, env: object, *, world: int = 0, options: UsdAnimationOptions | None = None
     ) -> UsdAnimation:
         """Return an animation of an environment; `record()` then takes its present state.
 
@@ -150,7 +151,7 @@ class UsdAnimation:
         made = cls(
             path,
             scene.model,
-            [PlacedBody(body=thing.body, splats=thing.splats) for thing in scene.objects],
+            [Placed(object=thing) for thing in scene.objects],
             world=world,
             options=options or UsdAnimationOptions(fps=scene.config.control_hz),
         )
@@ -161,7 +162,7 @@ class UsdAnimation:
         """Return the animation."""
         return self
 
-    def __exit__(self, kind: Any, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Publish what was recorded, unless an error ended the block."""
         if kind is None and self._times:
             self.publish()
@@ -203,7 +204,7 @@ class UsdAnimation:
         self._times.append(when)
         self._states.append(parts)
 
-    def _in_model(self, states: Sequence[NDArray[np.float64]]) -> tuple[PlacedBody, ...]:
+    def _in_model(self, states: Sequence[NDArray[np.float64]]) -> tuple[Placed, ...]:
         """Return the bodies with material, size and place as they are in the model at the first frame."""
         data = self.model.softmode
         columns = {name: getattr(data, name).numpy() for name in (*MATERIAL_FIELDS, "material_model", "scale")}
@@ -217,8 +218,11 @@ class UsdAnimation:
             placed.append(
                 dataclasses.replace(
                     given,
-                    material=Material(model=MaterialModel(int(columns["material_model"][i])), **values),
-                    splats=splats,
+                    object=dataclasses.replace(
+                        given.object,
+                        material=Material(model=MaterialModel(int(columns["material_model"][i])), **values),
+                        splats=splats,
+                    ),
                     position=tuple(translation.tolist()),
                     rotation=rotation,
                     scale=float(columns["scale"][i]),
@@ -254,10 +258,10 @@ class UsdAnimation:
 
     def _author_motion(
         self,
-        stage: Any,
-        layer: Any,
+        stage: Stage,
+        layer: Layer,
         path: str,
-        placed: PlacedBody,
+        placed: Placed,
         codes: list[float],
         states: list[NDArray[np.float64]],
     ) -> None:
@@ -280,7 +284,7 @@ class UsdAnimation:
             self._bake(stage, layer, path, placed, codes, local)
 
     def _bake(
-        self, stage: Any, layer: Any, path: str, placed: PlacedBody, codes: list[float], local: NDArray[np.float64]
+        self, stage: Stage, layer: Layer, path: str, placed: Placed, codes: list[float], local: NDArray[np.float64]
     ) -> None:
         """Author points and splats frame by frame, in the frame of their body."""
         UsdGeom, UsdVol = openusd("UsdGeom", "UsdVol")
@@ -293,7 +297,7 @@ class UsdAnimation:
         prim = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath(f"{path}/Splats"))
         turning = placed.splats.sh_degree > 0
         near, waiting = placed.splats.quats, 0.0
-        for code, splats in zip(codes, SkinnedSplats(placed.body, placed.splats).frames(local), strict=True):
+        for code, splats in zip(codes, splats_of_states(placed.object, local), strict=True):
             columns = splat_columns(splats, near=near)
             near = columns["orientations"]
             del columns["opacities"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,77 +14,27 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.cache import cached_body
 from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_points, quadrature_from_splats
-from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
 from softmode.deformables.materials.material import Material
-from softmode.deformables.model.authoring import SCALE_MAX, SCALE_MIN, add_reduced_body, rotation_matrix
-from softmode.deformables.skinning.skin_splats import average_basis
-from softmode.errors import AssetError, BasisError, ConfigError, SoftmodeError
-from softmode.objects.stage_asset import colored_mesh
-from softmode.objects.stage_bundle import body_of
-from softmode.objects.stage_scene import UsdDeformable, UsdScene, open_scene
-from softmode.splats.mesh_samples import sample_mesh
-from softmode.splats.splats import Splats, quat_from_rotation
+from softmode.deformables.model.authoring import rotation_matrix
+from softmode.errors import AssetError, ConfigError, SoftmodeError
+from softmode.objects.loader import Progress
+from softmode.objects.placed import Placed
+from softmode.objects.stage_body import place_deformable
+from softmode.objects.stage_scene import UsdScene, open_scene
+from softmode.splats.splats import quat_from_rotation
 
 Array = NDArray[np.float64]
-Progress = Callable[[str, float], None]
-
-RECIPE = 1
-"""Raise it when a stage's body comes to be built in another way: cached bodies are keyed by it."""
-_COVER = 8000
-"""Points on a mesh that is not closed, whose inside is then what they enclose."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class UsdBody:
-    """A soft body of a stage in a model."""
-
-    path: str
-    """Path of its prim."""
-    instance: int
-    """Index of the instance in the builder, for `add_pins`, `attach`, and parameters of one world."""
-    body: ReducedBody
-    """The reduced body; bodies of equal shape share it."""
-    material: Material
-    """What it is made of."""
-    position: Array
-    """Where its centre of mass rests [m], shape (3,)."""
-    rotation: Array
-    """How it is turned, shape (3, 3)."""
-    scale: float
-    """Its size over that of `body`."""
-    splats: Splats | None
-    """Its splats in the body frame [m]: the stage's, else samples of its meshes; None for Points without either."""
-    notes: tuple[str, ...] = ()
-    """What was read in another way than it was meant."""
-
-    def placed_splats(self) -> Splats | None:
-        """Return its splats where the body rests [m]."""
-        if self.splats is None:
-            return None
-        return self.splats.transformed(rotation=self.rotation, translation=self.position, scale=self.scale)
-
-    def average_basis(self) -> tuple[Array, Array]:
-        """Return its functions (N, n) and their gradients (N, n, 3) [1/m] averaged over its splats, for `SkinSplats`.
-
-        Raises:
-            ConfigError: If it has no splats.
-        """
-        if self.splats is None:
-            raise ConfigError(f"{self.path}: has no splats", hint="put a splat prim or a Mesh beneath the body")
-        return average_basis(lambda x: self.body.evaluate(x)[0], self.splats.means, self.splats.covariances())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class UsdImport:
     """What `add_usd` added."""
 
-    bodies: dict[str, UsdBody]
-    """Soft bodies by prim path, in the order of the stage, which is that of their instances."""
+    bodies: dict[str, Placed]
+    """Soft bodies by prim path, in the order of the stage; those of equal shape share a `ReducedBody`."""
+    instances: dict[str, int]
+    """Index of each in the builder by prim path, for `add_pins`, `attach`, and parameters of one world."""
     scene: UsdScene
     """What the stage says of them."""
     newton: dict[str, Any] = field(default_factory=dict)
@@ -109,7 +59,7 @@ def add_usd(
     splat_count: int = 2000,
     contact_radius: float = 0.0,
     newton_options: dict[str, Any] | None = None,
-    progress: bool | Progress | None = None,
+    progress: Progress = None,
 ) -> UsdImport:
     """Add everything in an OpenUSD stage to a world: soft bodies as reduced bodies, the rest through Newton's importer.
 
@@ -156,26 +106,29 @@ def add_usd(
     with tempfile.TemporaryDirectory() as folder:
         scene = open_scene(path, asset_root, folder, copy=True)
         # All bodies are built before anything is added: one that cannot be leaves the builder as it was.
-        ready = [
-            _build(deformable, build_options or BuildOptions(), material, surface_count, splat_count, progress)
+        ready = {
+            deformable.path: place_deformable(
+                deformable,
+                build_options,
+                material=material,
+                surface_count=surface_count,
+                splat_count=splat_count,
+                contact_radius=contact_radius,
+                progress=progress,
+            )
             for deformable in scene.deformables
-        ]
+        }
         options["xform"] = wp.transform(wp.vec3(*shift), wp.quat(*quat_from_rotation(turn)))
         rest = _add_rest(builder, os.path.join(folder, "rest.usdc"), str(path), options)
-    bodies = {}
-    for made in ready:
-        body = replace(made, position=turn @ made.position + shift, rotation=turn @ made.rotation)
-        instance = add_reduced_body(
-            builder,
-            body.body,
-            material=body.material,
-            position=body.position.tolist(),
-            rotation=body.rotation,
-            contact_radius=contact_radius,
-            scale=body.scale,
-        )
-        bodies[body.path] = replace(body, instance=instance)
-    return UsdImport(bodies=bodies, scene=scene, newton=rest)
+    bodies = {path: _moved(placed, turn, shift) for path, placed in ready.items()}
+    instances = {path: placed.add_to(builder) for path, placed in bodies.items()}
+    return UsdImport(bodies=bodies, instances=instances, scene=scene, newton=rest)
+
+
+def _moved(placed: Placed, turn: Array, shift: Array) -> Placed:
+    """Return an object after the stage has been turned (3, 3) and shifted (3,) [m]."""
+    x, y, z = (turn @ placed.position + shift).tolist()
+    return replace(placed, position=(x, y, z), rotation=turn @ placed.rotation)
 
 
 def _place(position: Sequence[float], rotation: ArrayLike | None) -> tuple[Array, Array]:
@@ -201,121 +154,3 @@ def _add_rest(builder: newton.ModelBuilder, crate: str, name: str, options: dict
 
 
 _NEWTON_HINT = "Mend the rigid part of the stage, or read the soft bodies alone with read_usd_scene"
-
-
-def _build(
-    deformable: UsdDeformable,
-    options: BuildOptions,
-    default: Material | None,
-    surface_count: int,
-    splat_count: int,
-    progress: bool | Progress | None,
-) -> UsdBody:
-    """Build or recall the body of a deformable, with its material, place and splats; its instance is yet to come."""
-    if deformable.bundle is not None:
-        if not SCALE_MIN <= deformable.scale <= SCALE_MAX:
-            raise AssetError(
-                f"{deformable.path}: a body of softmode is scaled by {deformable.scale:g}, outside "
-                f"{SCALE_MIN}..{SCALE_MAX}",
-                hint="It is in metres: scale it by 1 / metersPerUnit where it is referred to in other units",
-            )
-        body = body_of(deformable.bundle, deformable.path)
-        offset = np.zeros(3)  # the prim's frame is the body frame
-    else:
-        body = build_deformable(deformable, options, surface_count=surface_count, progress=progress)
-        offset = body.offset
-    splats = deformable.splats
-    if splats is None:
-        splats = _mesh_splats(deformable, splat_count)
-    if splats is not None and offset.any():
-        splats = splats.transformed(translation=-offset)
-    return UsdBody(
-        path=deformable.path,
-        instance=-1,
-        body=body,
-        material=deformable.material(body.volume * deformable.scale**3, default),
-        position=deformable.translation + deformable.scale * (deformable.rotation @ offset),
-        rotation=deformable.rotation,
-        scale=deformable.scale,
-        splats=splats,
-        notes=deformable.notes,
-    )
-
-
-def build_deformable(
-    deformable: UsdDeformable,
-    options: BuildOptions | None = None,
-    *,
-    surface_count: int = 400,
-    progress: bool | Progress | None = None,
-) -> ReducedBody:
-    """Build the body of a deformable, or recall it from the cache.
-
-    A closed Mesh, and the boundary of a TetMesh, are integrated as they are; a mesh that is not closed stands for what
-    it encloses; Points with widths fill a body, those without lie on its surface; splats are filled.
-
-    Args:
-        deformable: From `read_usd_scene`.
-        options: How it is reduced; defaults when None.
-        surface_count: Number of surface samples.
-        progress: Passed to :func:`softmode.deformables.build.build_body.build_body`.
-
-    Returns:
-        The body, named after its prim.
-
-    Raises:
-        AssetError: If it encloses no volume.
-    """
-    chosen = options or BuildOptions()
-    name = deformable.path.rpartition("/")[2]
-    splats = deformable.splats
-    shape: tuple[Any, ...]
-    if deformable.surface is not None:
-        shape = (deformable.surface.vertices, deformable.surface.faces)
-    elif deformable.kind == "Points":
-        shape = (deformable.points, deformable.point_radii)
-    elif splats is not None:
-        shape = (splats.means, splats.scales, splats.quats, splats.opacities)
-    else:
-        raise AssetError(f"{deformable.path}: its splats are invisible", hint="Make them visible, or add a mesh")
-
-    def build() -> ReducedBody:
-        try:
-            quadrature = _integrate(deformable, surface_count)
-            return build_body(quadrature, chosen, name=name, progress=progress)
-        except (AssetError, BasisError) as error:
-            raise AssetError(f"{deformable.path}: {error.message}", hint=error.hint) from error
-
-    return cached_body(("usd", RECIPE, name, deformable.kind, *shape, surface_count, chosen), build)
-
-
-def _integrate(deformable: UsdDeformable, surface_count: int) -> Quadrature:
-    """Integrate the shape of a deformable."""
-    surface, splats = deformable.surface, deformable.splats
-    if surface is not None:
-        try:
-            return quadrature_from_mesh(surface.vertices, surface.faces, surface_count=surface_count)
-        except AssetError:
-            cover = sample_mesh(colored_mesh([surface], deformable.path), _COVER)
-            return quadrature_from_points(cover.means, surface_count=surface_count)
-    if splats is not None and deformable.kind != "Points":
-        return quadrature_from_splats(
-            splats.means, splats.scales, splats.quats, splats.opacities, surface_count=surface_count
-        )
-    points, radii = deformable.points, deformable.point_radii
-    if not radii.any():
-        return quadrature_from_points(points, surface_count=surface_count)
-    # Particles that fill a body: round splats as wide as their radius. Half opaque at 1.18 of it, they close the gaps
-    # between particles that touch, and the volume of a lattice of them comes out to 2 %.
-    quats = np.tile([0.0, 0.0, 0.0, 1.0], (len(points), 1))
-    return quadrature_from_splats(
-        points, np.tile(radii[:, None], (1, 3)), quats, np.ones(len(points)), surface_count=surface_count
-    )
-
-
-def _mesh_splats(deformable: UsdDeformable, count: int) -> Splats | None:
-    """Return splats on the meshes that show a body: its visible ones, else its simulation geometry's surface."""
-    meshes = [mesh for mesh in (deformable.meshes or (deformable.surface,)) if mesh is not None and len(mesh.faces)]
-    if not meshes:
-        return None
-    return sample_mesh(colored_mesh(meshes, deformable.path), count)

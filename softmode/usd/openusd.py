@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
 import secrets
 from collections.abc import Iterator
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from softmode.errors import ConfigError, MissingExtraError, StorageError
+from softmode.stages.openusd import pxr
 
 SUFFIXES = (".usdc", ".usd", ".usda")
 """What can be written: binary, binary, text."""
@@ -22,9 +22,8 @@ def openusd(*names: str) -> list[Any]:
     Raises:
         MissingExtraError: If usd-core is not installed, or too old for splats.
     """
-    # By name: usd-core has no type stubs, a type checker takes its modules for empty.
     try:
-        return [importlib.import_module(f"pxr.{name}") for name in names]
+        return pxr(*names)
     except ImportError as error:
         raise MissingExtraError(
             "OpenUSD stages need usd-core", hint="install it with: pip install 'softmode[usd]'"

@@ -5,16 +5,15 @@ from __future__ import annotations
 import os
 import tempfile
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.errors import AssetError, ConfigError
+from softmode.objects.soft_object import SoftObject
 from softmode.objects.stage_bundle import body_of
-from softmode.scenes.skinned_splats import SkinnedSplats
+from softmode.scenes.binding import splats_of_states
 from softmode.splats.formats.usd import splats_from_prim
 from softmode.splats.splats import MAX_SPLATS, Splats
 from softmode.stages import process
@@ -30,20 +29,12 @@ class PlayedBody:
 
     path: str
     """Path of its prim."""
-    body: ReducedBody
-    """The body."""
-    splats: Splats | None
-    """Its splats in the body frame [m]."""
+    object: SoftObject
+    """The body with its splats."""
     times: Array
     """When the frames are [s], shape (F,)."""
     coordinates: Array
     """Reduced coordinates in the world, as in `state.softmode.q` [m], shape (F, n, 3)."""
-
-    @cached_property
-    def _skinned(self) -> SkinnedSplats:
-        if self.splats is None:
-            raise ConfigError(f"{self.path} has no splats", hint="record it with a PlacedBody that has")
-        return SkinnedSplats(self.body, self.splats)
 
     def splats_at(self, frame: int) -> Splats:
         """Return its splats in the world in one frame.
@@ -53,11 +44,12 @@ class PlayedBody:
         """
         if not -len(self.times) <= frame < len(self.times):
             raise ConfigError(f"frame is {frame}, there are {len(self.times)}")
-        return next(self._skinned.frames(self.coordinates[frame][None]))
+        return next(splats_of_states(self.object, self.coordinates[frame][None]))
 
     def points_at(self, frame: int) -> Array:
         """Return its surface samples in the world in one frame [m], shape (S, 3)."""
-        return self.body.surface_points + self.body.surface_basis.astype(np.float64) @ self.coordinates[frame]
+        body = self.object.body
+        return body.surface_points + body.surface_basis.astype(np.float64) @ self.coordinates[frame]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -114,12 +106,8 @@ def animation_from_answer(answer: process.Answer, name: str) -> UsdPlayback:
     rate = float(stage["rate"])
     if not (np.isfinite(rate) and rate > 0.0):
         raise AssetError(f"{name}: timeCodesPerSecond is {rate}", hint="Set it to the number of time codes in a second")
-    try:
+    with process.invalid_data(name):
         bodies = tuple(_played(sent, answer.arrays, rate, name) for sent in stage["bodies"])
-    except (TypeError, IndexError, KeyError, ValueError) as error:
-        if isinstance(error, AssetError):
-            raise
-        raise AssetError(f"{name}: holds invalid data ({error})", hint=process.REEXPORT) from error
     return UsdPlayback(fps=rate, bodies=bodies)
 
 
@@ -145,8 +133,9 @@ def _played(sent: dict[str, Any], arrays: list[NDArray[Any]], rate: float, name:
     ]
     return PlayedBody(
         path=sent["path"],
-        body=body,
-        splats=None if sent["splats"] is None else splats_from_prim(sent["splats"], arrays, source),
+        object=SoftObject(
+            body=body, splats=None if sent["splats"] is None else splats_from_prim(sent["splats"], arrays, source)
+        ),
         times=codes / rate,
         coordinates=np.array(world),
     )

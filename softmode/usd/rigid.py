@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import newton
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.scenes.scene_meshes import SceneMesh, scene_meshes
+from softmode.scenes.meshes import SceneMesh, scene_meshes
 from softmode.splats.splats import rotations_from_quats
+from softmode.stages.openusd import Stage
 from softmode.usd.openusd import openusd
 from softmode.usd.writer import prim_name, set_place, vectors
 
@@ -23,19 +25,20 @@ class RigidMeshes:
         world: Which world.
     """
 
-    def __init__(self, model: Any, world: int) -> None:
+    def __init__(self, model: newton.Model, world: int) -> None:
         """Make the meshes."""
         self._model = model
         self._meshes = scene_meshes(model, world=world)
         self._bodies = sorted({mesh.body for mesh in self._meshes})
-        self._poses: list[NDArray[np.float32]] = []
+        self._poses: list[NDArray[Any]] = []
 
-    def record(self, state: Any) -> None:
+    def record(self, state: newton.State) -> None:
         """Note where the bodies are in a state."""
         moving = [body for body in self._bodies if body >= 0]
-        self._poses.append(state.body_q.numpy()[moving] if moving else np.zeros((0, 7), np.float32))
+        poses = state.body_q
+        self._poses.append(np.zeros((0, 7), np.float32) if poses is None or not moving else poses.numpy()[moving])
 
-    def author(self, stage: Any, codes: list[float]) -> None:
+    def author(self, stage: Stage, codes: list[float]) -> None:
         """Author one Xform per body with the meshes that it carries, sampled where it moves."""
         if not self._meshes:
             return
@@ -62,7 +65,7 @@ class RigidMeshes:
                 set_place(xform, track[f, :3], rotations[f], 1.0, code)
 
 
-def _author_mesh(stage: Any, path: str, mesh: SceneMesh) -> None:
+def _author_mesh(stage: Stage, path: str, mesh: SceneMesh) -> None:
     """Author a triangle mesh."""
     UsdGeom, Vt = openusd("UsdGeom", "Vt")
     prim = UsdGeom.Mesh.Define(stage, path)

@@ -24,14 +24,15 @@ from numpy.typing import NDArray
 
 from softmode.deformables.materials.material import Material
 from softmode.errors import ConfigError
+from softmode.objects.placed import Placed
 from softmode.objects.stage_bundle import DTYPES, encode_body
 from softmode.splats.formats.usd import define_splats, set_splat_column, splat_columns
 from softmode.splats.splats import quats_from_rotations
 from softmode.stages import tokens
+from softmode.stages.openusd import Layer, Prim, Stage, Value
 from softmode.usd import kaolin
 from softmode.usd.handles import handle_weights
 from softmode.usd.openusd import openusd, whole_stage
-from softmode.usd.placed import PlacedBody
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -60,7 +61,7 @@ class UsdExportOptions:
 
 def write_usd(
     path: str | os.PathLike[str],
-    bodies: PlacedBody | Sequence[PlacedBody],
+    bodies: Placed | Sequence[Placed],
     *,
     options: UsdExportOptions | None = None,
 ) -> None:
@@ -78,9 +79,9 @@ def write_usd(
         StorageError: If the file cannot be written.
         MissingExtraError: If the extra `[usd]` is not installed.
     """
-    placed = [bodies] if isinstance(bodies, PlacedBody) else list(bodies)
+    placed = [bodies] if isinstance(bodies, Placed) else list(bodies)
     if not placed:
-        raise ConfigError("bodies is empty", hint="give at least one PlacedBody")
+        raise ConfigError("bodies is empty", hint="give at least one Placed")
     openusd("Usd")
     with whole_stage(path) as file:
         layer = new_layer(str(file))
@@ -95,7 +96,7 @@ def new_layer(name: str) -> Any:
     return Sdf.Layer.CreateNew(name)
 
 
-def save(layer: Any) -> None:
+def save(layer: Layer) -> None:
     """Save a layer.
 
     Raises:
@@ -109,7 +110,7 @@ def save(layer: Any) -> None:
         raise OSError(str(error).strip().splitlines()[-1].strip()) from error
 
 
-def new_stage(layer: Any) -> Any:
+def new_stage(layer: Layer) -> Any:
     """Return a stage on a layer, in metres with z up, with an Xform /World as its default prim."""
     Usd, UsdGeom = openusd("Usd", "UsdGeom")
     stage = Usd.Stage.Open(layer)
@@ -123,7 +124,7 @@ def new_stage(layer: Any) -> Any:
     return stage
 
 
-def author_bodies(stage: Any, bodies: Sequence[PlacedBody], options: UsdExportOptions) -> list[str]:
+def author_bodies(stage: Stage, bodies: Sequence[Placed], options: UsdExportOptions) -> list[str]:
     """Author bodies under /World and return the paths of their prims."""
     seen: set[str] = set()
     return [
@@ -144,7 +145,7 @@ def prim_name(label: str, seen: set[str]) -> str:
     return chosen
 
 
-def author_body(stage: Any, path: str, placed: PlacedBody, options: UsdExportOptions) -> str:
+def author_body(stage: Stage, path: str, placed: Placed, options: UsdExportOptions) -> str:
     """Author one body with all that belongs to it; return its path."""
     Usd, UsdGeom, UsdSemantics = openusd("Usd", "UsdGeom", "UsdSemantics")
     body = placed.body
@@ -173,7 +174,7 @@ def author_body(stage: Any, path: str, placed: PlacedBody, options: UsdExportOpt
     return path
 
 
-def attribute(prim: Any, name: str, kind: str, value: Any, *, custom: bool = False, uniform: bool = False) -> Any:
+def attribute(prim: Prim, name: str, kind: str, value: Value, *, custom: bool = False, uniform: bool = False) -> Any:
     """Author an attribute of a type that `Sdf.ValueTypeNames` names, and return it."""
     (Sdf,) = openusd("Sdf")
     variability = Sdf.VariabilityUniform if uniform else Sdf.VariabilityVarying
@@ -197,7 +198,7 @@ def vectors(values: NDArray[Any]) -> Any:
 
 
 def set_place(
-    root: Any, position: Sequence[float] | NDArray[Any], rotation: NDArray[Any], scale: float, time: Any = None
+    root: Prim, position: Sequence[float] | NDArray[Any], rotation: NDArray[Any], scale: float, time: Value = None
 ) -> None:
     """Author translate, orient and scale of an Xform in double precision, as a time sample or for all times."""
     Gf, Usd, UsdGeom = openusd("Gf", "Usd", "UsdGeom")
@@ -218,7 +219,7 @@ def set_place(
         ops["xformOp:scale"].Set(Gf.Vec3d(float(scale)), when)
 
 
-def _author_reduced(prim: Any, placed: PlacedBody) -> None:
+def _author_reduced(prim: Prim, placed: Placed) -> None:
     """Author the ReducedBody, and its material in full precision, as attributes of its prim."""
     (Vt,) = openusd("Vt")
     header, arrays, digest = encode_body(placed.body)
@@ -243,7 +244,7 @@ def _author_reduced(prim: Any, placed: PlacedBody) -> None:
             attribute(prim, tokens.MATERIAL_PREFIX + field.name, "Double", float(value), custom=True)
 
 
-def _author_material(stage: Any, prim: Any, material: Material) -> None:
+def _author_material(stage: Stage, prim: Prim, material: Material) -> None:
     """Author the physics material beneath a body, bound to it for physics."""
     UsdPhysics, UsdShade = openusd("UsdPhysics", "UsdShade")
     shader = UsdShade.Material.Define(stage, prim.GetPath().AppendChild("PhysicsMaterial"))
@@ -259,7 +260,7 @@ def _author_material(stage: Any, prim: Any, material: Material) -> None:
     binding.Bind(shader, UsdShade.Tokens.weakerThanDescendants, tokens.MATERIAL_PURPOSE)
 
 
-def _author_points(points: Any, placed: PlacedBody) -> None:
+def _author_points(points: Prim, placed: Placed) -> None:
     """Author the simulation geometry: the cubature points, which fill the body, with widths and masses."""
     UsdGeom, Vt = openusd("UsdGeom", "Vt")
     body = placed.body
@@ -273,7 +274,7 @@ def _author_points(points: Any, placed: PlacedBody) -> None:
     points.CreateDisplayColorAttr(Vt.Vec3fArray([(0.2, 0.5, 0.9)]))
 
 
-def set_points(points: Any, positions: NDArray[Any], time: float | None = None) -> None:
+def set_points(points: Prim, positions: NDArray[Any], time: float | None = None) -> None:
     """Author where points are, and the box around them, as a time sample or for all times."""
     (Usd,) = openusd("Usd")
     when = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
@@ -281,7 +282,7 @@ def set_points(points: Any, positions: NDArray[Any], time: float | None = None) 
     points.CreateExtentAttr().Set(vectors(np.stack([positions.min(axis=0), positions.max(axis=0)])), when)
 
 
-def _author_weights(prim: Any, weights: NDArray[np.float32], precision: str) -> None:
+def _author_weights(prim: Prim, weights: NDArray[np.float32], precision: str) -> None:
     """Author the skinning weights of splats as a primvar."""
     Sdf, UsdGeom = openusd("Sdf", "UsdGeom")
     half = precision == "half"
@@ -291,7 +292,7 @@ def _author_weights(prim: Any, weights: NDArray[np.float32], precision: str) -> 
     primvar.Set(float_array(weights, half=half))
 
 
-def _author_kaolin(prim: Any, placed: PlacedBody, weights: NDArray[np.float32] | None) -> None:
+def _author_kaolin(prim: Prim, placed: Placed, weights: NDArray[np.float32] | None) -> None:
     """Author Kaolin's attributes on the prim whose points are drawn."""
     schemas = {
         tokens.KAOLIN_MATERIAL_API: ("kaolin_physics_material:", kaolin.material_values(placed.body, placed.material)),

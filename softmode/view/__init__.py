@@ -1,1 +1,55 @@
-"""A live session with a soft body, to pull, pin and tune it while it moves; the browser tool is built on it."""
+"""A live session with a soft body, to pull, pin and tune it while it moves, and the page in the browser.
+
+Names are imported when they are first used; the page needs the extra `[viz]`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from softmode.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from softmode.view.app import ViewApp, ViewOptions
+    from softmode.view.live_types import (
+        DragView,
+        Energies,
+        Hit,
+        LiveOptions,
+        LiveParameters,
+        LiveStatus,
+        PinView,
+        SplatPicture,
+    )
+    from softmode.view.session import LiveSession
+
+__all__ = [
+    "DragView",
+    "Energies",
+    "Hit",
+    "LiveOptions",
+    "LiveParameters",
+    "LiveSession",
+    "LiveStatus",
+    "PinView",
+    "SplatPicture",
+    "ViewApp",
+    "ViewOptions",
+]
+
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "DragView": ".live_types",
+        "Energies": ".live_types",
+        "Hit": ".live_types",
+        "LiveOptions": ".live_types",
+        "LiveParameters": ".live_types",
+        "LiveSession": ".session",
+        "LiveStatus": ".live_types",
+        "PinView": ".live_types",
+        "SplatPicture": ".live_types",
+        "ViewApp": ".app",
+        "ViewOptions": ".app",
+    },
+)

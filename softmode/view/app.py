@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from softmode.checks import require_number
 from softmode.errors import ConfigError, MissingExtraError, SoftmodeError
 from softmode.view.panel import Command, MouseMode, Panel
 from softmode.view.stage import Stage
@@ -51,10 +52,9 @@ class ViewOptions:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        if not 0 <= self.port <= 65535:
-            raise ConfigError(f"port must lie in 0..65535, got {self.port}", hint="give a port like 8080, or 0 for any")
-        if not 1.0 <= self.frame_rate <= 120.0:
-            raise ConfigError(f"frame_rate must lie in 1..120, got {self.frame_rate}", hint="give a rate like 30")
+        hint = "give a port like 8080, or 0 for any"
+        require_number("port", self.port, at_least=0, at_most=65535, hint=hint)
+        require_number("frame_rate", self.frame_rate, at_least=1.0, at_most=120.0, hint="give a rate like 30")
 
     @property
     def is_local(self) -> bool:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from softmode.checks import require_number
 from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.tools.grips import Grip, Grips
 from softmode.errors import ConfigError
-from softmode.view.live_scenes import LiveScene
-from softmode.view.live_types import DragView, Hit, LiveOptions, PinView, vector3
+from softmode.scenes.scene import Scene
+from softmode.view.live_types import DragView, Hit, LiveOptions, PinView, finite_vector
 
+KeptPin = tuple[Grip, NDArray[np.float64], NDArray[np.float64]]
+"""A pin with its position [m] and rotation, a quaternion xyzw."""
 PIN_RADIUS = 0.1
 """How far a pinned region reaches if nothing is said, as a fraction of the object's size."""
 
@@ -34,7 +34,7 @@ class Hands:
         self.moved = False
         """Whether a step has been taken since the drag began."""
 
-    def take_up(self, scene: LiveScene) -> None:
+    def take_up(self, scene: Scene) -> None:
         """Start over with a scene; what it holds by itself is a pin."""
         self._scene, self._drag = scene, None
         self._pins.clear()
@@ -55,13 +55,13 @@ class Hands:
         self._pins.clear()
         self._drag = None
 
-    def kept(self) -> dict[int, tuple[Grip, Any, Any]]:
+    def kept(self) -> dict[int, KeptPin]:
         """Return the pins of the first object with position and rotation, for `hold_again`."""
         grips = self._scene.grips[0]
         pins = self._pins.items()
         return {number: (grips.held[grip], *grips.pose(grip)) for number, (index, grip) in pins if index == 0}
 
-    def hold_again(self, kept: dict[int, tuple[Grip, Any, Any]]) -> None:
+    def hold_again(self, kept: dict[int, KeptPin]) -> None:
         """Hold another build of the first object by the pins that it had, and by nothing else."""
         self.let_go()
         grips = self._scene.grips[0]
@@ -83,7 +83,7 @@ class Hands:
         if self._drag is None:
             raise ConfigError("nothing is dragged", hint="call begin_drag with a hit of pick")
         index, grip, offset = self._drag
-        self._grips(index).aim(grip, vector3("point", point) - offset)
+        self._grips(index).aim(grip, finite_vector("point", point) - offset)
 
     def end_drag(self) -> None:
         """Stop pulling."""
@@ -110,8 +110,7 @@ class Hands:
         grips = self._grips(hit.object_index)
         body = grips.body
         reach = PIN_RADIUS * float(np.linalg.norm(np.ptp(body.bounds, axis=0))) if radius is None else radius
-        if not (isinstance(reach, int | float) and math.isfinite(reach) and reach > 0.0):
-            raise ConfigError(f"radius must be a finite length > 0 [m], got {radius!r}")
+        require_number("radius", reach, above=0.0, unit="m")
         if len(self._pins.keys() - self._own) >= self._options.pin_max:
             raise ConfigError(f"there are {self._options.pin_max} pins already", hint="let go of one first")
         X = np.concatenate([body.surface_points, body.points])
@@ -127,7 +126,7 @@ class Hands:
         if wxyz is not None:
             w, x, y, z = unit_quaternion(wxyz)
             turn = (x, y, z, w)
-        self._grips(index).aim(grip, vector3("position", position), turn)
+        self._grips(index).aim(grip, finite_vector("position", position), turn)
 
     def unpin(self, pin: int) -> None:
         """Let a region go."""
@@ -174,11 +173,8 @@ def unit_quaternion(wxyz: ArrayLike) -> list[float]:
     Raises:
         ConfigError: If it is not four finite numbers, or all are zero.
     """
-    try:
-        numbers = np.array(wxyz, dtype=np.float64)
-    except (TypeError, ValueError):
-        numbers = np.zeros(0)
-    length = float(np.linalg.norm(numbers)) if numbers.shape == (4,) else 0.0
-    if not (np.isfinite(length) and length > 1e-9):
+    numbers = finite_vector("wxyz", wxyz, 4)
+    length = float(np.linalg.norm(numbers))
+    if not length > 1e-9:
         raise ConfigError(f"wxyz must be four finite numbers, not all zero, got {wxyz!r}")
     return (numbers / length).tolist()

@@ -9,10 +9,14 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from softmode.checks import require_number
+from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
+from softmode.deformables.model.authoring import NAMESPACE
 from softmode.deformables.solver.parameters import PARAMETER_LIMITS, set_parameters
 from softmode.errors import ConfigError
-from softmode.view.live_scenes import LiveScene
-from softmode.view.live_types import LiveParameters, vector3
+from softmode.scenes.host import host
+from softmode.scenes.scene import Scene
+from softmode.view.live_types import LiveParameters, finite_vector
 
 LIMITS = {name: PARAMETER_LIMITS[name] for name in ("youngs_modulus", "poissons_ratio", "density", "friction")}
 """Closed ranges of the parameters that other quantities follow, and"""
@@ -32,22 +36,20 @@ def checked(gravity: float | ArrayLike | None, values: dict[str, float | None]) 
     for name, value in values.items():
         if value is None:
             continue
-        low, high = limits[name]
-        if not (isinstance(value, int | float | np.number) and low <= float(value) <= high):
-            raise ConfigError(f"{name} must lie in {low:g}..{high:g}, got {value!r}")
+        require_number(name, value, at_least=limits[name][0], at_most=limits[name][1])
         chosen[name] = float(value)
     if gravity is not None:
         downwards = isinstance(gravity, int | float | np.number)
-        vector = vector3("gravity", (0.0, 0.0, -float(gravity)) if downwards else gravity)  # type: ignore[arg-type]
+        vector = finite_vector("gravity", (0.0, 0.0, -float(gravity)) if downwards else gravity)  # type: ignore[arg-type]
         if np.linalg.norm(vector) > GRAVITY_MAX:
             raise ConfigError(f"gravity must be at most {GRAVITY_MAX:g} m/s^2, got {gravity!r}")
         chosen["gravity"] = tuple((vector + 0.0).tolist())
     return chosen
 
 
-def apply(scene: LiveScene, given: dict[str, Any]) -> None:
+def apply(scene: Scene, given: dict[str, Any]) -> None:
     """Write what was given into the model, for all objects; the captured steps follow."""
-    data, device = scene.model.softmode, scene.model.device
+    data, device = getattr(scene.model, NAMESPACE), scene.model.device
     shape = data.friction.shape
     arrays = {name: wp.full(shape, given[name], dtype=float, device=device) for name in LIMITS if name in given}
     if arrays:
@@ -57,13 +59,13 @@ def apply(scene: LiveScene, given: dict[str, Any]) -> None:
             getattr(data, name).fill_(given[name])
     if "gravity" in given:
         scene.model.set_gravity(given["gravity"])
-        if hasattr(scene.solver, "reduced"):  # a coupled solver, whose MuJoCo keeps its own
+        if isinstance(scene.solver, SolverCoupledReduced):  # its MuJoCo keeps its own
             scene.solver.rigid.notify_model_changed(newton.ModelFlags.MODEL_PROPERTIES)
 
 
-def present(scene: LiveScene) -> LiveParameters:
+def present(scene: Scene) -> LiveParameters:
     """Return the values of the first object."""
-    data = scene.model.softmode
+    data = getattr(scene.model, NAMESPACE)
     values = {name: float(getattr(data, name).numpy()[0]) for name in LIMITS | DAMPING_LIMITS}
-    x, y, z = (scene.model.gravity.numpy()[0] + 0.0).tolist()
+    x, y, z = (host(scene.model.gravity)[0] + 0.0).tolist()
     return LiveParameters(**values, gravity=(x, y, z), handles=scene.objects[0].body.mode_count)

@@ -1,88 +1,38 @@
-"""What a live session runs: one object that hangs or falls, or an environment; both take blocks of captured steps."""
+"""What a live session runs: one object that hangs or falls, or an environment; both take blocks of captured steps.
+
+Both have the same face: a scene, whose grips a person uses; `step` takes a block; `over` says when the next episode is
+to begin; `marker_place` where the splats of a goal are.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Protocol, get_args
+from typing import Any, get_args
 
-import newton
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
 from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.materials.material import Material
-from softmode.deformables.model.authoring import add_reduced_body
-from softmode.deformables.solver.solver_reduced import SolverReduced
-from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
-from softmode.envs.task import Task
+from softmode.deformables.tools.grips import GripOptions
 from softmode.errors import ConfigError
 from softmode.learning.players import POLICIES, check_policy, policy_factory, trained_policy
-from softmode.objects.soft_object import ObjectConfig, SoftObject
+from softmode.objects.config import ObjectConfig
+from softmode.objects.placed import Placed
+from softmode.objects.soft_object import SoftObject
+from softmode.scenes.fixture import Fixture
+from softmode.scenes.splat_scene import SplatScene
+from softmode.scenes.table_scene import TableScene
 from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
 from softmode.view.live_types import HoldName, LiveOptions, SceneName
-from softmode.view.sources import LoadedObject
 
 BLOCK_STEPS = 2
 """Physics steps of a block of an object without an environment; even, there and back between two states."""
 HELD_PART = 0.12
 """Part of its height by which a hanging object is held."""
-TABLE_FRICTION = 0.8
-"""Coulomb coefficient of the table."""
-
-
-class LiveScene(Protocol):
-    """A model with its state, its solver and the grips of its objects."""
-
-    objects: tuple[SoftObject, ...]
-    """Soft objects, instance by instance."""
-    model: Any
-    solver: Any
-    control: Any
-    state: Any
-    grips: tuple[Grips, ...]
-    """Of each object."""
-    block_dt: float
-    """Simulated time of a block [s]."""
-    block_steps: int
-    """Physics steps of a block."""
-    marker: Splats | None
-    """Splats that mark a goal, to be put where `marker_place` says."""
-    cameras: list[PinholeCamera]
-    """Cameras that show the scene well, if any are known."""
-    terms: dict[str, float]
-    """Terms of the reward in the last block."""
-    success: bool
-    """Whether the task counts as solved."""
-    episode: int
-    """Episodes begun."""
-
-    @property
-    def source(self) -> ObjectConfig | None:
-        """What the first object is, None if that is not known."""
-        ...
-
-    def over(self, *, busy: bool) -> bool:
-        """Return whether the next episode is to begin; while a person is busy only a failure ends one."""
-        ...
-
-    def run(self) -> None:
-        """Take a block."""
-        ...
-
-    def reset(self) -> None:
-        """Start over; grips have been let go."""
-        ...
-
-    def marker_place(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the marker's centres before they are placed [m] (M, 3), and its pose: position, quaternion xyzw."""
-        ...
-
-    def close(self) -> None:
-        """Let go of what is held open."""
-        ...
 
 
 def grip_slots(options: LiveOptions) -> int:
@@ -99,7 +49,7 @@ class ObjectScene:
     """One object, held by a part of it or above a table.
 
     Args:
-        found: The object.
+        found: The object, at the scale that it has.
         scene: "hang" or "drop".
         hold: Which end a hanging object is held by.
         material: What it is made of.
@@ -112,69 +62,58 @@ class ObjectScene:
 
     def __init__(
         self,
-        found: LoadedObject,
+        found: Placed,
         scene: SceneName,
         hold: HoldName,
         material: Material,
         options: LiveOptions,
-        device: Any,
+        device: wp.DeviceLike,
     ) -> None:
         """Build model and solver, capture a block."""
         for name, value, known in (("scene", scene, SceneName), ("hold", hold, HoldName)):
             if value not in get_args(known):
                 raise ConfigError(f"{name} is {value!r}", hint=f"use one of {', '.join(map(repr, get_args(known)))}")
-        thing, self.source, self._pin_points = found.thing, found.config, options.pin_points
-        self.objects: tuple[SoftObject, ...] = (thing,)
+        thing, self.source, self._pin_points = found.object, found.object.config, options.pin_points
         self._hold: HoldName | None = hold if scene == "hang" else None
         self.marker: Splats | None = None
-        self.cameras: list[PinholeCamera] = []
+        self.viewpoints: Sequence[PinholeCamera] = ()
         self.terms: dict[str, float] = {}
         self.success, self.episode = False, 1
-        self.dt, self.block_steps = options.substep, BLOCK_STEPS
-        self.block_dt = self.dt * self.block_steps
-        builder, height = newton.ModelBuilder(), float(thing.body.bounds[1, 2] - thing.body.bounds[0, 2])
+        self.block_steps = BLOCK_STEPS
+        self.block_dt = options.substep * BLOCK_STEPS
+        table = []
         if scene == "drop":
-            table = newton.ModelBuilder.ShapeConfig(mu=TABLE_FRICTION, has_shape_collision=True)
             half = 3.0 * found.scale * float(np.ptp(thing.body.bounds, axis=0).max())
-            place = wp.transform((0.0, 0.0, -0.1 * half), wp.quat_identity())
-            color = (0.42, 0.48, 0.54)
-            builder.add_shape_box(
-                -1, xform=place, hx=half, hy=half, hz=0.1 * half, cfg=table, color=color, label="table"
-            )
+            below = (0.0, 0.0, -0.1 * half)
+            table = [Fixture(label="table", size=(half, half, 0.1 * half), position=below, color=(0.42, 0.48, 0.54))]
+        height = float(thing.body.bounds[1, 2] - thing.body.bounds[0, 2])
         position = (0.0, 0.0, found.scale * (thing.height + 0.6 * height))
-        instance = add_reduced_body(builder, thing.body, material=material, position=position, scale=found.scale)
-        add_grip_slots(builder, instance, grip_slots(options))
-        self.model: Any = builder.finalize(device=device)
-        self.solver: Any = SolverReduced(self.model, [thing.body])
-        self.control: Any = self.model.control()
-        count = grip_slots(options)
-        self.grips = (Grips(self.solver, 0, slot_count=count, options=strength_of(options)),)
-        self.state, self._scratch = self.model.state(), self.model.state()
-        self._two_steps()  # compiles
-        with wp.ScopedCapture(device=self.model.device) as capture:
-            self._two_steps()
-        self._graph: Any = capture.graph
+        self.scene = SplatScene(
+            table,
+            [replace(found, object=replace(thing, material=material), position=position)],
+            dt=options.substep,
+            steps_per_frame=BLOCK_STEPS,
+            grip_slots=grip_slots(options),
+            grip_options=strength_of(options),
+            device=device,
+        )
+        self.step()  # compiles
         self.reset()
-
-    def _two_steps(self) -> None:
-        """Step there and back between the two states."""
-        for first, second in ((self.state, self._scratch), (self._scratch, self.state)):
-            self.grips[0].apply(first, self.control, self.dt)
-            self.solver.step(first, second, self.control, None, self.dt)
 
     def over(self, *, busy: bool) -> bool:
         """An object has no episodes."""
         return False
 
-    def run(self) -> None:
+    def step(self) -> None:
         """Take a block."""
-        wp.capture_launch(self._graph)
+        self.scene.step()
 
     def reset(self) -> None:
         """Put the object back, and hold it again if it hangs."""
-        self.solver.reset(self.state)
+        self.scene.reset()
         if self._hold is not None:
-            self.grips[0].take(held_points(self.objects[0], self._hold, self._pin_points), self.state)
+            points = held_points(self.scene.objects[0], self._hold, self._pin_points)
+            self.scene.grips[0].take(points, self.scene.state)
 
     def marker_place(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return no centres: there is no marker."""
@@ -218,7 +157,7 @@ class EnvScene:
         config: Any,
         seed: int,
         options: LiveOptions,
-        device: Any,
+        device: wp.DeviceLike,
         progress: Any,
         source: ObjectConfig | None = None,
     ) -> None:
@@ -245,22 +184,16 @@ class EnvScene:
         # with cameras, so that the goal's marker is kept up to date
         given |= {"config": base, "device": device, "progress": progress, "render_mode": "rgb_array"}
         self._env: Any = gym.make(name, **given, disable_env_checker=True)
-        task: Task = self._env.unwrapped.task
-        scene: Any = task.scene
-        self._scene, self.objects, self.model, self.solver = scene, scene.objects, scene.model, scene.solver
-        self.control, self.grips = scene.control, scene.grips
-        self.block_steps = scene.config.substeps
-        self.block_dt = 1.0 / scene.config.control_hz
-        self.marker, self.cameras = task.marker(), task.render_cameras()
+        task = self._env.unwrapped.task
+        self.scene: TableScene = task.scene
+        self.block_steps = self.scene.config.substeps
+        self.block_dt = 1.0 / self.scene.config.control_hz
+        self.marker: Splats | None = task.marker()
+        self.viewpoints: Sequence[PinholeCamera] = task.render_cameras()
         self.config = base
-        self._factory: Callable[[int], Callable[[Any], Any]] = policy_factory(policy, self._env, trained)
+        self._factory = policy_factory(policy, self._env, trained)
         self.seed, self.episode = seed, 0
         self.reset()
-
-    @property
-    def state(self) -> Any:
-        """The present state."""
-        return self._scene.state
 
     @property
     def source(self) -> ObjectConfig | None:
@@ -271,7 +204,7 @@ class EnvScene:
         """Return whether the episode has ended; its time limit waits while a person is busy, a failure does not."""
         return self._failed or (self._done and not busy)
 
-    def run(self) -> None:
+    def step(self) -> None:
         """Take a control step."""
         self._observation, _, terminated, truncated, info = self._env.step(self._policy(self._observation))
         self._done, self._failed = terminated or truncated, terminated
@@ -291,9 +224,13 @@ class EnvScene:
         """Return the centres of the goal's marker and its pose."""
         if self.marker is None:
             return np.zeros((0, 3)), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-        points, place = self._scene.marker_points, self._scene.marker_place
+        points, place = self.scene.marker_points, self.scene.marker_place
         return points.numpy()[0].astype(np.float64), place.numpy()[0].astype(np.float64)
 
     def close(self) -> None:
         """Close the environment."""
         self._env.close()
+
+
+LiveScene = ObjectScene | EnvScene
+"""What a session runs."""

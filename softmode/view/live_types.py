@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from softmode.checks import require_fields, require_number
 from softmode.errors import ConfigError
 
 SceneName = Literal["hang", "drop"]
@@ -35,17 +36,11 @@ class LiveOptions:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        if not 1.0e-4 <= self.substep <= 0.05:
-            raise ConfigError(f"substep must lie in 1e-4..0.05 s, got {self.substep!r}")
-        if not 0.001 <= self.budget <= 1.0e6:
-            raise ConfigError(f"budget must lie in 0.001..1e6, got {self.budget!r}")
-        if not 0 <= self.pin_max <= 64:
-            raise ConfigError(f"pin_max must lie in 0..64, got {self.pin_max!r}")
-        if not 4 <= self.pin_points <= 64:
-            raise ConfigError(f"pin_points must lie in 4..64, got {self.pin_points!r}", hint="four points hold a turn")
-        for name in ("drag_stiffness", "drag_rate"):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise ConfigError(f"{name} must be a finite number > 0, got {getattr(self, name)!r}")
+        require_number("substep", self.substep, at_least=1.0e-4, at_most=0.05, unit="s")
+        require_number("budget", self.budget, at_least=0.001, at_most=1.0e6)
+        require_number("pin_max", self.pin_max, at_least=0, at_most=64)
+        require_number("pin_points", self.pin_points, at_least=4, at_most=64, hint="four points hold a turn")
+        require_fields(self, ("drag_stiffness", "drag_rate"), above=0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,8 +167,13 @@ class LiveStatus:
 Vector = NDArray[np.float64]
 
 
-def vector3(name: str, value: Any) -> Vector:
-    """Return three finite numbers as float64.
+def finite_vector(name: str, value: ArrayLike, count: int = 3) -> Vector:
+    """Return finite numbers as float64.
+
+    Args:
+        name: What messages call them.
+        value: The numbers, shape (count,).
+        count: How many there must be, 3 or 4.
 
     Raises:
         ConfigError: If they are not.
@@ -182,6 +182,6 @@ def vector3(name: str, value: Any) -> Vector:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
         numbers = np.zeros(0)
-    if numbers.shape != (3,) or not np.isfinite(numbers).all():
-        raise ConfigError(f"{name} must be three finite numbers, got {value!r}")
+    if numbers.shape != (count,) or not np.isfinite(numbers).all():
+        raise ConfigError(f"{name} must be {'three' if count == 3 else 'four'} finite numbers, got {value!r}")
     return numbers

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
+import newton
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.deformables.skinning.skin_splats import SkinSplats
+from softmode.deformables.model.authoring import NAMESPACE
 from softmode.objects.soft_object import SoftObject
-from softmode.splats.rasterizer import SplatArrays
+from softmode.scenes.binding import BoundSplats
 from softmode.splats.splats import Splats, rotations_from_quats
 from softmode.view.live_types import Hit, SplatPicture
 
@@ -33,38 +34,27 @@ class LivePicture:
         marker: Rigid splats behind them.
     """
 
-    def __init__(self, objects: tuple[SoftObject, ...], model: Any, marker: Splats | None) -> None:
+    def __init__(self, objects: Sequence[SoftObject], model: newton.Model, marker: Splats | None) -> None:
         """Upload the rest state."""
-        self.objects = objects
-        shown = [thing.splats for thing in objects] + ([] if marker is None else [marker])
-        self.arrays: SplatArrays = SplatArrays.from_splats(shown, device=model.device)
-        self.first = np.concatenate([[0], np.cumsum([splats.count for splats in shown])])
+        self.objects, self.bound = objects, BoundSplats(model, objects, others=[] if marker is None else [marker])
+        shown = [thing.visible_splats for thing in objects] + ([] if marker is None else [marker])
         self.colors = np.concatenate([splats.colors() for splats in shown])
         self.opacities = np.concatenate([splats.opacities for splats in shown]).astype(np.float32)
-        self._starts: Any = model.softmode.function_start
-        self._skins = [
-            SkinSplats(
-                thing.splats.means, thing.splats.covariances(), thing.basis, thing.grad_basis, device=model.device
-            )
-            for thing in objects
-        ]
+        self._starts = getattr(model, NAMESPACE).function_start
         self._marker = None if marker is None else marker.covariances()
 
-    def update(self, state: Any, marker_points: Array, marker_pose: Array) -> None:
-        """Deform the splats by a state and put the marker in its place."""
-        arrays = self.arrays
-        for i, skin in enumerate(self._skins):
-            skin.launch(
-                state.softmode.q,
-                self._starts[i : i + 1],
-                arrays.means,
-                arrays.covariances,
-                rotations=arrays.rotations,
-                first_splat=int(self.first[i]),
-            )
+    def update(self, state: newton.State, marker_points: Array, marker_pose: Array) -> None:
+        """Deform the splats by a state and put the marker in its place.
+
+        Args:
+            state: A state of the model.
+            marker_points: Centres of the marker before it is placed [m], shape (M, 3).
+            marker_pose: Its position [m] and quaternion xyzw, shape (7,).
+        """
+        self.bound.update(state)
         if self._marker is not None:
+            arrays, at = self.bound.arrays, self.bound.columns[-1]
             turn = rotations_from_quats(marker_pose[None, 3:])[0]
-            at: Any = slice(int(self.first[-2]), int(self.first[-1]))
             C = turn @ self._marker @ turn.T
             six = C.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
             arrays.means[0, at].assign((marker_points @ turn.T + marker_pose[:3]).astype(np.float32))
@@ -72,7 +62,7 @@ class LivePicture:
 
     def read(self) -> SplatPicture:
         """Return the splats on the host."""
-        means, six = self.arrays.means.numpy()[0], self.arrays.covariances.numpy()[0]
+        means, six = self.bound.arrays.means.numpy()[0], self.bound.arrays.covariances.numpy()[0]
         return SplatPicture(
             means=means.copy(),
             covariances=six[:, _SIX].reshape(-1, 3, 3),
@@ -80,9 +70,10 @@ class LivePicture:
             opacities=self.opacities,
         )
 
-    def pick(self, origin: Array, direction: Array, state: Any) -> Hit | None:
+    def pick(self, origin: Array, direction: Array, state: newton.State) -> Hit | None:
         """Return where a ray with a unit direction meets the objects; see `LiveSession.pick`."""
-        count = int(self.first[len(self.objects)])
+        columns = self.bound.columns[: len(self.objects)]
+        count = columns[-1].stop
         picture = self.read()
         means, covariances = picture.means[:count].astype(np.float64), picture.covariances[:count].astype(np.float64)
         away = means - origin
@@ -113,22 +104,22 @@ class LivePicture:
             if not reachable[chosen] < SLACK * size:
                 return None
             distance = float(along[chosen])
-        index = int(np.searchsorted(self.first, chosen, side="right")) - 1
+        index = next(o for o, of in enumerate(columns) if chosen < of.stop)
         point = origin + distance * direction
         return Hit(
             point=point,
-            rest_point=self._rest_point(index, chosen - int(self.first[index]), point, state),
+            rest_point=self._rest_point(index, chosen - columns[index].start, point, state),
             distance=distance,
             object_index=index,
             splat=chosen,
         )
 
-    def _rest_point(self, index: int, splat: int, point: Array, state: Any) -> Array:
+    def _rest_point(self, index: int, splat: int, point: Array, state: newton.State) -> Array:
         """Return the rest point [m] that a splat carries to a point, to first order about the splat's centre."""
         thing = self.objects[index]
         start = int(self._starts.numpy()[index])
-        q = state.softmode.q.numpy()[start : start + thing.body.function_count].astype(np.float64)
-        X = thing.splats.means[splat].astype(np.float64)
+        q = getattr(state, NAMESPACE).q.numpy()[start : start + thing.body.function_count].astype(np.float64)
+        X = thing.visible_splats.means[splat].astype(np.float64)
         x = X + thing.basis[splat] @ q
         F = np.eye(3) + q.T @ thing.grad_basis[splat]
         U, stretch, V = np.linalg.svd(F)

@@ -5,33 +5,29 @@ All calls must come from one thread.
 
 from __future__ import annotations
 
-import math
 import time
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.checks import require_number
 from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import NAMESPACE
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.energies import SoftEnergies
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import ObjectConfig, SoftObject
+from softmode.objects.config import ObjectConfig
+from softmode.objects.soft_object import SoftObject
+from softmode.scenes.host import host, soft_solver
+from softmode.scenes.meshes import SceneMesh, scene_meshes
 from softmode.view import live_parameters
+from softmode.view.coordinates import carry_over, coordinates
 from softmode.view.hands import Hands
-from softmode.view.live_recording import (
-    RECORD_HZ,
-    CoordinateRecorder,
-    FilmRecorder,
-    LiveRecording,
-    Recorder,
-    UsdRecorder,
-    live_camera,
-)
+from softmode.view.live_recording import LiveRecording
 from softmode.view.live_scenes import EnvScene, LiveScene, ObjectScene
 from softmode.view.live_types import (
     DragView,
@@ -44,13 +40,12 @@ from softmode.view.live_types import (
     PinView,
     SceneName,
     SplatPicture,
-    vector3,
+    finite_vector,
 )
+from softmode.view.pace import Pace
 from softmode.view.picture import LivePicture
+from softmode.view.recorders import RECORD_HZ, Recorder, live_camera, make_recorder
 from softmode.view.sources import load_source, with_handles
-
-RATE_WINDOW = 1.0
-"""Time over which the real-time factor is taken [s]."""
 
 
 class LiveSession:
@@ -66,8 +61,8 @@ class LiveSession:
         """Make the scene; use `from_object` or `from_env`."""
         self.options = options
         self._make, self._source = make, source
-        self._scene = make(source)
-        self._given: dict[str, float] = {}
+        self._live = make(source)
+        self._given: dict[str, Any] = {}
         self._playing = True
         self._recorder: Recorder | None = None
         self._hands = Hands(options)
@@ -76,18 +71,18 @@ class LiveSession:
 
     def _bind(self) -> None:
         """Take up a scene that has just been made."""
-        scene = self._scene
-        self._picture = LivePicture(scene.objects, scene.model, scene.marker)
+        self._scene = scene = self._live.scene
+        self._picture = LivePicture(scene.objects, scene.model, self._live.marker)
         self._energies = SoftEnergies(scene.solver)
-        self._reduced = getattr(scene.solver, "reduced", scene.solver)
-        self._meshes: tuple[Any, ...] | None = None
-        self._block_seconds = 0.0
+        self._reduced = soft_solver(scene.solver)
+        self._meshes: tuple[SceneMesh, ...] | None = None
+        self._pace = Pace(self._live.block_dt, self.options.budget)
         self._begin()
 
     def _begin(self) -> None:
         """Forget what belongs to the time before a reset."""
-        self._time, self._debt, self._bits, self._stale = 0.0, 0.0, 0, True
-        self._passed: deque[tuple[float, float]] = deque()
+        self._time, self._bits, self._stale = 0.0, 0, True
+        self._pace.begin()
         self._hands.take_up(self._scene)
         self._reduced.status.zero_()
 
@@ -101,7 +96,7 @@ class LiveSession:
         size: float | None = None,
         material: Material | None = None,
         options: LiveOptions | None = None,
-        device: Any = None,
+        device: wp.DeviceLike = None,
         progress: Any = None,
     ) -> LiveSession:
         """Make a session with one object.
@@ -125,7 +120,7 @@ class LiveSession:
 
         def make(origin: ObjectConfig | None) -> LiveScene:
             found = load_source(origin or source, None if origin else size, progress)
-            made = material or found.material or Material(youngs_modulus=1.0e5, density=250.0)
+            made = material or found.object.material or Material(youngs_modulus=1.0e5, density=250.0)
             return ObjectScene(found, scene, hold, made, chosen, device)
 
         return cls(make, None, chosen)
@@ -139,7 +134,7 @@ class LiveSession:
         config: Any = None,
         seed: int = 0,
         options: LiveOptions | None = None,
-        device: Any = None,
+        device: wp.DeviceLike = None,
         progress: Any = None,
     ) -> LiveSession:
         """Make a session with an environment, whose policy goes on while a person pulls the object.
@@ -179,33 +174,23 @@ class LiveSession:
         Raises:
             ConfigError: If `frame_dt` is not a finite number >= 0.
         """
-        if not (isinstance(frame_dt, int | float) and math.isfinite(frame_dt) and frame_dt >= 0.0):
-            raise ConfigError(f"frame_dt must be a finite number >= 0 [s], got {frame_dt!r}")
+        require_number("frame_dt", frame_dt, at_least=0.0, unit="s")
         now = time.perf_counter()
         if not self._playing:
             return 0.0
-        block = self._scene.block_dt
-        self._debt += frame_dt
-        count = int(self._debt / block + 1e-6)
-        if self._block_seconds > 0.0:
-            count = min(count, max(int(self.options.budget * frame_dt / self._block_seconds), 1))
-        passed = self._run(count)
-        self._debt = min(self._debt - passed, block)  # what did not fit is lost
-        self._passed.append((now, passed))
-        while self._passed[-1][0] - self._passed[0][0] > RATE_WINDOW and len(self._passed) > 2:
-            self._passed.popleft()
+        passed = self._run(self._pace.blocks(frame_dt))
+        self._pace.frame(now, passed)
         return passed
 
     def play(self) -> None:
         """Let time run; a session starts playing."""
         self._playing = True
-        self._debt = 0.0
-        self._passed.clear()
+        self._pace.begin()
 
     def pause(self) -> None:
         """Stop time; drags and pins may still be moved, and take effect when it runs again."""
         self._playing = False
-        self._passed.clear()
+        self._pace.pause()
 
     def step(self) -> float:
         """Take one block of physics steps, paused or not, and return the simulated time that passed [s]."""
@@ -217,7 +202,7 @@ class LiveSession:
         Parameters stay as they are.
         """
         self._hands.let_go()
-        self._scene.reset()
+        self._live.reset()
         live_parameters.apply(self._scene, self._given)
         self._begin()
 
@@ -226,7 +211,7 @@ class LiveSession:
         if self._recorder is not None:
             self._recorder.discard()
             self._recorder = None
-        self._scene.close()
+        self._live.close()
 
     # -- what to show -------------------------------------------------------------------------------------------------
 
@@ -238,7 +223,7 @@ class LiveSession:
     def bounds(self) -> NDArray[np.float64]:
         """Return the corners of a box around what is worth seeing at the start [m], shape (2, 3)."""
         corners = self.splats().means
-        if isinstance(self._scene, EnvScene):
+        if isinstance(self._live, EnvScene):
             corners = np.concatenate([corners, [[-0.08, -0.2, 0.0], [0.6, 0.2, 0.45]]])
         return np.stack([corners.min(axis=0), corners.max(axis=0)]).astype(np.float64)
 
@@ -247,56 +232,46 @@ class LiveSession:
         self._show()
         return self._picture.read()
 
-    def meshes(self) -> tuple[Any, ...]:
-        """Return the meshes of the rigid shapes, `softmode.scenes.scene_meshes.SceneMesh`; they do not change."""
+    def meshes(self) -> tuple[SceneMesh, ...]:
+        """Return the meshes of the rigid shapes; they do not change."""
         if self._meshes is None:
-            from softmode.scenes.scene_meshes import scene_meshes
-
             self._meshes = scene_meshes(self._scene.model)
         return self._meshes
 
     def poses(self) -> NDArray[np.float32]:
         """Return the poses of the rigid bodies: position [m] and quaternion (x, y, z, w), shape (B, 7)."""
-        poses = self._scene.state.body_q
-        return np.zeros((0, 7), np.float32) if poses is None else poses.numpy().copy()
+        return host(self._scene.state.body_q).astype(np.float32).reshape(-1, 7)
 
     def surface(self, object_index: int = 0) -> NDArray[np.float64]:
         """Return the surface samples of an object as they are now [m], shape (S, 3)."""
-        thing, model = self._object(object_index), self._scene.model
-        start = int(model.softmode.particle_start.numpy()[object_index])
-        x: Any = self._scene.state.particle_q[start : start + thing.body.surface_count]
-        return x.numpy().astype(np.float64)
+        count = self._object(object_index).body.surface_count
+        start = int(getattr(self._scene.model, NAMESPACE).particle_start.numpy()[object_index])
+        return host(self._scene.state.particle_q)[start : start + count].astype(np.float64)
 
     def centre(self, object_index: int = 0) -> NDArray[np.float64]:
         """Return the centre of mass of an object [m], shape (3,)."""
-        return self._object(object_index).body.mean_basis @ self._coordinates("q", object_index)
+        return self._object(object_index).body.mean_basis @ coordinates(self._scene, "q", object_index)
 
     def status(self) -> LiveStatus:
         """Return times, flags and the rewards of the environment."""
-        rate = 0.0
-        if len(self._passed) > 1:
-            rate = sum(dt for _, dt in list(self._passed)[1:]) / (self._passed[-1][0] - self._passed[0][0])
-        scene = self._scene
+        live = self._live
         return LiveStatus(
             time=self._time,
             playing=self._playing,
-            realtime_factor=rate,
-            step_milliseconds=1e3 * self._block_seconds / scene.block_steps,
+            realtime_factor=self._pace.factor,
+            step_milliseconds=1e3 * self._pace.block_seconds / live.block_steps,
             solver=status_reasons(self._bits),
             recording=self._recorder is not None,
-            reward_terms=dict(scene.terms),
-            success=scene.success,
-            episode=scene.episode,
+            reward_terms=dict(live.terms),
+            success=live.success,
+            episode=live.episode,
         )
 
     def energies(self) -> Energies:
         """Return the energies of all objects."""
         self._energies.update(self._scene.state)
-        return Energies(
-            kinetic=float(self._energies.kinetic.numpy().sum()),
-            elastic=float(self._energies.elastic.numpy().sum()),
-            gravitational=float(self._energies.gravitational.numpy().sum()),
-        )
+        energies = {name: getattr(self._energies, name) for name in ("kinetic", "elastic", "gravitational")}
+        return Energies(**{name: float(values.numpy().sum()) for name, values in energies.items()})
 
     # -- pulling and pinning ------------------------------------------------------------------------------------------
 
@@ -310,7 +285,7 @@ class LiveSession:
         Raises:
             ConfigError: If they are not finite, or the direction is zero.
         """
-        start, way = vector3("origin", origin), vector3("direction", direction)
+        start, way = finite_vector("origin", origin), finite_vector("direction", direction)
         length = float(np.linalg.norm(way))
         if length < 1e-12:
             raise ConfigError("direction is zero", hint="give the direction of the ray")
@@ -436,22 +411,20 @@ class LiveSession:
         """
         if self._recorder is not None:
             raise ConfigError("a recording is being made", hint="stop it before the handles change")
-        old, scene = self._object(0).body, self._scene
-        source = with_handles(self._source or scene.source, count)
+        old = self._object(0).body
+        source = with_handles(self._source or self._live.source, count)
         if count == old.mode_count:
             return
         self.end_drag()
-        q, qd = self._coordinates("q"), self._coordinates("qd")
-        kept = self._hands.kept()
-        elapsed, clock = self._time, self._clock
+        motion = [coordinates(self._scene, name) for name in ("q", "qd")]
+        pins, elapsed = self._hands.kept(), self._time
         made = self._make(source)  # a build that fails leaves all as it was
-        scene.close()
-        self._scene, self._source = made, source
+        self._live.close()
+        self._live, self._source = made, source
         self._bind()
-        self._clock = clock
         if not isinstance(made, EnvScene):
-            self._hands.hold_again(kept)
-            self._carry_over(old, q, qd)
+            self._hands.hold_again(pins)
+            carry_over(self._scene, old, *motion)
             self._time = elapsed
         live_parameters.apply(self._scene, self._given)
 
@@ -476,16 +449,12 @@ class LiveSession:
         """
         if self._recorder is not None:
             raise ConfigError(f"{self._recorder.path} is being recorded", hint="stop that recording first")
-        file, suffix = Path(path), Path(path).suffix.lower()
-        if suffix == ".npz":
-            self._recorder = CoordinateRecorder(file, [thing.body for thing in self._scene.objects])
-        elif suffix == ".mp4":
-            camera = live_camera(self._scene.cameras, self.bounds(), position, target, edge)
-            self._recorder = FilmRecorder(file, self._scene.model, self._picture, camera)
-        elif suffix in (".usdc", ".usd", ".usda"):
-            self._recorder = UsdRecorder(file, self._scene.model, self._scene.objects)
-        else:
-            raise ConfigError(f"recording {file} is no .mp4, .npz or .usdc file", hint="name it like out/poke.mp4")
+        self._recorder = make_recorder(
+            Path(path),
+            self._scene,
+            self._picture,
+            lambda: live_camera(self._live.viewpoints, self.bounds(), position, target, edge),
+        )
         self._record_from = self._clock
         self._record()
 
@@ -499,20 +468,9 @@ class LiveSession:
         Raises:
             ConfigError: If the recording is of other objects, or has no such frame.
         """
-        scene = self._scene
-        own = tuple(thing.body.fingerprint for thing in scene.objects)
-        if recording.fingerprints != own or recording.q.shape[1] != scene.state.softmode.q.shape[0]:
-            raise ConfigError("the recording is of other objects", hint="open the objects that were recorded")
-        if not 0 <= index < len(recording.times):
-            raise ConfigError(f"index must lie in 0..{len(recording.times) - 1}, got {index}")
+        recording.check(self._scene, index)
         self.pause()
-        state = scene.state
-        state.softmode.q.assign(recording.q[index])
-        state.softmode.qd.zero_()
-        state.softmode.dt_before.zero_()
-        if state.body_q is not None and recording.body_q.shape[1] == state.body_q.shape[0]:
-            state.body_q.assign(recording.body_q[index])
-        self._reduced.update_particles(state)
+        recording.show(self._scene, index)
         self._stale = True
 
     def stop_recording(self) -> Path:
@@ -534,33 +492,32 @@ class LiveSession:
 
     def _run(self, count: int) -> float:
         """Take blocks and return the simulated time that passed [s]."""
-        scene = self._scene
+        live = self._live
         if count < 1:
             return 0.0
-        for grips in scene.grips:
-            grips.begin_frame(count * scene.block_steps)
+        for grips in self._scene.grips:
+            grips.begin_frame(count * live.block_steps)
         self._bits, taken = 0, 0
         self._reduced.status.zero_()
         for _ in range(count):
-            if scene.over(busy=self._hands.busy):
+            if live.over(busy=self._hands.busy):
                 self.reset()
                 continue
             clock = time.perf_counter()
-            scene.run()
+            live.step()
             self._bits |= int(self._reduced.status.numpy()[0])  # waits for the device
-            spent = time.perf_counter() - clock
-            self._block_seconds = spent if self._block_seconds == 0.0 else 0.8 * self._block_seconds + 0.2 * spent
+            self._pace.took(time.perf_counter() - clock)
             taken += 1
-            self._time += scene.block_dt
-            self._clock += scene.block_dt
+            self._time += live.block_dt
+            self._clock += live.block_dt
             self._stale = self._hands.moved = True
             self._record()
-        return taken * scene.block_dt
+        return taken * live.block_dt
 
     def _show(self) -> None:
         """Deform the splats if anything has moved since."""
         if self._stale:
-            self._picture.update(self._scene.state, *self._scene.marker_place())
+            self._picture.update(self._scene.state, *self._live.marker_place())
             self._stale = False
 
     def _record(self) -> None:
@@ -569,25 +526,6 @@ class LiveSession:
         if recorder is not None and self._clock - self._record_from >= recorder.count / RECORD_HZ - 1e-9:
             self._show()
             recorder.add(self._clock - self._record_from, self._scene.state)
-
-    def _carry_over(self, old: ReducedBody, q: NDArray[np.float64], qd: NDArray[np.float64]) -> None:
-        """Give the object the positions and velocities that it had with another basis, by least squares."""
-        body, state = self._object(0).body, self._scene.state
-        X = np.concatenate([old.surface_points, old.points])
-        before, shift = old.evaluate(X)[0], old.offset - body.offset
-        rows = body.evaluate(X + shift)[0]
-        found = np.linalg.lstsq(rows, np.hstack([before @ q - shift, before @ qd]), rcond=1e-10)[0]
-        state.softmode.q.assign(found[:, :3])
-        state.softmode.qd.assign(found[:, 3:])
-        state.softmode.dt_before.zero_()
-        self._reduced.update_particles(state)
-
-    def _coordinates(self, name: str, object_index: int = 0) -> NDArray[np.float64]:
-        """Return coordinates "q" or velocities "qd" of an object, shape (n, 3)."""
-        body = self._object(object_index).body
-        start = int(self._scene.model.softmode.function_start.numpy()[object_index])
-        values: Any = getattr(self._scene.state.softmode, name)[start : start + body.function_count]
-        return values.numpy().astype(np.float64)
 
     def _object(self, index: int) -> SoftObject:
         objects = self._scene.objects

@@ -2,42 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import newton
 import numpy as np
 
-from softmode.deformables.materials.material import Material
 from softmode.errors import ConfigError
-from softmode.objects.object_build import config_of_file
+from softmode.objects.config import ObjectConfig
+from softmode.objects.loader import Progress, load, object_config
 from softmode.objects.object_file import surface_cover
-from softmode.objects.soft_object import ObjectConfig, SoftObject, load_object, tied
+from softmode.objects.placed import Placed
+from softmode.objects.soft_object import SoftObject
+from softmode.objects.stage_body import place_deformable
+from softmode.objects.stage_scene import read_usd_scene
 from softmode.stages import tokens
 
 HANDLES_MAX = 64
 """Most eigenmodes that `LiveSession.set_handles` builds."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class LoadedObject:
-    """An object with what is known of it."""
-
-    thing: SoftObject
-    """The object."""
-    config: ObjectConfig | None = None
-    """What it was made from, to make it with other handles; None if that is not known."""
-    material: Material | None = None
-    """What its file says that it is made of."""
-    scale: float = 1.0
-    """Its size over that of `thing`."""
-
-
 def load_source(
-    source: ObjectConfig | SoftObject | str | Path | None, size: float | None, progress: Any = None
-) -> LoadedObject:
-    """Return the object that a person names.
+    source: ObjectConfig | SoftObject | str | Path | None, size: float | None, progress: Progress = None
+) -> Placed:
+    """Return the object that a person names, at the origin and the scale that its stage gives it.
 
     Args:
         source: A configuration, an object, a file, or None for the plush. Of an OpenUSD stage with deformable bodies
@@ -51,39 +38,26 @@ def load_source(
     """
     if isinstance(source, SoftObject):
         _refuse_size(size, f"the body {source.body.name!r}")
-        return LoadedObject(thing=source)
+        return Placed(object=source)
     if isinstance(source, str | Path) and Path(source).suffix.lower() in tokens.SUFFIXES:
-        found = _usd_object(source, progress)
-        if found is not None:
-            _refuse_size(size, f"the body {found.thing.body.name!r} of {source}")
-            return found
-    if isinstance(source, str | Path):
-        config = config_of_file(source)
-    else:
-        config = source or ObjectConfig()
+        deformables = read_usd_scene(source).deformables
+        if deformables:
+            first = place_deformable(deformables[0], progress=progress)
+            _refuse_size(size, f"the body {first.body.name!r} of {source}")
+            splats = first.splats or surface_cover(first.body)
+            return Placed(object=replace(first.object, splats=splats), scale=first.scale)
+    config = object_config(source)
     if config.body is not None or config.extents is not None:
         _refuse_size(size, f"the body {config.body}" if config.body else f"a {config.shape} of {config.extents} m")
     elif size is not None:
         config = replace(config, size=size)
-    return LoadedObject(thing=load_object(config, progress), config=config)
+    return Placed(object=load(config, progress=progress))
 
 
 def _refuse_size(size: float | None, what: str) -> None:
     """Refuse a size for what has its own."""
     if size is not None:
         raise ConfigError(f"size given for {what}", hint="leave it out, or build it anew")
-
-
-def _usd_object(path: str | Path, progress: Any) -> LoadedObject | None:
-    """Return the first deformable body of a stage, None if there is none."""
-    from softmode.usd.importer import add_usd
-
-    found = add_usd(newton.ModelBuilder(), path, progress=progress)
-    if not found.bodies:
-        return None
-    first = next(iter(found.bodies.values()))
-    body, splats = first.body, first.splats or surface_cover(first.body)
-    return LoadedObject(thing=tied(body, splats), material=first.material, scale=first.scale)
 
 
 def with_handles(config: ObjectConfig | None, count: int) -> ObjectConfig:

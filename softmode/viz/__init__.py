@@ -1,8 +1,36 @@
-"""What viewers and recorders show of a scene: meshes of its shapes, and recordings for rerun.
+"""Films, recordings for rerun, and pictures of bodies.
 
-Importing this package is cheap; the recorder is in `softmode.viz.rerun_logger`.
+Names are imported when they are first used; recordings and pictures need the extra `[viz]`.
 """
 
-from softmode.scenes.scene_meshes import SceneMesh, scene_meshes, scene_poses
+from __future__ import annotations
 
-__all__ = ["SceneMesh", "scene_meshes", "scene_poses"]
+from typing import TYPE_CHECKING
+
+from softmode.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from softmode.viz.body_picture import write_body_picture
+    from softmode.viz.film import Film
+    from softmode.viz.rerun_logger import RerunLogger
+    from softmode.viz.rerun_options import RerunOptions
+    from softmode.viz.rerun_sources import RerunScene
+
+__all__ = [
+    "Film",
+    "RerunLogger",
+    "RerunOptions",
+    "RerunScene",
+    "write_body_picture",
+]
+
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "Film": ".film",
+        "RerunLogger": ".rerun_logger",
+        "RerunOptions": ".rerun_options",
+        "RerunScene": ".rerun_sources",
+        "write_body_picture": ".body_picture",
+    },
+)

@@ -2,76 +2,29 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import operator
-import socket
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
-from urllib.parse import urlsplit
 
+import newton
 import numpy as np
 from numpy.typing import NDArray
 
 from softmode.deformables.solver.energies import SoftEnergies
 from softmode.deformables.tools.sensing import ContactSensor
-from softmode.errors import ConfigError, MissingExtraError, StorageError
-from softmode.files import PendingFile
-from softmode.scenes.deformed_splats import DeformedSplats, SplatFrame
-from softmode.scenes.scene_meshes import PLANE_EXTENT, scene_meshes, scene_poses
+from softmode.errors import ConfigError
+from softmode.scenes.binding import BoundSplats, SplatFrame
+from softmode.scenes.host import host, soft_solver
+from softmode.scenes.meshes import distinct, scene_meshes, scene_poses
 from softmode.splats.camera import SplatCamera
 from softmode.splats.splats import Splats
 from softmode.viz.rerun_blueprint import make_blueprint
-from softmode.viz.rerun_sources import Moment, RerunScene, source_of
-
-__all__ = ["RerunLogger", "RerunOptions", "RerunScene"]
-
-LIVE = "rerun+http"
-"""How the address of a running viewer begins."""
-PORT = 9876
-"""Where a viewer listens if its address does not say."""
-CONNECT = 5.0
-"""Seconds in which a viewer has to answer."""
-FLUSH = 1.0
-"""Seconds for which rows of a file are gathered into chunks."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RerunOptions:
-    """What a recording holds."""
-
-    splats: bool = True
-    """Splats of the soft bodies, with their colours from all around (degree 0)."""
-    covariance_tolerance: float = 0.05
-    """Scales and orientations of an object's splats are written anew once the covariance of one of them has changed by
-    more than this, relative to itself (Frobenius norm); 0 writes every change. Centres are in every frame."""
-    surface: bool = True
-    """Surface samples as points; hidden in the saved layout."""
-    contacts: bool = True
-    """Forces of the soft bodies on rigid bodies and the world as arrows."""
-    force_scale: float = 0.02
-    """Length of an arrow per force [m/N]."""
-    images: bool = True
-    """Colour and depth of the cameras; draws those of an environment."""
-    jpeg_quality: int | None = 90
-    """Quality of colour pictures, 1..95; None writes them exactly."""
-    world_spacing: float = 1.5
-    """Distance of the worlds of a recording of several [m]."""
-    plane_extent: float = PLANE_EXTENT
-    """Edge of the quad that stands for an infinite plane [m]."""
-    eye: tuple[tuple[float, float, float], tuple[float, float, float]] = ((1.05, -0.4, 0.42), (0.34, -0.02, 0.19))
-    """Where the saved layout looks from and at [m]."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        for name in ("covariance_tolerance", "force_scale", "world_spacing"):
-            if not 0.0 <= getattr(self, name) < np.inf:
-                raise ConfigError(f"{name} must be finite and >= 0, got {getattr(self, name)}")
-        if self.jpeg_quality is not None and not 1 <= self.jpeg_quality <= 95:
-            raise ConfigError(f"jpeg_quality must lie in 1..95, got {self.jpeg_quality}", hint="None writes exactly")
+from softmode.viz.rerun_options import RerunOptions
+from softmode.viz.rerun_pictures import encoded, encoded_depth
+from softmode.viz.rerun_sources import Moment, source_of
+from softmode.viz.rerun_stream import RerunStream, check_target
 
 
 class RerunLogger:
@@ -89,7 +42,7 @@ class RerunLogger:
     Args:
         target: File to write (.rrd); or address of a running viewer, like "rerun+http://127.0.0.1:9876/proxy"; or
             "spawn", which opens one.
-        scene: An environment of softmode (its task in this process), a :class:`softmode.scenes.splat_scene.SplatScene`,
+        scene: An environment of softmode (its task in this process), a a :class:`softmode.scenes.SplatScene`,
             or a :class:`RerunScene`.
         worlds: Which worlds.
         options: What the recording holds.
@@ -101,39 +54,28 @@ class RerunLogger:
     """
 
     def __init__(
-        self, target: str | Path, scene: Any, *, worlds: Sequence[int] = (0,), options: RerunOptions | None = None
+        self, target: str | Path, scene: object, *, worlds: Sequence[int] = (0,), options: RerunOptions | None = None
     ) -> None:
         """Open the recording and write what does not change."""
-        live = check_target(target)
+        check_target(target)
         import rerun as rr
 
+        self._rr = rr
         self.options = options if options is not None else RerunOptions()
         self.worlds = _whole(worlds)
         self._source = source_of(scene, self.worlds or (0,))
-        model = self._source.model
-        count = max(int(model.world_count), 1)
+        count = max(int(self._source.model.world_count), 1)
         if not self.worlds or len(set(self.worlds)) < len(self.worlds) or not set(self.worlds) <= set(range(count)):
             raise ConfigError(f"worlds must name different ones of 0..{count - 1}, got {list(worlds)}")
         self._prefix = {w: "" if self.worlds == (0,) and count == 1 else f"world_{w}/" for w in self.worlds}
-        self._file = None if live else PendingFile(target, "recording")
         self._written: dict[tuple[int, int], NDArray[np.float32]] = {}
         self._marks: dict[int, NDArray[np.float32]] = {}
         self._lenses: dict[str, NDArray[np.float32]] = {}
         self._cameras: tuple[str, ...] | None = None
         self.frame_count = 0
         """Frames recorded."""
-        self._rr: Any = rr
-        # A file gains from large chunks, a viewer from prompt ones.
-        batches = rr.ChunkBatcherConfig.DEFAULT() if live else rr.ChunkBatcherConfig(flush_tick=FLUSH)
-        self._stream: Any = rr.RecordingStream("softmode", batcher_config=batches)
+        self._stream = RerunStream(target, self._source.name)
         try:
-            self._stream.set_log_time_enabled(False)
-            self._stream.set_log_tick_enabled(False)
-            if self._file is not None:
-                self._stream.save(self._file.temporary)
-            else:
-                _reach(self._stream, str(target))
-            self._stream.send_recording_name(self._source.name)
             self._prepare()
         except BaseException:
             self.discard()
@@ -160,63 +102,36 @@ class RerunLogger:
         Raises:
             StorageError: If what was written cannot be read back, as on a full disk, or the viewer has gone.
         """
-        if self._stream is None:
-            return
-        try:
-            self._end()
-        except RuntimeError as error:  # rerun's, of a sink that takes nothing
-            if self._file is not None:
-                self._file.discard()
-            hint = "look whether the viewer still runs" if self._file is None else "check the free space"
-            raise StorageError(f"the recording could not be sent: {error}", hint=hint) from error
-        if self._file is None:
-            return
-        try:
-            from rerun.chunk import RrdReader
-
-            RrdReader(self._file.temporary).store()  # reads the list of all chunks, which is written last
-        except Exception as error:
-            self._file.discard()
-            raise StorageError(f"recording {self._file.path} is not complete", hint="check the free space") from error
-        self._file.publish()
+        self._stream.publish()
 
     def discard(self) -> None:
         """End the recording and remove the file unless it was published."""
-        if self._stream is not None:
-            with contextlib.suppress(RuntimeError):  # of a viewer that has gone, which is no news here
-                self._end()
-        if self._file is not None:
-            self._file.discard()
-
-    def _end(self) -> None:
-        """Write out what is still in memory and close."""
-        stream, self._stream = self._stream, None
-        try:
-            stream.flush()
-        finally:
-            stream.disconnect()
+        self._stream.discard()
 
     # -- what does not change -----------------------------------------------------------------------------------------
 
     def _prepare(self) -> None:
         """Write meshes, places of the worlds and the layout; allocate what reads the device."""
         source, rr, options = self._source, self._rr, self.options
-        model, reduced = source.model, getattr(source.solver, "reduced", source.solver)
-        self._log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        model, reduced = source.model, soft_solver(source.solver)
+        self._stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._meshes, self._paths = {}, {}
         for place, w in enumerate(self.worlds):
             if len(self.worlds) > 1:
                 shift = (0.0, options.world_spacing * place, 0.0)
-                self._log(f"{self._prefix[w]}scene", rr.Transform3D(translation=shift), static=True)
+                self._stream.log(f"{self._prefix[w]}scene", rr.Transform3D(translation=shift), static=True)
             self._meshes[w] = scene_meshes(model, world=w, plane_extent=options.plane_extent)
             self._write_meshes(w)
         layout = reduced.layout
         instances = range(int(layout.instance_start[0]), int(layout.instance_start[1]))
         self._starts = {w: int(layout.instance_start[w]) for w in self.worlds}
-        self._soft = _unlike([layout.bodies[layout.asset[i]].name for i in instances])
+        self._soft = _distinct([layout.bodies[layout.asset[i]].name for i in instances])
         objects = source.objects or (None,) * len(self._soft)
-        self._splats = DeformedSplats(model, objects, self.worlds) if options.splats else None
-        self._objects = objects
+        self._shown = {o: thing.splats for o, thing in enumerate(objects) if thing is not None and thing.splats}
+        self._splats = None
+        if options.splats and self._shown:
+            # as if colours were the same from everywhere: those of higher degrees would turn with every splat
+            self._splats = BoundSplats(model, objects, worlds=self.worlds, sh_degree=0)
         self._energies = SoftEnergies(source.solver)
         self._samples = {
             (w, o): (int(reduced.instances.particle_start.numpy()[i]), int(reduced.instances.sample_count.numpy()[i]))
@@ -231,14 +146,14 @@ class RerunLogger:
         """Write the meshes of a world, each body's under its own entity."""
         rr, model = self._rr, self._source.model
         bodies = sorted({mesh.body for mesh in self._meshes[w]})
-        names = _unlike(["fixed" if b < 0 else str(model.body_label[b]) for b in bodies])
+        names = _distinct(["fixed" if b < 0 else str(model.body_label[b]) for b in bodies])
         root = f"{self._prefix[w]}scene"
         folder = {b: f"{root}/{n}" if b < 0 else f"{root}/bodies/{n}" for b, n in zip(bodies, names, strict=True)}
         self._paths[w] = {b: path for b, path in folder.items() if b >= 0}
         for mesh in self._meshes[w]:
             carrier = "world" if mesh.body < 0 else str(model.body_label[mesh.body])
             color = [round(255 * c) for c in (*mesh.color, mesh.opacity)]
-            self._log(
+            self._stream.log(
                 f"{folder[mesh.body]}/{_part(mesh.label.removeprefix(f'{carrier}/'))}",
                 rr.Mesh3D(
                     vertex_positions=mesh.vertices,
@@ -252,7 +167,11 @@ class RerunLogger:
     # -- a frame ------------------------------------------------------------------------------------------------------
 
     def record(
-        self, state: Any = None, *, time: float | None = None, scalars: Mapping[str, float] | None = None
+        self,
+        state: newton.State | None = None,
+        *,
+        time: float | None = None,
+        scalars: Mapping[str, float] | None = None,
     ) -> None:
         """Write a frame: after ``reset`` and every ``step`` of an environment, or with state and time of a scene.
 
@@ -264,12 +183,11 @@ class RerunLogger:
         Raises:
             ConfigError: If the recording has ended, or what a scene needs is missing.
         """
-        if self._stream is None:
-            raise ConfigError("the recording has ended", hint="record before publish, inside the with block")
         source, rr, stream = self._source, self._rr, self._stream
+        if stream.ended:
+            raise ConfigError("the recording has ended", hint="record before publish, inside the with block")
         moment = source.moment(state, time)
-        stream.set_time("step", sequence=moment.step)
-        stream.set_time("sim_time", duration=moment.time)
+        stream.set_moment(moment.step, moment.time)
         self._energies.update(moment.state)
         energies = {n: getattr(self._energies, n).numpy() for n in ("kinetic", "elastic", "gravitational")}
         cameras = list(source.cameras()) if self.options.images else []
@@ -285,16 +203,16 @@ class RerunLogger:
             prefix = self._prefix[w]
             for o, name in enumerate(self._soft):
                 for kind, values in energies.items():
-                    self._log(f"{prefix}energy/{name}/{kind}", rr.Scalars(float(values[self._starts[w] + o])))
+                    self._stream.log(f"{prefix}energy/{name}/{kind}", rr.Scalars(float(values[self._starts[w] + o])))
             for path, value in source.scalars(w).items():
-                self._log(f"{prefix}{path}", rr.Scalars(value))
+                self._stream.log(f"{prefix}{path}", rr.Scalars(value))
             self._log_marker(source.marker(w), w)
             for level, text in source.remarks(w):
-                self._log(f"{prefix}log", rr.TextLog(text, level=level))
+                self._stream.log(f"{prefix}log", rr.TextLog(text, level=level))
             for drawn in cameras:
                 self._log_images(drawn, w)
         for path, value in (scalars or {}).items():
-            self._log(path, rr.Scalars(float(value)))
+            self._stream.log(path, rr.Scalars(float(value)))
         self.frame_count += 1
 
     def _log_poses(self, moment: Moment) -> None:
@@ -304,32 +222,35 @@ class RerunLogger:
             where = {mesh.body: pose for mesh, pose in zip(self._meshes[w], poses, strict=True)}
             for body, path in self._paths[w].items():
                 pose = where[body]
-                self._log(path, self._rr.Transform3D(translation=pose[:3], quaternion=pose[3:]))
+                self._stream.log(path, self._rr.Transform3D(translation=pose[:3], quaternion=pose[3:]))
 
     def _log_soft(self, moment: Moment) -> None:
         """Write splats and surface samples."""
         rr = self._rr
-        frames = {} if self._splats is None else self._splats.frames(moment.state)
+        frames = {}
+        if self._splats is not None:
+            self._splats.update(moment.state)
+            frames = self._splats.frames()
         for (place, o), frame in frames.items():
             w = self.worlds[place]
             path = f"{self._prefix[w]}scene/soft/{self._soft[o]}"
             fields: dict[str, Any] = {"centers": frame.means}
             if self._changed((w, o), frame):
-                fields["scales"], fields["quaternions"] = self._splats.axes(frame)  # type: ignore[union-attr]
+                fields["scales"], fields["quaternions"] = frame.axes(self._source.model.device)
             if self.frame_count == 0:
-                thing: Any = self._objects[o]
-                fields |= _colors(thing.splats)
-            self._log(path, rr.GaussianSplats3D.from_fields(**fields))
+                fields |= _colors(self._shown[o])
+            self._stream.log(path, rr.GaussianSplats3D.from_fields(**fields))
         if not self.options.surface:
             return
-        positions: Any = moment.state.particle_q
-        points = positions.numpy().copy()  # rerun keeps what it is given, and on CPU this is the state's own memory
+        points = host(
+            moment.state.particle_q
+        ).copy()  # rerun keeps what it is given, and on CPU this is the state's own memory
         for (w, o), (first, count) in self._samples.items():
             path = f"{self._prefix[w]}scene/soft/{self._soft[o]}/surface"
             fields: dict[str, Any] = {"positions": points[first : first + count]}
             if self.frame_count == 0:
                 fields |= {"radii": [0.0012], "colors": [(250, 190, 60)]}
-            self._log(path, rr.Points3D.from_fields(**fields))
+            self._stream.log(path, rr.Points3D.from_fields(**fields))
 
     def _log_marker(self, marker: Splats | None, w: int) -> None:
         """Write the splats that mark the goal, when they change."""
@@ -339,7 +260,7 @@ class RerunLogger:
         if w not in self._marks:
             fields |= {"scales": marker.scales, "quaternions": marker.quats, **_colors(marker)}
         self._marks[w] = marker.means
-        self._log(f"{self._prefix[w]}scene/marker", self._rr.GaussianSplats3D.from_fields(**fields))
+        self._stream.log(f"{self._prefix[w]}scene/marker", self._rr.GaussianSplats3D.from_fields(**fields))
 
     def _changed(self, key: tuple[int, int], frame: SplatFrame) -> bool:
         """Return whether scales and orientations of an object are to be written, and note that they are."""
@@ -370,7 +291,7 @@ class RerunLogger:
                 labels=[f"{np.linalg.norm(v):.2f} N" for v in vectors],
                 show_labels=False,
             )
-            self._log(f"{self._prefix[w]}scene/contacts", arrows)
+            self._stream.log(f"{self._prefix[w]}scene/contacts", arrows)
 
     def _log_images(self, camera: SplatCamera, w: int) -> None:
         """Write the last pictures of the cameras of one size."""
@@ -383,8 +304,8 @@ class RerunLogger:
                 self._lenses[path] = lens
                 fx, fy, cx, cy = lens[16:].tolist()
                 turn = matrix[:3, :3].T
-                self._log(path, rr.Transform3D(translation=-turn @ matrix[:3, 3], mat3x3=turn))
-                self._log(
+                self._stream.log(path, rr.Transform3D(translation=-turn @ matrix[:3, 3], mat3x3=turn))
+                self._stream.log(
                     path,
                     rr.Pinhole(
                         image_from_camera=[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]],
@@ -393,30 +314,8 @@ class RerunLogger:
                     ),
                 )
             pixels = camera.images(view.name).numpy()[w].copy()
-            self._log(f"{path}/rgb", self._encoded(pixels))
-            self._log(f"{path}/depth", self._encoded_depth(camera.images(view.name, "depth").numpy()[w]))
-
-    def _encoded(self, pixels: NDArray[np.uint8]) -> Any:
-        """Return a picture for rerun, compressed unless it shall be exact."""
-        if self.options.jpeg_quality is None:
-            return self._rr.Image(pixels)
-        from PIL import Image
-
-        buffer = io.BytesIO()
-        Image.fromarray(pixels).save(buffer, "JPEG", quality=self.options.jpeg_quality)
-        return self._rr.EncodedImage(contents=buffer.getvalue(), media_type="image/jpeg")
-
-    def _encoded_depth(self, depth: NDArray[np.float32]) -> Any:
-        """Return a depth picture for rerun: 16 bit PNG in steps of 0.1 mm, which reach 6.5 m."""
-        from PIL import Image
-
-        buffer, steps = io.BytesIO(), np.round(np.clip(1e4 * depth, 0.0, 65535.0)).astype(np.uint16)
-        Image.fromarray(steps).save(buffer, "PNG", compress_level=1)
-        return self._rr.EncodedDepthImage(blob=buffer.getvalue(), media_type="image/png", meter=1e4)
-
-    def _log(self, path: str, what: Any, *, static: bool = False) -> None:
-        """Write one thing."""
-        self._stream.log(path, what, static=static)
+            self._stream.log(f"{path}/rgb", encoded(pixels, self.options.jpeg_quality))
+            self._stream.log(f"{path}/depth", encoded_depth(camera.images(view.name, "depth").numpy()[w]))
 
 
 def _colors(splats: Splats) -> dict[str, Any]:
@@ -437,49 +336,12 @@ def _whole(worlds: Sequence[int]) -> tuple[int, ...]:
         raise ConfigError(f"worlds must be whole numbers, got {worlds!r}", hint="give them like (0, 2)") from error
 
 
-def _reach(stream: Any, target: str) -> None:
-    """Open a viewer, or connect to one.
-
-    Raises:
-        ConfigError: If none is there.
-    """
-    try:
-        if target == "spawn":
-            stream.spawn()
-            return
-        place = urlsplit(target)
-        if place.hostname:  # rerun itself would try for as long as there is something to send
-            socket.create_connection((place.hostname, place.port or PORT), timeout=CONNECT).close()
-        stream.connect_grpc(target)
-    except (OSError, RuntimeError, ValueError) as error:
-        raise ConfigError(f"no rerun viewer answers at {target!r}: {error}", hint="start one with: rerun") from error
-
-
-def check_target(target: str | Path) -> bool:
-    """Return whether a recording is shown live instead of written.
-
-    Raises:
-        ConfigError: If it is neither a .rrd file, nor the address of a viewer, nor "spawn".
-        MissingExtraError: If rerun is not installed.
-    """
-    try:
-        import rerun  # noqa: F401
-    except ImportError as error:
-        raise MissingExtraError(
-            "recording for rerun needs rerun-sdk", hint="install it with: pip install 'softmode[viz]'"
-        ) from error
-    live = str(target) == "spawn" or str(target).startswith(LIVE)
-    if not live and Path(target).suffix.lower() != ".rrd":
-        raise ConfigError(f"recording {target} is no .rrd file", hint="name it like out/lift.rrd")
-    return live
-
-
-def _bodies_per_world(model: Any) -> int:
+def _bodies_per_world(model: newton.Model) -> int:
     """Return how many rigid bodies every world has."""
     worlds = max(int(model.world_count), 1)
     if worlds == 1 or model.body_count == 0:
         return int(model.body_count)
-    return int(np.diff(model.body_world_start.numpy()[: worlds + 1]).min())
+    return int(np.diff(host(model.body_world_start)[: worlds + 1]).min())
 
 
 def _part(label: str) -> str:
@@ -487,12 +349,7 @@ def _part(label: str) -> str:
     return "".join(c if c.isalnum() or c in "_-." else "_" for c in label) or "_"
 
 
-def _unlike(labels: Sequence[str]) -> list[str]:
+def _distinct(labels: Sequence[str]) -> list[str]:
     """Return labels as parts of entity paths, no two alike."""
-    found: list[str] = []
-    for label in map(_part, labels):
-        chosen, number = label, 2
-        while chosen in found:
-            chosen, number = f"{label}_{number}", number + 1
-        found.append(chosen)
-    return found
+    seen: set[str] = set()
+    return [distinct(_part(label), seen) for label in labels]

@@ -4,37 +4,86 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from enum import IntEnum
+from typing import Protocol, runtime_checkable
 
 import newton
 import numpy as np
+import warp as wp
 
 from softmode.deformables.model.status import status_reasons
-from softmode.envs.end_reason import EndReason
-from softmode.envs.results import info_arrays
-from softmode.envs.task import Task
 from softmode.errors import ConfigError
 from softmode.objects.soft_object import SoftObject
+from softmode.scenes.host import Solver, soft_solver
 from softmode.scenes.splat_scene import SplatScene
+from softmode.scenes.table_scene import TableScene
 from softmode.splats.camera import SplatCamera
 from softmode.splats.splats import Splats
+
+Numbers = Mapping[str, float | Sequence[float]]
+"""Numbers by path."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RerunScene:
-    """A scene of one's own: what a :class:`softmode.viz.rerun_logger.RerunLogger` shows of it.
+    """What a :class:`softmode.viz.RerunLogger` shows of a model that you step yourself.
 
     ``record`` is then called with the state and its time.
     """
 
-    model: Any
+    model: newton.Model
     """The model."""
-    solver: Any
-    """Its :class:`softmode.deformables.solver.solver_reduced.SolverReduced`, or one that couples it."""
+    solver: Solver
+    """What moves its soft bodies."""
     objects: Sequence[SoftObject | None] = ()
     """The soft bodies of a world in the order in which they were added, None for one without splats."""
     cameras: Sequence[SplatCamera] = ()
     """Cameras whose last pictures are recorded; render them before ``record``."""
+
+
+class ParameterColumns(Protocol):
+    """The parameters of the worlds of a task."""
+
+    parameters: Mapping[str, object]
+    """What may be drawn, by name."""
+    values: wp.array
+    """What was drawn, shape (world_count, columns)."""
+
+    def columns(self, name: str) -> slice:
+        """Return the columns of a parameter."""
+        ...
+
+
+@runtime_checkable
+class RecordedTask(Protocol):
+    """A task that runs in worlds of this process, as :class:`softmode.envs.task.Task` does."""
+
+    scene: TableScene
+    """Where it happens."""
+    table: ParameterColumns
+    """What was drawn for each episode."""
+    elapsed: wp.array
+    """Steps of the episode, shape (world_count,)."""
+    reward: wp.array
+    """Reward of the step."""
+    success: wp.array
+    """Whether the task counts as solved."""
+    end: wp.array
+    """Why the episode ended, one of `end_reasons`."""
+    end_reasons: type[IntEnum]
+    """RUNNING, TIME_LIMIT, and failures."""
+    observation: wp.array
+    """What the policy sees, shape (world_count, columns)."""
+    segments: Mapping[str, tuple[slice, object]]
+    """Columns of the observation by name, "finger_force" among them."""
+    terms: wp.array
+    """Terms of the reward, shape (world_count, at least as many)."""
+    term_names: Sequence[str]
+    """Their names."""
+    metrics: wp.array
+    """Metrics, shape (world_count, at least as many)."""
+    metric_names: Sequence[str]
+    """Their names."""
 
 
 @dataclass(frozen=True)
@@ -49,36 +98,6 @@ class Moment:
     """Value of the timeline "sim_time" [s]."""
 
 
-class Source(Protocol):
-    """What a logger reads."""
-
-    model: Any
-    solver: Any
-    objects: Sequence[SoftObject | None]
-    name: str
-    """Name of the recording."""
-
-    def moment(self, state: Any, time: float | None) -> Moment:
-        """Return the present moment."""
-        ...
-
-    def cameras(self) -> Sequence[SplatCamera]:
-        """Return the cameras, with pictures of the present moment."""
-        ...
-
-    def marker(self, world: int) -> Splats | None:
-        """Return the splats that mark a goal."""
-        ...
-
-    def scalars(self, world: int) -> Mapping[str, float | Sequence[float]]:
-        """Return numbers by path."""
-        ...
-
-    def remarks(self, world: int) -> Sequence[tuple[str, str]]:
-        """Return lines of text with their level."""
-        ...
-
-
 class SceneSource:
     """A :class:`RerunScene`."""
 
@@ -89,7 +108,7 @@ class SceneSource:
         self.objects: Sequence[SoftObject | None] = scene.objects
         self._cameras, self._step = scene.cameras, -1
 
-    def moment(self, state: Any, time: float | None) -> Moment:
+    def moment(self, state: newton.State | None, time: float | None) -> Moment:
         """Return the state that was given."""
         if state is None or time is None:
             raise ConfigError("record of a scene needs its state and time", hint="call record(state, time=seconds)")
@@ -103,7 +122,7 @@ class SceneSource:
     def marker(self, world: int) -> Splats | None:
         """Return nothing."""
 
-    def scalars(self, world: int) -> Mapping[str, float | Sequence[float]]:
+    def scalars(self, world: int) -> Numbers:
         """Return the solver's iterations and status."""
         return solver_scalars(self.solver, world)
 
@@ -115,7 +134,7 @@ class SceneSource:
 class TaskSource:
     """A task in its environment; time runs on from episode to episode."""
 
-    def __init__(self, task: Task, world: int, name: str) -> None:
+    def __init__(self, task: RecordedTask, world: int, name: str) -> None:
         """Keep the task; ``world`` is the one whose steps count."""
         scene = task.scene
         self.name, self.model, self.solver = name, scene.model, scene.solver
@@ -123,7 +142,7 @@ class TaskSource:
         self.task, self._world, self._step, self._elapsed = task, world, -1, 0
         self._drawn = False
 
-    def moment(self, state: Any, time: float | None) -> Moment:
+    def moment(self, state: newton.State | None, time: float | None) -> Moment:
         """Return the present state of the task's scene."""
         if state is not None or time is not None:
             raise ConfigError("record of an environment takes no state and no time", hint="call record()")
@@ -144,23 +163,22 @@ class TaskSource:
         scene = self.task.scene
         if not self._drawn or scene.marker is None:
             return None
-        means: Any = scene.splat_arrays.means
-        return replace(scene.marker, means=means.numpy()[world, -scene.marker.count :].copy())
+        assert scene.splats is not None  # it has just drawn them
+        means = scene.splats.arrays.means.numpy()[world, scene.splats.columns[-1]]
+        return replace(scene.marker, means=means.copy())
 
-    def scalars(self, world: int) -> Mapping[str, float | Sequence[float]]:
+    def scalars(self, world: int) -> Numbers:
         """Return reward, its terms, metrics, action, success and solver's figures; no reward before the first step."""
         task, found = self.task, dict(solver_scalars(self.solver, world))
-        info = info_arrays(task)
-        found["success"] = float(info.pop("is_success").numpy()[world])
-        terms = info.pop("reward_terms")
-        for name in ("parameters", "solver_status", "end_reason"):
-            info.pop(name)
-        for name, array in info.items():
-            found[f"metrics/{name}"] = array.numpy()[world].astype(float).tolist()
+        found["success"] = float(task.success.numpy()[world])
+        for k, name in enumerate(task.metric_names):
+            found[f"metrics/{name}"] = float(task.metrics.numpy()[world, k])
+        force = task.observation.numpy()[world, task.segments["finger_force"][0]]
+        found["metrics/finger_force"] = force.astype(float).tolist()
         if int(task.elapsed.numpy()[world]) > 0:
             found["reward/total"] = float(task.reward.numpy()[world])
-            for name, array in terms.items():
-                found[f"reward/terms/{name}"] = float(array.numpy()[world])
+            for k, name in enumerate(task.term_names):
+                found[f"reward/terms/{name}"] = float(task.terms.numpy()[world, k])
             found["action"] = task.scene.actions.numpy()[world].astype(float).tolist()
         return found
 
@@ -170,9 +188,9 @@ class TaskSource:
         if int(task.elapsed.numpy()[world]) == 0:
             drawn = ", ".join(f"{n} {v}" for n, v in self._parameters(world).items())
             lines.append(("INFO", f"episode begins: {drawn}"))
-        reason = EndReason(int(task.end.numpy()[world]))
-        if reason != EndReason.RUNNING:
-            lines.append(("INFO" if reason == EndReason.TIME_LIMIT else "WARN", f"episode ends: {reason.name.lower()}"))
+        reason = task.end_reasons(int(task.end.numpy()[world])).name.lower()
+        if reason != "running":
+            lines.append(("INFO" if reason == "time_limit" else "WARN", f"episode ends: {reason}"))
         return lines
 
     def _parameters(self, world: int) -> dict[str, str]:
@@ -183,22 +201,26 @@ class TaskSource:
         }
 
 
-def solver_scalars(solver: Any, world: int) -> dict[str, float | Sequence[float]]:
+Source = SceneSource | TaskSource
+"""What a logger reads: model, solver and objects, the present moment, pictures, the marker of a goal, numbers, text."""
+
+
+def solver_scalars(solver: Solver, world: int) -> Numbers:
     """Return iterations of the last step and the status bits of a world."""
-    reduced = getattr(solver, "reduced", solver)
+    reduced = soft_solver(solver)
     return {
         "solver/iterations": float(reduced.iteration.numpy()[world]),
         "solver/status": float(reduced.status.numpy()[world]),
     }
 
 
-def solver_remarks(solver: Any, world: int) -> list[tuple[str, str]]:
+def solver_remarks(solver: Solver, world: int) -> list[tuple[str, str]]:
     """Return the names of the status bits that are set."""
-    reasons = status_reasons(int(getattr(solver, "reduced", solver).status.numpy()[world]))
+    reasons = status_reasons(int(soft_solver(solver).status.numpy()[world]))
     return [("WARN", f"solver: {', '.join(reasons)}")] if reasons else []
 
 
-def source_of(scene: Any, worlds: Sequence[int]) -> Source:
+def source_of(scene: object, worlds: Sequence[int]) -> Source:
     """Return what reads a scene or an environment.
 
     Raises:
@@ -207,12 +229,11 @@ def source_of(scene: Any, worlds: Sequence[int]) -> Source:
     if isinstance(scene, RerunScene):
         return SceneSource(scene)
     if isinstance(scene, SplatScene):
-        cameras = () if scene.camera is None else (scene.camera,)
-        things = [replace(placed.thing, splats=placed.splats or placed.thing.splats) for placed in scene.objects]
-        return SceneSource(RerunScene(model=scene.model, solver=scene.solver, objects=things, cameras=cameras))
+        cameras = tuple(scene.cameras.values())
+        return SceneSource(RerunScene(model=scene.model, solver=scene.solver, objects=scene.objects, cameras=cameras))
     env = getattr(scene, "unwrapped", scene)
-    task = scene if isinstance(scene, Task) else getattr(env, "task", None)
-    if not isinstance(task, Task):
+    task = scene if isinstance(scene, RecordedTask) else getattr(env, "task", None)
+    if not isinstance(task, RecordedTask):
         raise ConfigError(
             f"scene is a {type(scene).__name__}",
             hint="pass an environment of softmode, a SplatScene, or RerunScene(model=..., solver=..., objects=...)",

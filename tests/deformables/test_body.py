@@ -112,6 +112,14 @@ def test_gradients_match_finite_differences(body: ReducedBody) -> None:
         assert np.abs(difference - gradient[:, :, d]).max() < 1e-6 * np.abs(gradient).max()
 
 
+def test_gradients_of_quadratic_handles() -> None:
+    """Handles of degree two have six more monomials, whose gradients match central differences to 1e-6 as well."""
+    options = BuildOptions(mode_count=2, kernel_count=60, handles="quadratic", cubature_count=40)
+    body = build_body(quadrature_from_box((0.3, 0.2, 0.1), point_count=400), options)
+    assert body.function_count > 4 * 3
+    test_gradients_match_finite_differences(body)
+
+
 def test_volume_counts_and_shapes(default) -> None:
     """Cubature weights are positive and sum to the volume; counts agree; the force error is under 1 %."""
     quadrature, body = default

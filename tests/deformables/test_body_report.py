@@ -22,8 +22,8 @@ from softmode.envs.tasks.place_in_bin import task as place_in_bin
 from softmode.envs.tasks.push_soft import task as push_soft
 from softmode.envs.tasks.shape_soft import config as shape_soft
 from softmode.errors import BasisError
-from softmode.objects import presets
-from softmode.objects.soft_object import ObjectConfig, load_object, object_source
+from softmode.objects import ObjectConfig, load, presets
+from softmode.objects.source import object_source
 
 GOOD = {
     "plush": ObjectConfig(),
@@ -61,12 +61,12 @@ def body(quadrature: Quadrature) -> ReducedBody:
 def test_good_bodies_are_clean(name: str) -> None:
     """Nothing is found on the plush and on every preset by their files, nor on some with what they were built from."""
     config = GOOD[name]
-    thing = load_object(config)
-    alone = report_body(thing.body, splats=thing.splats.means)
+    thing = load(config)
+    alone = report_body(thing.body, splats=thing.visible_splats.means)
     assert not alone.findings and alone.severity == 0
     if name not in ("cube", "rope", "post"):
         return
-    whole = report_body(thing.body, quadrature=object_source(config)[1](), splats=thing.splats.means)
+    whole = report_body(thing.body, quadrature=object_source(config).integrate(), splats=thing.visible_splats.means)
     assert not whole.findings
     assert whole.measure("error of orthonormality in mass") < (0.1 if config.clamped_height else 1e-9)
     # What the build itself measured, on the same points; a held body was refined at the face of its region.

@@ -30,7 +30,7 @@ def _coupling(folder: Path) -> dict[str, Any]:
     """A gripper about to close on a soft cube."""
     from newton.solvers import SolverMuJoCo
 
-    from softmode.deformables.model.authoring import add_reduced_body
+    from softmode.deformables import add_reduced_body
     from tests.scenes import Scene, add_gripper, cube
 
     body, fingers = cube(0.06), []
@@ -58,9 +58,7 @@ def _sensing(folder: Path) -> dict[str, Any]:
     import newton
     import warp as wp
 
-    from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
-    from softmode.deformables.model.authoring import add_reduced_body
-    from softmode.deformables.solver.attachments import attach
+    from softmode.deformables import SolverCoupledReduced, add_reduced_body, attach
     from tests.scenes import cube
 
     body = cube()
@@ -92,7 +90,7 @@ def _gradients(folder: Path) -> dict[str, Any]:
     """A soft bar that falls, and tracks of 20 markers that stand still."""
     import newton
 
-    from softmode.deformables.model.authoring import add_reduced_body
+    from softmode.deformables import add_reduced_body
     from tests.scenes import bar
 
     body = bar()

@@ -18,18 +18,6 @@ ROOT = Path(__file__).resolve().parents[2]
 # Before the first body is built: the cache lies in the checkout, so that a run leaves nothing outside it.
 os.environ.setdefault("SOFTMODE_CACHE", str(ROOT / ".cache" / "softmode"))
 
-PLAYBOT = ROOT.parent / "shared" / "data" / "splats" / "playbot" / "4_0" / "meta.json"
-"""A trained capture, SOG v2: a robot hovering over a patch of ground, with two loose hands. PLAYBOT by Stephane Agullo,
-CC-BY-4.0."""
-
-
-@pytest.fixture(scope="session")
-def playbot() -> Path:
-    """Return the trained capture, or skip."""
-    if not PLAYBOT.is_file():
-        pytest.skip(f"the trained capture {PLAYBOT} is not there")
-    return PLAYBOT
-
 
 @pytest.fixture(scope="session")
 def make_env() -> Callable[[str], gym.Env]:

@@ -15,7 +15,7 @@ from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.push_soft.scripted import ScriptedPush
 from softmode.envs.tasks.push_soft.task import PushSoftConfig, PushSoftEnv, push_scene
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import ObjectConfig
+from softmode.objects import ObjectConfig
 
 ENV_ID = "softmode/PushSoft-v0"
 IDLE = np.zeros(5, np.float32)

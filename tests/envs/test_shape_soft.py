@@ -17,7 +17,7 @@ from softmode.envs.tasks.shape_soft.scripted import ScriptedShape
 from softmode.envs.tasks.shape_soft.targets import record_press
 from softmode.envs.tasks.shape_soft.task import ShapeSoftEnv, ShapeSoftVectorEnv
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import ObjectConfig
+from softmode.objects import ObjectConfig
 from softmode.scenes.table_scene import GAP
 
 ENV_ID = "softmode/ShapeSoft-v0"

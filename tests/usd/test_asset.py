@@ -11,10 +11,10 @@ pytest.importorskip("pxr", reason="needs the extra [usd]")
 
 from softmode.deformables.build.options import BuildOptions
 from softmode.errors import AssetError
+from softmode.objects import ObjectConfig, Placed, SoftObject, load
 from softmode.objects.mesh_file import read_mesh
-from softmode.objects.object_build import config_of_file, file_kind
-from softmode.objects.soft_object import ObjectConfig, load_object
-from softmode.usd import PlacedBody, write_usd
+from softmode.objects.object_file import file_kind
+from softmode.usd import write_usd
 from tests.usd.export_scenes import assert_same, assert_same_splats, small_body, small_splats
 from tests.usd.stages import EDGES, Author, Gf, UsdGeom, UsdVol, box, shell, transform
 
@@ -57,10 +57,7 @@ def test_a_mesh_in_a_stage_is_the_object_that_it_is_in_other_files(tmp_path: Pat
     author.geometry("/World/Thing", "Mesh")
     author.save()
     box().export(tmp_path / "a.obj")
-    found = [
-        load_object(config_of_file(tmp_path / name, build=SMALL, pose="captured", splat_count=200))
-        for name in ("a.usda", "a.obj")
-    ]
+    found = [load(tmp_path / name, build=SMALL, pose="captured", splat_count=200) for name in ("a.usda", "a.obj")]
     one, two = (thing.body for thing in found)
     assert one.volume == pytest.approx(two.volume, rel=1e-5)
     np.testing.assert_allclose(one.bounds, two.bounds, atol=1e-6)
@@ -68,17 +65,17 @@ def test_a_mesh_in_a_stage_is_the_object_that_it_is_in_other_files(tmp_path: Pat
 
 def test_kinds_of_stages(tmp_path: Path) -> None:
     """A body of softmode goes before splats, and those before meshes; several bodies, or nothing, are refused."""
-    placed = PlacedBody(body=small_body("affine"), splats=small_splats())
+    placed = Placed(object=SoftObject(body=small_body("affine"), splats=small_splats()))
     write_usd(tmp_path / "body.usdc", placed)
     assert file_kind(tmp_path / "body.usdc") == "body"
-    thing = load_object(config_of_file(tmp_path / "body.usdc"))
+    thing = load(tmp_path / "body.usdc")
     assert_same(thing.body, small_body("affine"))
-    assert_same_splats(thing.splats, small_splats())
+    assert_same_splats(thing.visible_splats, small_splats())
     write_usd(tmp_path / "two.usdc", [placed, placed])
     with pytest.raises(AssetError, match="holds 2 bodies"):
         file_kind(tmp_path / "two.usdc")
     with pytest.raises(AssetError, match="holds 2 bodies"):
-        load_object(ObjectConfig(body=tmp_path / "two.usdc"))
+        load(ObjectConfig(body=tmp_path / "two.usdc"))
     author = Author.create(tmp_path / "splats.usda")
     author.geometry("/World/Thing", "Mesh")
     author.splats(UsdVol.ParticleField3DGaussianSplat.Define(author.stage, "/World/Splats"), shell(50))

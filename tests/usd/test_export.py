@@ -17,7 +17,8 @@ import pytest
 pytest.importorskip("pxr", reason="needs the extra [usd]")
 
 from softmode.errors import AssetError, ConfigError, MissingExtraError, StorageError
-from softmode.usd import PlacedBody, UsdExportOptions, add_usd, write_usd, writer
+from softmode.objects import Placed, SoftObject
+from softmode.usd import UsdExportOptions, add_usd, write_usd, writer
 from softmode.usd.handles import handles_from_coordinates
 from tests.usd.export_scenes import (
     KINDS,
@@ -37,12 +38,10 @@ Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade = (
 EPSILON = float(np.finfo(np.float32).eps)
 
 
-def placed(kind: str = "affine", *, coefficients: int = 1) -> PlacedBody:
+def placed(kind: str = "affine", *, coefficients: int = 1) -> Placed:
     """Return a bar of an odd material at an odd place."""
-    return PlacedBody(
-        body=small_body(kind),
-        material=MATERIAL,
-        splats=small_splats(coefficients),
+    return Placed(
+        object=SoftObject(body=small_body(kind), material=MATERIAL, splats=small_splats(coefficients)),
         name="toy",
         position=(0.1, -0.2, 0.3),
         rotation=TURN,
@@ -64,7 +63,7 @@ def test_round_trip_is_exact(tmp_path: Path, kind: str, suffix: str, coefficient
     write_usd(tmp_path / f"toy.{suffix}", toy)
     (found,) = add_usd(newton.ModelBuilder(), tmp_path / f"toy.{suffix}").bodies.values()
     assert_same(found.body, toy.body)
-    assert found.material == MATERIAL and found.notes == ()
+    assert found.material == MATERIAL and found.object.notes == ()
     assert found.splats is not None and toy.splats is not None
     assert_same_splats(found.splats, toy.splats)
     np.testing.assert_allclose(found.position, toy.position, rtol=1e-15)
@@ -77,7 +76,7 @@ def test_several_bodies_and_odd_names(tmp_path: Path) -> None:
     """Names become valid and unlike; bodies keep their order, one without splats has none."""
     toy = placed()
     bodies = [dataclasses.replace(toy, name=name) for name in ("my toy.ply", "my-toy.ply", "3d")]
-    bodies.append(dataclasses.replace(toy, name="bare", splats=None))
+    bodies.append(dataclasses.replace(toy, name="bare", object=dataclasses.replace(toy.object, splats=None)))
     write_usd(tmp_path / "toys.usdc", bodies)
     found = add_usd(newton.ModelBuilder(), tmp_path / "toys.usdc")
     assert list(found.bodies) == ["/World/my_toy_ply", "/World/my_toy_ply_2", "/World/_3d", "/World/bare"]
@@ -257,7 +256,8 @@ def test_a_body_in_a_stage_of_other_units(tmp_path: Path, up: str, meters: float
 
 def test_validators_find_nothing(tmp_path: Path) -> None:
     """All validators that OpenUSD registers pass a full stage, in a process without softmode; a poor one fails."""
-    write_usd(tmp_path / "toys.usdc", [placed(), dataclasses.replace(placed("quadratic"), splats=None)])
+    other = Placed(object=SoftObject(body=small_body("quadratic"), material=MATERIAL), name="toy")
+    write_usd(tmp_path / "toys.usdc", [placed(), other])
     poor = Usd.Stage.CreateNew(str(tmp_path / "poor.usda"))
     poor.DefinePrim("/A", "Xform")
     poor.GetRootLayer().Save()

@@ -16,10 +16,10 @@ import warp as wp
 
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.errors import AssetError, ConfigError, SolverDiverged, StorageError
+from softmode.objects import Placed, SoftObject
 from softmode.splats.formats import read_usd
 from softmode.stages import process
 from softmode.usd import (
-    PlacedBody,
     UsdAnimation,
     UsdAnimationOptions,
     UsdExportOptions,
@@ -62,7 +62,9 @@ class Scene:
         builder.add_ground_plane()
         self.model: Any = builder.finalize(device="cpu")
         self.state: Any = self.model.state()
-        self.bodies = [PlacedBody(body=small_body(kind), splats=small_splats(coefficients)) for kind in kinds]
+        self.bodies = [
+            Placed(object=SoftObject(body=small_body(kind), splats=small_splats(coefficients))) for kind in kinds
+        ]
 
     def move(self, frame: int) -> list[np.ndarray]:
         """Set the state of a frame; return the coordinates of the bodies of world 1."""
@@ -101,9 +103,9 @@ def test_handles_hold_the_states(tmp_path: Path, kind: str) -> None:
     assert found.fps == 30.0 and len(found.bodies) == 2
     for k, played in enumerate(found.bodies):
         body = scene.bodies[k].body
-        assert_same(played.body, body)
-        assert played.splats is not None
-        assert_same_splats(played.splats, scene.bodies[k].splats or played.splats)
+        assert_same(played.object.body, body)
+        assert played.object.splats is not None
+        assert_same_splats(played.object.splats, scene.bodies[k].splats or played.object.splats)
         np.testing.assert_allclose(played.times, 0.1 * np.arange(FRAMES), atol=1e-15)
         expected = np.array([frame[k] for frame in states])
         rounding = np.finfo(float).eps * np.linalg.cond(body.transform) * len(body.transform)
@@ -282,7 +284,7 @@ def test_bad_arguments(tmp_path: Path) -> None:
 
 def test_what_is_no_animation_is_refused(tmp_path: Path) -> None:
     """A stage without samples, a damaged file, and handles of another count."""
-    write_usd(tmp_path / "a.usdc", PlacedBody(body=small_body("affine")))
+    write_usd(tmp_path / "a.usdc", Placed(object=SoftObject(body=small_body("affine"))))
     with pytest.raises(AssetError, match="no animated body"):
         read_animation(tmp_path / "a.usdc")
     (tmp_path / "b.usdc").write_bytes((tmp_path / "a.usdc").read_bytes()[:5000])
@@ -318,7 +320,7 @@ def test_damaged_animations(tmp_path: Path) -> None:
             found = animation_from_answer(process.read_answer(request["answer"], "file"), "file")
             for played in found.bodies:
                 assert np.isfinite(played.coordinates).all() and np.isfinite(played.times).all()
-                assert_same(played.body, small_body("affine"))
+                assert_same(played.object.body, small_body("affine"))
         except AssetError as error:
             assert error.message and error.hint
             refused += 1

@@ -11,8 +11,9 @@ import pytest
 pytest.importorskip("pxr", reason="needs the extra [usd]")
 
 from softmode.errors import AssetError
+from softmode.objects import Placed, SoftObject
 from softmode.objects.stage_bundle import body_of, decode_body, encode_body
-from softmode.usd import PlacedBody, read_usd_scene, write_usd
+from softmode.usd import read_usd_scene, write_usd
 from softmode.usd.handles import (
     coordinates_from_handles,
     handle_weights,
@@ -48,7 +49,7 @@ def test_signs_of_zeros_survive_the_file(suffix: str, tmp_path: Path) -> None:
     header, arrays, digest = encode_body(body)
     lost = {name: array + 0.0 if array.dtype.kind == "f" else array for name, array in arrays.items()}
     assert_same(decode_body(header, lost, digest, "test"), body)
-    write_usd(tmp_path / f"bar{suffix}", PlacedBody(body=body))
+    write_usd(tmp_path / f"bar{suffix}", Placed(object=SoftObject(body=body)))
     (found,) = read_usd_scene(tmp_path / f"bar{suffix}").deformables
     assert found.bundle is not None
     assert_same(body_of(found.bundle, "test"), body)

@@ -64,7 +64,7 @@ def test_worlds_of_a_vector_environment(tmp_path: Path) -> None:
     finally:
         env.close()
     (toy,) = read_animation(tmp_path / "a.usdc").bodies
-    count = toy.body.function_count
+    count = toy.object.body.function_count
     np.testing.assert_allclose(toy.coordinates[-1], q[count:], atol=1e-12)
     assert np.abs(toy.coordinates[-1] - q[:count]).max() > 1e-3
     Usd, UsdGeom = openusd("Usd", "UsdGeom")

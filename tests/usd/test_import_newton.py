@@ -73,7 +73,7 @@ def test_everything_in_a_stage(tmp_path: Path) -> None:
     builder = newton.ModelBuilder()
     found = add_usd(builder, everything(tmp_path / "a.usda"), build_options=SMALL, surface_count=100)
     assert list(found.bodies) == ["/World/Toy", "/World/Brick"]
-    assert [body.instance for body in found.bodies.values()] == [0, 1]
+    assert list(found.instances.values()) == [0, 1]
     assert set(found.newton["path_body_map"]) == {
         "/World/Prop",
         *(f"/World/Robot/{n}" for n in ("base", "link", "finger")),
@@ -184,9 +184,11 @@ def test_it_rests_on_the_ground(tmp_path: Path) -> None:
     assert np.isfinite(state.body_q.numpy()).all()
     toy = found.bodies["/World/Toy"]
     assert toy.splats is not None
-    skin = SkinSplats(toy.splats.means, toy.splats.covariances(), *toy.average_basis())
+    skin = SkinSplats(toy.splats.means, toy.splats.covariances(), toy.object.basis, toy.object.grad_basis)
     drawn = SplatArrays.from_splats([toy.splats], world_count=2)
-    starts = wp.array(model.softmode.function_start.numpy()[toy.instance :: len(found.bodies)], dtype=wp.int32)
+    starts = wp.array(
+        model.softmode.function_start.numpy()[found.instances["/World/Toy"] :: len(found.bodies)], dtype=wp.int32
+    )
     skin.launch(state.softmode.q, starts, drawn.means, drawn.covariances)
     means = drawn.means.numpy()[0, : toy.splats.count]
     assert abs(means[:, 2].min()) < 0.003 and abs(means[:, 2].max() - 0.06) < 0.006, "they went with the body"
@@ -220,7 +222,7 @@ def test_what_the_stage_does_not_say(tmp_path: Path) -> None:
     toy = found.bodies["/World/Toy"]
     assert toy.material == given
     assert toy.body.volume == pytest.approx(0.1 * 0.08 * 0.06, rel=0.05)
-    assert any("surface deformable" in note for note in toy.notes)
+    assert any("surface deformable" in note for note in toy.object.notes)
 
 
 def test_picture_from_a_visible_mesh(tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ pytest.importorskip("pxr", reason="needs the extra [usd]")
 
 from softmode.deformables.materials.material import Material
 from softmode.errors import AssetError, MaterialError
+from softmode.objects.stage_body import build_deformable
 from softmode.usd import read_usd_scene
-from softmode.usd.importer import build_deformable
 from tests.usd.stages import EDGES, FAMILIES, KINDS, MATERIAL, Author, Sdf, UsdGeom, UsdShade, UsdVol, shell, transform
 
 EPSILON = float(np.finfo(np.float32).eps)

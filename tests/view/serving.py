@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from softmode.deformables.build.options import BuildOptions
-from softmode.objects.soft_object import ObjectConfig
+from softmode.objects import ObjectConfig
 from softmode.view.app import ViewApp, ViewOptions
 from softmode.view.session import LiveSession
 

@@ -11,8 +11,9 @@ from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, lift_scene
 from softmode.errors import AssetError, ConfigError
-from softmode.objects.soft_object import ObjectConfig, load_object
+from softmode.objects import ObjectConfig, load
 from softmode.splats.formats import write_splats
+from softmode.view.coordinates import coordinates
 from softmode.view.live_recording import LiveRecording
 from softmode.view.live_types import LiveOptions
 from softmode.view.session import LiveSession
@@ -190,9 +191,9 @@ def test_pick_finds_the_material_point_of_a_deformed_body(hanging):
     hanging.begin_drag(side(hanging))
     hanging.drag_to(hanging.centre() + np.array([0.05, -0.03, 0.02]))
     settle(hanging)
-    body = load_object(BOX).body
+    body = load(BOX).body
     hit = hanging.pick(hanging.drag().point + np.array([0.0, -1.0, 0.0]), (0.0, 1.0, 0.0))
-    x = hit.rest_point + body.evaluate(hit.rest_point[None])[0][0] @ hanging._coordinates("q")
+    x = hit.rest_point + body.evaluate(hit.rest_point[None])[0][0] @ coordinates(hanging._scene, "q")
     assert np.linalg.norm(hit.rest_point - x) > 0.1 * SIZE
     np.testing.assert_allclose(x, hit.point, atol=5e-3 * SIZE)
 
@@ -389,9 +390,9 @@ def test_handles_change_while_it_moves():
     live.begin_drag(side(live))
     live.drag_to(live.centre() + np.array([0.03, 0.0, 0.0]))
     settle(live, 10)
-    before, rest, speed = live.surface(), session().surface(), live._coordinates("qd")
+    before, rest, speed = live.surface(), session().surface(), coordinates(live._scene, "qd")
     pins, elapsed = live.pins(), live.status().time
-    body = load_object(BOX).body
+    body = load(BOX).body
     momentum = body.mean_basis @ speed
     live.set_handles(8)
     assert live.parameters.handles == 8 and live.drag() is None
@@ -399,7 +400,9 @@ def test_handles_change_while_it_moves():
     assert np.abs(before - rest).max() > 0.05 * SIZE
     np.testing.assert_allclose(live.surface(), before, atol=0.01 * SIZE)
     new = live._object(0).body
-    np.testing.assert_allclose(new.mean_basis @ live._coordinates("qd"), momentum, atol=0.02 * np.linalg.norm(momentum))
+    np.testing.assert_allclose(
+        new.mean_basis @ coordinates(live._scene, "qd"), momentum, atol=0.02 * np.linalg.norm(momentum)
+    )
     (old,), (held,) = pins.values(), live.pins().values()
     np.testing.assert_array_equal(held.position, old.position)
     live.end_drag()
@@ -519,7 +522,7 @@ def test_recordings_that_cannot_be(hanging, tmp_path):
 
 def test_objects_come_from_files(tmp_path):
     """A splat file, a mesh file and a saved body make sessions; a saved body has its own size and handles."""
-    thing = load_object(BOX)
+    thing = load(BOX)
     body = tmp_path / "box.npz"
     thing.body.save(body)
     live = LiveSession.from_object(body, options=PATIENT)
@@ -658,6 +661,6 @@ def test_idle_grips_leave_an_environment_as_it_is():
         live.step()
         observation, *_ = env.step(policy(observation))
     base: Any = env.unwrapped
-    np.testing.assert_array_equal(live._coordinates("q"), base.scene.state.softmode.q.numpy())
+    np.testing.assert_array_equal(coordinates(live._scene, "q"), base.scene.state.softmode.q.numpy())
     live.close()
     env.close()

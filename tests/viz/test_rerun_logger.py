@@ -23,14 +23,13 @@ import softmode  # noqa: F401  (registers the environments)
 from softmode.cli.main import main
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
-from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.deformables.solver.energies import SoftEnergies
 from softmode.deformables.tools.sensing import ContactSensor
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
 from softmode.errors import ConfigError, MissingExtraError
 from softmode.learning.players import policy_factory
-from softmode.objects.soft_object import ObjectConfig, load_object
-from softmode.scenes.deformed_splats import DeformedSplats, splat_axes
+from softmode.objects import load
+from softmode.scenes import BoundSplats, SplatFrame
 from softmode.splats.splats import rotations_from_quats
 from softmode.viz.rerun_logger import RerunLogger, RerunOptions
 from softmode.viz.rerun_sources import RerunScene
@@ -103,16 +102,16 @@ def test_episode_is_what_the_environment_did(env: Any, tmp_path: Path) -> None:
     """Frame k of the file holds state, info, forces and pictures after step k, and the splats that skinning gives."""
     task, path, steps = env.unwrapped.task, tmp_path / "lift.rrd", 40
     scene, thing = task.scene, task.scene.soft
-    skin = SkinSplats(thing.splats.means, thing.splats.covariances(), thing.basis, thing.grad_basis)
-    splats = DeformedSplats(scene.model, [thing], [0])
+    splats = BoundSplats(scene.model, [thing])
     sensor, energies = ContactSensor(scene.solver, [-1, *range(scene.model.body_count)]), SoftEnergies(scene.solver)
     truth: list[dict[str, Any]] = []
 
     def note(reward: float, info: dict[str, Any]) -> None:
         sensor.update()
         energies.update(scene.state)
-        frame = splats.frames(scene.state)[0, 0]
-        assert skin.count == len(frame.means)
+        splats.update(scene.state)
+        frame = splats.frames()[0, 0]
+        assert thing.splats.count == len(frame.means)
         force = sensor.force_matrix.numpy()[0].reshape(-1, 3)
         truth.append(
             {
@@ -196,8 +195,10 @@ def test_vector_environment(tmp_path: Path) -> None:
                 _, reward, *_ = envs.step(np.zeros(envs.action_space.shape, np.float32))
                 log.record()
                 rewards.append(reward)
-        means = DeformedSplats(envs.unwrapped.task.scene.model, [envs.unwrapped.task.scene.soft], [2])
-        last = means.frames(envs.unwrapped.task.scene.state)[0, 0].means
+        shown = envs.unwrapped.task.scene
+        splats = BoundSplats(shown.model, shown.objects, worlds=[2])
+        splats.update(shown.state)
+        last = splats.frames()[0, 0].means
     finally:
         envs.close()
     file = Recording(tmp_path / "many.rrd")
@@ -216,7 +217,7 @@ def test_vector_environment(tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def falling() -> Any:
     """Return a plush over the ground in two worlds, and its object."""
-    thing = load_object(ObjectConfig(size=0.08))
+    thing = load(size=0.08)
 
     def populate(world: newton.ModelBuilder) -> None:
         add_reduced_body(
@@ -271,7 +272,8 @@ def test_axes_give_the_covariances_back() -> None:
     wanted = 10.0 ** rng.uniform(-4.0, -2.0, size=(1000, 3))
     wanted[:100] = wanted[:100, :1]
     covariances = np.einsum("nij,nj,nkj->nik", axes, wanted**2, axes).astype(np.float32)
-    scales, quats = splat_axes(covariances.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]], "cpu")
+    six = covariances.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+    scales, quats = SplatFrame(means=np.zeros((1000, 3), np.float32), covariances=six).axes("cpu")
     size = np.linalg.norm(covariances, axis=(1, 2))
     assert (np.linalg.norm(gaussians(scales, quats) - covariances, axis=(1, 2)) < 1e-6 * size).all()
     np.testing.assert_allclose(np.linalg.norm(quats, axis=1), 1.0, atol=1e-6)

@@ -40,7 +40,7 @@ def quadrature_from_mesh(
 
     Raises:
         AssetError: If the mesh is empty, not finite, not closed, not consistently oriented, or of zero or negative
-        volume.
+            volume.
     """
     check_counts(point_count, surface_count)
     vertex, face = _load_mesh(vertices, faces)

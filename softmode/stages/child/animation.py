@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import Any
 
 from .. import tokens
-from .answer import prims_of
+from ..openusd import Stage, pxr
+from .answer import Arrays, prims_of
 from .limits import Refused
 from .scene import bundle_of
 from .splats import read_prim
@@ -15,7 +15,7 @@ MAX_FRAMES = 1_000_000
 """Most time samples that a body may have."""
 
 
-def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
+def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any]:
     """Return each body with its samples.
 
     Args:
@@ -23,7 +23,7 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
         request: `most`, the largest number of splats.
         arrays: Takes the arrays.
     """
-    Usd, UsdGeom, Vt = (importlib.import_module(f"pxr.{name}") for name in ("Usd", "UsdGeom", "Vt"))
+    Usd, UsdGeom, Vt = pxr("Usd", "UsdGeom", "Vt")
     most = request["most"]
     bodies = []
     for prim in prims_of(stage):

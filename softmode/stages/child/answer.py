@@ -8,6 +8,7 @@ import os
 import sys
 from typing import Any
 
+from ..openusd import Stage, Value, pxr
 from .layers import inside, open_layers, split_package
 from .limits import MAX_DEPTH, Budget, Refused
 
@@ -23,7 +24,7 @@ class Arrays:
         self.described: list[tuple[str, list[int]]] = []
         self.values: list[Any] = []
 
-    def add(self, value: Any) -> int:
+    def add(self, value: Value) -> int:
         """Add an array of OpenUSD; return its number."""
         view = memoryview(value)
         self.described.append((view.format, list(view.shape or ())))
@@ -78,7 +79,7 @@ def open_stage(path: str, root: str, budget: Budget, strict: bool) -> Any:
         budget: Allowed for each file.
         strict: Whether a stage that does not compose (a cycle of references, say) is refused.
     """
-    Usd = importlib.import_module("pxr.Usd")
+    (Usd,) = pxr("Usd")
     layer = open_layers(path, root, budget)
     stage = Usd.Stage.Open(layer, load=Usd.Stage.LoadAll)
     for used in stage.GetUsedLayers():
@@ -91,9 +92,9 @@ def open_stage(path: str, root: str, budget: Budget, strict: bool) -> Any:
     return stage
 
 
-def prims_of(stage: Any) -> Any:
+def prims_of(stage: Stage) -> Any:
     """Yield all prims, those of instances included; refuse too many or too deep ones."""
-    Usd = importlib.import_module("pxr.Usd")
+    (Usd,) = pxr("Usd")
     for count, prim in enumerate(Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())):
         if count > MAX_PRIMS:
             raise Refused(f"has more than {MAX_PRIMS} prims", "Import a part of it")

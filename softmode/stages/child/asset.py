@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import Any
 
 from .. import tokens
-from .answer import prims_of
+from ..openusd import Stage, pxr
+from .answer import Arrays, prims_of
 from .deformables import visible
 from .scene import geometry_of
 from .splats import flat
 
 
-def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
+def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any]:
     """Return the visible Mesh prims, or the TetMesh prims where there is none; guides and proxies are not looked at.
 
     Args:
@@ -20,7 +20,7 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
         request: `geometry`: whether to send the meshes, or only to count.
         arrays: Takes the arrays.
     """
-    Usd, UsdGeom, UsdPhysics = (importlib.import_module(f"pxr.{name}") for name in ("Usd", "UsdGeom", "UsdPhysics"))
+    Usd, UsdGeom, UsdPhysics = pxr("Usd", "UsdGeom", "UsdPhysics")
     time = Usd.TimeCode.EarliestTime()
     transforms = UsdGeom.XformCache(time)
     prims = list(prims_of(stage))

@@ -6,6 +6,7 @@ import importlib
 from typing import Any
 
 from .. import tokens
+from ..openusd import Attribute, Layer, Prim, Stage, Value, pxr
 from .limits import Refused
 
 _MEND = "Mend or remove the prim"
@@ -38,7 +39,7 @@ _OF_ANGULAR = {"physics:stiffness": _TORQUE, "physics:damping": _TORQUE, "physic
 
 
 def write_rest(
-    stage: Any, prims: list[Any], path: str, geometries: list[str], bodies: list[str], between: list[tuple[str, str]]
+    stage: Stage, prims: list[Prim], path: str, geometries: list[str], bodies: list[str], between: list[tuple[str, str]]
 ) -> None:
     """Flatten a stage without its deformables into a crate.
 
@@ -53,9 +54,7 @@ def write_rest(
         bodies: Prims that are deformable bodies; their schemas are taken off.
         between: What ties deformables to others, deactivated too.
     """
-    Sdf, Usd, UsdGeom, UsdPhysics = (
-        importlib.import_module(f"pxr.{n}") for n in ("Sdf", "Usd", "UsdGeom", "UsdPhysics")
-    )
+    Sdf, Usd, UsdGeom, UsdPhysics = pxr("Sdf", "Usd", "UsdGeom", "UsdPhysics")
     skipped = set(geometries)
     for prim in prims:
         if str(prim.GetPath()) not in skipped:
@@ -79,10 +78,10 @@ def write_rest(
         raise Refused("cannot be flattened", "Flatten it with usdcat --flatten")
 
 
-def _hold_still(layer: Any) -> None:
+def _hold_still(layer: Layer) -> None:
     """Give what has time samples the value of the first: Newton reads defaults, deformables are read at that time."""
 
-    def visit(path: Any) -> None:
+    def visit(path: Value) -> None:
         times = layer.ListTimeSamplesForPath(path) if path.IsPropertyPath() else ()
         if times:
             layer.GetAttributeAtPath(path).default = layer.QueryTimeSample(path, times[0])
@@ -92,10 +91,10 @@ def _hold_still(layer: Any) -> None:
     layer.Traverse("/", visit)
 
 
-def _check(prim: Any) -> None:
+def _check(prim: Prim) -> None:
     """Refuse numbers that are not finite where geometry or physics needs them, and indices that point nowhere."""
     numpy = importlib.import_module("numpy")
-    first = importlib.import_module("pxr.Usd").TimeCode.EarliestTime()
+    first = pxr("Usd")[0].TimeCode.EarliestTime()
     kind = str(prim.GetTypeName())
     values: dict[str, Any] = {}
     for attribute in prim.GetAuthoredAttributes():
@@ -145,11 +144,11 @@ _CHECKED = (
 )
 
 
-def _convert(stage: Any, meters: float, kilograms: float) -> None:
+def _convert(stage: Stage, meters: float, kilograms: float) -> None:
     """Bring a stage to metres and kilograms: scale its outermost transforms and what UsdPhysics gives in units."""
-    Usd, UsdGeom, UsdPhysics = (importlib.import_module(f"pxr.{n}") for n in ("Usd", "UsdGeom", "UsdPhysics"))
+    Usd, UsdGeom, UsdPhysics = pxr("Usd", "UsdGeom", "UsdPhysics")
     walk = iter(Usd.PrimRange(stage.GetPseudoRoot()))
-    inner: set[Any] = set()
+    inner: set[Value] = set()
     for prim in walk:
         xform = UsdGeom.Xformable(prim)
         outermost = xform and not any(prim.GetPath().HasPrefix(path) for path in inner)
@@ -170,7 +169,7 @@ def _convert(stage: Any, meters: float, kilograms: float) -> None:
     UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
 
 
-def _convert_attribute(attribute: Any, prismatic: bool, meters: float, kilograms: float) -> None:
+def _convert_attribute(attribute: Attribute, prismatic: bool, meters: float, kilograms: float) -> None:
     """Multiply the value of an attribute by its units."""
     name = attribute.GetName()
     powers = _UNITS.get(name) or (_PRISMATIC.get(name) if prismatic else None)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass, field
 from typing import Any
 
 from .. import tokens
+from ..openusd import Prim, Stage, Value, pxr
 from .limits import Refused
 
 _GEOMETRY = (tokens.TET_MESH, tokens.MESH, tokens.POINTS, tokens.SPLATS)
@@ -23,24 +23,24 @@ _BETWEEN = (
 class Body:
     """A deformable body of a stage."""
 
-    prim: Any
+    prim: Prim
     """What carries the body's schema."""
-    geometry: Any
+    geometry: Prim
     """Its simulation geometry; of one that is only splats the first of them."""
-    splats: list[Any] = field(default_factory=list)
+    splats: list[Prim] = field(default_factory=list)
     """Its visible splat prims."""
-    meshes: list[Any] = field(default_factory=list)
+    meshes: list[Prim] = field(default_factory=list)
     """Its other visible meshes."""
     notes: list[str] = field(default_factory=list)
     """What was read in another way than it was meant."""
 
 
-def applied(prim: Any) -> list[str]:
+def applied(prim: Prim) -> list[str]:
     """Return the applied schemas, those that are not registered included."""
     return list(prim.GetPrimTypeInfo().GetAppliedAPISchemas())
 
 
-def _is_body(prim: Any) -> bool:
+def _is_body(prim: Prim) -> bool:
     """Return whether a prim is an enabled deformable body."""
     if not any(name in tokens.BODY_APIS for name in applied(prim)):
         return False
@@ -51,7 +51,7 @@ def _is_body(prim: Any) -> bool:
     return True
 
 
-def uninstance(stage: Any, *, every: bool = False) -> None:
+def uninstance(stage: Stage, *, every: bool = False) -> None:
     """Make the instances that hold deformables, or all, ordinary prims, in the session.
 
     Parts of a deformable must be told apart, and what is converted to other units is edited prim by prim, which
@@ -77,7 +77,7 @@ def uninstance(stage: Any, *, every: bool = False) -> None:
     raise Refused("nests instances too deeply", "Flatten the stage")
 
 
-def find_bodies(prims: list[Any]) -> tuple[list[Body], list[tuple[str, str]]]:
+def find_bodies(prims: list[Prim]) -> tuple[list[Body], list[tuple[str, str]]]:
     """Return the deformable bodies, and the path and type of what ties them to others, which is not read.
 
     Args:
@@ -107,9 +107,9 @@ def find_bodies(prims: list[Any]) -> tuple[list[Body], list[tuple[str, str]]]:
     return bodies, between
 
 
-def _body(root: Any, roots: set[Any]) -> Body | None:
+def _body(root: Prim, roots: set[Value]) -> Body | None:
     """Return what belongs to a body: the geometries beneath it up to other bodies; None for cables, left to Newton."""
-    owned: list[Any] = []
+    owned: list[Prim] = []
     _collect(root, root, roots, owned)
     of_type = {kind: [p for p in owned if p.GetTypeName() == kind] for kind in _GEOMETRY}
     marked = [p for p in owned if any(a in tokens.SIM_APIS for a in applied(p))]
@@ -150,7 +150,7 @@ def _body(root: Any, roots: set[Any]) -> Body | None:
     return body
 
 
-def _collect(prim: Any, root: Any, roots: set[Any], owned: list[Any]) -> None:
+def _collect(prim: Prim, root: Prim, roots: set[Value], owned: list[Prim]) -> None:
     """Gather a prim and what lies beneath it, up to other bodies."""
     if prim != root and (prim.GetPath() in roots or any(name in _FOREIGN for name in applied(prim))):
         return
@@ -161,10 +161,10 @@ def _collect(prim: Any, root: Any, roots: set[Any], owned: list[Any]) -> None:
 
 def _everything() -> Any:
     """Return the predicate of all prims that count, instances entered."""
-    return importlib.import_module("pxr.Usd").TraverseInstanceProxies()
+    return pxr("Usd")[0].TraverseInstanceProxies()
 
 
-def visible(prim: Any) -> bool:
+def visible(prim: Prim) -> bool:
     """Return whether a prim is visible."""
-    UsdGeom = importlib.import_module("pxr.UsdGeom")
+    (UsdGeom,) = pxr("UsdGeom")
     return UsdGeom.Imageable(prim).ComputeVisibility() != UsdGeom.Tokens.invisible

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import re
 from typing import Any
 
+from ..openusd import Layer, Value, pxr
 from .limits import Budget, Refused, check_nesting
 
 MAX_LAYERS = 1024
@@ -44,7 +44,7 @@ def open_layers(path: str, root: str, budget: Budget) -> Any:
     Raises:
         Refused: If a path leads out of the root, or a layer does not exist or cannot be opened.
     """
-    Sdf = importlib.import_module("pxr.Sdf")
+    (Sdf,) = pxr("Sdf")
     first = None
     queue, seen = [path], {path}
     while queue:
@@ -71,13 +71,13 @@ def open_layers(path: str, root: str, budget: Budget) -> Any:
     return first
 
 
-def _assets(layer: Any) -> list[tuple[str, bool]]:
+def _assets(layer: Layer) -> list[tuple[str, bool]]:
     """Return every asset path of a layer and whether it names a layer."""
-    Sdf = importlib.import_module("pxr.Sdf")
+    (Sdf,) = pxr("Sdf")
     found = [(str(name), True) for name in layer.GetCompositionAssetDependencies() if name]  # "": the layer itself
     single, several = Sdf.ValueTypeNames.Asset, Sdf.ValueTypeNames.AssetArray
 
-    def visit(path: Any) -> None:
+    def visit(path: Value) -> None:
         if path.IsPropertyPath():
             spec = layer.GetAttributeAtPath(path)
             if spec is None or spec.typeName not in (single, several):

@@ -6,13 +6,14 @@ import importlib
 from typing import Any
 
 from .. import tokens
-from .answer import prims_of
+from ..openusd import Prim, Stage, Value, pxr
+from .answer import Arrays, prims_of
 from .deformables import applied, find_bodies, uninstance, visible
 from .limits import Refused
 from .splats import flat, read_prim
 
 
-def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
+def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any]:
     """Return what the stage says and each of its deformables.
 
     Args:
@@ -20,7 +21,7 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
         request: `most`, the largest number of splats, and `copy`: where the rest of the stage goes, None for nowhere.
         arrays: Takes the arrays.
     """
-    Usd, UsdGeom, UsdPhysics = (importlib.import_module(f"pxr.{name}") for name in ("Usd", "UsdGeom", "UsdPhysics"))
+    Usd, UsdGeom, UsdPhysics = pxr("Usd", "UsdGeom", "UsdPhysics")
     meters, kilograms = UsdGeom.GetStageMetersPerUnit(stage), UsdPhysics.GetStageKilogramsPerUnit(stage)
     uninstance(stage, every=request["copy"] is not None and (meters != 1.0 or kilograms != 1.0))
     prims = list(prims_of(stage))
@@ -31,7 +32,7 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
     used: list[str] = []
     most = request["most"]
 
-    def read_splats(prim: Any) -> dict[str, Any]:
+    def read_splats(prim: Prim) -> dict[str, Any]:
         nonlocal most
         found, count = read_prim(prim, time, arrays, most)
         most -= count
@@ -81,9 +82,9 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
     }
 
 
-def _other_units(stage: Any) -> list[str]:
+def _other_units(stage: Stage) -> list[str]:
     """Return a note for each layer whose unit or axis is not the stage's: OpenUSD takes its numbers as they are."""
-    UsdGeom = importlib.import_module("pxr.UsdGeom")
+    (UsdGeom,) = pxr("UsdGeom")
     expected = {"metersPerUnit": UsdGeom.GetStageMetersPerUnit(stage), "upAxis": UsdGeom.GetStageUpAxis(stage)}
     notes = []
     for layer in stage.GetUsedLayers():
@@ -94,7 +95,7 @@ def _other_units(stage: Any) -> list[str]:
     return notes
 
 
-def geometry_of(prim: Any, time: Any, arrays: Any) -> dict[str, Any]:
+def geometry_of(prim: Prim, time: Value, arrays: Arrays) -> dict[str, Any]:
     """Return the numbers of the arrays of a Mesh, TetMesh or Points prim, by attribute."""
     found: dict[str, Any] = {"path": str(prim.GetPath())}
     names = {
@@ -118,7 +119,7 @@ def geometry_of(prim: Any, time: Any, arrays: Any) -> dict[str, Any]:
     return found
 
 
-def _scalar(prim: Any, other: Any, name: str) -> float | None:
+def _scalar(prim: Prim, other: Prim, name: str) -> float | None:
     """Return an authored number of a body or its geometry that is not zero, the value that says "not given"."""
     for owner in (prim, other):
         value, _ = _authored(owner, name)
@@ -127,7 +128,7 @@ def _scalar(prim: Any, other: Any, name: str) -> float | None:
     return None
 
 
-def _authored(prim: Any, name: str) -> tuple[float | None, str]:
+def _authored(prim: Prim, name: str) -> tuple[float | None, str]:
     """Return the value of `<namespace>:<name>` under the first namespace that has one, and the attribute's name."""
     for namespace in tokens.NAMESPACES:
         attribute = prim.GetAttribute(f"{namespace}:{name}")
@@ -137,9 +138,9 @@ def _authored(prim: Any, name: str) -> tuple[float | None, str]:
     return None, ""
 
 
-def _material(geometry: Any, body: Any) -> dict[str, Any] | None:
+def _material(geometry: Prim, body: Prim) -> dict[str, Any] | None:
     """Return what the material says that is bound to the geometry, else to the body: for physics, else for all."""
-    UsdShade = importlib.import_module("pxr.UsdShade")
+    (UsdShade,) = pxr("UsdShade")
     for prim in (geometry, body):
         for purpose in (tokens.MATERIAL_PURPOSE, UsdShade.Tokens.allPurpose):
             material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)
@@ -163,7 +164,7 @@ def _material(geometry: Any, body: Any) -> dict[str, Any] | None:
     return None
 
 
-def bundle_of(prim: Any, arrays: Any) -> dict[str, Any] | None:
+def bundle_of(prim: Prim, arrays: Arrays) -> dict[str, Any] | None:
     """Return softmode's own attributes of a body: strings, numbers, and the numbers of arrays."""
     marker = prim.GetAttribute(tokens.FORMAT)
     if not marker or not marker.HasAuthoredValue():

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import Any
+
+from ..openusd import Prim, Stage, Value, pxr
+from .answer import Arrays, prims_of
 
 _ARRAYS = ("positions", "orientations", "scales", "opacities", "radiance:sphericalHarmonicsCoefficients")
 
 
-def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
+def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any]:
     """Return what the stage and each splat prim say.
 
     Args:
@@ -16,14 +18,13 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
         request: `time` (a time code, None for the earliest) and `most`, the largest number of splats.
         arrays: Takes the arrays.
     """
-    Usd, UsdGeom = (importlib.import_module(f"pxr.{name}") for name in ("Usd", "UsdGeom"))
-    answer = importlib.import_module(".answer", __package__)
+    Usd, UsdGeom = pxr("Usd", "UsdGeom")
     code = request["time"]
     time = Usd.TimeCode.EarliestTime() if code is None else Usd.TimeCode(code)
     transforms = UsdGeom.XformCache(time)
     prims: list[dict[str, Any]] = []
     total = 0
-    for prim in answer.prims_of(stage):
+    for prim in prims_of(stage):
         if prim.GetTypeName() != "ParticleField3DGaussianSplat":
             continue
         if UsdGeom.Imageable(prim).ComputeVisibility(time) == UsdGeom.Tokens.invisible:
@@ -34,7 +35,7 @@ def read(stage: Any, request: dict[str, Any], arrays: Any) -> dict[str, Any]:
     return {"up": str(UsdGeom.GetStageUpAxis(stage)), "meters": UsdGeom.GetStageMetersPerUnit(stage), "prims": prims}
 
 
-def read_prim(prim: Any, time: Any, arrays: Any, most: int) -> tuple[dict[str, Any], int]:
+def read_prim(prim: Prim, time: Value, arrays: Arrays, most: int) -> tuple[dict[str, Any], int]:
     """Return what a splat prim says, and its number of splats."""
     found: dict[str, int] = {}
     spaces: list[str] = []
@@ -59,6 +60,6 @@ def read_prim(prim: Any, time: Any, arrays: Any, most: int) -> tuple[dict[str, A
     }, count
 
 
-def flat(matrix: Any) -> list[float]:
+def flat(matrix: Value) -> list[float]:
     """Return the rows of a matrix one after the other."""
     return [x for row in matrix for x in row]

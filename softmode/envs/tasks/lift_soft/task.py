@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -18,8 +19,8 @@ from softmode.envs.task import Task
 from softmode.envs.task_config import TaskConfig
 from softmode.envs.tasks.lift_soft import kernels
 from softmode.errors import ConfigError
+from softmode.objects.config import ObjectConfig
 from softmode.objects.presets import BEAM, BEAM_MATERIAL
-from softmode.objects.soft_object import ObjectConfig
 from softmode.robots.arm import ArmDescription
 from softmode.scenes.table_scene import TableSceneConfig
 from softmode.splats.splats import Splats
@@ -63,7 +64,7 @@ class LiftSoftConfig(TaskConfig):
         require_fields(self, ("hold_steps",), at_least=1)
 
     @classmethod
-    def presets(cls) -> dict[str, LiftSoftConfig]:
+    def presets(cls) -> dict[str, Self]:
         """Return "beam": object and goals of Isaac Lab's `Isaac-Lift-Soft-Franka`, as high as this arm reaches."""
         scene = replace(lift_scene(), object=BEAM, material=BEAM_MATERIAL)
         return {"beam": cls(scene=scene, yaw_range=0.5, goal_height=0.2, goal_range=(0.08, 0.15, 0.08))}

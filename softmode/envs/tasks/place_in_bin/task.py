@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import Self
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from softmode.envs.task import Task
 from softmode.envs.task_config import TaskConfig
 from softmode.envs.tasks.place_in_bin import kernels
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import ObjectConfig
+from softmode.objects.config import ObjectConfig
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
 from softmode.scenes.table_scene import Fixture, TableSceneConfig
@@ -142,7 +143,7 @@ class PlaceInBinConfig(TaskConfig):
         require_fields(self, ("hold_steps",), at_least=1)
 
     @classmethod
-    def presets(cls) -> dict[str, PlaceInBinConfig]:
+    def presets(cls) -> dict[str, Self]:
         """Return "plush": three plush toys, which cost more time."""
         build = BuildOptions(mode_count=3, cubature_count=128)
         toy, other = (ObjectConfig(size=size, surface_count=160, build=build) for size in (0.07, 0.055))

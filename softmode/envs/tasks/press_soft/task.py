@@ -21,7 +21,7 @@ from softmode.envs.task import Task
 from softmode.envs.task_config import TaskConfig
 from softmode.envs.tasks.press_soft import kernels
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import ObjectConfig
+from softmode.objects.config import ObjectConfig
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
 from softmode.scenes.table_scene import TableSceneConfig

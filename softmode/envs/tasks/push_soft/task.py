@@ -21,7 +21,8 @@ from softmode.envs.structs import filled
 from softmode.envs.task import Task
 from softmode.envs.task_config import TaskConfig
 from softmode.envs.tasks.push_soft import kernels
-from softmode.objects.soft_object import ObjectConfig, load_object
+from softmode.objects.config import ObjectConfig
+from softmode.objects.loader import load
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
 from softmode.scenes.table_scene import TableSceneConfig
@@ -164,7 +165,7 @@ class PushSoft(Task):
 
     def marker(self) -> Splats:
         """Return the outline of the object, to be drawn on the table."""
-        soft = load_object(self.config.scene.object)
+        soft = load(self.config.scene.object)
         points = soft.body.surface_points[:, :2]
         corners = points[ConvexHull(points).vertices]
         edges = np.roll(corners, -1, axis=0) - corners

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 import warp as wp
@@ -117,7 +118,7 @@ class RopeRouteConfig(TaskConfig):
         return tuple(fixture for fixture in self.scene.fixtures if fixture.shape == "cylinder")
 
     @classmethod
-    def presets(cls) -> dict[str, RopeRouteConfig]:
+    def presets(cls) -> dict[str, Self]:
         """Return "one_peg", with a single peg, for a start."""
         return {"one_peg": cls(scene=replace(rope_scene(), fixtures=pegs_at(PEGS[:1])))}
 

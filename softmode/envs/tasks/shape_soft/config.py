@@ -13,7 +13,7 @@ from softmode.deformables.materials.material import Material
 from softmode.envs.presets import RL_SOLVER
 from softmode.envs.task_config import TaskConfig
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import ObjectConfig
+from softmode.objects.config import ObjectConfig
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
 from softmode.scenes.table_scene import TableSceneConfig

@@ -16,7 +16,7 @@ from softmode.envs.tasks.shape_soft import kernels
 from softmode.envs.tasks.shape_soft.config import ShapeSoftConfig
 from softmode.envs.tasks.shape_soft.goals import POINTS, GoalMethods, reward_rules
 from softmode.envs.tasks.shape_soft.targets import ShapeTargets, record_press
-from softmode.objects.soft_object import load_object
+from softmode.objects.loader import load
 from softmode.splats.splats import Splats
 
 
@@ -97,7 +97,7 @@ class ShapeSoft(Task):
 
     def marker(self) -> Splats:
         """Return the surface of the post; `observe` bends it."""
-        return dots(load_object(self.config.scene.object).body.surface_points, 0.004, opacity=0.35)
+        return dots(load(self.config.scene.object).body.surface_points, 0.004, opacity=0.35)
 
 
 class ShapeSoftEnv(GoalMethods, SoftEnv):

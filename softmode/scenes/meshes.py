@@ -11,7 +11,10 @@ import numpy as np
 from newton import GeoType, ShapeFlags
 from numpy.typing import NDArray
 
+from softmode.checks import require_number
 from softmode.errors import ConfigError
+from softmode.scenes.host import host
+from softmode.splats.splats import rotations_from_quats
 
 PLANE_EXTENT = 4.0
 """Edge of the quad that stands for an infinite plane [m]."""
@@ -72,16 +75,13 @@ def scene_meshes(model: newton.Model, *, world: int = 0, plane_extent: float = P
     worlds = max(int(model.world_count), 1)
     if not 0 <= world < worlds:
         raise ConfigError(f"world must lie in 0..{worlds - 1}, got {world}")
-    if not 0.0 < plane_extent < np.inf:
-        raise ConfigError(f"plane_extent must be finite and > 0, got {plane_extent}", hint="give metres, like 4.0")
+    require_number("plane_extent", plane_extent, above=0.0, unit="m", hint="give metres, like 4.0")
     if model.shape_count == 0:
         return ()
-    data: Any = model
-    columns = (data.shape_world, data.shape_flags, data.shape_body, data.shape_type, data.shape_scale)
-    owner, flags, bodies, kinds, scales = (column.numpy() for column in columns)
-    poses = data.shape_transform.numpy()
-    colors = None if data.shape_color is None else data.shape_color.numpy()
-    opacities = None if data.shape_opacity is None else data.shape_opacity.numpy()
+    names = ("world", "flags", "body", "type", "scale", "transform")
+    owner, flags, bodies, kinds, scales, poses = (getattr(model, f"shape_{name}").numpy() for name in names)
+    colors = None if model.shape_color is None else model.shape_color.numpy()
+    opacities = None if model.shape_opacity is None else model.shape_opacity.numpy()
     seen: set[str] = set()
     meshes = []
     shown = np.isin(owner, [-1, world]) & ((flags & int(ShapeFlags.VISIBLE)) != 0)
@@ -90,10 +90,10 @@ def scene_meshes(model: newton.Model, *, world: int = 0, plane_extent: float = P
         if found is None:
             continue
         vertices, faces, normals = found
-        rotation = _rotation(poses[s, 3:].astype(np.float64))
+        rotation = rotations_from_quats(poses[s : s + 1, 3:])[0]
         carrier = "world" if bodies[s] < 0 else str(model.body_label[bodies[s]])
         label = str(model.shape_label[s])
-        label = _unlike(label if label.startswith(f"{carrier}/") else f"{carrier}/{label}", seen)
+        label = distinct(label if label.startswith(f"{carrier}/") else f"{carrier}/{label}", seen)
         meshes.append(
             SceneMesh(
                 label=label,
@@ -121,12 +121,11 @@ def scene_poses(meshes: Sequence[SceneMesh], state: newton.State) -> NDArray[np.
     poses = np.tile(np.array([0, 0, 0, 0, 0, 0, 1], np.float32), (len(meshes), 1))
     body = np.array([mesh.body for mesh in meshes], dtype=np.int64)
     if (body >= 0).any():
-        where: Any = state.body_q
-        poses[body >= 0] = where.numpy()[body[body >= 0]]
+        poses[body >= 0] = host(state.body_q)[body[body >= 0]]
     return poses
 
 
-def _unlike(label: str, seen: set[str]) -> str:
+def distinct(label: str, seen: set[str]) -> str:
     """Return the label with a number behind it if it was seen before, and note it as seen."""
     chosen, number = label, 2
     while chosen in seen:
@@ -208,18 +207,6 @@ def _creased(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> Any:
     key = np.concatenate([at[:, None], np.round(normals * 1e4)], axis=1)
     _, kept, corner = np.unique(key, axis=0, return_index=True, return_inverse=True)
     return vertices[faces.reshape(-1)[kept]], corner.reshape(-1, 3).astype(np.int32), normals[kept]
-
-
-def _rotation(xyzw: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the matrix of a unit quaternion."""
-    x, y, z, w = xyzw / np.linalg.norm(xyzw)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def _color(source: Any, color: Any) -> tuple[float, float, float]:

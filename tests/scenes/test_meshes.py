@@ -12,9 +12,8 @@ import pytest
 import warp as wp
 
 from softmode.errors import ConfigError
-from softmode.scenes import scene_meshes
-from softmode.scenes.scene_meshes import SEGMENTS
-from softmode.viz import scene_poses
+from softmode.scenes import scene_meshes, scene_poses
+from softmode.scenes.meshes import SEGMENTS
 
 TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
 TETRAHEDRON_FACES = np.array([0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3], np.int32)

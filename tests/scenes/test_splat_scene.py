@@ -12,8 +12,8 @@ from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.status import status_reasons
 from softmode.errors import ConfigError
-from softmode.objects.soft_object import ObjectConfig, SoftObject, load_object
-from softmode.scenes.splat_scene import PlacedObject, SplatScene
+from softmode.objects import ObjectConfig, Placed, SoftObject, load
+from softmode.scenes import SplatScene
 from softmode.splats.pinhole import PinholeCamera
 from softmode.viz.film import Film
 from tests.scenes import GRAVITY
@@ -30,19 +30,16 @@ def cube() -> SoftObject:
     """Return a red cube."""
     build = BuildOptions(mode_count=3, kernel_count=150, cubature_count=128)
     shape = {"shape": "box", "extents": (EDGE,) * 3, "splat_count": 600, "surface_count": 100}
-    return load_object(ObjectConfig(**shape, colors=RED, build=build))
+    return load(ObjectConfig(**shape, colors=RED, build=build))
 
 
 def make_scene(cube: SoftObject, *places: tuple[float, float, float], **given) -> SplatScene:
     """Return cubes over the ground, every other one green."""
     world = newton.ModelBuilder()
     world.add_ground_plane()
-    red = cube.splats
-    green = replace(red, sh=red.sh[:, :, [1, 0, 2]])
-    things = [
-        PlacedObject(thing=cube, position=p, material=STUFF, splats=green if i % 2 else None)
-        for i, p in enumerate(places)
-    ]
+    red = replace(cube, material=STUFF)
+    green = replace(red, splats=replace(cube.visible_splats, sh=cube.visible_splats.sh[:, :, [1, 0, 2]]))
+    things = [Placed(object=green if i % 2 else red, position=p) for i, p in enumerate(places)]
     return SplatScene(world, things, dt=DT, **given)
 
 
@@ -50,7 +47,7 @@ def test_kinetic_energy_of_free_fall_is_the_work_of_gravity(cube: SoftObject) ->
     """After n steps of implicit Euler v = n g dt, so that T = 2 m v^2 / 2 for two cubes; none is kept by the graph."""
     scene = make_scene(cube, (0.0, 0.0, 1.0), (0.3, 0.0, 1.0), steps_per_frame=4)
     for frame in (1, 2):
-        scene.advance()
+        scene.step()
         assert scene.kinetic_energy() == pytest.approx(MASS * (4 * frame * GRAVITY * DT) ** 2, rel=1e-5)
     moved = (scene.surface(1) - cube.body.surface_points - (0.3, 0.0, 1.0)).mean(axis=0)
     np.testing.assert_allclose(moved, (0.0, 0.0, -GRAVITY * DT**2 * 8 * 9 / 2), atol=1e-6)
@@ -97,8 +94,8 @@ def test_graph_equals_single_steps(cube: SoftObject) -> None:
     """A frame is its physics steps, bit for bit, and the first one starts from the initial state."""
     scene, other = (make_scene(cube, (0.0, 0.0, 0.5 * EDGE + 1e-3), steps_per_frame=2) for _ in range(2))
     for _ in range(3):
-        scene.advance()
-        other._two_steps()
+        scene.step()
+        other._steps()
     np.testing.assert_array_equal(scene.state.softmode.q.numpy(), other.state.softmode.q.numpy())
     assert not status_reasons(int(scene.solver.status.numpy()[0]))
 

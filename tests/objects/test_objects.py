@@ -10,8 +10,10 @@ import pytest
 
 from softmode.deformables.build.options import BuildOptions
 from softmode.errors import AssetError, ConfigError
-from softmode.objects import soft_object as objects
-from softmode.objects.soft_object import ObjectConfig, choose_part, load_object, stable_rotation
+from softmode.objects import ObjectConfig, load, loader
+from softmode.objects.parts import Part, choose_part
+from softmode.objects.pose import stable_rotation
+from softmode.objects.source import object_source
 from softmode.splats import Splats, make_plush, write_ply
 from softmode.splats.point_cloud import splats_from_points
 
@@ -62,7 +64,7 @@ def capture() -> Splats:
 
 
 @pytest.mark.parametrize(("rule", "height"), [("thickest", 0.6), ("tallest", 1.09), ("largest", 0.0)])
-def test_part_is_chosen_by_its_rule(capture: Splats, rule: objects.Part, height: float) -> None:
+def test_part_is_chosen_by_its_rule(capture: Splats, rule: Part, height: float) -> None:
     """The ball is thickest, the pole tallest, the ground largest: each has a height of its own."""
     part = choose_part(capture, rule)
     assert np.ptp(part.means[:, 2]) == pytest.approx(height, abs=0.01)
@@ -97,7 +99,7 @@ def box(x: float, y: float, z: float) -> np.ndarray:
 def test_an_object_that_stands_is_left_alone() -> None:
     """A cube and the plush rest on a face already; a ball never tips, whatever it stands on."""
     assert stable_rotation(box(1.0, 1.0, 1.0)) is None
-    assert stable_rotation(load_object(ObjectConfig()).body.surface_points) is None
+    assert stable_rotation(load(ObjectConfig()).body.surface_points) is None
 
 
 @pytest.mark.parametrize("tilt", [0.3, 0.7, 1.2])
@@ -127,10 +129,10 @@ def test_an_object_on_its_tip_topples_and_then_stands() -> None:
 
 def test_plush_stands_on_the_table_at_its_size() -> None:
     """The longest edge is the size, the lowest surface sample lies `height` under the centre of mass."""
-    thing = load_object(ObjectConfig(size=0.07))
-    assert np.ptp(thing.splats.means, axis=0).max() == pytest.approx(0.07, rel=0.02)
+    thing = load(ObjectConfig(size=0.07))
+    assert np.ptp(thing.visible_splats.means, axis=0).max() == pytest.approx(0.07, rel=0.02)
     assert thing.height == pytest.approx(-thing.body.surface_points[:, 2].min())
-    assert thing.basis.shape == (thing.splats.count, thing.body.function_count)
+    assert thing.basis.shape == (thing.visible_splats.count, thing.body.function_count)
     assert thing.grad_basis.shape == (*thing.basis.shape, 3)
 
 
@@ -139,10 +141,10 @@ def test_a_contact_radius_lifts_what_stands_free() -> None:
     box = ObjectConfig(
         shape="box", extents=(0.04, 0.04, 0.06), surface_count=40, build=BuildOptions(mode_count=1, cubature_count=24)
     )
-    thing = load_object(box)
+    thing = load(box)
     assert thing.body.driven_count == 0
-    assert load_object(replace(box, contact_radius=0.002)).height == pytest.approx(thing.height + 0.002)
-    post = load_object(replace(box, contact_radius=0.002, clamped_height=0.01))
+    assert load(replace(box, contact_radius=0.002)).height == pytest.approx(thing.height + 0.002)
+    post = load(replace(box, contact_radius=0.002, clamped_height=0.01))
     assert post.height == pytest.approx(-post.body.surface_points[:, 2].min())
     low = post.body.surface_points[:, 2] < post.body.surface_points[:, 2].min() + 0.009
     free = post.body.evaluate(post.body.surface_points)[0][:, post.body.driven_count :]
@@ -152,9 +154,9 @@ def test_a_contact_radius_lifts_what_stands_free() -> None:
 
 def test_affine_motion_of_body_moves_the_splats_along() -> None:
     """x(X) = X + sum b_k q_k with q = affine(A, t) is A X + t at every splat."""
-    thing = load_object(ObjectConfig())
+    thing = load(ObjectConfig())
     A, t = np.array([[1.1, 0.2, 0.0], [0.0, 0.9, 0.1], [-0.1, 0.0, 1.0]]), np.array([0.1, -0.2, 0.3])
-    X = thing.splats.means.astype(float)
+    X = thing.visible_splats.means.astype(float)
     np.testing.assert_allclose(X + thing.basis @ thing.body.affine(A, t), X @ A.T + t, atol=1e-9)
 
 
@@ -164,13 +166,13 @@ def test_body_comes_from_the_cache_the_second_time(tmp_path: Path, monkeypatch: 
     file = tmp_path / "ball.ply"
     write_ply(file, shell(800, 1.0, (0.0, 0.0, 0.0)))
     config = ObjectConfig(splat=file, size=0.05)
-    first = load_object(config)
-    monkeypatch.setattr(objects, "build_body", lambda *_, **__: pytest.fail("built again"))
-    second = load_object(config)
+    first = load(config)
+    monkeypatch.setattr(loader, "build_body", lambda *_, **__: pytest.fail("built again"))
+    second = load(config)
     np.testing.assert_array_equal(first.basis, second.basis)
-    np.testing.assert_array_equal(first.splats.means, second.splats.means)
+    np.testing.assert_array_equal(first.visible_splats.means, second.visible_splats.means)
     with pytest.raises(pytest.fail.Exception, match="built again"):
-        load_object(replace(config, size=0.06))
+        load(replace(config, size=0.06))
 
 
 def test_up_axis_turns_the_file_upright(tmp_path: Path) -> None:
@@ -178,22 +180,22 @@ def test_up_axis_turns_the_file_upright(tmp_path: Path) -> None:
     down = make_plush().transformed(rotation=[[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # z up -> y down
     write_ply(tmp_path / "down.ply", down)
     write_ply(tmp_path / "up.ply", make_plush())
-    a = objects._read_splats(ObjectConfig(splat=tmp_path / "down.ply", up="-y", part="all"))
-    b = objects._read_splats(ObjectConfig(splat=tmp_path / "up.ply", up="+z", part="all"))
+    a = object_source(ObjectConfig(splat=tmp_path / "down.ply", up="-y", part="all")).splats
+    b = object_source(ObjectConfig(splat=tmp_path / "up.ply", up="+z", part="all")).splats
     np.testing.assert_allclose(a.means, b.means, atol=1e-6)
 
 
 def test_trained_capture_becomes_the_robot(playbot: Path) -> None:
     """Ground and hands go; the pointed foot cannot carry it, so it lies; nothing of it is under the table."""
     config = ObjectConfig(splat=playbot, size=0.08)
-    thing = load_object(config)
-    assert 1500 < thing.splats.count < 1900  # of 8406: 6163 are ground, 468 are hands
-    assert thing.splats.sh_degree == 2
+    thing = load(config)
+    assert 1500 < thing.visible_splats.count < 1900  # of 8406: 6163 are ground, 468 are hands
+    assert thing.visible_splats.sh_degree == 2
     lying = stable_rotation(thing.body.surface_points)
     assert lying is None
-    standing = objects.load_object(replace(config, pose="captured"))
+    standing = load(replace(config, pose="captured"))
     assert stable_rotation(standing.body.surface_points) is not None
-    assert np.ptp(standing.splats.means, axis=0).max() == pytest.approx(0.08, rel=0.03)
+    assert np.ptp(standing.visible_splats.means, axis=0).max() == pytest.approx(0.08, rel=0.03)
     assert thing.height < 0.6 * standing.height
     assert thing.body.volume == pytest.approx(standing.body.volume, rel=0.02)
 
@@ -228,7 +230,7 @@ def test_unusable_files_are_refused_by_name(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "bad.ply"
     BAD_FILES[kind](path)
     with pytest.raises(AssetError, match=r"bad\.ply") as caught:
-        load_object(ObjectConfig(splat=path))
+        load(ObjectConfig(splat=path))
     assert caught.value.hint
 
 
@@ -236,7 +238,7 @@ def test_empty_crop_says_where_the_splats_are(tmp_path: Path) -> None:
     """The remedy of a crop that misses gives the bounds of what it missed."""
     write_ply(tmp_path / "plush.ply", make_plush(count=300))
     with pytest.raises(AssetError, match="no splat lies inside crop") as caught:
-        load_object(ObjectConfig(splat=tmp_path / "plush.ply", up="+z", crop=(9.0, 9.0, 9.0, 10.0, 10.0, 10.0)))
+        load(ObjectConfig(splat=tmp_path / "plush.ply", up="+z", crop=(9.0, 9.0, 9.0, 10.0, 10.0, 10.0)))
     assert "fill" in caught.value.hint
 
 

@@ -5,18 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import newton
 import numpy as np
 import pytest
 import trimesh
 from scipy.integrate import solve_bvp
 from trimesh.visual import ColorVisuals
 
+from softmode.deformables import Material
 from softmode.deformables.model.authoring import add_pins, add_reduced_body
 from softmode.errors import ConfigError
-from softmode.objects import presets
-from softmode.objects import soft_object as objects
+from softmode.objects import ObjectConfig, SoftObject, load, loader, presets
 from softmode.objects.primitives import checker, primitive_mesh, primitive_quadrature
-from softmode.objects.soft_object import ObjectConfig, load_object
 from softmode.splats.splats import rotations_from_quats
 from tests.scenes import GRAVITY, Scene
 
@@ -58,7 +58,7 @@ def test_splats_lie_flat_on_the_surface_in_two_colours(name: str) -> None:
     """Centres lie on the mesh, third axes point outward, and both colours cover between a third and two thirds."""
     (shape, extents), _, _ = SHAPES[name]
     config = ObjectConfig(shape=shape, extents=extents, splat_count=600, colors=((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
-    thing = load_object(config)
+    thing = load(config)
     splats = thing.splats
     assert splats.count == 600
     mesh = primitive_mesh(shape, extents)  # convex: the distance is the largest to the planes of its faces
@@ -93,7 +93,7 @@ def write_mesh(path: Path, *, closed: bool) -> None:
 def test_mesh_file_becomes_a_body_of_its_size_and_colour(tmp_path: Path) -> None:
     """A glTF file has y up; size is the longest edge; the red stays but for the painted light."""
     write_mesh(tmp_path / "box.glb", closed=True)
-    thing = load_object(ObjectConfig(mesh=tmp_path / "box.glb", size=0.1, splat_count=300))
+    thing = load(ObjectConfig(mesh=tmp_path / "box.glb", size=0.1, splat_count=300))
     np.testing.assert_allclose(np.ptp(thing.body.bounds, axis=0), (0.05, 0.05, 0.1), rtol=1e-5)
     assert thing.body.volume == pytest.approx(0.05**2 * 0.1, rel=1e-5)
     assert thing.height == pytest.approx(0.05, rel=1e-5)
@@ -104,29 +104,29 @@ def test_mesh_file_becomes_a_body_of_its_size_and_colour(tmp_path: Path) -> None
 def test_open_mesh_stands_for_what_it_encloses(tmp_path: Path) -> None:
     """A sphere with a small hole is filled like a shell of splats, whose voxels err by some per cent."""
     write_mesh(tmp_path / "shell.ply", closed=False)
-    thing = load_object(ObjectConfig(mesh=tmp_path / "shell.ply", size=0.1, up="+y", splat_count=300))
+    thing = load(ObjectConfig(mesh=tmp_path / "shell.ply", size=0.1, up="+y", splat_count=300))
     assert thing.body.volume == pytest.approx(np.pi / 6 * 0.1**3, rel=0.08)
 
 
 def test_shape_comes_from_the_cache_the_second_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A second load builds nothing and gives the same object; other colours share the body, other samples do not."""
     monkeypatch.setenv("SOFTMODE_CACHE", str(tmp_path))
-    first = load_object(presets.CUBE)
-    monkeypatch.setattr(objects, "build_body", lambda *_, **__: pytest.fail("built again"))
-    second = load_object(presets.CUBE)
+    first = load(presets.CUBE)
+    monkeypatch.setattr(loader, "build_body", lambda *_, **__: pytest.fail("built again"))
+    second = load(presets.CUBE)
     np.testing.assert_array_equal(first.basis, second.basis)
     np.testing.assert_array_equal(first.splats.sh, second.splats.sh)
-    painted = load_object(replace(presets.CUBE, colors=((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))))
+    painted = load(replace(presets.CUBE, colors=((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))))
     assert painted.body.fingerprint == first.body.fingerprint
     with pytest.raises(pytest.fail.Exception, match="built again"):
-        load_object(replace(presets.CUBE, surface_count=150))
+        load(replace(presets.CUBE, surface_count=150))
 
 
-def hang(thing: objects.SoftObject, material: objects.Any, half: float) -> np.ndarray:
+def hang(thing: SoftObject, material: Material, half: float) -> np.ndarray:
     """Hold a slender body at its middle, let it come to rest; return the mean drop and reach of its ends [m]."""
     held = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]) * thing.height * 0.6
 
-    def populate(world: objects.Any) -> None:
+    def populate(world: newton.ModelBuilder) -> None:
         add_reduced_body(world, thing.body, material=replace(material, viscosity=0.05))
         add_pins(world, 0, held, stiffness=1e4)
 
@@ -162,8 +162,8 @@ def test_rope_bends_like_a_heavy_elastica(modulus: float) -> None:
     """Ends drop by 0.28 and 0.61 of their length, the elastica's to 2 %: neither locked nor torn."""
     half, radius = 0.5 * presets.ROPE.extents[0], 0.5 * presets.ROPE.extents[1]  # type: ignore[index]
     material = replace(presets.ROPE_MATERIAL, youngs_modulus=modulus, density=1000.0)
-    load = 1000.0 * GRAVITY * 4.0 * half**3 / (modulus * radius**2)
-    np.testing.assert_allclose(hang(load_object(presets.ROPE), material, half) / half, heavy_elastica(load), rtol=0.02)
+    pull = 1000.0 * GRAVITY * 4.0 * half**3 / (modulus * radius**2)
+    np.testing.assert_allclose(hang(load(presets.ROPE), material, half) / half, heavy_elastica(pull), rtol=0.02)
 
 
 def test_beam_sags_like_a_timoshenko_beam() -> None:
@@ -173,14 +173,14 @@ def test_beam_sags_like_a_timoshenko_beam() -> None:
     weight = material.density * GRAVITY * edge**2
     bending = half * heavy_elastica(12.0 * weight * half**3 / (E * edge**4))[0]
     shear = weight * half**2 * (1.0 + nu) * (12.0 + 11.0 * nu) / (E * edge**2 * 10.0 * (1.0 + nu))
-    assert hang(load_object(presets.BEAM), material, half)[0] == pytest.approx(bending + shear, rel=0.04)
+    assert hang(load(presets.BEAM), material, half)[0] == pytest.approx(bending + shear, rel=0.04)
 
 
 @pytest.mark.parametrize("name", ["BEAM", "CUBE", "PAD", "ROPE"])
 def test_presets_are_small(name: str) -> None:
     """At most 48 functions, 384 cubature points, 200 samples and 3,000 splats; centred, standing on their height."""
     config = getattr(presets, name)
-    thing = load_object(config)
+    thing = load(config)
     assert thing.body.function_count <= 48 and thing.body.point_count <= 384
     assert thing.body.surface_count <= 200 and 1000 <= thing.splats.count <= 3000
     assert thing.height == pytest.approx(0.5 * config.extents[2], rel=0.02)

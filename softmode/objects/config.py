@@ -1,0 +1,119 @@
+"""`ObjectConfig`: which soft object, how large and how finely reduced."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from softmode.checks import require_fields, require_number
+from softmode.deformables.build.options import BuildOptions
+from softmode.errors import ConfigError
+from softmode.objects.parts import Part
+from softmode.objects.primitives import Color, Extents, find_axis
+from softmode.splats.colored_mesh import ColoredMesh
+from softmode.splats.splats import Splats, UpAxis
+
+Shape = Literal["plush", "box", "cylinder", "capsule", "sphere"]
+Pose = Literal["stable", "captured"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectConfig:
+    """Which soft object, how large, how finely reduced: the built-in plush, a shape, a file, or a body as it is."""
+
+    shape: Shape = "plush"
+    """What it is where neither `splat` nor `mesh` is given: "plush", or a "box", "cylinder", "capsule" or "sphere" of
+    `extents`."""
+    extents: Extents | None = None
+    """Edges of a shape's bounding box along x, y and z [m]. A round shape needs two that are equal, a sphere three; a
+    capsule lies along the third, its longest, a cylinder along the third, its length or the thickness of a disc."""
+    splat: str | Path | Splats | None = None
+    """Splat file (.ply, SOG v2, .spz, .splat, OpenUSD), or a point cloud (.npz, see `read_points`, or .ply); or splats
+    that have been read."""
+    mesh: str | Path | ColoredMesh | None = None
+    """Mesh file (.obj, .glb, .stl, ... whatever trimesh reads, OpenUSD), or a mesh that has been read. One that is not
+    closed stands for what it encloses."""
+    body: str | Path | None = None
+    """File of a body (`softmode body build`, `ReducedBody.save`, or a stage with one from `usd.write_usd`): taken as it
+    is, with its own size, pose, surface samples, regions and splats."""
+    size: float = 0.08
+    """Longest edge of the bounding box of plush, splat file or mesh, upright [m]; the gripper opens 0.09 m."""
+    colors: tuple[Color, Color] | None = None
+    """Two colours, 0..1, of a shape or mesh, as a checker pattern; None for orange and cream, or the mesh's own."""
+    splat_count: int = 2000
+    """Number of splats on a shape or mesh."""
+    surface_count: int = 400
+    """Number of surface samples, the points that feel contact."""
+    up: UpAxis | None = None
+    """Axis of the file that points up; None for "-y" (splat files: trained captures mostly have y down), "+y" (glTF) or
+    "+z" (OpenUSD, which is read with z up, point clouds, other meshes, and what has been read)."""
+    crop: tuple[float, float, float, float, float, float] | None = None
+    """Box (x0, y0, z0, x1, y1, z1) of the splat file, after turning it up, outside which splats are dropped; cuts an
+    object off what it touched when it was captured."""
+    part: Part = "thickest"
+    """Which of the separate parts of a splat file is the object: the one with the largest least spread, so that neither
+    the ground it was captured on, wide but thin, nor loose small parts win; the one with the greatest height; the one
+    with most splats; or whatever there is."""
+    pose: Pose = "stable"
+    """"stable" lays an object from a file that cannot stand as it is there (on a pointed foot, say) on the side that
+    needs the least turn; "captured" lets it topple."""
+    contact_radius: float = 0.0
+    """How far the surface that touches stands out from the body's [m]. Samples are points: one or two millimetres keep
+    an edge that presses between them from catching on them."""
+    clamped_height: float = 0.0
+    """Height of the foot that is fixed to the table [m], 0 for an object that stands free. A clamped object keeps its
+    scale."""
+    build: BuildOptions = field(default_factory=BuildOptions)
+    """How the body is reduced."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_number("size", self.size, at_least=0.005, at_most=1.0, unit="m", hint="give the longest edge in metres")
+        require_fields(self, ("contact_radius", "clamped_height"), at_least=0.0, unit="m")
+        require_number("splat_count", self.splat_count, at_least=100)
+        require_number("surface_count", self.surface_count, at_least=16)
+        if self.crop is not None and not all(a < b for a, b in zip(self.crop[:3], self.crop[3:], strict=True)):
+            raise ConfigError(f"crop {self.crop} is empty", hint="give x0 y0 z0 x1 y1 z1 with every 0 below its 1")
+        for name, known in (("shape", Shape), ("up", UpAxis), ("part", Part), ("pose", Pose)):
+            if getattr(self, name) not in (*get_args(known), *((None,) if name == "up" else ())):
+                raise ConfigError(
+                    f"{name} is {getattr(self, name)!r}", hint=f"use one of {', '.join(map(repr, get_args(known)))}"
+                )
+        files = (self.splat, self.mesh, self.body)
+        if sum(file is not None for file in files) + (self.shape != "plush") > 1:
+            raise ConfigError(
+                f"shape {self.shape!r}, splat {self.splat!r}, mesh {self.mesh!r} and body {self.body!r} exclude each"
+                " other",
+                hint="give one of them",
+            )
+        if self.body is not None and self.clamped_height > 0.0:
+            raise ConfigError(
+                f"clamped_height is {self.clamped_height} m for a body that is built",
+                hint="build it with a region for its foot: softmode body build FILE --region foot=...",
+            )
+        self._check_extents()
+        if self.colors is not None:
+            if self.shape == "plush" and self.mesh is None:
+                raise ConfigError("colors are for shapes and meshes", hint="leave them out; splats have their own")
+            if np.shape(self.colors) != (2, 3) or not all(0.0 <= x <= 1.0 for color in self.colors for x in color):
+                raise ConfigError(f"colors {self.colors} are not two colours", hint="give two of (r, g, b) in 0..1")
+
+    def _check_extents(self) -> None:
+        """Check that a shape has extents that fit it, and nothing else has any."""
+        if (self.extents is None) != (self.shape == "plush"):
+            raise ConfigError(
+                f"shape {self.shape!r} with extents {self.extents}",
+                hint="give a box, cylinder, capsule or sphere three lengths in metres, and anything else a size",
+            )
+        if self.extents is None or self.shape == "plush":
+            return
+        if len(self.extents) != 3 or not all(1.0e-3 <= x <= 2.0 for x in self.extents):
+            raise ConfigError(f"extents must be three lengths in 0.001..2 m, got {self.extents!r}")
+        if find_axis(self.shape, self.extents) is None:
+            raise ConfigError(
+                f"extents {self.extents} are not those of a {self.shape}",
+                hint="give a sphere three equal lengths, a cylinder two, a capsule two and a third not below them",
+            )

@@ -1,0 +1,120 @@
+"""`load`: whatever describes a soft object, as a soft object."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.body.regions import Region
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.cache import cached_body
+from softmode.deformables.materials.material import Material
+from softmode.objects.config import ObjectConfig
+from softmode.objects.object_file import file_kind, read_object, surface_cover
+from softmode.objects.soft_object import SoftObject
+from softmode.objects.source import may_turn, object_source, splats_of_body, standing_quadrature
+from softmode.splats.colored_mesh import ColoredMesh
+from softmode.splats.splats import Splats
+
+if TYPE_CHECKING:
+    import trimesh
+
+    Source = ObjectConfig | ReducedBody | Splats | ColoredMesh | trimesh.Trimesh | trimesh.Scene
+    """What can be loaded beside a file."""
+
+RECIPE = 4
+"""Part of the cache key; raise it when the way from a file or shape to a body changes."""
+Progress = Callable[[str, float], None] | bool | None
+
+
+def load(
+    source: Source | str | os.PathLike[str] | None = None,
+    *,
+    material: Material | None = None,
+    progress: Progress = None,
+    **options: Any,
+) -> SoftObject:
+    """Return a soft object: read or make its splats, build or recall its body.
+
+    Args:
+        source: A configuration; a file of splats, of a point cloud, of a mesh or of a body, or an OpenUSD stage with
+            any of these; a body; splats or a mesh (also of trimesh) in memory; None for the built-in plush.
+        material: What it is made of; None for what its file says.
+        progress: Passed to :func:`softmode.deformables.build.build_body.build_body`.
+        options: Fields of `ObjectConfig`, such as ``size=0.08``; they replace those of a configuration. A body takes
+            only ``contact_radius``.
+
+    Returns:
+        The object. A body without splats of its own is covered with some.
+
+    Raises:
+        AssetError: If a file is missing, cannot be read, or encloses no volume.
+        ConfigError: If an option is out of range.
+        TypeError: If the source is none of these, or there is no such option.
+    """
+    if isinstance(source, ReducedBody):
+        return SoftObject(body=source, splats=surface_cover(source), material=material, **options)
+    config = object_config(source, **options)
+    if config.body is not None:
+        found = read_object(config.body)
+        return replace(
+            found,
+            splats=found.splats or surface_cover(found.body),
+            material=material or found.material,
+            contact_radius=config.contact_radius,
+            config=config,
+        )
+    parts = object_source(config)
+
+    def build() -> ReducedBody:
+        quadrature, turn = standing_quadrature(config, parts)
+        regions = ()
+        if config.clamped_height > 0.0:
+            wide = float("inf")
+            top = float(quadrature.bounds[0, 2]) + config.clamped_height
+            regions = (Region(name="foot", box=((-wide,) * 3, (wide, wide, top))),)
+        body = build_body(quadrature, config.build, name=parts.name, regions=regions, progress=progress)
+        return replace(body, provenance={**body.provenance, "turn": json.dumps(turn.tolist())})
+
+    clamp = (config.clamped_height,) if config.clamped_height > 0.0 else ()
+    body = cached_body((RECIPE, *parts.key, may_turn(config), config.surface_count, config.build, *clamp), build)
+    turn = np.array(json.loads(str(body.provenance["turn"])))
+    splats = splats_of_body(parts.splats, body, turn)
+    return SoftObject(body=body, splats=splats, material=material, contact_radius=config.contact_radius, config=config)
+
+
+def object_config(source: Source | str | os.PathLike[str] | None, **options: Any) -> ObjectConfig:
+    """Return the configuration of an object that is no body in memory.
+
+    Args:
+        source: As for `load`.
+        options: Fields of `ObjectConfig`; they replace those of a configuration.
+
+    Raises:
+        AssetError: If a file is missing or cannot be read.
+        ConfigError: If an option is out of range.
+        TypeError: If the source is nothing that can be loaded.
+    """
+    if isinstance(source, ObjectConfig):
+        return replace(source, **options)
+    if source is None:
+        return ObjectConfig(**options)
+    if isinstance(source, str | os.PathLike):
+        kind = file_kind(source)
+        return ObjectConfig(**{"splat" if kind == "points" else kind: Path(source)}, **options)
+    if isinstance(source, Splats):
+        return ObjectConfig(splat=source, **options)
+    if isinstance(source, ColoredMesh):
+        return ObjectConfig(mesh=source, **options)
+    import trimesh
+
+    if isinstance(source, trimesh.Trimesh | trimesh.Scene):
+        return ObjectConfig(mesh=ColoredMesh.from_trimesh(source), **options)
+    raise TypeError(f"source is a {type(source).__name__}: give a file, a configuration, a body, splats or a mesh")

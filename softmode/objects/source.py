@@ -1,0 +1,187 @@
+"""What an object is made of: its splats upright at its size, and how its solid is integrated and laid down."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.build.quadrature import quadrature_from_splats
+from softmode.deformables.build.quadrature_grid import Quadrature
+from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
+from softmode.errors import AssetError
+from softmode.objects.config import ObjectConfig
+from softmode.objects.mesh_file import read_mesh
+from softmode.objects.parts import choose_part
+from softmode.objects.pose import stable_rotation
+from softmode.objects.primitives import Color, primitive_mesh, primitive_quadrature, surface_splats, turned
+from softmode.splats.colored_mesh import ColoredMesh
+from softmode.splats.formats import read_splats
+from softmode.splats.plush import make_plush
+from softmode.splats.point_cloud import is_point_cloud, read_points
+from softmode.splats.splats import Splats, up_rotation
+from softmode.stages import tokens
+
+DEFAULT_COLORS: tuple[Color, Color] = ((0.93, 0.55, 0.22), (0.97, 0.90, 0.76))
+"""Colours of a shape that is given none."""
+
+
+@dataclass(frozen=True)
+class ObjectSource:
+    """What an object is made of, before it is turned to a stable pose."""
+
+    splats: Splats
+    """What shows it, upright, standing on z = 0 around the origin, at its size [m]."""
+    integrate: Callable[[], Quadrature]
+    """Integrates its solid."""
+    name: str
+    """Name of its body."""
+    key: tuple[object, ...]
+    """What the body depends on beside the configuration."""
+    asset_splats: int
+    """Number of splats of its file, once cropped, before one part of them was chosen."""
+
+
+def object_source(config: ObjectConfig) -> ObjectSource:
+    """Return what an object is made of.
+
+    Raises:
+        AssetError: If a file cannot be read.
+    """
+    count = config.surface_count
+    if config.mesh is not None:
+        mesh = _upright_mesh(config, config.mesh)
+        splats = surface_splats(mesh, config.splat_count, config.colors)
+        name = mesh.name if isinstance(config.mesh, ColoredMesh) else Path(config.mesh).name
+        return ObjectSource(splats, partial(_mesh_solid, mesh, count), name, ("mesh", mesh.corners), splats.count)
+    if config.shape != "plush" and config.extents is not None:
+        shape, extents = config.shape, config.extents
+        mesh = ColoredMesh.from_trimesh(primitive_mesh(shape, extents), name=shape)
+        splats = surface_splats(mesh, config.splat_count, config.colors or DEFAULT_COLORS)
+        solid = partial(primitive_quadrature, shape, extents, count)
+        return ObjectSource(splats, solid, shape, (shape, extents), splats.count)
+    splats, given, name = _upright_splats(config)
+    arrays = (splats.means, splats.scales, splats.quats, splats.opacities)
+    solid = partial(quadrature_from_splats, *arrays, surface_count=count)
+    return ObjectSource(splats, solid, name, ("splats", *arrays), given)
+
+
+def standing_quadrature(config: ObjectConfig, source: ObjectSource) -> tuple[Quadrature, NDArray[np.float64]]:
+    """Integrate an object and lay it on a stable side if its pose is to be stable.
+
+    Args:
+        config: Which object.
+        source: What it is made of.
+
+    Returns:
+        The quadrature, and the rotation that was applied, shape (3, 3).
+
+    Raises:
+        AssetError: If it encloses no volume.
+    """
+    try:
+        quadrature = source.integrate()
+    except AssetError as error:
+        raise AssetError(f"{source.splats.name}: {error.message}", hint=error.hint) from error
+    turn = None
+    if may_turn(config):
+        centre = quadrature.weights @ quadrature.points / quadrature.volume
+        turn = stable_rotation(quadrature.surface_points - centre)
+    return (quadrature, np.eye(3)) if turn is None else (turned(quadrature, turn), turn)
+
+
+def may_turn(config: ObjectConfig) -> bool:
+    """Return whether an object is laid on a stable side if it has to be."""
+    return config.pose == "stable" and (config.splat is not None or config.mesh is not None)
+
+
+def splats_of_body(splats: Splats, body: ReducedBody, turn: NDArray[np.float64]) -> Splats:
+    """Return the splats of a source in the frame of the body built from it, without those far from it.
+
+    What lies beyond an eighth of the body's size around its bounding box are floaters of the capture.
+
+    Args:
+        splats: Splats of the source, N.
+        body: The body.
+        turn: The rotation by which it was laid down, shape (3, 3).
+    """
+    if not np.array_equal(turn, np.eye(3)):
+        splats = splats.transformed(rotation=turn)
+    low, high = body.bounds + body.offset
+    margin = 0.125 * np.linalg.norm(high - low)
+    near = ((splats.means >= low - margin) & (splats.means <= high + margin)).all(axis=1)
+    return splats.subset(near).transformed(translation=-body.offset)
+
+
+def _upright_mesh(config: ObjectConfig, given: str | Path | ColoredMesh) -> ColoredMesh:
+    """Return the mesh upright, standing on z = 0 around the origin, scaled to the wanted size."""
+    up = "+z"
+    if isinstance(given, ColoredMesh):
+        mesh = given
+    else:
+        mesh = read_mesh(given)
+        up = "+y" if Path(given).suffix.lower() in (".glb", ".gltf") else up
+    corners = mesh.corners.astype(np.float64) @ up_rotation(config.up or up).T
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    centre = np.array([*(0.5 * (low + high))[:2], low[2]])
+    return replace(mesh, corners=((corners - centre) * (config.size / (high - low).max())).astype(np.float32))
+
+
+def _mesh_solid(mesh: ColoredMesh, surface_count: int) -> Quadrature:
+    """Integrate a mesh or, if it is not closed, what a dense cover of splats encloses."""
+    corners = mesh.corners.astype(np.float64).reshape(-1, 3)
+    try:
+        return quadrature_from_mesh(corners, np.arange(len(corners)).reshape(-1, 3), surface_count=surface_count)
+    except AssetError:
+        cover = surface_splats(mesh, 8000)
+        return quadrature_from_splats(
+            cover.means, cover.scales, cover.quats, cover.opacities, surface_count=surface_count
+        )
+
+
+def _upright_splats(config: ObjectConfig) -> tuple[Splats, int, str]:
+    """Return the object's splats upright, standing on z = 0, scaled; how many there were; the name of the object."""
+    if config.splat is None:
+        cropped = splats = make_plush()
+        name, stray = "plush", 0.0
+    else:
+        cropped, name = _cropped_splats(config, config.splat)
+        splats, stray = choose_part(cropped, config.part), 0.002
+    low, high = splats.bounds(quantile=stray)
+    extent = float((high - low).max())
+    if not extent > 0.0:
+        raise AssetError(f"{splats.name}: all splats lie at one point", hint="export the asset again")
+    scale = config.size / extent
+    centre = np.array([*(0.5 * (low + high))[:2], low[2]])
+    return splats.transformed(translation=-scale * centre, scale=scale), cropped.count, name
+
+
+def _cropped_splats(config: ObjectConfig, given: str | Path | Splats) -> tuple[Splats, str]:
+    """Read splats or a point cloud, turn them upright and crop them; return them with the name of the object."""
+    up = "+z"
+    if isinstance(given, Splats):
+        splats, name = given, given.name
+    else:
+        file = Path(given)
+        if is_point_cloud(file):
+            splats = read_points(file)
+        else:
+            splats, up = read_splats(file), "+z" if file.suffix.lower() in tokens.SUFFIXES else "-y"
+        whole = file.resolve()
+        name = whole.parent.name if whole.name == "meta.json" else whole.name
+    splats = splats.oriented(config.up or up)
+    if config.crop is None:
+        return splats, name
+    inside = (splats.means >= config.crop[:3]).all(axis=1) & (splats.means <= config.crop[3:]).all(axis=1)
+    if not inside.any():
+        low, high = np.round(splats.bounds(), 3).tolist()
+        raise AssetError(
+            f"{splats.name}: no splat lies inside crop {config.crop}",
+            hint=f"the splats fill {low} to {high} once turned up",
+        )
+    return splats.subset(inside), name

@@ -1,0 +1,148 @@
+"""`BoundSplats`: the splats of soft bodies, moved by the states of a model with the kernels that cameras use."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import newton
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from softmode.deformables.model.authoring import NAMESPACE
+from softmode.deformables.skinning.skin_splats import SkinSplats
+from softmode.deformables.skinning.skinning_kernels import vec6
+from softmode.errors import ConfigError
+from softmode.objects.soft_object import SoftObject
+from softmode.scenes.host import host
+from softmode.scenes.splat_axes_kernels import principal_axes
+from softmode.splats.rasterizer import SplatArrays
+from softmode.splats.splats import Splats
+
+_ROWS = 400_000
+"""Most splats of states that are moved in one launch; bounds the memory."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SplatFrame:
+    """The splats of one object in one world."""
+
+    means: NDArray[np.float32]
+    """Centres [m], shape (N, 3)."""
+    covariances: NDArray[np.float32]
+    """Covariances xx xy xz yy yz zz [m^2], shape (N, 6)."""
+
+    def axes(self, device: wp.DeviceLike = None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the principal axes: standard deviations [m] (N, 3), and unit quaternions xyzw to the world (N, 4)."""
+        six = wp.array(np.ascontiguousarray(self.covariances, np.float32), dtype=vec6, device=device)
+        scales = wp.zeros(six.shape, dtype=wp.vec3, device=device)
+        quats = wp.zeros(six.shape, dtype=wp.quat, device=device)
+        wp.launch(principal_axes, dim=six.shape, inputs=[six], outputs=[scales, quats], device=device)
+        return host(scales), host(quats)
+
+
+class BoundSplats:
+    """Splats that follow the soft bodies of a model: the mean of x(X) and F Sigma F^T over each splat.
+
+    Args:
+        model: A model with soft bodies, the same in every world; None for states of a single body on their own.
+        objects: The soft bodies of a world in the order in which they were added, at least one; None for a body that is
+            not shown.
+        worlds: Which worlds; all of them if None. Without a model: which states, the first if None.
+        others: Splats behind those of the objects, which `update` leaves where they are: a marker, rigid toys.
+        sh_degree: Highest degree of the colours, 0 to 3; None for that of the splats.
+        device: Warp device where there is no model.
+
+    Raises:
+        ConfigError: If the model has other soft bodies, nothing has splats, or there is no model for several objects.
+    """
+
+    def __init__(
+        self,
+        model: newton.Model | None,
+        objects: Sequence[SoftObject | None],
+        *,
+        worlds: Sequence[int] | None = None,
+        others: Sequence[Splats] = (),
+        sh_degree: int | None = None,
+        device: wp.DeviceLike = None,
+    ) -> None:
+        """Upload the splats at rest."""
+        device = device if model is None else model.device
+        shown = [thing for thing in objects if thing is not None and thing.splats is not None]
+        if model is not None:
+            starts = _function_starts(model, len(objects), worlds)
+        elif len(shown) == len(objects) == 1:
+            starts = np.array([0] if worlds is None else worlds)[:, None] * shown[0].body.function_count
+        else:
+            raise ConfigError(f"there are {len(objects)} objects and no model", hint="give one object that has splats")
+        parts = [*(thing.visible_splats for thing in shown), *others]
+        self.arrays = SplatArrays.from_splats(parts, world_count=len(starts), sh_degree=sh_degree, device=device)
+        """The splats as they are, for cameras and rasterisers."""
+        ends = np.cumsum([splats.count for splats in parts]).tolist()
+        self.columns = tuple(slice(end - splats.count, end) for end, splats in zip(ends, parts, strict=True))
+        """Where the splats of each object that has some are in `arrays`, then those of `others`."""
+        self.indices = tuple(o for o, thing in enumerate(objects) if thing is not None and thing.splats is not None)
+        """Which objects have splats."""
+        self._skins = []
+        for o, thing, rest in zip(self.indices, shown, parts, strict=False):
+            skin = SkinSplats(rest.means, rest.covariances(), thing.basis, thing.grad_basis, device=device)
+            self._skins.append((skin, wp.array(np.ascontiguousarray(starts[:, o]), dtype=int, device=device)))
+
+    def update(self, state: newton.State) -> None:
+        """Move the splats to where a state of the model has them; capturable after a first time."""
+        self.move(getattr(state, NAMESPACE).q)
+
+    def move(self, q: wp.array) -> None:
+        """Move the splats by the coordinates q of all instances [m], flat vec3d; capturable after a first time."""
+        arrays = self.arrays
+        for (skin, start), columns in zip(self._skins, self.columns, strict=False):
+            skin.launch(
+                q, start, arrays.means, arrays.covariances, rotations=arrays.rotations, first_splat=columns.start
+            )
+
+    def frames(self) -> dict[tuple[int, int], SplatFrame]:
+        """Return the splats as they are by place of the world in `worlds` and object; reads from the device."""
+        means, covariances = host(self.arrays.means), host(self.arrays.covariances)
+        return {
+            (w, o): SplatFrame(means=means[w, columns].copy(), covariances=covariances[w, columns].copy())
+            for o, columns in zip(self.indices, self.columns, strict=False)
+            for w in range(len(means))
+        }
+
+
+def splats_of_states(thing: SoftObject, states: ArrayLike) -> Iterator[Splats]:
+    """Yield the splats of an object in each of its states, on the host.
+
+    Args:
+        thing: The object.
+        states: Reduced coordinates [m], shape (F, n, 3).
+    """
+    q, rest = np.asarray(states, dtype=np.float64), thing.visible_splats
+    count = max(1, _ROWS // rest.count)
+    for first in range(0, len(q), count):
+        part = q[first : first + count]
+        bound = BoundSplats(None, [thing], worlds=range(len(part)), device="cpu")
+        bound.move(wp.array(part.reshape(-1, 3), dtype=wp.vec3d, device="cpu"))
+        turns = bound.arrays.rotations.numpy()
+        for (k, _), frame in bound.frames().items():
+            # colours of degree 0 look the same from everywhere, and no rotations are computed for them
+            yield rest.with_covariances(frame.means, frame.covariances, turns[k] if rest.sh_degree else np.eye(3))
+
+
+def _function_starts(model: newton.Model, count: int, worlds: Sequence[int] | None) -> NDArray[np.int32]:
+    """Return where q of each of the soft bodies of a world begins, shape (worlds, count).
+
+    Raises:
+        ConfigError: If the worlds do not hold that many.
+    """
+    data = getattr(model, NAMESPACE)
+    owner, every = data.instance_world.numpy(), max(int(model.world_count), 1)
+    if len(owner) != every * count or (every > 1 and not np.array_equal(owner, np.repeat(np.arange(every), count))):
+        raise ConfigError(
+            f"objects names {count} soft bodies, the model has {len(owner)} in {every} worlds",
+            hint="give one object, or None, per soft body of a world, in the order in which they were added",
+        )
+    starts = data.function_start.numpy().reshape(every, count)
+    return starts if worlds is None else starts[list(worlds)]

@@ -1,0 +1,54 @@
+"""Recording launches as a graph: a picture, or the step of a scene, which leaves the scene as it was."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from softmode.errors import ConfigError
+
+if TYPE_CHECKING:
+    from softmode.scenes.scene import Scene
+
+
+def capture_graph(launches: Callable[[], None], device: wp.DeviceLike) -> wp.Graph:
+    """Return launches as a graph for `wp.capture_launch`.
+
+    They run once before, which compiles kernels and allocates what they need.
+
+    Args:
+        launches: Launches, without anything that reads from the device.
+        device: Warp device.
+    """
+    launches()
+    with wp.ScopedCapture(device=device) as capture:
+        launches()
+    assert capture.graph is not None
+    return capture.graph
+
+
+def capture_step(scene: Scene, step: Callable[[], None]) -> wp.Graph:
+    """Return the step of a scene as a graph; its state stays as it was, and the solver forgets the trial.
+
+    Args:
+        scene: The scene.
+        step: Moves `scene.state` on by launches alone; it ends where it began, in `scene.state`.
+    """
+    before = scene.model.state()
+    before.assign(scene.state)
+    graph = capture_graph(step, scene.model.device)
+    scene.solver.reset(scene.state)
+    scene.state.assign(before)
+    return graph
+
+
+def require_even(name: str, count: int) -> None:
+    """Raise unless a number of steps is even and at least 2, so that steps between two states end where they began.
+
+    Raises:
+        ConfigError: If it is not.
+    """
+    if count < 2 or count % 2:
+        raise ConfigError(f"{name} must be even and at least 2, got {count}")

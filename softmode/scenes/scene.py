@@ -1,0 +1,81 @@
+"""What a scene is: a model that runs, with the soft objects in it and the cameras that see them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import newton
+
+from softmode.deformables.tools.grips import Grips
+from softmode.objects.soft_object import SoftObject
+from softmode.scenes.binding import BoundSplats
+from softmode.scenes.host import Solver
+from softmode.splats.camera import CameraOptions, SplatCamera
+from softmode.splats.camera_randomization import CameraRandomization
+from softmode.splats.pinhole import PinholeCamera
+
+
+class Scene(Protocol):
+    """A model with solver, state, objects and cameras, which takes steps.
+
+    :class:`softmode.scenes.SplatScene` and :class:`softmode.scenes.TableScene` are scenes, and so is what a live
+    session runs. Recorders and the browser tool read scenes.
+    """
+
+    model: newton.Model
+    """The model."""
+    state: newton.State
+    """Where everything is."""
+    control: newton.Control
+    """What drives joints, pins and regions."""
+    objects: tuple[SoftObject, ...]
+    """The soft objects of a world, in the order of their instances."""
+    grips: tuple[Grips, ...]
+    """Grips of each object, that pull and hold it while the scene runs; none if it was made without slots."""
+    splats: BoundSplats | None
+    """The splats of the objects as cameras see them; None without cameras."""
+    cameras: dict[tuple[int, int], SplatCamera]
+    """The cameras by the width and height of their pictures [px]."""
+
+    @property
+    def solver(self) -> Solver:
+        """What moves it."""
+        ...
+
+    def step(self) -> None:
+        """Take the physics steps of a frame, as a graph."""
+        ...
+
+    def reset(self) -> None:
+        """Start over."""
+        ...
+
+
+def cameras_by_size(
+    model: newton.Model,
+    splats: BoundSplats,
+    cameras: Sequence[PinholeCamera],
+    *,
+    options: CameraOptions | None = None,
+    randomization: CameraRandomization | None = None,
+) -> dict[tuple[int, int], SplatCamera]:
+    """Return one :class:`softmode.splats.camera.SplatCamera` per image size; they share the splats.
+
+    Args:
+        model: The model.
+        splats: The splats of its objects.
+        cameras: What to draw.
+        options: Light and background.
+        randomization: What `randomize` of the cameras draws.
+    """
+    return {
+        size: SplatCamera(
+            model,
+            splats.arrays,
+            [camera for camera in cameras if (camera.width, camera.height) == size],
+            options=options,
+            randomization=randomization,
+        )
+        for size in sorted({(camera.width, camera.height) for camera in cameras})
+    }

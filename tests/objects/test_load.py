@@ -1,0 +1,106 @@
+"""`load`: whatever describes an object gives the same object; `Placed`: where it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import newton
+import numpy as np
+import pytest
+import trimesh
+
+from softmode.deformables import BuildOptions, Material
+from softmode.errors import ConfigError
+from softmode.objects import ObjectConfig, Placed, SoftObject, load, surface_cover
+from softmode.splats import make_plush, write_ply
+from softmode.splats.formats import read_splats
+
+SMALL = {
+    "surface_count": 60,
+    "build": BuildOptions(mode_count=1, handles="affine", kernel_count=60, cubature_count=48),
+}
+RUBBER = Material(youngs_modulus=3.0e4, density=400.0)
+
+
+@pytest.fixture(scope="module")
+def cup(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the file of a box."""
+    file = tmp_path_factory.mktemp("assets") / "cup.obj"
+    trimesh.creation.box((0.1, 0.05, 0.04)).export(file)
+    return file
+
+
+def test_a_mesh_in_memory_is_the_mesh_of_the_file(cup: Path) -> None:
+    """File, configuration and trimesh give one body and the same splats, bit by bit."""
+    options = {"size": 0.06, "splat_count": 120, **SMALL}
+    found = [load(cup, **options), load(ObjectConfig(mesh=cup), **options)]
+    found.append(load(trimesh.load_mesh(cup, process=False), **options))
+    for thing in found[1:]:
+        assert thing.body.fingerprint == found[0].body.fingerprint
+        np.testing.assert_array_equal(thing.visible_splats.means, found[0].visible_splats.means)
+    assert found[0].config == ObjectConfig(mesh=cup, **options)
+    with pytest.raises(TypeError, match="colour"):
+        load(cup, colour="red")
+
+
+def test_splats_in_memory_stand_with_z_up(tmp_path: Path) -> None:
+    """Splats that have been read are those of the file with its axis named."""
+    write_ply(tmp_path / "toy.ply", make_plush(count=500))
+    one = load(tmp_path / "toy.ply", up="+z", size=0.06, **SMALL)
+    two = load(read_splats(tmp_path / "toy.ply"), size=0.06, **SMALL)
+    assert one.body.fingerprint == two.body.fingerprint
+    np.testing.assert_array_equal(one.visible_splats.means, two.visible_splats.means)
+
+
+def test_a_body_is_covered_and_keeps_its_material(cup: Path) -> None:
+    """A body in memory takes splats on its samples; a contact radius lifts it."""
+    body = load(cup, **SMALL).body
+    thing = load(body, material=RUBBER, contact_radius=0.002)
+    assert thing.body is body and thing.material == RUBBER
+    np.testing.assert_array_equal(thing.visible_splats.means, surface_cover(body).means)
+    assert thing.height == pytest.approx(0.002 - body.surface_points[:, 2].min())
+
+
+def test_what_is_no_source_is_refused() -> None:
+    """A source of another type is named."""
+    with pytest.raises(TypeError, match="ndarray"):
+        load(np.zeros((3, 3)))  # pyright: ignore[reportArgumentType]
+
+
+def test_an_object_without_splats_says_so(cup: Path) -> None:
+    """Asking for splats that are not there is an error with a remedy; the object itself is fine."""
+    bare = replace(load(cup, **SMALL), splats=None)
+    assert Placed(object=bare).placed_splats() is None
+    with pytest.raises(ConfigError, match="no splats") as caught:
+        _ = bare.basis
+    assert caught.value.hint
+
+
+def test_a_placed_object_is_where_it_was_put(cup: Path) -> None:
+    """Particles and splats are scale R X + p, the velocity is that of every particle, the mass goes with scale^3."""
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    thing = load(cup, material=RUBBER, contact_radius=0.001, **SMALL)
+    placed = Placed(object=thing, position=(0.1, 0.2, 0.3), rotation=turn, scale=2.0, velocity=(0.0, 0.0, -1.0))
+    builder = newton.ModelBuilder()
+    assert placed.add_to(builder) == 0 and placed.add_to(builder, self_contact=True) == 1
+    expected = 2.0 * thing.body.surface_points @ turn.T + placed.position
+    model = builder.finalize(device="cpu")
+    count = thing.body.surface_count
+    particles, velocities, masses = model.particle_q, model.particle_qd, model.particle_mass
+    assert particles is not None and velocities is not None and masses is not None
+    np.testing.assert_allclose(particles.numpy()[:count], expected, atol=1e-6)
+    np.testing.assert_allclose(velocities.numpy(), np.tile((0.0, 0.0, -1.0), (2 * count, 1)))
+    assert placed.mass == pytest.approx(RUBBER.density * 8.0 * thing.body.volume)
+    assert masses.numpy()[:count].sum() == pytest.approx(placed.mass, rel=1e-5)
+    splats = placed.placed_splats()
+    assert splats is not None
+    centres = 2.0 * thing.visible_splats.means @ turn.T + placed.position
+    np.testing.assert_allclose(splats.means, centres, atol=1e-6)
+
+
+@pytest.mark.parametrize("given", [{"position": (0.0, 0.0, float("inf"))}, {"rotation": -np.eye(3)}, {"scale": 5.0}])
+def test_bad_places_are_refused(given: dict, cup: Path) -> None:
+    """A place is checked when it is made."""
+    with pytest.raises(ConfigError, match=next(iter(given))):
+        Placed(object=SoftObject(body=load(cup, **SMALL).body), **given)
