@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from newton.sensors import SensorCamera
 
-from softmode.splats.splats import Splats, quat_from_rotation
+from softmode.splats.splats import Splats, quats_from_rotations
 
 
 class NewtonCamera:
@@ -43,7 +43,7 @@ class NewtonCamera:
         self.sensor = SensorCamera(self.model, load_textures=False)
         rotation = world_to_camera[:3, :3].T
         position = -rotation @ world_to_camera[:3, 3]
-        turned = quat_from_rotation(rotation @ np.diag([1.0, -1.0, -1.0]))
+        turned = quats_from_rotations(rotation @ np.diag([1.0, -1.0, -1.0]))
         self.pose: Any = wp.array([wp.transform(position, turned)], dtype=wp.transform, device=device)
         fx, fy, cx, cy = lens
         rays = np.zeros((size, size, 1, 2, 3))

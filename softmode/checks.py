@@ -9,6 +9,9 @@ from typing import Any
 
 from softmode.errors import ConfigError, SoftmodeError
 
+SEED_MAX = 2**31 - 1
+"""Largest seed of an episode or a run."""
+
 
 def require_number(
     name: str,

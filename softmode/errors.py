@@ -60,7 +60,7 @@ class CheckpointError(SoftmodeError, ValueError):
     """A policy or checkpoint file is missing, damaged, foreign, or belongs to another environment or version."""
 
 
-class RunError(SoftmodeError, OSError):
+class RunError(StorageError):
     """The folder of a training run exists, is missing, or cannot be written."""
 
 

@@ -23,7 +23,7 @@ from scipy import sparse
 from threadpoolctl import threadpool_limits
 
 from softmode.deformables.build.cache import cache_directory
-from softmode.files import atomic_write
+from softmode.files import whole_file
 from tests.oracle import frames
 from tests.oracle.fem import Mesh, simulate
 from tests.oracle.scenes import BEND, SCENES, Scene
@@ -97,8 +97,7 @@ def _motion(name: str) -> Array:
                 return file["displacement"].astype(np.float64)
     with threadpool_limits(limits=1, user_api="blas"):
         displacement = simulate(scene, bdf2=True)[1]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as file:
+    with whole_file(path) as file:
         np.savez(file, nodes=nodes, displacement=displacement.astype(np.float32))
     return displacement
 

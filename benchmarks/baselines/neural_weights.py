@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from softmode.deformables.build.cache import cache_directory, fingerprint_of
-from softmode.files import atomic_write
+from softmode.files import whole_file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +156,7 @@ def _train(
     arrays: dict[str, Any] = {"bounds": bounds, "seconds": np.array(time.perf_counter() - start)}
     for k, layer in enumerate(layers):
         arrays[f"matrix_{k}"], arrays[f"bias_{k}"] = layer.weight.detach().numpy(), layer.bias.detach().numpy()
-    with atomic_write(path) as file:
+    with whole_file(path) as file:
         np.savez(file, **arrays)
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from softmode.errors import AssetError, ConfigError
+from softmode.checks import require_fields
+from softmode.cli.common import short_name
+from softmode.errors import ConfigError
+from softmode.files import check_place
 
 if TYPE_CHECKING:
     from softmode.deformables.body.reduced_body import ReducedBody
@@ -16,13 +18,6 @@ if TYPE_CHECKING:
     from softmode.deformables.build.report import BodyReport
     from softmode.objects.object_build import StifferBox
     from softmode.splats.splats import Splats
-
-
-def _short(name: str) -> Any:
-    """Return what gives an option a short name; evaluated when tyro reads the annotation, not on import."""
-    import tyro
-
-    return tyro.conf.arg(aliases=[name])
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,7 +66,7 @@ class _Asset:
 class BodyBuild(_Asset):
     """Build the body of a splat file, mesh or point cloud and save it with its splats."""
 
-    out: Annotated[Path | None, _short("-o")] = None
+    out: Annotated[Path | None, short_name("-o")] = None
     """Body file to write, FILE.npz beside the file if omitted; `softmode play --object`, `body show` and `body check`
     take it, and `ReducedBody.load` reads it."""
 
@@ -96,7 +91,7 @@ class BodyBuild(_Asset):
 class BodyShow(_Asset):
     """Draw a body: soft modes, skinning weights, cubature, kernels, spectra, report."""
 
-    out: Annotated[Path | None, _short("-o")] = None
+    out: Annotated[Path | None, short_name("-o")] = None
     """Picture to write, FILE.png beside the file if omitted."""
     youngs_modulus: float = 1.0e5
     """Young's modulus for the frequencies [Pa]."""
@@ -108,9 +103,7 @@ class BodyShow(_Asset):
         stem = self.file.parent.name if self.file.name == "meta.json" else self.file.stem
         out = self.out if self.out is not None else self.file.with_name(f"{stem}.png")
         _check_target(out, ".png", self.file)
-        for name in ("youngs_modulus", "density"):
-            if not 0.0 < getattr(self, name) < float("inf"):
-                raise ConfigError(f"{name} must be a finite number > 0, got {getattr(self, name)}")
+        require_fields(self, ("youngs_modulus", "density"), above=0.0)
         from softmode.cli.common import quiet_warp
         from softmode.viz.body_picture import mode_frequencies, write_body_picture
 
@@ -244,10 +237,6 @@ def _check_target(path: Path, suffix: str, source: Path) -> None:
     """Refuse a file that cannot be written, or that is the source, before any work is done."""
     if path.suffix.lower() != suffix:
         raise ConfigError(f"out {path} is no {suffix} file", hint=f"name it like toy{suffix}")
-    folder = path.absolute().parent
-    if not folder.is_dir():
-        raise AssetError(f"{path}: there is no folder {folder}", hint="make the folder first")
-    if path.is_dir() or not os.access(folder, os.W_OK):
-        raise AssetError(f"{path}: cannot be written there", hint="choose another name or folder")
+    check_place(path, "file", make_folders=False)
     if path.exists() and source.exists() and path.samefile(source):
         raise ConfigError(f"{path} is the file that is read", hint="choose another name with --out")

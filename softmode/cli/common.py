@@ -10,6 +10,13 @@ from typing import Any
 from softmode.errors import ConfigError
 
 
+def short_name(name: str) -> Any:
+    """Return what gives an option a short name; evaluated when tyro reads the annotation, not on import."""
+    import tyro
+
+    return tyro.conf.arg(aliases=[name])
+
+
 @contextlib.contextmanager
 def quiet_warp() -> Iterator[None]:
     """Start Warp and silence what it tells about every module it loads; its warnings stay."""

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from softmode.cli.common import bar_interval, quiet_warp, warp_device
+from softmode.cli.common import bar_interval, quiet_warp, short_name, warp_device
 from softmode.envs.catalogue import purpose, registered_id
 from softmode.errors import ConfigError
 from softmode.learning.players import check_policy, policy_factory, trained_policy
@@ -20,20 +20,13 @@ ROBOT = "softmode_arm"
 """Name of the robot in the dataset."""
 
 
-def _short(name: str) -> Any:
-    """Return what gives an option a short name; evaluated when tyro reads the annotation, not on import."""
-    import tyro
-
-    return tyro.conf.arg(aliases=[name])
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Record:
     """Record episodes of an environment as a LeRobot v3.0 dataset."""
 
     env: str
     """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
-    out: Annotated[Path | None, _short("-o")] = None
+    out: Annotated[Path | None, short_name("-o")] = None
     """Folder of the dataset, out/NAME if omitted; must not exist, unless --append is given."""
     policy: str = "scripted"
     """scripted, random, zero, or the checkpoint of a run."""

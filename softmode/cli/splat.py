@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from pathlib import Path
 from typing import Literal
 
-from softmode.errors import AssetError, ConfigError
+from softmode.checks import require_number
+from softmode.errors import AssetError
+from softmode.files import check_place
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -37,10 +38,9 @@ class SplatFromMesh:
         """Sample, fit, write; return the exit code."""
         out = self.out if self.out is not None else self.mesh.with_name(f"{self.mesh.stem}_splats.ply")
         _check_target(out)
-        if self.size is not None and not 0.0 < self.size < float("inf"):
-            raise ConfigError(f"size must be a finite number > 0, got {self.size}", hint="give it in metres, like 0.08")
-        if self.count < 1:
-            raise ConfigError(f"count must be at least 1, got {self.count}", hint="give a number of splats like 10000")
+        if self.size is not None:
+            require_number("size", self.size, above=0.0, hint="give it in metres, like 0.08")
+        require_number("count", self.count, at_least=1, hint="give a number of splats like 10000")
 
         from tqdm import tqdm
 
@@ -145,8 +145,4 @@ def _check_target(path: Path) -> None:
             f"splat file {path}: cannot write {path.suffix or '(no suffix)'!r}",
             hint=f"name it like toy.ply; writable are {', '.join(WRITABLE)}",
         )
-    folder = path.absolute().parent
-    if not folder.is_dir():
-        raise AssetError(f"splat file {path}: there is no folder {folder}", hint="make the folder first")
-    if path.is_dir() or not os.access(folder, os.W_OK):
-        raise AssetError(f"splat file {path}: cannot be written there", hint="choose another name or folder")
+    check_place(path, "splat file", make_folders=False)

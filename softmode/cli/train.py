@@ -7,8 +7,9 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
+from softmode.checks import require_number
 from softmode.cli.common import quiet_warp
-from softmode.errors import ConfigError, StorageError
+from softmode.errors import ConfigError
 from softmode.learning.players import require_torch
 
 
@@ -117,8 +118,7 @@ class Evaluate:
         from softmode.learning.environments import make_vector_env
         from softmode.learning.policy import evaluate, load_policy
 
-        if self.num_envs < 1:
-            raise ConfigError(f"num_envs must be at least 1, got {self.num_envs}", hint="give a count like 16")
+        require_number("num_envs", self.num_envs, at_least=1, hint="give a count like 16")
         policy = load_policy(self.policy, self.device)
         options = {**policy.env_options, **parse_env_options(self.env_options)}
         if self.obs_type is not None:
@@ -152,13 +152,7 @@ class Export:
         if self.out.exists():
             raise ConfigError(f"{self.out} exists", hint="remove it, or write another file")
         load_policy(self.checkpoint)  # refuses a file whose actor does not fit its header
-        try:
-            self.out.parent.mkdir(parents=True, exist_ok=True)
-            write_checkpoint(policy_only(read_checkpoint(self.checkpoint)), self.out)
-        except OSError as error:
-            raise StorageError(
-                f"{self.out} cannot be written ({error.strerror or error})", hint="choose another folder"
-            ) from error
+        write_checkpoint(policy_only(read_checkpoint(self.checkpoint)), self.out)
         print(f"{self.out}: {self.out.stat().st_size / 1e3:.0f} kB")
         return 0
 

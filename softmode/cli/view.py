@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from softmode import ENVIRONMENTS
+from softmode.checks import require_number
 from softmode.errors import AssetError, ConfigError
 
 if TYPE_CHECKING:
@@ -59,8 +60,8 @@ def view(options: View) -> int:
     """Serve a session until Ctrl-C; see :class:`View`."""
     from softmode.view.app import ViewApp, ViewOptions
 
-    if options.duration is not None and not 0.0 < options.duration < float("inf"):
-        raise ConfigError(f"duration must be a finite number > 0, got {options.duration}", hint="give seconds, like 60")
+    if options.duration is not None:
+        require_number("duration", options.duration, above=0.0, hint="give seconds, like 60")
     served = ViewOptions(
         host=options.host,
         port=options.port,

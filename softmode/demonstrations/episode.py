@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,11 @@ from softmode.demonstrations import schema
 from softmode.demonstrations.pictures import FilmWriter, encode_png
 from softmode.demonstrations.schema import INDEX_FEATURES, Feature
 from softmode.demonstrations.statistics import PictureStatistics, Statistics, number_statistics
-from softmode.errors import ConfigError, StorageError
+from softmode.errors import ConfigError
+from softmode.files import storage_errors
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 
 class Episode:
@@ -59,10 +63,8 @@ class Episode:
     def _film(self, name: str) -> FilmWriter:
         """Return the film of a camera."""
         if name not in self.films:
-            try:
+            with storage_errors(self._stage, hint="free some space"):
                 self._stage.mkdir(exist_ok=True)
-            except OSError as error:
-                raise StorageError(f"{self._stage} cannot be made: {error.strerror}", hint="free some space") from error
             height, width, _ = self._features[name].shape
             self.films[name] = FilmWriter(self._stage / f"{name}.mp4", height, width, self._fps)
         return self.films[name]
@@ -96,19 +98,19 @@ class Episode:
         }
         return arrays | {name: values[:, None] for name, values in filled.items()}
 
-    def table(self, arrays: Mapping[str, NDArray[Any]], form: Any) -> Any:
+    def table(self, arrays: Mapping[str, NDArray[Any]], form: pa.Schema) -> pa.Table:
         """Return the episode as a table of a schema."""
-        pa = schema.arrow()
+        arrow = schema.arrow()
         columns = []
         for field in form:
             if field.name not in arrays:
-                columns.append(pa.array(self._columns[field.name], field.type))
+                columns.append(arrow.array(self._columns[field.name], field.type))
                 continue
-            flat = pa.array(arrays[field.name].ravel())
-            if pa.types.is_fixed_size_list(field.type):
-                flat = pa.FixedSizeListArray.from_arrays(flat, type=field.type)
+            flat = arrow.array(arrays[field.name].ravel())
+            if arrow.types.is_fixed_size_list(field.type):
+                flat = arrow.FixedSizeListArray.from_arrays(flat, type=field.type)
             columns.append(flat)
-        return pa.table(columns, schema=form)
+        return arrow.table(columns, schema=form)
 
     def statistics(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Statistics]:
         """Return the statistics of every feature."""
@@ -118,7 +120,7 @@ class Episode:
         }
 
 
-def _checked(name: str, value: Any, kind: Feature) -> NDArray[Any]:
+def _checked(name: str, value: object, kind: Feature) -> NDArray[Any]:
     """Return a value of a frame as an array of its feature's shape and type."""
     try:
         array = np.asarray(value)

@@ -11,7 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.errors import AssetError, MissingExtraError, StorageError
+from softmode.errors import AssetError, MissingExtraError
+from softmode.files import storage_errors
+
+_SPACE = "free some space"
 
 
 def encode_png(picture: NDArray[np.uint8]) -> bytes:
@@ -97,10 +100,11 @@ class FilmWriter:
         Raises:
             StorageError: If the encoder stopped, as it does when the disk is full.
         """
-        try:
-            self._sink.send(np.ascontiguousarray(picture))
-        except (OSError, StopIteration) as error:
-            raise StorageError(f"film {self.path} cannot be written: {error}", hint="free some space") from error
+        with storage_errors(f"film {self.path}", hint=_SPACE):
+            try:
+                self._sink.send(np.ascontiguousarray(picture))
+            except StopIteration as error:
+                raise OSError("the encoder stopped") from error
         self._count += 1
 
     def close(self) -> None:
@@ -109,13 +113,14 @@ class FilmWriter:
         Raises:
             StorageError: If it does not hold every picture.
         """
-        try:
-            self._sink.close()
-            count, _ = ffmpeg().count_frames_and_secs(str(self.path))
-        except (OSError, RuntimeError) as error:
-            raise StorageError(f"film {self.path} cannot be written: {error}", hint="free some space") from error
-        if count != self._count:
-            raise StorageError(f"film {self.path} holds {count} of {self._count} pictures", hint="free some space")
+        with storage_errors(f"film {self.path}", hint=_SPACE):
+            try:
+                self._sink.close()
+                count, _ = ffmpeg().count_frames_and_secs(str(self.path))
+            except RuntimeError as error:
+                raise OSError(str(error)) from error
+            if count != self._count:
+                raise OSError(f"it holds {count} of {self._count} pictures")
 
     def abort(self) -> None:
         """Stop the encoder; whatever it wrote is of no use."""

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 
+from softmode.checks import SEED_MAX, require_number
 from softmode.demonstrations.schema import Feature
 from softmode.demonstrations.writer import DatasetWriter
 from softmode.errors import ConfigError
@@ -124,12 +125,9 @@ def observation_columns(observation: Any, features: Mapping[str, Feature]) -> di
 
 def check_recording(episodes: int, seed: int, noise: float) -> None:
     """Raise ConfigError if a number of :func:`record_episodes` is out of range."""
-    if episodes < 1:
-        raise ConfigError(f"episodes must be at least 1, got {episodes}", hint="give a count like 100")
-    if not 0 <= seed < 1 << 31:
-        raise ConfigError(f"seed must lie in 0..2^31-1, got {seed}", hint="give a whole number like 0")
-    if not 0.0 <= noise <= 1.0:
-        raise ConfigError(f"noise must lie in 0..1, got {noise}", hint="give a part of the action range, like 0.1")
+    require_number("episodes", episodes, at_least=1, hint="give a count like 100")
+    require_number("seed", seed, at_least=0, at_most=SEED_MAX, hint="give a whole number like 0")
+    require_number("noise", noise, at_least=0.0, at_most=1.0, hint="give a part of the action range, like 0.1")
 
 
 def record_episodes(

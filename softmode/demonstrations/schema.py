@@ -122,7 +122,7 @@ def feature_to_json(feature: Feature, fps: int) -> dict[str, Any]:
     return entry
 
 
-def feature_from_json(entry: Any) -> Feature:
+def feature_from_json(entry: Mapping[str, Any]) -> Feature:
     """Return the feature that info.json describes; raises ConfigError, KeyError or TypeError if it describes none."""
     names = entry["names"]
     return Feature(

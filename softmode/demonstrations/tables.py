@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,7 +30,7 @@ def write_table(path: Path, tables: Sequence[Any]) -> Path:
     return path
 
 
-def write_json(path: Path, content: Any) -> Path:
+def write_json(path: Path, content: Mapping[str, Any]) -> Path:
     """Write a JSON file."""
     path.write_text(json.dumps(content, indent=4, ensure_ascii=False, allow_nan=False), encoding="utf-8")
     return path
@@ -40,9 +39,3 @@ def write_json(path: Path, content: Any) -> Path:
 def listed(statistics: Mapping[str, Statistics]) -> dict[str, dict[str, Any]]:
     """Return statistics as lists."""
     return {name: {key: value.tolist() for key, value in values.items()} for name, values in statistics.items()}
-
-
-def sync(path: Path) -> None:
-    """Make sure that a file's bytes are on the disk before it is renamed."""
-    with path.open("rb") as file:
-        os.fsync(file.fileno())

@@ -16,8 +16,9 @@ from softmode.demonstrations.episode import Episode
 from softmode.demonstrations.metadata import Metadata, read_metadata
 from softmode.demonstrations.schema import INDEX_FEATURES, Feature
 from softmode.demonstrations.statistics import Statistics, combine
-from softmode.demonstrations.tables import listed, rows_table, sync, tasks_table, write_json, write_table
-from softmode.errors import ConfigError, StorageError
+from softmode.demonstrations.tables import listed, rows_table, tasks_table, write_json, write_table
+from softmode.errors import ConfigError
+from softmode.files import storage_errors, sync
 
 STAGE = ".recording"
 """Folder inside a dataset where files of an unfinished episode are written."""
@@ -91,24 +92,18 @@ class DatasetWriter:
         self._films_done = -1  # number of the last film
         self._root, self._is_new, self._lock = self.folder, False, None
         self._made: list[Path] = []
-        self._episode: Any = None
+        self._episode: Episode
         try:
-            exists = self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir()))
-            if exists and not append:
-                raise ConfigError(f"{self.folder} exists", hint="choose another folder, or append to it")
-            if not exists:
-                self._make_root()
-            self._take_lock()
-            if exists:
-                self._continue()
-            shutil.rmtree(self._root / STAGE, ignore_errors=True)
-        except OSError as error:
-            if isinstance(error, StorageError):
-                raise
-            self.close()
-            raise StorageError(
-                f"dataset {self.folder} cannot be written: {error.strerror or error}", hint="choose another folder"
-            ) from error
+            with storage_errors(f"dataset {self.folder}", hint="choose another folder"):
+                exists = self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir()))
+                if exists and not append:
+                    raise ConfigError(f"{self.folder} exists", hint="choose another folder, or append to it")
+                if not exists:
+                    self._make_root()
+                self._take_lock()
+                if exists:
+                    self._continue()
+                shutil.rmtree(self._root / STAGE, ignore_errors=True)
         except BaseException:
             self.close()
             raise
@@ -234,17 +229,10 @@ class DatasetWriter:
             raise ConfigError("the episode has no frames", hint="add some before saving it")
         if not isinstance(task, str) or not task.strip():
             raise ConfigError(f"the task is {task!r}", hint="describe it in words")
+        what = f"another episode of dataset {self.folder}, whose {self._episode_count} are complete,"
         try:
-            self._save(task)
-        except OSError as error:
-            self.discard_episode()
-            if isinstance(error, StorageError):
-                raise
-            raise StorageError(
-                f"dataset {self.folder} cannot take another episode: {error.strerror or error}; its "
-                f"{self._episode_count} episodes are complete",
-                hint="free some space and append",
-            ) from error
+            with storage_errors(what, hint="free some space and append"):
+                self._save(task)
         except BaseException:
             self.discard_episode()
             raise

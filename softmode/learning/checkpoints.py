@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import io
-import json
-import math
 import os
-import zipfile
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,14 +11,12 @@ from numpy.typing import NDArray
 
 from softmode import __version__
 from softmode.errors import CheckpointError, ConfigError
-from softmode.files import atomic_write
+from softmode.files import read_archive, write_archive
 from softmode.learning.hyperparameters import Hyperparameters
 from softmode.learning.spaces import Interface
 
 FORMAT = "softmode.Checkpoint"
 FORMAT_VERSION = 1
-MAX_HEADER = 1 << 20
-"""Largest header that is read [bytes]."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -53,8 +46,12 @@ class Checkpoint:
 def write_checkpoint(checkpoint: Checkpoint, path: str | os.PathLike[str]) -> None:
     """Write a checkpoint; the file appears complete or not at all.
 
+    Args:
+        checkpoint: What to write.
+        path: The file.
+
     Raises:
-        OSError: If it cannot be written; what was there before stays.
+        StorageError: If it cannot be written; what was there before stays.
     """
     header = {
         "format": FORMAT,
@@ -68,12 +65,7 @@ def write_checkpoint(checkpoint: Checkpoint, path: str | os.PathLike[str]) -> No
         "progress": checkpoint.progress,
         "arrays": sorted(checkpoint.arrays),
     }
-    arrays = dict(checkpoint.arrays)
-    arrays["header"] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **arrays)
-    with atomic_write(path) as file:
-        file.write(buffer.getbuffer())
+    write_archive(path, header, checkpoint.arrays, "checkpoint")
 
 
 def policy_only(checkpoint: Checkpoint) -> Checkpoint:
@@ -89,28 +81,7 @@ def read_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
         CheckpointError: If the file is missing, damaged, foreign, or of another version.
     """
     hint = "give the policy.npz, best.npz or latest.npz of a run of this version of softmode"
-    try:
-        stored = _read_arrays(Path(path))
-        header = json.loads(stored.pop("header").tobytes().decode())
-    except FileNotFoundError as error:
-        raise CheckpointError(f"checkpoint {path} does not exist", hint=hint) from error
-    except OSError as error:
-        raise CheckpointError(f"checkpoint {path} cannot be read ({error.strerror or error})", hint=hint) from error
-    except KeyError as error:
-        raise CheckpointError(f"{path} is no checkpoint of softmode: it has no header", hint=hint) from error
-    except RecursionError as error:
-        raise CheckpointError(f"{path} is no checkpoint of softmode: its header is nested", hint=hint) from error
-    except Exception as error:  # errors of a damaged archive have no common base
-        raise CheckpointError(
-            f"checkpoint {path} is damaged or no .npz file ({type(error).__name__}: {error})", hint=hint
-        ) from error
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise CheckpointError(f"{path} is no checkpoint of softmode", hint=hint)
-    if header.get("version") != FORMAT_VERSION:
-        raise CheckpointError(
-            f"checkpoint {path} has format version {header.get('version')}, this softmode reads {FORMAT_VERSION}",
-            hint="train again, or use the version of softmode that wrote it: " + str(header.get("softmode")),
-        )
+    header, stored = read_archive(path, FORMAT, FORMAT_VERSION, what="checkpoint", hint=hint, error=CheckpointError)
     try:
         if header["arrays"] != sorted(stored):
             raise ValueError("arrays are missing or were added")
@@ -133,7 +104,7 @@ def read_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
             arrays=stored,
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, ConfigError) as error:
-        raise CheckpointError(f"checkpoint {path} is damaged ({error})", hint=hint) from error
+        raise CheckpointError(f"checkpoint {path}: damaged ({error})", hint=hint) from error
 
 
 def same_env(one: str, other: str) -> bool:
@@ -160,32 +131,3 @@ def check_env(checkpoint: Checkpoint, path: object, env: str | None, interface: 
 def _describe(interface: Interface) -> str:
     seen = {**interface.vectors, **interface.pictures}
     return f"observation {seen}, action {interface.action_size} in {interface.action_low} to {interface.action_high}"
-
-
-def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an uncompressed .npz file; nothing larger than the file is ever allocated."""
-    arrays: dict[str, NDArray[Any]] = {}
-    with zipfile.ZipFile(path) as archive:
-        for member in archive.infolist():
-            if member.compress_type != zipfile.ZIP_STORED or member.file_size != member.compress_size:
-                raise ValueError(f"{member.filename} is compressed")
-            name = member.filename.removesuffix(".npy")
-            if name == "header" and member.file_size > MAX_HEADER:
-                raise ValueError("the header is too large")
-            if name in arrays:
-                raise ValueError(f"{name} is there twice")
-            arrays[name] = _parse_array(archive.read(member), name)
-    return arrays
-
-
-def _parse_array(content: bytes, name: str) -> NDArray[Any]:
-    """Return the array in the bytes of a .npy file of numbers."""
-    stream = io.BytesIO(content)
-    if np.lib.format.read_magic(stream) != (1, 0):
-        raise ValueError(f"{name} has another version of the .npy format")
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
-    if fortran or dtype.kind not in "fiu" or dtype.hasobject:
-        raise ValueError(f"{name} holds no plain numbers")
-    if any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize != len(content) - stream.tell():
-        raise ValueError(f"{name} has another size than its shape says")
-    return np.frombuffer(content, dtype, offset=stream.tell()).reshape(shape).copy()

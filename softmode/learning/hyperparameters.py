@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import typing
 from typing import Any, Literal
 
+from softmode.checks import require_fields, require_number
 from softmode.errors import ConfigError
 
 
@@ -84,18 +84,14 @@ class Hyperparameters:
         for name in ("rollout_steps", "epochs", "minibatches", "features"):
             _require(name, getattr(self, name), _is_count(getattr(self, name)), "a whole number >= 1")
         _require("critic_warmup", self.critic_warmup, self.critic_warmup == 0 or _is_count(self.critic_warmup), ">= 0")
-        for name in ("discount", "gae_lambda"):
-            _require(
-                name, getattr(self, name), _number(getattr(self, name)) and 0 <= getattr(self, name) <= 1, "0 to 1"
-            )
+        require_fields(self, ("discount", "gae_lambda"), at_least=0.0, at_most=1.0, hint="change it")
         positive = ("learning_rate", "desired_kl", "max_learning_rate", "clip", "max_gradient_norm", "initial_std")
-        for name in (*positive, "min_std", "max_std"):
-            _require(name, getattr(self, name), _number(getattr(self, name)) and getattr(self, name) > 0, "> 0")
+        require_fields(self, (*positive, "min_std", "max_std"), above=0.0, hint="change it")
         coefficients = ("value", "entropy", "bound", "state_prediction", "teacher")
-        for name in (f"{word}_coefficient" for word in coefficients):
-            _require(name, getattr(self, name), _number(getattr(self, name)) and getattr(self, name) >= 0, ">= 0")
-        ok = self.clip_value is None or (_number(self.clip_value) and self.clip_value > 0)
-        _require("clip_value", self.clip_value, ok, "> 0 or none")
+        names = (f"{word}_coefficient" for word in coefficients)
+        require_fields(self, names, at_least=0.0, hint="change it")
+        if self.clip_value is not None:
+            require_number("clip_value", self.clip_value, above=0.0, hint="give a number, or none")
         ok = self.min_std <= self.initial_std <= self.max_std
         _require("initial_std", self.initial_std, ok, f"from min_std {self.min_std} to max_std {self.max_std}")
         _require("hidden", self.hidden, all(_is_count(width) for width in self.hidden), "widths >= 1")
@@ -158,14 +154,10 @@ def preset(num_envs: int, *, pixels: bool = False) -> Hyperparameters:
     return base
 
 
-def _is_count(value: Any) -> bool:
+def _is_count(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value >= 1
 
 
-def _number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _require(name: str, value: Any, ok: bool, expected: str) -> None:
+def _require(name: str, value: object, ok: bool, expected: str) -> None:
     if not ok:
         raise ConfigError(f"{name} must be {expected}, got {value!r}", hint=f"change {name}")

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import io
-
 import numpy as np
 import torch
 
 from softmode.errors import TrainingDiverged
+from softmode.files import whole_file
 from softmode.learning.rollout import Rollout
 from softmode.learning.run_folder import RunFolder
 
@@ -64,10 +63,9 @@ class NanGuard:
             content[name] = joined[start:].cpu().numpy()
         content["world"] = chosen.cpu().numpy()
         content["first_bad"] = first[:MAX_WORLDS].cpu().numpy() + offset
-        buffer = io.BytesIO()
-        np.savez(buffer, **content)  # type: ignore[arg-type]
         name = f"nonfinite-{iteration:06d}-rank{rank}.npz"
-        folder.write(name, buffer.getvalue())
+        with folder.writing(name), whole_file(folder.path / name) as file:
+            np.savez(file, allow_pickle=False, **content)
         listed = ", ".join(str(world) for world in chosen.tolist())
         more = "" if len(worlds) <= MAX_WORLDS else f" and {len(worlds) - MAX_WORLDS} more"
         return TrainingDiverged(

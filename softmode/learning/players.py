@@ -4,9 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from softmode.errors import CheckpointError, ConfigError, MissingExtraError
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+
+    from softmode.learning.policy import Policy
+
+Player = Callable[[Any], Any]
+"""Turns an observation into an action."""
 
 POLICIES = ("scripted", "random", "zero")
 """Policies that need no file."""
@@ -20,7 +28,7 @@ def check_policy(name: str) -> None:
         )
 
 
-def trained_policy(name: str, env: str) -> Any:
+def trained_policy(name: str, env: str) -> Policy | None:
     """Return the policy in a checkpoint, or None for a policy that needs no file.
 
     Args:
@@ -34,7 +42,7 @@ def trained_policy(name: str, env: str) -> Any:
     return None if name in POLICIES else policy_file(name, env)
 
 
-def policy_factory(name: str, env: Any, trained: Any = None) -> Callable[[int], Callable[[Any], Any]]:
+def policy_factory(name: str, env: gym.Env, trained: Policy | None = None) -> Callable[[int], Player]:
     """Return what makes a policy for each episode.
 
     Args:
@@ -57,23 +65,22 @@ def policy_factory(name: str, env: Any, trained: Any = None) -> Callable[[int], 
         return lambda seed: scripted_policy(env)
     if name == "random":
 
-        def random(seed: int) -> Callable[[Any], Any]:
+        def random(seed: int) -> Player:
             env.action_space.seed(seed)
             return lambda observation: env.action_space.sample()
 
         return random
     if name == "zero":
-        zero = env.action_space.low * 0
+        zero = env.action_space.low * 0  # type: ignore[attr-defined]
         return lambda seed: lambda observation: zero.copy()
-    if trained is None:
-        from softmode.learning.policy import load_policy
+    from softmode.learning.policy import load_policy
 
-        trained = load_policy(name)
-    trained.check(env)
-    return lambda seed: trained
+    player = load_policy(name) if trained is None else trained
+    player.check(env)
+    return lambda seed: player
 
 
-def policy_file(path: str, env: str) -> Any:
+def policy_file(path: str, env: str) -> Policy:
     """Return the policy in a checkpoint of an environment.
 
     Raises:

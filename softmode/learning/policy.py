@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from softmode.checks import require_number
 from softmode.errors import CheckpointError, ConfigError, MissingExtraError
 
 try:
@@ -61,7 +62,7 @@ class Policy:
         """Return the environment of the policy, with the options it was trained with and further ones."""
         return gym.make(self.env, **with_config(self.env, {**self.env_options, **options}))
 
-    def check(self, env: Any) -> None:
+    def check(self, env: gym.Env | gym.vector.VectorEnv) -> None:
         """Refuse an environment other than the policy's.
 
         Raises:
@@ -193,8 +194,7 @@ def evaluate(
     Raises:
         ConfigError: If ``episodes`` is not at least 1 or the worlds do not reset themselves.
     """
-    if episodes < 1:
-        raise ConfigError(f"episodes must be at least 1, got {episodes}", hint="give a count like 200")
+    require_number("episodes", episodes, at_least=1, hint="give a count like 200")
     if isinstance(env, gym.vector.VectorEnv):
         return _evaluate_vector(env, policy, episodes, seed, torch.device(device))
     returns, lengths, successes = [], [], []

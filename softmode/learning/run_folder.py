@@ -8,11 +8,12 @@ import json
 import os
 import re
 import time
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 from softmode.errors import MissingExtraError, RunError
-from softmode.files import atomic_write
+from softmode.files import storage_errors, whole_file
 
 CONFIG, PROGRESS, LATEST, BEST = "config.json", "progress.csv", "latest.npz", "best.npz"
 """Names of the files of a run."""
@@ -44,16 +45,10 @@ class RunFolder:
                     hint="give the folder of a run, or drop --resume to start one",
                 )
             return
-        try:
+        if path.exists():
+            raise RunError(f"run folder {path} exists", hint="choose another one, or go on with its run: --resume")
+        with storage_errors(f"run folder {path}", hint="choose another folder", error=RunError):
             path.mkdir(parents=True)
-        except FileExistsError as error:
-            raise RunError(
-                f"run folder {path} exists", hint="choose another one, or go on with its run: --resume"
-            ) from error
-        except OSError as error:
-            raise RunError(
-                f"run folder {path} cannot be made ({error.strerror or error})", hint="choose another folder"
-            ) from error
 
     @staticmethod
     def name_for(root: Path, env: str, name: str | None) -> Path:
@@ -89,18 +84,13 @@ class RunFolder:
         Raises:
             RunError: If it cannot be written; what was there before stays.
         """
-        try:
-            with atomic_write(self.path / name) as file:
-                file.write(content)
-        except OSError as error:
-            raise self.cannot_write(name, error) from error
+        with self.writing(name), whole_file(self.path / name, make_folders=False) as file:
+            file.write(content)
 
-    def cannot_write(self, name: str, error: OSError) -> RunError:
-        """Return the error of a file that could not be written."""
-        return RunError(
-            f"{self.path / name} cannot be written ({error.strerror or error})",
-            hint=f"earlier checkpoints are intact: free some space and go on with --run-dir {self.path} --resume",
-        )
+    def writing(self, name: str) -> AbstractContextManager[None]:
+        """Return the context in which a file of the run is written; what cannot be written raises RunError there."""
+        hint = f"earlier checkpoints are intact: free some space and go on with --run-dir {self.path} --resume"
+        return storage_errors(self.path / name, hint=hint, error=RunError)
 
     def forget_after(self, iteration: int) -> None:
         """Drop rows of the table behind the checkpoint that the run goes on from."""
@@ -124,7 +114,7 @@ class RunFolder:
         Raises:
             RunError: If it cannot be written.
         """
-        try:
+        with self.writing(PROGRESS):
             if self._columns is None:
                 self._columns = list(row)
                 (self.path / PROGRESS).write_text(",".join(self._columns) + "\n")
@@ -132,15 +122,11 @@ class RunFolder:
             texts = ("" if cell is None else f"{cell:.6g}" if isinstance(cell, float) else str(cell) for cell in cells)
             with (self.path / PROGRESS).open("a") as file:
                 file.write(",".join(texts) + "\n")
-        except OSError as error:
-            raise self.cannot_write(PROGRESS, error) from error
         if self._writer is not None:
-            try:
+            with self.writing("tensorboard"):
                 for name, value in row.items():
                     if value is not None and name not in ("iteration", "env_steps"):
                         self._writer.add_scalar(name, value, row["env_steps"])
-            except OSError as error:
-                raise self.cannot_write("tensorboard", error) from error
 
     def start_tensorboard(self, purge_after: int | None) -> None:
         """Write scalars for TensorBoard too.

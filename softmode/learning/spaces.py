@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -38,7 +39,7 @@ class Interface:
         return dataclasses.asdict(self)
 
     @classmethod
-    def from_json(cls, values: Any) -> Interface:
+    def from_json(cls, values: Mapping[str, Any]) -> Interface:
         """Return the interface that :meth:`to_json` wrote.
 
         Raises:
@@ -58,7 +59,7 @@ class Interface:
         return interface
 
     @classmethod
-    def of(cls, env: Any) -> Interface:
+    def of(cls, env: gym.Env | gym.vector.VectorEnv) -> Interface:
         """Return the interface of an environment or a vector environment.
 
         Raises:
@@ -87,7 +88,7 @@ class Interface:
         return cls(vectors=vectors, pictures=pictures, action_low=low, action_high=high)
 
 
-def _length(value: Any) -> int:
+def _length(value: object) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value < 2**31:
         raise ValueError(f"length {value!r}")
     return value

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from softmode.checks import SEED_MAX, require_number
 from softmode.errors import ConfigError
 from softmode.learning.hyperparameters import Hyperparameters, preset
 
@@ -65,18 +65,14 @@ class TrainOptions:
 
     def __post_init__(self) -> None:
         """Check every range."""
-        if self.num_envs < 1:
-            raise ConfigError(f"num_envs must be at least 1, got {self.num_envs}", hint="give a count like 16")
-        if not 0 <= self.seed < 2**31:
-            raise ConfigError(f"seed must lie in 0..2^31-1, got {self.seed}", hint="give a whole number like 0")
-        if self.total_steps is not None and self.total_steps < 1:
-            raise ConfigError(f"total_steps must be at least 1, got {self.total_steps}", hint="give a count like 1e6")
-        if self.time_limit is not None and not 0.0 < self.time_limit < math.inf:
-            raise ConfigError(f"time_limit must be > 0 s, got {self.time_limit}", hint="give seconds like 300")
-        if self.eval_episodes < 0:
-            raise ConfigError(f"eval_episodes must be at least 0, got {self.eval_episodes}", hint="0 evaluates nothing")
-        if not self.checkpoint_seconds >= 0.0:
-            raise ConfigError(f"checkpoint_seconds must be >= 0, got {self.checkpoint_seconds}", hint="give seconds")
+        require_number("num_envs", self.num_envs, at_least=1, hint="give a count like 16")
+        require_number("seed", self.seed, at_least=0, at_most=SEED_MAX, hint="give a whole number like 0")
+        if self.total_steps is not None:
+            require_number("total_steps", self.total_steps, at_least=1, hint="give a count like 1e6")
+        if self.time_limit is not None:
+            require_number("time_limit", self.time_limit, above=0.0, unit="s", hint="give seconds like 300")
+        require_number("eval_episodes", self.eval_episodes, at_least=0, hint="0 evaluates nothing")
+        require_number("checkpoint_seconds", self.checkpoint_seconds, at_least=0.0, unit="s", hint="give seconds")
         if self.resume and self.run_dir is None:
             raise ConfigError("resume needs the folder of the run", hint="name it with --run-dir")
         if self.resume and self.init is not None:

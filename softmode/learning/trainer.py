@@ -376,10 +376,8 @@ class _Run:
             },
             arrays=arrays,
         )
-        try:
+        with self.folder.writing(name):
             write_checkpoint(checkpoint, self.folder.path / name)
-        except OSError as error:
-            raise self.folder.cannot_write(name, error) from error
 
     def finish(self) -> TrainResult:
         """Evaluate the last policy on the first rank."""

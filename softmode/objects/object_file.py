@@ -8,7 +8,6 @@ from typing import Literal
 
 import numpy as np
 
-from softmode.deformables.body.file import read_beside, write_body
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.errors import AssetError
 from softmode.objects.soft_object import SoftObject
@@ -31,7 +30,7 @@ def write_object(path: str | os.PathLike[str], body: ReducedBody, splats: Splats
         splats: Its splats in the body frame; None writes the body alone, as `ReducedBody.save` does.
     """
     fields = {} if splats is None else {f"splats.{name}": getattr(splats, name) for name in _FIELDS}
-    write_body(body, path, beside=fields)
+    body.save(path, beside=fields)
 
 
 def read_object(path: str | os.PathLike[str]) -> SoftObject:
@@ -47,8 +46,7 @@ def read_object(path: str | os.PathLike[str]) -> SoftObject:
         from softmode.objects.stage_asset import read_usd_body
 
         return read_usd_body(path)
-    body = ReducedBody.load(path)
-    stored = read_beside(path, "splats.")
+    body, stored = ReducedBody.load_with(path)
     if not stored:
         return SoftObject(body=body)
     missing = {f"splats.{name}" for name in _FIELDS} ^ set(stored)

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.deformables.body.file import body_fields, body_from_fields
-from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.body.reduced_body import FORMAT, FORMAT_VERSION, ReducedBody
 from softmode.errors import AssetError
 from softmode.stages import tokens
 
@@ -39,7 +38,7 @@ def content_digest(header: str, arrays: Mapping[str, NDArray]) -> str:
 
 def encode_body(body: ReducedBody) -> tuple[str, dict[str, NDArray], str]:
     """Return the header, the arrays by field, flat in C order, and the digest of both."""
-    fields, arrays = body_fields(body)
+    fields, arrays = body.fields()
     fields["arrays"] = {name: [array.dtype.str, list(array.shape)] for name, array in arrays.items()}
     flat = {name: np.ascontiguousarray(array).reshape(-1) for name, array in arrays.items()}
     zeros = {name: np.flatnonzero((array == 0.0) & np.signbit(array)).tolist() for name, array in flat.items()}
@@ -84,7 +83,9 @@ def decode_body(header: str, arrays: Mapping[str, NDArray], digest: str, source:
         shaped[name] = flat[name].reshape(shape).copy()
     if set(flat) != set(described):
         raise AssetError(f"{source}: its softmode body has arrays that its header does not name", hint=_HINT)
-    return body_from_fields(ReducedBody, fields, shaped, source, hint=_HINT)
+    if (fields.pop("format", None), fields.pop("version", None)) != (FORMAT, FORMAT_VERSION):
+        raise AssetError(f"{source}: its softmode body is of another version", hint=_HINT)
+    return ReducedBody.from_fields(fields, shaped, source, hint=_HINT)
 
 
 def body_of(attributes: Mapping[str, Any], source: str) -> ReducedBody:

@@ -9,8 +9,11 @@ import functools
 import warp as wp
 
 from softmode.splats.blend_cpu_kernels import (
+    ALPHA_MAX_TEXT,
+    COLUMN,
     LANES,
     PATIENCE,
+    ROW,
     _in_lanes,
     add_weighted,
     has_light,
@@ -21,13 +24,12 @@ from softmode.splats.blend_cpu_kernels import (
     tile_mat,
     vec16,
 )
+from softmode.splats.blend_cpu_kernels import TILE_THREADS as TILE_THREADS
 from softmode.splats.lane_ops import highest_bit, lowest_bit
 from softmode.splats.rasterizer_kernels import TILE, Frame
 
 wp.set_module_options({"enable_backward": False})
 
-TILE_THREADS = 1
-"""Threads of a tile."""
 NEVER = wp.constant(1.0e30)
 
 
@@ -63,7 +65,9 @@ def add_depth(total_in: vec16, far_in: vec16, seen_in: vec16, depth: float) -> v
     ...
 
 
-@wp.func_native(_in_lanes("weight alpha difference", "result = alpha < 0.99f ? weight * difference : (lanes)0.0f;"))
+@wp.func_native(
+    _in_lanes("weight alpha difference", f"result = alpha < {ALPHA_MAX_TEXT} ? weight * difference : (lanes)0.0f;")
+)
 def by_log_alpha(weight_in: vec16, alpha_in: vec16, difference_in: vec16) -> vec16:
     """Return the loss by the logarithm of alpha, zero where alpha is cut."""
     ...
@@ -81,17 +85,13 @@ def add_product(total_in: vec16, x_in: vec16, y_in: vec16) -> vec16:
     ...
 
 
-_ROW = "const lanes row = {0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1};"
-_COLUMN = "const lanes column = {0, 1, 2, 3, 4, 5, 6, 7, 0, 1, 2, 3, 4, 5, 6, 7};"
-
-
-@wp.func_native(_in_lanes("", f"{_ROW} result = row - v;"))
+@wp.func_native(_in_lanes("", f"{ROW} result = row - v;"))
 def offset_y(v: float) -> vec16:
     """Return dy = y - v."""
     ...
 
 
-@wp.func_native(_in_lanes("dy", f"{_COLUMN} result = (column - u) - tilt * dy;"))
+@wp.func_native(_in_lanes("dy", f"{COLUMN} result = (column - u) - tilt * dy;"))
 def offset_x(dy_in: vec16, u: float, tilt: float) -> vec16:
     """Return dx = x - u - tilt dy."""
     ...

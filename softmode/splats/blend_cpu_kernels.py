@@ -11,7 +11,7 @@ import math
 import warp as wp
 
 from softmode.splats.lane_ops import lowest_bit
-from softmode.splats.rasterizer_kernels import TILE, Frame
+from softmode.splats.rasterizer_kernels import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN, Frame
 
 wp.set_module_options({"enable_backward": False})
 
@@ -29,7 +29,12 @@ vec5 = wp.types.vector(length=5, dtype=float)
 tile_mat = wp.types.matrix(shape=(PAIRS, LANES), dtype=float)
 
 LOG2_E = wp.constant(1.0 / math.log(2.0))
-LOG2_255 = wp.constant(math.log2(255.0))
+LOG2_255 = wp.constant(-math.log2(ALPHA_MIN))
+
+# The numbers of the vector expressions.
+ALPHA_MAX_TEXT, TRANSMITTANCE_MIN_TEXT = f"{ALPHA_MAX}f", f"{TRANSMITTANCE_MIN}f"
+COLUMN = f"const lanes column = {{{', '.join(str(lane % TILE) for lane in range(LANES))}}};"
+ROW = f"const lanes row = {{{', '.join(str(lane // TILE) for lane in range(LANES))}}};"
 
 
 def _in_lanes(arguments: str, expression: str) -> str:
@@ -52,9 +57,9 @@ def _in_lanes(arguments: str, expression: str) -> str:
 @wp.func_native(
     _in_lanes(
         "light",
-        """
-    const lanes column = {0, 1, 2, 3, 4, 5, 6, 7, 0, 1, 2, 3, 4, 5, 6, 7};
-    const lanes row = {0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1};
+        f"""
+    {COLUMN}
+    {ROW}
     lanes dy = row - v;
     lanes dx = (column - u) - tilt * dy;
     lanes power = peak - (a * dx) * dx - (b * dy) * dy;
@@ -70,8 +75,8 @@ def _in_lanes(arguments: str, expression: str) -> str:
     p = p * f + 6.9314718e-1f;
     p = p * f + 1.0f;
     lanes alpha = (lanes)((words)p + ((words)shifted << 23));
-    alpha = __builtin_elementwise_min(alpha, (lanes)0.99f);
-    result = ((power >= -7.9943534f) & (light > 0.0f)) ? alpha : (lanes)0.0f;
+    alpha = __builtin_elementwise_min(alpha, (lanes){ALPHA_MAX_TEXT});
+    result = ((power >= -{LOG2_255:.8g}f) & (light > 0.0f)) ? alpha : (lanes)0.0f;
 """,
     )
 )
@@ -80,7 +85,11 @@ def splat_alpha(light_in: vec16, u: float, v: float, tilt: float, a: float, b: f
     ...
 
 
-@wp.func_native(_in_lanes("light alpha", "result = light - alpha * light < 1.0e-4f ? (lanes)0.0f : alpha * light;"))
+@wp.func_native(
+    _in_lanes(
+        "light alpha", f"result = light - alpha * light < {TRANSMITTANCE_MIN_TEXT} ? (lanes)0.0f : alpha * light;"
+    )
+)
 def splat_weight(light_in: vec16, alpha_in: vec16) -> vec16:
     """Return alpha T, zero where the splat would take more than the last of the light."""
     ...
@@ -89,9 +98,9 @@ def splat_weight(light_in: vec16, alpha_in: vec16) -> vec16:
 @wp.func_native(
     _in_lanes(
         "light alpha",
-        """
+        f"""
     lanes after = light - alpha * light;
-    result = ((after < 1.0e-4f) & (light > 0.0f)) ? -light : after;
+    result = ((after < {TRANSMITTANCE_MIN_TEXT}) & (light > 0.0f)) ? -light : after;
 """,
     )
 )

@@ -23,7 +23,7 @@ from softmode.splats.lane_ops import (
     stage_put,
     sync_lanes,
 )
-from softmode.splats.rasterizer_kernels import ALPHA_MAX, TILE, TRANSMITTANCE_MIN, Frame
+from softmode.splats.rasterizer_kernels import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN, Frame
 
 wp.set_module_options({"enable_backward": False})
 
@@ -37,7 +37,7 @@ TILE_THREADS = 32 * PARTS
 BLOCK_DIM = 32 * BLOCK_WARPS
 """Block size of the launch."""
 LOG2_E = wp.constant(1.0 / math.log(2.0))
-LOG2_ALPHA_MIN = wp.constant(-math.log2(255.0))
+LOG2_ALPHA_MIN = wp.constant(math.log2(ALPHA_MIN))
 FINISHED = wp.constant(1.0e30)
 
 

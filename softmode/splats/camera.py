@@ -13,6 +13,7 @@ from typing import Any, Literal, get_args
 import newton
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from softmode.errors import ConfigError
 from softmode.splats import camera_kernels as kernels
@@ -105,7 +106,7 @@ class SplatCamera:
         """Allocate images and build the mesh sensor."""
         self.model, self.splats, self.cameras = model, splats, tuple(cameras)
         self.options = options if options is not None else CameraOptions()
-        self.device: Any = model.device
+        self.device = model.device
         self.world_count = worlds = max(int(model.world_count), 1)
         sizes = {(camera.width, camera.height) for camera in self.cameras}
         if len(sizes) != 1 or len({camera.name for camera in self.cameras}) != len(self.cameras):
@@ -252,14 +253,13 @@ class SplatCamera:
         """
         return self._part(self.views.world_to_camera, name)
 
-    def _part(self, array: wp.array, name: str) -> wp.array:
+    def _part(self, array: wp.array, name: str) -> Any:
         """Return the views of one camera."""
         names = [camera.name for camera in self.cameras]
         if name not in names:
             raise ConfigError(f"no camera {name!r}, there are {names}")
         first = names.index(name) * self.world_count
-        part: Any = array[first : first + self.world_count]
-        return part
+        return array[first : first + self.world_count]
 
     def look_at(self, name: str, position: wp.array, target: wp.array, up: Vector = (0.0, 0.0, 1.0)) -> None:
         """Place a camera in every world; capturable. One that would look along `up` keeps its pose.
@@ -309,7 +309,7 @@ class SplatCamera:
         """Return the ids of `segmentation` whose label matches a shell pattern such as "*/finger_left/*"."""
         return tuple(i for i, label in enumerate(self.labels) if fnmatch.fnmatchcase(label, pattern))
 
-    def seed(self, seeds: Any) -> None:
+    def seed(self, seeds: int | ArrayLike) -> None:
         """Set the seeds of `randomize` and count its draws from zero, see `ViewVariation.seed`."""
         self.variation.seed(seeds)
 

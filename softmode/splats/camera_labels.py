@@ -1,7 +1,6 @@
 """Names of what a segmentation shows: splat objects first, then the shapes of the model, alike in every world."""
 
 from collections import Counter
-from typing import Any
 
 import newton
 import numpy as np
@@ -19,10 +18,9 @@ def segmentation_table(model: newton.Model, object_names: tuple[str, ...]) -> tu
         model: The model.
         object_names: Label of each of the O splat objects.
     """
-    shape_body: Any = model.shape_body
-    shape_world: Any = model.shape_world
-    bodies = shape_body.numpy() if model.shape_count else []
-    worlds = shape_world.numpy() if model.shape_count else []
+    shape_body, shape_world = model.shape_body, model.shape_world
+    bodies = [] if shape_body is None else shape_body.numpy()
+    worlds = [] if shape_world is None else shape_world.numpy()
     labels, known = list(object_names), {}
     table = np.zeros(model.shape_count, dtype=np.int32)
     seen: Counter[tuple[int, str]] = Counter()

@@ -5,15 +5,14 @@ world, on how often that world was drawn and on the index of the camera, and on 
 a single world with its seed. Host code that draws with NumPy passes its draws on as seeds.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from softmode.checks import require_number
 from softmode.errors import ConfigError
 from softmode.splats import camera_randomization_kernels as kernels
 
@@ -51,12 +50,9 @@ class CameraRandomization:
         """Check the ranges."""
         relative = ("focal", "light", "light_tint", "splat_opacity", "splat_brightness", "splat_tint")
         for item in fields(self):
-            value, limit = getattr(self, item.name), 1.0 if item.name in relative else math.inf
-            if not 0.0 <= value < limit:
-                raise ConfigError(
-                    f"CameraRandomization.{item.name} is {value}, expected 0 <= {item.name} < {limit}",
-                    hint="Give half the width of the range around the described value",
-                )
+            limit = 1.0 if item.name in relative else None
+            hint = "Give half the width of the range around the described value"
+            require_number(item.name, getattr(self, item.name), at_least=0.0, below=limit, hint=hint)
 
     @property
     def changes_lens(self) -> bool:
@@ -82,7 +78,7 @@ class ViewVariation:
         world_count: int,
         randomization: CameraRandomization,
         *,
-        device: Any = None,
+        device: str | wp.Device | None = None,
     ) -> None:
         """Allocate the arrays with the described values."""
         self.randomization, self.world_count, self.device = randomization, world_count, wp.get_device(device)
@@ -91,7 +87,7 @@ class ViewVariation:
         self._lenses = wp.array(described, dtype=wp.vec4, device=device)
         self._sky = (wp.vec3(*sky[0]), wp.vec3(*sky[1]))
 
-        def full(count: int, value: Sequence[float], dtype: Any) -> wp.array:
+        def full(count: int, value: Sequence[float], dtype: type) -> wp.array:
             return wp.array(np.tile(np.asarray(value, np.float32), (count, 1)), dtype=dtype, device=device)
 
         self.offset = full(views, (0, 0, 0, 0, 0, 0, 1), wp.transform)

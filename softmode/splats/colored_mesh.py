@@ -12,6 +12,7 @@ from softmode.errors import AssetError
 
 if TYPE_CHECKING:
     import trimesh
+    from PIL import Image
 
 GREY = 0.6
 """Colour of a mesh that names none; gamma-encoded."""
@@ -190,7 +191,7 @@ def _gamma_encoded(linear: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
-def _pixels(image: Any, name: str) -> NDArray[np.uint8]:
+def _pixels(image: Image.Image, name: str) -> NDArray[np.uint8]:
     """Decode an image, bounded."""
     if image.width * image.height > _TEXEL_LIMIT:
         raise AssetError(

@@ -7,7 +7,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from softmode.errors import ConfigError
+from softmode.checks import require_number
 from softmode.splats.splats import Splats
 
 
@@ -32,10 +32,7 @@ def split_components(
     if gap is None:
         low, high = splats.bounds(quantile=0.01)
         gap = max(0.015 * float(np.linalg.norm(high - low)), 1e-9)
-    if not (np.isfinite(gap) and gap > 0.0):
-        raise ConfigError(
-            f"gap must be positive and finite, got {gap}", hint="Give a distance in the unit of the asset"
-        )
+    require_number("gap", gap, above=0.0, hint="Give a distance in the unit of the asset")
     solid = np.flatnonzero(splats.opacities >= min_opacity)
     if len(solid) == 0:
         return []

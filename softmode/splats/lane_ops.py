@@ -6,10 +6,12 @@ of a warp exist because Warp moves a vec4 as four numbers, where a GPU has instr
 
 import warp as wp
 
-WARP = 32
-"""Threads of a CUDA warp, bits of a word."""
 BLOCK_WARPS = 4
 """Warps of a block in kernels that use `queue_address` and `stage_address`."""
+QUEUE = 1120
+"""Entries of a warp's queue: 1024 ranks, 31 left over, and room to read beyond them."""
+STAGE = 96
+"""Entries of a warp's stage: three for each of 32 splats."""
 
 
 @wp.func_native(
@@ -184,15 +186,15 @@ def load4(source: wp.array[wp.vec4], i: int) -> wp.vec4:
 @wp.func_native(
     snippet=f"""
 #if defined(__CUDA_ARCH__)
-    __shared__ unsigned short queue[{BLOCK_WARPS} * 1120];
-    return reinterpret_cast<uint64_t>(queue + (threadIdx.x >> 5) * 1120);
+    __shared__ unsigned short queue[{BLOCK_WARPS} * {QUEUE}];
+    return reinterpret_cast<uint64_t>(queue + (threadIdx.x >> 5) * {QUEUE});
 #else
     return 0;
 #endif
 """
 )
 def queue_address() -> wp.uint64:
-    """Return this warp's 1120 uint16 of shared memory: 1024 ranks, 31 left over, and room to read beyond them."""
+    """Return this warp's QUEUE uint16 of shared memory."""
     ...
 
 
@@ -224,15 +226,15 @@ def queue_get(address: wp.uint64, i: int) -> int:
 @wp.func_native(
     snippet=f"""
 #if defined(__CUDA_ARCH__)
-    __shared__ float4 stage[{BLOCK_WARPS} * 96];
-    return reinterpret_cast<uint64_t>(stage + (threadIdx.x >> 5) * 96);
+    __shared__ float4 stage[{BLOCK_WARPS} * {STAGE}];
+    return reinterpret_cast<uint64_t>(stage + (threadIdx.x >> 5) * {STAGE});
 #else
     return 0;
 #endif
 """
 )
 def stage_address() -> wp.uint64:
-    """Return this warp's 96 vec4 of shared memory."""
+    """Return this warp's STAGE vec4 of shared memory."""
     ...
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from softmode.errors import ConfigError
+from softmode.checks import require_number
 from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.splats import SH_DC, Splats, quats_from_rotations
 
@@ -40,8 +40,7 @@ def sample_mesh(mesh: ColoredMesh, count: int, *, seed: int = 0) -> Splats:
     Raises:
         ConfigError: If the count is not positive.
     """
-    if count < 1:
-        raise ConfigError(f"count must be at least 1, got {count}", hint="give a number of splats like 10000")
+    require_number("count", count, at_least=1, hint="give a number of splats like 10000")
     rng = np.random.default_rng(seed)
     drawn = CANDIDATES_PER_SAMPLE * count
     cumulative = np.cumsum(mesh.areas())

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.errors import ConfigError
-from softmode.splats.splats import quat_from_rotation, rotations_from_quats
+from softmode.splats.splats import quats_from_rotations, rotations_from_quats
 
 Vector = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
@@ -103,7 +103,7 @@ class PinholeCamera:
             )
         forward /= np.linalg.norm(forward)
         right /= np.linalg.norm(right)
-        quat = quat_from_rotation(np.stack([right, np.cross(forward, right), forward], axis=1))
+        quat = quats_from_rotations(np.stack([right, np.cross(forward, right), forward], axis=1))
         return cls.from_matrix(
             name,
             _fov_matrix(name, fov_y, width, height),
@@ -210,7 +210,7 @@ class PinholeCamera:
     def world_to_camera(self) -> NDArray[np.float64]:
         """Rigid transform from the frame of `body`, or the world, to the camera, shape (4, 4)."""
         matrix = np.eye(4)
-        matrix[:3, :3] = rotations_from_quats(np.asarray(self.quat)[None])[0].T
+        matrix[:3, :3] = rotations_from_quats(self.quat).T
         matrix[:3, 3] = -matrix[:3, :3] @ np.asarray(self.position)
         return matrix
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from softmode.errors import ConfigError
+from softmode.checks import require_number
 from softmode.splats.splats import SH_DC, Splats, quats_from_rotations
 
 _FUR = np.array([0.80, 0.53, 0.27])
@@ -59,8 +59,7 @@ def make_plush(count: int = 4000, seed: int = 0, *, height: float = 0.08) -> Spl
         ConfigError: If the count is below 200 or the height is not positive.
     """
     scale = _checked_height(height)
-    if count < 200:
-        raise ConfigError(f"count must be at least 200, got {count}")
+    require_number("count", count, at_least=200)
     rng = np.random.default_rng(seed)
     points, area = _even_surface_points(count, rng)
     normals = _unit_normals(points)
@@ -91,8 +90,7 @@ def make_plush(count: int = 4000, seed: int = 0, *, height: float = 0.08) -> Spl
 
 def _checked_height(height: float) -> float:
     """Return the height if it is positive and finite."""
-    if not (np.isfinite(height) and height > 0.0):
-        raise ConfigError(f"height must be positive and finite, got {height}", hint="Give the height in metres")
+    require_number("height", height, above=0.0, unit="m")
     return float(height)
 
 

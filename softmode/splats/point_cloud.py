@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from softmode.errors import AssetError
+from softmode.files import read_arrays
 from softmode.splats.formats.common import sh_from_colors
 from softmode.splats.splats import MAX_SPLATS, Splats, quats_from_rotations
 
@@ -60,13 +60,7 @@ def read_points(path: str | os.PathLike[str]) -> Splats:
     if not file.is_file():
         raise AssetError(f"{name}: no such file", hint="Check the path")
     if file.suffix.lower() == ".npz":
-        try:
-            with np.load(file, allow_pickle=False) as stored:
-                arrays = {key: stored[key] for key in ("points", "normals", "colors") if key in stored.files}
-        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError, MemoryError) as error:
-            raise AssetError(f"{name}: damaged or not an .npz ({error})", hint=_HINT) from error
-        except Exception as error:  # zlib and struct errors of a damaged archive have no common base.
-            raise AssetError(f"{name}: damaged ({type(error).__name__}: {error})", hint=_HINT) from error
+        arrays = read_arrays(file, ("points", "normals", "colors"), what="point cloud", hint=_HINT)
         if "points" not in arrays:
             raise AssetError(f"{name}: holds no points", hint=_HINT)
         return splats_from_points(arrays["points"], arrays.get("normals"), arrays.get("colors"), name=name)

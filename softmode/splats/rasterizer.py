@@ -12,7 +12,6 @@ which is what keeps small images right.
 """
 
 import functools
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +19,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from softmode.checks import require_number
 from softmode.errors import ConfigError
 from softmode.splats import blend_cpu_kernels, blend_cuda_kernels, cover_cuda_kernels, depth_sort_kernels
 from softmode.splats import rasterizer_kernels as kernels
@@ -46,11 +46,8 @@ class RasterizerOptions:
     def __post_init__(self) -> None:
         """Check the ranges."""
         # Depths are sorted by their bits, which do so for positive numbers only.
-        if not 0.0 < self.near < math.inf or not 0.0 <= self.pixel_variance < math.inf:
-            raise ConfigError(
-                f"near is {self.near} m and the dilation {self.pixel_variance} px^2",
-                hint="Give near > 0 and dilation >= 0; None for the dilation takes the usual one",
-            )
+        require_number("near", self.near, above=0.0, unit="m")
+        require_number("dilation", self.pixel_variance, at_least=0.0, unit="px^2", hint="None takes the usual one")
 
     @property
     def pixel_variance(self) -> float:
@@ -85,7 +82,7 @@ class SplatArrays:
         *,
         world_count: int = 1,
         sh_degree: int | None = None,
-        device: Any = None,
+        device: str | wp.Device | None = None,
     ) -> "SplatArrays":
         """Upload the objects in their rest state, every world alike; means, covariances and rotations are per world.
 
@@ -100,10 +97,10 @@ class SplatArrays:
         """
         if isinstance(objects, Splats) or not objects:
             raise ConfigError("objects is empty or no list", hint="Pass a list of at least one Splats")
-        if world_count < 1:
-            raise ConfigError(f"world_count must be at least 1, got {world_count}", hint="Pass model.world_count")
-        if sh_degree is not None and not 0 <= sh_degree <= 3:
-            raise ConfigError(f"sh_degree must be 0 to 3, got {sh_degree}", hint="Pass None for that of the objects")
+        require_number("world_count", world_count, at_least=1, hint="Pass model.world_count")
+        if sh_degree is not None:
+            hint = "Pass None for that of the objects"
+            require_number("sh_degree", sh_degree, at_least=0, at_most=3, hint=hint)
         degree = max(splats.sh_degree for splats in objects) if sh_degree is None else sh_degree
         width = (degree + 1) ** 2
         sh = [splats.sh[:, :width] for splats in objects]
@@ -150,7 +147,7 @@ class ViewArrays:
         *,
         world: Sequence[int] | None = None,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        device: Any = None,
+        device: str | wp.Device | None = None,
     ) -> "ViewArrays":
         """Return one view per camera fixed in the world.
 
@@ -223,7 +220,7 @@ class SplatRasterizer:
         height: int,
         *,
         options: RasterizerOptions | None = None,
-        device: Any = None,
+        device: str | wp.Device | None = None,
     ) -> None:
         """Allocate the buffers."""
         self.options = options if options is not None else RasterizerOptions()

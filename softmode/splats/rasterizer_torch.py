@@ -100,9 +100,9 @@ def _function() -> Any:
             adjoint: AdjointRasterizer,
             splats: SplatArrays,
             views: ViewArrays,
-            mesh_rgb: Any,
-            mesh_depth: Any,
-            *values: Any,
+            mesh_rgb: wp.array | None,
+            mesh_depth: wp.array | None,
+            *values: Tensor | None,
         ) -> Any:
             given = {name: value for name, value in zip(INPUTS, values, strict=True) if value is not None}
             splats = replace(splats, **{k: view(given[k], getattr(splats, k)) for k in SPLAT_INPUTS if k in given})
@@ -115,7 +115,7 @@ def _function() -> Any:
             return tuple(wp.to_torch(image).clone() for image in (rasterizer.rgb, rasterizer.alpha, rasterizer.depth))
 
         @staticmethod
-        def backward(ctx: Any, *losses: Any) -> Any:
+        def backward(ctx: Any, *losses: Tensor) -> Any:
             adjoint, splats, views = ctx.adjoint, ctx.splats, ctx.views
             mesh: dict[str, Any] = dict(zip(("mesh_rgb", "mesh_depth"), ctx.meshes, strict=True))
             rasterizer = adjoint.rasterizer

@@ -6,7 +6,6 @@ no vertex colours, one texture per shape and 8 bits per channel; the tests compa
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -84,7 +83,7 @@ def render_mesh(
     width: int,
     height: int,
     samples: int = 4,
-    device: Any = None,
+    device: str | wp.Device | None = None,
 ) -> ReferenceViews:
     """Draw a mesh, unlit, both sides of its triangles alike.
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import newton
 import numpy as np
@@ -38,7 +37,7 @@ class RigidSplats:
 
     def in_body(self) -> Splats:
         """Return the splats in the frame of the body, view-dependent colour turned along."""
-        return self.splats.transformed(rotation=rotations_from_quats([self.quat])[0], translation=self.position)
+        return self.splats.transformed(rotation=rotations_from_quats(self.quat), translation=self.position)
 
 
 class RigidSplatsSkin:
@@ -59,7 +58,7 @@ class RigidSplatsSkin:
             raise ConfigError("parts is empty or no list", hint="Pass a list of at least one RigidSplats")
         self.objects = tuple(part.in_body() for part in parts)
         """The splats in the frames of their bodies; append them to the objects of `SplatArrays.from_splats`."""
-        self.device: Any = model.device
+        self.device = model.device
         bodies = np.stack([world_bodies(model, part.body, "RigidSplats") for part in parts], axis=1)
         owner = np.repeat(np.arange(len(parts), dtype=np.int32), [splats.count for splats in self.objects])
         rest = SplatArrays.from_splats(self.objects, sh_degree=0, device=self.device)
@@ -114,8 +113,8 @@ def world_bodies(model: newton.Model, label: str, what: str) -> np.ndarray:
     """
     worlds = max(int(model.world_count), 1)
     named = [i for i, known in enumerate(model.body_label) if label in (known, known.rsplit("/", maxsplit=1)[-1])]
-    body_world: Any = model.body_world
-    world = body_world.numpy()[named] if named else np.zeros(0, dtype=np.int32)
+    body_world = model.body_world
+    world = np.zeros(0, np.int32) if body_world is None or not named else body_world.numpy()[named]
     if len(named) == worlds == 1 or np.array_equal(world, np.arange(worlds)):
         return np.asarray(named, dtype=np.int32)
     raise ConfigError(

@@ -1,12 +1,11 @@
 """The shadow that splats cast on meshes: a small orthographic depth map along the light, one per world."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import warp as wp
 
-from softmode.errors import ConfigError
+from softmode.checks import require_fields, require_number
 from softmode.splats import shadow_kernels as kernels
 from softmode.splats.camera_meshes import MeshImages, MeshLight
 from softmode.splats.rasterizer import SplatArrays, ViewArrays
@@ -27,10 +26,9 @@ class ShadowOptions:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        if not (0.0 <= self.strength <= 1.0 and self.cells >= 1 and self.margin >= 1.0 and 0.0 <= self.softness <= 8.0):
-            raise ConfigError(
-                f"{self} is out of range", hint="Give strength in 0..1, cells >= 1, margin >= 1 and softness in 0..8"
-            )
+        require_number("strength", self.strength, at_least=0.0, at_most=1.0)
+        require_fields(self, ("cells", "margin"), at_least=1)
+        require_number("softness", self.softness, at_least=0.0, at_most=8.0)
 
 
 class SplatShadow:
@@ -52,7 +50,7 @@ class SplatShadow:
         light: MeshLight,
         *,
         options: ShadowOptions | None = None,
-        device: Any = None,
+        device: str | wp.Device | None = None,
     ) -> None:
         """Allocate the map."""
         self._light = [wp.vec3(*radiance) for radiance in (*light.ambient, light.color)]

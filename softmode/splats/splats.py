@@ -8,7 +8,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
+from softmode.checks import require_number
 from softmode.errors import AssetError, ConfigError
 from softmode.splats.principal_axes import axes_of_covariances, axes_of_gradients, nearest_rotations
 
@@ -149,8 +151,7 @@ class Splats:
 
     def with_sh_degree(self, degree: int) -> Splats:
         """Return the splats with the spherical harmonics cut to `degree` (no more than they have)."""
-        if not 0 <= degree <= 3:
-            raise ConfigError(f"degree must be 0, 1, 2 or 3, got {degree}")
+        require_number("degree", degree, at_least=0, at_most=3)
         return replace(self, sh=self.sh[:, : (degree + 1) ** 2])
 
     def transformed(
@@ -173,12 +174,11 @@ class Splats:
         proper = matrix.shape == (3, 3) and np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-5)
         if not (proper and np.linalg.det(matrix) > 0.0):
             raise ConfigError("rotation must be a proper (3, 3) rotation matrix", hint="Pass scale as its own argument")
-        if not (np.isfinite(scale) and scale > 0.0):
-            raise ConfigError(f"scale must be positive and finite, got {scale}")
+        require_number("scale", scale, above=0.0)
         means = scale * self.means.astype(np.float64) @ matrix.T + np.asarray(translation, dtype=np.float64)
         quats, sh = self.quats, self.sh
         if rotation is not None:
-            quats = multiply_quats(quat_from_rotation(matrix), self.quats)
+            quats = multiply_quats(quats_from_rotations(matrix), self.quats)
             sh = rotate_sh(self.sh, matrix)
         return replace(self, means=means, quats=quats, scales=self.scales * np.float32(scale), sh=sh)
 
@@ -285,40 +285,13 @@ def up_rotation(up: UpAxis) -> NDArray[np.float64]:
 
 
 def rotations_from_quats(quats: ArrayLike) -> NDArray[np.float64]:
-    """Return rotation matrices, shape (N, 3, 3), of quaternions xyzw, shape (N, 4); normalises them."""
-    q = np.asarray(quats, dtype=np.float64)
-    x, y, z, w = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
+    """Return rotation matrices, shape (..., 3, 3), of quaternions xyzw of any length, shape (..., 4)."""
+    return Rotation.from_quat(np.asarray(quats, dtype=np.float64)).as_matrix()
 
 
 def quats_from_rotations(rotations: ArrayLike) -> NDArray[np.float64]:
-    """Return unit quaternions xyzw, shape (N, 4), of proper rotation matrices, shape (N, 3, 3).
-
-    Takes the largest of the four squared components as pivot, so no rotation is ill-conditioned.
-    """
-    m = np.asarray(rotations, dtype=np.float64)
-    d = np.diagonal(m, axis1=1, axis2=2)
-    trace = d.sum(axis=1)
-    squares = np.concatenate([1 - trace[:, None] + 2 * d, 1 + trace[:, None]], axis=1)
-    outer = np.empty((len(m), 4, 4))
-    for i in range(4):
-        outer[:, i, i] = squares[:, i]
-    for i, j in ((0, 1), (0, 2), (1, 2)):
-        outer[:, i, j] = outer[:, j, i] = m[:, i, j] + m[:, j, i]
-    for i, (j, k) in enumerate(((2, 1), (0, 2), (1, 0))):
-        outer[:, i, 3] = outer[:, 3, i] = m[:, j, k] - m[:, k, j]
-    row = outer[np.arange(len(m)), squares.argmax(axis=1)]
-    return row / np.linalg.norm(row, axis=1, keepdims=True)
-
-
-def quat_from_rotation(rotation: ArrayLike) -> NDArray[np.float64]:
-    """Return the unit quaternion xyzw, shape (4,), of one proper rotation matrix."""
-    return quats_from_rotations(np.asarray(rotation, dtype=np.float64)[None])[0]
+    """Return unit quaternions xyzw, shape (..., 4), of proper rotation matrices, shape (..., 3, 3)."""
+    return Rotation.from_matrix(np.asarray(rotations, dtype=np.float64)).as_quat()
 
 
 def multiply_quats(left: ArrayLike, right: ArrayLike) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from typing import Any
 
 import warp as wp
 
+from softmode.checks import require_number
 from softmode.errors import ConfigError
 from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
 
@@ -48,10 +49,8 @@ class ThreadedRasterizer:
         options: RasterizerOptions | None = None,
     ) -> None:
         """Allocate the buffers."""
-        if threads is not None and threads < 1:
-            raise ConfigError(f"threads is {threads}, expected at least 1", hint="None takes one per core")
-        if view_count < 1:
-            raise ConfigError(f"view_count is {view_count}, expected at least 1")
+        require_number("threads", 1 if threads is None else threads, at_least=1, hint="None takes one per core")
+        require_number("view_count", view_count, at_least=1)
         count = min(threads if threads is not None else os.cpu_count() or 1, view_count)
         bounds = [view_count * i // count for i in range(count + 1)]
         self.options = options if options is not None else RasterizerOptions()
@@ -62,16 +61,16 @@ class ThreadedRasterizer:
             SplatRasterizer(splat_count, s.stop - s.start, width, height, options=self.options, device=self.device)
             for s in self._slices
         ]
-        self.rgb: Any
-        self.depth: Any
-        self.alpha: Any
-        self.object_id: Any
-        self.median_depth: Any
+        self.rgb: wp.array
+        self.depth: wp.array
+        self.alpha: wp.array
+        self.object_id: wp.array
+        self.median_depth: wp.array
         for name in OUTPUTS:
             first = getattr(self._parts[0], name)
             written = first.shape == self._parts[0].rgb.shape
             shape = (view_count, height, width) if written else first.shape
-            whole: Any = wp.zeros(shape, dtype=first.dtype, device=self.device)
+            whole = wp.zeros(shape, dtype=first.dtype, device=self.device)
             setattr(self, name, whole)
             for part, views in zip(self._parts, self._slices, strict=True):
                 setattr(part, name, whole[views] if written else whole)
@@ -152,7 +151,7 @@ class ThreadedRasterizer:
                     hint="Size the rasteriser for these arrays",
                 )
 
-        def cut(array: Any, part: slice) -> Any:
+        def cut(array: wp.array | None, part: slice) -> Any:
             return array if array is None or array.shape[0] == 1 else array[part]
 
         def job(part: SplatRasterizer, s: slice) -> Callable[[], None]:

@@ -22,7 +22,7 @@ from softmode.objects.loader import Progress
 from softmode.objects.placed import Placed
 from softmode.objects.stage_body import place_deformable
 from softmode.objects.stage_scene import UsdScene, open_scene
-from softmode.splats.splats import quat_from_rotation
+from softmode.splats.splats import quats_from_rotations
 
 Array = NDArray[np.float64]
 
@@ -118,7 +118,7 @@ def add_usd(
             )
             for deformable in scene.deformables
         }
-        options["xform"] = wp.transform(wp.vec3(*shift), wp.quat(*quat_from_rotation(turn)))
+        options["xform"] = wp.transform(wp.vec3(*shift), wp.quat(*quats_from_rotations(turn)))
         rest = _add_rest(builder, os.path.join(folder, "rest.usdc"), str(path), options)
     bodies = {path: _moved(placed, turn, shift) for path, placed in ready.items()}
     instances = {path: placed.add_to(builder) for path, placed in bodies.items()}

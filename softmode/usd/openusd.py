@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import os
-import secrets
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from softmode.errors import ConfigError, MissingExtraError, StorageError
+from softmode.errors import ConfigError, MissingExtraError
+from softmode.files import PendingFile, check_place
 from softmode.stages.openusd import pxr
 
 SUFFIXES = (".usdc", ".usd", ".usda")
@@ -54,14 +54,7 @@ def check_stage(path: str | os.PathLike[str]) -> Path:
     """
     openusd("Usd")
     target = checked_target(path)
-    folder = target.absolute().parent
-    while not folder.exists():
-        folder = folder.parent
-    if not (folder.is_dir() and os.access(folder, os.W_OK)):
-        raise StorageError(
-            f"stage {target}: cannot be written ({folder} is no folder that may be written to)",
-            hint="choose another folder",
-        )
+    check_place(target, "stage")
     return target
 
 
@@ -75,20 +68,5 @@ def whole_stage(path: str | os.PathLike[str]) -> Iterator[Path]:
         ConfigError: If the suffix is none of OpenUSD's.
         StorageError: If the file cannot be written; nothing is left behind.
     """
-    target = checked_target(path)
-    temporary = target.with_name(f".{target.stem}-{secrets.token_hex(6)}{target.suffix}")
-    try:
-        try:
-            temporary.open("xb").close()  # with the permissions that the umask asks for, and errors of the place itself
-            yield temporary
-            with temporary.open("rb+") as file:
-                os.fsync(file.fileno())
-            os.replace(temporary, target)
-        except OSError as error:
-            raise StorageError(
-                f"stage {target}: cannot be written ({error.strerror or error})",
-                hint="check the folder, its permissions and the free space",
-            ) from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
+    with PendingFile(checked_target(path), "stage", make_folders=False) as file:
+        yield file.temporary

@@ -203,7 +203,7 @@ def set_place(
     """Author translate, orient and scale of an Xform in double precision, as a time sample or for all times."""
     Gf, Usd, UsdGeom = openusd("Gf", "Usd", "UsdGeom")
     when = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
-    x, y, z, w = quats_from_rotations(np.asarray(rotation, dtype=np.float64)[None])[0].tolist()
+    x, y, z, w = quats_from_rotations(rotation).tolist()
     orient, double = Gf.Quatd(w, x, y, z), UsdGeom.XformOp.PrecisionDouble
     ops = {op.GetOpName(): op for op in root.GetOrderedXformOps()}
     if not ops:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from softmode.checks import require_number
 from softmode.deformables.model.authoring import NAMESPACE
 from softmode.errors import AssetError, ConfigError
+from softmode.files import read_arrays
 from softmode.scenes.host import soft_solver
 from softmode.scenes.scene import Scene
 
@@ -38,16 +39,16 @@ class LiveRecording:
         Raises:
             AssetError: If the file is missing, damaged or foreign.
         """
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                data = {name: file[name] for name in ("format", "times", "q", "body_q", "fingerprints")}
-        except Exception as error:  # a damaged archive raises whatever its parser stumbled on
-            raise AssetError(f"recording {path} cannot be read: {error}", hint="record it again") from error
+        hint = "record it again"
+        names = ("format", "times", "q", "body_q", "fingerprints")
+        data = read_arrays(path, names, what="recording", hint=hint)
+        if set(names) != set(data):
+            raise AssetError(f"recording {path} is not one of a live session", hint=hint)
         times, q, body_q = data["times"], data["q"], data["body_q"]
         good = str(data["format"]) == _FORMAT and times.ndim == 1 and q.ndim == 3 and body_q.ndim == 3
         good = good and len(times) == len(q) == len(body_q) and q.shape[2] == 3 and body_q.shape[2] == 7
         if not good or not all(np.isfinite(x).all() for x in (times, q, body_q)):
-            raise AssetError(f"recording {path} is not one of a live session", hint="record it again")
+            raise AssetError(f"recording {path} is not one of a live session", hint=hint)
         prints = tuple(str(x) for x in data["fingerprints"])
         return cls(times=times, q=q, body_q=body_q.astype(np.float32), fingerprints=prints)
 

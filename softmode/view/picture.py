@@ -54,7 +54,7 @@ class LivePicture:
         self.bound.update(state)
         if self._marker is not None:
             arrays, at = self.bound.arrays, self.bound.columns[-1]
-            turn = rotations_from_quats(marker_pose[None, 3:])[0]
+            turn = rotations_from_quats(marker_pose[3:])
             C = turn @ self._marker @ turn.T
             six = C.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
             arrays.means[0, at].assign((marker_points @ turn.T + marker_pose[:3]).astype(np.float32))

@@ -17,6 +17,7 @@ from softmode.deformables.build.cubature import POISSON_RATIO
 from softmode.deformables.build.reduced_stiffness import elastic_modes, reduced_stiffness
 from softmode.deformables.build.report import BodyReport
 from softmode.errors import ConfigError, MissingExtraError
+from softmode.files import whole_file
 from softmode.splats.splats import SH_DC, Splats
 
 Array = NDArray[np.float64]
@@ -90,6 +91,7 @@ def write_body_picture(
     Raises:
         MissingExtraError: If matplotlib is not installed.
         ConfigError: If the name is not that of a .png.
+        StorageError: If it cannot be written.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -99,8 +101,6 @@ def write_body_picture(
             "the picture of a body needs matplotlib", hint="install it with: pip install 'softmode[viz]'"
         ) from error
     from PIL import Image
-
-    from softmode.files import atomic_write
 
     target = Path(path)
     if target.suffix.lower() != ".png":
@@ -149,8 +149,7 @@ def write_body_picture(
     _write_report(figure.add_subplot(lower[3]), body, report)
     canvas.draw()
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3])
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(target) as file:
+    with whole_file(target, "picture") as file:
         # 256 colours, dithered, are enough here and make half the size.
         few = picture.quantize(palette=picture.quantize(256), dither=Image.Dither.FLOYDSTEINBERG)
         few.save(file, format="png", optimize=True)

@@ -22,7 +22,8 @@ class Film:
         path: The video to write (.mp4).
 
     Raises:
-        ConfigError: If it cannot be written there.
+        ConfigError: If it has another suffix.
+        StorageError: If it cannot be written there.
         MissingExtraError: If what encodes it is not installed.
     """
 

@@ -48,8 +48,8 @@ class RerunLogger:
         options: What the recording holds.
 
     Raises:
-        ConfigError: If the file cannot be written there, no viewer answers at the address, the scene is none of these,
-            or a world does not exist.
+        ConfigError: If no viewer answers at the address, the scene is none of these, or a world does not exist.
+        StorageError: If the file cannot be written there.
         MissingExtraError: If rerun is not installed.
     """
 

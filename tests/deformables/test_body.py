@@ -308,9 +308,9 @@ def test_foreign_and_old_files_are_refused(body: ReducedBody, tmp_path: Path) ->
     path.write_text("not an archive")
     rejects("damaged")
     np.savez(path, x=np.ones(3))
-    rejects("not a softmode body")
+    rejects("not a softmode.ReducedBody")
     np.savez(path, x=np.array([object()], dtype=object), allow_pickle=True)
-    rejects("damaged|not a softmode body")
+    rejects("damaged|not a softmode.ReducedBody")
     body.save(path)
     with np.load(path) as file:
         stored = {k: file[k] for k in file.files}
@@ -323,7 +323,7 @@ def test_foreign_and_old_files_are_refused(body: ReducedBody, tmp_path: Path) ->
         rewrite({"version": version})
         rejects(f"version {version}")
     rewrite({"format": "other"})
-    rejects("not a softmode body")
+    rejects("not a softmode.ReducedBody")
     rewrite({}, points=stored["points"][:-1])
     rejects("points|weights")
     rewrite({}, weights=stored["weights"] * 2.0)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from softmode.errors import AssetError
+from softmode.errors import AssetError, StorageError
 from softmode.splats import Splats, read_splats, write_ply
 from tests.splats.test_splats import random_splats
 
@@ -47,10 +47,10 @@ def test_ply_round_trip(tmp_path: Path, coefficients: int) -> None:
 
 def test_ply_write_is_atomic(tmp_path: Path) -> None:
     """A failing write leaves neither the target nor a temporary file."""
-    with pytest.raises(AssetError, match="cannot be written"):
+    with pytest.raises(StorageError, match="cannot be written"):
         write_ply(tmp_path / "absent" / "a.ply", random_splats())
     (tmp_path / "taken.ply").mkdir()
-    with pytest.raises(AssetError, match="cannot be written"):
+    with pytest.raises(StorageError, match="cannot be written"):
         write_ply(tmp_path / "taken.ply", random_splats())
     assert [path.name for path in tmp_path.iterdir()] == ["taken.ply"]
 

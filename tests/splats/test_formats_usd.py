@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from softmode.errors import AssetError, ConfigError, MissingExtraError
+from softmode.errors import AssetError, ConfigError, MissingExtraError, StorageError
 from softmode.splats import Splats, read_splats, write_splats, write_usd
 from softmode.splats.formats import read_usd
 from softmode.splats.splats import sh_basis, up_rotation
@@ -268,7 +268,7 @@ def test_refusals_of_the_writer(tmp_path: Path) -> None:
             write_usd(tmp_path / "a.usdc", frames)
     with pytest.raises(ConfigError, match="fps"):
         write_usd(tmp_path / "a.usdc", random_splats(), fps=0.0)
-    with pytest.raises(AssetError, match="cannot be written"):
+    with pytest.raises(StorageError, match="cannot be written"):
         write_usd(tmp_path / "absent" / "a.usdc", random_splats())
     with pytest.raises(AssetError, match="cannot write"):
         write_usd(tmp_path / "a.usdz", random_splats())

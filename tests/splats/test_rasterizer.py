@@ -12,7 +12,7 @@ import warp as wp
 from softmode.errors import ConfigError
 from softmode.splats import Splats, make_plush
 from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
-from softmode.splats.splats import quat_from_rotation, rotations_from_quats
+from softmode.splats.splats import quats_from_rotations, rotations_from_quats
 from tests.splats.dense_reference import DenseImage, render_dense
 
 DEVICES = ["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)]
@@ -150,7 +150,7 @@ def test_rigid_motion_of_splats_and_camera_changes_nothing(device: str) -> None:
         if turned:
             # Means and covariances move, coefficients stay in the rest frame: what skinning does.
             moved = SplatArrays.from_splats([splats.transformed(r)], device=device)
-            quat = wp.quat(*quat_from_rotation(r))
+            quat = wp.quat(*quats_from_rotations(r))
             rotations = wp.full((1, splats.count), quat, dtype=wp.quat, device=device)
             arrays = replace(arrays, means=moved.means, covariances=moved.covariances, rotations=rotations)
             eye = r @ eye
@@ -397,7 +397,7 @@ def test_refuses_sizes_out_of_range(arguments: Any, message: str) -> None:
 @pytest.mark.parametrize("options", [{"near": 0.0}, {"near": -1.0}, {"near": float("nan")}, {"dilation": -0.1}])
 def test_refuses_options_out_of_range(options: Any) -> None:
     """Near planes behind the camera and negative variances."""
-    with pytest.raises(ConfigError, match="near is"):
+    with pytest.raises(ConfigError, match=next(iter(options))):
         RasterizerOptions(**options)
 
 

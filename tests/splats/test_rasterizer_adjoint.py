@@ -18,7 +18,7 @@ from softmode.splats import blend_adjoint_cpu_kernels, blend_adjoint_cuda_kernel
 from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
 from softmode.splats.rasterizer_adjoint import AdjointRasterizer
 from softmode.splats.rasterizer_kernels import vec6
-from softmode.splats.splats import quat_from_rotation
+from softmode.splats.splats import quats_from_rotations
 from tests.splats import dense_reference
 from tests.splats.dense_reference import render_dense
 from tests.splats.test_rasterizer import EYES, UNDECIDED, look_at
@@ -177,7 +177,7 @@ class Scene:
 
     def arrays(self, device: str) -> tuple[SplatArrays, ViewArrays]:
         """Upload."""
-        turns = np.stack([quat_from_rotation(self.turn(world)) for world in range(2)])
+        turns = np.stack([quats_from_rotations(self.turn(world)) for world in range(2)])
         splats = SplatArrays(
             means=wp.array(self.means, dtype=wp.vec3, device=device),
             covariances=wp.array(self.covariances, dtype=vec6, device=device),

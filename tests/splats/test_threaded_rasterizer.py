@@ -111,7 +111,7 @@ def test_errors_of_a_thread_reach_the_caller() -> None:
     three = replace(views, background=wp.zeros(3, dtype=wp.vec3, device="cpu"))
     with pytest.raises(ConfigError, match=r"views\.background"):
         four.render(SplatArrays.from_splats([ball(100)], device="cpu"), three)
-    with pytest.raises(ConfigError, match="threads is 0"):
+    with pytest.raises(ConfigError, match="threads must be at least 1, got 0"):
         ThreadedRasterizer(100, 2, WIDTH, HEIGHT, threads=0)
-    with pytest.raises(ConfigError, match="view_count is 0"):
+    with pytest.raises(ConfigError, match="view_count must be at least 1, got 0"):
         ThreadedRasterizer(100, 0, WIDTH, HEIGHT)

@@ -26,7 +26,7 @@ from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.energies import SoftEnergies
 from softmode.deformables.tools.sensing import ContactSensor
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
-from softmode.errors import ConfigError, MissingExtraError
+from softmode.errors import ConfigError, MissingExtraError, StorageError
 from softmode.learning.players import policy_factory
 from softmode.objects import load
 from softmode.scenes import BoundSplats, SplatFrame
@@ -386,7 +386,7 @@ def test_bad_input_is_refused(falling: Any, env: Any, tmp_path: Path, monkeypatc
         with pytest.raises(ConfigError, match=next(iter(given))):
             RerunOptions(**given)
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match="cannot be written"):
+    with pytest.raises(StorageError, match="cannot be written"):
         RerunLogger(tmp_path / "file" / "a.rrd", source)
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(MissingExtraError, match=r"softmode\[viz\]"):

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from softmode.errors import BasisError
-
-if TYPE_CHECKING:
-    from softmode.deformables.body.reduced_body import ReducedBody
 
 _KINDS = {
     "name": str,
@@ -26,18 +24,26 @@ _FLOAT32 = ("grad_basis", "surface_basis")
 _INDICES = ("handle_degrees", "handle_regions", "core_index", "region_index")
 
 
-def check_body(body: ReducedBody) -> None:
-    """Verify types, shapes, dtypes, ranges, finiteness and the weights' sum.
+def check_fields(body: Mapping[str, Any]) -> None:
+    """Verify types, shapes, dtypes, ranges, finiteness and the weights' sum of a body's fields.
+
+    Args:
+        body: The fields of a `ReducedBody` by name.
 
     Raises:
         BasisError: If any is wrong.
     """
     for name, kind in _KINDS.items():
-        if not isinstance(getattr(body, name), kind):
-            raise BasisError(f"{name}: expected {kind.__name__}, got {type(getattr(body, name)).__name__}")
-    p, s, n, k = (len(v) for v in (body.points, body.surface_points, body.mean_basis, body.centres))
-    m, j, raw = len(body.eigenvalues), len(body.handle_degrees), len(body.transform)
-    r, regions, cores, samples = body.driven_count, len(body.region_names), len(body.core_index), len(body.region_index)
+        if not isinstance(body[name], kind):
+            raise BasisError(f"{name}: expected {kind.__name__}, got {type(body[name]).__name__}")
+
+    def count(*names: str) -> list[int]:
+        return [len(body[name]) for name in names]
+
+    p, s, n, k = count("points", "surface_points", "mean_basis", "centres")
+    m, j, raw = count("eigenvalues", "handle_degrees", "transform")
+    regions, cores, samples = count("region_names", "core_index", "region_index")
+    r, volume, weights = body["driven_count"], body["volume"], body["weights"]
     expected = {
         "points": (p, 3),
         "weights": (p,),
@@ -69,17 +75,17 @@ def check_body(body: ReducedBody) -> None:
         "drive_affine": (regions, r, 4),
     }
     for name, shape in expected.items():
-        value = getattr(body, name)
+        value = body[name]
         dtype = np.float32 if name in _FLOAT32 else np.int64 if name in _INDICES else np.float64
         if value.shape != shape or value.dtype != dtype:
             raise BasisError(f"{name}: expected {np.dtype(dtype)} {shape}, got {value.dtype} {value.shape}")
         if not np.isfinite(value).all():
             raise BasisError(f"{name}: not all finite")
-    if not (body.volume > 0.0 and (body.weights >= 0.0).all() and abs(body.weights.sum() / body.volume - 1.0) < 1e-6):
-        raise BasisError(f"weights: expected >= 0 with sum {body.volume}, got sum {body.weights.sum()}")
+    if not (volume > 0.0 and (weights >= 0.0).all() and abs(weights.sum() / volume - 1.0) < 1e-6):
+        raise BasisError(f"weights: expected >= 0 with sum {volume}, got sum {weights.sum()}")
     if not 0 <= r <= n:
         raise BasisError(f"driven_count: expected 0..{n}, got {r}")
-    exact = int((body.region_stiffness == 0.0).sum())
+    exact = int((body["region_stiffness"] == 0.0).sum())
     ranges = {
         "handle_degrees": (0, 2),
         "handle_regions": (-1, exact - 1),
@@ -87,9 +93,9 @@ def check_body(body: ReducedBody) -> None:
         "region_index": (0, regions - 1),
     }
     for name, (low, high) in ranges.items():
-        value = getattr(body, name)
+        value = body[name]
         if len(value) and not (low <= value.min() and value.max() <= high):
             raise BasisError(f"{name}: expected {low}..{high}, got {value.min()}..{value.max()}")
-    counts = np.array([1, 4, 10])[body.handle_degrees]
-    if counts.sum() != raw or set(body.core_index) != set(range(regions)):
+    counts = np.array([1, 4, 10])[body["handle_degrees"]]
+    if counts.sum() != raw or set(body["core_index"]) != set(range(regions)):
         raise BasisError(f"transform: expected {counts.sum()} rows and a core for each region, got {raw} rows")

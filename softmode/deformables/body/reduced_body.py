@@ -11,25 +11,31 @@ others vanish there: to hold or move a region exactly is to prescribe the first 
 
 from __future__ import annotations
 
+import dataclasses
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from softmode.deformables.body.check import check_body
-from softmode.deformables.body.file import read_body, write_body
+from softmode.deformables.body.check import check_fields
 from softmode.deformables.body.regions import Envelope, Region
 from softmode.deformables.body.rkpm import BasisRKPM, KernelName
 from softmode.deformables.body.skinning_weights import SkinningWeights, enveloped
-from softmode.errors import BasisError, ConfigError
+from softmode.errors import AssetError, BasisError, ConfigError
+from softmode.files import read_archive, write_archive
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Scalar = str | int | float | bool | None
 
+FORMAT, FORMAT_VERSION = "softmode.ReducedBody", 2
+"""Kind and version of a body's file."""
+_HINT = "build the body again"
 REACH = 0.35
 """How far from its nearest kernel centre a point may lie, as a fraction of the kernel's support. Inside an object the
 ratio stays under 0.3; beyond, the functions grow as extrapolated polynomials do (tenfold at 0.5), so they are held
@@ -287,9 +293,54 @@ class ReducedBody:
         motion = np.concatenate([(a - np.eye(3)).transpose(0, 2, 1), t[:, None]], axis=1)
         return np.einsum("irk,ikc->rc", self.drive_affine, motion)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write an .npz without pickle; the file appears complete or not at all."""
-        write_body(self, path)
+    def fields(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """Return what is no array, with the format and its version, ready for JSON, and the arrays by name."""
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+        told = {name: value for name, value in values.items() if name not in arrays}
+        return {"format": FORMAT, "version": FORMAT_VERSION, **told}, arrays
+
+    @classmethod
+    def from_fields(
+        cls, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], source: str, *, hint: str = _HINT
+    ) -> ReducedBody:
+        """Return the body of what :meth:`fields` returned, checked.
+
+        Args:
+            header: What is no array, without format and version.
+            arrays: The arrays by name.
+            source: Where they come from, for messages.
+            hint: The remedy.
+
+        Raises:
+            AssetError: If they are not those of a body.
+        """
+        names = {f.name for f in dataclasses.fields(cls)}
+        if set(header) | set(arrays) != names or set(header) & set(arrays):
+            wrong = sorted(names ^ (set(header) | set(arrays)))
+            raise AssetError(f"{source}: fields {wrong} do not match", hint=hint)
+        try:
+            values: dict[str, Any] = {**header, **arrays, "region_names": tuple(header["region_names"])}
+            body = cls(**values)
+            body.check()
+        except BasisError as error:
+            raise AssetError(f"{source}: {error.message}", hint=hint) from error
+        except (TypeError, IndexError, AttributeError, KeyError, ValueError) as error:
+            raise AssetError(f"{source}: a field has another type or shape ({error})", hint=hint) from error
+        return body
+
+    def save(self, path: str | os.PathLike[str], *, beside: Mapping[str, NDArray[Any]] | None = None) -> None:
+        """Write an .npz without pickle; the file appears complete or not at all.
+
+        Args:
+            path: The file; its folder is made if it is missing.
+            beside: Arrays to store beside the body, by names with a dot; `load` skips them.
+
+        Raises:
+            StorageError: If it cannot be written.
+        """
+        header, arrays = self.fields()
+        write_archive(path, header, {**arrays, **(beside or {})}, "body file")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> ReducedBody:
@@ -298,7 +349,18 @@ class ReducedBody:
         Raises:
             AssetError: If the file is missing, damaged, foreign, or of another version.
         """
-        return read_body(cls, path)
+        return cls.load_with(path)[0]
+
+    @classmethod
+    def load_with(cls, path: str | os.PathLike[str]) -> tuple[ReducedBody, dict[str, NDArray[Any]]]:
+        """Read a file written by `save`, and the arrays that it carries beside the body.
+
+        Raises:
+            AssetError: If the file is missing, damaged, foreign, or of another version.
+        """
+        header, arrays = read_archive(path, FORMAT, FORMAT_VERSION, what="body file", hint=_HINT)
+        own = {name: array for name, array in arrays.items() if "." not in name}
+        return cls.from_fields(header, own, f"body file {path}"), {n: a for n, a in arrays.items() if n not in own}
 
     def check(self) -> None:
         """Verify shapes, dtypes, finiteness and the weights' sum.
@@ -306,4 +368,4 @@ class ReducedBody:
         Raises:
             BasisError: If any is wrong.
         """
-        check_body(self)
+        check_fields({f.name: getattr(self, f.name) for f in dataclasses.fields(self)})

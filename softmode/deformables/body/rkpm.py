@@ -309,7 +309,7 @@ def make_basis(
     if x.ndim != 2 or x.shape[1] != 3 or len(x) < 4:
         raise BasisError(f"points: expected at least 4 points of shape (P, 3), got {x.shape}")
     if kernel_count < 4:
-        raise ConfigError(f"kernel_count: expected at least 4, got {kernel_count}")
+        raise ConfigError(f"kernel_count must be at least 4, got {kernel_count}")
     if spacing is None:
         spacing = float(np.median(KDTree(x).query(x, k=2)[0][:, 1]))
     centres = x[sample_farthest(x, kernel_count, seed=seed)]

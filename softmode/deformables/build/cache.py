@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from softmode.deformables.body.file import FORMAT_VERSION
-from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.body.reduced_body import FORMAT_VERSION, ReducedBody
 from softmode.errors import AssetError, ConfigError
 
 
@@ -54,7 +53,7 @@ def cache_directory() -> Path:
     return Path(override) if override else Path.home() / ".cache" / "softmode"
 
 
-def fingerprint_of(*values: Any) -> str:
+def fingerprint_of(*values: object) -> str:
     """Return the sha256 of nested scalars, strings, bytes, files (paths), arrays, dataclasses, sequences, mappings."""
     digest = hashlib.sha256()
     for value in values:
@@ -62,7 +61,7 @@ def fingerprint_of(*values: Any) -> str:
     return digest.hexdigest()
 
 
-def _feed(digest: Any, value: Any) -> None:
+def _feed(digest: hashlib._Hash, value: object) -> None:
     if isinstance(value, np.ndarray):
         digest.update(f"array {value.dtype.str} {value.shape};".encode())
         digest.update(np.ascontiguousarray(value).tobytes())

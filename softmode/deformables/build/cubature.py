@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from softmode.checks import require_number
 from softmode.deformables.build.reduced_stiffness import elastic_modes, reduced_stiffness
 from softmode.deformables.build.static_response import lame_parameters
-from softmode.errors import BasisError, ConfigError
+from softmode.errors import BasisError
 
 Array = NDArray[np.float64]
 
@@ -90,8 +91,7 @@ def select_cubature(
         ConfigError: If count is less than 8.
         BasisError: If the forces are not finite.
     """
-    if count < 8:
-        raise ConfigError(f"cubature_count: expected at least 8, got {count}")
+    require_number("cubature_count", count, at_least=8)
     point_count = len(grad_basis)
     if count >= point_count:
         return Cubature(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from softmode.checks import require_number
 from softmode.deformables.body.rkpm import KernelName
 from softmode.deformables.build.functions import RANK_TOLERANCE
 from softmode.errors import ConfigError
@@ -46,17 +47,13 @@ class BuildOptions:
 
     def __post_init__(self) -> None:
         """Check ranges."""
-        if self.mode_count < 1:
-            raise ConfigError(f"mode_count: expected at least 1, got {self.mode_count}")
+        require_number("mode_count", self.mode_count, at_least=1)
         if self.kernel_count <= self.mode_count + 4:
             raise ConfigError(f"kernel_count: expected more than mode_count + 4, got {self.kernel_count}")
-        if self.cubature_count is not None and self.cubature_count < 8:
-            raise ConfigError(f"cubature_count: expected at least 8 or None, got {self.cubature_count}")
-        if not 0.0 < self.rank_tolerance <= 1.0e-2:
-            raise ConfigError(f"rank_tolerance: expected 0 < tolerance <= 0.01, got {self.rank_tolerance!r}")
+        if self.cubature_count is not None:
+            require_number("cubature_count", self.cubature_count, at_least=8)
+        require_number("rank_tolerance", self.rank_tolerance, above=0.0, at_most=1.0e-2)
         if self.handles not in get_args(HandleName):
             raise ConfigError(f"handles: expected one of {get_args(HandleName)}, got {self.handles!r}")
-        if not 0 <= self.response_derivatives <= 18:
-            raise ConfigError(f"response_derivatives: expected 0..18, got {self.response_derivatives}")
-        if not 0.0 <= self.poissons_ratio < 0.5:
-            raise ConfigError(f"poissons_ratio: expected 0 <= nu < 0.5, got {self.poissons_ratio!r}")
+        require_number("response_derivatives", self.response_derivatives, at_least=0, at_most=18)
+        require_number("poissons_ratio", self.poissons_ratio, at_least=0.0, below=0.5)

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softmode.errors import AssetError, ConfigError
+from softmode.checks import require_number
+from softmode.errors import AssetError
 
 Array = NDArray[np.float64]
 
@@ -72,10 +73,8 @@ def check_counts(point_count: int, surface_count: int) -> None:
     Raises:
         ConfigError: If there are fewer than 32 points or 8 samples.
     """
-    if point_count < 32:
-        raise ConfigError(f"point_count: expected at least 32, got {point_count}")
-    if surface_count < 8:
-        raise ConfigError(f"surface_count: expected at least 8, got {surface_count}")
+    require_number("point_count", point_count, at_least=32)
+    require_number("surface_count", surface_count, at_least=8)
 
 
 def grid_shape(extent: Array, volume: float, area: float, point_count: int) -> NDArray[np.int64]:

@@ -13,15 +13,16 @@ solver's own float32 Cholesky factor at q_t. Both integrators are covered, and d
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 import newton
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from softmode.checks import require_fields, require_number
 from softmode.deformables.gradients import adjoint_kernels as kernels
 from softmode.deformables.gradients.krylov import Gmres
 from softmode.deformables.model.authoring import NAMESPACE
@@ -50,18 +51,16 @@ class AdjointOptions:
     cycle_max: int = 5
     """Restarts at most."""
     residual_warning: float = 1.0e-4
-    """|r| / |f| of a step above which a warning is given: away from the root the theorem does not hold, and"""
+    """|r| / |f| of a step above which a warning is given: away from the root the theorem does not hold."""
     residual_max: float = 1.0e-2
-    """above which the step is refused."""
+    """|r| / |f| of a step above which it is refused."""
 
     def __post_init__(self) -> None:
         """Check every range."""
-        for name in ("cycle_length", "cycle_max"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("tolerance", "residual_warning", "residual_max"):
-            if not getattr(self, name) > 0.0:
-                raise ConfigError(f"{name} must be > 0, got {getattr(self, name)!r}")
+        require_fields(self, ("cycle_length", "cycle_max"), at_least=1)
+        require_number("tolerance", self.tolerance, above=0.0)
+        for name in ("residual_warning", "residual_max"):  # infinite ones are never reached
+            require_number(name, min(getattr(self, name), 1.0), above=0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,13 +164,13 @@ class AdjointReduced:
         self._entry = {name: self._zeros((step_max, *entries), kind) for name, kind in kinds.items()}
 
         points = (self.instances, layout.point_max)
-        self._step: Any = kernels.Linearised()
+        self._step = kernels.Linearised()
         self._step.place, self._step.place_start, self._step.point = (self._zeros(points, wp.mat33d) for _ in range(3))
         self._step.entry_slip, self._step.entry = (self._zeros(entries, wp.vec3d) for _ in range(2))
         self._step.entry_hessian = self._zeros(entries, wp.mat33d)
-        self._points: Any = Points()
+        self._points = Points()
         self._points.stress = self._step.point
-        self._constraints: Any = Entries()
+        self._constraints = Entries()
         self._constraints.count, self._constraints.row = solver.entries.count, solver.entries.row
         self._constraints.force = self._step.entry
         self._gmres = Gmres(solver, cycle_length=self.options.cycle_length, cycle_max=self.options.cycle_max)
@@ -214,7 +213,7 @@ class AdjointReduced:
         control: newton.Control | None,
         dt: float,
         *,
-        force: Any = None,
+        force: wp.array | None = None,
     ) -> None:
         """Advance by ``dt`` [s] as the solver does, with an extra generalised force [N], vec3d (N,), and record it."""
         solver = self.solver
@@ -258,7 +257,9 @@ class AdjointReduced:
 
     # -- backward -----------------------------------------------------------------------------------------------------
 
-    def backward(self, *, loss_q: Any = None, loss_qd: Any = None) -> ReducedGradients:
+    def backward(
+        self, *, loss_q: wp.array | ArrayLike | None = None, loss_qd: wp.array | ArrayLike | None = None
+    ) -> ReducedGradients:
         """Differentiate a loss of the recorded steps.
 
         Args:
@@ -283,7 +284,7 @@ class AdjointReduced:
         points = (self.instances, solver.layout.point_max)
         field = {name: self._zeros(points, wp.float64) for name in ("log_modulus", "poissons_ratio", "viscosity")}
         friction = self._zeros((self.instances, entry), wp.float64)
-        sums: Any = kernels.Sums()
+        sums = kernels.Sums()
         sums.mass, sums.mass_damping, sums.gravity = (self._zeros(solver.functions, vec8d) for _ in range(3))
         pin_target = self._zeros((steps, max(self.pin_total, 1)), wp.vec3d)
         pin_stiffness = self._zeros((max(self.pin_total, 1),), wp.float64)
@@ -343,7 +344,7 @@ class AdjointReduced:
             **totals,
         )
 
-    def _cotangent(self, name: str, values: Any) -> Any:
+    def _cotangent(self, name: str, values: wp.array | ArrayLike | None) -> Any:
         """Return dL/dq or dL/dv in blocks, with a row of zeros for the state before the record."""
         shape = (self.step_count + 1, self.total)
         out = self._zeros((self.step_count + 2, *self.solver.functions), vec8d)
@@ -391,7 +392,7 @@ class AdjointReduced:
         solver._assemble(dt)
         solver.system.factor(progress.active)
 
-    def _measure(self, t: int, residual: Any) -> None:
+    def _measure(self, t: int, residual: wp.array) -> None:
         """Measure the residual of the restored step and linearise it."""
         solver, dt = self.solver, self.dt[t]
         step = [solver.instances, solver.motion, solver.entries, self._resolution]
@@ -409,15 +410,15 @@ class AdjointReduced:
             dim = (self.instances, self.entry_max)
             self._launch(kernels.place_entries, dim, [*tables, solver.entries, stick_range, solver.q], [self._step])
 
-    def _solve(self, t: int, right: Any, solution: Any) -> None:
+    def _solve(self, t: int, right: wp.array, solution: wp.array) -> None:
         """Solve H_t^T solution = right at the free functions; leave H_t^T solution at the driven ones."""
 
-        def apply(active: Any, direction: Any, product: Any) -> None:
+        def apply(active: wp.array, direction: wp.array, product: wp.array) -> None:
             self._apply(t, active, direction, product)
 
         self._gmres.solve(apply, right, solution, tolerance=self.options.tolerance)
 
-    def _apply(self, t: int, active: Any, direction: Any, product: Any) -> None:
+    def _apply(self, t: int, active: wp.array, direction: wp.array, product: wp.array) -> None:
         """Write H_t^T direction in active worlds to ``product`` and, for the driven functions, to ``_driven``."""
         solver, dt = self.solver, wp.float64(self.dt[t])
         tables, points = [solver.instances, solver.basis], (self.instances, solver.layout.point_max)
@@ -433,7 +434,7 @@ class AdjointReduced:
             [product, self._driven],
         )
 
-    def _sum_points(self, active: Any) -> None:
+    def _sum_points(self, active: wp.array) -> None:
         """Sum what stands at the points, less what stands at the entries, into the solver's chunks."""
         solver, chunk = self.solver, self.solver.gradient_chunk
         dim = (self.instances, chunk.shape[1], solver.layout.block_count)
@@ -463,8 +464,10 @@ class AdjointReduced:
     def _blocks(self) -> tuple[int, int]:
         return self.instances, self.solver.layout.block_count
 
-    def _zeros(self, shape: Sequence[int], dtype: Any) -> Any:
+    def _zeros(self, shape: Sequence[int], dtype: type) -> Any:
         return wp.zeros(tuple(shape), dtype=dtype, device=self.device)
 
-    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: Sequence[Any] = ()) -> None:
+    def _launch(
+        self, kernel: Callable[..., None], dim: int | Sequence[int], inputs: list[Any], outputs: Sequence[Any] = ()
+    ) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=list(outputs), device=self.device)

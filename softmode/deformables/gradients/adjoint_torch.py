@@ -53,7 +53,7 @@ def _function() -> Any:
             "PyTorch is not installed", hint="install it with: pip install 'softmode[rl]'"
         ) from error
 
-    def view(tensor: Tensor, adjoint: AdjointReduced, dtype: Any = wp.vec3d) -> wp.array:
+    def view(tensor: Tensor, adjoint: AdjointReduced, dtype: type = wp.vec3d) -> wp.array:
         """Return a tensor as a Warp array on the adjoint's device, sharing memory where it can."""
         scalar = torch.float32 if dtype is wp.float32 else torch.float64
         there = tensor.detach().to(device=wp.device_to_torch(adjoint.device), dtype=scalar).contiguous()
@@ -61,7 +61,7 @@ def _function() -> Any:
 
     class Rollout(torch.autograd.Function):
         @staticmethod
-        def forward(ctx: Any, adjoint: AdjointReduced, step_count: int, dt: float, *values: Any) -> Any:
+        def forward(ctx: Any, adjoint: AdjointReduced, step_count: int, dt: float, *values: Tensor | None) -> Any:
             given = {name: value for name, value in zip(INPUTS, values, strict=True) if value is not None}
             model = adjoint.solver.model
             for name in given.keys() & set(INSTANCE_PARAMETERS):
@@ -87,7 +87,7 @@ def _function() -> Any:
             return tuple(wp.to_torch(values).clone() for values in (adjoint.q, adjoint.qd))
 
         @staticmethod
-        def backward(ctx: Any, *losses: Any) -> Any:
+        def backward(ctx: Any, *losses: Tensor) -> Any:
             adjoint = ctx.adjoint
             if adjoint.generation != ctx.generation:
                 raise ConfigError(

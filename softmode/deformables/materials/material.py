@@ -41,6 +41,7 @@ angular frequency omega of the body at rest has the damping ratio zeta = alpha /
 
 from dataclasses import dataclass
 
+from softmode.checks import require_fields, require_number
 from softmode.deformables.materials.hessian_kernels import HessianBlocks, hessian, stress_derivative
 from softmode.deformables.materials.material_kernels import (
     MaterialModel,
@@ -104,20 +105,9 @@ class Material:
 
     def __post_init__(self) -> None:
         """Check every range."""
-        for name in ("youngs_modulus", "density"):
-            value = getattr(self, name)
-            if not 0.0 < value < float("inf"):
-                raise MaterialError(
-                    f"{name} must be a finite number > 0, got {value!r}", hint=f"give {name} in SI units"
-                )
-        if not -1.0 < self.poissons_ratio < 0.5:
-            raise MaterialError(
-                f"poissons_ratio must lie in (-1, 0.5), got {self.poissons_ratio!r}",
-                hint="use 0.49 for a nearly incompressible material",
-            )
-        for name in ("viscosity", "mass_damping", "friction"):
-            value = getattr(self, name)
-            if not 0.0 <= value < float("inf"):
-                raise MaterialError(
-                    f"{name} must be a finite number >= 0, got {value!r}", hint="use 0 to switch it off"
-                )
+        error = MaterialError
+        require_fields(self, ("youngs_modulus", "density"), above=0.0, hint="give it in SI units", error=error)
+        hint = "use 0.49 for a nearly incompressible material"
+        require_number("poissons_ratio", self.poissons_ratio, above=-1.0, below=0.5, hint=hint, error=error)
+        rates = ("viscosity", "mass_damping", "friction")
+        require_fields(self, rates, at_least=0.0, hint="use 0 to switch it off", error=error)

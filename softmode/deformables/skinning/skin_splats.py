@@ -6,7 +6,6 @@ what is left of it in float32, and their sum is rounded once at the end.
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -77,7 +76,7 @@ class SkinSplats:
         grad_basis: ArrayLike,
         *,
         stretch_limit: float = STRETCH_LIMIT,
-        device: Any = None,
+        device: str | wp.Device | None = None,
     ) -> None:
         """Upload the rest state."""
         x, s = np.asarray(means, dtype=np.float64), np.asarray(covariances, dtype=np.float64)

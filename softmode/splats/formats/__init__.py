@@ -13,8 +13,8 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from softmode.errors import AssetError, ConfigError
-from softmode.splats.formats.common import typed_errors
+from softmode.errors import ConfigError
+from softmode.splats.formats.common import typed_errors, unreadable
 from softmode.splats.formats.compressed_ply import write_compressed_ply
 from softmode.splats.formats.ply import read_ply, write_ply
 from softmode.splats.formats.sog import read_sog
@@ -81,11 +81,12 @@ def read_splats(path: str | os.PathLike[str]) -> Splats:
         if file.is_dir():
             return read_sog(file)
         if not file.exists():
-            raise AssetError(f"splat file {file}: no such file", hint="Check the path")
+            raise unreadable(file, "no such file", hint="Check the path")
         reader = _READERS.get(file.suffix.lower())
         if reader is None:
-            raise AssetError(
-                f"splat file {file}: unknown kind {file.suffix.lower() or '(no suffix)'!r}",
+            raise unreadable(
+                file,
+                f"unknown kind {file.suffix.lower() or '(no suffix)'!r}",
                 hint=f"Readable are {', '.join(READABLE)}; convert others with SuperSplat or splat-transform",
             )
         return reader(file)
@@ -103,15 +104,17 @@ def write_splats(path: str | os.PathLike[str], splats: Splats, *, up: UpAxis = "
             is up and take "+z" only.
 
     Raises:
-        AssetError: If the suffix names no writable format, or the file cannot be written.
+        AssetError: If the suffix names no writable format.
+        StorageError: If the file cannot be written.
         ConfigError: If `up` is no axis, or not "+z" for OpenUSD.
         MissingExtraError: If OpenUSD is to be written without the extra `[usd]`.
     """
     file = Path(path)
     suffix = next((known for known in _WRITERS if file.name.lower().endswith(known)), None)
     if suffix is None:
-        raise AssetError(
-            f"splat file {file}: cannot write {file.suffix.lower() or '(no suffix)'!r}",
+        raise unreadable(
+            file,
+            f"cannot write {file.suffix.lower() or '(no suffix)'!r}",
             hint=f"Writable are {', '.join(WRITABLE)}",
         )
     if up != "+z":

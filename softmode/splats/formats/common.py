@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import struct
 import zipfile
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from softmode.errors import AssetError
-from softmode.files import atomic_write
 from softmode.splats.splats import MAX_SPLATS, SH_DC
 
 REEXPORT = "The file is damaged or incomplete: copy or export it again"
@@ -26,6 +24,17 @@ FREE_BYTES = 8 * 2**20
 """Bytes that anything may unpack to however small it is: Zstandard and WebP pack what is all the same without limit."""
 MAX_RATIO = 1032
 """Largest ratio of unpacked to packed bytes that a reader accepts: what deflate can reach at most."""
+
+
+def unreadable(path: object, problem: str, hint: str = REEXPORT) -> AssetError:
+    """Return the error of a splat file that cannot be read.
+
+    Args:
+        path: The file.
+        problem: What is wrong.
+        hint: The remedy.
+    """
+    return AssetError(f"splat file {path}: {problem}", hint=hint)
 
 
 @contextlib.contextmanager
@@ -45,37 +54,23 @@ def typed_errors(name: str) -> Iterator[None]:
         RuntimeError,
         SyntaxError,
     ) as error:
-        raise AssetError(f"splat file {name}: cannot be read ({error})", hint=REEXPORT) from error
+        raise unreadable(name, f"cannot be read ({error})") from error
     except (ValueError, OverflowError, MemoryError, Image.DecompressionBombError) as error:
-        raise AssetError(f"splat file {name}: holds invalid data ({error})", hint=REEXPORT) from error
-
-
-@contextlib.contextmanager
-def atomic_splat_file(path: str | os.PathLike[str]) -> Iterator[Any]:
-    """Yield a binary file that takes the place of `path` when complete; what fails raises AssetError."""
-    try:
-        with atomic_write(path) as file:
-            yield file
-    except OSError as error:
-        raise AssetError(
-            f"splat file {path}: cannot be written ({error})", hint="Check the folder and its permissions"
-        ) from error
+        raise unreadable(name, f"holds invalid data ({error})") from error
 
 
 def check_count(count: int, name: str) -> int:
     """Return the declared number of splats if a reader may allocate for it."""
     if not 0 < count <= MAX_SPLATS:
-        raise AssetError(
-            f"splat file {name}: {count} splats, expected 1 to {MAX_SPLATS}", hint="Export the asset again, decimated"
-        )
+        raise unreadable(name, f"{count} splats, expected 1 to {MAX_SPLATS}", hint="Export the asset again, decimated")
     return count
 
 
-def read_exactly(file: Any, size: int, path: Path) -> bytes:
+def read_exactly(file: BinaryIO, size: int, path: Path) -> bytes:
     """Return the next `size` bytes of a file whose size has been checked."""
     data = file.read(size)
     if len(data) != size:
-        raise AssetError(f"splat file {path}: shrank while it was read", hint="Read it again when nothing writes to it")
+        raise unreadable(path, "shrank while it was read", hint="Read it again when nothing writes to it")
     return data
 
 

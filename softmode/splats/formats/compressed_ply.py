@@ -15,15 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.errors import AssetError
+from softmode.files import whole_file
 from softmode.splats.formats.common import (
-    REEXPORT,
-    atomic_splat_file,
     exp_scales,
     quats_from_smallest_three,
     sh_from_colors,
     smallest_three_from_quats,
     to_unsigned,
+    unreadable,
 )
 from softmode.splats.splats import SH_DC, Splats
 
@@ -51,7 +50,7 @@ def decode_compressed(chunk: NDArray[Any], vertex: NDArray[Any], sh: NDArray[Any
     _require_columns(chunk, [*_BOUNDS, *_SCALE_BOUNDS, *(_COLOR_BOUNDS if with_colors else [])], "<f4", "chunk", path)
     _require_columns(vertex, _PACKED, "<u4", "vertex", path)
     if len(chunk) != -(-count // _CHUNK):
-        raise AssetError(f"splat file {path}: {len(chunk)} chunks for {count} splats of 256 each", hint=REEXPORT)
+        raise unreadable(path, f"{len(chunk)} chunks for {count} splats of 256 each")
     row = np.arange(count) // _CHUNK
 
     def within(bounds: list[str], fraction: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -68,10 +67,7 @@ def decode_compressed(chunk: NDArray[Any], vertex: NDArray[Any], sh: NDArray[Any
     if sh is not None:
         names = [f"f_rest_{i}" for i in range(len(sh.dtype.names or ()))]
         if len(sh) != count or len(names) not in (9, 24, 45):
-            raise AssetError(
-                f"splat file {path}: {len(sh)} rows of {len(names)} spherical harmonics for {count} splats",
-                hint=REEXPORT,
-            )
+            raise unreadable(path, f"{len(sh)} rows of {len(names)} spherical harmonics for {count} splats")
         _require_columns(sh, names, "u1", "sh", path)
         codes = np.stack([sh[name] for name in names], axis=1)
         rest = _SH_CODES[codes].reshape(count, 3, -1).transpose(0, 2, 1)
@@ -94,8 +90,9 @@ _SH_CODES[[0, 255]] = -4.0, 4.0
 def _require_columns(table: NDArray[Any], names: list[str], kind: str, element: str, path: str) -> None:
     """Raise an AssetError unless the table has exactly these columns, all of this type."""
     if sorted(table.dtype.names or ()) != sorted(names) or any(table.dtype[name] != np.dtype(kind) for name in names):
-        raise AssetError(
-            f"splat file {path}: element {element!r} of a compressed .ply has unexpected properties",
+        raise unreadable(
+            path,
+            f"element {element!r} of a compressed .ply has unexpected properties",
             hint="Convert it with splat-transform to an ordinary .ply",
         )
 
@@ -116,7 +113,7 @@ def write_compressed_ply(path: str | os.PathLike[str], splats: Splats) -> None:
         splats: What to write, in its own frame.
 
     Raises:
-        AssetError: If the file cannot be written.
+        StorageError: If the file cannot be written.
     """
     starts = np.arange(0, splats.count, _CHUNK)
     row = np.arange(splats.count) // _CHUNK
@@ -155,7 +152,7 @@ def write_compressed_ply(path: str | os.PathLike[str], splats: Splats) -> None:
     lines += [f"element vertex {splats.count}", *(f"property uint {name}" for name in _PACKED)]
     if rest.shape[1]:
         lines += [f"element sh {splats.count}", *(f"property uchar f_rest_{i}" for i in range(rest.shape[1]))]
-    with atomic_splat_file(path) as file:
+    with whole_file(path, "splat file", make_folders=False) as file:
         file.write("\n".join([*lines, "end_header\n"]).encode("ascii"))
         file.write(chunk.astype("<f4").tobytes())
         file.write(vertex.astype("<u4").tobytes())

@@ -15,14 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.errors import AssetError
+from softmode.files import whole_file
 from softmode.splats.formats.common import (
-    REEXPORT,
-    atomic_splat_file,
     check_count,
     exp_scales,
     read_exactly,
     sigmoid,
+    unreadable,
 )
 from softmode.splats.formats.compressed_ply import decode_compressed
 from softmode.splats.splats import Splats
@@ -76,8 +75,9 @@ def read_ply(path: str | os.PathLike[str]) -> Splats:
             ["chunk", "vertex"],
             ["chunk", "vertex", "sh"],
         ):
-            raise AssetError(
-                f"splat file {file_path}: elements {[element.name for element in elements][:8]}, expected 'vertex', or "
+            raise unreadable(
+                file_path,
+                f"elements {[element.name for element in elements][:8]}, expected 'vertex', or "
                 "'chunk', 'vertex' and 'sh'",
                 hint="Only splat .ply files can be read; sample a mesh with `softmode splat from-mesh`",
             )
@@ -86,10 +86,8 @@ def read_ply(path: str | os.PathLike[str]) -> Splats:
             _check_columns(vertex, str(file_path))
         declared, size = offset + sum(element.size for element in elements), os.fstat(file.fileno()).st_size
         if size != declared:
-            raise AssetError(
-                f"splat file {file_path}: header declares {vertex.count} splats and {declared} bytes, the file holds "
-                f"{size}",
-                hint=REEXPORT,
+            raise unreadable(
+                file_path, f"header declares {vertex.count} splats and {declared} bytes, the file holds {size}"
             )
         file.seek(offset)
         tables = {
@@ -131,7 +129,7 @@ def _parse_header(head: bytes, name: str) -> tuple[list[_Element], int]:
     """Return the elements and the offset of the data."""
     match = re.search(rb"(?:^|\n)end_header\r?\n", head)
     if not head.startswith(b"ply") or match is None:
-        raise AssetError(f"splat file {name}: no PLY header within {_HEADER_LIMIT} bytes", hint=REEXPORT)
+        raise unreadable(name, f"no PLY header within {_HEADER_LIMIT} bytes")
     elements: list[_Element] = []
     form = ""
     for line in head[: match.start()].decode("ascii", "replace").splitlines()[1:]:
@@ -144,17 +142,16 @@ def _parse_header(head: bytes, name: str) -> tuple[list[_Element], int]:
             elements.append(_Element(name=words[1], count=int(words[2]), properties=[]))
         elif words[0] == "property" and len(words) == 3 and words[1] in _PLY_TYPES and elements:
             if any(words[2] == known for known, _ in elements[-1].properties):
-                raise AssetError(f"splat file {name}: property {words[2][:80]} is declared twice", hint=REEXPORT)
+                raise unreadable(name, f"property {words[2][:80]} is declared twice")
             elements[-1].properties.append((words[2], _PLY_TYPES[words[1]]))
         else:
-            raise AssetError(
-                f"splat file {name}: unreadable header line {line[:80]!r}",
+            raise unreadable(
+                name,
+                f"unreadable header line {line[:80]!r}",
                 hint="Splat files hold scalar properties only; a mesh .ply is no splat file",
             )
     if form != "binary_little_endian":
-        raise AssetError(
-            f"splat file {name}: format {form or 'missing'!r}, expected binary_little_endian", hint="Export as binary"
-        )
+        raise unreadable(name, f"format {form or 'missing'!r}, expected binary_little_endian", hint="Export as binary")
     return elements, match.end()
 
 
@@ -163,15 +160,14 @@ def _check_columns(vertex: _Element, name: str) -> None:
     names = {field for field, _ in vertex.properties}
     missing = [field for field in _PLY_COLUMNS if field not in names]
     if missing:
-        raise AssetError(
-            f"splat file {name}: properties {', '.join(missing)} are missing",
+        raise unreadable(
+            name,
+            f"properties {', '.join(missing)} are missing",
             hint="Only splat .ply files (f_dc, opacity, scale, rot) can be read; a point cloud or a mesh is none",
         )
     rest = {field for field in names if field.startswith("f_rest_")}
     if len(rest) not in (0, 9, 24, 45) or rest != {f"f_rest_{i}" for i in range(len(rest))}:
-        raise AssetError(
-            f"splat file {name}: {len(rest)} f_rest properties, expected f_rest_0.. of 0, 9, 24 or 45", hint=REEXPORT
-        )
+        raise unreadable(name, f"{len(rest)} f_rest properties, expected f_rest_0.. of 0, 9, 24 or 45")
 
 
 def write_ply(path: str | os.PathLike[str], splats: Splats) -> None:
@@ -184,7 +180,7 @@ def write_ply(path: str | os.PathLike[str], splats: Splats) -> None:
         splats: What to write, in its own frame.
 
     Raises:
-        AssetError: If the file cannot be written.
+        StorageError: If the file cannot be written.
     """
     opacity = np.clip(splats.opacities.astype(np.float64), 1e-6, 1.0 - 1e-6)
     rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(splats.count, -1)
@@ -202,6 +198,6 @@ def write_ply(path: str | os.PathLike[str], splats: Splats) -> None:
         table[name] = column
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {splats.count}"]
     header = "\n".join([*lines, *(f"property float {name}" for name in named), "end_header\n"])
-    with atomic_splat_file(path) as file:
+    with whole_file(path, "splat file", make_folders=False) as file:
         file.write(header.encode("ascii"))
         file.write(table.tobytes())

@@ -20,7 +20,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from softmode.errors import AssetError
-from softmode.splats.formats.common import FREE_BYTES, MAX_RATIO, REEXPORT, exp_scales, quats_from_smallest_three
+from softmode.splats.formats.common import (
+    FREE_BYTES,
+    MAX_RATIO,
+    exp_scales,
+    quats_from_smallest_three,
+    unreadable,
+)
 from softmode.splats.splats import MAX_SPLATS, Splats
 
 _META_LIMIT = 16 * 1024 * 1024
@@ -52,11 +58,12 @@ _Reader = Callable[[str, int], bytes]
 """Return the bytes of a named member, refusing more than the given number."""
 
 
-def _check_member(name: Any, source: str) -> str:
+def _check_member(name: object, source: str) -> str:
     """Return the name if it is a plain file name, so that no member leads out of the asset."""
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.\-]{0,127}", name):
-        raise AssetError(
-            f"splat file {source}: member name {str(name)[:80]!r} is not a plain file name",
+        raise unreadable(
+            source,
+            f"member name {str(name)[:80]!r} is not a plain file name",
             hint="Members must lie beside meta.json; do not trust this file",
         )
     return name
@@ -68,14 +75,15 @@ def _folder_reader(folder: Path, meta: str = "meta.json") -> _Reader:
     def read(name: str, limit: int) -> bytes:
         file = folder / (meta if name == "meta.json" else name)
         if not file.is_file():
-            raise AssetError(
-                f"splat file {folder / meta}: member {name} is missing",
+            raise unreadable(
+                folder / meta,
+                f"member {name} is missing",
                 hint="Copy the whole folder, with all .webp files",
             )
         with open(file, "rb") as stream:
             data = stream.read(limit + 1)
         if len(data) > limit:
-            raise AssetError(f"splat file {file}: larger than {limit} bytes", hint="Decimate the asset first")
+            raise unreadable(file, f"larger than {limit} bytes", hint="Decimate the asset first")
         return data
 
     return read
@@ -88,16 +96,13 @@ def _archive_reader(archive: zipfile.ZipFile, source: str) -> _Reader:
         try:
             info = archive.getinfo(name)
         except KeyError:
-            raise AssetError(f"splat file {source}: member {name} is missing", hint=REEXPORT) from None
+            raise unreadable(source, f"member {name} is missing") from None
         if info.file_size > limit:
-            raise AssetError(
-                f"splat file {source}: member {name} larger than {limit} bytes", hint="Decimate the asset first"
-            )
+            raise unreadable(source, f"member {name} larger than {limit} bytes", hint="Decimate the asset first")
         if info.file_size > max(FREE_BYTES, _ARCHIVE_RATIO * info.compress_size):
-            raise AssetError(
-                f"splat file {source}: member {name} unpacks from {info.compress_size} to {info.file_size} bytes, "
-                "which no image does",
-                hint=REEXPORT,
+            raise unreadable(
+                source,
+                f"member {name} unpacks from {info.compress_size} to {info.file_size} bytes, which no image does",
             )
         with archive.open(info) as stream:
             return stream.read(limit)
@@ -129,7 +134,7 @@ class _SogMeta:
         self.path = path
 
     def fail(self, problem: str) -> AssetError:
-        return AssetError(f"splat file {self.source}: {self.path}: {problem}", hint=REEXPORT)
+        return unreadable(self.source, f"{self.path}: {problem}")
 
     def __contains__(self, key: str) -> bool:
         return isinstance(self.value, dict) and key in self.value
@@ -164,11 +169,9 @@ def _decode(source: str, read: _Reader) -> Splats:
     try:
         meta = _SogMeta(json.loads(read("meta.json", _META_LIMIT)), source)
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise AssetError(f"splat file {source}: meta.json is no JSON ({error})", hint=REEXPORT) from error
+        raise unreadable(source, f"meta.json is no JSON ({error})") from error
     if "version" not in meta or meta["version"].value != 2:
-        raise AssetError(
-            f"splat file {source}: not SOG version 2", hint="Convert it with splat-transform to SOG v2 or to .ply"
-        )
+        raise unreadable(source, "not SOG version 2", hint="Convert it with splat-transform to SOG v2 or to .ply")
     count = meta["count"].integer(1, MAX_SPLATS)
     file_bytes = image_bytes = 0
 
@@ -178,23 +181,21 @@ def _decode(source: str, read: _Reader) -> Splats:
         size = _webp_size(data)
         # The header is judged before any decoder sees the data: an image may not unpack to more than its splats need.
         if not low <= size[0] * size[1] <= high or (width is not None and size[0] != width):
-            raise AssetError(
-                f"splat file {source}: image {name} is {size[0]} x {size[1]} pixels, expected "
+            raise unreadable(
+                source,
+                f"image {name} is {size[0]} x {size[1]} pixels, expected "
                 + (f"{width} wide and " if width else "")
                 + f"{low} to {high} pixels of lossless WebP for {count} splats",
-                hint=REEXPORT,
             )
         # A single colour packs without bound; together, the images of real splats pack by less than ten.
         file_bytes, image_bytes = file_bytes + len(data), image_bytes + 4 * size[0] * size[1]
         if image_bytes > max(FREE_BYTES, MAX_RATIO * file_bytes):
-            raise AssetError(
-                f"splat file {source}: images of {file_bytes} bytes cannot hold the {count} splats that meta.json "
-                "declares",
-                hint=REEXPORT,
+            raise unreadable(
+                source, f"images of {file_bytes} bytes cannot hold the {count} splats that meta.json declares"
             )
         with Image.open(io.BytesIO(data), formats=["WEBP"]) as picture:
             if picture.size != size:
-                raise AssetError(f"splat file {source}: image {name} contradicts its header", hint=REEXPORT)
+                raise unreadable(source, f"image {name} contradicts its header")
             return np.asarray(picture.convert("RGBA"))
 
     def pixels(name: str) -> NDArray[np.uint8]:
@@ -213,7 +214,7 @@ def _decode(source: str, read: _Reader) -> Splats:
     # Quaternions: the largest of w, x, y, z is dropped (alpha - 252 names it), the others lie in +-1/sqrt(2).
     packed = pixels(meta["quats"]["files"].files(1)[0])
     if (packed[:, 3] < 252).any():
-        raise AssetError(f"splat file {source}: quats hold a mode below 252", hint=REEXPORT)
+        raise unreadable(source, "quats hold a mode below 252")
     others = (packed[:, :3] / 255.0 - 0.5) * np.sqrt(2.0)
     wxyz = quats_from_smallest_three(packed[:, 3] - 252, others)
 

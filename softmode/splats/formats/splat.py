@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from softmode.errors import AssetError
-from softmode.splats.formats.common import REEXPORT, atomic_splat_file, check_count, read_exactly, sh_from_colors
+from softmode.files import whole_file
+from softmode.splats.formats.common import check_count, read_exactly, sh_from_colors, unreadable
 from softmode.splats.splats import SH_DC, Splats
 
 _RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("wxyz", "u1", 4)])
@@ -28,7 +28,7 @@ def read_splat(path: str | os.PathLike[str]) -> Splats:
     with open(file_path, "rb") as file:
         size = os.fstat(file.fileno()).st_size
         if size % _RECORD.itemsize:
-            raise AssetError(f"splat file {file_path}: {size} bytes are no multiple of 32", hint=REEXPORT)
+            raise unreadable(file_path, f"{size} bytes are no multiple of 32")
         count = check_count(size // _RECORD.itemsize, str(file_path))
         table = np.frombuffer(read_exactly(file, count * _RECORD.itemsize, file_path), dtype=_RECORD)
     wxyz = (table["wxyz"].astype(np.float64) - 128.0) / 128.0
@@ -53,7 +53,7 @@ def write_splat(path: str | os.PathLike[str], splats: Splats) -> None:
         splats: What to write, in its own frame.
 
     Raises:
-        AssetError: If the file cannot be written.
+        StorageError: If the file cannot be written.
     """
     table = np.empty(splats.count, dtype=_RECORD)
     table["mean"], table["scale"] = splats.means, splats.scales
@@ -63,5 +63,5 @@ def write_splat(path: str | os.PathLike[str], splats: Splats) -> None:
     wxyz = splats.quats[:, [3, 0, 1, 2]]
     largest = np.take_along_axis(wxyz, np.abs(wxyz).argmax(axis=1)[:, None], axis=1)
     table["wxyz"] = np.clip(np.rint(np.where(largest > 0.0, -wxyz, wxyz) * 128.0 + 128.0), 0, 255)
-    with atomic_splat_file(path) as file:
+    with whole_file(path, "splat file", make_folders=False) as file:
         file.write(table.tobytes())

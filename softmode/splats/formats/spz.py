@@ -21,17 +21,17 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.errors import AssetError, ConfigError, MissingExtraError
+from softmode.errors import ConfigError, MissingExtraError
+from softmode.files import whole_file
 from softmode.splats.formats.common import (
     FREE_BYTES,
     MAX_RATIO,
-    REEXPORT,
-    atomic_splat_file,
     check_count,
     exp_scales,
     quats_from_smallest_three,
     read_exactly,
     smallest_three_from_quats,
+    unreadable,
 )
 from softmode.splats.splats import Splats
 
@@ -90,17 +90,16 @@ def _check_header(fields: tuple[Any, ...], versions: range, packed_size: int, pa
     """Return the header if its values are possible for a file of this size."""
     magic, version, count, degree, fractional_bits, flags = fields[:6]
     if magic != _MAGIC:
-        raise AssetError(f"splat file {path}: no SPZ header", hint=REEXPORT)
+        raise unreadable(path, "no SPZ header")
     if version not in versions:
-        raise AssetError(
-            f"splat file {path}: SPZ version {version}, expected {versions[0]} to {versions[-1]}",
+        raise unreadable(
+            path,
+            f"SPZ version {version}, expected {versions[0]} to {versions[-1]}",
             hint="Convert it with splat-transform to a newer SPZ or to .ply",
         )
     if degree > 4 or fractional_bits > 30:
-        raise AssetError(
-            f"splat file {path}: spherical-harmonic degree {degree} and {fractional_bits} fractional bits, expected "
-            "at most 4 and 30",
-            hint=REEXPORT,
+        raise unreadable(
+            path, f"spherical-harmonic degree {degree} and {fractional_bits} fractional bits, expected at most 4 and 30"
         )
     header = _Header(
         version=version,
@@ -110,10 +109,7 @@ def _check_header(fields: tuple[Any, ...], versions: range, packed_size: int, pa
         flags=flags,
     )
     if sum(header.sizes().values()) > max(FREE_BYTES, MAX_RATIO * packed_size):
-        raise AssetError(
-            f"splat file {path}: {packed_size} bytes cannot hold the {count} splats that the header declares",
-            hint=REEXPORT,
-        )
+        raise unreadable(path, f"{packed_size} bytes cannot hold the {count} splats that the header declares")
     return header
 
 
@@ -122,18 +118,18 @@ def _unpack_gzip(data: bytes, path: str) -> tuple[_Header, dict[str, memoryview]
     stream = zlib.decompressobj(wbits=31)
     head = stream.decompress(data, _HEADER.size)
     if len(head) < _HEADER.size:
-        raise AssetError(f"splat file {path}: ends within its header", hint=REEXPORT)
+        raise unreadable(path, "ends within its header")
     header = _check_header(_HEADER.unpack(head), range(1, 4), len(data), path)
     sizes = header.sizes()
     expected = sum(sizes.values())
     allowed = expected + (_EXTENSION_LIMIT if header.flags & _EXTENDED else 0)
     body = stream.decompress(stream.unconsumed_tail, allowed + 1)
     if not expected <= len(body) <= allowed or not stream.eof or stream.unused_data:
-        raise AssetError(
-            f"splat file {path}: header declares {header.count} splats, {expected} bytes unpacked, the file holds "
+        raise unreadable(
+            path,
+            f"header declares {header.count} splats, {expected} bytes unpacked, the file holds "
             f"{'more than ' if len(body) > allowed else ''}{min(len(body), allowed)}"
             + ("" if stream.eof and not stream.unused_data else ", or does not end where its gzip stream ends"),
-            hint=REEXPORT,
         )
     view, start, arrays = memoryview(body), 0, {}
     for name, size in sizes.items():
@@ -160,22 +156,16 @@ def _zstd() -> Any:
 def _unpack_zstd(data: bytes, path: str) -> tuple[_Header, dict[str, bytes]]:
     """Return header and arrays of version 4; every frame must unpack to exactly the size its array needs."""
     if len(data) < _HEADER_4.size:
-        raise AssetError(f"splat file {path}: ends within its header", hint=REEXPORT)
+        raise unreadable(path, "ends within its header")
     *fields, stream_count, table = _HEADER_4.unpack_from(data)
     header = _check_header(tuple(fields), range(4, 5), len(data), path)
     sizes = header.sizes()
     start = table + len(sizes) * _ENTRY.size
     if stream_count != len(sizes) or table < _HEADER_4.size or start > len(data):
-        raise AssetError(
-            f"splat file {path}: {stream_count} streams listed at byte {table} of {len(data)}, expected {len(sizes)}",
-            hint=REEXPORT,
-        )
+        raise unreadable(path, f"{stream_count} streams listed at byte {table} of {len(data)}, expected {len(sizes)}")
     entries = [_ENTRY.unpack_from(data, table + i * _ENTRY.size) for i in range(len(sizes))]
     if [entry[1] for entry in entries] != list(sizes.values()) or start + sum(e[0] for e in entries) != len(data):
-        raise AssetError(
-            f"splat file {path}: the sizes of its streams contradict {header.count} splats or {len(data)} bytes",
-            hint=REEXPORT,
-        )
+        raise unreadable(path, f"the sizes of its streams contradict {header.count} splats or {len(data)} bytes")
     zstd = _zstd()
     arrays = {}
     for (name, size), (packed, _) in zip(sizes.items(), entries, strict=True):
@@ -185,9 +175,9 @@ def _unpack_zstd(data: bytes, path: str) -> tuple[_Header, dict[str, bytes]]:
         try:
             arrays[name] = stream.decompress(data[start : start + packed], size + 1)
         except zstd.ZstdError as error:
-            raise AssetError(f"splat file {path}: stream of {name} is damaged ({error})", hint=REEXPORT) from error
+            raise unreadable(path, f"stream of {name} is damaged ({error})") from error
         if len(arrays[name]) != size or not stream.eof or stream.unused_data:
-            raise AssetError(f"splat file {path}: stream of {name} does not hold {size} bytes", hint=REEXPORT)
+            raise unreadable(path, f"stream of {name} does not hold {size} bytes")
         start += packed
     return header, arrays
 
@@ -239,7 +229,8 @@ def write_spz(path: str | os.PathLike[str], splats: Splats, *, version: Literal[
         version: 3 (gzip; the one that nearly every viewer reads) or 4 (Zstandard).
 
     Raises:
-        AssetError: If the file cannot be written, or a coordinate exceeds the format's 8388607 m.
+        AssetError: If a coordinate exceeds the format's 8388607 m.
+        StorageError: If the file cannot be written.
         ConfigError: If the version is neither 3 nor 4.
         MissingExtraError: If version 4 is asked for without Zstandard.
     """
@@ -248,8 +239,9 @@ def write_spz(path: str | os.PathLike[str], splats: Splats, *, version: Literal[
     reach = max(float(np.abs(splats.means).max()), 2.0**-30)
     fractional_bits = min(20, int(np.floor(np.log2((2**23 - 1) / reach))))
     if fractional_bits < 0:
-        raise AssetError(
-            f"splat file {path}: a coordinate of {reach:.3g} m exceeds the 8388607 m of SPZ",
+        raise unreadable(
+            path,
+            f"a coordinate of {reach:.3g} m exceeds the 8388607 m of SPZ",
             hint="Move the splats to the origin or write .ply",
         )
     fixed = np.rint(splats.means.astype(np.float64) * 2.0**fractional_bits).astype("<i4")
@@ -274,7 +266,7 @@ def write_spz(path: str | os.PathLike[str], splats: Splats, *, version: Literal[
         frames = [zstd.compress(array) for array in arrays]
         table = b"".join(_ENTRY.pack(len(f), len(a)) for f, a in zip(frames, arrays, strict=True))
         packed = _HEADER_4.pack(*fields, len(arrays), _HEADER_4.size) + table + b"".join(frames)
-    with atomic_splat_file(path) as file:
+    with whole_file(path, "splat file", make_folders=False) as file:
         file.write(packed)
 
 

@@ -21,8 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from softmode.checks import require_number
 from softmode.errors import AssetError, ConfigError, MissingExtraError
-from softmode.splats.formats.common import REEXPORT, atomic_splat_file, typed_errors
+from softmode.files import whole_file
+from softmode.splats.formats.common import REEXPORT, typed_errors, unreadable
 from softmode.splats.splats import MAX_SPLATS, Splats, UpAxis, rotate_sh, up_rotation
 from softmode.stages import process
 
@@ -62,8 +64,9 @@ def _read_stage(file: Path, time_code: float | None) -> Splats:
         answer = process.ask(request, name=f"splat file {file}")
     stage = answer.described
     if not stage["prims"]:
-        raise AssetError(
-            f"splat file {file}: holds no visible ParticleField3DGaussianSplat prim",
+        raise unreadable(
+            file,
+            "holds no visible ParticleField3DGaussianSplat prim",
             hint="Export the splats as such, or check that the prim is not invisible or in an unloaded payload",
         )
     parts: list[Splats] = []
@@ -71,11 +74,11 @@ def _read_stage(file: Path, time_code: float | None) -> Splats:
         splats = splats_from_prim(prim, answer.arrays, f"splat file {file}: {prim['path']}")
         parts.append(placed(splats, np.array(prim["matrix"]).reshape(4, 4).T))
     if stage["up"] not in UP_AXES:
-        raise AssetError(f"splat file {file}: upAxis is {stage['up'][:20]!r}", hint="Set it to X, Y or Z")
+        raise unreadable(file, f"upAxis is {stage['up'][:20]!r}", hint="Set it to X, Y or Z")
     up = up_rotation(UP_AXES[stage["up"]])
     meters = float(stage["meters"])
     if not (np.isfinite(meters) and meters > 0.0):
-        raise AssetError(f"splat file {file}: metersPerUnit is {meters}", hint="Set it to the length of the unit in m")
+        raise unreadable(file, f"metersPerUnit is {meters}", hint="Set it to the length of the unit in m")
     return joined(parts, f"splat file {file}").transformed(rotation=up, scale=meters)
 
 
@@ -178,7 +181,7 @@ def write_usd(path: str | os.PathLike[str], splats: Splats | Sequence[Splats], *
         fps: Frames per second of an animation.
 
     Raises:
-        AssetError: If the file cannot be written.
+        StorageError: If the file cannot be written.
         ConfigError: If there are no frames, they differ in count or degree, or `fps` is not positive.
         MissingExtraError: If the extra `[usd]` is not installed.
     """
@@ -188,13 +191,12 @@ def write_usd(path: str | os.PathLike[str], splats: Splats | Sequence[Splats], *
             "an animation needs at least one frame, and the same number of splats and degree in all",
             hint="Deform one set of rest splats",
         )
-    if not (np.isfinite(fps) and fps > 0.0):
-        raise ConfigError(f"fps must be positive and finite, got {fps}")
+    require_number("fps", fps, above=0.0)
     suffix = Path(path).suffix.lower()
     if suffix not in (".usd", ".usda", ".usdc"):
-        raise AssetError(f"splat file {path}: cannot write {suffix!r}", hint="Name a .usdc, .usda or .usd file")
+        raise unreadable(path, f"cannot write {suffix!r}", hint="Name a .usdc, .usda or .usd file")
     process.pxr_folder()
-    with atomic_splat_file(path) as file, tempfile.TemporaryDirectory() as folder:
+    with whole_file(path, "splat file", make_folders=False) as file, tempfile.TemporaryDirectory() as folder:
         scratch = os.path.join(folder, "splats" + suffix)
         if not _build_layer(frames, fps).Export(scratch):
             raise OSError("OpenUSD could not write it")

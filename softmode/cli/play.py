@@ -1,0 +1,219 @@
+"""The command ``softmode play``: episodes of an environment, filmed."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import shlex
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from softmode.checks import require_number
+from softmode.cli.common import BuildBar, bar_interval, quiet_warp, warp_device
+from softmode.envs.catalogue import config_class, registered_id
+from softmode.errors import ConfigError, MaterialError
+from softmode.learning.players import POLICIES, check_policy, policy_factory, policy_file
+from softmode.viz.film import Film
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Play:
+    """Play episodes of an environment and film them."""
+
+    env: str
+    """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
+    policy: str = "scripted"
+    """scripted, random, zero, or the checkpoint of a run, for example runs/LiftSoft-v0/*/best.npz."""
+    episodes: int = 1
+    """Episodes to play."""
+    seed: int = 0
+    """Seed of the first episode; the next ones count up."""
+    video: Path | None = None
+    """Film to write (.mp4): the camera's view beside an overview. A contact sheet (.png) is written beside it."""
+    rerun: str | None = None
+    """Recording to write for the rerun viewer (.rrd); or the address of a running one, like
+    rerun+http://127.0.0.1:9876/proxy; or spawn, which opens one."""
+    usd: Path | None = None
+    """OpenUSD stage to write (.usdc, .usd or .usda)."""
+    usd_mode: Literal["handles", "baked"] = "handles"
+    """What the stage samples: handle matrices only, or also every splat."""
+    splat: Path | None = None
+    """Splat file of the object (INRIA .ply, or a SOG v2 folder, meta.json or .sog); the built-in plush if omitted."""
+    object: Path | None = None
+    """Body file of the object, from `softmode body build`, or a stage with a body; instead of a splat file."""
+    size: float | None = None
+    """Longest edge of the object [m], as the task has it if omitted; the gripper opens 0.09 m."""
+    up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
+    """Axis of the splat file that points up, -y if omitted."""
+    crop: tuple[float, float, float, float, float, float] | None = None
+    """Box x0 y0 z0 x1 y1 z1 of the splat file, once turned up, outside which splats are dropped."""
+    part: Literal["thickest", "tallest", "largest", "all"] | None = None
+    """Which of the separate parts of the splat file is the object; the thickest if omitted."""
+    pose: Literal["stable", "captured"] | None = None
+    """Lay an object that cannot stand on its stable side (as if omitted), or let it topple."""
+    youngs_modulus: float | None = None
+    """Young's modulus of the object [Pa]; random if omitted."""
+    device: str | None = None
+    """Warp device, for example cpu or cuda:0."""
+
+    def run(self) -> int:
+        """Play; return the exit code."""
+        return play(self)
+
+
+def play(options: Play) -> int:
+    """Play episodes; see :class:`Play`."""
+    check_policy(options.policy)
+    registered_id(options.env)
+    require_number("episodes", options.episodes, at_least=1, hint="give a count like 3")
+    require_number("seed", options.seed, at_least=0, hint="give a whole number like 0")
+    if (modulus := options.youngs_modulus) is not None:
+        require_number("youngs-modulus", modulus, above=0.0, hint="give it in Pa, like 2e5", error=MaterialError)
+    if options.rerun is not None:
+        from softmode.viz.rerun_stream import check_target
+
+        check_target(options.rerun)
+    if options.usd is not None:
+        from softmode.usd.openusd import check_stage
+
+        check_stage(options.usd)
+    film = None
+    try:
+        if options.video is not None:
+            film = Film(options.video)
+        return _play(options, film)
+    finally:
+        if film:
+            film.discard()
+
+
+def _play(options: Play, film: Film | None) -> int:
+    """Build the environment, play, publish the film."""
+    import gymnasium as gym
+    import warp as wp
+
+    started = time.perf_counter()
+    trained = None if options.policy in POLICIES else policy_file(options.policy, options.env)
+    given = dict(trained.env_options) if trained else {}
+    with quiet_warp():
+        if not any(Path(wp.config.kernel_cache_dir or "").glob("wp_softmode.deformables.solver.step_kernels_*")):
+            print("compiling kernels (first run only, a minute or two)", file=sys.stderr, flush=True)
+        with BuildBar() as progress:
+            env = gym.make(
+                options.env,
+                render_mode="rgb_array" if film or options.rerun else None,
+                config=_task_config(options, given.pop("config", {})),
+                **given,
+                device=warp_device(options.device),
+                progress=progress,
+            )
+        try:
+            if trained:
+                trained.check(env)
+            body = env.unwrapped.scene.soft.body  # type: ignore[attr-defined]
+            print(
+                f"body {body.name!r}: {body.function_count} functions, {body.point_count} cubature points, "
+                f"built in {body.build_seconds:.2f} s; scene ready after {time.perf_counter() - started:.1f} s"
+            )
+            fps = env.metadata["render_fps"]
+            policy = policy_factory(options.policy, env, trained)
+            seeds = range(options.seed, options.seed + options.episodes)
+            with _recorders(options, env) as logs:
+                successes = sum(_play_episode(env, options, policy, seed, film, logs, fps) for seed in seeds)
+        finally:
+            env.close()
+    if film:
+        film.publish()
+        print(f"wrote {film.path} and {film.sheet_path}")
+    if options.rerun and Path(options.rerun).suffix.lower() == ".rrd":
+        print(f"wrote {options.rerun}; open it with: rerun {shlex.quote(options.rerun)}")
+    if options.usd:
+        print(f"wrote {options.usd}; read it with softmode.usd.read_animation, or open it in any viewer of OpenUSD")
+    if options.episodes > 1:
+        print(f"{successes} of {options.episodes} episodes succeeded")
+    return 0
+
+
+@contextlib.contextmanager
+def _recorders(options: Play, env: gym.Env) -> Iterator[list[Any]]:
+    """Yield what records the state of the environment after every step, each publishing its file at the end."""
+    with contextlib.ExitStack() as stack:
+        logs: list[Any] = []
+        if options.rerun is not None:
+            from softmode.viz.rerun_logger import RerunLogger
+
+            logs.append(stack.enter_context(RerunLogger(options.rerun, env)))
+        if options.usd is not None:
+            from softmode.usd.animation import UsdAnimation, UsdAnimationOptions
+
+            usd = UsdAnimationOptions(mode=options.usd_mode, fps=env.metadata["render_fps"])
+            logs.append(stack.enter_context(UsdAnimation.of_env(options.usd, env, options=usd)))
+        yield logs
+
+
+def _play_episode(
+    env: Any, options: Play, factory: Callable[[int], Any], seed: int, film: Film | None, logs: list[Any], fps: int
+) -> bool:
+    """Play one episode, print its outcome, return whether it succeeded."""
+    import gymnasium as gym
+    from tqdm import tqdm
+
+    given = {} if options.youngs_modulus is None else {"youngs_modulus": options.youngs_modulus}
+    observation, info = env.reset(seed=seed, options=given)
+    policy = factory(seed)
+    for log in logs:
+        log.record()
+    total, steps, seconds = 0.0, 0, 0.0
+    limit = gym.spec(registered_id(options.env)).max_episode_steps
+    with tqdm(total=limit, desc=f"seed {seed}", unit="step", mininterval=bar_interval()) as bar:
+        done = False
+        while not done:
+            action = policy(observation)
+            clock = time.perf_counter()
+            observation, reward, terminated, truncated, info = env.step(action)
+            seconds += (time.perf_counter() - clock) if steps else 0.0  # the first step compiles and records
+            total, steps, done = total + float(reward), steps + 1, terminated or truncated
+            if film:
+                film.add(env.render(), fps)
+            for log in logs:
+                log.record()
+            bar.update()
+    modulus = info["parameters"]["youngs_modulus"]
+    print(
+        f"seed {seed}: E {modulus:.3g} Pa, {1e3 * seconds / max(steps - 1, 1):.1f} ms per control step, "
+        f"return {total:.1f}, success: {info['is_success']}"
+    )
+    return bool(info["is_success"])
+
+
+def _task_config(options: Play, trained: dict[str, Any]) -> Any:
+    """Turn the options that concern the object into a configuration, else as that of a trained policy."""
+    from softmode.learning.config_values import config_of
+    from softmode.objects.config import ObjectConfig
+
+    base = config_of(config_class(options.env), trained)
+    scene = base.scene
+    names = ("splat", "size", "up", "crop", "part", "pose")
+    given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    if options.object is not None:
+        if given:
+            raise ConfigError(
+                f"{', '.join(given)} given for the body {options.object}", hint="give them to softmode body build"
+            )
+        scene = dataclasses.replace(scene, object=ObjectConfig(body=options.object))
+    elif given:
+        thing = scene.object
+        if options.splat is not None:
+            thing = ObjectConfig(surface_count=thing.surface_count, build=thing.build)
+        if thing.extents is not None or thing.body is not None:
+            what = f"a {thing.shape} of {thing.extents} m" if thing.body is None else f"the body {thing.body}"
+            raise ConfigError(f"{', '.join(given)} given for {what}", hint="give a --splat file too")
+        thing = dataclasses.replace(thing, **given)
+        scene = dataclasses.replace(scene, object=thing)
+    return dataclasses.replace(base, scene=scene, mesh_samples=4 if options.video else base.mesh_samples)
