@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, Self, get_args
 
@@ -86,6 +87,6 @@ class TaskConfig:
         return known[name]
 
     @classmethod
-    def presets(cls) -> dict[str, Self]:
+    def presets(cls) -> Mapping[str, Self]:
         """Return the named variants of the task."""
         return {}

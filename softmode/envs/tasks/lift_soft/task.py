@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -64,7 +65,7 @@ class LiftSoftConfig(TaskConfig):
         require_fields(self, ("hold_steps",), at_least=1)
 
     @classmethod
-    def presets(cls) -> dict[str, Self]:
+    def presets(cls) -> Mapping[str, Self]:
         """Return "beam": object and goals of Isaac Lab's `Isaac-Lift-Soft-Franka`, as high as this arm reaches."""
         scene = replace(lift_scene(), object=BEAM, material=BEAM_MATERIAL)
         return {"beam": cls(scene=scene, yaw_range=0.5, goal_height=0.2, goal_range=(0.08, 0.15, 0.08))}

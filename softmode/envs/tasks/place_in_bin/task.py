@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Self
@@ -143,7 +144,7 @@ class PlaceInBinConfig(TaskConfig):
         require_fields(self, ("hold_steps",), at_least=1)
 
     @classmethod
-    def presets(cls) -> dict[str, Self]:
+    def presets(cls) -> Mapping[str, Self]:
         """Return "plush": three plush toys, which cost more time."""
         build = BuildOptions(mode_count=3, cubature_count=128)
         toy, other = (ObjectConfig(size=size, surface_count=160, build=build) for size in (0.07, 0.055))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -118,7 +119,7 @@ class RopeRouteConfig(TaskConfig):
         return tuple(fixture for fixture in self.scene.fixtures if fixture.shape == "cylinder")
 
     @classmethod
-    def presets(cls) -> dict[str, Self]:
+    def presets(cls) -> Mapping[str, Self]:
         """Return "one_peg", with a single peg, for a start."""
         return {"one_peg": cls(scene=replace(rope_scene(), fixtures=pegs_at(PEGS[:1])))}
 
