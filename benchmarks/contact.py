@@ -18,7 +18,7 @@ import warp as wp
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
-from softmode.envs.scripted import ScriptedLift
+from softmode.envs.tasks.lift_soft.scripted import ScriptedLift
 from softmode.envs.tasks.lift_soft.task import LiftSoftEnv
 from tests import reference
 from tests.deformables.test_coupling import grasp, impact, totals

@@ -20,7 +20,7 @@ from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_splats
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient, solve
 from softmode.deformables.solver.minimise import check_convergence
-from softmode.envs.scripted import ScriptedLift
+from softmode.envs.tasks.lift_soft.scripted import ScriptedLift
 from softmode.envs.tasks.lift_soft.task import LiftSoftEnv
 from softmode.splats import make_plush
 

@@ -2,7 +2,7 @@
 
 Run: ``python benchmarks/worlds.py --device cuda:0 --worlds 1 64 1024``. Every world plays the same downward motion with
 the gripper closing on the object, so that contact is active in all of them; with ``--random`` every world plays random
-actions of its own instead. ``--preset rl`` takes the scene of ``softmode.envs.rl_scene``.
+actions of its own instead. ``--preset rl`` takes the scene of ``softmode.envs.presets``.
 
 Prints milliseconds per control step, world steps per second, the union of the solver's status bits and, on CUDA, the
 memory taken; with ``--pixels 64`` also the time of a picture of that edge in every world, meshes, shadows and splats,
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from softmode.envs.rl_scene import rl_scene
+from softmode.envs.presets import rl_scene
 from softmode.scenes.table_scene import TableScene, TableSceneConfig
 from softmode.splats.camera import SplatCamera
 from softmode.splats.pinhole import PinholeCamera

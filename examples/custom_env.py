@@ -14,11 +14,7 @@ import numpy as np
 import warp as wp
 from gymnasium.utils.env_checker import check_env
 
-from softmode.envs import check_vector_env
-from softmode.envs.rl_scene import rl_scene
-from softmode.envs.soft_env import SoftEnv
-from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.task import Segment, Task, TaskConfig
+from softmode.envs import Segment, SoftEnv, SoftVectorEnv, Task, TaskConfig, check_vector_env, rl_scene
 from softmode.objects import ObjectConfig
 from softmode.scenes import TableSceneConfig
 from softmode.viz import Film

@@ -17,7 +17,7 @@ from PIL import Image
 from scipy import stats
 
 import softmode  # noqa: F401  (registers the environments)
-from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
+from softmode.envs import LiftSoftConfig
 from softmode.splats import CameraRandomization
 
 COLUMNS, GRAVITY = 4, 9.81

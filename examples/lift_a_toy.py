@@ -15,8 +15,7 @@ import numpy as np
 import warp as wp
 
 import softmode  # noqa: F401  (registers the environments)
-from softmode.envs.scripted import scripted_policy
-from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
+from softmode.envs import LiftSoftConfig, scripted_policy
 from softmode.viz import Film
 
 GRAVITY = 9.81

@@ -16,7 +16,7 @@ import warp as wp
 from rerun.chunk import RrdReader
 
 import softmode  # noqa: F401  (registers the environments)
-from softmode.envs.scripted import scripted_policy
+from softmode.envs import scripted_policy
 from softmode.viz import RerunLogger, RerunOptions
 
 GRAVITY = 9.81

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import MISSING, fields, is_dataclass
 from typing import Any
 
 from softmode.errors import ConfigError, SoftmodeError
@@ -63,16 +64,73 @@ def require_number(
     raise error(f"{name} must {wanted}, got {value!r}", hint=hint)
 
 
-def require_fields(owner: Any, names: Iterable[str], **limits: Any) -> None:
+def require_fields(owner: Any, names: Iterable[str], *, count: int | None = None, **limits: Any) -> None:
     """Raise unless every named field of an object is a finite number within the limits of :func:`require_number`.
 
     Args:
-        owner: The object.
+        owner: The object. The default of a dataclass' field is the remedy, where no other one is given.
         names: Its fields.
+        count: How many numbers each of them holds; None for a number alone.
         limits: Keywords of :func:`require_number`.
 
     Raises:
         ConfigError: If one of them is not.
     """
+    defaults = {entry.name: entry.default for entry in fields(owner)} if is_dataclass(owner) else {}
     for name in names:
-        require_number(name, getattr(owner, name), **limits)
+        default = defaults.get(name, MISSING)
+        hint = "" if default is MISSING else f"the default of {type(owner).__name__}.{name} is {default}"
+        chosen = {"hint": hint, **limits}
+        if count is None:
+            require_number(name, getattr(owner, name), **chosen)
+        else:
+            require_numbers(name, getattr(owner, name), count, **chosen)
+
+
+def require_numbers(name: str, values: Sequence[float], count: int, **limits: Any) -> None:
+    """Raise unless a sequence holds as many finite numbers as it should, each within its limits.
+
+    Args:
+        name: What messages call it.
+        values: The numbers.
+        count: How many.
+        limits: Keywords of :func:`require_number`.
+
+    Raises:
+        ConfigError: If it does not.
+    """
+    if len(values) != count:
+        raise ConfigError(f"{name} must hold {count} numbers, got {values!r}", hint=limits.get("hint", ""))
+    for index, value in enumerate(values):
+        require_number(f"{name}[{index}]", value, **limits)
+
+
+def require_range(name: str, pair: Sequence[float], **limits: Any) -> None:
+    """Raise unless a pair is a range, low <= high, of finite numbers within their limits.
+
+    Args:
+        name: What messages call it.
+        pair: Low and high.
+        limits: Keywords of :func:`require_number`, for both.
+
+    Raises:
+        ConfigError: If it is not.
+    """
+    require_numbers(name, pair, 2, **limits)
+    if pair[0] > pair[1]:
+        raise ConfigError(f"{name} must satisfy low <= high, got {pair!r}", hint=limits.get("hint", ""))
+
+
+def require_choice(name: str, value: object, choices: Collection[object]) -> None:
+    """Raise unless a value is one of those that are allowed.
+
+    Args:
+        name: What the message calls it.
+        value: What was given.
+        choices: What is allowed.
+
+    Raises:
+        ConfigError: If it is none of them.
+    """
+    if value not in choices:
+        raise ConfigError(f"{name} is {value!r}", hint=f"use one of {', '.join(map(repr, choices))}")

@@ -38,11 +38,11 @@ _FAST = {
     "deformables/test_static_response.py": "axial_response_is_that_of_a_hanging_bar",
     "demonstrations/test_format.py": "info data_table episodes_table",
     "documentation/test_prose.py": "",
-    "envs/test_objects.py": "part_is_chosen_by_its_rule a_tilted_box_lies_down_on_its_nearest_face",
-    "envs/test_primitives.py": "solid_has_the_closed_form_volume_area_and_bounds",
+    "objects/test_objects.py": "part_is_chosen_by_its_rule a_tilted_box_lies_down_on_its_nearest_face",
+    "objects/test_primitives.py": "solid_has_the_closed_form_volume_area_and_bounds",
     "envs/test_push_soft.py": "observation_says_where_to_go reward_is_the_sum_of_its_terms",
-    "envs/test_splat_scene.py": "kinetic_energy_of_free_fall_is_the_work_of_gravity",
-    "envs/test_table_scene.py": "configuration_is_checked",
+    "scenes/test_splat_scene.py": "kinetic_energy_of_free_fall_is_the_work_of_gravity",
+    "scenes/test_table_scene.py": "configuration_is_checked",
     "learning/test_checkpoints.py": "round_trip",
     "learning/test_policy.py": "the_interval_is_wilsons",
     "learning/test_ppo.py": "adam_is_adam densities_are_those_of_a_gaussian moments_are_those_of_all_samples",
@@ -66,7 +66,7 @@ _FAST = {
     "usd/test_export_bundle.py": "",
     "usd/test_import_newton.py": "units_of_everything",
     "view/test_session.py": "time_passes_as_told pick_meets_the_near_face",
-    "viz/test_scene_meshes.py": "bounds_and_volume",
+    "scenes/test_meshes.py": "bounds_and_volume",
 }
 """Tests of `make test-fast`: quick ones of every room, by file; all of a file where none is named."""
 

@@ -166,7 +166,7 @@ def test_cuda_senses():
 
 def test_cuda_lifts():
     """The scripted policy lifts the plush on CUDA with pixel observations."""
-    from softmode.envs.scripted import ScriptedLift
+    from softmode.envs.tasks.lift_soft.scripted import ScriptedLift
     from softmode.envs.tasks.lift_soft.task import LiftSoftEnv
 
     env = LiftSoftEnv(obs_type="pixels_agent_pos", device="cuda:0")

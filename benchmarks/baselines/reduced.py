@@ -30,7 +30,8 @@ from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
 from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
-from softmode.deformables.solver.solver_reduced import Integrator, SolverReduced, SolverReducedOptions
+from softmode.deformables.solver.options import Integrator, SolverReducedOptions
+from softmode.deformables.solver.solver_reduced import SolverReduced
 
 POINTS = 5000
 """Quadrature points, as in the papers."""

@@ -40,8 +40,8 @@ class Bench:
 
     def run(self) -> int:
         """Measure; return the exit code."""
+        from softmode.envs.arguments import checked_device
         from softmode.envs.catalogue import config_class
-        from softmode.envs.soft_env import checked_device
         from softmode.envs.throughput import report_throughput
 
         if not self.num_envs:

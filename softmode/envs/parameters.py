@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from softmode.envs.structs import StructType, filled
 from softmode.errors import ConfigError
 
 
@@ -59,7 +60,7 @@ class ParameterTable:
         values: The drawn numbers, float32, shape (world_count, columns).
     """
 
-    def __init__(self, parameters: Sequence[Parameter], world_count: int, device: Any = None) -> None:
+    def __init__(self, parameters: Sequence[Parameter], world_count: int, device: wp.DeviceLike = None) -> None:
         """Lay out the columns and upload their ranges."""
         self.parameters = {parameter.name: parameter for parameter in parameters}
         self.world_count = world_count
@@ -69,7 +70,7 @@ class ParameterTable:
             self._column[name] = columns
             columns += parameter.size
 
-        def upload(rows: list[Any], dtype: Any) -> wp.array:
+        def upload(rows: list[np.ndarray], dtype: type) -> wp.array:
             return wp.array(np.concatenate(rows), dtype=dtype, device=device)
 
         chosen = self.parameters.values()
@@ -82,17 +83,17 @@ class ParameterTable:
         """Return the first column of a parameter."""
         return self._column[name]
 
+    def columns_in(self, struct: StructType) -> Any:
+        """Return a struct of a kernel whose fields are the first columns of the parameters of their names."""
+        return filled(struct, **self._column)
+
     def columns(self, name: str) -> slice:
         """Return the columns of a parameter."""
         return slice(self._column[name], self._column[name] + self.parameters[name].size)
 
-    def check(self, options: Mapping[str, Any] | None) -> dict[str, NDArray[np.float32]]:
-        """Return reset options as arrays, see `check_options`."""
-        return check_options(self.parameters, options, self.world_count)
-
 
 def check_options(
-    parameters: Mapping[str, Parameter], options: Mapping[str, Any] | None, world_count: int
+    parameters: Mapping[str, Parameter], options: Mapping[str, object], world_count: int
 ) -> dict[str, NDArray[np.float32]]:
     """Return reset options as arrays of shape (world_count, size), or raise before anything changes.
 
@@ -104,14 +105,13 @@ def check_options(
     Raises:
         ConfigError: If a name is unknown, or a value no finite number within its range.
     """
-    given = dict(options or {})
-    unknown = sorted(set(given) - set(parameters))
+    unknown = sorted(set(options) - set(parameters))
     if unknown:
         raise ConfigError(f"unknown reset options {unknown}", hint=f"use {', '.join(parameters)}")
-    return {name: _checked(parameters[name], value, world_count) for name, value in given.items()}
+    return {name: _checked(parameters[name], value, world_count) for name, value in options.items()}
 
 
-def _checked(parameter: Parameter, value: Any, world_count: int) -> NDArray[np.float32]:
+def _checked(parameter: Parameter, value: object, world_count: int) -> NDArray[np.float32]:
     """Return one option as an array."""
     try:
         numbers = np.asarray(value, np.float32)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from softmode.envs.reward_kernels import TOUCH_FORCE
+from softmode.envs.scripted_base import ScriptedPolicy, Vector
 
-class ScriptedGrasp:
+
+class ScriptedGrasp(ScriptedPolicy):
     """Take the object: align above it, go down, close until it is held, move on with it, try again if it slips.
 
     The grasp yaw is the one across the object's narrowest horizontal extent that needs the least turn of the wrist. The
@@ -17,7 +20,7 @@ class ScriptedGrasp:
     An object that topples or rolls is waited for, and planned anew where it comes to rest.
 
     Args:
-        env: A bare environment of one world in pose_delta mode.
+        env: An environment of one world in pose_delta mode.
         way: From the centre of the held object [m] to its next move [m], both of shape (3,).
         squeeze: Force of each finger as a multiple of the least that friction needs to carry the weight.
         least_force: But at least this force [N].
@@ -36,21 +39,22 @@ class ScriptedGrasp:
 
     def __init__(
         self,
-        env: Any,
-        way: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+        env: gym.Env,
+        way: Callable[[Vector], Vector],
         *,
         squeeze: float = 5.0,
         least_force: float = 1.5,
     ) -> None:
         """Remember the environment and plan nothing yet."""
-        self.env, self._way, self._squeeze, self._least_force = env, way, squeeze, least_force
+        super().__init__(env)
+        self._way, self._squeeze, self._least_force = way, squeeze, least_force
         self.reset()
 
     def reset(self) -> None:
         """Forget the episode; call after ``env.reset``."""
         self._start("align")
         self._grip = 1.0
-        self._grasp: tuple[NDArray[np.float64], float] | None = None
+        self._grasp: tuple[Vector, float] | None = None
         self._planned_at = np.full(3, np.inf)
 
     @property
@@ -67,19 +71,16 @@ class ScriptedGrasp:
         """Enter a phase."""
         self._phase, self._elapsed, self._count = phase, 0, 0
 
-    def __call__(self) -> NDArray[np.float32]:
+    def __call__(self, observation: object = None) -> NDArray[np.float32]:
         """Return the action for the present state."""
-        scene = self.env.scene
-        centre = scene.object_position.numpy()[0, 0].astype(float)
-        still = np.linalg.norm(scene.object_velocity.numpy()[0, 0]) < self.STILL
-        tool = scene.controller.target_position.numpy()[0].astype(float)
-        force = np.linalg.norm(scene.finger_force.numpy()[0], axis=1)
+        centre, tool, force = self.centre, self.tool, self.weaker_force
+        still = np.linalg.norm(self.scene.object_velocity.numpy()[0, 0]) < self.STILL
         if self._phase in ("align", "descend") and np.linalg.norm(centre - self._planned_at) > self.MOVED:
             self._grasp, self._planned_at = self._plan(), centre
             self._start("align")
         assert self._grasp is not None
         place, yaw = self._grasp
-        turn = yaw - float(scene.controller.target_yaw.numpy()[0])
+        turn = yaw - self.yaw
         self._elapsed += 1
         goal = place
         if self._phase == "align":
@@ -93,37 +94,34 @@ class ScriptedGrasp:
             if self._count > 4:
                 self._start("close")
         elif self._phase == "close":
-            self._grip = self._regulated(force)
-            self._count += force.min() > 0.7 * self._wanted_force()
+            self._regulate()
+            self._count += force > 0.7 * self._wanted_force()
             if self._count > 12:
                 self._start("lift")
             elif self._elapsed > self.PATIENCE:
                 self.reset()
                 goal = tool
         else:
-            self._count = self._count + 1 if force.min() < 0.02 else 0
-            self._grip = self._regulated(force)
+            self._count = self._count + 1 if force < TOUCH_FORCE else 0
+            self._regulate()
             goal = tool + self._way(centre)
             if self._count > 8:
                 self.reset()
                 goal = tool
-        options = self.env.config.scene.control
-        move = np.clip((goal - tool) / options.translation_scale, -1.0, 1.0)
-        spin = np.clip(turn / options.rotation_scale, -1.0, 1.0)
-        return np.array([*move, spin, self._grip], np.float32)
+        return self.action(goal - tool, turn, self._grip)
 
-    def _plan(self) -> tuple[NDArray[np.float64], float]:
+    def _plan(self) -> tuple[Vector, float]:
         """Choose grasp point and yaw from the surface samples."""
-        scene, gripper = self.env.scene, self.env.config.scene.arm.gripper
+        scene, gripper = self.scene, self.arm.gripper
         points = scene.state.particle_q.numpy()[: scene.soft.body.surface_count].astype(float)
         top, bottom = points[:, 2].max(), points[:, 2].min()
         depth = min(0.5 * gripper.pad_size[2], 0.5 * (top - bottom))
-        centre = scene.object_position.numpy()[0, 0].astype(float)
+        centre = self.centre
         # at the height of the centre of mass, unless the palm would press on the top
         under_palm = top - (gripper.finger_length - 0.5 * gripper.pad_size[2]) + self.PALM_GAP
-        height = max(centre[2], bottom + depth, under_palm, self.env.config.scene.control.workspace_lower[2])
+        height = max(centre[2], bottom + depth, under_palm, self.control.workspace_lower[2])
         near = points[np.abs(points[:, 2] - height) < 0.5 * gripper.pad_size[2]]
-        best: tuple[float, float, NDArray[np.float64]] | None = None
+        best: tuple[float, float, Vector] | None = None
         for yaw in np.linspace(-0.5 * np.pi, 0.5 * np.pi, 36, endpoint=False):
             forward, sideways = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
             along, across = near[:, :2] @ forward, near[:, :2] @ sideways
@@ -137,14 +135,11 @@ class ScriptedGrasp:
 
     def _wanted_force(self) -> float:
         """Force of each finger that carries the weight by friction with a margin [N]."""
-        scene = self.env.config.scene
-        weight = scene.material.density * self.env.scene.soft.body.volume * 9.81
+        scene = self.scene.config
+        weight = scene.material.density * self.scene.soft.body.volume * 9.81
         friction = np.sqrt(scene.material.friction * scene.arm.gripper.friction)
         return max(self._squeeze * 0.5 * weight / friction, self._least_force)
 
-    def _regulated(self, force: NDArray[np.floating]) -> float:
+    def _regulate(self) -> None:
         """Close while the weaker finger feels too little, open while it feels too much."""
-        wanted = self._wanted_force()
-        error = np.clip((wanted - force.min()) / wanted, -1.0, 1.0)
-        rate = 0.06 if force.min() < 0.02 else 0.012
-        return float(np.clip(self._grip - rate * error, -1.0, 1.0))
+        self._grip = self.regulated(self._grip, self._wanted_force(), closing=0.06, holding=0.012)

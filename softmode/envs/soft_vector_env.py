@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -13,13 +13,31 @@ import warp as wp
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from softmode.checks import require_choice
+from softmode.deformables.build.build_body import Progress
+from softmode.envs.arguments import (
+    RENDER_MODES,
+    Shortcuts,
+    checked_actions,
+    checked_config,
+    checked_count,
+    checked_device,
+    checked_options,
+    checked_processes,
+    world_seed,
+)
 from softmode.envs.parameters import check_options
-from softmode.envs.soft_env import checked_actions, checked_config, checked_device, world_seed
-from softmode.envs.task import ObservationType, Task, TaskConfig
+from softmode.envs.results import map_tree
+from softmode.envs.task import Task
+from softmode.envs.task_config import ObservationType, TaskConfig
+from softmode.envs.tensors import Tensor, host_array
 from softmode.envs.worlds import LocalWorlds, RemoteWorlds
 from softmode.errors import ConfigError, MissingExtraError
+
+if TYPE_CHECKING:
+    pass
 
 Output = Literal["numpy", "torch"]
 
@@ -56,7 +74,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         MissingExtraError: If torch is asked for and not installed.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012  (gymnasium's convention)
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 30}  # noqa: RUF012  (gymnasium's convention)
     task_class: ClassVar[type[Task]] = Task
     """The task."""
 
@@ -75,26 +93,28 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         output: Output = "numpy",
         processes: int = 1,
-        device: Any = None,
-        progress: Any = None,
+        device: wp.DeviceLike = None,
+        progress: bool | Progress | None = None,
     ) -> None:
         """Build the scene, capture the step and make the spaces."""
-        if isinstance(num_envs, bool) or not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
-            raise ConfigError(f"num_envs is {num_envs!r}", hint="give a whole number of at least 1")
-        whole = isinstance(max_episode_steps, (int, np.integer)) and not isinstance(max_episode_steps, bool)
-        if max_episode_steps is not None and not (whole and max_episode_steps >= 1):
-            raise ConfigError(
-                f"max_episode_steps is {max_episode_steps!r}",
-                hint="give a whole number of at least 1, or None for no limit",
-            )
-        if output not in ("numpy", "torch"):
-            raise ConfigError(f"output is {output!r}", hint="use 'numpy' or 'torch'")
+        self.num_envs = checked_count("num_envs", num_envs)
+        if max_episode_steps is not None:
+            max_episode_steps = checked_count("max_episode_steps", max_episode_steps)
+        require_choice("output", output, get_args(Output))
         try:
             mode = AutoresetMode(autoreset_mode)
         except ValueError as error:
             known = ", ".join(f"AutoresetMode.{choice.name}" for choice in AutoresetMode)
             raise ConfigError(f"autoreset_mode is {autoreset_mode!r}", hint=f"use one of {known}") from error
-        config = checked_config(self, config, preset, obs_type, render_mode, control_mode, splat, size)
+        given = Shortcuts(
+            obs_type=obs_type,
+            render_mode=render_mode,
+            control_mode=control_mode,
+            splat=splat,
+            size=size,
+            preset=preset,
+        )
+        config = checked_config(self.task_class.config_class, config, given)
         if output == "torch":
             try:
                 import torch  # noqa: F401
@@ -103,7 +123,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
                     "output='torch' needs torch", hint="install it with: pip install 'softmode[rl]'"
                 ) from error
         self.config, self.obs_type, self.render_mode, self.output = config, obs_type, render_mode, output
-        self.num_envs, self.autoreset_mode = int(num_envs), mode
+        self.autoreset_mode = mode
         self.metadata = {
             **self.metadata,
             "render_fps": round(config.scene.control_hz),
@@ -132,8 +152,8 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             self._worlds = [LocalWorlds(self.task_class, arguments[0])]
         else:
             try:
-                for given in arguments:
-                    self._worlds.append(RemoteWorlds(self.task_class, given))
+                for part in arguments:
+                    self._worlds.append(RemoteWorlds(self.task_class, part))
                 for worlds in self._worlds:
                     worlds.connect()
             except BaseException:
@@ -158,9 +178,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             seed: Seed s, for s + i in world i; or one per world, None among them to go on; or None.
             options: ``reset_mask`` (num_envs,) bool, and parameters of the task, one value or one per world.
         """
-        if options is not None and not isinstance(options, Mapping):
-            raise ConfigError(f"options is a {type(options).__name__}", hint="give a dict")
-        given = dict(options or {})
+        given = checked_options(options)
         mask = self._checked_mask(given.pop("reset_mask", None))
         chosen = check_options(self._worlds[0].parameters, given, self.num_envs)
         seeds = self._seeds(seed, mask)
@@ -171,7 +189,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             self._results = [worlds.result() for worlds in self._worlds]
             return self._gather("observation"), self._masked(self._gather("info"), self._everywhere())
 
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+    def step(self, actions: ArrayLike | Tensor) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Advance every world by one control step.
 
         Args:
@@ -184,7 +202,11 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         """
         if self._random is None:
             raise ConfigError("step comes before the first reset", hint="call reset() first")
-        numbers = self._tensors_assigned(actions) if self.output == "torch" else self._checked_actions(actions)
+        numbers = None
+        if self.output == "torch":
+            self._assign_tensors(actions)
+        else:
+            numbers = checked_actions(actions, self.action_space)
         with self._stream():
             for worlds, part in zip(self._worlds, self._slices, strict=True):
                 worlds.step(None if numbers is None else numbers[part])
@@ -236,13 +258,11 @@ class SoftVectorEnv(gym.vector.VectorEnv):
 
     # -- arguments ----------------------------------------------------------------------------------------------------
 
-    def _checked_mask(self, mask: Any) -> NDArray[np.bool_]:
+    def _checked_mask(self, mask: object) -> NDArray[np.bool_]:
         """Return which worlds a reset concerns."""
         if mask is None:
             return np.ones(self.num_envs, bool)
-        if hasattr(mask, "cpu"):
-            mask = mask.cpu()
-        mask = np.asarray(mask)
+        mask = host_array(mask) if isinstance(mask, Tensor) else np.asarray(mask)
         if mask.dtype != bool or mask.shape != (self.num_envs,) or not mask.any():
             raise ConfigError(
                 f"reset_mask is {mask.dtype} of shape {mask.shape}",
@@ -252,7 +272,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             raise ConfigError("the first reset is partial", hint="call reset() for all worlds once")
         return mask
 
-    def _seeds(self, seed: Any, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    def _seeds(self, seed: object, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
         """Return the seed of every world's draws, -1 where they go on."""
         first = self._random is None
         if seed is None:
@@ -275,15 +295,14 @@ class SoftVectorEnv(gym.vector.VectorEnv):
                 seeds[i] = world_seed(self._random[i])
         return seeds
 
-    def _checked_actions(self, actions: Any) -> NDArray[np.float32]:
-        """Return actions as an array, or raise before anything moves."""
-        return checked_actions(actions, self.action_space)  # type: ignore[arg-type]
-
-    def _tensors_assigned(self, actions: Any) -> None:
+    def _assign_tensors(self, actions: object) -> None:
         """Copy a tensor of actions to the task, on the device."""
         import torch
 
-        tensor = actions if isinstance(actions, torch.Tensor) else torch.from_numpy(self._checked_actions(actions))
+        if isinstance(actions, torch.Tensor):
+            tensor = actions
+        else:
+            tensor = torch.from_numpy(checked_actions(actions, self.action_space))
         if tuple(tensor.shape) != self.action_space.shape:
             raise ConfigError(
                 f"actions have shape {tuple(tensor.shape)}, expected {self.action_space.shape}",
@@ -331,7 +350,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         if numpy:
             rows = np.full(self.num_envs, None, dtype=object)
             for i in np.flatnonzero(ended):
-                rows[i] = _row(observation, int(i))
+                rows[i] = map_tree(lambda array, i=i: array[i].copy(), observation)
             observation = rows
         infos["final_obs"], infos["_final_obs"] = observation, _copy(ended)
         infos["final_info"], infos["_final_info"] = self._masked(final["info"], ended), _copy(ended)
@@ -358,29 +377,6 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             out[name] = self._masked(value, mask) if isinstance(value, dict) else value
             out[f"_{name}"] = _copy(mask)
         return out
-
-
-def checked_processes(processes: Any, num_envs: int, device: Any, output: str) -> int:
-    """Return how many processes share the worlds.
-
-    Raises:
-        ConfigError: If they cannot.
-    """
-    if isinstance(processes, bool) or not isinstance(processes, (int, np.integer)) or processes < 1:
-        raise ConfigError(f"processes is {processes!r}", hint="give a whole number of at least 1")
-    if processes > 1 and (not device.is_cpu or output != "numpy"):
-        raise ConfigError(
-            f"processes is {processes} on {device} with output {output!r}",
-            hint="several processes serve CPU and numpy only; leave processes at 1",
-        )
-    return min(int(processes), num_envs)
-
-
-def _row(tree: Any, index: int) -> Any:
-    """Return one world of a tree of numpy arrays."""
-    if isinstance(tree, dict):
-        return {name: _row(value, index) for name, value in tree.items()}
-    return tree[index].copy()
 
 
 def _copy(mask: Any) -> Any:

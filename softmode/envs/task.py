@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from enum import IntEnum
-from typing import Any, ClassVar, Literal, Self, get_args
+from typing import Any, ClassVar, cast
 
 import gymnasium as gym
 import numpy as np
@@ -15,144 +13,26 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.body.rkpm import sample_farthest
+from softmode.deformables.build.build_body import Progress
 from softmode.deformables.model import status as bits
 from softmode.deformables.solver.parameters import set_parameters
 from softmode.envs import task_kernels as kernels
+from softmode.envs.cameras import overview, square_camera, wrist_camera
+from softmode.envs.end_reason import EndReason
+from softmode.envs.observation import PROPRIOCEPTION, ObservationLayout, Segment, object_part
 from softmode.envs.parameters import Parameter, ParameterTable
-from softmode.errors import ConfigError
+from softmode.envs.reward_kernels import StepResult, WorldState
+from softmode.envs.structs import filled
+from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.scenes.table_scene import GAP, TableScene, TableSceneConfig
 from softmode.splats.camera import CameraOptions
-from softmode.splats.camera_randomization import CameraRandomization
 from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
 
-ObservationType = Literal["state", "pixels", "pixels_agent_pos"]
-CameraName = Literal["front", "wrist"]
-ImageOutput = Literal["depth", "segmentation"]
 FALL = 0.05
 """How far under its resting height on the table object 0 counts as dropped [m]."""
 MATERIAL = ("youngs_modulus", "poissons_ratio", "density", "friction", "scale")
-"""Parameters of the soft bodies, in the order of their columns."""
-
-
-class EndReason(IntEnum):
-    """Why an episode ended, ``info["end_reason"]``; what comes after TIME_LIMIT is a failure and terminates.
-
-    The limit of a single environment is that of Gymnasium's ``TimeLimit`` around it, which info does not tell.
-    """
-
-    RUNNING = 0
-    TIME_LIMIT = 1
-    DIVERGED = 2
-    """A number of the world's state was not finite."""
-    DROPPED = 3
-    """The object fell off the table."""
-    SPILLED = 4
-    """Another object left the container that it belongs in."""
-
-
-@dataclass(frozen=True)
-class Segment:
-    """A named part of the observation vector."""
-
-    name: str
-    """What it holds."""
-    size: int
-    """How many numbers."""
-    low: float | tuple[float, ...]
-    """Bound below, in the unit of the quantity."""
-    high: float | tuple[float, ...]
-    """Bound above."""
-
-
-PROPRIOCEPTION = (
-    Segment("tool_position", 3, -2.0, 2.0),
-    Segment("tool_heading", 2, -1.0, 1.0),
-    Segment("opening", 1, -0.1, 0.5),
-    Segment("finger_force", 2, 0.0, 200.0),
-    Segment("joint_angles", 7, -3.5, 3.5),
-    Segment("command_lead", 3, -1.0, 1.0),
-    Segment("command_turn", 1, -1.0, 1.0),
-    Segment("command_opening", 1, -0.5, 0.5),
-)
-
-
-@dataclass(frozen=True, kw_only=True)
-class TaskConfig:
-    """Scene, randomisation and pictures, common to all tasks."""
-
-    scene: TableSceneConfig = field(default_factory=TableSceneConfig)
-    """Objects, robot and physics."""
-    position_range: tuple[float, float] = (0.05, 0.08)
-    """Half-width of the object's random position in x and y [m]."""
-    yaw_range: float = math.pi
-    """Half-width of its random yaw [rad]."""
-    youngs_modulus_range: tuple[float, float] | None = (2.0e4, 2.0e6)
-    """Range of the random Young's modulus [Pa], log-uniform; None keeps the scene's material, as for all of these."""
-    poissons_ratio_range: tuple[float, float] | None = None
-    """Range of the random Poisson's ratio."""
-    density_range: tuple[float, float] | None = None
-    """Range of the random density [kg/m^3], log-uniform."""
-    friction_range: tuple[float, float] | None = None
-    """Range of the random friction coefficient of the object."""
-    scale_range: tuple[float, float] | None = None
-    """Range of the random size of the objects, as a factor."""
-    camera: CameraName = "front"
-    """Camera of pixel observations: one in front of the table, or one on the hand."""
-    image_size: int = 96
-    """Edge of a pixel observation [px]."""
-    image_outputs: tuple[ImageOutput, ...] = ()
-    """What pixel observations hold beside colours: "depth" [m], "segmentation" (int32, see ``SplatCamera.labels``)."""
-    camera_randomization: CameraRandomization | None = None
-    """Random pose, lens, light and colours of every episode."""
-    render_size: int = 256
-    """Edge of each half of a rendered frame [px]."""
-    mesh_samples: int = 1
-    """Rays per pixel for robot and table, in observations and renderings: 1, or 4 for smooth edges."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        if not (min(self.position_range) >= 0.0 and self.yaw_range >= 0.0):
-            raise ConfigError(f"position_range {self.position_range} and yaw_range {self.yaw_range} must be >= 0")
-        limits = {
-            "youngs_modulus_range": (0.0, np.inf),
-            "poissons_ratio_range": (-1.0, 0.5),
-            "density_range": (0.0, np.inf),
-            "friction_range": (-1e-9, np.inf),
-            "scale_range": (0.49, 2.01),
-        }
-        for name, (least, most) in limits.items():
-            chosen = getattr(self, name)
-            if chosen is not None and not least < chosen[0] <= chosen[1] < most:
-                raise ConfigError(f"{name} must satisfy {max(least, 0)} < low <= high < {most}, got {chosen}")
-        if self.camera not in get_args(CameraName):
-            raise ConfigError(f"camera is {self.camera!r}", hint="use 'front' or 'wrist'")
-        if not set(self.image_outputs) <= set(get_args(ImageOutput)):
-            raise ConfigError(f"image_outputs is {self.image_outputs}", hint="name 'depth', 'segmentation' or nothing")
-        if not 36 <= self.image_size <= 640:
-            raise ConfigError(f"image_size must lie in 36..640 px, got {self.image_size}")
-        if not 64 <= self.render_size <= 1024:
-            raise ConfigError(f"render_size must lie in 64..1024 px, got {self.render_size}")
-        if self.mesh_samples not in (1, 4):
-            raise ConfigError(f"mesh_samples must be 1 or 4, got {self.mesh_samples}")
-
-    @classmethod
-    def preset(cls, name: str) -> Self:
-        """Return a named variant of the task.
-
-        Raises:
-            ConfigError: If there is none of that name.
-        """
-        known = cls.presets()
-        if name not in known:
-            names = ", ".join(map(repr, known)) or "none"
-            raise ConfigError(f"{cls.__name__} has no preset {name!r}", hint=f"there are: {names}")
-        return known[name]
-
-    @classmethod
-    def presets(cls) -> dict[str, Self]:
-        """Return the named variants of the task."""
-        return {}
+"""Parameters of the soft bodies."""
 
 
 class Task:
@@ -206,8 +86,8 @@ class Task:
         limit: int = 0,
         autoreset_mode: AutoresetMode = AutoresetMode.DISABLED,
         render: bool = False,
-        device: Any = None,
-        progress: Any = None,
+        device: wp.DeviceLike = None,
+        progress: bool | Progress | None = None,
     ) -> None:
         """Build the scene and allocate what a step writes."""
         self.config, self.obs_type, self.world_count = config, obs_type, world_count
@@ -234,48 +114,31 @@ class Task:
         soft = self.scene.soft
         self.points = sample_farthest(soft.body.surface_points, self.point_count, first=0)
         """Surface samples of object 0 in the observation."""
-        self._points = wp.array(self.points, dtype=int, device=self.device)
-        self._lay_out()
+        proprioception_and_goal = (*PROPRIOCEPTION, *self.goal_segments())
+        self.layout = ObservationLayout(
+            (*proprioception_and_goal, *object_part(self.point_count), *self.object_segments())
+        )
+        self.segments = self.layout.segments
+        """Columns of each segment: proprioception, goal, object, and what a task adds about it."""
+        self.low, self.high = self.layout.low, self.layout.high
+        self.agent_size = sum(segment.size for segment in proprioception_and_goal)
+        """Leading columns of the observation that do not see the object: proprioception and goal."""
         self._allocate()
         self.build()
         self.reset()
         self._step()  # compiles what the graph needs
-        with wp.ScopedCapture(device=self.device) as capture:
-            self._step()
-        self.graph: Any = capture.graph
+        self.graph = captured(self._step, self.device)
         """The step as a captured graph."""
-
-    def _lay_out(self) -> None:
-        """Give every segment of the observation its columns."""
-        reach = 2.0
-        body = (
-            Segment("object_position", 3, -reach, reach),
-            Segment("object_velocity", 3, -20.0, 20.0),
-            Segment("object_offset", 3, -2.0 * reach, 2.0 * reach),
-            Segment("object_points", 3 * self.point_count, -reach, reach),
-        )
-        self.segments: dict[str, tuple[slice, Segment]] = {}
-        """Columns of each segment: proprioception, goal, object, and what a task adds about it."""
-        column = 0
-        for segment in (*PROPRIOCEPTION, *self.goal_segments(), *body, *self.object_segments()):
-            self.segments[segment.name] = (slice(column, column + segment.size), segment)
-            column += segment.size
-        chosen = [segment for _, segment in self.segments.values()]
-        low = [np.broadcast_to(np.array(segment.low, np.float32), segment.size) for segment in chosen]
-        high = [np.broadcast_to(np.array(segment.high, np.float32), segment.size) for segment in chosen]
-        self.low, self.high = np.concatenate(low), np.concatenate(high)
-        self.agent_size = self.column("object_position")
-        """Leading columns of the observation that do not see the object: proprioception and goal."""
 
     def column(self, segment: str) -> int:
         """Return the first column of a segment of the observation."""
-        return self.segments[segment][0].start
+        return self.layout.column(segment)
 
     def _allocate(self) -> None:
         """Make the arrays that a step writes."""
         worlds, device = self.world_count, self.device
 
-        def zeros(*shape: int, dtype: Any = float) -> wp.array:
+        def zeros(*shape: int, dtype: type = float) -> wp.array:
             return wp.zeros((worlds, *shape), dtype=dtype, device=device)
 
         self.seed, self.episode, self.elapsed, self.end, self.failure = (zeros(dtype=int) for _ in range(5))
@@ -289,19 +152,40 @@ class Task:
         self.metrics, self.final_metrics = (zeros(max(len(self.metric_names), 1)) for _ in range(2))
         self.final_parameters = wp.zeros_like(self.table.values)
         self.final_status = wp.zeros_like(self.scene.solver.status)
-        self._never, self._fresh = zeros(dtype=wp.bool), zeros(dtype=wp.bool)
+        self.never = zeros(dtype=wp.bool)
+        """A mask of no world."""
+        self._fresh = zeros(dtype=wp.bool)
         self.any_done = wp.zeros(1, dtype=int, device=device)
-        instances = worlds * len(self.scene.objects)
+        scene, instances = self.scene, worlds * len(self.scene.objects)
         self._material = wp.zeros((len(MATERIAL), instances), dtype=float, device=device)
+        self._materials = {name: cast(wp.array, self._material[k]) for k, name in enumerate(MATERIAL)}
+        columns = [self.table.column(name) for name in MATERIAL]
+        self._material_columns = wp.array(columns, dtype=int, device=device)
         self._solver_mask = wp.zeros(worlds + 1, dtype=wp.bool, device=device)
         self._low = wp.array(self.low, dtype=float, device=device)
         self._high = wp.array(self.high, dtype=float, device=device)
+        self.state = filled(
+            WorldState,
+            scene,
+            scene.controller,
+            scene.model.softmode,
+            scene.state,
+            parameters=self.table.values,
+            points=wp.array(self.points, dtype=int, device=device),
+            q=scene.state.softmode.q,
+            stride=len(scene.objects),
+        )
+        """What the kernels of a task read."""
+        self.result = filled(StepResult, self, marker_place=scene.marker_place)
+        """What they write."""
+        self._arm = filled(kernels.ArmState, scene.controller, scene.state)
+        self._episode = filled(kernels.Episode, self)
         self.images: dict[str, wp.array] = {}
         """Pictures of the observation by key: pixels, depth, segmentation; shape (world_count, height, width, ...)."""
         self.final_images: dict[str, wp.array] = {}
         if self.obs_type != "state":
             edge = self.config.image_size
-            camera = self.scene.cameras[edge, edge]
+            camera = scene.cameras[edge, edge]
             self.images["pixels"] = camera.images("pixels")
             for name in self.config.image_outputs:
                 self.images[name] = camera.images("pixels", name)
@@ -367,39 +251,54 @@ class Task:
         """Return the splats that mark the goal in pictures; `observe` writes `scene.marker_place`."""
         return None
 
+    def front_camera(self, name: str, edge: int) -> PinholeCamera:
+        """Return the camera that looks at the object from the front, with pictures of `edge` x `edge` pixels."""
+        return square_camera(name, edge, (0.86, 0.34, 0.25), (0.44, 0.0, 0.11), 0.60)
+
     def observation_camera(self) -> PinholeCamera:
         """Return the camera of pixel observations, named "pixels"."""
-        edge = self.config.image_size
-        return front_camera("pixels", edge) if self.config.camera == "front" else wrist_camera("pixels", edge)
+        camera = self.front_camera if self.config.camera == "front" else wrist_camera
+        return camera("pixels", self.config.image_size)
 
     def render_cameras(self) -> list[PinholeCamera]:
         """Return the cameras whose pictures stand side by side in a rendered frame."""
         edge = self.config.render_size
-        return [front_camera("front", edge), overview("overview", edge)]
+        return [self.front_camera("front", edge), overview("overview", edge)]
 
     # -- helpers for subclasses ---------------------------------------------------------------------------------------
 
-    def launch(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any], dim: Any = None) -> None:
-        """Launch a kernel over the worlds."""
+    def launch(
+        self,
+        kernel: wp.Kernel | Callable[..., None],
+        inputs: Sequence[object],
+        outputs: Sequence[object] = (),
+        dim: int | tuple[int, ...] | None = None,
+    ) -> None:
+        """Launch a kernel over the worlds.
+
+        Args:
+            kernel: The kernel.
+            inputs: Its first arguments.
+            outputs: Its last arguments.
+            dim: Number of threads; None for one per world.
+        """
         dim = self.world_count if dim is None else dim
         wp.launch(kernel, dim=dim, inputs=list(inputs), outputs=list(outputs), device=self.device)
 
     def place_object(self, index: int, position: str, yaw: str, ground: float = 0.0) -> None:
-        """Put an object where two parameters say, standing on the table or on `ground` [m] above it."""
-        scene, table = self.scene, self.table
+        """Put an object down.
+
+        Args:
+            index: Which object of a world.
+            position: The parameter that says where its centre is [m].
+            yaw: The one that says its rotation about the vertical [rad].
+            ground: Height over the table of what it stands on [m].
+        """
+        scene, column = self.scene, self.table.column
+        columns = filled(kernels.Placement, position=column(position), yaw=column(yaw), scale=column("scale"))
         self.launch(
             kernels.place_object,
-            [
-                scene.world_mask,
-                table.values,
-                table.column(position),
-                table.column(yaw),
-                table.column("scale"),
-                scene.objects[index].height,
-                GAP + ground,
-                len(scene.objects),
-                index,
-            ],
+            [scene.world_mask, self.state, columns, scene.objects[index].height, GAP + ground, index],
             [scene.place_position, scene.place_yaw],
         )
 
@@ -440,8 +339,8 @@ class Task:
         terms[mask], end[mask] = 0.0, EndReason.RUNNING
         self.terms.assign(terms)
         self.end.assign(end)
-        self._observe()
-        self._draw_pictures()
+        self.write_observation()
+        self.draw_pictures()
 
     def _draw(self) -> None:
         """Draw the parameters of the worlds in `scene.world_mask`."""
@@ -454,60 +353,27 @@ class Task:
 
     def _start(self) -> None:
         """Set those worlds up from their parameters."""
-        scene, table = self.scene, self.table
-        mask, stride = scene.world_mask, len(scene.objects)
-        self.launch(
-            kernels.spread_materials,
-            [table.values, table.column(MATERIAL[0]), stride],
-            [self._material],
-            self.world_count * stride,
-        )
+        scene = self.scene
+        mask, values = scene.world_mask, self._material
+        self.launch(kernels.spread_materials, [self.state, self._material_columns], [values], values.shape[1])
         wp.copy(self._solver_mask, mask, count=self.world_count)
-        values: Any = self._material
-        set_parameters(scene.solver, self._solver_mask, **{name: values[k] for k, name in enumerate(MATERIAL)})
+        set_parameters(scene.solver, self._solver_mask, **self._materials)
         self.place()
         scene.reset_worlds()
         for camera in scene.cameras.values():
             camera.randomize(mask)
-        self.launch(kernels.clear_worlds, [mask], [self.elapsed, self.done, self.success, self.failure])
+        self.launch(kernels.clear_worlds, [mask], [self._episode, self.result])
         self.clear()
 
-    def _observe(self) -> None:
+    def write_observation(self) -> None:
         """Write the observation and the metrics of all worlds."""
-        scene = self.scene
-        controller, state, data = scene.controller, scene.state, scene.model.softmode
-        self.launch(
-            kernels.observe_arm,
-            [
-                controller.coord_start,
-                state.joint_q,
-                controller.tool_pose,
-                controller.opening,
-                scene.finger_force,
-                controller.target_position,
-                controller.target_yaw,
-                controller.commanded_q,
-            ],
-            [self.observation],
-        )
-        self.launch(
-            kernels.observe_object,
-            [
-                scene.object_position,
-                scene.object_velocity,
-                controller.tool_pose,
-                data.particle_start,
-                state.particle_q,
-                self._points,
-                len(scene.objects),
-                self.column("object_position"),
-            ],
-            [self.observation],
-        )
+        arm, body = (self.layout.columns_in(struct) for struct in (kernels.ArmColumns, kernels.ObjectColumns))
+        self.launch(kernels.observe_arm, [self.state, self._arm, arm], [self.observation])
+        self.launch(kernels.observe_object, [self.state, body], [self.observation])
         self.observe()
         self.launch(kernels.bound_observation, [self._low, self._high], [self.observation, self.finite])
 
-    def _draw_pictures(self) -> None:
+    def draw_pictures(self) -> None:
         """Draw the picture of a pixel observation."""
         if self.obs_type != "state":
             edge = self.config.image_size
@@ -525,14 +391,14 @@ class Task:
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
             wp.copy(self._fresh, self.done)
             scene.control_step()
-            self._restart(self._fresh)
-            self._observe()
-            self._finish(self._fresh)
+            self.restart(self._fresh)
+            self.write_observation()
+            self.finish(self._fresh)
             self.clear()  # what `evaluate` counted in worlds that only started
         else:
             scene.control_step()
-            self._observe()
-            self._finish(self._never)
+            self.write_observation()
+            self.finish(self.never)
             if self.autoreset_mode == AutoresetMode.SAME_STEP:
                 if self.images:
                     wp.capture_if(self.any_done, on_true=self._keep_pictures)
@@ -542,49 +408,32 @@ class Task:
                 wp.copy(self.final_parameters, self.table.values)
                 wp.copy(self.final_status, scene.solver.status)
                 wp.copy(self._fresh, self.done)
-                self._restart(self._fresh)
-                self._observe()
-        self._draw_pictures()
+                self.restart(self._fresh)
+                self.write_observation()
+        self.draw_pictures()
 
-    def _restart(self, mask: wp.array) -> None:
+    def restart(self, mask: wp.array) -> None:
         """Start new episodes in the worlds of the mask."""
         wp.copy(self.scene.world_mask, mask)
         self._draw()
         self._start()
 
-    def _finish(self, fresh: wp.array) -> None:
+    def finish(self, fresh: wp.array) -> None:
         """Judge the step."""
         scene = self.scene
         self.failure.zero_()
         self.any_done.zero_()
         self.evaluate()
+        status, lowest = scene.solver.status, scene.soft.height - FALL
         self.launch(
             kernels.finish_step,
-            [
-                fresh,
-                self.limit,
-                bits.WORLD_NOT_FINITE,
-                scene.solver.status,
-                self.finite,
-                scene.object_position,
-                scene.soft.height - FALL,
-            ],
-            [
-                self.terms,
-                self.elapsed,
-                self.failure,
-                self.reward,
-                self.terminated,
-                self.truncated,
-                self.end,
-                self.done,
-                self.any_done,
-            ],
+            [fresh, self.limit, bits.WORLD_NOT_FINITE, status, self.finite, self.state, lowest],
+            [self.result, self._episode],
         )
 
     def _keep_pictures(self) -> None:
         """Draw the last picture of the episodes that end."""
-        self._draw_pictures()
+        self.draw_pictures()
         for name, image in self.images.items():
             wp.copy(self.final_images[name], image)
 
@@ -604,8 +453,8 @@ class Task:
         if self.obs_type == "state":
             keys = self.state_keys()
             if keys:
-                return gym.spaces.Dict({name: self.state_space(columns) for name, columns in keys.items()})
-            return self.state_space(slice(0, len(self.low)))
+                return gym.spaces.Dict({name: self.layout.space(columns) for name, columns in keys.items()})
+            return self.layout.space(slice(0, len(self.low)))
         edge = self.config.image_size
         spaces: dict[str, gym.Space] = {"pixels": gym.spaces.Box(0, 255, (edge, edge, 3), np.uint8)}
         if "depth" in self.images:
@@ -614,37 +463,13 @@ class Task:
             count = len(self.scene.cameras[edge, edge].labels)
             spaces["segmentation"] = gym.spaces.Box(-1, count, (edge, edge), np.int32)
         if self.obs_type == "pixels_agent_pos":
-            spaces["agent_pos"] = self.state_space(slice(0, self.agent_size))
+            spaces["agent_pos"] = self.layout.space(slice(0, self.agent_size))
         return spaces["pixels"] if list(spaces) == ["pixels"] else gym.spaces.Dict(spaces)
 
-    def state_space(self, columns: slice) -> gym.spaces.Box:
-        """Return the space of some columns of the observation vector."""
-        return gym.spaces.Box(self.low[columns], self.high[columns], dtype=np.float32)
 
-
-def front_camera(name: str, edge: int) -> PinholeCamera:
-    """Return the camera that looks at the object from the front."""
-    return PinholeCamera.look_at(
-        name, position=(0.86, 0.34, 0.25), target=(0.44, 0.0, 0.11), width=edge, height=edge, fov_y=0.60
-    )
-
-
-def wrist_camera(name: str, edge: int) -> PinholeCamera:
-    """Return the camera on the hand that looks between the fingers."""
-    return PinholeCamera.look_at(
-        name,
-        position=(0.12, 0.0, 0.02),
-        target=(0.0, 0.0, 0.14),
-        up=(-1.0, 0.0, 0.0),
-        width=edge,
-        height=edge,
-        fov_y=1.1,
-        body="link7",
-    )
-
-
-def overview(name: str, edge: int) -> PinholeCamera:
-    """Return the camera that sees arm and table."""
-    return PinholeCamera.look_at(
-        name, position=(1.05, -0.85, 0.60), target=(0.30, 0.0, 0.25), width=edge, height=edge, fov_y=0.60
-    )
+def captured(launches: Callable[[], None], device: wp.Device) -> wp.Graph:
+    """Return what a function launches as a graph."""
+    with wp.ScopedCapture(device=device) as capture:
+        launches()
+    assert capture.graph is not None
+    return capture.graph

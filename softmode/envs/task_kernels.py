@@ -2,11 +2,72 @@
 
 import warp as wp
 
+from softmode.envs.end_reason import EndReason
+from softmode.envs.reward_kernels import StepResult, WorldState, surface_point, tool_position
+from softmode.robots.arm import ARM_JOINT_COUNT
+
 wp.set_module_options({"enable_backward": False})
 
-TIME_LIMIT = wp.constant(1)
-DIVERGED = wp.constant(2)
-DROPPED = wp.constant(3)
+_LEFT = wp.constant(ARM_JOINT_COUNT)
+_RIGHT = wp.constant(ARM_JOINT_COUNT + 1)
+
+
+@wp.struct
+class ArmState:
+    """Joints and command of the arm in every world."""
+
+    coord_start: wp.array[int]
+    joint_q: wp.array[float]
+    opening: wp.array[float]
+    target_position: wp.array[wp.vec3]
+    target_yaw: wp.array[float]
+    commanded_q: wp.array2d[float]
+
+
+@wp.struct
+class ArmColumns:
+    """First columns of the proprioception."""
+
+    tool_position: int
+    tool_heading: int
+    opening: int
+    finger_force: int
+    joint_angles: int
+    command_lead: int
+    command_turn: int
+    command_opening: int
+
+
+@wp.struct
+class ObjectColumns:
+    """First columns of object 0."""
+
+    object_position: int
+    object_velocity: int
+    object_offset: int
+    object_points: int
+
+
+@wp.struct
+class Placement:
+    """Columns of the parameters that say where an object is put down."""
+
+    position: int  # of x and y [m]
+    yaw: int  # [rad]
+    scale: int
+
+
+@wp.struct
+class Episode:
+    """How the episode of every world goes on and ends."""
+
+    elapsed: wp.array[int]  # control steps
+    reward: wp.array[float]
+    terminated: wp.array[wp.bool]
+    truncated: wp.array[wp.bool]
+    end: wp.array[int]  # an EndReason
+    done: wp.array[wp.bool]
+    any_done: wp.array[int]
 
 
 @wp.kernel
@@ -41,13 +102,10 @@ def draw_parameters(
 @wp.kernel
 def place_object(
     world_mask: wp.array[wp.bool],
-    parameters: wp.array2d[float],
-    position_column: int,  # of x and y [m]
-    yaw_column: int,  # [rad]
-    scale_column: int,
+    state: WorldState,
+    drawn: Placement,
     height: float,  # of the unscaled object's centre [m]
     gap: float,  # [m]
-    stride: int,  # soft objects per world
     object_index: int,
     # Out, per instance:
     position_out: wp.array[wp.vec3d],
@@ -57,92 +115,78 @@ def place_object(
     w = wp.tid()
     if not world_mask[w]:
         return
-    x = wp.float64(parameters[w, position_column])
-    y = wp.float64(parameters[w, position_column + 1])
-    position_out[w * stride + object_index] = wp.vec3d(x, y, wp.float64(height * parameters[w, scale_column] + gap))
-    yaw_out[w * stride + object_index] = wp.float64(parameters[w, yaw_column])
+    x = wp.float64(state.parameters[w, drawn.position])
+    y = wp.float64(state.parameters[w, drawn.position + 1])
+    z = wp.float64(height * state.parameters[w, drawn.scale] + gap)
+    position_out[w * state.stride + object_index] = wp.vec3d(x, y, z)
+    yaw_out[w * state.stride + object_index] = wp.float64(state.parameters[w, drawn.yaw])
 
 
 @wp.kernel
 def spread_materials(
-    parameters: wp.array2d[float],
-    column: int,  # of the first
-    stride: int,  # soft objects per world
-    # Out, (5, instance_count):
+    state: WorldState,
+    columns: wp.array[int],
+    # Out, (columns, instance_count):
     values: wp.array2d[float],
 ):
     """Give all soft objects of a world the drawn material and scale."""
     i = wp.tid()
     for m in range(values.shape[0]):
-        values[m, i] = parameters[i // stride, column + m]
+        values[m, i] = state.parameters[i // state.stride, columns[m]]
 
 
 @wp.kernel
 def observe_arm(
-    coord_start: wp.array[int],
-    joint_q: wp.array[float],
-    tool_pose: wp.array[wp.transform],
-    opening: wp.array[float],
-    finger_force: wp.array2d[wp.vec3],
-    target_position: wp.array[wp.vec3],
-    target_yaw: wp.array[float],
-    commanded_q: wp.array2d[float],
+    state: WorldState,
+    arm: ArmState,
+    column: ArmColumns,
     # Out:
     observation: wp.array2d[float],
 ):
     """Write proprioception: tool, heading, opening, finger forces, joints, and how far the command leads."""
     w = wp.tid()
-    pose = tool_pose[w]
-    p = wp.transform_get_translation(pose)
-    forward = wp.quat_rotate(wp.transform_get_rotation(pose), wp.vec3(1.0, 0.0, 0.0))
+    p = tool_position(state, w)
+    forward = wp.quat_rotate(wp.transform_get_rotation(state.tool_pose[w]), wp.vec3(1.0, 0.0, 0.0))
     length = wp.max(wp.sqrt(forward[0] * forward[0] + forward[1] * forward[1]), 1.0e-9)
     c = -forward[0] / length
     s = -forward[1] / length
+    lead = arm.target_position[w] - p
     for k in range(3):
-        observation[w, k] = p[k]
-    observation[w, 3] = c
-    observation[w, 4] = s
-    observation[w, 5] = opening[w]
+        observation[w, column.tool_position + k] = p[k]
+        observation[w, column.command_lead + k] = lead[k]
+    observation[w, column.tool_heading] = c
+    observation[w, column.tool_heading + 1] = s
+    observation[w, column.opening] = arm.opening[w]
     for f in range(2):
-        observation[w, 6 + f] = wp.length(finger_force[w, f])
-    start = coord_start[w]
-    for j in range(7):
-        observation[w, 8 + j] = joint_q[start + j]
-    lead = target_position[w] - p
-    for k in range(3):
-        observation[w, 15 + k] = lead[k]
+        observation[w, column.finger_force + f] = wp.length(state.finger_force[w, f])
+    start = arm.coord_start[w]
+    for j in range(ARM_JOINT_COUNT):
+        observation[w, column.joint_angles + j] = arm.joint_q[start + j]
     # sine of the angle from the measured heading to the commanded one
-    observation[w, 18] = c * wp.sin(target_yaw[w]) - s * wp.cos(target_yaw[w])
-    observation[w, 19] = commanded_q[w, 7] + commanded_q[w, 8]
+    observation[w, column.command_turn] = c * wp.sin(arm.target_yaw[w]) - s * wp.cos(arm.target_yaw[w])
+    observation[w, column.command_opening] = arm.commanded_q[w, _LEFT] + arm.commanded_q[w, _RIGHT]
 
 
 @wp.kernel
 def observe_object(
-    object_position: wp.array2d[wp.vec3],
-    object_velocity: wp.array2d[wp.vec3],
-    tool_pose: wp.array[wp.transform],
-    particle_start: wp.array[int],
-    particle_q: wp.array[wp.vec3],
-    points: wp.array[int],
-    stride: int,  # soft objects per world
-    column: int,
+    state: WorldState,
+    column: ObjectColumns,
     # Out:
     observation: wp.array2d[float],
 ):
     """Write centre, velocity, centre relative to the tool, and surface points relative to the centre of object 0."""
     w = wp.tid()
-    x = object_position[w, 0]
-    v = object_velocity[w, 0]
-    offset = x - wp.transform_get_translation(tool_pose[w])
+    x = state.object_position[w, 0]
+    v = state.object_velocity[w, 0]
+    offset = x - tool_position(state, w)
     for k in range(3):
-        observation[w, column + k] = x[k]
-        observation[w, column + 3 + k] = v[k]
-        observation[w, column + 6 + k] = offset[k]
-    start = particle_start[w * stride]
-    for i in range(points.shape[0]):
-        r = particle_q[start + points[i]] - x
+        observation[w, column.object_position + k] = x[k]
+        observation[w, column.object_velocity + k] = v[k]
+        observation[w, column.object_offset + k] = offset[k]
+    for i in range(state.points.shape[0]):
+        r = surface_point(state, w, i) - x
         for k in range(3):
-            observation[w, column + 9 + 3 * i + k] = r[k]
+            observation[w, column.object_points + 3 * i + k] = r[k]
 
 
 @wp.kernel
@@ -170,19 +214,17 @@ def bound_observation(
 def clear_worlds(
     world_mask: wp.array[wp.bool],
     # Out:
-    elapsed: wp.array[int],
-    done: wp.array[wp.bool],
-    success: wp.array[wp.bool],
-    failure: wp.array[int],
+    episode: Episode,
+    result: StepResult,
 ):
     """Start the episode of the masked worlds."""
     w = wp.tid()
     if not world_mask[w]:
         return
-    elapsed[w] = 0
-    done[w] = False
-    success[w] = False
-    failure[w] = 0
+    episode.elapsed[w] = 0
+    episode.done[w] = False
+    result.success[w] = False
+    result.failure[w] = EndReason.RUNNING
 
 
 @wp.kernel
@@ -204,52 +246,45 @@ def finish_step(
     not_finite: int,  # status bit
     status: wp.array[int],
     finite: wp.array[wp.bool],
-    object_position: wp.array2d[wp.vec3],
+    state: WorldState,
     lowest: float,  # height under which object 0 is lost [m]
     # In, out:
-    terms: wp.array2d[float],
-    elapsed: wp.array[int],
-    failure: wp.array[int],
-    # Out:
-    reward: wp.array[float],
-    terminated: wp.array[wp.bool],
-    truncated: wp.array[wp.bool],
-    end: wp.array[int],
-    done: wp.array[wp.bool],
-    any_done: wp.array[int],
+    result: StepResult,
+    episode: Episode,
 ):
     """Sum the reward, count the step and decide whether the episode ends."""
     w = wp.tid()
     if fresh[w]:
-        reward[w] = 0.0
-        terminated[w] = False
-        truncated[w] = False
-        end[w] = 0
-        done[w] = False
-        for t in range(terms.shape[1]):
-            terms[w, t] = 0.0
+        episode.reward[w] = 0.0
+        episode.terminated[w] = False
+        episode.truncated[w] = False
+        episode.end[w] = EndReason.RUNNING
+        episode.done[w] = False
+        for t in range(result.terms.shape[1]):
+            result.terms[w, t] = 0.0
         return
-    why = failure[w]
-    if not (object_position[w, 0][2] >= lowest):
-        why = DROPPED
+    why = result.failure[w]
+    if not (state.object_position[w, 0][2] >= lowest):
+        why = EndReason.DROPPED
     if (status[w] & not_finite) != 0 or not finite[w]:
-        why = DIVERGED
+        why = EndReason.DIVERGED
     total = float(0.0)
-    for t in range(terms.shape[1]):
-        if not wp.isfinite(terms[w, t]):
-            terms[w, t] = 0.0
-        total += terms[w, t]
-    steps = elapsed[w] + 1
+    for t in range(result.terms.shape[1]):
+        if not wp.isfinite(result.terms[w, t]):
+            result.terms[w, t] = 0.0
+        total += result.terms[w, t]
+    steps = episode.elapsed[w] + 1
+    failed = why != EndReason.RUNNING
     late = limit > 0 and steps >= limit
-    elapsed[w] = steps
-    failure[w] = why
-    reward[w] = total
-    terminated[w] = why != 0
-    truncated[w] = late
-    end[w] = why
-    if late and why == 0:
-        end[w] = TIME_LIMIT
-    over = why != 0 or late
-    done[w] = over
+    episode.elapsed[w] = steps
+    result.failure[w] = why
+    episode.reward[w] = total
+    episode.terminated[w] = failed
+    episode.truncated[w] = late
+    episode.end[w] = why
+    if late and not failed:
+        episode.end[w] = EndReason.TIME_LIMIT
+    over = failed or late
+    episode.done[w] = over
     if over:
-        wp.atomic_max(any_done, 0, 1)
+        wp.atomic_max(episode.any_done, 0, 1)

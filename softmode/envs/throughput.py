@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -10,14 +11,13 @@ import gymnasium as gym
 import numpy as np
 import warp as wp
 
-from softmode.envs.soft_env import checked_device
+from softmode.envs.arguments import checked_device
+from softmode.envs.reward_kernels import TOUCH_FORCE
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.task import Task
+from softmode.envs.task import Task, captured
 from softmode.errors import ConfigError
 
 Actions = Literal["random", "grasp"]
-TOUCH = 0.02
-"""Force from which a finger counts as touching [N]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +80,7 @@ def measure_throughput(
         _, _, terminated, _, _ = env.step(source(step))
         force = env.state_observation[:, column]
         failures = failures + terminated.sum()
-        touching = touching + (force > TOUCH).any(1).sum()
+        touching = touching + (force > TOUCH_FORCE).any(1).sum()
     wp.synchronize_device(env.device)
     seconds = time.perf_counter() - clock
     taken = (free_before - env.device.free_memory) / 1e6 if tensors and env.device.is_cuda and free_before else 0.0
@@ -183,24 +183,23 @@ def stage_times(task: Task, repeats: int = 20) -> dict[str, float]:
     """
     scene = task.scene
 
-    def physics() -> None:
-        scene.control_step()
-
     def judging() -> None:
-        task._observe()
-        task._finish(task._never)
+        task.write_observation()
+        task.finish(task.never)
 
     def reset() -> None:
-        task._restart(task._never)
+        task.restart(task.never)
 
-    parts: dict[str, Any] = {"physics": physics, "observe and judge": judging, "masked reset": reset}
+    parts: dict[str, Callable[[], None]] = {
+        "physics": scene.control_step,
+        "observe and judge": judging,
+        "masked reset": reset,
+    }
     if task.images:
-        parts["camera"] = task._draw_pictures
-    graphs: dict[str, Any] = {"whole step": task.graph}
+        parts["camera"] = task.draw_pictures
+    graphs: dict[str, wp.Graph] = {"whole step": task.graph}
     for name, part in parts.items():
-        with wp.ScopedCapture(device=task.device) as capture:
-            part()
-        graphs[name] = capture.graph
+        graphs[name] = captured(part, task.device)
     spent: dict[str, list[float]] = {name: [] for name in graphs}
     for _ in range(repeats + 2):  # in turn, so that all see the same states
         for name, graph in graphs.items():

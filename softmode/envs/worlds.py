@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from softmode.envs.soft_env import info_arrays, observation_arrays, render_worlds
+from softmode.envs.results import info_arrays, map_tree, observation_arrays, render_worlds
 from softmode.envs.task import Task
 from softmode.errors import SoftmodeError, WorkerError
 
@@ -85,7 +86,7 @@ class RemoteWorlds:
 
     def __init__(self, task_class: type[Task], arguments: dict[str, Any]) -> None:
         """Start the child; `connect` waits until it is built."""
-        context: Any = multiprocessing.get_context()
+        context = multiprocessing.get_context()
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(
             target=_serve, args=(theirs, task_class, {**arguments, "progress": None}), daemon=True
@@ -137,7 +138,7 @@ class RemoteWorlds:
             self._process.terminate()
         self._pipe.close()
 
-    def _send(self, name: str, *arguments: Any) -> None:
+    def _send(self, name: str, *arguments: object) -> None:
         """Send a call; the answer to an earlier one that an error or an interruption left there is thrown away."""
         if self._pending:
             with contextlib.suppress(SoftmodeError):
@@ -170,7 +171,7 @@ class RemoteWorlds:
         )
 
 
-def _serve(pipe: Any, task_class: type[Task], arguments: dict[str, Any]) -> None:
+def _serve(pipe: Connection, task_class: type[Task], arguments: dict[str, Any]) -> None:
     """Build the worlds and do what the parent says until it hangs up."""
     try:
         with wp.ScopedDevice("cpu"):
@@ -188,7 +189,7 @@ def _serve(pipe: Any, task_class: type[Task], arguments: dict[str, Any]) -> None
                 return
             try:
                 value = getattr(worlds, name)(*given)
-                answer = (True, _to_numpy(worlds.result() if name in ("reset", "step") else value))
+                answer = (True, map_tree(_on_host, worlds.result() if name in ("reset", "step") else value))
             except Exception as error:
                 answer = (False, _portable(error))
             pipe.send(answer)
@@ -206,8 +207,6 @@ def _portable(error: Exception) -> Exception:
     )
 
 
-def _to_numpy(tree: Any) -> Any:
-    """Return a tree of arrays as numpy arrays."""
-    if isinstance(tree, dict):
-        return {name: _to_numpy(value) for name, value in tree.items()}
-    return tree.numpy() if isinstance(tree, wp.array) else tree
+def _on_host(value: object) -> object:
+    """Return a Warp array as a NumPy array, and anything else as it is."""
+    return value.numpy() if isinstance(value, wp.array) else value

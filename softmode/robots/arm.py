@@ -11,9 +11,9 @@ import newton
 import numpy as np
 import warp as wp
 
+from softmode.checks import require_choice, require_fields
 from softmode.errors import ConfigError
-from softmode.robots.arm_shapes import Part, add_part, arm_links, base_parts, finger_parts
-from softmode.robots.checks import require_non_negative, require_positive, require_sequence
+from softmode.robots.arm_shapes import Part, add_part, arm_links, base_parts, finger_parts, hand_parts
 
 ARM_JOINT_COUNT = 7
 """Revolute joints between base and hand."""
@@ -53,9 +53,9 @@ class GripperDescription:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        require_positive(self, "stroke", "finger_length", "finger_mass", "force_limit", "drive_stiffness")
-        require_non_negative(self, "armature", "damping", "drive_damping", "friction")
-        require_sequence(self, "pad_size", 3, positive=True)
+        require_fields(self, ("stroke", "finger_length", "finger_mass", "force_limit", "drive_stiffness"), above=0.0)
+        require_fields(self, ("armature", "damping", "drive_damping", "friction"), at_least=0.0)
+        require_fields(self, ("pad_size",), count=3, above=0.0)
         if self.pad_size[2] > self.finger_length:
             raise ConfigError(
                 f"pad_size[2] = {self.pad_size[2]} m is longer than finger_length = {self.finger_length} m",
@@ -109,26 +109,20 @@ class ArmDescription:
 
     def __post_init__(self) -> None:
         """Check the ranges, and that the home pose can be reached."""
-        require_positive(self, "shoulder_height", "upper_arm_length", "forearm_length", "flange_length", "hand_length")
-        for name in ("link_masses", "effort_limits", "drive_stiffnesses"):
-            require_sequence(self, name, ARM_JOINT_COUNT, positive=True)
-        for name in ("armatures", "dampings", "drive_dampings"):
-            require_sequence(self, name, ARM_JOINT_COUNT, non_negative=True)
-        for name in ("joint_lower", "joint_upper"):
-            require_sequence(self, name, ARM_JOINT_COUNT)
-        require_sequence(self, "home_position", 3)
+        lengths = ("shoulder_height", "upper_arm_length", "forearm_length", "flange_length", "hand_length")
+        require_fields(self, lengths, above=0.0)
+        joints = ARM_JOINT_COUNT
+        require_fields(self, ("link_masses", "effort_limits", "drive_stiffnesses"), count=joints, above=0.0)
+        require_fields(self, ("armatures", "dampings", "drive_dampings"), count=joints, at_least=0.0)
+        require_fields(self, ("joint_lower", "joint_upper"), count=joints)
+        require_fields(self, ("home_position",), count=3)
         if not all(low < high for low, high in zip(self.joint_lower, self.joint_upper, strict=True)):
             raise ConfigError(
                 f"joint_lower {self.joint_lower} is not below joint_upper {self.joint_upper}",
                 hint="give each joint a range in rad, lower before upper",
             )
-        if self.touch not in ("gripper", "all"):
-            raise ConfigError(f"touch is {self.touch!r}", hint="use 'gripper' or 'all'")
-        if not 0.0 <= self.home_opening <= self.gripper.stroke:
-            raise ConfigError(
-                f"home_opening = {self.home_opening} m lies outside 0..stroke = {self.gripper.stroke} m",
-                hint="choose an opening that the gripper has",
-            )
+        require_choice("touch", self.touch, ("gripper", "all"))
+        require_fields(self, ("home_opening",), at_least=0.0, at_most=self.gripper.stroke, unit="m")
         self.joint_q_over(self.home_position)
 
     @property
@@ -260,6 +254,7 @@ def add_arm(
     bodies: list[int] = []
     joints: list[int] = []
     shapes: list[int] = []
+    added: list[int] = []
     coord_start, dof_start = builder.joint_coord_count, builder.joint_dof_count
     weight = {"mujoco:gravcomp": 1.0} if arm.gravity_compensation else {}
 
@@ -282,8 +277,9 @@ def add_arm(
         bodies.append(body)
         return body
 
-    add_parts(-1, base_parts(arm), 1.0, "base", base)
-    offsets, axes, links = arm_links(arm)
+    add_parts(-1, base_parts(), 1.0, "base", base)
+    offsets, axes, links = arm_links(arm.shoulder_height, arm.upper_arm_length, arm.forearm_length, arm.flange_length)
+    links.append(hand_parts(arm.hand_length, gripper.stroke))
     home = arm.home_joint_q
     for k in range(ARM_JOINT_COUNT):
         mount = wp.transform(wp.vec3(0.0, 0.0, offsets[k]), wp.quat_identity())
@@ -317,7 +313,13 @@ def add_arm(
     for side, name in ((1.0, "left"), (-1.0, "right")):
         body = builder.add_link(label=f"{label}/finger_{name}", custom_attributes=weight)
         fingers.append(body)
-        added = add_parts(body, finger_parts(gripper, side), gripper.finger_mass, f"finger_{name}", wp.transform())
+        added = add_parts(
+            body,
+            finger_parts(gripper.pad_size, gripper.finger_length, side),
+            gripper.finger_mass,
+            f"finger_{name}",
+            wp.transform(),
+        )
         pads.append(added[0])
         for shape in added:
             builder.add_shape_collision_filter_pair(shape, palm)

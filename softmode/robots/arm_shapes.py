@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import newton
 import warp as wp
-
-if TYPE_CHECKING:
-    from softmode.robots.arm import ArmDescription, GripperDescription
 
 _WHITE = (0.90, 0.91, 0.92)
 _GRAPHITE = (0.16, 0.17, 0.19)
@@ -46,7 +43,7 @@ _PEDESTAL_HEIGHT = 0.14
 """Height of the first axis' bearing above the mounting plane [m]."""
 
 
-def base_parts(arm: ArmDescription) -> list[Part]:
+def base_parts() -> list[Part]:
     """Return the shapes of the static base."""
     middle = 0.5 * (0.025 + _PEDESTAL_HEIGHT)
     return [
@@ -62,12 +59,24 @@ def base_parts(arm: ArmDescription) -> list[Part]:
     ]
 
 
-def arm_links(arm: ArmDescription) -> tuple[list[float], list[tuple[float, float, float]], list[list[Part]]]:
-    """Return, per joint, its offset along the parent's z [m], its axis, and the shapes of the link behind it."""
+def arm_links(
+    shoulder_height: float, upper_arm_length: float, forearm_length: float, flange_length: float
+) -> tuple[list[float], list[tuple[float, float, float]], list[list[Part]]]:
+    """Return, per joint, its offset along the parent's z [m], its axis, and the shapes of the link behind it.
+
+    Args:
+        shoulder_height: Height of the second axis above the mounting plane [m].
+        upper_arm_length: Shoulder to elbow [m].
+        forearm_length: Elbow to wrist [m].
+        flange_length: Wrist to flange [m].
+
+    Returns:
+        Offsets and axes of seven joints, and the shapes of the six links before the hand.
+    """
     along_z, along_y = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
-    half_upper, half_fore = 0.5 * arm.upper_arm_length, 0.5 * arm.forearm_length
-    neck = arm.shoulder_height - _PEDESTAL_HEIGHT
-    offsets = [_PEDESTAL_HEIGHT, neck, half_upper, half_upper, half_fore, half_fore, arm.flange_length]
+    half_upper, half_fore = 0.5 * upper_arm_length, 0.5 * forearm_length
+    neck = shoulder_height - _PEDESTAL_HEIGHT
+    offsets = [_PEDESTAL_HEIGHT, neck, half_upper, half_upper, half_fore, half_fore, flange_length]
     axes = [along_z, along_y, along_z, along_y, along_z, along_y, along_z]
 
     def sleeve(length: float, radius: float, color: tuple[float, float, float] = _WHITE) -> Part:
@@ -91,23 +100,20 @@ def arm_links(arm: ArmDescription) -> tuple[list[float], list[tuple[float, float
     def ring(z: float, radius: float) -> Part:
         return Part(kind="cylinder", center=(0.0, 0.0, z), size=(radius, 0.004), color=_STEEL)
 
-    flange = arm.flange_length
     links = [
         [sleeve(neck, 0.068), *hub(neck, 0.070, 0.068)],
         [_capsule_along_z(0.0, half_upper, 0.058), ring(half_upper, 0.056)],
         [_capsule_along_z(0.0, half_upper, 0.054), *hub(half_upper, 0.060, 0.060)],
         [_capsule_along_z(0.0, half_fore, 0.050), ring(half_fore, 0.048)],
         [_capsule_along_z(0.0, half_fore, 0.046), *hub(half_fore, 0.050, 0.050)],
-        [_capsule_along_z(0.0, 0.4 * flange, 0.042), sleeve(flange - 0.004, 0.040)],
-        _hand_parts(arm),
+        [_capsule_along_z(0.0, 0.4 * flange_length, 0.042), sleeve(flange_length - 0.004, 0.040)],
     ]
     return offsets, axes, links
 
 
-def _hand_parts(arm: ArmDescription) -> list[Part]:
-    """Return the shapes of the hand; the last one is the palm."""
-    length = arm.hand_length
-    half_width = 0.5 * arm.gripper.stroke + 0.022
+def hand_parts(length: float, stroke: float) -> list[Part]:
+    """Return the shapes of the hand, `length` [m] long, for fingers of a `stroke` [m]; the last one is the palm."""
+    half_width = 0.5 * stroke + 0.022
     half_height = max(0.5 * (length - 0.026), 0.005)
     return [
         Part(kind="cylinder", center=(0.0, 0.0, 0.010), size=(0.040, 0.010), color=_STEEL, name="flange"),
@@ -133,10 +139,15 @@ def _hand_parts(arm: ArmDescription) -> list[Part]:
     ]
 
 
-def finger_parts(gripper: GripperDescription, side: float) -> list[Part]:
-    """Return the shapes of one finger, its pad first; at zero the pad's face lies in the plane y = 0."""
-    width, thickness, height = gripper.pad_size
-    length = gripper.finger_length
+def finger_parts(pad_size: tuple[float, float, float], length: float, side: float) -> list[Part]:
+    """Return the shapes of one finger, its pad first; at zero the pad's face lies in the plane y = 0.
+
+    Args:
+        pad_size: Size of the pad [m]: across the finger, thickness, along the finger.
+        length: Length of the finger [m].
+        side: 1 for the left finger, -1 for the right one.
+    """
+    width, thickness, height = pad_size
     back = 0.009
     return [
         Part(

@@ -21,7 +21,7 @@ import numpy as np
 
 from softmode.errors import AssetError, ConfigError
 from softmode.robots.assets import RobotAsset
-from softmode.robots.description import JointDrive, RobotGripper
+from softmode.robots.description import JointDrive, RobotGripper, ToolPose
 
 _TOOL_NAMES = (
     "pinch",
@@ -112,7 +112,7 @@ class CompiledRobot:
         self.mujoco.mj_forward(self.model, data)
         return data
 
-    def tool(self, name: str | None, offset: np.ndarray) -> tuple[int, Any]:
+    def tool(self, name: str | None, offset: np.ndarray) -> tuple[int, ToolPose]:
         """Return the link that carries the tool, and the tool's pose in it."""
         model = self.model
         sites = {model.site(s).name: s for s in range(model.nsite)}
@@ -133,7 +133,8 @@ class CompiledRobot:
             link, position, (w, x, y, z) = bodies[name], np.zeros(3), (1.0, 0.0, 0.0, 0.0)
         turned = np.zeros(3)
         self.mujoco.mju_rotVecQuat(turned, offset, np.array([w, x, y, z]))
-        return link, tuple(float(value) for value in (*(position + turned), x, y, z, w))
+        px, py, pz = (position + turned).tolist()
+        return link, (px, py, pz, float(x), float(y), float(z), float(w))
 
     # -- drives -------------------------------------------------------------------------------------------------------
 
@@ -255,7 +256,7 @@ class CompiledRobot:
         drives: tuple[JointDrive | None, ...],
         start: np.ndarray,
         link: int,
-        tool: Any,
+        tool: ToolPose,
         hand: list[int],
     ) -> RobotGripper | None:
         """Return the gripper as given, or as found behind the end effector."""
@@ -279,7 +280,7 @@ class CompiledRobot:
         closed, wide = ([float(pair[k]) for pair in given.values()] for k in (0, 1))
         return RobotGripper(joints=tuple(given), closed=tuple(closed), open=tuple(wide))
 
-    def _distance(self, j: int, q: float, start: np.ndarray, link: int, tool: Any) -> float:
+    def _distance(self, j: int, q: float, start: np.ndarray, link: int, tool: ToolPose) -> float:
         """Return the distance of a finger's centre of mass from the tool point with its joint at a coordinate [m]."""
         joint_q = start.copy()
         joint_q[j] = q

@@ -16,10 +16,10 @@ import newton
 import numpy as np
 import warp as wp
 
+from softmode.checks import require_choice, require_fields, require_number
 from softmode.errors import ConfigError
 from softmode.robots import control_kernels as kernels
 from softmode.robots.arm import ARM_JOINT_COUNT, ArmIndices
-from softmode.robots.checks import require_positive, require_sequence
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,18 +57,12 @@ class ArmControlOptions:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        if self.mode not in ("pose_delta", "joint_delta"):
-            raise ConfigError(f"mode is {self.mode!r}", hint="use 'pose_delta' or 'joint_delta'")
-        require_positive(self, "translation_scale", "rotation_scale", "joint_scale", "opening_rate", "max_lead")
-        require_positive(self, "max_lead_angle", "squeeze_lead", "damping", "rotation_weight")
-        require_sequence(self, "workspace_lower", 3)
-        require_sequence(self, "workspace_upper", 3)
-        if not 0.0 <= self.posture_gain <= 1.0:
-            raise ConfigError(f"posture_gain = {self.posture_gain} lies outside 0..1", hint="use 0 to switch it off")
-        if self.iterations < 1:
-            raise ConfigError(
-                f"iterations = {self.iterations} must be at least 1", hint="six are enough for any action"
-            )
+        require_choice("mode", self.mode, ("pose_delta", "joint_delta"))
+        scales = ("translation_scale", "rotation_scale", "joint_scale", "opening_rate", "max_lead")
+        require_fields(self, (*scales, "max_lead_angle", "squeeze_lead", "damping", "rotation_weight"), above=0.0)
+        require_fields(self, ("workspace_lower", "workspace_upper"), count=3)
+        require_fields(self, ("posture_gain",), at_least=0.0, at_most=1.0)
+        require_number("iterations", self.iterations, at_least=1, hint="six are enough for any action")
         lower, upper = self.workspace_lower, self.workspace_upper
         if not all(a < b for a, b in zip(lower, upper, strict=True)):
             raise ConfigError(
@@ -149,6 +143,15 @@ class ArmController:
         self.opening = wp.zeros(w, dtype=wp.float32, device=device)
         self.target_position = wp.zeros(w, dtype=wp.vec3, device=device)
         self.target_yaw = wp.zeros(w, dtype=wp.float32, device=device)
+        self._command = [
+            self.commanded_q,
+            self._previous_q,
+            self.target_position,
+            self.target_yaw,
+            self.tool_pose,
+            self.opening,
+        ]
+        """What moves when the command does."""
         self._everywhere = wp.ones(w, dtype=wp.bool, device=device)
         self._device = device
         self._reset(model.joint_q, self._everywhere)
@@ -156,22 +159,12 @@ class ArmController:
     def _make_settings(self):
         options, gripper = self.options, self.arm.description.gripper
         settings = kernels.Settings()
+        for name in kernels.Settings.vars.keys() & vars(options).keys():
+            setattr(settings, name, getattr(options, name))
         settings.joint_mode = int(options.mode == "joint_delta")
-        settings.translation_scale = options.translation_scale
-        settings.rotation_scale = options.rotation_scale
-        settings.joint_scale = options.joint_scale
-        settings.opening_rate = options.opening_rate
         settings.stroke = gripper.stroke
         # Both drives saturate at an opening error of twice force_limit / stiffness.
         settings.opening_lead = options.squeeze_lead * 2.0 * gripper.force_limit / gripper.drive_stiffness
-        settings.workspace_lower = wp.vec3(*options.workspace_lower)
-        settings.workspace_upper = wp.vec3(*options.workspace_upper)
-        settings.max_lead = options.max_lead
-        settings.max_lead_angle = options.max_lead_angle
-        settings.damping = options.damping
-        settings.rotation_weight = options.rotation_weight
-        settings.posture_gain = options.posture_gain
-        settings.iterations = options.iterations
         return settings
 
     def reset(self, state: newton.State, world_mask: wp.array | None = None) -> None:
@@ -188,14 +181,7 @@ class ArmController:
             kernels.reset_command,
             dim=self.world_count,
             inputs=[self._chain, joint_q, world_mask],
-            outputs=[
-                self.commanded_q,
-                self._previous_q,
-                self.target_position,
-                self.target_yaw,
-                self.tool_pose,
-                self.opening,
-            ],
+            outputs=self._command,
             device=self._device,
         )
 
@@ -217,14 +203,7 @@ class ArmController:
             kernels.move_command,
             dim=self.world_count,
             inputs=[self._chain, self._settings, action, state.joint_q],
-            outputs=[
-                self.commanded_q,
-                self._previous_q,
-                self.target_position,
-                self.target_yaw,
-                self.tool_pose,
-                self.opening,
-            ],
+            outputs=self._command,
             device=self._device,
         )
 

@@ -13,7 +13,10 @@ import newton
 import numpy as np
 import warp as wp
 
+from softmode.checks import require_choice
 from softmode.errors import AssetError, ConfigError
+
+ToolPose = tuple[float, float, float, float, float, float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +76,7 @@ class RobotDescription:
     """Joint coordinates of the home pose [m or rad]."""
     end_effector: str
     """Name of the link that carries the tool."""
-    tool: tuple[float, float, float, float, float, float, float]
+    tool: ToolPose
     """Pose of the tool point in the frame of that link: position [m], quaternion (xyzw)."""
     hand_links: tuple[str, ...]
     """Names of the end effector's link and of all links behind it."""
@@ -90,10 +93,8 @@ class RobotDescription:
 
     def __post_init__(self) -> None:
         """Check what a caller may replace."""
-        if self.collision not in ("hull", "mesh"):
-            raise ConfigError(f"collision is {self.collision!r}", hint="use 'hull' or 'mesh'")
-        if self.touch not in ("gripper", "all"):
-            raise ConfigError(f"touch is {self.touch!r}", hint="use 'gripper' or 'all'")
+        require_choice("collision", self.collision, ("hull", "mesh"))
+        require_choice("touch", self.touch, ("gripper", "all"))
         for name in ("home", "joint_lower", "joint_upper", "drives"):
             if len(getattr(self, name)) != len(self.joint_names):
                 raise ConfigError(

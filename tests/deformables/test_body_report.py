@@ -20,7 +20,7 @@ from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
 from softmode.deformables.build.report import BodyReport, report_body
 from softmode.envs.tasks.place_in_bin import task as place_in_bin
 from softmode.envs.tasks.push_soft import task as push_soft
-from softmode.envs.tasks.shape_soft import task as shape_soft
+from softmode.envs.tasks.shape_soft import config as shape_soft
 from softmode.errors import BasisError
 from softmode.objects import ObjectConfig, load, presets
 from softmode.objects.source import object_source

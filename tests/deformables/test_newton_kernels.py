@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
-from softmode.envs.rl_scene import RL_BUILD, RL_SOLVER, rl_scene
+from softmode.envs.presets import RL_BUILD, RL_SOLVER, rl_scene
 from softmode.scenes.table_scene import TableScene, TableSceneConfig
 
 CLOSE = np.array([0.0, 0.0, -1.0, 0.0, 1.0], np.float32)

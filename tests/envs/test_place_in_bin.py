@@ -11,8 +11,8 @@ import pytest
 
 import softmode  # noqa: F401  (registers the environments)
 from softmode.deformables.model.status import WORLD_COLLAPSED, WORLD_ITERATION_LIMIT
+from softmode.envs.end_reason import EndReason
 from softmode.envs.scripted import scripted_policy
-from softmode.envs.task import EndReason
 from softmode.envs.tasks.place_in_bin.scripted import ScriptedPlace
 from softmode.envs.tasks.place_in_bin.task import Bin, PlaceInBinConfig, PlaceInBinEnv, bin_scene
 from softmode.errors import ConfigError

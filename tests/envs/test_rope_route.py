@@ -53,7 +53,7 @@ def lay(env: RopeRouteEnv, x: float, y: float, turn: float = 0.5 * np.pi, height
     c, s = np.cos(turn), np.sin(turn)
     rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     env.scene.state.softmode.q.assign(env.scene.soft.body.affine(rotation, (x, y, height)))
-    env.task._observe()
+    env.task.write_observation()
 
 
 def seen(env: RopeRouteEnv, name: str) -> np.ndarray:

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from softmode.envs.scripted import ScriptedLift
+from softmode.envs.tasks.lift_soft.scripted import ScriptedLift
 from softmode.envs.tasks.lift_soft.task import LiftSoftEnv
 from softmode.errors import ConfigError
 

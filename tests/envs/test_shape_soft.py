@@ -12,9 +12,10 @@ import warp as wp
 
 import softmode  # noqa: F401  (registers the environments)
 from softmode.envs.scripted import scripted_policy
+from softmode.envs.tasks.shape_soft.config import ShapeSoftConfig, shape_scene
 from softmode.envs.tasks.shape_soft.scripted import ScriptedShape
 from softmode.envs.tasks.shape_soft.targets import record_press
-from softmode.envs.tasks.shape_soft.task import ShapeSoftConfig, ShapeSoftEnv, ShapeSoftVectorEnv, shape_scene
+from softmode.envs.tasks.shape_soft.task import ShapeSoftEnv, ShapeSoftVectorEnv
 from softmode.errors import ConfigError
 from softmode.objects import ObjectConfig
 from softmode.scenes.table_scene import GAP

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
+from softmode.envs.end_reason import EndReason
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.task import EndReason
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
 from softmode.errors import ConfigError
 

@@ -74,7 +74,7 @@ class SolverReducedProxy(ReducedSolver, CouplingInterface):
         self.coupled = False
         """Whether a coupler has taken the solver in."""
 
-    def step(
+    def step(  # pyright: ignore[reportIncompatibleMethodOverride]  # the observables are those of this solver
         self,
         state_in: newton.State,
         state_out: newton.State,
@@ -109,7 +109,7 @@ class SolverReducedProxy(ReducedSolver, CouplingInterface):
         self.reduced.report(observables)
 
     def reset(
-        self, state: newton.State, world_mask: wp.array | None = None, flags: newton.StateFlags | None = None
+        self, state: newton.State, world_mask: wp.array | None = None, flags: newton.StateFlags | int | None = None
     ) -> None:
         """Reset the soft bodies; see :meth:`softmode.deformables.solver.solver_reduced.SolverReduced.reset`."""
         self.reduced.reset(state, world_mask, flags)

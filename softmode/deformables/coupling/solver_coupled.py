@@ -191,7 +191,7 @@ class SolverCoupledReduced(ReducedSolver):
             setattr(container, kind, getattr(container.rigid, kind))
         return container
 
-    def step(
+    def step(  # pyright: ignore[reportIncompatibleMethodOverride]  # the observables are those of this solver
         self,
         state_in: newton.State,
         state_out: newton.State,
@@ -307,7 +307,7 @@ class SolverCoupledReduced(ReducedSolver):
         self._bind()
 
     def reset(
-        self, state: newton.State, world_mask: wp.array | None = None, flags: newton.StateFlags | None = None
+        self, state: newton.State, world_mask: wp.array | None = None, flags: newton.StateFlags | int | None = None
     ) -> None:
         """Reset soft and rigid bodies of the chosen worlds to the model's initial state.
 

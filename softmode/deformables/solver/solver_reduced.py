@@ -92,7 +92,7 @@ class SolverReduced(ReducedSolver):
         if not self.model.device.is_capturing:
             self._check_materials()
 
-    def step(
+    def step(  # pyright: ignore[reportIncompatibleMethodOverride]  # the observables are those of this solver
         self,
         state_in: newton.State,
         state_out: newton.State,
@@ -179,7 +179,7 @@ class SolverReduced(ReducedSolver):
             wp.copy(present(observables.instance_contact_f), self.instance_force)
 
     def reset(
-        self, state: newton.State, world_mask: wp.array | None = None, flags: newton.StateFlags | None = None
+        self, state: newton.State, world_mask: wp.array | None = None, flags: newton.StateFlags | int | None = None
     ) -> None:
         """Put the bodies of the chosen worlds back to the model's initial state and clear what those worlds report.
 

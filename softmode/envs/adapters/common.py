@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
+from softmode.envs.tensors import Tensor, host_array
 from softmode.errors import ConfigError, MissingExtraError
 
 
@@ -16,7 +17,7 @@ def missing(library: str, extra: str) -> MissingExtraError:
     return MissingExtraError(f"this adapter needs {library}", hint=f"install it with: pip install 'softmode[{extra}]'")
 
 
-def checked_env(env: Any, adapter: str, *, output: str | None = None) -> VectorEnv:
+def checked_env(env: object, adapter: str, *, output: str | None = None) -> VectorEnv:
     """Return an environment that an adapter can take.
 
     Args:
@@ -44,11 +45,11 @@ def checked_env(env: Any, adapter: str, *, output: str | None = None) -> VectorE
     return env
 
 
-def to_numpy(tree: Any) -> Any:
+def to_numpy(tree: object) -> Any:
     """Return a tree of arrays or tensors as NumPy arrays on the host."""
     if isinstance(tree, Mapping):
         return {key: to_numpy(value) for key, value in tree.items()}
-    return tree.detach().cpu().numpy() if hasattr(tree, "detach") else np.asarray(tree)
+    return host_array(tree) if isinstance(tree, Tensor) else np.asarray(tree)
 
 
 def take(tree: Any, world: int) -> Any:

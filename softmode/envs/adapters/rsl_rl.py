@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import warp as wp
 from gymnasium.vector import VectorEnv
 
 from softmode.envs.adapters.common import checked_env, missing
+from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.errors import ConfigError
 
 try:
@@ -42,14 +43,15 @@ class RslRlVecEnv(VecEnv):
 
     def __init__(self, env: VectorEnv, *, seed: int | None = None) -> None:
         """Reset the environment; rsl_rl never does."""
-        self.env: Any = checked_env(env, "RslRlVecEnv", output="torch")
-        inner: Any = env.unwrapped
-        if not getattr(inner, "max_episode_steps", None):
+        self.env = checked_env(env, "RslRlVecEnv", output="torch")
+        inner = cast(SoftVectorEnv, env.unwrapped)
+        limit = getattr(inner, "max_episode_steps", None)
+        if not limit:
             raise ConfigError("RslRlVecEnv needs a time limit", hint="give gymnasium.make_vec max_episode_steps=150")
         self._inner = inner
         self.num_envs = env.num_envs
         self.num_actions = int(env.single_action_space.shape[0])  # type: ignore[index]
-        self.max_episode_length = int(inner.max_episode_steps)
+        self.max_episode_length = int(limit)
         self.cfg = inner.config
         observation, _ = env.reset(seed=seed)
         self._observations = self._groups(observation)

@@ -14,6 +14,7 @@ from softmode.errors import ConfigError
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
+    from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 except ImportError as error:
     raise missing("stable-baselines3", "rl") from error
 
@@ -40,7 +41,7 @@ class StableBaselinesVecEnv(VecEnv):
         self.env = checked_env(env, "StableBaselinesVecEnv")
         self.spec = env.spec
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
-        self._actions: Any = None
+        self._actions = np.empty(0, np.float32)
 
     def reset(self) -> Any:
         """Start new episodes in all worlds, with the seeds and options set before."""
@@ -86,11 +87,11 @@ class StableBaselinesVecEnv(VecEnv):
         frames: Any = self.env.render()
         return [None] * self.num_envs if frames is None else list(frames)
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of the environment, once for each index."""
         return [getattr(self._owner(attr_name), attr_name) for _ in self._get_indices(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(self, attr_name: str, value: object, indices: VecEnvIndices = None) -> None:
         """Set an attribute of the environment.
 
         Raises:
@@ -102,12 +103,14 @@ class StableBaselinesVecEnv(VecEnv):
             )
         setattr(self._owner(attr_name) if self.has_attr(attr_name) else self.env.unwrapped, attr_name, value)
 
-    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
         """Call a method of the environment once and return its result for each index."""
         result = getattr(self._owner(method_name), method_name)(*method_args, **method_kwargs)
         return [result for _ in self._get_indices(indices)]
 
-    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Any = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """Return False: no world has a wrapper of its own. `VecMonitor` records the episodes."""
         return [False for _ in self._get_indices(indices)]
 

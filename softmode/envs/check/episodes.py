@@ -45,7 +45,7 @@ class Event:
     """Shape (num_envs,)."""
     infos: dict[str, Any]
     """Infos."""
-    returned: Any
+    returned: object
     """The objects themselves."""
     is_step: bool
     """Whether it was a step."""
@@ -89,7 +89,7 @@ class Subject:
         space.seed(seed)
         self.actions = [space.sample() for _ in range(2 * steps + 16)]
         self._forms: dict[str, Any] = {}
-        self._sample: Any = None
+        self._sample: object = None
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> Event:
         """Reset and check what comes back."""
@@ -146,7 +146,7 @@ class Subject:
         return self.reset(options={"reset_mask": event.done.copy()})
 
     def run(
-        self, count: int, *, seed: Any = None, actions: list[Any] | None = None, overwrite: bool = False
+        self, count: int, *, seed: int | None = None, actions: list[Any] | None = None, overwrite: bool = False
     ) -> list[Event]:
         """Reset with a seed and step ``count`` times.
 
@@ -189,7 +189,7 @@ class Subject:
                 return self.replace_action(action, world, item)
         return action
 
-    def _check_infos(self, infos: Any) -> None:
+    def _check_infos(self, infos: object) -> None:
         """Check masks and forms."""
         check_infos(self.num_envs, as_numpy(infos), self._forms)
 
@@ -224,7 +224,7 @@ class Subject:
                 )
 
 
-def _overwrite(returned: Any) -> None:
+def _overwrite(returned: object) -> None:
     """Write other numbers into everything that was returned and can be written."""
     for _, array in leaves(returned):
         if isinstance(array, np.ndarray):

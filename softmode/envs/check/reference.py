@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import gymnasium as gym
 import numpy as np
+from numpy.typing import ArrayLike
 
 from softmode.envs.check.episodes import Event, Subject
 from softmode.envs.check.values import equal, leaves
+from softmode.envs.tensors import Tensor, host_array
 from softmode.errors import EnvironmentCheckError
 
 REFUSALS = (ValueError, TypeError, AssertionError, gym.error.Error)
@@ -80,8 +80,6 @@ class Reference:
                 )
 
 
-def bits(array: Any) -> bytes:
+def bits(array: ArrayLike | Tensor) -> bytes:
     """Return an array's content."""
-    if hasattr(array, "detach"):
-        array = array.detach().cpu().numpy()
-    return np.asarray(array).tobytes()
+    return np.asarray(host_array(array) if isinstance(array, Tensor) else array).tobytes()

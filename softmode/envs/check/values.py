@@ -13,10 +13,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, iterate
 from numpy.typing import NDArray
 
+from softmode.envs.tensors import Tensor, host_array
 from softmode.errors import EnvironmentCheckError
 
 
-def as_numpy(value: Any) -> Any:
+def as_numpy(value: object) -> Any:
     """Return a tree of dicts, tuples and arrays as NumPy copies; tensors of any library come to the host.
 
     Libraries are recognised by their arrays' methods, so none is imported.
@@ -24,9 +25,10 @@ def as_numpy(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: as_numpy(item) for key, item in value.items()}
     if isinstance(value, tuple | list):
-        return type(value)(*map(as_numpy, value)) if hasattr(value, "_fields") else type(value)(map(as_numpy, value))
-    if hasattr(value, "detach") and hasattr(value, "cpu"):  # torch
-        return value.detach().cpu().numpy().copy()
+        items = map(as_numpy, value)
+        return type(value)(*items) if hasattr(value, "_fields") else type(value)(items)
+    if isinstance(value, Tensor):
+        return host_array(value).copy()
     if isinstance(value, np.ndarray) and value.dtype == object:
         copy = np.empty_like(value)
         for index in np.ndindex(value.shape):
@@ -37,7 +39,7 @@ def as_numpy(value: Any) -> Any:
     return value
 
 
-def leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+def leaves(value: object, path: str = "") -> Iterator[tuple[str, Any]]:
     """Yield (path, array) of every array in a tree, those inside arrays of objects included."""
     if isinstance(value, Mapping):
         for key, item in value.items():
@@ -52,9 +54,9 @@ def leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         yield path, value
 
 
-def like(action: Any, sample: Any) -> Any:
+def like(action: object, sample: object) -> Any:
     """Return an action as the library of ``sample``, an array that the environment returned, wants it."""
-    if not hasattr(sample, "detach"):
+    if not isinstance(sample, Tensor):
         return action
     torch = sys.modules["torch"]  # it is there: the environment returned one of its tensors
     if isinstance(action, Mapping):
@@ -64,7 +66,7 @@ def like(action: Any, sample: Any) -> Any:
     return torch.as_tensor(np.array(action), device=sample.device)
 
 
-def equal(a: Any, b: Any) -> bool:
+def equal(a: object, b: object) -> bool:
     """Whether two trees of NumPy arrays hold the same bits; NaN equals NaN."""
     if isinstance(a, Mapping) and isinstance(b, Mapping):
         return a.keys() == b.keys() and all(equal(a[key], b[key]) for key in a)
@@ -178,13 +180,13 @@ def check_observation(env: VectorEnv, batch: Any, call: str, lenient: int | None
 _INSIDE = "return what observation_space.contains accepts: its keys, shapes, dtypes and bounds, without NaN"
 
 
-def _describe(tree: Any) -> str:
+def _describe(tree: object) -> str:
     """Return shapes and dtypes of a tree."""
     parts = [f"{path} {array.dtype}{tuple(array.shape)}".strip() for path, array in leaves(tree)]
     return ", ".join(parts) or type(tree).__name__
 
 
-def _check_dtypes(space: gym.Space, batch: Any, call: str, path: str = "") -> None:
+def _check_dtypes(space: gym.Space, batch: object, call: str, path: str = "") -> None:
     """Compare dtypes leaf by leaf; `Space.contains` accepts whatever casts."""
     if isinstance(space, gym.spaces.Dict) and isinstance(batch, Mapping):
         for key in space.spaces.keys() & batch.keys():
@@ -200,7 +202,7 @@ def _check_dtypes(space: gym.Space, batch: Any, call: str, path: str = "") -> No
         )
 
 
-def check_reward(env: VectorEnv, reward: Any) -> None:
+def check_reward(env: VectorEnv, reward: object) -> None:
     """Rule ``rewards``: floats, one per world, finite."""
     if not isinstance(reward, np.ndarray) or reward.shape != (env.num_envs,) or reward.dtype.kind != "f":
         raise EnvironmentCheckError(
@@ -218,7 +220,7 @@ def check_reward(env: VectorEnv, reward: Any) -> None:
         )
 
 
-def check_flag(env: VectorEnv, flag: Any, name: str) -> None:
+def check_flag(env: VectorEnv, flag: object, name: str) -> None:
     """Rule ``flags``: booleans, one per world."""
     if not isinstance(flag, np.ndarray) or flag.shape != (env.num_envs,) or flag.dtype != np.bool_:
         raise EnvironmentCheckError(
@@ -228,10 +230,10 @@ def check_flag(env: VectorEnv, flag: Any, name: str) -> None:
         )
 
 
-def check_kinds(observation: Any, others: Mapping[str, Any]) -> None:
+def check_kinds(observation: object, others: Mapping[str, object]) -> None:
     """Rule ``array kind``: observations, rewards and flags come from one library and lie on one device."""
 
-    def kind(array: Any) -> tuple[str, str]:
+    def kind(array: object) -> tuple[str, str]:
         return type(array).__module__.partition(".")[0], str(getattr(array, "device", "cpu"))
 
     kinds = {f"observation{path}": kind(array) for path, array in leaves(observation)}
@@ -244,7 +246,7 @@ def check_kinds(observation: Any, others: Mapping[str, Any]) -> None:
 
 
 def check_infos(
-    num_envs: int, infos: Any, seen: dict[str, tuple[tuple[int, ...], np.dtype]], path: str = "infos"
+    num_envs: int, infos: object, seen: dict[str, tuple[tuple[int, ...], np.dtype]], path: str = "infos"
 ) -> None:
     """Rule ``info masks``: every key has a boolean mask ``_key``, and keeps shape and dtype from call to call.
 

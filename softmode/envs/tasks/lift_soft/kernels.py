@@ -1,75 +1,85 @@
 """Device side of LiftSoft: goal, reward, success."""
 
+from enum import IntEnum
+
 import warp as wp
 
-from softmode.envs.grasp_kernels import grasped
+from softmode.envs.reward_kernels import StepResult, WorldState, count_held, grasped, tool_position
 
 wp.set_module_options({"enable_backward": False})
+
+Term = IntEnum("Term", "reach grasp lift goal hold", start=0)
+Metric = IntEnum("Metric", "object_height goal_distance", start=0)
+
+
+@wp.struct
+class Drawn:
+    """Columns of the parameters."""
+
+    goal: int  # x, y [m] and how far to rise [m]
+    scale: int
+
+
+@wp.struct
+class Columns:
+    """Columns of the observation."""
+
+    goal: int
+
+
+@wp.struct
+class Rules:
+    """When the goal is met."""
+
+    goal_tolerance: float  # [m]
+    hold_steps: int
 
 
 @wp.kernel
 def observe(
-    parameters: wp.array2d[float],
-    goal_parameter: int,
-    object_position: wp.array2d[wp.vec3],
+    state: WorldState,
+    drawn: Drawn,
+    column: Columns,
     height: float,  # of the unscaled object's centre at rest [m]
-    scale_parameter: int,
-    goal_column: int,
     # Out:
-    observation: wp.array2d[float],
-    metrics: wp.array2d[float],
-    marker_place: wp.array[wp.transform],
+    result: StepResult,
 ):
     """Write the goal, relative to the object and as a position, the rise and the distance."""
     w = wp.tid()
-    rest_height = height * parameters[w, scale_parameter]
+    rest_height = height * state.parameters[w, drawn.scale]
     goal = wp.vec3(
-        parameters[w, goal_parameter],
-        parameters[w, goal_parameter + 1],
-        rest_height + parameters[w, goal_parameter + 2],
+        state.parameters[w, drawn.goal],
+        state.parameters[w, drawn.goal + 1],
+        rest_height + state.parameters[w, drawn.goal + 2],
     )
-    x = object_position[w, 0]
+    x = state.object_position[w, 0]
     for k in range(3):
-        observation[w, goal_column + k] = goal[k]
-    metrics[w, 0] = x[2] - rest_height
-    metrics[w, 1] = wp.length(goal - x)
-    marker_place[w] = wp.transform(goal, wp.quat_identity())
+        result.observation[w, column.goal + k] = goal[k]
+    result.metrics[w, Metric.object_height] = x[2] - rest_height
+    result.metrics[w, Metric.goal_distance] = wp.length(goal - x)
+    result.marker_place[w] = wp.transform(goal, wp.quat_identity())
 
 
 @wp.kernel
 def evaluate(
-    parameters: wp.array2d[float],
-    goal_parameter: int,
-    object_position: wp.array2d[wp.vec3],
-    tool_pose: wp.array[wp.transform],
-    finger_force: wp.array2d[wp.vec3],
-    metrics: wp.array2d[float],  # rise, distance to the goal [m]
-    tolerance: float,  # [m]
-    hold_steps: int,
+    state: WorldState,
+    drawn: Drawn,
+    rules: Rules,
     # In, out:
-    held: wp.array[int],
-    # Out:
-    terms: wp.array2d[float],
-    success: wp.array[wp.bool],
+    result: StepResult,
 ):
     """Reward reaching, grasping, lifting, nearing the goal, and staying there."""
     w = wp.tid()
-    offset = object_position[w, 0] - wp.transform_get_translation(tool_pose[w])
-    held_by_both = grasped(finger_force, w)
-    grasp = float(0.0)
-    if held_by_both:
-        grasp = 1.0
-    rise = metrics[w, 0]
-    distance = metrics[w, 1]
-    there = held_by_both and distance <= tolerance
-    steps = int(0)
-    if there:
-        steps = held[w] + 1
-    held[w] = steps
-    lifted = wp.clamp(rise / wp.max(parameters[w, goal_parameter + 2], 1.0e-3), 0.0, 1.0)
-    terms[w, 0] = 1.0 - wp.tanh(6.0 * wp.length(offset))
-    terms[w, 1] = 0.5 * grasp
-    terms[w, 2] = 1.0 * lifted * grasp
-    terms[w, 3] = 2.0 * lifted * grasp * (1.0 - wp.tanh(10.0 * distance))
-    terms[w, 4] = wp.where(there, 2.0, 0.0)
-    success[w] = steps >= hold_steps
+    offset = state.object_position[w, 0] - tool_position(state, w)
+    held_by_both = grasped(state, w)
+    grasp = wp.where(held_by_both, 1.0, 0.0)
+    rise = result.metrics[w, Metric.object_height]
+    distance = result.metrics[w, Metric.goal_distance]
+    there = held_by_both and distance <= rules.goal_tolerance
+    lifted = wp.clamp(rise / wp.max(state.parameters[w, drawn.goal + 2], 1.0e-3), 0.0, 1.0)
+    result.terms[w, Term.reach] = 1.0 - wp.tanh(6.0 * wp.length(offset))
+    result.terms[w, Term.grasp] = 0.5 * grasp
+    result.terms[w, Term.lift] = 1.0 * lifted * grasp
+    result.terms[w, Term.goal] = 2.0 * lifted * grasp * (1.0 - wp.tanh(10.0 * distance))
+    result.terms[w, Term.hold] = wp.where(there, 2.0, 0.0)
+    count_held(there, rules.hold_steps, result, w)

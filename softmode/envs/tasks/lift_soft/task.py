@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
+from softmode.checks import require_fields, require_numbers
 from softmode.envs.markers import sphere_marker
+from softmode.envs.observation import Segment
 from softmode.envs.parameters import Parameter
-from softmode.envs.rl_scene import rl_scene
+from softmode.envs.presets import rl_scene
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.task import Segment, Task, TaskConfig
+from softmode.envs.structs import filled
+from softmode.envs.task import Task
+from softmode.envs.task_config import TaskConfig
 from softmode.envs.tasks.lift_soft import kernels
 from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
@@ -54,15 +60,12 @@ class LiftSoftConfig(TaskConfig):
             raise ConfigError(
                 f"goal_height {self.goal_height} and goal_range {self.goal_range} must keep the goal in 0..0.4 m"
             )
-        if not min(self.goal_range) >= 0.0:
-            raise ConfigError(f"goal_range must be >= 0, got {self.goal_range}")
-        if not 0.0 < self.goal_tolerance < self.goal_height:
-            raise ConfigError(f"goal_tolerance must lie in 0..goal_height, got {self.goal_tolerance}")
-        if self.hold_steps < 1:
-            raise ConfigError(f"hold_steps must be at least 1, got {self.hold_steps}")
+        require_numbers("goal_range", self.goal_range, 3, at_least=0.0, unit="m")
+        require_fields(self, ("goal_tolerance",), above=0.0, below=self.goal_height, unit="m")
+        require_fields(self, ("hold_steps",), at_least=1)
 
     @classmethod
-    def presets(cls) -> dict[str, LiftSoftConfig]:
+    def presets(cls) -> Mapping[str, Self]:
         """Return "beam": object and goals of Isaac Lab's `Isaac-Lift-Soft-Franka`, as high as this arm reaches."""
         scene = replace(lift_scene(), object=BEAM, material=BEAM_MATERIAL)
         return {"beam": cls(scene=scene, yaw_range=0.5, goal_height=0.2, goal_range=(0.08, 0.15, 0.08))}
@@ -78,8 +81,12 @@ class LiftSoft(Task):
 
     config: LiftSoftConfig
     config_class = LiftSoftConfig
-    term_names = ("reach", "grasp", "lift", "goal", "hold")
-    metric_names = ("object_height", "goal_distance")
+    term_names = tuple(kernels.Term.__members__)
+    metric_names = tuple(kernels.Metric.__members__)
+
+    def build(self) -> None:
+        """Look the columns up."""
+        self._drawn = self.table.columns_in(kernels.Drawn)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the goal: x, y [m] and how far to rise [m]."""
@@ -104,37 +111,13 @@ class LiftSoft(Task):
 
     def observe(self) -> None:
         """Write goal, rise and distance."""
-        scene = self.scene
-        self.launch(
-            kernels.observe,
-            [
-                self.table.values,
-                self.table.column("goal"),
-                scene.object_position,
-                scene.soft.height,
-                self.table.column("scale"),
-                self.column("goal"),
-            ],
-            [self.observation, self.metrics, scene.marker_place],
-        )
+        columns = self.layout.columns_in(kernels.Columns)
+        self.launch(kernels.observe, [self.state, self._drawn, columns, self.scene.soft.height], [self.result])
 
     def evaluate(self) -> None:
         """Judge the grasp and the height."""
-        scene, config = self.scene, self.config
-        self.launch(
-            kernels.evaluate,
-            [
-                self.table.values,
-                self.table.column("goal"),
-                scene.object_position,
-                scene.controller.tool_pose,
-                scene.finger_force,
-                self.metrics,
-                config.goal_tolerance,
-                config.hold_steps,
-            ],
-            [self.held, self.terms, self.success],
-        )
+        rules = filled(kernels.Rules, self.config)
+        self.launch(kernels.evaluate, [self.state, self._drawn, rules], [self.result])
 
     def marker(self) -> Splats:
         """Return a small ball."""

@@ -1,12 +1,56 @@
 """Device side of PlaceInBin: the bin as seen from tool and objects, reward, success, spills."""
 
+from enum import IntEnum
+
 import warp as wp
 
-from softmode.envs.grasp_kernels import grasped, touched
+from softmode.envs.end_reason import EndReason
+from softmode.envs.reward_kernels import StepResult, WorldState, count_held, grasped, tool_position, touched
 
 wp.set_module_options({"enable_backward": False})
 
-SPILLED = wp.constant(4)
+Term = IntEnum("Term", "reach grasp lift carry lower release rest", start=0)
+Metric = IntEnum("Metric", "object_height bin_distance others_inside", start=0)
+
+
+@wp.struct
+class Drawn:
+    """Columns of the parameters."""
+
+    scale: int
+
+
+@wp.struct
+class Columns:
+    """Columns of the observation."""
+
+    goal: int
+    goal_offset: int
+    object_goal: int
+    other_offsets: int  # zero where there are no others
+
+
+@wp.struct
+class BinShape:
+    """The bin, and the toy that is to lie in it."""
+
+    rim: wp.vec3  # centre of the bin's opening [m]
+    half: wp.vec2  # half of its inner edges [m]
+    margin: float  # of the part of the bin over which to lower the object, from its walls [m]
+    wall: float  # thickness of the walls [m]
+    floor: float  # height of the bin's floor [m]
+    highest: float  # height of the centre of what counts as inside [m]
+    height: float  # of the unscaled toy's centre at rest [m]
+    radius: float  # from there to its farthest point [m]
+    clearance: float  # over the rim while carrying [m]
+
+
+@wp.struct
+class Rules:
+    """When the goal is met."""
+
+    rest_speed: float  # [m/s]
+    hold_steps: int
 
 
 @wp.func
@@ -19,102 +63,78 @@ def beyond(x: wp.vec3, centre: wp.vec3, half: wp.vec2):
 
 @wp.kernel
 def observe(
-    rim: wp.vec3,  # centre of the bin's opening [m]
-    half: wp.vec2,  # half of its inner edges [m]
-    highest: float,  # height of the centre of what counts as inside [m]
-    object_position: wp.array2d[wp.vec3],
-    tool_pose: wp.array[wp.transform],
-    goal_column: int,
-    object_column: int,
+    state: WorldState,
+    column: Columns,
+    container: BinShape,
     # Out:
-    observation: wp.array2d[float],
-    metrics: wp.array2d[float],
+    result: StepResult,
 ):
     """Write the ways to the bin and to the other objects, the distance, and how many of these are inside."""
     w = wp.tid()
-    tool = wp.transform_get_translation(tool_pose[w])
-    x = object_position[w, 0]
+    tool = tool_position(state, w)
+    rim = container.rim
+    x = state.object_position[w, 0]
     for k in range(3):
-        observation[w, goal_column + k] = rim[k]
-        observation[w, goal_column + 3 + k] = rim[k] - tool[k]
-        observation[w, object_column + k] = rim[k] - x[k]
+        result.observation[w, column.goal + k] = rim[k]
+        result.observation[w, column.goal_offset + k] = rim[k] - tool[k]
+        result.observation[w, column.object_goal + k] = rim[k] - x[k]
     inside = float(0.0)
-    for o in range(1, object_position.shape[1]):
-        other = object_position[w, o]
-        if beyond(other, rim, half) == 0.0 and other[2] <= highest:
+    for o in range(1, state.stride):
+        other = state.object_position[w, o]
+        if beyond(other, rim, container.half) == 0.0 and other[2] <= container.highest:
             inside += 1.0
         for k in range(3):
-            observation[w, object_column + 3 * o + k] = other[k] - x[k]
-    metrics[w, 0] = x[2]
-    metrics[w, 1] = beyond(x, rim, half)
-    metrics[w, 2] = inside
+            result.observation[w, column.other_offsets + 3 * (o - 1) + k] = other[k] - x[k]
+    result.metrics[w, Metric.object_height] = x[2]
+    result.metrics[w, Metric.bin_distance] = beyond(x, rim, container.half)
+    result.metrics[w, Metric.others_inside] = inside
 
 
 @wp.kernel
 def evaluate(
-    parameters: wp.array2d[float],
-    scale_parameter: int,
-    rim: wp.vec3,  # [m]
-    half: wp.vec2,  # [m]
-    margin: float,  # of the part of the bin over which to lower the object, from its walls [m]
-    wall: float,  # thickness of the walls [m]
-    floor: float,  # height of the bin's floor [m]
-    highest: float,  # height of the centre of what counts as inside [m]
-    height: float,  # of the unscaled object's centre at rest [m]
-    radius: float,  # from there to the farthest point [m]
-    clearance: float,  # over the rim while carrying [m]
-    rest_speed: float,  # [m/s]
-    hold_steps: int,
-    object_position: wp.array2d[wp.vec3],
-    object_velocity: wp.array2d[wp.vec3],
-    tool_pose: wp.array[wp.transform],
-    finger_force: wp.array2d[wp.vec3],
-    metrics: wp.array2d[float],  # height, distance from the bin [m], other objects inside
+    state: WorldState,
+    drawn: Drawn,
+    container: BinShape,
+    rules: Rules,
     # In, out:
-    held: wp.array[int],
-    # Out:
-    terms: wp.array2d[float],
-    success: wp.array[wp.bool],
-    failure: wp.array[int],
+    result: StepResult,
 ):
     """Reward grasping, lifting, carrying, lowering, letting go and leaving the object at rest."""
     w = wp.tid()
-    x = object_position[w, 0]
-    size = parameters[w, scale_parameter]
-    distance = wp.length(x - wp.transform_get_translation(tool_pose[w]))
-    inside = metrics[w, 1] == 0.0 and x[2] <= highest
+    rim = container.rim
+    x = state.object_position[w, 0]
+    size = state.parameters[w, drawn.scale]
+    distance = wp.length(x - tool_position(state, w))
+    inside = result.metrics[w, Metric.bin_distance] == 0.0 and x[2] <= container.highest
     # fingers may feel another object: only near the first one they hold that one
-    grip = grasped(finger_force, w) and distance < size * radius + 0.02
-    low = height * size
-    carried = rim[2] + low + clearance
-    aside = beyond(x, rim, half - wp.vec2(margin, margin))
+    grip = grasped(state, w) and distance < size * container.radius + 0.02
+    low = container.height * size
+    carried = rim[2] + low + container.clearance
+    aside = beyond(x, rim, container.half - wp.vec2(container.margin, container.margin))
     held_or_in = wp.where(grip or inside, 1.0, 0.0)
     lift = wp.clamp((x[2] - low) / (carried - low), 0.0, 1.0)
     lowered = float(0.0)
     if aside == 0.0:
         lift = 1.0
-        lowered = wp.clamp((carried - x[2]) / (carried - low - floor), 0.0, 1.0)
+        lowered = wp.clamp((carried - x[2]) / (carried - low - container.floor), 0.0, 1.0)
     near = 1.0 - wp.tanh(6.0 * aside)
     reach = 1.0 - wp.tanh(5.0 * distance)
     if inside:
         reach = 1.0
         lift = 1.0
         near = 1.0
-    free = inside and not touched(finger_force, w)
-    complete = int(metrics[w, 2]) == object_position.shape[1] - 1
-    resting = free and complete and wp.length(object_velocity[w, 0]) <= rest_speed
-    steps = int(0)
-    if resting:
-        steps = held[w] + 1
-    held[w] = steps
-    terms[w, 0] = reach
-    terms[w, 1] = 0.5 * held_or_in
-    terms[w, 2] = lift * held_or_in
-    terms[w, 3] = lift * near * held_or_in
-    terms[w, 4] = lowered * held_or_in
-    terms[w, 5] = wp.where(free, 1.0, 0.0)
-    terms[w, 6] = wp.where(resting, 2.0, 0.0)
-    success[w] = steps >= hold_steps
-    for o in range(1, object_position.shape[1]):
-        if not (beyond(object_position[w, o], rim, half + wp.vec2(wall, wall)) == 0.0):
-            failure[w] = SPILLED
+    free = inside and not touched(state, w)
+    complete = int(result.metrics[w, Metric.others_inside]) == state.stride - 1
+    resting = free and complete and wp.length(state.object_velocity[w, 0]) <= rules.rest_speed
+    result.terms[w, Term.reach] = reach
+    result.terms[w, Term.grasp] = 0.5 * held_or_in
+    result.terms[w, Term.lift] = lift * held_or_in
+    result.terms[w, Term.carry] = lift * near * held_or_in
+    result.terms[w, Term.lower] = lowered * held_or_in
+    result.terms[w, Term.release] = wp.where(free, 1.0, 0.0)
+    result.terms[w, Term.rest] = wp.where(resting, 2.0, 0.0)
+    count_held(resting, rules.hold_steps, result, w)
+    walls = container.half + wp.vec2(container.wall, container.wall)
+    for o in range(1, state.stride):
+        if not (beyond(state.object_position[w, o], rim, walls) == 0.0):
+            result.failure[w] = EndReason.SPILLED

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from softmode.envs.scripted_base import ScriptedPolicy, Vector, bounded
 from softmode.envs.scripted_grasp import ScriptedGrasp
+from softmode.envs.tasks.place_in_bin.kernels import Metric
 from softmode.envs.tasks.place_in_bin.task import PlaceInBin
-from softmode.errors import ConfigError
-
-Vector = NDArray[np.float64]
 
 
-class ScriptedPlace:
+class ScriptedPlace(ScriptedPolicy):
     """Grasp the toy, carry it over the rim to where the bin has most room, lower it, let go, rise.
 
     It is let go as soon as fingers or toy are about to meet what lies in the bin. A toy that slips on the way is
@@ -42,17 +40,13 @@ class ScriptedPlace:
     WALL = 0.045
     """Least distance of the chosen place from the walls [m]: room for the fingers."""
 
-    def __init__(self, env: Any, *, squeeze: float = 5.0, speed: float = 0.010) -> None:
+    task_class = PlaceInBin
+    task: PlaceInBin
+
+    def __init__(self, env: gym.Env, *, squeeze: float = 5.0, speed: float = 0.010) -> None:
         """Remember the environment and plan nothing yet."""
-        base = env.unwrapped
-        if not isinstance(getattr(base, "task", None), PlaceInBin) or base.config.scene.control.mode != "pose_delta":
-            raise ConfigError(
-                "this scripted policy plays PlaceInBin in pose_delta mode only",
-                hint="make the environment with control_mode='pose_delta'",
-            )
-        self.env, self._speed = base, speed
-        self._task: PlaceInBin = base.task
-        self._grasp = ScriptedGrasp(base, self._carry, squeeze=squeeze)
+        super().__init__(env)
+        self._grasp, self._speed = ScriptedGrasp(env, self._carry, squeeze=squeeze), speed
         self.reset()
 
     def reset(self) -> None:
@@ -63,7 +57,7 @@ class ScriptedPlace:
         self._opening: float | None = None
         self._grip = 0.0
 
-    def __call__(self, observation: Any = None) -> NDArray[np.float32]:
+    def __call__(self, observation: object = None) -> NDArray[np.float32]:
         """Return the action for the present state."""
         if self._opening is None:
             action = self._grasp()
@@ -76,55 +70,45 @@ class ScriptedPlace:
 
     def _let_go(self) -> NDArray[np.float32]:
         """Open far enough, then rise; start again if the toy ended up beside the bin."""
-        task, scene = self._task, self._task.scene
-        measured = float(scene.controller.opening.numpy()[0])
+        measured = float(self.scene.controller.opening.numpy()[0])
         if self._opening is None:
-            self._opening = min(measured + self.SPREAD, self.env.config.scene.arm.gripper.stroke)
-        tool = scene.controller.target_position.numpy()[0].astype(float)
-        missing = task.rim[2] + self.RISE - tool[2]
+            self._opening = min(measured + self.SPREAD, self.arm.gripper.stroke)
+        missing = self.task.rim[2] + self.RISE - self.tool[2]
         opened = measured > self._opening - 0.002
         if not opened:
             self._grip = min(self._grip + 0.1, 1.0)
-        elif missing < 0.01 and task.metrics.numpy()[0, 1] > 0.0:
+        elif missing < 0.01 and self.task.metrics.numpy()[0, Metric.bin_distance] > 0.0:
             self.reset()
-        return self._action(np.array([0.0, 0.0, np.clip(missing, 0.0, self._speed) * opened]), self._grip)
-
-    def _action(self, move: Vector, grip: float) -> NDArray[np.float32]:
-        """Return the action for a move of the tool [m]."""
-        scale = self.env.config.scene.control.translation_scale
-        return np.array([*np.clip(move / scale, -1.0, 1.0), 0.0, grip], np.float32)
+        return self.action(np.array([0.0, 0.0, np.clip(missing, 0.0, self._speed) * opened]), 0.0, self._grip)
 
     def _carry(self, centre: Vector) -> Vector:
         """Return the next move of the held toy: up, across once it clears the rim, down over its place."""
-        task, scene = self._task, self._task.scene
         points = self._surfaces()
-        tool, pad = scene.controller.target_position.numpy()[0], self.env.config.scene.arm.gripper.pad_size
-        lowest = min(float(points[0][:, 2].min()), float(tool[2]) - 0.5 * pad[2])
+        lowest = min(float(points[0][:, 2].min()), float(self.tool[2]) - 0.5 * self.arm.gripper.pad_size[2])
         if self._place is None:
             self._place = self._roomiest()
         aside = self._place - centre[:2]
         self._above = self._above or bool(np.linalg.norm(aside) < self.NEAR)
-        up = task.rim[2] + self.CLEARANCE - lowest
+        up = self.task.rim[2] + self.CLEARANCE - lowest
         if self._above:
-            top = max((float(x[:, 2].max()) for x in points[1:]), default=self.env.config.bin.floor)
+            top = max((float(x[:, 2].max()) for x in points[1:]), default=self.task.config.bin.floor)
             up = top + self.GAP - lowest
             self._arrived = up > -0.002
         way = np.array([*aside, up])
         if not self._above and up > 0.004:
             way[:2] = 0.0
-        return way * min(1.0, self._speed / max(float(np.linalg.norm(way)), 1.0e-9))
+        return bounded(way, self._speed)
 
     def _surfaces(self) -> list[Vector]:
         """Return the surface samples of every object [m]."""
-        scene = self._task.scene
-        points = scene.state.particle_q.numpy().astype(float)
-        counts = [thing.body.surface_count for thing in scene.objects]
+        points = self.scene.state.particle_q.numpy().astype(float)
+        counts = [thing.body.surface_count for thing in self.scene.objects]
         return np.split(points[: sum(counts)], np.cumsum(counts)[:-1])
 
     def _roomiest(self) -> Vector:
         """Return the place in the bin that is farthest from the other objects."""
-        task = self._task
-        others = task.scene.object_position.numpy()[0, 1:, :2].astype(float)
+        task = self.task
+        others = self.scene.object_position.numpy()[0, 1:, :2].astype(float)
         span = [np.linspace(-1.0, 1.0, 9) * max(half - self.WALL, 0.0) for half in task.half]
         grid = np.stack(np.meshgrid(*span), axis=-1).reshape(-1, 2) + np.array(task.rim[:2])
         if not len(others):

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import Self
 
 import numpy as np
-import warp as wp
 
+from softmode.checks import require_fields, require_number, require_numbers
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
+from softmode.envs.cameras import square_camera
+from softmode.envs.observation import Segment
 from softmode.envs.parameters import Parameter
-from softmode.envs.rl_scene import RL_SOLVER
+from softmode.envs.presets import RL_SOLVER
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.task import Segment, Task, TaskConfig
+from softmode.envs.structs import filled
+from softmode.envs.task import Task
+from softmode.envs.task_config import TaskConfig
 from softmode.envs.tasks.place_in_bin import kernels
 from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
@@ -23,6 +29,8 @@ from softmode.robots.control import ArmControlOptions
 from softmode.scenes.table_scene import Fixture, TableSceneConfig
 from softmode.splats.pinhole import PinholeCamera
 
+CLEARANCE = 0.015
+"""Between the rim and the bottom of what is carried over it [m]."""
 _BUILD = BuildOptions(mode_count=1, cubature_count=48)
 TOY = ObjectConfig(
     shape="box",
@@ -70,12 +78,10 @@ class Bin:
 
     def __post_init__(self) -> None:
         """Check the sizes."""
-        if not all(0.02 <= edge <= 0.5 for edge in self.inner):
-            raise ConfigError(f"bin: inner must lie in 0.02..0.5 m, got {self.inner}")
-        if not 0.0 < self.floor < self.height <= 0.3:
-            raise ConfigError(f"bin: 0 < floor < height <= 0.3 m, got {self.floor} and {self.height}")
-        if not 0.002 <= self.wall <= 0.05:
-            raise ConfigError(f"bin: wall must lie in 0.002..0.05 m, got {self.wall}")
+        require_numbers("bin: inner", self.inner, 2, at_least=0.02, at_most=0.5, unit="m")
+        require_number("bin: height", self.height, above=0.0, at_most=0.3, unit="m")
+        require_number("bin: floor", self.floor, above=0.0, below=self.height, unit="m")
+        require_number("bin: wall", self.wall, at_least=0.002, at_most=0.05, unit="m")
 
     def fixtures(self) -> tuple[Fixture, ...]:
         """Return floor and walls."""
@@ -132,17 +138,13 @@ class PlaceInBinConfig(TaskConfig):
     def __post_init__(self) -> None:
         """Check the ranges."""
         super().__post_init__()
-        if not min(self.other_range) >= 0.0:
-            raise ConfigError(f"other_range must be >= 0, got {self.other_range}")
-        if not 0.0 <= self.rim_allowance <= 0.1:
-            raise ConfigError(f"rim_allowance must lie in 0..0.1 m, got {self.rim_allowance}")
-        if not self.rest_speed > 0.0:
-            raise ConfigError(f"rest_speed must be above 0, got {self.rest_speed}")
-        if self.hold_steps < 1:
-            raise ConfigError(f"hold_steps must be at least 1, got {self.hold_steps}")
+        require_numbers("other_range", self.other_range, 2, at_least=0.0, unit="m")
+        require_fields(self, ("rim_allowance",), at_least=0.0, at_most=0.1, unit="m")
+        require_fields(self, ("rest_speed",), above=0.0, unit="m/s")
+        require_fields(self, ("hold_steps",), at_least=1)
 
     @classmethod
-    def presets(cls) -> dict[str, PlaceInBinConfig]:
+    def presets(cls) -> Mapping[str, Self]:
         """Return "plush": three plush toys, which cost more time."""
         build = BuildOptions(mode_count=3, cubature_count=128)
         toy, other = (ObjectConfig(size=size, surface_count=160, build=build) for size in (0.07, 0.055))
@@ -161,11 +163,8 @@ class PlaceInBin(Task):
 
     config: PlaceInBinConfig
     config_class = PlaceInBinConfig
-    term_names = ("reach", "grasp", "lift", "carry", "lower", "release", "rest")
-    metric_names = ("object_height", "bin_distance", "others_inside")
-
-    CLEARANCE = 0.015
-    """Between the rim and the bottom of what is carried over it [m]."""
+    term_names = tuple(kernels.Term.__members__)
+    metric_names = tuple(kernels.Metric.__members__)
 
     def scene_config(self) -> TableSceneConfig:
         """Add the bin."""
@@ -182,8 +181,15 @@ class PlaceInBin(Task):
         self.highest = given.height + self.config.rim_allowance
         """Height of its centre below which an object is in the bin [m]."""
         points = [thing.body.surface_points for thing in self.scene.objects]
-        self.radius = float(np.linalg.norm(points[0], axis=1).max())
-        """From the centre of the unscaled toy to its farthest point [m]."""
+        self._container = filled(
+            kernels.BinShape,
+            self,
+            given,
+            margin=0.3 * min(self.half),
+            height=self.scene.soft.height,
+            radius=float(np.linalg.norm(points[0], axis=1).max()),
+            clearance=CLEARANCE,
+        )
         scale = (self.config.scale_range or (1.0, 1.0))[1]
         self._check_room([scale * float(np.linalg.norm(x[:, :2], axis=1).max()) for x in points])
 
@@ -251,65 +257,17 @@ class PlaceInBin(Task):
 
     def observe(self) -> None:
         """Write ways and distances."""
-        scene = self.scene
-        self.launch(
-            kernels.observe,
-            [
-                wp.vec3(*self.rim),
-                wp.vec2(*self.half),
-                self.highest,
-                scene.object_position,
-                scene.controller.tool_pose,
-                self.column("goal"),
-                self.column("object_goal"),
-            ],
-            [self.observation, self.metrics],
-        )
+        columns = self.layout.columns_in(kernels.Columns, other_offsets=0)
+        self.launch(kernels.observe, [self.state, columns, self._container], [self.result])
 
     def evaluate(self) -> None:
         """Judge where everything is."""
-        scene, config = self.scene, self.config
-        self.launch(
-            kernels.evaluate,
-            [
-                self.table.values,
-                self.table.column("scale"),
-                wp.vec3(*self.rim),
-                wp.vec2(*self.half),
-                0.3 * min(self.half),
-                config.bin.wall,
-                config.bin.floor,
-                self.highest,
-                scene.soft.height,
-                self.radius,
-                self.CLEARANCE,
-                config.rest_speed,
-                config.hold_steps,
-                scene.object_position,
-                scene.object_velocity,
-                scene.controller.tool_pose,
-                scene.finger_force,
-                self.metrics,
-            ],
-            [self.held, self.terms, self.success, self.failure],
-        )
+        drawn, rules = self.table.columns_in(kernels.Drawn), filled(kernels.Rules, self.config)
+        self.launch(kernels.evaluate, [self.state, drawn, self._container, rules], [self.result])
 
-    def observation_camera(self) -> PinholeCamera:
-        """Return a camera that sees toy and bin from above, or the one on the hand."""
-        if self.config.camera != "front":
-            return super().observation_camera()
-        return bin_camera("pixels", self.config.image_size)
-
-    def render_cameras(self) -> list[PinholeCamera]:
-        """Return that camera, and the overview."""
-        return [bin_camera("front", self.config.render_size), *super().render_cameras()[1:]]
-
-
-def bin_camera(name: str, edge: int) -> PinholeCamera:
-    """Return the camera in front of the table that looks over the rim into the bin."""
-    return PinholeCamera.look_at(
-        name, position=(0.98, 0.02, 0.52), target=(0.42, 0.022, 0.04), width=edge, height=edge, fov_y=0.70
-    )
+    def front_camera(self, name: str, edge: int) -> PinholeCamera:
+        """Return the camera that looks over the rim into the bin, with pictures of `edge` x `edge` pixels."""
+        return square_camera(name, edge, (0.98, 0.02, 0.52), (0.42, 0.022, 0.04), 0.70)
 
 
 class PlaceInBinEnv(SoftEnv):

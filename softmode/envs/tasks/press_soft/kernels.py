@@ -1,85 +1,105 @@
 """Device side of PressSoft: contact force, reward, success."""
 
+from enum import IntEnum
+
 import warp as wp
+
+from softmode.envs.reward_kernels import StepResult, WorldState, count_held, tool_position
 
 wp.set_module_options({"enable_backward": False})
 
+Term = IntEnum("Term", "reach force hold overshoot", start=0)
+Metric = IntEnum("Metric", "contact_force force_error indentation centre_distance", start=0)
 
-@wp.func
-def goal_band(goal: float, share: float, least: float):
-    """Return how far the force may be from the goal [N]."""
-    return wp.max(share * goal, least)
+
+@wp.struct
+class Drawn:
+    """Columns of the parameters."""
+
+    goal_force: int  # [N]
+    scale: int
+
+
+@wp.struct
+class Columns:
+    """Columns of the observation."""
+
+    goal_force: int
+    contact_force: int
+    missing_force: int
+
+
+@wp.struct
+class Pad:
+    """What is pressed, and with what."""
+
+    top: float  # height of the unscaled pad [m]
+    tip_length: float  # from the tool point down to the finger tips [m]
+    gauge: float  # height of the marker per newton that is missing [m/N]
+
+
+@wp.struct
+class Rules:
+    """When the goal is met."""
+
+    force_tolerance: float  # as a share of the goal
+    least_tolerance: float  # [N]
+    centre_tolerance: float  # [m]
+    hold_steps: int
 
 
 @wp.kernel
 def observe(
-    parameters: wp.array2d[float],
-    goal_parameter: int,
-    scale_parameter: int,
-    object_position: wp.array2d[wp.vec3],
-    tool_pose: wp.array[wp.transform],
-    finger_force: wp.array2d[wp.vec3],
-    top: float,  # height of the unscaled pad [m]
-    tip_length: float,  # from the tool point down to the finger tips [m]
-    gauge: float,  # height of the marker per newton that is missing [m/N]
-    goal_column: int,
+    state: WorldState,
+    drawn: Drawn,
+    column: Columns,
+    pad: Pad,
     # Out:
-    observation: wp.array2d[float],
-    metrics: wp.array2d[float],
-    marker_place: wp.array[wp.transform],
+    result: StepResult,
 ):
     """Write goal force, contact force and their difference; the metrics; and the marker over the pad."""
     w = wp.tid()
-    goal = parameters[w, goal_parameter]
-    surface = top * parameters[w, scale_parameter]
-    p = wp.transform_get_translation(tool_pose[w])
-    x = object_position[w, 0]
+    goal = state.parameters[w, drawn.goal_force]
+    surface = pad.top * state.parameters[w, drawn.scale]
+    p = tool_position(state, w)
+    x = state.object_position[w, 0]
     # vertical: what the fingers squeeze each other with adds nothing
-    force = finger_force[w, 0][2] + finger_force[w, 1][2]
-    observation[w, goal_column] = goal
-    observation[w, goal_column + 1] = force
-    observation[w, goal_column + 2] = goal - force
-    metrics[w, 0] = force
-    metrics[w, 1] = force - goal
-    metrics[w, 2] = surface - (p[2] - tip_length)
-    metrics[w, 3] = wp.sqrt((x[0] - p[0]) * (x[0] - p[0]) + (x[1] - p[1]) * (x[1] - p[1]))
+    force = state.finger_force[w, 0][2] + state.finger_force[w, 1][2]
+    result.observation[w, column.goal_force] = goal
+    result.observation[w, column.contact_force] = force
+    result.observation[w, column.missing_force] = goal - force
+    aside = wp.sqrt((x[0] - p[0]) * (x[0] - p[0]) + (x[1] - p[1]) * (x[1] - p[1]))
+    result.metrics[w, Metric.contact_force] = force
+    result.metrics[w, Metric.force_error] = force - goal
+    result.metrics[w, Metric.indentation] = surface - (p[2] - pad.tip_length)
+    result.metrics[w, Metric.centre_distance] = aside
     missing = wp.clamp(goal - force, 0.0, goal)
-    marker_place[w] = wp.transform(wp.vec3(x[0] + 0.05, x[1] + 0.05, surface + gauge * missing), wp.quat_identity())
+    place = wp.vec3(x[0] + 0.05, x[1] + 0.05, surface + pad.gauge * missing)
+    result.marker_place[w] = wp.transform(place, wp.quat_identity())
 
 
 @wp.kernel
 def evaluate(
-    parameters: wp.array2d[float],
-    goal_parameter: int,
-    metrics: wp.array2d[float],  # force, error [N], indentation, distance from the pad's axis [m]
-    share: float,
-    least: float,  # [N]
-    radius: float,  # [m]
-    hold_steps: int,
+    state: WorldState,
+    drawn: Drawn,
+    rules: Rules,
     # In, out:
-    held: wp.array[int],
-    # Out:
-    terms: wp.array2d[float],
-    success: wp.array[wp.bool],
+    result: StepResult,
 ):
     """Reward reaching the middle of the pad, the right force, and keeping it; punish far too much."""
     w = wp.tid()
-    goal = parameters[w, goal_parameter]
-    force = metrics[w, 0]
-    error = wp.abs(metrics[w, 1])
-    gap = wp.max(-metrics[w, 2], 0.0)
-    aside = wp.max(metrics[w, 3] - 0.5 * radius, 0.0)
-    central = metrics[w, 3] <= radius
-    there = central and error <= goal_band(goal, share, least)
-    steps = int(0)
-    if there:
-        steps = held[w] + 1
-    held[w] = steps
+    goal = state.parameters[w, drawn.goal_force]
+    force = result.metrics[w, Metric.contact_force]
+    error = wp.abs(result.metrics[w, Metric.force_error])
+    distance = result.metrics[w, Metric.centre_distance]
+    gap = wp.max(-result.metrics[w, Metric.indentation], 0.0)
+    aside = wp.max(distance - 0.5 * rules.centre_tolerance, 0.0)
+    there = distance <= rules.centre_tolerance and error <= wp.max(rules.force_tolerance * goal, rules.least_tolerance)
     reach = 1.0 - wp.tanh(25.0 * wp.sqrt(gap * gap + aside * aside))
     # from no force on there is a slope towards the goal, steepest at the goal
     match = wp.max(1.0 - wp.tanh(1.5 * error / goal) / wp.tanh(1.5), 0.0)
-    terms[w, 0] = reach
-    terms[w, 1] = 1.5 * reach * match
-    terms[w, 2] = wp.where(there, 2.0, 0.0)
-    terms[w, 3] = -wp.clamp((force - 1.3 * goal) / goal, 0.0, 1.0)
-    success[w] = steps >= hold_steps
+    result.terms[w, Term.reach] = reach
+    result.terms[w, Term.force] = 1.5 * reach * match
+    result.terms[w, Term.hold] = wp.where(there, 2.0, 0.0)
+    result.terms[w, Term.overshoot] = -wp.clamp((force - 1.3 * goal) / goal, 0.0, 1.0)
+    count_held(there, rules.hold_steps, result, w)

@@ -6,14 +6,19 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from softmode.checks import require_fields, require_range
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
+from softmode.envs.cameras import square_camera
 from softmode.envs.markers import sphere_marker
+from softmode.envs.observation import Segment
 from softmode.envs.parameters import Parameter
-from softmode.envs.rl_scene import RL_SOLVER
+from softmode.envs.presets import RL_SOLVER
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.task import Segment, Task, TaskConfig
+from softmode.envs.structs import filled
+from softmode.envs.task import Task
+from softmode.envs.task_config import TaskConfig
 from softmode.envs.tasks.press_soft import kernels
 from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
@@ -95,18 +100,11 @@ class PressSoftConfig(TaskConfig):
     def __post_init__(self) -> None:
         """Check the ranges."""
         super().__post_init__()
-        low, high = self.force_range
-        if not 0.0 < low <= high <= MOST_FORCE:
-            raise ConfigError(f"force_range must satisfy 0 < low <= high <= {MOST_FORCE} N, got {self.force_range}")
-        if not (0.0 < self.force_tolerance < 1.0 and 0.0 <= self.least_tolerance < low):
-            raise ConfigError(
-                f"force_tolerance {self.force_tolerance} must lie in 0..1 and least_tolerance {self.least_tolerance} N "
-                f"below the least goal, {low} N"
-            )
-        if not self.centre_tolerance > 0.0:
-            raise ConfigError(f"centre_tolerance must be positive, got {self.centre_tolerance}")
-        if self.hold_steps < 1:
-            raise ConfigError(f"hold_steps must be at least 1, got {self.hold_steps}")
+        require_range("force_range", self.force_range, above=0.0, at_most=MOST_FORCE, unit="N")
+        require_fields(self, ("force_tolerance",), above=0.0, below=1.0)
+        require_fields(self, ("least_tolerance",), at_least=0.0, below=self.force_range[0], unit="N")
+        require_fields(self, ("centre_tolerance",), above=0.0, unit="m")
+        require_fields(self, ("hold_steps",), at_least=1)
 
 
 class PressSoft(Task):
@@ -122,8 +120,12 @@ class PressSoft(Task):
 
     config: PressSoftConfig
     config_class = PressSoftConfig
-    term_names = ("reach", "force", "hold", "overshoot")
-    metric_names = ("contact_force", "force_error", "indentation", "centre_distance")
+    term_names = tuple(kernels.Term.__members__)
+    metric_names = tuple(kernels.Metric.__members__)
+
+    def build(self) -> None:
+        """Look the columns up."""
+        self._drawn = self.table.columns_in(kernels.Drawn)
 
     @property
     def top(self) -> float:
@@ -168,61 +170,21 @@ class PressSoft(Task):
 
     def observe(self) -> None:
         """Write the forces, the indentation and the distance from the middle."""
-        scene, table = self.scene, self.table
-        self.launch(
-            kernels.observe,
-            [
-                table.values,
-                table.column("goal_force"),
-                table.column("scale"),
-                scene.object_position,
-                scene.controller.tool_pose,
-                scene.finger_force,
-                self.top,
-                self.tip_length,
-                GAUGE,
-                self.column("goal_force"),
-            ],
-            [self.observation, self.metrics, scene.marker_place],
-        )
+        columns, pad = self.layout.columns_in(kernels.Columns), filled(kernels.Pad, self, gauge=GAUGE)
+        self.launch(kernels.observe, [self.state, self._drawn, columns, pad], [self.result])
 
     def evaluate(self) -> None:
         """Judge place and force."""
-        config = self.config
-        self.launch(
-            kernels.evaluate,
-            [
-                self.table.values,
-                self.table.column("goal_force"),
-                self.metrics,
-                config.force_tolerance,
-                config.least_tolerance,
-                config.centre_tolerance,
-                config.hold_steps,
-            ],
-            [self.held, self.terms, self.success],
-        )
+        rules = filled(kernels.Rules, self.config)
+        self.launch(kernels.evaluate, [self.state, self._drawn, rules], [self.result])
 
     def marker(self) -> Splats:
         """Return a small ball; it hangs beside the pad, over its top by `GAUGE` per newton that is missing."""
         return sphere_marker(0.006)
 
-    def observation_camera(self) -> PinholeCamera:
-        """Return a camera close to the pad, or the one on the hand."""
-        if self.config.camera != "front":
-            return super().observation_camera()
-        return pad_camera("pixels", self.config.image_size)
-
-    def render_cameras(self) -> list[PinholeCamera]:
-        """Return that camera and the overview."""
-        return [pad_camera("front", self.config.render_size), *super().render_cameras()[1:]]
-
-
-def pad_camera(name: str, edge: int) -> PinholeCamera:
-    """Return a camera that sees pad, finger tips and marker."""
-    return PinholeCamera.look_at(
-        name, position=(0.80, -0.24, 0.21), target=(0.465, 0.015, 0.065), width=edge, height=edge, fov_y=0.42
-    )
+    def front_camera(self, name: str, edge: int) -> PinholeCamera:
+        """Return a camera close to pad, finger tips and marker, with pictures of `edge` x `edge` pixels."""
+        return square_camera(name, edge, (0.80, -0.24, 0.21), (0.465, 0.015, 0.065), 0.42)
 
 
 class PressSoftEnv(SoftEnv):

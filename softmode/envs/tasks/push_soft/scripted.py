@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from softmode.envs.scripted_base import ScriptedPolicy, Vector, half_turn
 from softmode.envs.tasks.push_soft.task import PushSoft
-from softmode.errors import ConfigError
-
-Vector = NDArray[np.float64]
 
 
-class ScriptedPush:
+class ScriptedPush(ScriptedPolicy):
     """Push the object to its goal: go behind it, over it where it stands in the way, push, stop.
 
     The two fingers stand side by side across the way, a stable fork: an object that slips off the line is caught by
@@ -36,15 +33,12 @@ class ScriptedPush:
     LATERAL = 0.010
     """How far the tool may be off the line through object and goal before it goes behind the object again [m]."""
 
-    def __init__(self, env: Any, *, speed: float = 0.006) -> None:
-        """Remember the environment."""
-        base = env.unwrapped
-        if not isinstance(getattr(base, "task", None), PushSoft) or base.config.scene.control.mode != "pose_delta":
-            raise ConfigError(
-                "this scripted policy plays PushSoft in pose_delta mode only",
-                hint="make the environment with control_mode='pose_delta'",
-            )
-        self.env = base
+    task_class = PushSoft
+    task: PushSoft
+
+    def __init__(self, env: gym.Env, *, speed: float = 0.006) -> None:
+        """Remember the environment and plan nothing yet."""
+        super().__init__(env)
         self._speed = speed
         self.reset()
 
@@ -53,18 +47,13 @@ class ScriptedPush:
         self._phase = "behind"
         self._yaw: float | None = None
 
-    def __call__(self, observation: Any = None) -> NDArray[np.float32]:
+    def __call__(self, observation: object = None) -> NDArray[np.float32]:
         """Return the action for the present state."""
-        task, scene = self.env.task, self.env.scene
-        seen = task.observation.numpy()[0].astype(float)
-        way = seen[task.segments["object_goal"][0]]
-        centre = seen[task.segments["object_position"][0]]
-        tool = scene.controller.target_position.numpy()[0].astype(float)
-        yaw = float(scene.controller.target_yaw.numpy()[0])
+        way, centre, tool, yaw = self.segment("object_goal"), self.centre, self.tool, self.yaw
         distance = float(np.linalg.norm(way))
         towards = way / max(distance, 1.0e-6)
-        size = float(task.table.values.numpy()[0, task.table.column("scale")])
-        back, low = task.push_distance * size, task.push_height
+        size = float(self.drawn("scale")[0])
+        back, low = self.task.push_distance * size, self.task.push_height
         offset = tool[:2] - centre[:2]
         along, across = float(offset @ towards), float(towards[0] * offset[1] - towards[1] * offset[0])
         step = self._speed
@@ -73,7 +62,7 @@ class ScriptedPush:
         if self._phase == "push" and (distance < self.DONE or abs(across) > 3.0 * self.LATERAL):
             self._phase = "rest" if distance < self.AGAIN else "behind"
         if self._phase == "rest":
-            return self._action(np.zeros(3), 0.0)
+            return self._evenly(np.zeros(3), 0.0)
         if self._phase == "behind":
             if self._yaw is None or abs(along + back) > 2.0 * self.CLEARANCE:
                 self._yaw = _across(towards, yaw)
@@ -81,7 +70,7 @@ class ScriptedPush:
             move = self._way_behind(tool, np.array([*start, low]), along < 0.0 and -along > back, centre, size)
             if np.linalg.norm(move) < self.LATERAL / 2.0 and abs(self._yaw - yaw) < 0.1:
                 self._phase = "push"
-            return self._action(move, self._yaw - yaw)
+            return self._evenly(move, self._yaw - yaw)
         # push: along the way, and back onto its line; gently at the end
         assert self._yaw is not None
         ahead = min(step, max(0.3 * (distance - 0.5 * self.DONE), 0.001))
@@ -89,12 +78,11 @@ class ScriptedPush:
         if distance > 0.03:
             self._yaw = _across(towards, yaw)
         move = np.array([*(ahead * towards + sideways), low - tool[2]])
-        return self._action(move, self._yaw - yaw)
+        return self._evenly(move, self._yaw - yaw)
 
     def _way_behind(self, tool: Vector, goal: Vector, is_behind: bool, centre: Vector, size: float) -> Vector:
         """Return the move to the place behind the object: straight if it is free, else up, across and down."""
-        soft, gripper = self.env.scene.soft, self.env.config.scene.arm.gripper
-        above = 2.0 * soft.height * size + 0.5 * gripper.pad_size[2] + 0.012
+        above = 2.0 * self.scene.soft.height * size + 0.5 * self.arm.gripper.pad_size[2] + 0.012
         move = goal - tool
         if is_behind and tool[2] < above - 0.005:
             return move
@@ -104,17 +92,14 @@ class ScriptedPush:
             return np.array([0.0, 0.0, above - tool[2]])
         return np.array([*move[:2], above - tool[2]])
 
-    def _action(self, move: Vector, turn: float) -> NDArray[np.float32]:
-        """Return the action for a move [m] and a turn [rad] of the tool."""
-        options = self.env.config.scene.control
-        move = move / options.translation_scale
-        return np.array(
-            [*(move / max(1.0, float(np.abs(move).max()))), np.clip(turn / options.rotation_scale, -1.0, 1.0), 0.0],
-            np.float32,
-        )
+    def _evenly(self, move: Vector, turn: float) -> NDArray[np.float32]:
+        """Return the action for a move [m], shortened without a change of direction, and a turn [rad] of the tool."""
+        action, steps = self.action(move, turn, 0.0), move / self.control.translation_scale
+        action[:3] = steps / max(1.0, float(np.abs(steps).max()))
+        return action
 
 
 def _across(towards: Vector, yaw: float) -> float:
     """Return the tool yaw nearest to `yaw` [rad] at which the fingers stand side by side across a direction."""
     angle = float(np.arctan2(towards[1], towards[0]))
-    return yaw + float(np.remainder(angle - yaw + 0.5 * np.pi, np.pi) - 0.5 * np.pi)
+    return yaw + half_turn(angle - yaw)

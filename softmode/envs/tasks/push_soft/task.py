@@ -8,16 +8,19 @@ import numpy as np
 import warp as wp
 from scipy.spatial import ConvexHull
 
+from softmode.checks import require_fields, require_number, require_range
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
 from softmode.envs.markers import dots
+from softmode.envs.observation import Segment
 from softmode.envs.parameters import Parameter
-from softmode.envs.rl_scene import RL_SOLVER
+from softmode.envs.presets import RL_SOLVER
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.task import Segment, Task, TaskConfig
+from softmode.envs.structs import filled
+from softmode.envs.task import Task
+from softmode.envs.task_config import TaskConfig
 from softmode.envs.tasks.push_soft import kernels
-from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
 from softmode.objects.loader import load
 from softmode.robots.arm import ArmDescription
@@ -76,21 +79,14 @@ class PushSoftConfig(TaskConfig):
     def __post_init__(self) -> None:
         """Check the ranges."""
         super().__post_init__()
-        (near, far), (least, most) = self.goal_distance, self.goal_direction
-        if not 0.0 <= near <= far <= 0.5:
-            raise ConfigError(f"goal_distance must satisfy 0 <= low <= high <= 0.5 m, got {self.goal_distance}")
+        require_range("goal_distance", self.goal_distance, at_least=0.0, at_most=0.5, unit="m")
         for name in ("goal_direction", "goal_yaw"):
-            least, most = getattr(self, name)
-            if not -np.pi <= least <= most <= np.pi:
-                raise ConfigError(f"{name} must satisfy -pi <= low <= high <= pi, got {(least, most)}")
-        if not 0.0 < self.goal_tolerance <= 0.1:
-            raise ConfigError(f"goal_tolerance must lie in 0..0.1 m, got {self.goal_tolerance}")
-        if self.yaw_tolerance is not None and not 0.0 < self.yaw_tolerance <= np.pi:
-            raise ConfigError(f"yaw_tolerance must lie in 0..pi, or be None, got {self.yaw_tolerance}")
-        if not self.rest_speed > 0.0:
-            raise ConfigError(f"rest_speed must be above 0, got {self.rest_speed}")
-        if self.hold_steps < 1:
-            raise ConfigError(f"hold_steps must be at least 1, got {self.hold_steps}")
+            require_range(name, getattr(self, name), at_least=-np.pi, at_most=np.pi, unit="rad")
+        require_fields(self, ("goal_tolerance",), above=0.0, at_most=0.1, unit="m")
+        if self.yaw_tolerance is not None:
+            require_number("yaw_tolerance", self.yaw_tolerance, above=0.0, at_most=np.pi, unit="rad")
+        require_fields(self, ("rest_speed",), above=0.0, unit="m/s")
+        require_fields(self, ("hold_steps",), at_least=1)
 
 
 class PushSoft(Task):
@@ -106,8 +102,8 @@ class PushSoft(Task):
 
     config: PushSoftConfig
     config_class = PushSoftConfig
-    term_names = ("reach", "progress", "goal", "rest")
-    metric_names = ("goal_distance", "yaw_error")
+    term_names = tuple(kernels.Term.__members__)
+    metric_names = tuple(kernels.Metric.__members__)
 
     def build(self) -> None:
         """Allocate what the reward remembers."""
@@ -120,6 +116,7 @@ class PushSoft(Task):
         """From the centre of the unscaled object to the tool that pushes it [m]."""
         self.push_height = self.config.scene.control.workspace_lower[2] + 0.006
         """Height of the tool that pushes [m]."""
+        self._columns = self.layout.columns_in(kernels.Columns)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the goal: distance [m] and direction [rad] from the object, and the angle to turn [rad]."""
@@ -157,50 +154,14 @@ class PushSoft(Task):
 
     def observe(self) -> None:
         """Write goal, ways and errors."""
-        scene, table, data = self.scene, self.table, self.scene.model.softmode
-        self.launch(
-            kernels.observe,
-            [
-                table.values,
-                table.column("position"),
-                table.column("yaw"),
-                table.column("scale"),
-                table.column("goal"),
-                table.column("goal_yaw"),
-                scene.object_position,
-                scene.controller.tool_pose,
-                data.particle_start,
-                scene.state.particle_q,
-                self._points,
-                self._rest,
-                len(scene.objects),
-                self.push_distance,
-                self.push_height,
-                scene.soft.height,
-                self.column("goal"),
-                self.column("object_goal"),
-            ],
-            [self.observation, self.metrics, scene.marker_place],
-        )
+        drawn, push = self.table.columns_in(kernels.Drawn), filled(kernels.Push, self)
+        self.launch(kernels.observe, [self.state, drawn, self._columns, push, self._rest], [self.result])
 
     def evaluate(self) -> None:
         """Judge the place, the speed and the way so far."""
-        scene, config = self.scene, self.config
-        self.launch(
-            kernels.evaluate,
-            [
-                self.metrics,
-                self.observation,
-                self.column("push_offset"),
-                scene.object_velocity,
-                config.goal_tolerance,
-                -1.0 if config.yaw_tolerance is None else config.yaw_tolerance,
-                config.rest_speed,
-                config.hold_steps,
-                config.scene.control.translation_scale,
-            ],
-            [self.held, self.before, self.terms, self.success],
-        )
+        config, yaw = self.config, self.config.yaw_tolerance
+        rules = filled(kernels.Rules, config, config.scene.control, yaw_tolerance=-1.0 if yaw is None else yaw)
+        self.launch(kernels.evaluate, [self.state, self._columns, rules], [self.result, self.before])
 
     def marker(self) -> Splats:
         """Return the outline of the object, to be drawn on the table."""

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 import warp as wp
 
+from softmode.checks import require_fields, require_range
+from softmode.envs.cameras import square_camera
 from softmode.envs.markers import sphere_marker
+from softmode.envs.observation import Segment
 from softmode.envs.parameters import Parameter
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.task import Segment, Task, TaskConfig
+from softmode.envs.structs import filled
+from softmode.envs.task import Task
+from softmode.envs.task_config import TaskConfig
+from softmode.envs.task_kernels import Placement
 from softmode.envs.tasks.rope_route import kernels
 from softmode.errors import ConfigError
 from softmode.objects.presets import ROPE, ROPE_MATERIAL
@@ -98,15 +106,10 @@ class RopeRouteConfig(TaskConfig):
         """Check the ranges."""
         super().__post_init__()
         for name in ("goal_aside", "goal_beyond"):
-            low, high = getattr(self, name)
-            if not -0.2 <= low <= high <= 0.2:
-                raise ConfigError(f"{name} must satisfy -0.2 <= low <= high <= 0.2 m, got {(low, high)}")
-        if not self.goal_tolerance > 0.0:
-            raise ConfigError(f"goal_tolerance must be positive, got {self.goal_tolerance}")
-        if not 0.0 < self.winding < np.pi:
-            raise ConfigError(f"winding must lie in 0..pi, got {self.winding}")
-        if self.hold_steps < 1:
-            raise ConfigError(f"hold_steps must be at least 1, got {self.hold_steps}")
+            require_range(name, getattr(self, name), at_least=-0.2, at_most=0.2, unit="m")
+        require_fields(self, ("goal_tolerance",), above=0.0, unit="m")
+        require_fields(self, ("winding",), above=0.0, below=np.pi, unit="rad")
+        require_fields(self, ("hold_steps",), at_least=1)
         if not self.pegs:
             raise ConfigError("scene.fixtures holds no cylinder", hint="add pegs: pegs_at(((0.45, 0.0),))")
 
@@ -116,7 +119,7 @@ class RopeRouteConfig(TaskConfig):
         return tuple(fixture for fixture in self.scene.fixtures if fixture.shape == "cylinder")
 
     @classmethod
-    def presets(cls) -> dict[str, RopeRouteConfig]:
+    def presets(cls) -> Mapping[str, Self]:
         """Return "one_peg", with a single peg, for a start."""
         return {"one_peg": cls(scene=replace(rope_scene(), fixtures=pegs_at(PEGS[:1])))}
 
@@ -136,8 +139,8 @@ class RopeRoute(Task):
 
     config: RopeRouteConfig
     config_class = RopeRouteConfig
-    term_names = ("reach", "grasp", "route", "goal", "hold")
-    metric_names = ("goal_distance", "least_winding", "highest_point", "grasp_distance")
+    term_names = tuple(kernels.Term.__members__)
+    metric_names = tuple(kernels.Metric.__members__)
 
     def build(self) -> None:
         """Sample the axis."""
@@ -154,7 +157,9 @@ class RopeRoute(Task):
         """Points on the axis, from tail to end [m], shape (world_count, AXIS_POINTS)."""
         self.peg_height = min(peg.position[2] + peg.size[1] for peg in self.config.pegs)
         """Height of the lowest peg's top [m]."""
-        self._pegs = wp.array([peg.position[:2] for peg in self.config.pegs], dtype=wp.vec2, device=device)
+        pegs = wp.array([peg.position[:2] for peg in self.config.pegs], dtype=wp.vec2, device=device)
+        self._rope = filled(kernels.Rope, self, height=self.scene.soft.height, peg_position=pegs)
+        self._columns = self.layout.columns_in(kernels.Columns)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the side of the first peg, and the goal: aside of the last peg, and beyond it [m]."""
@@ -185,79 +190,31 @@ class RopeRoute(Task):
 
     def place(self) -> None:
         """Put the rope down."""
-        scene, table = self.scene, self.table
-        columns = [table.column(name) for name in ("position", "yaw", "scale")]
+        scene, columns = self.scene, self.table.columns_in(Placement)
         self.launch(
             kernels.place_rope,
-            [scene.world_mask, table.values, *columns, self.half_length, scene.soft.height, GAP],
+            [scene.world_mask, self.state, columns, self._rope, GAP],
             [scene.place_position, scene.place_yaw],
         )
 
     def observe(self) -> None:
         """Trace the axis and write goal, end and winding."""
-        scene, table = self.scene, self.table
-        self.launch(
-            kernels.trace_axis,
-            [scene.model.softmode.function_start, self._rest, self._basis, scene.state.softmode.q],
-            [self.axis],
-            (self.world_count, AXIS_POINTS),
-        )
-        self.launch(
-            kernels.observe,
-            [
-                table.values,
-                table.column("route"),
-                table.column("goal"),
-                self._pegs,
-                self.axis,
-                self.grasp_point,
-                scene.controller.tool_pose,
-                self.column("goal"),
-                self.column("grasp_offset"),
-                scene.soft.height,
-            ],
-            [self.observation, self.metrics, scene.marker_place],
-        )
+        self.launch(kernels.trace_axis, [self.state, self._rest, self._basis], [self.axis], self.axis.shape)
+        drawn = self.table.columns_in(kernels.Drawn)
+        self.launch(kernels.observe, [self.state, drawn, self._columns, self._rope], [self.result])
 
     def evaluate(self) -> None:
         """Judge the route and the end's place."""
-        config, scene = self.config, self.scene
-        self.launch(
-            kernels.evaluate,
-            [
-                self.observation,
-                self.column("winding"),
-                len(config.pegs),
-                self.metrics,
-                scene.finger_force,
-                config.winding,
-                config.goal_tolerance,
-                self.peg_height,
-                config.hold_steps,
-            ],
-            [self.held, self.terms, self.success],
-        )
+        rules = filled(kernels.Rules, self.config)
+        self.launch(kernels.evaluate, [self.state, self._columns, self._rope, rules], [self.result])
 
     def marker(self) -> Splats:
         """Return a ball."""
         return sphere_marker(0.5 * self.config.goal_tolerance)
 
-    def observation_camera(self) -> PinholeCamera:
-        """Return a camera that sees rope and pegs, or the one on the hand."""
-        if self.config.camera != "front":
-            return super().observation_camera()
-        return rope_camera("pixels", self.config.image_size)
-
-    def render_cameras(self) -> list[PinholeCamera]:
-        """Return that camera and the overview."""
-        return [rope_camera("front", self.config.render_size), *super().render_cameras()[1:]]
-
-
-def rope_camera(name: str, edge: int) -> PinholeCamera:
-    """Return a camera that looks down on rope and pegs from the front, past the hand."""
-    return PinholeCamera.look_at(
-        name, position=(0.95, -0.50, 0.62), target=(0.44, -0.10, 0.02), width=edge, height=edge, fov_y=0.68
-    )
+    def front_camera(self, name: str, edge: int) -> PinholeCamera:
+        """Return a camera that looks down on rope and pegs, past the hand, with pictures of `edge` x `edge` pixels."""
+        return square_camera(name, edge, (0.95, -0.50, 0.62), (0.44, -0.10, 0.02), 0.68)
 
 
 class RopeRouteEnv(SoftEnv):

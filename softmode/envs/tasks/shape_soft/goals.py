@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from softmode.envs.task import EndReason
+from softmode.envs.end_reason import EndReason
+from softmode.envs.structs import filled
 from softmode.envs.tasks.shape_soft import kernels
+from softmode.envs.tasks.shape_soft.config import ShapeSoftConfig
+from softmode.envs.tensors import Tensor
 from softmode.errors import ConfigError
 
-if TYPE_CHECKING:
-    from softmode.envs.tasks.shape_soft.task import ShapeSoftConfig
-
+Goals = np.ndarray | Tensor
+Infos = Mapping[str, Any] | Sequence[Mapping[str, Any]] | np.ndarray | None
 POINTS = 12
 """Points of a goal."""
 
 
-def reward_arguments(config: ShapeSoftConfig) -> list[Any]:
+def reward_rules(config: ShapeSoftConfig) -> Any:
     """Return what the reward depends on beside the goals."""
-    return [int(config.reward == "sparse"), config.reward_length, config.goal_tolerance]
+    return filled(kernels.Rules, config, point_count=POINTS, sparse=int(config.reward == "sparse"))
 
 
 class GoalMethods:
@@ -30,12 +32,10 @@ class GoalMethods:
 
     config: ShapeSoftConfig
 
-    @property
-    def task_device(self) -> Any:
-        """Device on which rewards of numpy arrays are computed: that of the task."""
-        raise NotImplementedError
+    device: wp.Device
+    """Device on which rewards of numpy arrays are computed: that of the task."""
 
-    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> Any:
+    def compute_reward(self, achieved_goal: Goals, desired_goal: Goals, info: Infos = None) -> Any:
         """Return the reward of a step that led to `achieved_goal`, bit for bit that of the step on the same device.
 
         Args:
@@ -51,7 +51,7 @@ class GoalMethods:
         """
         size = 3 * POINTS
         pair: tuple[Any, ...] = (achieved_goal, desired_goal)
-        if not all(hasattr(goal, "detach") for goal in pair):
+        if not all(isinstance(goal, Tensor) for goal in pair):
             pair = tuple(np.asarray(goal, np.float32) for goal in pair)
         leading = tuple(pair[0].shape[:-1])
         if any(tuple(goal.shape) != (*leading, size) for goal in pair):
@@ -59,8 +59,8 @@ class GoalMethods:
                 f"goals have shapes {tuple(pair[0].shape)} and {tuple(pair[1].shape)}",
                 hint=f"give both the same shape (..., {size})",
             )
-        if not hasattr(pair[0], "detach"):
-            goals = [wp.array(goal.reshape(-1, size), dtype=float, device=self.task_device) for goal in pair]
+        if not isinstance(pair[0], Tensor):
+            goals = [wp.array(goal.reshape(-1, size), dtype=float, device=self.device) for goal in pair]
             return self._launch(goals).numpy().reshape(leading)[()]
         with _torch_stream(pair[0]):
             goals = [wp.from_torch(goal.detach().float().reshape(-1, size).contiguous()) for goal in pair]
@@ -70,11 +70,11 @@ class GoalMethods:
         """Compute the reward of each row."""
         device = goals[0].device
         reward = wp.zeros(goals[0].shape[0], dtype=float, device=device)
-        inputs = [*goals, POINTS, *reward_arguments(self.config)]
+        inputs = [*goals, reward_rules(self.config)]
         wp.launch(kernels.compute_reward, dim=reward.shape[0], inputs=inputs, outputs=[reward], device=device)
         return reward
 
-    def compute_terminated(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> Any:
+    def compute_terminated(self, achieved_goal: Goals, desired_goal: Goals, info: Infos = None) -> Any:
         """Return whether the episode ended by a failure, which `info` (one or a sequence) knows; goals end none."""
         if isinstance(info, Mapping):
             return _failed(info)
@@ -82,7 +82,7 @@ class GoalMethods:
             return np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
         return np.array([_failed(one) for one in info])
 
-    def compute_truncated(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> Any:
+    def compute_truncated(self, achieved_goal: Goals, desired_goal: Goals, info: Infos = None) -> Any:
         """Return False: the time limit is not the task's."""
         return np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
 
@@ -92,7 +92,7 @@ def _failed(info: Mapping[str, Any]) -> bool:
     return bool(info.get("end_reason", EndReason.RUNNING) > EndReason.TIME_LIMIT)
 
 
-def _torch_stream(tensor: Any) -> Any:
+def _torch_stream(tensor: Any) -> contextlib.AbstractContextManager[object]:
     """Return the context in which kernels wait for what torch does on the device of a tensor."""
     if not tensor.is_cuda:
         return contextlib.nullcontext()

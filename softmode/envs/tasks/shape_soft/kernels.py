@@ -1,43 +1,85 @@
 """Device side of ShapeSoft: target shapes, error, reward, success."""
 
+from enum import IntEnum
+
 import warp as wp
+
+from softmode.envs.reward_kernels import StepResult, WorldState, count_held, surface_point
 
 wp.set_module_options({"enable_backward": False})
 
 TURN = wp.constant(6.283185307179586)
+Term = IntEnum("Term", "shape there", start=0)
+Metric = IntEnum("Metric", "shape_error", start=0)
+
+
+@wp.struct
+class Drawn:
+    """Columns of the parameters."""
+
+    position: int
+    yaw: int
+    goal: int  # displacement [m] and direction [rad]
+
+
+@wp.struct
+class Columns:
+    """Columns of the observation."""
+
+    tool_position: int  # the first one of proprioception
+    desired_goal: int
+    achieved_goal: int
+    arm: int
+
+
+@wp.struct
+class Target:
+    """A recorded press along y; see `targets.ShapeTargets`."""
+
+    points: wp.array3d[wp.vec3]  # (directions, levels, points) [m]
+    displacement_max: float  # of the last level [m]
+
+
+@wp.struct
+class Rules:
+    """What the reward depends on beside the goals."""
+
+    point_count: int
+    sparse: int
+    reward_length: float  # [m]
+    goal_tolerance: float  # [m]
+    hold_steps: int
 
 
 @wp.func
-def target_point(
-    parameters: wp.array2d[float],
-    yaw_parameter: int,
-    goal_parameter: int,  # displacement [m] and direction [rad]
-    press: wp.array3d[wp.vec3],  # along y: (directions, levels, points)
-    displacement_max: float,  # of the last level [m]
-    w: int,
-    i: int,
-):
+def target_point(state: WorldState, drawn: Drawn, target: Target, w: int, i: int):
     """Return a point of the target shape: the press that was recorded, turned about the vertical.
 
     A post at yaw psi that is pressed in direction alpha + 90 degrees: R(alpha) x(R(psi - alpha) X), x the press.
     """
-    directions = press.shape[0]
-    levels = press.shape[1]
-    alpha = parameters[w, goal_parameter + 1] - 0.25 * TURN
-    turns = (parameters[w, yaw_parameter] - alpha) / TURN
+    directions = target.points.shape[0]
+    levels = target.points.shape[1]
+    alpha = state.parameters[w, drawn.goal + 1] - 0.25 * TURN
+    turns = (state.parameters[w, drawn.yaw] - alpha) / TURN
     at = (turns - wp.floor(turns)) * float(directions)
     j = wp.min(int(at), directions - 1)
     u = at - float(j)
-    depth = wp.clamp(parameters[w, goal_parameter] / displacement_max, 0.0, 1.0) * float(levels - 1)
+    depth = wp.clamp(state.parameters[w, drawn.goal] / target.displacement_max, 0.0, 1.0) * float(levels - 1)
     k = wp.min(int(depth), levels - 2)
     v = depth - float(k)
     m = (j + 1) % directions
-    near = (1.0 - v) * press[j, k, i] + v * press[j, k + 1, i]
-    far = (1.0 - v) * press[m, k, i] + v * press[m, k + 1, i]
+    near = (1.0 - v) * target.points[j, k, i] + v * target.points[j, k + 1, i]
+    far = (1.0 - v) * target.points[m, k, i] + v * target.points[m, k + 1, i]
     x = (1.0 - u) * near + u * far
     c = wp.cos(alpha)
     s = wp.sin(alpha)
     return wp.vec3(c * x[0] - s * x[1], s * x[0] + c * x[1], x[2])
+
+
+@wp.func
+def foot_position(state: WorldState, drawn: Drawn, w: int):
+    """Return the middle of the foot, on the table [m]."""
+    return wp.vec3(state.parameters[w, drawn.position], state.parameters[w, drawn.position + 1], 0.0)
 
 
 @wp.func
@@ -58,18 +100,13 @@ def shape_error(
 
 
 @wp.func
-def reward_terms(
-    error: float,  # [m]
-    sparse: int,
-    length: float,  # [m]
-    tolerance: float,  # [m]
-):
-    """Return the terms `shape` and `there`."""
+def reward_terms(error: float, rules: Rules):
+    """Return the terms `shape` and `there` of an error [m]."""
     there = float(0.0)
-    if error <= tolerance:
+    if error <= rules.goal_tolerance:
         there = 1.0
-    shape = 1.0 - wp.tanh(error / length)
-    if sparse != 0:
+    shape = 1.0 - wp.tanh(error / rules.reward_length)
+    if rules.sparse != 0:
         shape = 0.0
         there = there - 1.0
     return wp.vec2(shape, there)
@@ -77,112 +114,82 @@ def reward_terms(
 
 @wp.kernel
 def observe_points(
-    parameters: wp.array2d[float],
-    position_parameter: int,
-    yaw_parameter: int,
-    goal_parameter: int,
-    press: wp.array3d[wp.vec3],
-    displacement_max: float,
-    particle_start: wp.array[int],
-    particle_q: wp.array[wp.vec3],
-    points: wp.array[int],
-    stride: int,  # soft objects per world
-    desired_column: int,
-    achieved_column: int,
+    state: WorldState,
+    drawn: Drawn,
+    column: Columns,
+    target: Target,
     # Out:
-    observation: wp.array2d[float],
+    result: StepResult,
 ):
     """Write a point of the target shape and where it is now, relative to the foot on the table."""
     w, i = wp.tid()
-    x = target_point(parameters, yaw_parameter, goal_parameter, press, displacement_max, w, i)
-    foot = wp.vec3(parameters[w, position_parameter], parameters[w, position_parameter + 1], 0.0)
-    now = particle_q[particle_start[w * stride] + points[i]] - foot
+    x = target_point(state, drawn, target, w, i)
+    now = surface_point(state, w, i) - foot_position(state, drawn, w)
     for a in range(3):
-        observation[w, desired_column + 3 * i + a] = x[a]
-        observation[w, achieved_column + 3 * i + a] = now[a]
+        result.observation[w, column.desired_goal + 3 * i + a] = x[a]
+        result.observation[w, column.achieved_goal + 3 * i + a] = now[a]
 
 
 @wp.kernel
 def observe(
-    desired_column: int,
-    achieved_column: int,
-    point_count: int,
-    arm_column: int,
+    column: Columns,
     arm_size: int,
+    rules: Rules,
     # In, out:
-    observation: wp.array2d[float],
-    # Out:
-    metrics: wp.array2d[float],
+    result: StepResult,
 ):
     """Write the error, and proprioception once more."""
     w = wp.tid()
     for k in range(arm_size):
-        observation[w, arm_column + k] = observation[w, k]
-    metrics[w, 0] = shape_error(observation, achieved_column, observation, desired_column, point_count, w)
+        result.observation[w, column.arm + k] = result.observation[w, column.tool_position + k]
+    seen = result.observation
+    error = shape_error(seen, column.achieved_goal, seen, column.desired_goal, rules.point_count, w)
+    result.metrics[w, Metric.shape_error] = error
 
 
 @wp.kernel
 def shape_marker(
-    parameters: wp.array2d[float],
-    position_parameter: int,
-    yaw_parameter: int,
-    goal_parameter: int,
-    press: wp.array3d[wp.vec3],
-    displacement_max: float,
+    state: WorldState,
+    drawn: Drawn,
+    target: Target,
     first: int,  # of the marker's points in the table
     # Out:
     marker_points: wp.array2d[wp.vec3],
-    marker_place: wp.array[wp.transform],
+    result: StepResult,
 ):
     """Bend the marker into the target shape."""
     w, i = wp.tid()
-    marker_points[w, i] = target_point(parameters, yaw_parameter, goal_parameter, press, displacement_max, w, first + i)
+    marker_points[w, i] = target_point(state, drawn, target, w, first + i)
     if i == 0:
-        foot = wp.vec3(parameters[w, position_parameter], parameters[w, position_parameter + 1], 0.0)
-        marker_place[w] = wp.transform(foot, wp.quat_identity())
+        result.marker_place[w] = wp.transform(foot_position(state, drawn, w), wp.quat_identity())
 
 
 @wp.kernel
 def evaluate(
-    observation: wp.array2d[float],
-    achieved_column: int,
-    desired_column: int,
-    point_count: int,
-    sparse: int,
-    length: float,
-    tolerance: float,
-    hold_steps: int,
+    column: Columns,
+    rules: Rules,
     # In, out:
-    held: wp.array[int],
-    # Out:
-    terms: wp.array2d[float],
-    success: wp.array[wp.bool],
+    result: StepResult,
 ):
     """Reward nearness to the target shape, and being there."""
     w = wp.tid()
-    error = shape_error(observation, achieved_column, observation, desired_column, point_count, w)
-    pair = reward_terms(error, sparse, length, tolerance)
-    terms[w, 0] = pair[0]
-    terms[w, 1] = pair[1]
-    steps = int(0)
-    if error <= tolerance:
-        steps = held[w] + 1
-    held[w] = steps
-    success[w] = steps >= hold_steps
+    seen = result.observation
+    error = shape_error(seen, column.achieved_goal, seen, column.desired_goal, rules.point_count, w)
+    pair = reward_terms(error, rules)
+    result.terms[w, Term.shape] = pair[0]
+    result.terms[w, Term.there] = pair[1]
+    count_held(error <= rules.goal_tolerance, rules.hold_steps, result, w)
 
 
 @wp.kernel
 def compute_reward(
     achieved: wp.array2d[float],
     desired: wp.array2d[float],
-    point_count: int,
-    sparse: int,
-    length: float,
-    tolerance: float,
+    rules: Rules,
     # Out:
     reward: wp.array[float],
 ):
     """Compute the reward of any pairs of goals as `evaluate` and the step's sum do."""
     n = wp.tid()
-    pair = reward_terms(shape_error(achieved, 0, desired, 0, point_count, n), sparse, length, tolerance)
+    pair = reward_terms(shape_error(achieved, 0, desired, 0, rules.point_count, n), rules)
     reward[n] = pair[0] + pair[1]

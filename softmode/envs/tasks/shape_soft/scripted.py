@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from softmode.envs.scripted_base import ScriptedPolicy, bounded, half_turn
 from softmode.envs.tasks.shape_soft.task import ShapeSoft
-from softmode.errors import ConfigError
 
 
-class ScriptedShape:
+class ScriptedShape(ScriptedPolicy):
     """Bend the post: turn the open fingers into the direction of the bend, press until the free end is where it should.
 
     Args:
@@ -23,17 +22,14 @@ class ScriptedShape:
         ConfigError: If the environment is another one, or its actions are not tool steps.
     """
 
-    def __init__(self, env: Any, *, speed: float = 0.005, gain: float = 0.25) -> None:
-        """Remember the environment."""
-        base = env.unwrapped
-        if not isinstance(getattr(base, "task", None), ShapeSoft) or base.config.scene.control.mode != "pose_delta":
-            raise ConfigError(
-                "this scripted policy plays ShapeSoft in pose_delta mode only",
-                hint="make the environment with control_mode='pose_delta'",
-            )
-        self.env = base
+    task_class = ShapeSoft
+    task: ShapeSoft
+
+    def __init__(self, env: gym.Env, *, speed: float = 0.005, gain: float = 0.25) -> None:
+        """Remember the environment and plan nothing yet."""
+        super().__init__(env)
         self._speed, self._gain = speed, gain
-        rest = base.scene.soft.body.surface_points[base.task.points][:, 2]
+        rest = self.scene.soft.body.surface_points[self.task.points][:, 2]
         self._end = rest > rest.max() - 0.02
         self.reset()
 
@@ -41,28 +37,21 @@ class ScriptedShape:
         """Forget the episode; call after ``env.reset``."""
         self._turned = False
 
-    def __call__(self, observation: Any = None) -> NDArray[np.float32]:
+    def __call__(self, observation: object = None) -> NDArray[np.float32]:
         """Return the action for the present state."""
-        task, scene, arm = self.env.task, self.env.scene, self.env.config.scene.arm
-        seen, drawn = task.observation.numpy()[0].astype(float), task.table.values.numpy()[0].astype(float)
         desired, achieved = (
-            seen[task.segments[name][0]].reshape(-1, 3)[self._end, :2].mean(axis=0)
-            for name in ("desired_goal", "achieved_goal")
+            self.segment(name).reshape(-1, 3)[self._end, :2].mean(axis=0) for name in ("desired_goal", "achieved_goal")
         )
-        tool = scene.controller.target_position.numpy()[0].astype(float)
-        yaw = float(scene.controller.target_yaw.numpy()[0])
+        tool, arm = self.tool, self.arm
         # the fingers close along the tool's y axis
-        direction = drawn[task.table.column("goal") + 1] - 0.5 * np.pi
-        turn = float(np.remainder(direction - yaw + 0.5 * np.pi, np.pi) - 0.5 * np.pi)
-        foot = drawn[task.table.columns("position")]
+        turn = half_turn(self.drawn("goal")[1] - 0.5 * np.pi - self.yaw)
+        foot = self.drawn("position")
         if not self._turned:
             move = foot - tool[:2]
             self._turned = bool(np.linalg.norm(move) < 0.001 and abs(turn) < 0.03)
         else:
             move = self._gain * (desired - achieved)
-        move = move * min(1.0, self._speed / max(float(np.linalg.norm(move)), 1.0e-9))
-        options = self.env.config.scene.control
+        move = bounded(move, self._speed)
         step = np.append(move, np.clip(arm.home_position[2] - tool[2], -self._speed, self._speed))
         grip = 2.0 * arm.home_opening / arm.gripper.stroke - 1.0
-        spin = np.clip(turn / options.rotation_scale, -1.0, 1.0)
-        return np.array([*np.clip(step / options.translation_scale, -1.0, 1.0), spin, grip], np.float32)
+        return self.action(step, turn, grip)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -82,14 +81,14 @@ def record_press(scene: TableScene, displacement: float) -> Press:
 class ShapeTargets:
     """Points of the bent object on the device."""
 
-    points: Any
+    points: wp.array
     """vec3, shape (DIRECTIONS, LEVELS, points): where the press moved the rest points that were turned by direction
     j / DIRECTIONS of a turn, at level k / (LEVELS - 1) of the greatest displacement [m]."""
     displacement_max: float
     """The greatest displacement [m]."""
 
     @staticmethod
-    def from_press(body: ReducedBody, press: Press, rest: NDArray[np.float64], device: Any) -> ShapeTargets:
+    def from_press(body: ReducedBody, press: Press, rest: NDArray[np.float64], device: wp.DeviceLike) -> ShapeTargets:
         """Evaluate a press at rest points.
 
         Args:

@@ -1,0 +1,167 @@
+"""Checks of what the environments are called with: options, devices, actions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import get_args
+
+import gymnasium as gym
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from softmode.checks import require_choice
+from softmode.envs.task_config import ObservationType, TaskConfig
+from softmode.errors import ConfigError
+from softmode.objects.config import ObjectConfig
+
+CONTROL_MODES = ("pose_delta", "joint_delta")
+RENDER_MODES = ("rgb_array",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shortcuts:
+    """What the constructors of environments take beside or instead of a configuration."""
+
+    obs_type: ObservationType = "state"
+    """Kind of observation."""
+    render_mode: str | None = None
+    """"rgb_array" or None."""
+    control_mode: str | None = None
+    """What actions mean; None keeps the configuration's."""
+    splat: str | Path | None = None
+    """Splat file of the object; None for the configured one."""
+    size: float | None = None
+    """Longest edge of the object [m]."""
+    preset: str | None = None
+    """Named variant of the task, instead of a configuration."""
+
+
+def checked_config(wanted: type[TaskConfig], config: TaskConfig | None, given: Shortcuts) -> TaskConfig:
+    """Return the configuration with the constructor's shortcuts applied.
+
+    Args:
+        wanted: Class of the configuration.
+        config: The configuration, or None for the preset or the default.
+        given: The shortcuts.
+
+    Raises:
+        ConfigError: If an option is unknown, or the configuration of another task.
+    """
+    require_choice("obs_type", given.obs_type, get_args(ObservationType))
+    require_choice("render_mode", given.render_mode, (*RENDER_MODES, None))
+    require_choice("control_mode", given.control_mode, (*CONTROL_MODES, None))
+    if config is not None and not isinstance(config, wanted):
+        raise ConfigError(
+            f"config is a {type(config).__name__}",
+            hint=f"pass {wanted.__name__}(image_size=128), of {wanted.__module__}",
+        )
+    if config is not None and given.preset is not None:
+        raise ConfigError(f"preset {given.preset!r} and config exclude each other", hint="give one of them")
+    if config is None:
+        config = wanted() if given.preset is None else wanted.preset(given.preset)
+    scene = config.scene
+    if given.control_mode is not None:
+        scene = replace(scene, control=replace(scene.control, mode=given.control_mode))  # type: ignore[arg-type]
+    if given.splat is not None or given.size is not None:
+        scene = replace(scene, object=_with_splat(scene.object, given))
+    return replace(config, scene=scene)
+
+
+def _with_splat(thing: ObjectConfig, given: Shortcuts) -> ObjectConfig:
+    """Return an object of another splat file or size."""
+    if given.splat is not None and (thing.extents is not None or thing.mesh is not None or thing.body is not None):
+        thing = ObjectConfig(surface_count=thing.surface_count, build=thing.build)
+    if thing.extents is not None or thing.body is not None:
+        what = f"a {thing.shape} of {thing.extents} m" if thing.body is None else f"the body {thing.body}"
+        raise ConfigError(
+            f"size given for {what}", hint="set the extents of config.scene.object, or give a splat file too"
+        )
+    changes = {"splat": given.splat, "size": given.size}
+    return replace(thing, **{name: value for name, value in changes.items() if value is not None})  # type: ignore[arg-type]
+
+
+def checked_device(device: wp.DeviceLike) -> wp.Device:
+    """Return a Warp device.
+
+    Raises:
+        ConfigError: If there is no such device.
+    """
+    if isinstance(device, str) and device == "cuda":
+        device = "cuda:0"
+    try:
+        return wp.get_device(device)
+    except (ValueError, RuntimeError) as error:
+        known = ", ".join(str(found) for found in wp.get_devices())
+        raise ConfigError(f"there is no device {device!r}", hint=f"use one of {known}") from error
+
+
+def checked_options(options: Mapping[str, object] | None) -> dict[str, object]:
+    """Return reset options as a dict of its own.
+
+    Raises:
+        ConfigError: If they are no mapping.
+    """
+    if options is not None and not isinstance(options, Mapping):
+        raise ConfigError(f"options is a {type(options).__name__}", hint="give a dict")
+    return dict(options or {})
+
+
+def checked_actions(actions: object, space: gym.Space) -> NDArray[np.float32]:
+    """Return actions as an array.
+
+    Raises:
+        ConfigError: If they have another shape than those of the space, or a number is not finite.
+    """
+    try:
+        numbers = np.asarray(actions, np.float32)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"action is no array of numbers: {error}", hint="give one number per entry") from error
+    if numbers.shape != space.shape:
+        raise ConfigError(
+            f"action has shape {numbers.shape}, expected {space.shape}",
+            hint="give one number in [-1, 1] per entry of env.action_space",
+        )
+    if not np.isfinite(numbers).all():
+        where = f" of worlds {np.flatnonzero(~np.isfinite(numbers).all(axis=1)).tolist()}" if numbers.ndim > 1 else ""
+        raise ConfigError(f"action{where} holds NaN or infinity", hint="check the policy that produced it")
+    return numbers
+
+
+def checked_count(name: str, value: object) -> int:
+    """Return a whole number of at least 1.
+
+    Raises:
+        ConfigError: If it is none.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise ConfigError(f"{name} is {value!r}", hint="give a whole number of at least 1")
+    return int(value)
+
+
+def checked_processes(processes: object, num_envs: int, device: wp.Device, output: str) -> int:
+    """Return how many processes share the worlds.
+
+    Args:
+        processes: How many were asked for.
+        num_envs: Number of worlds.
+        device: Where the worlds live.
+        output: "numpy" or "torch".
+
+    Raises:
+        ConfigError: If they cannot share them.
+    """
+    count = checked_count("processes", processes)
+    if count > 1 and (not device.is_cpu or output != "numpy"):
+        raise ConfigError(
+            f"processes is {count} on {device} with output {output!r}",
+            hint="several processes serve CPU and numpy only; leave processes at 1",
+        )
+    return min(count, num_envs)
+
+
+def world_seed(random: np.random.Generator) -> int:
+    """Return the seed of a world's draws from the generator that `reset(seed=...)` made."""
+    return int(random.integers(2**31))

@@ -1,0 +1,100 @@
+"""The observation vector: its named segments, from which its columns, bounds and spaces follow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from softmode.envs.structs import StructType, filled
+from softmode.robots.arm import ARM_JOINT_COUNT
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A named part of the observation vector."""
+
+    name: str
+    """Name of the quantity."""
+    size: int
+    """How many numbers."""
+    low: float | tuple[float, ...]
+    """Bound below, in the unit of the quantity."""
+    high: float | tuple[float, ...]
+    """Bound above."""
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the bounds of every number, two float32 arrays of shape (size,)."""
+        low, high = (np.broadcast_to(np.array(bound, np.float32), self.size) for bound in (self.low, self.high))
+        return low, high
+
+
+PROPRIOCEPTION = (
+    Segment("tool_position", 3, -2.0, 2.0),
+    Segment("tool_heading", 2, -1.0, 1.0),
+    Segment("opening", 1, -0.1, 0.5),
+    Segment("finger_force", 2, 0.0, 200.0),
+    Segment("joint_angles", ARM_JOINT_COUNT, -3.5, 3.5),
+    Segment("command_lead", 3, -1.0, 1.0),
+    Segment("command_turn", 1, -1.0, 1.0),
+    Segment("command_opening", 1, -0.5, 0.5),
+)
+"""What every observation begins with."""
+
+
+def object_part(point_count: int) -> tuple[Segment, ...]:
+    """Return the segments of object 0 that every state observation has.
+
+    Args:
+        point_count: How many of its surface points are observed.
+    """
+    return (
+        Segment("object_position", 3, -2.0, 2.0),
+        Segment("object_velocity", 3, -20.0, 20.0),
+        Segment("object_offset", 3, -4.0, 4.0),
+        Segment("object_points", 3 * point_count, -2.0, 2.0),
+    )
+
+
+class ObservationLayout:
+    """Where every segment stands in the observation vector, and its bounds.
+
+    Args:
+        segments: The segments in their order.
+
+    Attributes:
+        segments: Columns and segment by name.
+        low: Bounds below, float32, shape (D,).
+        high: Bounds above, float32, shape (D,).
+    """
+
+    def __init__(self, segments: Iterable[Segment]) -> None:
+        """Give every segment its columns."""
+        self.segments: dict[str, tuple[slice, Segment]] = {}
+        column = 0
+        for segment in segments:
+            self.segments[segment.name] = (slice(column, column + segment.size), segment)
+            column += segment.size
+        bounds = [segment.bounds() for _, segment in self.segments.values()]
+        self.low, self.high = (np.concatenate(part) for part in zip(*bounds, strict=True))
+
+    def column(self, segment: str) -> int:
+        """Return the first column of a segment."""
+        return self.segments[segment][0].start
+
+    def columns_in(self, struct: StructType, **absent: int) -> Any:
+        """Return a struct of a kernel whose fields are the first columns of the segments of their names.
+
+        Args:
+            struct: The struct.
+            absent: Values of fields whose segment may be missing.
+        """
+        starts = {name: columns.start for name, (columns, _) in self.segments.items()}
+        return filled(struct, **{**absent, **starts})
+
+    def space(self, columns: slice) -> gym.spaces.Box:
+        """Return the space of some columns."""
+        return gym.spaces.Box(self.low[columns], self.high[columns], dtype=np.float32)

@@ -1,0 +1,88 @@
+"""What a task made, as trees of arrays: observations and infos of all worlds or of one, frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from softmode.envs.task import Task
+
+Tree = wp.array | dict[str, "Tree"]
+"""An array whose first axis is the world, or a dict of such trees."""
+
+
+def observation_arrays(task: Task, *, final: bool = False) -> Tree:
+    """Return the observation of all worlds in the structure of `Task.observation_space`; `final`: before the reset."""
+    vector = task.final_observation if final else task.observation
+    if task.obs_type == "state":
+        keys = task.state_keys()
+        return {name: columns_of(vector, columns) for name, columns in keys.items()} if keys else vector
+    images: dict[str, Tree] = dict(task.final_images if final else task.images)
+    if task.obs_type == "pixels_agent_pos":
+        images["agent_pos"] = columns_of(vector, slice(task.agent_size))
+    return images["pixels"] if list(images) == ["pixels"] else images
+
+
+def info_arrays(task: Task, *, final: bool = False) -> dict[str, Tree]:
+    """Return the infos of all worlds; with `final`, those of the episodes that ended in this step."""
+    solver = task.scene.solver
+    now = (task.success, task.metrics, task.table.values, task.observation, solver.status)
+    ended = (
+        task.final_success,
+        task.final_metrics,
+        task.final_parameters,
+        task.final_observation,
+        task.final_status,
+    )
+    success, metrics, parameters, vector, status = ended if final else now
+    return {
+        "is_success": success,
+        "reward_terms": {name: columns_of(task.terms, k) for k, name in enumerate(task.term_names)},
+        **{name: columns_of(metrics, k) for k, name in enumerate(task.metric_names)},
+        "parameters": {
+            name: columns_of(parameters, columns.start if columns.stop - columns.start == 1 else columns)
+            for name, columns in ((name, task.table.columns(name)) for name in task.table.parameters)
+        },
+        "finger_force": columns_of(vector, task.segments["finger_force"][0]),
+        "solver_status": status,
+        "end_reason": task.end,
+    }
+
+
+def columns_of(array: wp.array, columns: int | slice) -> wp.array:
+    """Return a view of one column, shape (world_count,), or of several."""
+    return cast(wp.array, array[:, columns])
+
+
+def map_tree(function: Callable[[Any], Any], tree: Any) -> Any:
+    """Return a tree of the results of a function on each leaf; a dict is a branch, all else a leaf."""
+    if isinstance(tree, dict):
+        return {name: map_tree(function, value) for name, value in tree.items()}
+    return function(tree)
+
+
+def take(tree: Tree, world: int, *, scalars: bool = False) -> Any:
+    """Return one world of a tree as NumPy arrays of its own.
+
+    Args:
+        tree: The tree.
+        world: Index of the world.
+        scalars: Whether single numbers become Python's.
+    """
+
+    def row(array: wp.array) -> Any:
+        value = array.numpy()[world]
+        return value.item() if scalars and value.ndim == 0 else value.copy()
+
+    return map_tree(row, tree)
+
+
+def render_worlds(task: Task) -> NDArray[np.uint8]:
+    """Return the rendered frame of every world, shape (world_count, height, width, 3)."""
+    cameras = task.render_cameras()
+    drawn = task.scene.render((cameras[0].width, cameras[0].height))
+    return np.concatenate([drawn.images(camera.name).numpy() for camera in cameras], axis=2)

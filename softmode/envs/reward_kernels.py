@@ -1,0 +1,76 @@
+"""What the kernels of all tasks read and write, and what a touch, a grasp and a held goal are."""
+
+import warp as wp
+
+TOUCH_FORCE = wp.constant(0.02)
+"""Force from which a finger counts as touching [N]."""
+
+
+@wp.struct
+class WorldState:
+    """What goals, observations and rewards are functions of, world first."""
+
+    parameters: wp.array2d[float]  # drawn at reset
+    object_position: wp.array2d[wp.vec3]  # centres of mass [m]
+    object_velocity: wp.array2d[wp.vec3]  # [m/s]
+    tool_pose: wp.array[wp.transform]
+    finger_force: wp.array2d[wp.vec3]  # [N]
+    function_start: wp.array[int]
+    q: wp.array[wp.vec3d]  # reduced coordinates [m]
+    particle_start: wp.array[int]
+    particle_q: wp.array[wp.vec3]  # surface samples [m]
+    points: wp.array[int]  # those of object 0 that are observed
+    stride: int  # soft objects per world
+
+
+@wp.struct
+class StepResult:
+    """What the kernels of a task write, world first."""
+
+    observation: wp.array2d[float]
+    metrics: wp.array2d[float]
+    terms: wp.array2d[float]  # of the reward
+    success: wp.array[wp.bool]
+    failure: wp.array[int]  # an EndReason
+    held: wp.array[int]  # control steps in a row in which the goal was met
+    marker_place: wp.array[wp.transform]
+
+
+@wp.func
+def tool_position(state: WorldState, world: int):
+    """Return where the tool is [m]."""
+    return wp.transform_get_translation(state.tool_pose[world])
+
+
+@wp.func
+def surface_point(state: WorldState, world: int, point: int):
+    """Return where an observed surface point of object 0 is [m]."""
+    return state.particle_q[state.particle_start[world * state.stride] + state.points[point]]
+
+
+@wp.func
+def touches(state: WorldState, world: int, finger: int):
+    """Return whether a finger feels an object."""
+    return wp.length(state.finger_force[world, finger]) > TOUCH_FORCE
+
+
+@wp.func
+def grasped(state: WorldState, world: int):
+    """Return whether both fingers feel an object."""
+    return touches(state, world, 0) and touches(state, world, 1)
+
+
+@wp.func
+def touched(state: WorldState, world: int):
+    """Return whether any finger feels an object."""
+    return touches(state, world, 0) or touches(state, world, 1)
+
+
+@wp.func
+def count_held(met: bool, hold_steps: int, result: StepResult, world: int):
+    """Count the control steps in a row in which the goal is met; enough of them are a success."""
+    steps = int(0)
+    if met:
+        steps = result.held[world] + 1
+    result.held[world] = steps
+    result.success[world] = steps >= hold_steps

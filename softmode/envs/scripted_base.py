@@ -1,0 +1,115 @@
+"""What the scripted policies share: reading world 0 of a task, and actions from ways of the tool."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from softmode.envs.reward_kernels import TOUCH_FORCE
+from softmode.envs.soft_env import SoftEnv
+from softmode.envs.task import Task
+from softmode.errors import ConfigError
+
+Vector = NDArray[np.float64]
+
+
+class ScriptedPolicy:
+    """A policy that reads the simulation, not the observation; called with an observation it returns an action.
+
+    Args:
+        env: An environment of one world, wrapped or not, with the task that the policy plays.
+
+    Raises:
+        ConfigError: If the environment is another one, or its actions are not tool steps.
+    """
+
+    task_class: ClassVar[type[Task]] = Task
+    """The task that it plays."""
+
+    def __init__(self, env: gym.Env) -> None:
+        """Remember the environment."""
+        base = env.unwrapped
+        task = base.task if isinstance(base, SoftEnv) else None
+        if not isinstance(task, self.task_class) or task.config.scene.control.mode != "pose_delta":
+            raise ConfigError(
+                f"this scripted policy plays {self.task_class.__name__} in pose_delta mode only",
+                hint="make the environment with control_mode='pose_delta'",
+            )
+        self.task, self.scene = task, task.scene
+        self.arm, self.control = task.config.scene.arm, task.config.scene.control
+
+    def reset(self) -> None:
+        """Forget the episode; call after ``env.reset``."""
+
+    def __call__(self, observation: object = None) -> NDArray[np.float32]:
+        """Return the action for the present state."""
+        raise NotImplementedError
+
+    # -- reading ------------------------------------------------------------------------------------------------------
+
+    @property
+    def tool(self) -> Vector:
+        """Commanded position of the tool [m]."""
+        return self.scene.controller.target_position.numpy()[0].astype(float)
+
+    @property
+    def yaw(self) -> float:
+        """Commanded yaw of the tool [rad]."""
+        return float(self.scene.controller.target_yaw.numpy()[0])
+
+    @property
+    def centre(self) -> Vector:
+        """Centre of mass of object 0 [m]."""
+        return self.scene.object_position.numpy()[0, 0].astype(float)
+
+    @property
+    def weaker_force(self) -> np.floating:
+        """Force on the finger that feels less [N]."""
+        return np.linalg.norm(self.scene.finger_force.numpy()[0], axis=1).min()
+
+    def segment(self, name: str) -> Vector:
+        """Return a segment of the observation vector."""
+        return self.task.observation.numpy()[0, self.task.segments[name][0]].astype(float)
+
+    def drawn(self, name: str) -> Vector:
+        """Return a parameter of the episode."""
+        return self.task.table.values.numpy()[0, self.task.table.columns(name)].astype(float)
+
+    # -- acting -------------------------------------------------------------------------------------------------------
+
+    def action(self, move: Vector, turn: float, grip: float) -> NDArray[np.float32]:
+        """Return an action.
+
+        Args:
+            move: Way of the tool [m], clipped to what a control step allows.
+            turn: Turn of the tool [rad], clipped likewise.
+            grip: Entry of the gripper, 1 open, -1 squeezing.
+        """
+        spin = np.clip(turn / self.control.rotation_scale, -1.0, 1.0)
+        return np.array([*np.clip(move / self.control.translation_scale, -1.0, 1.0), spin, grip], np.float32)
+
+    def regulated(self, grip: float, wanted: float, *, closing: float, holding: float) -> float:
+        """Return the gripper's next entry: it closes while the weaker finger feels too little, and opens otherwise.
+
+        Args:
+            grip: The last entry.
+            wanted: Force of each finger [N].
+            closing: Greatest change while a finger touches nothing.
+            holding: Greatest change while both touch.
+        """
+        force = self.weaker_force
+        error = np.clip((wanted - force) / wanted, -1.0, 1.0)
+        return float(np.clip(grip - (closing if force < TOUCH_FORCE else holding) * error, -1.0, 1.0))
+
+
+def bounded(way: Vector, longest: float) -> Vector:
+    """Return a way, shortened to a length [m] if it is longer."""
+    return way * min(1.0, longest / max(float(np.linalg.norm(way)), 1.0e-9))
+
+
+def half_turn(angle: float) -> float:
+    """Return an angle [rad] in -pi/2..pi/2 that differs by half turns: fingers may change sides."""
+    return float(np.remainder(angle + 0.5 * np.pi, np.pi) - 0.5 * np.pi)

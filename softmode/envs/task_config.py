@@ -1,0 +1,92 @@
+"""The configuration that all tasks have: scene, ranges of what is random, pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, Self, get_args
+
+from softmode.checks import require_choice, require_number, require_numbers, require_range
+from softmode.errors import ConfigError
+from softmode.scenes.table_scene import TableSceneConfig
+from softmode.splats.camera_randomization import CameraRandomization
+
+ObservationType = Literal["state", "pixels", "pixels_agent_pos"]
+CameraName = Literal["front", "wrist"]
+ImageOutput = Literal["depth", "segmentation"]
+
+_RANGES: dict[str, dict[str, float]] = {
+    "youngs_modulus_range": {"above": 0.0},
+    "poissons_ratio_range": {"above": -1.0, "below": 0.5},
+    "density_range": {"above": 0.0},
+    "friction_range": {"at_least": 0.0},
+    "scale_range": {"above": 0.49, "below": 2.01},
+}
+"""Limits of the ranges that may be None."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskConfig:
+    """Scene, randomisation and pictures, common to all tasks."""
+
+    scene: TableSceneConfig = field(default_factory=TableSceneConfig)
+    """Objects, robot and physics."""
+    position_range: tuple[float, float] = (0.05, 0.08)
+    """Half-width of the object's random position in x and y [m]."""
+    yaw_range: float = math.pi
+    """Half-width of its random yaw [rad]."""
+    youngs_modulus_range: tuple[float, float] | None = (2.0e4, 2.0e6)
+    """Range of the random Young's modulus [Pa], log-uniform; None keeps the scene's material, as for all of these."""
+    poissons_ratio_range: tuple[float, float] | None = None
+    """Range of the random Poisson's ratio."""
+    density_range: tuple[float, float] | None = None
+    """Range of the random density [kg/m^3], log-uniform."""
+    friction_range: tuple[float, float] | None = None
+    """Range of the random friction coefficient of the object."""
+    scale_range: tuple[float, float] | None = None
+    """Range of the random size of the objects, as a factor."""
+    camera: CameraName = "front"
+    """Camera of pixel observations: one in front of the table, or one on the hand."""
+    image_size: int = 96
+    """Edge of a pixel observation [px]."""
+    image_outputs: tuple[ImageOutput, ...] = ()
+    """What pixel observations hold beside colours: "depth" [m], "segmentation" (int32, see ``SplatCamera.labels``)."""
+    camera_randomization: CameraRandomization | None = None
+    """Random pose, lens, light and colours of every episode."""
+    render_size: int = 256
+    """Edge of each half of a rendered frame [px]."""
+    mesh_samples: int = 1
+    """Rays per pixel for robot and table, in observations and renderings: 1, or 4 for smooth edges."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_numbers("position_range", self.position_range, 2, at_least=0.0, unit="m")
+        require_number("yaw_range", self.yaw_range, at_least=0.0, unit="rad")
+        for name, limits in _RANGES.items():
+            if getattr(self, name) is not None:
+                require_range(name, getattr(self, name), **limits)
+        require_choice("camera", self.camera, get_args(CameraName))
+        if not set(self.image_outputs) <= set(get_args(ImageOutput)):
+            raise ConfigError(f"image_outputs is {self.image_outputs}", hint="name 'depth', 'segmentation' or nothing")
+        require_number("image_size", self.image_size, at_least=36, at_most=640, unit="px")
+        require_number("render_size", self.render_size, at_least=64, at_most=1024, unit="px")
+        require_choice("mesh_samples", self.mesh_samples, (1, 4))
+
+    @classmethod
+    def preset(cls, name: str) -> Self:
+        """Return a named variant of the task.
+
+        Raises:
+            ConfigError: If there is none of that name.
+        """
+        known = cls.presets()
+        if name not in known:
+            names = ", ".join(map(repr, known)) or "none"
+            raise ConfigError(f"{cls.__name__} has no preset {name!r}", hint=f"there are: {names}")
+        return known[name]
+
+    @classmethod
+    def presets(cls) -> Mapping[str, Self]:
+        """Return the named variants of the task."""
+        return {}

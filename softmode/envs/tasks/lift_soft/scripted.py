@@ -1,0 +1,46 @@
+"""The scripted policy of LiftSoft."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from softmode.envs.scripted_base import ScriptedPolicy, Vector, bounded
+from softmode.envs.scripted_grasp import ScriptedGrasp
+from softmode.envs.tasks.lift_soft.task import LiftSoft
+
+
+class ScriptedLift(ScriptedPolicy):
+    """Grasp the object (:class:`ScriptedGrasp`), lift it to the goal, try again if it slips.
+
+    Args:
+        env: A LiftSoft environment, wrapped or not.
+        squeeze: Force of each finger as a multiple of the least that friction needs to carry the weight.
+        least_force: But at least this force [N]; stiff objects touch the fingers with few samples and turn out of less.
+
+    Raises:
+        ConfigError: If the environment is another one, or its actions are not tool steps.
+    """
+
+    task_class = LiftSoft
+    task: LiftSoft
+
+    def __init__(self, env: gym.Env, *, squeeze: float = 5.0, least_force: float = 6.0) -> None:
+        """Remember the environment and plan nothing yet."""
+        super().__init__(env)
+        self._grasp = ScriptedGrasp(env, self._way, squeeze=squeeze, least_force=least_force)
+
+    def reset(self) -> None:
+        """Forget the episode; call after ``env.reset``."""
+        self._grasp.reset()
+
+    def __call__(self, observation: object = None) -> NDArray[np.float32]:
+        """Return the action for the present state."""
+        return self._grasp()
+
+    def _way(self, centre: Vector) -> Vector:
+        """Return the next move of a held object: up first, sideways once it is clear of the table."""
+        way = self.segment("goal") - centre
+        way[:2] *= float(centre[2] - self.scene.soft.height > 0.02)
+        return bounded(way, 0.008)

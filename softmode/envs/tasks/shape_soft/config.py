@@ -1,0 +1,91 @@
+"""Configuration of ShapeSoft: its scene, goals and reward."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import numpy as np
+
+from softmode.checks import require_choice, require_fields, require_number, require_range
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.materials.material import Material
+from softmode.envs.presets import RL_SOLVER
+from softmode.envs.task_config import TaskConfig
+from softmode.errors import ConfigError
+from softmode.objects.config import ObjectConfig
+from softmode.robots.arm import ArmDescription
+from softmode.robots.control import ArmControlOptions
+from softmode.scenes.table_scene import TableSceneConfig
+
+RewardType = Literal["dense", "sparse"]
+
+POST = ObjectConfig(
+    shape="cylinder",
+    extents=(0.03, 0.03, 0.12),
+    surface_count=240,
+    contact_radius=0.0015,
+    clamped_height=0.012,
+    build=BuildOptions(mode_count=2, response_derivatives=0, cubature_count=96),
+)
+"""A soft post whose foot is fixed to the table; 0.7 mm (rms) from one of 49 functions when its end is bent by 84 mm."""
+POST_MATERIAL = Material(youngs_modulus=2.0e5, density=300.0, friction=0.4)
+"""Soft rubber foam."""
+
+
+def shape_scene() -> TableSceneConfig:
+    """Return the scene: the post between the open fingers."""
+    return TableSceneConfig(
+        object=POST,
+        material=POST_MATERIAL,
+        solver=RL_SOLVER,
+        substeps=4,
+        arm=ArmDescription(home_position=(0.45, 0.0, 0.09), home_opening=0.08),
+        control=ArmControlOptions(workspace_lower=(0.33, -0.12, 0.08), workspace_upper=(0.57, 0.12, 0.20)),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShapeSoftConfig(TaskConfig):
+    """Goal and success of ShapeSoft."""
+
+    scene: TableSceneConfig = field(default_factory=shape_scene)
+    """Objects, robot and physics; the object is a cylinder that stands upright on a clamped foot."""
+    position_range: tuple[float, float] = (0.01, 0.01)
+    """Half-width of the post's random position in x and y [m]."""
+    youngs_modulus_range: tuple[float, float] | None = (5.0e4, 1.0e6)
+    """Range of the random Young's modulus [Pa], log-uniform; None keeps the scene's material."""
+    goal_displacement: tuple[float, float] = (0.025, 0.06)
+    """Range of the displacement of the free end in the target shape [m]."""
+    goal_direction: tuple[float, float] = (-np.pi, np.pi)
+    """Range of the direction in which it is bent, about z from the x axis [rad]."""
+    reward: RewardType = "dense"
+    """"dense": 1 - tanh(error / `reward_length`), and 1 more at the target; "sparse": 0 there and -1 elsewhere."""
+    reward_length: float = 0.02
+    """Error of the shape that matters to the dense reward [m]."""
+    goal_tolerance: float = 0.005
+    """Error of the shape, root mean square over the points, that counts as at the target [m]."""
+    hold_steps: int = 10
+    """Control steps in a row at the target that make a success."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        super().__post_init__()
+        thing = self.scene.object
+        upright = thing.shape == "cylinder" and thing.extents is not None and thing.extents[0] == thing.extents[1]
+        if not upright or not thing.clamped_height > 0.0:
+            raise ConfigError(
+                f"the object of ShapeSoft is a {thing.shape} {thing.extents}, clamped {thing.clamped_height} m high",
+                hint="give a cylinder with two equal horizontal extents and clamped_height > 0",
+            )
+        if self.scale_range is not None:
+            raise ConfigError(
+                f"scale_range is {self.scale_range}", hint="a clamped object keeps its scale; leave it out"
+            )
+        height = thing.extents[2] if thing.extents is not None else 0.0
+        require_range("goal_displacement", self.goal_displacement, at_least=0.0, at_most=0.6 * height, unit="m")
+        require_number("goal_displacement[1]", self.goal_displacement[1], above=0.0, unit="m")
+        require_range("goal_direction", self.goal_direction, at_least=-np.pi, at_most=np.pi, unit="rad")
+        require_choice("reward", self.reward, get_args(RewardType))
+        require_fields(self, ("reward_length", "goal_tolerance"), above=0.0, at_most=0.1, unit="m")
+        require_fields(self, ("hold_steps",), at_least=1)

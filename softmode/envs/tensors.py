@@ -1,0 +1,33 @@
+"""What the environments use of torch's tensors, without importing torch."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+
+@runtime_checkable
+class Tensor(Protocol):
+    """A tensor of torch, recognised by its methods."""
+
+    dtype: Any
+    shape: tuple[int, ...]
+    device: Any
+
+    def detach(self) -> Tensor:
+        """Return it without its gradient."""
+        ...
+
+    def cpu(self) -> Tensor:
+        """Return it on the host."""
+        ...
+
+    def numpy(self) -> np.ndarray:
+        """Return it as an array, of the same memory on the host."""
+        ...
+
+
+def host_array(tensor: Tensor) -> np.ndarray:
+    """Return a tensor as an array on the host."""
+    return tensor.detach().cpu().numpy()
