@@ -166,7 +166,8 @@ def start_line_search(
     Where Newton's own Hessian turns out to be indefinite the world stays put and takes the projected one next.
 
     A step below the tolerance (in contact, far below the stick range too) is taken in full: there the change of the
-    potential drowns in rounding.
+    potential drowns in rounding. If the residual is still too large after it, the next small step is searched for:
+    between sticking and slipping, full steps may go round in circles.
     """
     if state.active[w] == 0:
         if member == 0:
@@ -201,6 +202,7 @@ def start_line_search(
             last = 0
     state.slope[w] = slope
     state.step_length[w] = wp.float64(1.0)
+    small_again = wp.where(state.iteration[w] > 0, state.last[w], 0)
     state.last[w] = last
     if unsound == 1:
         state.step_length[w] = wp.float64(0.0)
@@ -209,7 +211,7 @@ def start_line_search(
     elif last == 1 and state.project[w] != 0 and state.iteration[w] < PROJECTED_ITERATIONS:
         # too stiff a matrix takes small steps: that says nothing of the distance to the minimum
         state.last[w] = 0
-    elif last == 0:
+    elif last == 0 or small_again == 1:
         state.searching[w] = 1
         wp.atomic_max(state.any_searching, 0, 1)
 
