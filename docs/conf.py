@@ -26,6 +26,8 @@ author = "the softmode authors"
 copyright = "the softmode authors, Apache-2.0"
 release = importlib.metadata.version("softmode")
 
+# A builtin such as `object` in an annotation is also the name of fields; the builtin is meant.
+suppress_warnings = ["ref.python"]
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",

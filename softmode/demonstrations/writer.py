@@ -334,8 +334,9 @@ class DatasetWriter:
 
     def close(self) -> None:
         """Drop what belongs to no saved episode and let go of the folder; harmless twice."""
-        if self._episode is not None:
-            self._episode.abort()
+        episode = getattr(self, "_episode", None)  # none yet if the folder could not be opened
+        if episode is not None:
+            episode.abort()
         if self._lock is not None:
             shutil.rmtree(self._root if self._is_new else self._root / STAGE, ignore_errors=True)
             os.close(self._lock)

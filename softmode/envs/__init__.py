@@ -5,8 +5,9 @@ Names are loaded when they are first used.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from softmode.lazy import lazy_names
 
 if TYPE_CHECKING:
     from softmode.envs.adapters import RslRlVecEnv, SkrlWrapper, StableBaselinesVecEnv
@@ -71,33 +72,47 @@ __all__ = [
     "scripted_policy",
 ]
 
-_HOME = {
-    "adapters": "RslRlVecEnv SkrlWrapper StableBaselinesVecEnv",
-    "check": "VectorEnvReport check_vector_env",
-    "end_reason": "EndReason",
-    "observation": "Segment",
-    "parameters": "Parameter",
-    "presets": "rl_scene",
-    "scripted": "scripted_policy",
-    "soft_env": "SoftEnv",
-    "soft_vector_env": "SoftVectorEnv",
-    "task": "Task",
-    "task_config": "TaskConfig",
-    "tasks.lift_soft.task": "LiftSoft LiftSoftConfig LiftSoftEnv LiftSoftVectorEnv",
-    "tasks.place_in_bin.task": "PlaceInBin PlaceInBinConfig PlaceInBinEnv PlaceInBinVectorEnv",
-    "tasks.press_soft.task": "PressSoft PressSoftConfig PressSoftEnv PressSoftVectorEnv",
-    "tasks.push_soft.task": "PushSoft PushSoftConfig PushSoftEnv PushSoftVectorEnv",
-    "tasks.rope_route.task": "RopeRoute RopeRouteConfig RopeRouteEnv RopeRouteVectorEnv",
-    "tasks.shape_soft.config": "ShapeSoftConfig",
-    "tasks.shape_soft.task": "ShapeSoft ShapeSoftEnv ShapeSoftVectorEnv",
-    "throughput": "measure_throughput",
-}
-"""Names by the module that they come from."""
-
-
-def __getattr__(name: str) -> Any:
-    """Load a public name from its module."""
-    for module, names in _HOME.items():
-        if name in names.split():
-            return getattr(importlib.import_module(f"{__name__}.{module}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "EndReason": ".end_reason",
+        "LiftSoft": ".tasks.lift_soft.task",
+        "LiftSoftConfig": ".tasks.lift_soft.task",
+        "LiftSoftEnv": ".tasks.lift_soft.task",
+        "LiftSoftVectorEnv": ".tasks.lift_soft.task",
+        "Parameter": ".parameters",
+        "PlaceInBin": ".tasks.place_in_bin.task",
+        "PlaceInBinConfig": ".tasks.place_in_bin.task",
+        "PlaceInBinEnv": ".tasks.place_in_bin.task",
+        "PlaceInBinVectorEnv": ".tasks.place_in_bin.task",
+        "PressSoft": ".tasks.press_soft.task",
+        "PressSoftConfig": ".tasks.press_soft.task",
+        "PressSoftEnv": ".tasks.press_soft.task",
+        "PressSoftVectorEnv": ".tasks.press_soft.task",
+        "PushSoft": ".tasks.push_soft.task",
+        "PushSoftConfig": ".tasks.push_soft.task",
+        "PushSoftEnv": ".tasks.push_soft.task",
+        "PushSoftVectorEnv": ".tasks.push_soft.task",
+        "RopeRoute": ".tasks.rope_route.task",
+        "RopeRouteConfig": ".tasks.rope_route.task",
+        "RopeRouteEnv": ".tasks.rope_route.task",
+        "RopeRouteVectorEnv": ".tasks.rope_route.task",
+        "RslRlVecEnv": ".adapters",
+        "Segment": ".observation",
+        "ShapeSoft": ".tasks.shape_soft.task",
+        "ShapeSoftConfig": ".tasks.shape_soft.config",
+        "ShapeSoftEnv": ".tasks.shape_soft.task",
+        "ShapeSoftVectorEnv": ".tasks.shape_soft.task",
+        "SkrlWrapper": ".adapters",
+        "SoftEnv": ".soft_env",
+        "SoftVectorEnv": ".soft_vector_env",
+        "StableBaselinesVecEnv": ".adapters",
+        "Task": ".task",
+        "TaskConfig": ".task_config",
+        "VectorEnvReport": ".check",
+        "check_vector_env": ".check",
+        "measure_throughput": ".throughput",
+        "rl_scene": ".presets",
+        "scripted_policy": ".scripted",
+    },
+)

@@ -6,8 +6,9 @@ when they are first used.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from softmode.lazy import lazy_names
 
 if TYPE_CHECKING:
     from softmode.robots.arm import ArmDescription, ArmIndices, GripperDescription, add_arm
@@ -35,20 +36,23 @@ __all__ = [
     "load",
 ]
 
-_HOME = {
-    "arm": "ArmDescription ArmIndices GripperDescription add_arm",
-    "assets": "available fetch",
-    "control": "ArmControlOptions ArmController",
-    "description": "JointDrive RobotDescription RobotGripper RobotIndices",
-    "loading": "load",
-    "soft_fingertips": "SoftFingertips add_soft_fingertips",
-}
-"""Names by the module that they come from."""
-
-
-def __getattr__(name: str) -> Any:
-    """Load a public name from its module."""
-    for module, names in _HOME.items():
-        if name in names.split():
-            return getattr(importlib.import_module(f"{__name__}.{module}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "ArmControlOptions": ".control",
+        "ArmController": ".control",
+        "ArmDescription": ".arm",
+        "ArmIndices": ".arm",
+        "GripperDescription": ".arm",
+        "JointDrive": ".description",
+        "RobotDescription": ".description",
+        "RobotGripper": ".description",
+        "RobotIndices": ".description",
+        "SoftFingertips": ".soft_fingertips",
+        "add_arm": ".arm",
+        "add_soft_fingertips": ".soft_fingertips",
+        "available": ".assets",
+        "fetch": ".assets",
+        "load": ".loading",
+    },
+)

@@ -54,7 +54,7 @@ class CompiledRobot:
 
     def __post_init__(self) -> None:
         """Check that every link has at most one hinge or slide."""
-        self.mujoco: Any = importlib.import_module("mujoco")
+        self.mujoco = importlib.import_module("mujoco")
         model = self.model
         self.joint_names = tuple(model.joint(j).name for j in range(model.njnt))
         scalar = (int(self.mujoco.mjtJoint.mjJNT_HINGE), int(self.mujoco.mjtJoint.mjJNT_SLIDE))

@@ -155,7 +155,7 @@ class RobotDescription:
 
     def _link_poses(self, joint_q: Sequence[float] | None = None) -> dict[str, wp.transformd]:
         """Return the pose of every link in the base frame; the home pose's if no coordinates are given."""
-        mujoco: Any = importlib.import_module("mujoco")
+        mujoco = importlib.import_module("mujoco")
         model = mujoco.MjModel.from_xml_string(self.mjcf)
         data = mujoco.MjData(model)
         data.qpos[:] = model.qpos0 + np.asarray(self.home if joint_q is None else joint_q, float)

@@ -117,7 +117,7 @@ def _locate(source: str | Path, asset_root: str | Path | None, download: bool) -
 
 def _read(asset: RobotAsset) -> Any:
     """Return the editable MuJoCo specification of a file whose references have been checked."""
-    mujoco: Any = importlib.import_module("mujoco")
+    mujoco = importlib.import_module("mujoco")
     tree = read_xml(asset.path)
     try:
         if tree.tag == "robot":

@@ -92,6 +92,6 @@ def add_soft_fingertips(
 def _link_poses(builder: newton.ModelBuilder) -> list[wp.transform]:
     """Return where the joint coordinates of a builder put its bodies."""
     model: Any = builder.finalize(device="cpu")
-    state: Any = model.state()
+    state = model.state()
     newton.eval_fk(model, model.joint_q, model.joint_qd, state)
     return [wp.transform(*pose) for pose in state.body_q.numpy()]

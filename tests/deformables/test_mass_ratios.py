@@ -102,7 +102,7 @@ def test_solve_foresees_what_mujoco_does(rigid, height, cone, jacobian):
     error, change, rows = 0.0, 0.0, 0
     for _ in range(30):
         scene.step()
-        if solver.any_pushed.numpy()[0]:
+        if solver._any_pushed.numpy()[0]:
             velocity = scene.state.joint_qd.numpy()
             error = max(error, np.abs(solver.reduced.tables.rigid.table.r.numpy()[0] / scene.dt - velocity).max())
             change = max(change, np.abs(velocity - solver.predicted_state.joint_qd.numpy()).max())
@@ -362,7 +362,7 @@ def test_worlds_of_several_articulations():
         for _ in range(15):
             replay()
         arrays = scene.state.softmode.q, scene.state.joint_q, scene.state.joint_qd, scene.state.body_q
-        return [array.numpy().reshape(len(worlds), -1) for array in arrays], scene.solver.pushed.numpy().copy()
+        return [array.numpy().reshape(len(worlds), -1) for array in arrays], scene.solver._pushed.numpy().copy()
 
     every, _ = run(workshop(64), range(64))
     for i in (4, 63):
@@ -389,7 +389,7 @@ def test_untouched_world_among_touched():
         scene.step()
         free.step(state, following, None, None, scene.dt)
         state, following = following, state
-    assert list(scene.solver.pushed.numpy()) == [1, 0]
+    assert list(scene.solver._pushed.numpy()) == [1, 0]
     np.testing.assert_array_equal(scene.state.body_q.numpy()[1], state.body_q.numpy()[1])
     np.testing.assert_array_equal(scene.state.body_qd.numpy()[1], state.body_qd.numpy()[1])
     assert list(scene.reduced.tables.rigid.table.count.numpy()) == [6, 0]

@@ -10,7 +10,7 @@ import pytest
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, lift_scene
-from softmode.errors import AssetError, ConfigError
+from softmode.errors import AssetError, ConfigError, StorageError
 from softmode.objects import ObjectConfig, load
 from softmode.splats.formats import write_splats
 from softmode.view.coordinates import coordinates
@@ -502,8 +502,8 @@ def test_a_video_shows_the_object(hanging, tmp_path):
 def test_recordings_that_cannot_be(hanging, tmp_path):
     """Wrong names and places are refused, nothing to stop is said, and a closed session leaves nothing behind."""
     (tmp_path / "folder.npz").mkdir()
-    for wrong in (tmp_path / "poke.gif", tmp_path / "folder.npz"):
-        with pytest.raises(ConfigError, match="recording"):
+    for wrong, error in ((tmp_path / "poke.gif", ConfigError), (tmp_path / "folder.npz", StorageError)):
+        with pytest.raises(error, match="recording"):
             hanging.start_recording(wrong)
     with pytest.raises(ConfigError, match="edge"):
         hanging.start_recording(tmp_path / "poke.mp4", edge=7)

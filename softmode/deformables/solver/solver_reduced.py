@@ -27,6 +27,7 @@ from softmode.deformables.solver.reduced_solver import ReducedSolver
 from softmode.deformables.solver.step_checks import check_step
 from softmode.deformables.solver.step_tables import allocate_tables
 from softmode.errors import ConfigError
+from softmode.versions import warn_untested
 
 __all__ = [
     "SolverReduced",
@@ -65,6 +66,7 @@ class SolverReduced(ReducedSolver):
         rigid: RigidDofs | None = None,
     ) -> None:
         """Allocate the tables; see the class."""
+        warn_untested()
         if not hasattr(model, NAMESPACE):
             raise ConfigError("model holds no reduced body", hint="call add_reduced_body before finalize")
         rigid = rigid or RigidDofs.prescribed(model)

@@ -234,7 +234,7 @@ def _build_layer(frames: list[Splats], fps: float) -> Any:
 
 def define_splats(stage: Any, path: str, sh_degree: int) -> Any:
     """Define a `ParticleField3DGaussianSplat` without values on a stage and return it."""
-    UsdVol: Any = importlib.import_module("pxr.UsdVol")
+    UsdVol = importlib.import_module("pxr.UsdVol")
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         raise MissingExtraError(
             "the installed usd-core has no ParticleField3DGaussianSplat",
@@ -278,8 +278,8 @@ def set_splat_column(
         time_code: When; None for always.
         half: Author the variant of half precision, `positionsh` beside `positions`; an extent has none.
     """
-    Usd: Any = importlib.import_module("pxr.Usd")
-    Vt: Any = importlib.import_module("pxr.Vt")
+    Usd = importlib.import_module("pxr.Usd")
+    Vt = importlib.import_module("pxr.Vt")
     half = half and name != "extent"
     kind = {"orientations": "Quat{}Array", "opacities": "{}Array"}.get(name, "Vec3{}Array")
     number = ("Half" if half else "Float") if name == "opacities" else ("h" if half else "f")
