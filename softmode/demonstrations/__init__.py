@@ -28,17 +28,4 @@ __all__ = [
     "record_episodes",
 ]
 
-__getattr__, __dir__ = lazy_names(
-    __name__,
-    {
-        "Dataset": ".reader",
-        "DatasetWriter": ".writer",
-        "Episode": ".episode",
-        "Feature": ".schema",
-        "Recorded": ".recording",
-        "environment_features": ".recording",
-        "observation_columns": ".recording",
-        "read_dataset": ".reader",
-        "record_episodes": ".recording",
-    },
-)
+__getattr__, __dir__ = lazy_names(__name__)

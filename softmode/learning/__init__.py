@@ -37,23 +37,4 @@ __all__ = [
     "write_checkpoint",
 ]
 
-__getattr__, __dir__ = lazy_names(
-    __name__,
-    {
-        "ActorCritic": ".networks",
-        "Checkpoint": ".checkpoints",
-        "Evaluation": ".policy",
-        "Hyperparameters": ".hyperparameters",
-        "Policy": ".policy",
-        "TrainOptions": ".train_options",
-        "TrainResult": ".train_options",
-        "evaluate": ".policy",
-        "load_policy": ".policy",
-        "make_vector_env": ".environments",
-        "policy_factory": ".players",
-        "preset": ".hyperparameters",
-        "read_checkpoint": ".checkpoints",
-        "train": ".trainer",
-        "write_checkpoint": ".checkpoints",
-    },
-)
+__getattr__, __dir__ = lazy_names(__name__)

@@ -52,28 +52,4 @@ __all__ = [
     "write_object",
 ]
 
-__getattr__, __dir__ = lazy_names(
-    __name__,
-    {
-        "BEAM": ".presets",
-        "BEAM_MATERIAL": ".presets",
-        "CUBE": ".presets",
-        "CUBE_MATERIAL": ".presets",
-        "FitOptions": ".mesh_fit",
-        "MeshFit": ".mesh_fit",
-        "ObjectConfig": ".config",
-        "PAD": ".presets",
-        "PAD_MATERIAL": ".presets",
-        "Placed": ".placed",
-        "ROPE": ".presets",
-        "ROPE_MATERIAL": ".presets",
-        "SoftObject": ".soft_object",
-        "StifferBox": ".object_build",
-        "build_object": ".object_build",
-        "load": ".loader",
-        "read_mesh": ".mesh_file",
-        "splats_from_mesh": ".mesh_fit",
-        "surface_cover": ".object_file",
-        "write_object": ".object_file",
-    },
-)
+__getattr__, __dir__ = lazy_names(__name__)

@@ -36,23 +36,4 @@ __all__ = [
     "load",
 ]
 
-__getattr__, __dir__ = lazy_names(
-    __name__,
-    {
-        "ArmControlOptions": ".control",
-        "ArmController": ".control",
-        "ArmDescription": ".arm",
-        "ArmIndices": ".arm",
-        "GripperDescription": ".arm",
-        "JointDrive": ".description",
-        "RobotDescription": ".description",
-        "RobotGripper": ".description",
-        "RobotIndices": ".description",
-        "SoftFingertips": ".soft_fingertips",
-        "add_arm": ".arm",
-        "add_soft_fingertips": ".soft_fingertips",
-        "available": ".assets",
-        "fetch": ".assets",
-        "load": ".loading",
-    },
-)
+__getattr__, __dir__ = lazy_names(__name__)

@@ -36,23 +36,4 @@ __all__ = [
     "splats_of_states",
 ]
 
-__getattr__, __dir__ = lazy_names(
-    __name__,
-    {
-        "BoundSplats": ".binding",
-        "Fixture": ".fixture",
-        "Record": ".splat_scene",
-        "Scene": ".scene",
-        "SceneMesh": ".meshes",
-        "SplatFrame": ".binding",
-        "SplatScene": ".splat_scene",
-        "TableScene": ".table_scene",
-        "TableSceneConfig": ".table_scene",
-        "add_fixture": ".fixture",
-        "capture_graph": ".capture",
-        "capture_step": ".capture",
-        "scene_meshes": ".meshes",
-        "scene_poses": ".meshes",
-        "splats_of_states": ".binding",
-    },
-)
+__getattr__, __dir__ = lazy_names(__name__)

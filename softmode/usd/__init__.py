@@ -31,20 +31,4 @@ __all__ = [
     "write_usd",
 ]
 
-__getattr__, __dir__ = lazy_names(
-    __name__,
-    {
-        "PlayedBody": ".playback",
-        "UsdAnimation": ".animation",
-        "UsdAnimationOptions": ".animation",
-        "UsdDeformable": "softmode.objects.stage_scene",
-        "UsdExportOptions": ".writer",
-        "UsdImport": ".importer",
-        "UsdPlayback": ".playback",
-        "UsdScene": "softmode.objects.stage_scene",
-        "add_usd": ".importer",
-        "read_animation": ".playback",
-        "read_usd_scene": "softmode.objects.stage_scene",
-        "write_usd": ".writer",
-    },
-)
+__getattr__, __dir__ = lazy_names(__name__)

@@ -37,19 +37,4 @@ __all__ = [
     "ViewOptions",
 ]
 
-__getattr__, __dir__ = lazy_names(
-    __name__,
-    {
-        "DragView": ".live_types",
-        "Energies": ".live_types",
-        "Hit": ".live_types",
-        "LiveOptions": ".live_types",
-        "LiveParameters": ".live_types",
-        "LiveSession": ".session",
-        "LiveStatus": ".live_types",
-        "PinView": ".live_types",
-        "SplatPicture": ".live_types",
-        "ViewApp": ".app",
-        "ViewOptions": ".app",
-    },
-)
+__getattr__, __dir__ = lazy_names(__name__)

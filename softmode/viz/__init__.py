@@ -24,13 +24,4 @@ __all__ = [
     "write_body_picture",
 ]
 
-__getattr__, __dir__ = lazy_names(
-    __name__,
-    {
-        "Film": ".film",
-        "RerunLogger": ".rerun_logger",
-        "RerunOptions": ".rerun_options",
-        "RerunScene": ".rerun_sources",
-        "write_body_picture": ".body_picture",
-    },
-)
+__getattr__, __dir__ = lazy_names(__name__)
