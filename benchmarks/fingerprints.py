@@ -78,14 +78,12 @@ def episode(task: str) -> dict[str, str]:
 
 def scripted(task: str) -> str:
     """Return a hash of a scripted episode: every whole observation and reward."""
-    import importlib
+    from softmode.envs.scripted import scripted_policy
 
     env: Any = gym.make(f"softmode/{task}-v0", device="cpu")
-    for module in ("softmode.envs.scripted",):
-        policy = importlib.import_module(module).scripted_policy
     numbers = hashlib.sha256()
     observation, _ = env.reset(seed=3)
-    play, done = policy(env), False
+    play, done = scripted_policy(env), False
     while not done:
         observation, reward, terminated, truncated, _ = env.step(play(observation))
         values = observation.values() if isinstance(observation, dict) else (observation,)

@@ -55,13 +55,18 @@ def require_number(
         return
     unit = f" {unit}" if unit else ""
     if at_least is not None and at_most is not None:
-        wanted = f"lie in {at_least:g}..{at_most:g}{unit}"
+        wanted = f"lie in {_written(at_least)}..{_written(at_most)}{unit}"
     elif isinstance(at_least, int) and isinstance(value, int) and below is None:
         wanted = f"be at least {at_least}{unit}"
     else:
-        bounds = " and".join(f"{sign}{limit:g}" for limit, sign, _ in limits if limit is not None)
+        bounds = " and".join(f"{sign}{_written(limit)}" for limit, sign, _ in limits if limit is not None)
         wanted = f"be a finite number{bounds}{unit}"
     raise error(f"{name} must {wanted}, got {value!r}", hint=hint)
+
+
+def _written(limit: float) -> str:
+    """Return a limit as messages show it; a whole number with all of its digits."""
+    return str(limit) if isinstance(limit, int) else f"{limit:g}"
 
 
 def require_fields(owner: Any, names: Iterable[str], *, count: int | None = None, **limits: Any) -> None:

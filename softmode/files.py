@@ -163,6 +163,26 @@ def whole_file(path: str | os.PathLike[str], what: str = "file", *, make_folders
 # -- archives ---------------------------------------------------------------------------------------------------------
 
 
+@contextlib.contextmanager
+def damage_errors(what: str, *, hint: str, error: type[SoftmodeError] = AssetError) -> Iterator[None]:
+    """Turn whatever reading an .npz in a block raises into one typed error.
+
+    Args:
+        what: The file, for the message.
+        hint: The remedy.
+        error: What is raised.
+
+    Raises:
+        AssetError: Or ``error``, if the block raises anything.
+    """
+    try:
+        yield
+    except FileNotFoundError as caught:
+        raise error(f"{what}: does not exist", hint=hint) from caught
+    except Exception as caught:  # zlib, struct and zipfile errors of a damaged archive have no common base
+        raise error(f"{what}: damaged or no .npz ({type(caught).__name__}: {caught})", hint=hint) from caught
+
+
 def write_archive(
     path: str | os.PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], what: str = "archive"
 ) -> None:
@@ -207,13 +227,9 @@ def read_archive(
     Raises:
         AssetError: Or ``error``, if the file is missing, damaged, of another kind or of another version.
     """
-    try:
+    with damage_errors(f"{what} {path}", hint=hint, error=error):
         arrays = _stored_arrays(Path(path))
         header = json.loads(arrays.pop("header").tobytes()) if "header" in arrays else None
-    except FileNotFoundError as caught:
-        raise error(f"{what} {path}: does not exist", hint=hint) from caught
-    except Exception as caught:  # zlib, struct and zipfile errors of a damaged archive have no common base
-        raise error(f"{what} {path}: damaged or no .npz ({type(caught).__name__}: {caught})", hint=hint) from caught
     if not isinstance(header, dict) or header.pop("format", None) != kind:
         raise error(f"{what} {path}: not a {kind}", hint=hint)
     if (found := header.pop("version", None)) != version:
@@ -241,13 +257,8 @@ def read_arrays(
     Raises:
         AssetError: Or ``error``, if the file is missing, damaged or no .npz.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files if names is None or name in names}
-    except FileNotFoundError as caught:
-        raise error(f"{what} {path}: does not exist", hint=hint) from caught
-    except Exception as caught:  # as above
-        raise error(f"{what} {path}: damaged or no .npz ({type(caught).__name__}: {caught})", hint=hint) from caught
+    with damage_errors(f"{what} {path}", hint=hint, error=error), np.load(path, allow_pickle=False) as file:
+        return {name: file[name] for name in file.files if names is None or name in names}
 
 
 def _stored_arrays(path: Path) -> dict[str, NDArray[Any]]:

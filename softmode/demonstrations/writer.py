@@ -105,7 +105,7 @@ class DatasetWriter:
                     self._continue()
                 shutil.rmtree(self._root / STAGE, ignore_errors=True)
         except BaseException:
-            self.close()
+            self._release()
             raise
         self._begin()
 
@@ -334,9 +334,11 @@ class DatasetWriter:
 
     def close(self) -> None:
         """Drop what belongs to no saved episode and let go of the folder; harmless twice."""
-        episode = getattr(self, "_episode", None)  # none yet if the folder could not be opened
-        if episode is not None:
-            episode.abort()
+        self._episode.abort()
+        self._release()
+
+    def _release(self) -> None:
+        """Let go of the folder, and remove what was made and not completed."""
         if self._lock is not None:
             shutil.rmtree(self._root if self._is_new else self._root / STAGE, ignore_errors=True)
             os.close(self._lock)

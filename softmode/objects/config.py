@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from softmode.checks import require_fields, require_number
+from softmode.checks import require_choice, require_fields, require_number
 from softmode.deformables.build.options import BuildOptions
 from softmode.errors import ConfigError
 from softmode.objects.parts import Part
@@ -78,10 +78,8 @@ class ObjectConfig:
         if self.crop is not None and not all(a < b for a, b in zip(self.crop[:3], self.crop[3:], strict=True)):
             raise ConfigError(f"crop {self.crop} is empty", hint="give x0 y0 z0 x1 y1 z1 with every 0 below its 1")
         for name, known in (("shape", Shape), ("up", UpAxis), ("part", Part), ("pose", Pose)):
-            if getattr(self, name) not in (*get_args(known), *((None,) if name == "up" else ())):
-                raise ConfigError(
-                    f"{name} is {getattr(self, name)!r}", hint=f"use one of {', '.join(map(repr, get_args(known)))}"
-                )
+            if name != "up" or self.up is not None:
+                require_choice(name, getattr(self, name), get_args(known))
         files = (self.splat, self.mesh, self.body)
         if sum(file is not None for file in files) + (self.shape != "plush") > 1:
             raise ConfigError(

@@ -10,6 +10,7 @@ import numpy as np
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.errors import AssetError
+from softmode.files import damage_errors
 from softmode.objects.soft_object import SoftObject
 from softmode.splats.formats import READABLE
 from softmode.splats.point_cloud import ply_kind, splats_from_points
@@ -67,13 +68,8 @@ def file_kind(path: str | os.PathLike[str]) -> FileKind:
         raise AssetError(f"file {file}: no such file", hint="check the path")
     suffix = file.suffix.lower()
     if suffix == ".npz":
-        try:
-            with np.load(file, allow_pickle=False) as stored:
-                return "points" if "points" in stored.files and "header" not in stored.files else "body"
-        except Exception as error:  # whatever a damaged archive leads zipfile, zlib and numpy to
-            raise AssetError(
-                f"file {file}: damaged or not an .npz ({type(error).__name__}: {error})", hint="build or write it again"
-            ) from error
+        with damage_errors(f"file {file}", hint="build or write it again"), np.load(file, allow_pickle=False) as stored:
+            return "points" if "points" in stored.files and "header" not in stored.files else "body"
     if suffix == ".ply":
         found = ply_kind(file)
         return "splat" if found == "splats" else "mesh" if found == "mesh" else "points"

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from softmode.deformables.model.authoring import NAMESPACE
+from softmode.deformables.model.namespaces import soft
 from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.deformables.skinning.skinning_kernels import vec6
 from softmode.errors import ConfigError
@@ -92,7 +92,7 @@ class BoundSplats:
 
     def update(self, state: newton.State) -> None:
         """Move the splats to where a state of the model has them; capturable after a first time."""
-        self.move(getattr(state, NAMESPACE).q)
+        self.move(soft(state).q)
 
     def move(self, q: wp.array) -> None:
         """Move the splats by the coordinates q of all instances [m], flat vec3d; capturable after a first time."""
@@ -137,12 +137,12 @@ def _function_starts(model: newton.Model, count: int, worlds: Sequence[int] | No
     Raises:
         ConfigError: If the worlds do not hold that many.
     """
-    data = getattr(model, NAMESPACE)
+    data = soft(model)
     owner, every = data.instance_world.numpy(), max(int(model.world_count), 1)
     if len(owner) != every * count or (every > 1 and not np.array_equal(owner, np.repeat(np.arange(every), count))):
         raise ConfigError(
             f"objects names {count} soft bodies, the model has {len(owner)} in {every} worlds",
             hint="give one object, or None, per soft body of a world, in the order in which they were added",
         )
-    starts = data.function_start.numpy().reshape(every, count)
+    starts = np.asarray(data.function_start.numpy(), dtype=np.int32).reshape(every, count)
     return starts if worlds is None else starts[list(worlds)]

@@ -8,12 +8,6 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
-from softmode.deformables.solver.solver_reduced import SolverReduced
-
-Solver = SolverReduced | SolverCoupledReduced
-"""What moves soft bodies."""
-
 
 def host(array: wp.array | None) -> NDArray[Any]:
     """Return what an array of a model or a state holds, on the host; nothing for one that is not there."""

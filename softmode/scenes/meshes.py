@@ -12,7 +12,6 @@ from newton import GeoType, ShapeFlags
 from numpy.typing import NDArray
 
 from softmode.checks import require_number
-from softmode.errors import ConfigError
 from softmode.scenes.host import host
 from softmode.splats.splats import rotations_from_quats
 
@@ -73,8 +72,7 @@ def scene_meshes(model: newton.Model, *, world: int = 0, plane_extent: float = P
         ConfigError: If there is no such world, or ``plane_extent`` is not positive.
     """
     worlds = max(int(model.world_count), 1)
-    if not 0 <= world < worlds:
-        raise ConfigError(f"world must lie in 0..{worlds - 1}, got {world}")
+    require_number("world", world, at_least=0, at_most=worlds - 1)
     require_number("plane_extent", plane_extent, above=0.0, unit="m", hint="give metres, like 4.0")
     if model.shape_count == 0:
         return ()

@@ -7,10 +7,10 @@ from typing import Protocol
 
 import newton
 
+from softmode.deformables.solver.reduced_solver import ReducedSolver
 from softmode.deformables.tools.grips import Grips
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.binding import BoundSplats
-from softmode.scenes.host import Solver
 from softmode.splats.camera import CameraOptions, SplatCamera
 from softmode.splats.camera_randomization import CameraRandomization
 from softmode.splats.pinhole import PinholeCamera
@@ -39,7 +39,7 @@ class Scene(Protocol):
     """The cameras by the width and height of their pictures [px]."""
 
     @property
-    def solver(self) -> Solver:
+    def solver(self) -> ReducedSolver:
         """What moves it."""
         ...
 

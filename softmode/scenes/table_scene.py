@@ -16,7 +16,6 @@ from softmode.deformables.model.authoring import add_reduced_body, register_cust
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
-from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
 from softmode.objects.loader import Progress, load
 from softmode.objects.soft_object import SoftObject
@@ -106,8 +105,7 @@ class TableScene:
         progress: Progress = None,
     ) -> None:
         """Build model, solvers and controller, and capture the control step."""
-        if world_count < 1:
-            raise ConfigError(f"world_count must be at least 1, got {world_count}")
+        require_number("world_count", world_count, at_least=1)
         self.config = config
         self.world_count = world_count
         self.device = wp.get_device(device)

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from softmode.checks import require_number
 from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model.authoring import MATERIAL_FIELDS, body_key
@@ -110,8 +111,7 @@ class UsdAnimation:
         self.options = options or UsdAnimationOptions()
         self.model, self.world = model, world
         worlds = max(int(model.world_count), 1)
-        if not 0 <= world < worlds:
-            raise ConfigError(f"world must lie in 0..{worlds - 1}, got {world}")
+        require_number("world", world, at_least=0, at_most=worlds - 1)
         data = model.softmode
         self._instances = np.flatnonzero(np.isin(data.instance_world.numpy(), [-1, world])).tolist()
         found = [int(data.body_key.numpy()[i]) for i in self._instances]

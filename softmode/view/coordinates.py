@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.model.authoring import NAMESPACE
+from softmode.deformables.model.namespaces import soft
 from softmode.scenes.scene import Scene
 
 Array = NDArray[np.float64]
@@ -22,8 +22,8 @@ def coordinates(scene: Scene, name: Literal["q", "qd"], object_index: int = 0) -
         name: "q" for coordinates, "qd" for velocities.
         object_index: Which object.
     """
-    start = int(getattr(scene.model, NAMESPACE).function_start.numpy()[object_index])
-    values = getattr(getattr(scene.state, NAMESPACE), name).numpy()
+    start = int(soft(scene.model).function_start.numpy()[object_index])
+    values = getattr(soft(scene.state), name).numpy()
     return values[start : start + scene.objects[object_index].body.function_count].astype(np.float64)
 
 
@@ -36,7 +36,7 @@ def carry_over(scene: Scene, old: ReducedBody, q: Array, qd: Array) -> None:
         q: Its coordinates [m], shape (n, 3).
         qd: Their velocities [m/s], shape (n, 3).
     """
-    body, state = scene.objects[0].body, getattr(scene.state, NAMESPACE)
+    body, state = scene.objects[0].body, soft(scene.state)
     X = np.concatenate([old.surface_points, old.points])
     before, shift = old.evaluate(X)[0], old.offset - body.offset
     rows = body.evaluate(X + shift)[0]

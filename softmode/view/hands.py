@@ -150,9 +150,7 @@ class Hands:
     # -- inside -------------------------------------------------------------------------------------------------------
 
     def _grips(self, index: int) -> Grips:
-        count = len(self._scene.grips)
-        if not 0 <= index < count:
-            raise ConfigError(f"object_index must lie in 0..{count - 1}, got {index}")
+        require_number("object_index", index, at_least=0, at_most=len(self._scene.grips) - 1)
         return self._scene.grips[index]
 
     def _pin(self, pin: int) -> tuple[int, int]:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from softmode.checks import require_number
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
-from softmode.deformables.model.authoring import NAMESPACE
+from softmode.deformables.model.namespaces import soft
 from softmode.deformables.solver.parameters import PARAMETER_LIMITS, set_parameters
 from softmode.errors import ConfigError
 from softmode.scenes.host import host
@@ -49,7 +49,7 @@ def checked(gravity: float | ArrayLike | None, values: dict[str, float | None]) 
 
 def apply(scene: Scene, given: dict[str, Any]) -> None:
     """Write what was given into the model, for all objects; the captured steps follow."""
-    data, device = getattr(scene.model, NAMESPACE), scene.model.device
+    data, device = soft(scene.model), scene.model.device
     shape = data.friction.shape
     arrays = {name: wp.full(shape, given[name], dtype=float, device=device) for name in LIMITS if name in given}
     if arrays:
@@ -65,7 +65,7 @@ def apply(scene: Scene, given: dict[str, Any]) -> None:
 
 def present(scene: Scene) -> LiveParameters:
     """Return the values of the first object."""
-    data = getattr(scene.model, NAMESPACE)
+    data = soft(scene.model)
     values = {name: float(getattr(data, name).numpy()[0]) for name in LIMITS | DAMPING_LIMITS}
     x, y, z = (host(scene.model.gravity)[0] + 0.0).tolist()
     return LiveParameters(**values, gravity=(x, y, z), handles=scene.objects[0].body.mode_count)

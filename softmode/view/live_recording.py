@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.checks import require_number
-from softmode.deformables.model.authoring import NAMESPACE
+from softmode.deformables.model.namespaces import soft
 from softmode.errors import AssetError, ConfigError
 from softmode.files import read_arrays
 from softmode.scenes.scene import Scene
@@ -58,13 +58,13 @@ class LiveRecording:
             ConfigError: If it is of other objects, or has no such frame.
         """
         own = tuple(thing.body.fingerprint for thing in scene.objects)
-        if self.fingerprints != own or self.q.shape[1] != getattr(scene.state, NAMESPACE).q.shape[0]:
+        if self.fingerprints != own or self.q.shape[1] != soft(scene.state).q.shape[0]:
             raise ConfigError("the recording is of other objects", hint="open the objects that were recorded")
         require_number("index", index, at_least=0, at_most=len(self.times) - 1)
 
     def show(self, scene: Scene, index: int) -> None:
         """Put everything of a scene where a frame has it, at rest."""
-        state = getattr(scene.state, NAMESPACE)
+        state = soft(scene.state)
         state.q.assign(self.q[index])
         state.qd.zero_()
         state.dt_before.zero_()

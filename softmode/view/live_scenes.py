@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from softmode.checks import SEED_MAX, require_choice, require_number
 from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.materials.material import Material
 from softmode.deformables.tools.grips import GripOptions
@@ -71,8 +72,7 @@ class ObjectScene:
     ) -> None:
         """Build model and solver, capture a block."""
         for name, value, known in (("scene", scene, SceneName), ("hold", hold, HoldName)):
-            if value not in get_args(known):
-                raise ConfigError(f"{name} is {value!r}", hint=f"use one of {', '.join(map(repr, get_args(known)))}")
+            require_choice(name, value, get_args(known))
         thing, self.source, self._pin_points = found.object, found.object.config, options.pin_points
         self._hold: HoldName | None = hold if scene == "hang" else None
         self.marker: Splats | None = None
@@ -170,8 +170,7 @@ class EnvScene:
         kind = config_class(name)
         if config is not None and not isinstance(config, kind):
             raise ConfigError(f"config is a {type(config).__name__}", hint=f"{name} takes a {kind.__name__}")
-        if not 0 <= seed < 2**31:
-            raise ConfigError(f"seed must lie in 0..2147483647, got {seed!r}")
+        require_number("seed", seed, at_least=0, at_most=SEED_MAX)
         check_policy(policy)
         trained = None if policy in POLICIES else trained_policy(policy, name)
         given = dict(trained.env_options) if trained else {}

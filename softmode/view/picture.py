@@ -8,7 +8,7 @@ import newton
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.deformables.model.authoring import NAMESPACE
+from softmode.deformables.model.namespaces import soft
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.binding import BoundSplats
 from softmode.splats.splats import Splats, rotations_from_quats
@@ -40,7 +40,7 @@ class LivePicture:
         shown = [thing.visible_splats for thing in objects] + ([] if marker is None else [marker])
         self.colors = np.concatenate([splats.colors() for splats in shown])
         self.opacities = np.concatenate([splats.opacities for splats in shown]).astype(np.float32)
-        self._starts = getattr(model, NAMESPACE).function_start
+        self._starts = soft(model).function_start
         self._marker = None if marker is None else marker.covariances()
 
     def update(self, state: newton.State, marker_points: Array, marker_pose: Array) -> None:
@@ -118,7 +118,7 @@ class LivePicture:
         """Return the rest point [m] that a splat carries to a point, to first order about the splat's centre."""
         thing = self.objects[index]
         start = int(self._starts.numpy()[index])
-        q = getattr(state, NAMESPACE).q.numpy()[start : start + thing.body.function_count].astype(np.float64)
+        q = soft(state).q.numpy()[start : start + thing.body.function_count].astype(np.float64)
         X = thing.visible_splats.means[splat].astype(np.float64)
         x = X + thing.basis[splat] @ q
         F = np.eye(3) + q.T @ thing.grad_basis[splat]

@@ -11,7 +11,7 @@ import newton
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from softmode.deformables.model.authoring import NAMESPACE
+from softmode.deformables.model.namespaces import soft
 from softmode.errors import ConfigError, SolverDiverged
 from softmode.files import PendingFile
 from softmode.objects.soft_object import SoftObject
@@ -41,7 +41,7 @@ class CoordinateRecorder:
     def add(self, time: float, state: newton.State) -> None:
         """Take a frame."""
         poses = host(state.body_q).astype(np.float32).reshape(-1, 7)
-        self._frames.append((time, getattr(state, NAMESPACE).q.numpy().copy(), poses))
+        self._frames.append((time, np.array(soft(state).q.numpy(), dtype=np.float64), poses))
         self.count += 1
 
     def finish(self) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from softmode.checks import require_number
 from softmode.deformables.materials.material import Material
-from softmode.deformables.model.authoring import NAMESPACE
+from softmode.deformables.model.namespaces import soft
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.energies import SoftEnergies
 from softmode.errors import ConfigError
@@ -245,7 +245,7 @@ class LiveSession:
     def surface(self, object_index: int = 0) -> NDArray[np.float64]:
         """Return the surface samples of an object as they are now [m], shape (S, 3)."""
         count = self._object(object_index).body.surface_count
-        start = int(getattr(self._scene.model, NAMESPACE).particle_start.numpy()[object_index])
+        start = int(soft(self._scene.model).particle_start.numpy()[object_index])
         return host(self._scene.state.particle_q)[start : start + count].astype(np.float64)
 
     def centre(self, object_index: int = 0) -> NDArray[np.float64]:
@@ -529,6 +529,5 @@ class LiveSession:
 
     def _object(self, index: int) -> SoftObject:
         objects = self._scene.objects
-        if not 0 <= index < len(objects):
-            raise ConfigError(f"object_index must lie in 0..{len(objects) - 1}, got {index}")
+        require_number("object_index", index, at_least=0, at_most=len(objects) - 1)
         return objects[index]

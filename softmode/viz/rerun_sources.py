@@ -12,9 +12,9 @@ import numpy as np
 import warp as wp
 
 from softmode.deformables.model.status import status_reasons
+from softmode.deformables.solver.reduced_solver import ReducedSolver
 from softmode.errors import ConfigError
 from softmode.objects.soft_object import SoftObject
-from softmode.scenes.host import Solver
 from softmode.scenes.splat_scene import SplatScene
 from softmode.scenes.table_scene import TableScene
 from softmode.splats.camera import SplatCamera
@@ -33,7 +33,7 @@ class RerunScene:
 
     model: newton.Model
     """The model."""
-    solver: Solver
+    solver: ReducedSolver
     """What moves its soft bodies."""
     objects: Sequence[SoftObject | None] = ()
     """The soft bodies of a world in the order in which they were added, None for one without splats."""
@@ -205,7 +205,7 @@ Source = SceneSource | TaskSource
 """What a logger reads: model, solver and objects, the present moment, pictures, the marker of a goal, numbers, text."""
 
 
-def solver_scalars(solver: Solver, world: int) -> Numbers:
+def solver_scalars(solver: ReducedSolver, world: int) -> Numbers:
     """Return iterations of the last step and the status bits of a world."""
     return {
         "solver/iterations": float(solver.iteration.numpy()[world]),
@@ -213,7 +213,7 @@ def solver_scalars(solver: Solver, world: int) -> Numbers:
     }
 
 
-def solver_remarks(solver: Solver, world: int) -> list[tuple[str, str]]:
+def solver_remarks(solver: ReducedSolver, world: int) -> list[tuple[str, str]]:
     """Return the names of the status bits that are set."""
     reasons = status_reasons(int(solver.status.numpy()[world]))
     return [("WARN", f"solver: {', '.join(reasons)}")] if reasons else []

@@ -25,8 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 from softmode.checks import require_fields, require_number
 from softmode.deformables.gradients import adjoint_kernels as kernels
 from softmode.deformables.gradients.krylov import Gmres
-from softmode.deformables.model.authoring import NAMESPACE
 from softmode.deformables.model.lane_kernels import vec8d
+from softmode.deformables.model.namespaces import soft
 from softmode.deformables.model.status import WORLD_NOT_FINITE
 from softmode.deformables.model.struct_kernels import PointConstraints, Points
 from softmode.deformables.solver.detect import adapt
@@ -203,7 +203,7 @@ class AdjointReduced:
         """Forget the record and begin a new one at ``state``."""
         self.dt = []
         self.generation += 1
-        data = getattr(state, NAMESPACE)
+        data = soft(state)
         wp.copy(self._q[0], data.q_before)
         wp.copy(self._qd[0], data.qd_before)
         self._copy_state(state, 0)
@@ -244,7 +244,7 @@ class AdjointReduced:
 
     def _copy_state(self, state: newton.State, t: int) -> None:
         """Keep the state of time t."""
-        data = getattr(state, NAMESPACE)
+        data = soft(state)
         wp.copy(self._q[t + 1], data.q)
         wp.copy(self._qd[t + 1], data.qd)
         wp.copy(self._dt_before[t], data.dt_before)
@@ -374,7 +374,7 @@ class AdjointReduced:
     def _restore(self, t: int) -> None:
         """Put recorded step t back into the solver, evaluate it at its root and factor the solver's matrix there."""
         solver, dt = self.solver, self.dt[t]
-        data = getattr(self._state, NAMESPACE)
+        data = soft(self._state)
         for name, rows in (("q", self._q), ("qd", self._qd)):
             wp.copy(getattr(data, name), rows[t + 1])
             wp.copy(getattr(data, f"{name}_before"), rows[t])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from softmode.deformables.gradients.adjoint import AdjointReduced
-from softmode.deformables.model.authoring import NAMESPACE
+from softmode.deformables.model.namespaces import soft
 from softmode.errors import ConfigError, MissingExtraError
 
 if TYPE_CHECKING:
@@ -65,11 +65,11 @@ def _function() -> Any:
             given = {name: value for name, value in zip(INPUTS, values, strict=True) if value is not None}
             model = adjoint.solver.model
             for name in given.keys() & set(INSTANCE_PARAMETERS):
-                wp.copy(getattr(getattr(model, NAMESPACE), name), view(given[name], adjoint, wp.float32))
+                wp.copy(getattr(soft(model), name), view(given[name], adjoint, wp.float32))
             adjoint.solver.notify_model_changed(0)
             state, after, control = model.state(), model.state(), model.control()
             for name in given.keys() & {"q", "qd"}:
-                wp.copy(getattr(getattr(state, NAMESPACE), name), view(given[name], adjoint))
+                wp.copy(getattr(soft(state), name), view(given[name], adjoint))
             paths: dict[str, Any] = {
                 name: view(given[name], adjoint) for name in given.keys() & {"pin_target", "q_driven", "force"}
             }
@@ -79,7 +79,7 @@ def _function() -> Any:
             adjoint.start(state)
             for t in range(step_count):
                 for name in paths.keys() & {"pin_target", "q_driven"}:
-                    wp.copy(getattr(getattr(control, NAMESPACE), name), paths[name][t])
+                    wp.copy(getattr(soft(control), name), paths[name][t])
                 adjoint.step(state, after, control, dt, force=paths["force"][t] if "force" in paths else None)
                 state, after = after, state
             ctx.adjoint, ctx.generation = adjoint, adjoint.generation
