@@ -373,7 +373,7 @@ def remembered_slip(
     slip = wp.vec3d()
     for k in range(SLOTS):
         if stick_shape[particle][k] == shape:
-            point = wp.vec3d(stick_point[particle][k, 0], stick_point[particle][k, 1], stick_point[particle][k, 2])
+            point = stick_point[particle][k]
             slip = wp.quat_rotate(rotation, point)
             if prescribed == 0:
                 slip = x - origin - slip

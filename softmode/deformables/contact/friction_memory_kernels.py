@@ -47,9 +47,7 @@ def remember_slip(
         stretch = constraints.stick[i, e] * wp.length(total)
         if not wp.isfinite(stretch + limit):
             continue
-        elastic = total
-        if stretch > limit:
-            elastic = limit / stretch * total
+        elastic = wp.where(stretch > limit, limit / stretch * total, total)
         point = constraints.anchor[i, e]
         if prescribed != 0:
             point = wp.quat_rotate_inv(rotation, elastic)
@@ -59,8 +57,7 @@ def remember_slip(
             slid = samples.position[i, s] - before + total - elastic
             point = wp.quat_rotate_inv(rotation, slid - origin)
         stuck[slot] = shape
-        for axis in range(3):
-            points[slot, axis] = point[axis]
+        points[slot] = point
     particle = instances.particle_start[i] + s
     stick_shape_out[particle] = stuck
     stick_point_out[particle] = points

@@ -119,10 +119,8 @@ def gradient_at(instances: Instances, basis: Basis, motion: Motion, i: int, s: i
 @wp.func
 def cofactor(F: wp.mat33d):
     """Return cof F = det(F) F^-T, whose columns are the cross products of those of F."""
-    a = wp.vec3d(F[0, 0], F[1, 0], F[2, 0])
-    b = wp.vec3d(F[0, 1], F[1, 1], F[2, 1])
-    c = wp.vec3d(F[0, 2], F[1, 2], F[2, 2])
-    return wp.matrix_from_cols(wp.cross(b, c), wp.cross(c, a), wp.cross(a, b))
+    T = wp.transpose(F)
+    return wp.matrix_from_cols(wp.cross(T[1], T[2]), wp.cross(T[2], T[0]), wp.cross(T[0], T[1]))
 
 
 @wp.func
@@ -513,10 +511,7 @@ def write_pairs(
     particle = instances.particle_start[i] + s
     for before in range(SLOTS):
         if stick_partner[particle][before] == j - state.instance_start[instances.world[i]]:
-            slip = wp.vec3d()
-            for axis in range(3):
-                slip[axis] = stick_slip[particle][before, axis]
-            slip = gradient_at(instances, basis, motion, i, s) * slip
+            slip = gradient_at(instances, basis, motion, i, s) * stick_slip[particle][before]
             offset += slip - wp.dot(n, slip) * n
     pairs.held[i, s, slot] = pairs.constraint[i, k]
     for side in range(2):
@@ -577,8 +572,7 @@ def remember_pairs(
         F = gradient_at(instances, basis, motion, i, s)
         elastic = clamped_inverse(F, instances.scale[i]) * (wp.min(wp.float64(1.0), limit / stretch) * total)
         partner[slot] = pairs.other[i, s, slot] - state.instance_start[instances.world[i]]
-        for axis in range(3):
-            slips[slot, axis] = elastic[axis]
+        slips[slot] = elastic
     particle = instances.particle_start[i] + s
     stick_partner_out[particle] = partner
     stick_slip_out[particle] = slips

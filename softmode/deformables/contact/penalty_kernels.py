@@ -17,17 +17,11 @@ doi:10.1145/3386569.3392425, eq. 13), mu f_n f0(|d_t|), which creeps.
 
 import warp as wp
 
-from softmode.deformables.model.declare import kernel_over
-from softmode.deformables.model.lane_kernels import vec8d
 from softmode.deformables.model.struct_kernels import (
-    Basis,
     Instances,
-    Motion,
     NewtonState,
     PointConstraints,
-    Rigid,
     first_coupled,
-    interpolate_change,
     p_wave_modulus,
 )
 
@@ -132,90 +126,6 @@ def stiffness_per_area(instances: Instances, i: int, partner_mass: float, partne
         mass *= partner_mass / (mass + partner_mass)
     inertia = mass / (wp.min(instances.area[i], partner_area) * dt * dt)
     return wp.max(wp.max(BULK_FACTOR * wave / instances.size[i], INERTIA_FACTOR * inertia), STIFFNESS_FLOOR)
-
-
-@wp.func
-def evaluate_constraint(
-    instances: Instances,
-    basis: Basis,
-    motion: Motion,
-    state: NewtonState,
-    rigid: Rigid,
-    stick_range: wp.float64,  # eps of the friction potential for this step [m]
-    # State in:
-    selected: wp.array[int],
-    q: wp.array2d[vec8d],
-    r: wp.array2d[wp.float64],
-    derivatives: int,
-    # In and out:
-    constraints: PointConstraints,
-    i: int,
-    e: int,
-):
-    """Evaluate pins and contacts at displacement d = sum_k b_k (q_k - q_nk) - J r, less that of a soft partner.
-
-    A contact of two soft bodies is a constraint of each, which has one half of its energy and all of its force.
-    """
-    w = instances.world[i]
-    if selected[w] == 0 or e >= constraints.count[i]:
-        return
-    d = interpolate_change(basis.row, constraints.row[i, e], q, motion.q_start, i, instances.function_count[i])
-    smoothing = instances.smoothing[i]
-    share = wp.float64(1.0)
-    if e >= constraints.count[i] - constraints.pair_count[i]:
-        j = constraints.partner[i, e]
-        if j >= 0:
-            d -= interpolate_change(
-                basis.row, constraints.partner_row[i, e], q, motion.q_start, j, instances.function_count[j]
-            )
-            smoothing = wp.min(smoothing, instances.smoothing[j])
-            share = wp.float64(0.5)
-    for k in range(constraints.dof_begin[i, e], constraints.dof_end[i, e]):
-        d -= r[w, k] * wp.vec3d(constraints.jacobian[i, e, k])
-    stiffness = constraints.stiffness[i, e]
-    identity = wp.identity(n=3, dtype=wp.float64)
-    H = stiffness * identity
-    if e < instances.pin_count[i]:
-        x = constraints.offset[i, e] + d
-        constraints.energy[i, e] = wp.float64(0.5) * stiffness * wp.length_sq(x)
-        constraints.force[i, e] = -stiffness * x
-    else:
-        n = constraints.normal[i, e]
-        total = constraints.offset[i, e] + d
-        psi, slope, curvature = normal_potential(-wp.dot(n, total), wp.float64(smoothing))
-        if derivatives != 0 and state.iteration[w] <= state.friction_lag:
-            held = slope
-            if state.iteration[w] == 0:
-                # in an impact the first guess lies far too deep: friction of such a force would be too stiff to solve
-                deep = wp.float64(smoothing) - wp.float64(2.0) * wp.min(
-                    wp.dot(n, constraints.offset[i, e]), wp.float64(0.0)
-                )
-                _psi, most, _curvature = normal_potential(deep, wp.float64(smoothing))
-                held = wp.min(slope, most)
-            constraints.normal_force[i, e] = stiffness * held
-        normal_force = constraints.normal_force[i, e]
-        # offset = gap n + memory - drift of the shape: the tangential part is the slip
-        t = total - wp.dot(n, total) * n
-        y = wp.length(t)
-        limit = constraints.friction[i, e] * normal_force
-        stick = constraints.stick[i, e]
-        f0, secant, tangent = slip_potential(y, limit, stick, stick_range)
-        constraints.slip[i, e] = t
-        constraints.energy[i, e] = share * (stiffness * psi + f0)
-        constraints.force[i, e] = stiffness * slope * n - secant * t
-        # f0 is concave in y^2, so the quadratic of the secant's curvature lies above it and its steps cannot overshoot,
-        # from however far away; the potential's own curvature along the slip converges faster once the state is close
-        N = wp.outer(n, n)
-        H = stiffness * curvature * N + secant * (identity - N)
-        if state.exact[w] != 0 and y > wp.float64(1.0e-9) * stick_range:
-            H += (tangent - secant) / (y * y) * wp.outer(t, t)
-    if derivatives != 0:
-        constraints.hessian[i, e] = wp.mat33(H)
-        for k in range(constraints.dof_begin[i, e], constraints.dof_end[i, e]):
-            constraints.coupling[i, e, k] = wp.mat33(H) * constraints.jacobian[i, e, k]
-
-
-evaluate_constraints = kernel_over(evaluate_constraint, "evaluate_constraints", "i", "e")
 
 
 @wp.kernel

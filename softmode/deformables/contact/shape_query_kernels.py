@@ -21,18 +21,7 @@ _MESH = int(GeoType.MESH)
 _CONE = int(GeoType.CONE)
 _CONVEX_MESH = int(GeoType.CONVEX_MESH)
 
-SUPPORTED_SHAPES = (
-    GeoType.PLANE,
-    GeoType.HFIELD,
-    GeoType.SPHERE,
-    GeoType.CAPSULE,
-    GeoType.ELLIPSOID,
-    GeoType.CYLINDER,
-    GeoType.BOX,
-    GeoType.MESH,
-    GeoType.CONE,
-    GeoType.CONVEX_MESH,
-)
+SUPPORTED_SHAPES = (PLANE, HEIGHTFIELD, _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX, _MESH, _CONE, _CONVEX_MESH)
 """Shape types a soft body can touch."""
 
 
@@ -55,36 +44,43 @@ class Heightfields:
 
 
 @wp.func
+def surface(distance: float, normal: wp.vec3):
+    """Return a distance with its normal."""
+    out = SurfaceQuery()
+    out.distance = distance
+    out.normal = normal
+    return out
+
+
+@wp.func
+def direction(delta: wp.vec3, length: float, fallback: wp.vec3):
+    """Return a vector over its length, or another one where it has none."""
+    return wp.where(length > 1.0e-9, delta / wp.max(length, 1.0e-9), fallback)
+
+
+@wp.func
 def query_segment(x: wp.vec3, half_height: float, radius: float):
     """Return the distance to a capsule along Z."""
-    out = SurfaceQuery()
-    core = wp.vec3(0.0, 0.0, wp.clamp(x[2], -half_height, half_height))
-    delta = x - core
+    delta = x - wp.vec3(0.0, 0.0, wp.clamp(x[2], -half_height, half_height))
     length = wp.length(delta)
-    out.distance = length - radius
-    out.normal = wp.where(length > 1.0e-9, delta / wp.max(length, 1.0e-9), wp.vec3(1.0, 0.0, 0.0))
-    return out
+    return surface(length - radius, direction(delta, length, wp.vec3(1.0, 0.0, 0.0)))
 
 
 @wp.func
 def query_extents(excess: wp.vec3, side: wp.vec3):
     """Return the distance to a box of which a point exceeds the half extents by ``excess`` on the given sides."""
-    out = SurfaceQuery()
-    outside = wp.vec3(wp.max(excess[0], 0.0), wp.max(excess[1], 0.0), wp.max(excess[2], 0.0))
+    outside = wp.max(excess, wp.vec3())
     length = wp.length(outside)
     if length > 0.0:
-        out.distance = length
-        out.normal = wp.cw_mul(side, outside) / length
-        return out
+        return surface(length, wp.cw_mul(side, outside) / length)
     axis = int(0)
     if excess[1] > excess[axis]:
         axis = 1
     if excess[2] > excess[axis]:
         axis = 2
-    out.distance = excess[axis]
-    out.normal = wp.vec3()
-    out.normal[axis] = side[axis]
-    return out
+    normal = wp.vec3()
+    normal[axis] = side[axis]
+    return surface(excess[axis], normal)
 
 
 @wp.func
@@ -102,44 +98,35 @@ def query_box(x: wp.vec3, half: wp.vec3):
 @wp.func
 def query_plane(x: wp.vec3, size: wp.vec3):
     """Return the distance to the plane z = 0, or to what is below its rectangle where it has a size."""
-    out = SurfaceQuery()
-    out.distance = x[2]
-    out.normal = wp.vec3(0.0, 0.0, 1.0)
     if size[0] > 0.0 and size[1] > 0.0:
         excess = wp.vec3(wp.abs(x[0]) - 0.5 * size[0], wp.abs(x[1]) - 0.5 * size[1], x[2])
-        out = query_extents(excess, wp.vec3(wp.sign(x[0]), wp.sign(x[1]), 1.0))
-    return out
+        return query_extents(excess, wp.vec3(wp.sign(x[0]), wp.sign(x[1]), 1.0))
+    return surface(x[2], wp.vec3(0.0, 0.0, 1.0))
 
 
 @wp.func
 def query_cylinder(x: wp.vec3, radius: float, half_height: float):
     """Return the distance to a cylinder along Z."""
-    out = SurfaceQuery()
     across = wp.vec3(x[0], x[1], 0.0)
     rho = wp.length(across)
-    radial = wp.where(rho > 1.0e-9, across / wp.max(rho, 1.0e-9), wp.vec3(1.0, 0.0, 0.0))
+    radial = direction(across, rho, wp.vec3(1.0, 0.0, 0.0))
     axial = wp.vec3(0.0, 0.0, wp.sign(x[2]))
     dr = rho - radius
     dz = wp.abs(x[2]) - half_height
     if dr > 0.0 and dz > 0.0:
-        out.distance = wp.sqrt(dr * dr + dz * dz)
-        out.normal = (dr * radial + dz * axial) / out.distance
-    elif dr > dz:
-        out.distance = dr
-        out.normal = radial
-    else:
-        out.distance = dz
-        out.normal = axial
-    return out
+        distance = wp.sqrt(dr * dr + dz * dz)
+        return surface(distance, (dr * radial + dz * axial) / distance)
+    if dr > dz:
+        return surface(dr, radial)
+    return surface(dz, axial)
 
 
 @wp.func
 def query_cone(x: wp.vec3, radius: float, half_height: float):
     """Return the distance to a cone along Z, its apex at +half_height."""
-    out = SurfaceQuery()
     across = wp.vec3(x[0], x[1], 0.0)
     rho = wp.length(across)
-    radial = wp.where(rho > 1.0e-9, across / wp.max(rho, 1.0e-9), wp.vec3(1.0, 0.0, 0.0))
+    radial = direction(across, rho, wp.vec3(1.0, 0.0, 0.0))
     axis = wp.vec3(0.0, 0.0, 1.0)
     slant = wp.sqrt(radius * radius + 4.0 * half_height * half_height)
     # in the half plane (rho, z): outward normal of the flank, and distance from the rim along it towards the apex
@@ -150,9 +137,7 @@ def query_cone(x: wp.vec3, radius: float, half_height: float):
     along = wp.dot(from_rim, up)
     below = -half_height - x[2]
     if above <= 0.0 and below <= 0.0:  # inside
-        out.distance = wp.max(above, below)
-        out.normal = wp.where(above > below, flank, -axis)
-        return out
+        return surface(wp.max(above, below), wp.where(above > below, flank, -axis))
     # nearest of the base disc and the flank
     delta = wp.vec3(0.0, 0.0, -below)
     if rho > radius:
@@ -166,9 +151,8 @@ def query_cone(x: wp.vec3, radius: float, half_height: float):
     if wp.length_sq(other) < wp.length_sq(delta):
         delta = other
         fallback = flank
-    out.distance = wp.length(delta)
-    out.normal = wp.where(out.distance > 1.0e-9, delta / wp.max(out.distance, 1.0e-9), fallback)
-    return out
+    distance = wp.length(delta)
+    return surface(distance, direction(delta, distance, fallback))
 
 
 @wp.func
@@ -212,10 +196,7 @@ def query_ellipsoid(x: wp.vec3, axes: wp.vec3):
         delta[i] = side * share * s * e[i]  # x - y
         normal[i] = side * share * e[i]  # y_i / r_i, along y_i / e_i^2
     normal = wp.normalize(normal)
-    out = SurfaceQuery()
-    out.distance = float(wp.dot(delta, normal))
-    out.normal = wp.vec3(normal)
-    return out
+    return surface(float(wp.dot(delta, normal)), wp.vec3(normal))
 
 
 @wp.func
@@ -276,8 +257,7 @@ def query_heightfield(x: wp.vec3, fields: Heightfields, f: int, reach: float):
 
     Cells are searched in rings around the point until they are farther away than the nearest triangle.
     """
-    out = SurfaceQuery()
-    out.distance = 1.0e6
+    out = surface(1.0e6, wp.vec3())
     grid = fields.grid[f]
     extent = fields.extent[f]
     side = wp.vec3(wp.sign(x[0]), wp.sign(x[1]), 1.0)
@@ -357,8 +337,7 @@ def query_mesh(x: wp.vec3, mesh: wp.uint64, scale: wp.vec3, reach: float):
     mean edge for one, and so half of the points near a 0.2 mm thin plate for inside out; winding numbers are right
     too, where parts overlap as well, but take ten times as long.
     """
-    out = SurfaceQuery()
-    out.distance = 1.0e6
+    out = surface(1.0e6, wp.vec3())
     smallest = wp.min(wp.abs(scale[0]), wp.min(wp.abs(scale[1]), wp.abs(scale[2])))
     query = wp.mesh_query_point_sign_parity(mesh, wp.cw_div(x, scale), reach / smallest, 1, 0.1)
     if query.result:
@@ -378,8 +357,7 @@ def query_mesh(x: wp.vec3, mesh: wp.uint64, scale: wp.vec3, reach: float):
 @wp.func
 def query_shape(shape_type: int, scale: wp.vec3, mesh: wp.uint64, x: wp.vec3, reach: float):
     """Return the distance of ``x`` (shape frame) to a shape but a heightfield; to a mesh where within ``reach``."""
-    out = SurfaceQuery()
-    out.distance = 1.0e6
+    out = surface(1.0e6, wp.vec3())
     if shape_type == PLANE:
         out = query_plane(x, scale)
     elif shape_type == _SPHERE:

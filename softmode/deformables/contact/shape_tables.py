@@ -13,7 +13,7 @@ from softmode.deformables.model.layout import Layout
 from softmode.deformables.model.tables import allocate, host
 from softmode.errors import ConfigError
 
-MESHES = (GeoType.MESH, GeoType.CONVEX_MESH)
+MESHES = (int(GeoType.MESH), int(GeoType.CONVEX_MESH))
 
 
 def solid_shapes(model: newton.Model) -> np.ndarray:
@@ -24,7 +24,7 @@ def solid_shapes(model: newton.Model) -> np.ndarray:
     """
     flags, kinds, scale = host(model.shape_flags), host(model.shape_type), host(model.shape_scale)
     solid = (flags & int(newton.ShapeFlags.COLLIDE_PARTICLES)) != 0
-    for shape in np.flatnonzero(solid & ~np.isin(kinds, [int(kind) for kind in SUPPORTED_SHAPES])):
+    for shape in np.flatnonzero(solid & ~np.isin(kinds, SUPPORTED_SHAPES)):
         raise ConfigError(
             f"{_name(model, shape)} is a {GeoType(int(kinds[shape])).name.lower()}, which a soft body cannot touch",
             hint="put a mesh or primitives (newton.ModelBuilder.approximate_meshes makes convex parts) in its place, "
@@ -44,7 +44,7 @@ def solid_shapes(model: newton.Model) -> np.ndarray:
             hint="use a straight cylinder or a mesh",
         )
     uneven = np.ptp(np.abs(scale), axis=1) > 1e-5 * np.abs(scale).max(axis=1)
-    for shape in np.flatnonzero(solid & np.isin(kinds, [int(kind) for kind in MESHES]) & uneven):
+    for shape in np.flatnonzero(solid & np.isin(kinds, MESHES) & uneven):
         raise ConfigError(
             f"{_name(model, shape)} is a mesh scaled by {scale[shape]}, whose distances a soft body cannot query",
             hint="scale the vertices of the mesh instead",

@@ -126,43 +126,30 @@ class SolverCoupledReduced(ReducedSolver):
     def _bind(self) -> None:
         """Point to the arrays of the model and of MuJoCo that the kernels read."""
         model, device, table, data = self.model, self.model.device, self.tables.rigid.table, self.rigid.mjw_data
-        self._inertia = allocate(
-            kernels.Inertia,
-            "",
-            {},
-            device,
-            given={
-                "dof_start": table.dof_start,
-                "dof_articulation": self._dof_articulation,
-                "articulation_dof_start": table.articulation_dof_start,
-                "joint_start": model.articulation_start,
-                "joint_end": model.articulation_end,
-                "joint_child": model.joint_child,
-                "dof_body": self._dof_body,
-                "body_flags": model.body_flags,
-                "body_mass": model.body_mass,
-                "body_inertia": model.body_inertia,
-                "armature": model.joint_armature,
-                "damping": self._damping,
-                "jacobian": table.jacobian,
-            },
-        )
-        self._turned = allocate(
-            rows.TurnedJoints,
-            "",
-            {},
-            device,
-            given={
-                "joint": self._turned_joint,
-                "free": self._turned_free,
-                "qd_start": model.joint_qd_start,
-                "q_start": model.joint_q_start,
-                "child": model.joint_child,
-                "parent_frame": model.joint_X_p,
-                "child_frame": model.joint_X_c,
-                "body_com": model.body_com,
-            },
-        )
+        given = {name: getattr(model, name) for name in ("joint_child", "body_flags", "body_mass", "body_inertia")}
+        given |= {
+            "dof_start": table.dof_start,
+            "dof_articulation": self._dof_articulation,
+            "articulation_dof_start": table.articulation_dof_start,
+            "joint_start": model.articulation_start,
+            "joint_end": model.articulation_end,
+            "dof_body": self._dof_body,
+            "armature": model.joint_armature,
+            "damping": self._damping,
+            "jacobian": table.jacobian,
+        }
+        self._inertia = allocate(kernels.Inertia, "", {}, device, given=given)
+        given = {
+            "joint": self._turned_joint,
+            "free": self._turned_free,
+            "qd_start": model.joint_qd_start,
+            "q_start": model.joint_q_start,
+            "child": model.joint_child,
+            "parent_frame": model.joint_X_p,
+            "child_frame": model.joint_X_c,
+            "body_com": model.body_com,
+        }
+        self._turned = allocate(rows.TurnedJoints, "", {}, device, given=given)
         rows_of = ("type", "id", "J", "J_rownnz", "J_rowadr", "J_colind", "D", "aref", "frictionloss")
         given = {name: getattr(data.efc, name) for name in rows_of}
         given |= {

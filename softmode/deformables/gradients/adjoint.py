@@ -13,7 +13,7 @@ solver's own float32 Cholesky factor at q_t. Both integrators are covered, and d
 """
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -29,8 +29,10 @@ from softmode.deformables.model.lane_kernels import vec8d
 from softmode.deformables.model.namespaces import soft
 from softmode.deformables.model.status import WORLD_NOT_FINITE
 from softmode.deformables.model.struct_kernels import PointConstraints, Points
+from softmode.deformables.model.tables import allocate
 from softmode.deformables.solver.detect import adapt
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient
+from softmode.deformables.solver.iteration_kernels import NewtonStep
 from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.deformables.solver.step_kernels import sum_forces
 from softmode.errors import ConfigError, SolverDiverged
@@ -39,7 +41,7 @@ Array = NDArray[np.float64]
 
 _ENTRY = ("row", "normal", "offset", "stiffness", "friction")
 """What a step's point constraints are made of, besides their count: members of the solver's ``PointConstraints``."""
-_SUMS = ("youngs_modulus", "poissons_ratio", "viscosity", "friction", "density", "mass_damping")
+_TOTALS = ("youngs_modulus", "poissons_ratio", "viscosity", "friction", "density", "mass_damping", "gravity")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,17 +132,18 @@ class AdjointReduced:
 
     def __init__(self, solver: SolverReduced, step_max: int, *, options: AdjointOptions | None = None) -> None:
         """Allocate the record and the work space."""
-        if solver.tables.rigid.count_max:
+        t = self.tables = solver.tables
+        if t.rigid.count_max:
             raise ConfigError(
                 "the step solves for joint dofs, whose solver has no derivative",
                 hint="use SolverReduced with prescribed rigid bodies",
             )
-        if solver.tables.pairs is not None:
+        if t.pairs is not None:
             raise ConfigError(
                 "contact between soft bodies has no derivative",
                 hint="use SolverReducedOptions(soft_contact=False), or one body per world",
             )
-        if solver.tables.instances.link_pin_count.numpy().any():
+        if t.instances.link_pin_count.numpy().any():
             raise ConfigError("pins that follow a rigid body have no derivative", hint="pin to the world (link=-1)")
         if solver.model.shape_count and solver.options.stick_ratio > 0.0:
             raise ConfigError(
@@ -148,7 +151,7 @@ class AdjointReduced:
                 hint="use SolverReducedOptions(stick_ratio=0.0), friction smoothed over stick_velocity",
             )
         self.solver, self.options, self.step_max = solver, options or AdjointOptions(), step_max
-        self.device, layout = solver.model.device, solver.tables.layout
+        self.device, layout = solver.model.device, t.layout
         self.instances, self.total = layout.instance_count, int(solver.parameters.q.shape[0])
         self.pin_total = int(solver.parameters.pin_target.shape[0]) if layout.pin_max else 0
         self.entry_max = solver.view.constraint_max if solver.model.shape_count else layout.pin_max
@@ -160,26 +163,31 @@ class AdjointReduced:
         states, entries = (step_max + 2, self.total), (self.instances, max(self.entry_max, 1))
         self._q, self._qd = self._zeros(states, wp.vec3d), self._zeros(states, wp.vec3d)
         self._dt_before = self._zeros((step_max + 1, self.instances), wp.float64)
-        self._force, self._costate = (self._zeros((step_max, *solver.tables.unknowns), vec8d) for _ in range(2))
+        self._force, self._costate = (self._zeros((step_max, *t.unknowns), vec8d) for _ in range(2))
         self._entry_count = self._zeros((step_max, self.instances), int)
-        kinds = {name: getattr(solver.tables.constraints, name).dtype for name in _ENTRY}
+        kinds = {name: getattr(t.constraints, name).dtype for name in _ENTRY}
         self._entry = {name: self._zeros((step_max, *entries), kind) for name, kind in kinds.items()}
 
-        points = (self.instances, layout.point_max)
-        self._step = kernels.Linearised()
-        self._step.place, self._step.place_start, self._step.point = (self._zeros(points, wp.mat33d) for _ in range(3))
-        self._step.entry_slip, self._step.entry = (self._zeros(entries, wp.vec3d) for _ in range(2))
-        self._step.entry_hessian = self._zeros(entries, wp.mat33d)
-        self._points = Points()
-        self._points.stress = self._step.point
-        self._constraints = PointConstraints()
-        self._constraints.count, self._constraints.row = solver.tables.constraints.count, solver.tables.constraints.row
-        self._constraints.force = self._step.entry
+        self._sizes = {
+            "instance": self.instances,
+            "point": layout.point_max,
+            "entry": self.entry_max,
+            "pin": self.pin_total,
+            "unknown": 3 * layout.block_count,
+        }
+        axes = {"": "instance point", "entry_slip entry_hessian entry": "instance entry"}
+        self._step = allocate(kernels.Linearised, axes, self._sizes, self.device)
+        points, constraints = Points(), PointConstraints()
+        points.stress, constraints.force = self._step.point, self._step.entry
+        constraints.count, constraints.row = t.constraints.count, t.constraints.row
+        given = {"instances": t.instances, "basis": t.basis, "arrays": t.arrays}
+        given |= {"points": points, "constraints": constraints}
+        self._sums = allocate(NewtonStep, "", {}, self.device, given=given)
         self._gmres = Gmres(solver, cycle_length=self.options.cycle_length, cycle_max=self.options.cycle_max)
-        self._driven = self._zeros(solver.tables.unknowns, vec8d)
+        self._driven = self._zeros(t.unknowns, vec8d)
         self._state = solver.model.state()
         self._resolution = wp.array(
-            1.0e-9 * layout.size * solver.tables.instances.scale.numpy(), dtype=wp.float64, device=self.device
+            1.0e-9 * layout.size * t.instances.scale.numpy(), dtype=wp.float64, device=self.device
         )
 
     @property
@@ -221,7 +229,8 @@ class AdjointReduced:
         solver = self.solver
         solver.begin(state_in, control, dt)
         if force is not None:
-            self._launch(kernels.add_force, self._blocks, [solver.tables.instances, force], [solver.tables.motion])
+            t = self.tables
+            t.launch(kernels.add_force, self._blocks, t.instances, force.reshape((1, -1)), t.motion)
         solver.detect(state_in, control, dt, prescribed=True)
         solver.minimise(dt)
         solver.finish(state_out, dt)
@@ -233,11 +242,11 @@ class AdjointReduced:
         Raises:
             ConfigError: If ``step_max`` steps are recorded already.
         """
-        t, solver = self.step_count, self.solver
+        t = self.step_count
         if t == self.step_max:
             raise ConfigError(f"{t} steps are recorded, the most there is room for", hint="raise step_max")
         self._copy_state(state, t + 1)
-        wp.copy(self._force[t], solver.tables.motion.force)
+        wp.copy(self._force[t], self.tables.motion.force)
         for stored, values in self._entries(t):
             wp.copy(stored, values)
         self.dt.append(float(dt))
@@ -251,7 +260,7 @@ class AdjointReduced:
 
     def _entries(self, t: int) -> list[tuple[Any, Any]]:
         """Return pairs of what is stored of the point constraints of step t and where the solver has it."""
-        entries, width = self.solver.tables.constraints, self.entry_max
+        entries, width = self.tables.constraints, self.entry_max
         pairs = [(self._entry_count[t], entries.count)]
         if width:
             pairs += [(stored[t], getattr(entries, name)[:, :width]) for name, stored in self._entry.items()]
@@ -279,79 +288,56 @@ class AdjointReduced:
         Warns:
             RuntimeWarning: If a step is further from its root than ``residual_warning``.
         """
-        steps, solver, entry = self.step_count, self.solver, max(self.entry_max, 1)
+        steps, t = self.step_count, self.tables
         if steps == 0:
             raise ConfigError("no step is recorded", hint="call start and step first")
         q_bar, qd_bar = self._cotangent("loss_q", loss_q), self._cotangent("loss_qd", loss_qd)
-        points = (self.instances, solver.tables.layout.point_max)
-        field = {name: self._zeros(points, wp.float64) for name in ("log_modulus", "poissons_ratio", "viscosity")}
-        friction = self._zeros((self.instances, entry), wp.float64)
-        sums = kernels.Sums()
-        sums.mass, sums.mass_damping, sums.gravity = (self._zeros(solver.tables.unknowns, vec8d) for _ in range(3))
+        axes = {
+            "": "instance unknown",
+            "log_modulus poissons_ratio viscosity": "instance point",
+            "friction": "instance entry",
+            "pin_stiffness": "pin",
+        }
+        sums = allocate(kernels.Sums, axes, self._sizes, self.device)
+        totals = allocate(kernels.Totals, "instance", self._sizes, self.device)
         pin_target = self._zeros((steps, max(self.pin_total, 1)), wp.vec3d)
-        pin_stiffness = self._zeros((max(self.pin_total, 1),), wp.float64)
         residual, error = (self._zeros((steps, self.instances), wp.float64) for _ in range(2))
-        tables = [solver.tables.instances, solver.tables.basis]
+        bodies, (points, entries) = (t.instances, t.basis), self._dims
 
-        for t in reversed(range(steps)):
-            now, before, earlier = ([q_bar[row], qd_bar[row]] for row in (t + 2, t + 1, t))
-            costate, dt = self._costate[t], wp.float64(self.dt[t])
-            self._restore(t)
-            self._measure(t, residual[t])
-            self._launch(kernels.add_velocity, solver.tables.unknowns, [solver.tables.motion, now[1], dt], [now[0]])
-            self._solve(t, now[0], costate)
-            wp.copy(error[t], self._gmres.error)
-            self._launch(kernels.accumulate_points, points, [*tables, costate, dt], [*field.values(), self._step])
+        for k in reversed(range(steps)):
+            costate, dt = self._costate[k], wp.float64(self.dt[k])
+            self._restore(k)
+            self._measure(k, residual[k])
+            t.launch(kernels.add_velocity, t.unknowns, t.motion, qd_bar[k + 2], dt, q_bar[k + 2])
+            self._solve(k, q_bar[k + 2], costate)
+            wp.copy(error[k], self._gmres.error)
+            t.launch(kernels.accumulate_points, points, *bodies, costate, dt, sums, self._step)
             if self.entry_max:
-                constraints = [pin_stiffness, friction, pin_target[t], self._step]
-                dim = (self.instances, self.entry_max)
-                self._launch(
-                    kernels.accumulate_entries, dim, [*tables, solver.tables.constraints, costate], constraints
-                )
-            self._sum_points(solver.tables.newton.active)
-            self._launch(
-                kernels.propagate,
-                solver.tables.unknowns,
-                [
-                    *tables,
-                    solver.tables.motion,
-                    solver.tables.arrays.gradient_chunk,
-                    solver.model.gravity,
-                    solver.tables.arrays.q,
-                    costate,
-                    self._driven,
-                    dt,
-                ],
-                [*now, *before, *earlier, sums],
-            )
+                found = (costate, sums, pin_target[k], self._step)
+                t.launch(kernels.accumulate_entries, entries, *bodies, t.constraints, *found)
+            self._sum_points(t.newton.active)
+            given = (t.motion, t.arrays, t.model.gravity, costate, self._driven, dt, k)
+            t.launch(kernels.propagate, t.unknowns, *bodies, *given, q_bar, qd_bar, sums)
 
         self._check(residual.numpy(), error.numpy())
-        totals = {name: self._zeros((self.instances,), wp.float64) for name in _SUMS}
-        gravity = self._zeros((self.instances,), wp.vec3d)
-        gathered = [*field.values(), friction, sums]
-        self._launch(
-            kernels.sum_gradients,
-            self.instances,
-            [solver.tables.instances, solver.parameters.density, *gathered],
-            [*totals.values(), gravity],
-        )
+        density = self.solver.parameters.density
+        t.launch(kernels.sum_gradients, self.instances, t.instances, density, sums, totals)
         return ReducedGradients(
             q=self._unpack(q_bar[1:2])[0],
             qd=self._unpack(qd_bar[1:2])[0],
             force=self._unpack(self._costate[:steps]),
             q_driven=self._unpack(q_bar[2:]),
             pin_target=pin_target[:, : self.pin_total],
-            pin_stiffness=pin_stiffness[: self.pin_total],
-            log_modulus=field["log_modulus"],
-            gravity=gravity,
+            pin_stiffness=sums.pin_stiffness[: self.pin_total],
+            log_modulus=sums.log_modulus,
             grad_residual=residual,
-            **totals,
+            **{name: getattr(totals, name) for name in _TOTALS},
         )
 
     def _cotangent(self, name: str, values: wp.array | ArrayLike | None) -> Any:
         """Return dL/dq or dL/dv in blocks, with a row of zeros for the state before the record."""
         shape = (self.step_count + 1, self.total)
-        out = self._zeros((self.step_count + 2, *self.solver.tables.unknowns), vec8d)
+        out = self._zeros((self.step_count + 2, *self.tables.unknowns), vec8d)
         if values is None:
             return out
         if not isinstance(values, wp.array):
@@ -361,105 +347,76 @@ class AdjointReduced:
             values = wp.array(host, dtype=wp.vec3d, device=self.device)
         if values.shape != shape or values.dtype != wp.vec3d:
             raise ConfigError(f"{name}: expected vec3d {shape}, got {values.dtype} {values.shape}")
-        self._launch(kernels.pack, (shape[0], *self._blocks), [self.solver.tables.instances, values], [out[1:]])
+        self.tables.launch(kernels.pack, (shape[0], *self._blocks), self.tables.instances, values, out[1:])
         return out
 
     def _unpack(self, blocks: Any) -> Any:
         """Return blocks (T, ...) as vec3d (T, N)."""
         out = self._zeros((blocks.shape[0], self.total), wp.vec3d)
-        dim = (blocks.shape[0], self.instances, self.solver.tables.layout.stride)
-        self._launch(kernels.unpack, dim, [self.solver.tables.instances, blocks], [out])
+        dim = (blocks.shape[0], self.instances, self.tables.layout.stride)
+        self.tables.launch(kernels.unpack, dim, self.tables.instances, blocks, out)
         return out
 
-    def _restore(self, t: int) -> None:
-        """Put recorded step t back into the solver, evaluate it at its root and factor the solver's matrix there."""
-        solver, dt = self.solver, self.dt[t]
+    def _restore(self, k: int) -> None:
+        """Put recorded step k back into the solver, evaluate it at its root and factor the solver's matrix there."""
+        t, dt = self.tables, self.dt[k]
         data = soft(self._state)
         for name, rows in (("q", self._q), ("qd", self._qd)):
-            wp.copy(getattr(data, name), rows[t + 1])
-            wp.copy(getattr(data, f"{name}_before"), rows[t])
-        wp.copy(data.dt_before, self._dt_before[t])
-        solver.begin(self._state, None, dt)
-        wp.copy(solver.tables.motion.force, self._force[t])
-        end = solver.tables.arrays.q.reshape((1, *solver.tables.unknowns))
-        self._launch(kernels.pack, (1, *self._blocks), [solver.tables.instances, self._q[t + 2 : t + 3]], [end])
-        for stored, values in self._entries(t):
+            wp.copy(getattr(data, name), rows[k + 1])
+            wp.copy(getattr(data, f"{name}_before"), rows[k])
+        wp.copy(data.dt_before, self._dt_before[k])
+        self.solver.begin(self._state, None, dt)
+        wp.copy(t.motion.force, self._force[k])
+        end = t.arrays.q.reshape((1, *t.unknowns))
+        t.launch(kernels.pack, (1, *self._blocks), t.instances, self._q[k + 2 : k + 3], end)
+        for stored, values in self._entries(k):
             wp.copy(values, stored)
-        adapt(solver.tables, dt)
-        progress = solver.tables.newton
+        adapt(t, dt)
+        progress = t.newton
         for flag in (progress.active, progress.refresh, progress.exact):
             flag.fill_(1)
         progress.project.zero_()
         progress.iteration.zero_()
-        evaluate(solver.tables, dt, derivatives=True)
-        gather_gradient(solver.tables, dt)
-        assemble(solver.tables, dt)
-        solver.tables.system.factor(progress.active)
+        evaluate(t, dt, derivatives=True)
+        gather_gradient(t, dt)
+        assemble(t, dt)
+        t.system.factor(progress.active)
 
-    def _measure(self, t: int, residual: wp.array) -> None:
+    def _measure(self, k: int, residual: wp.array) -> None:
         """Measure the residual of the restored step and linearise it."""
-        solver, dt = self.solver, self.dt[t]
-        step = [solver.tables.instances, solver.tables.motion, solver.tables.constraints, self._resolution]
-        self._launch(
-            kernels.measure_residual,
-            self.instances,
-            [
-                *step,
-                solver.tables.arrays.q,
-                solver.tables.arrays.gradient,
-                solver.tables.arrays.gradient_chunk,
-                wp.float64(dt),
-            ],
-            [residual],
-        )
-        tables = [solver.tables.instances, solver.tables.basis, solver.tables.motion]
-        points = (self.instances, solver.tables.layout.point_max)
-        self._launch(kernels.place_points, points, [*tables, solver.tables.arrays.q], [self._step])
+        t, dt, (points, entries) = self.tables, self.dt[k], self._dims
+        step = (t.motion, t.constraints, self._resolution, t.arrays, wp.float64(dt))
+        t.launch(kernels.measure_residual, self.instances, t.instances, *step, residual)
+        bodies = (t.instances, t.basis, t.motion)
+        t.launch(kernels.place_points, points, *bodies, t.arrays.q, self._step)
         if self.entry_max:
-            stick_range = wp.float64(solver.options.stick_velocity * dt)
-            dim = (self.instances, self.entry_max)
-            self._launch(
-                kernels.place_entries,
-                dim,
-                [*tables, solver.tables.constraints, stick_range, solver.tables.arrays.q],
-                [self._step],
-            )
+            stick_range = wp.float64(self.solver.options.stick_velocity * dt)
+            t.launch(kernels.place_entries, entries, *bodies, t.constraints, stick_range, t.arrays.q, self._step)
 
-    def _solve(self, t: int, right: wp.array, solution: wp.array) -> None:
+    def _solve(self, k: int, right: wp.array, solution: wp.array) -> None:
         """Solve H_t^T solution = right at the free functions; leave H_t^T solution at the driven ones."""
 
         def apply(active: wp.array, direction: wp.array, product: wp.array) -> None:
-            self._apply(t, active, direction, product)
+            self._apply(k, active, direction, product)
 
         self._gmres.solve(apply, right, solution, tolerance=self.options.tolerance)
 
-    def _apply(self, t: int, active: wp.array, direction: wp.array, product: wp.array) -> None:
+    def _apply(self, k: int, active: wp.array, direction: wp.array, product: wp.array) -> None:
         """Write H_t^T direction in active worlds to ``product`` and, for the driven functions, to ``_driven``."""
-        solver, dt = self.solver, wp.float64(self.dt[t])
-        tables, points = (
-            [solver.tables.instances, solver.tables.basis],
-            (self.instances, solver.tables.layout.point_max),
-        )
-        self._launch(kernels.apply_points, points, [*tables, active, direction, dt], [self._step])
+        t, dt, (points, entries) = self.tables, wp.float64(self.dt[k]), self._dims
+        bodies = (t.instances, t.basis)
+        t.launch(kernels.apply_points, points, *bodies, active, direction, dt, self._step)
         if self.entry_max:
-            dim = (self.instances, self.entry_max)
-            self._launch(
-                kernels.apply_entries, dim, [*tables, solver.tables.constraints, active, direction], [self._step]
-            )
+            t.launch(kernels.apply_entries, entries, *bodies, t.constraints, active, direction, self._step)
         self._sum_points(active)
-        self._launch(
-            kernels.sum_product,
-            solver.tables.unknowns,
-            [*tables, solver.tables.motion, active, solver.tables.arrays.gradient_chunk, direction, dt],
-            [product, self._driven],
-        )
+        given = (t.motion, active, t.arrays, direction, dt)
+        t.launch(kernels.sum_product, t.unknowns, *bodies, *given, product, self._driven)
 
     def _sum_points(self, active: wp.array) -> None:
         """Sum what stands at the points, less what stands at the entries, into the solver's chunks."""
-        solver, chunk = self.solver, self.solver.tables.arrays.gradient_chunk
-        dim = (self.instances, chunk.shape[1], solver.tables.layout.block_count)
-        tables = [solver.tables.instances, solver.tables.basis, self._points, self._constraints]
-        self._launch(sum_forces, dim, [*tables, active, chunk.shape[1]], [chunk])
+        t = self.tables
+        dim = (self.instances, t.arrays.gradient_chunk.shape[1], t.layout.block_count)
+        t.launch(sum_forces, dim, self._sums, active)
 
     def _check(self, residual: Array, error: Array) -> None:
         """Refuse steps that are no roots and systems that were not solved."""
@@ -482,12 +439,12 @@ class AdjointReduced:
 
     @property
     def _blocks(self) -> tuple[int, int]:
-        return self.instances, self.solver.tables.layout.block_count
+        return self.instances, self.tables.layout.block_count
+
+    @property
+    def _dims(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Threads over the cubature points, and over the point constraints."""
+        return (self.instances, self.tables.layout.point_max), (self.instances, self.entry_max)
 
     def _zeros(self, shape: Sequence[int], dtype: type) -> Any:
         return wp.zeros(tuple(shape), dtype=dtype, device=self.device)
-
-    def _launch(
-        self, kernel: Callable[..., None], dim: int | Sequence[int], inputs: list[Any], outputs: Sequence[Any] = ()
-    ) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=list(outputs), device=self.device)

@@ -9,6 +9,7 @@ import warp as wp
 from softmode.deformables.contact.penalty_kernels import friction_potential, normal_potential
 from softmode.deformables.materials.hessian_kernels import stress_derivative
 from softmode.deformables.materials.material_kernels import green_strain, hooke_stress, stress
+from softmode.deformables.model.declare import struct
 from softmode.deformables.model.deformation_kernels import displacement_gradient, elastic_gradient
 from softmode.deformables.model.lane_kernels import LANES, free_part, vec8d
 from softmode.deformables.model.struct_kernels import (
@@ -19,12 +20,13 @@ from softmode.deformables.model.struct_kernels import (
     interpolate,
     interpolate_change,
 )
+from softmode.deformables.solver.iteration_kernels import NewtonArrays
 from softmode.deformables.solver.step_kernels import material_of
 
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.struct
+@struct
 class Linearised:
     """A recorded step at its root."""
 
@@ -36,7 +38,45 @@ class Linearised:
     entry: wp.array2d[wp.vec3d]  # what is summed over the entries next [N]
 
 
+@struct
+class Sums:
+    """Gradients that are gathered over the steps."""
+
+    log_modulus: wp.array2d[wp.float64]  # (instance_count, point_max), as the next two
+    poissons_ratio: wp.array2d[wp.float64]
+    viscosity: wp.array2d[wp.float64]
+    friction: wp.array2d[wp.float64]  # (instance_count, entry_max)
+    pin_stiffness: wp.array[wp.float64]  # (pin_count,)
+    mass: wp.array2d[vec8d]  # (instance_count, 3 block_count), as what follows
+    mass_damping: wp.array2d[vec8d]
+    gravity: wp.array2d[vec8d]
+
+
+@struct
+class Totals:
+    """Gradients by the parameters of the instances, shape (instance_count,)."""
+
+    youngs_modulus: wp.array[wp.float64]
+    poissons_ratio: wp.array[wp.float64]
+    viscosity: wp.array[wp.float64]
+    friction: wp.array[wp.float64]
+    density: wp.array[wp.float64]
+    mass_damping: wp.array[wp.float64]
+    gravity: wp.array[wp.vec3d]
+
+
 # -- layout ------------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def block_of(instances: Instances, values: wp.array2d[wp.vec3d], t: int, i: int, b: int, axis: int):
+    """Return a block of a component of vectors of a state, shape (step_count, function_total)."""
+    block = vec8d()
+    for lane in range(LANES):
+        k = LANES * b + lane
+        if k < instances.function_count[i]:
+            block[lane] = values[t, instances.function_start[i] + k][axis]
+    return block
 
 
 @wp.kernel
@@ -48,14 +88,8 @@ def pack(
 ):
     """Put vectors of a state into blocks."""
     t, i, b = wp.tid()
-    stride = out.shape[2] / 3
     for axis in range(3):
-        block = vec8d()
-        for lane in range(LANES):
-            k = LANES * b + lane
-            if k < instances.function_count[i]:
-                block[lane] = values[t, instances.function_start[i] + k][axis]
-        out[t, i, axis * stride + b] = block
+        out[t, i, axis * (out.shape[2] / 3) + b] = block_of(instances, values, t, i, b, axis)
 
 
 @wp.kernel
@@ -80,20 +114,15 @@ def unpack(
 @wp.kernel
 def add_force(
     instances: Instances,
-    force: wp.array[wp.vec3d],  # (function_total,) [N]
+    force: wp.array2d[wp.vec3d],  # (1, function_total) [N]
     # In and out:
     motion: Motion,
 ):
     """Add a generalised force to that of a step."""
     i, b = wp.tid()
-    stride = motion.force.shape[1] / 3
     for axis in range(3):
-        block = motion.force[i, axis * stride + b]
-        for lane in range(LANES):
-            k = LANES * b + lane
-            if k < instances.function_count[i]:
-                block[lane] += force[instances.function_start[i] + k][axis]
-        motion.force[i, axis * stride + b] = block
+        e = axis * (motion.force.shape[1] / 3) + b
+        motion.force[i, e] = motion.force[i, e] + block_of(instances, force, 0, i, b, axis)
 
 
 # -- the linearisation at a recorded step ------------------------------------------------------------------------------
@@ -162,9 +191,7 @@ def measure_residual(
     motion: Motion,
     entries: PointConstraints,
     resolution: wp.array[wp.float64],  # (instance_count,), motion [m] whose inertia is no force worth naming
-    q: wp.array2d[vec8d],
-    gradient: wp.array2d[vec8d],
-    internal: wp.array3d[vec8d],  # (instance_count, chunk_count, 3 block_count), forces of points less entries
+    arrays: NewtonArrays,  # chunks of the gradient: forces of points less entries
     dt: wp.float64,
     # Out:
     ratio_out: wp.array[wp.float64],  # (instance_count,)
@@ -177,10 +204,11 @@ def measure_residual(
     inertial = wp.float64(0.0)
     elastic = wp.float64(0.0)
     external = wp.float64(0.0)
-    for e in range(q.shape[1]):
-        r = gradient[i, e]
+    internal = arrays.gradient_chunk
+    for e in range(arrays.q.shape[1]):
+        r = arrays.gradient[i, e]
         total += wp.dot(r, r)
-        inertia = weight * (q[i, e] - motion.q_inertial[i, e])
+        inertia = weight * (arrays.q[i, e] - motion.q_inertial[i, e])
         inertial += wp.dot(inertia, inertia)
         force = motion.force[i, e]
         external += wp.dot(force, force)
@@ -246,7 +274,7 @@ def sum_product(
     basis: Basis,
     motion: Motion,
     active: wp.array[int],
-    chunk: wp.array3d[vec8d],  # sums of V dP grad b over the points less b f over the entries
+    arrays: NewtonArrays,  # chunks: sums of V dP grad b over the points less b f over the entries
     direction: wp.array2d[vec8d],
     dt: wp.float64,
     # Out:
@@ -262,8 +290,8 @@ def sum_product(
     rate = motion.rate[i] / dt
     total = instances.mass[i] * rate * (rate + wp.float64(instances.mass_damping[i])) * direction[i, e]
     if LANES * b < instances.function_count[i]:
-        for k in range(chunk.shape[1]):
-            total = total + chunk[i, k, e]
+        for k in range(arrays.gradient_chunk.shape[1]):
+            total = total + arrays.gradient_chunk[i, k, e]
     free = free_part(total, instances.driven_count[i] - LANES * b)
     out[i, e] = free
     driven_out[i, e] = total - free
@@ -291,10 +319,8 @@ def accumulate_points(
     basis: Basis,
     costate: wp.array2d[vec8d],  # lambda
     dt: wp.float64,
-    # In and out, (instance_count, point_max):
-    log_modulus: wp.array2d[wp.float64],
-    poissons_ratio: wp.array2d[wp.float64],
-    viscosity: wp.array2d[wp.float64],
+    # In and out:
+    sums: Sums,
     # Out:
     step: Linearised,  # point: V dP_start^T[Lambda], what the start of the step feels through dissipation
 ):
@@ -315,7 +341,7 @@ def accumulate_points(
     mu = material.mu
     lam = material.lam
     nu = wp.float64(instances.poissons_ratio[i])
-    log_modulus[i, p] = log_modulus[i, p] - V * wp.ddot(L, stress(material, G, G_start, dt))
+    sums.log_modulus[i, p] = sums.log_modulus[i, p] - V * wp.ddot(L, stress(material, G, G_start, dt))
 
     # d ln(mu)/d nu = -1 / (1 + nu); dlambda/dnu = E (1 + 2 nu^2) / ((1 + nu) (1 - 2 nu))^2
     modulus = two * mu * (one + nu)
@@ -326,14 +352,14 @@ def accumulate_points(
     material.lam = one
     by_lam = stress(material, G, G_start, dt)
     slope = modulus * (one + two * nu * nu) / (root * root) * by_lam - mu / (one + nu) * by_mu
-    poissons_ratio[i, p] = poissons_ratio[i, p] - V * wp.ddot(L, slope)
+    sums.poissons_ratio[i, p] = sums.poissons_ratio[i, p] - V * wp.ddot(L, slope)
 
     # viscous stress: tau / dt F C (E - E_start) with Hooke's tensor C
     material.mu = mu
     material.lam = lam
     F = wp.identity(n=3, dtype=wp.float64) + G
     by_tau = one / dt * (F * hooke_stress(material, green_strain(G) - green_strain(G_start)))
-    viscosity[i, p] = viscosity[i, p] - V * wp.ddot(L, by_tau)
+    sums.viscosity[i, p] = sums.viscosity[i, p] - V * wp.ddot(L, by_tau)
     F_start = wp.identity(n=3, dtype=wp.float64) + G_start
     strain = wp.float64(0.5) / s * (wp.transpose(F) * L + wp.transpose(L) * F)
     step.point[i, p] = -V * material.viscosity / dt * (F_start * hooke_stress(material, strain))
@@ -346,8 +372,7 @@ def accumulate_entries(
     entries: PointConstraints,
     costate: wp.array2d[vec8d],
     # In and out:
-    pin_stiffness: wp.array[wp.float64],  # (pin_count,)
-    friction: wp.array2d[wp.float64],  # (instance_count, entry_max)
+    sums: Sums,
     # Out:
     pin_target_out: wp.array[wp.vec3d],  # (pin_count,), of this step
     step: Linearised,  # entry: what the start of the step feels through slip
@@ -361,7 +386,7 @@ def accumulate_entries(
     if e < instances.pin_count[i]:
         pin = instances.pin_start[i] + e
         pin_target_out[pin] = entries.stiffness[i, e] * L
-        pin_stiffness[pin] = pin_stiffness[pin] - wp.dot(L, step.entry_slip[i, e])
+        sums.pin_stiffness[pin] = sums.pin_stiffness[pin] - wp.dot(L, step.entry_slip[i, e])
         return
     n = entries.normal[i, e]
     back = wp.transpose(step.entry_hessian[i, e]) * L
@@ -369,16 +394,7 @@ def accumulate_entries(
     # c = sqrt(friction of body * friction of shape)
     if instances.friction[i] > 0.0:
         share = wp.float64(0.5) * entries.friction[i, e] / wp.float64(instances.friction[i])
-        friction[i, e] = friction[i, e] - share * wp.dot(L, step.entry_slip[i, e])
-
-
-@wp.struct
-class Sums:
-    """Gradients that are gathered over the steps, per unknown, (instance_count, 3 block_count)."""
-
-    mass: wp.array2d[vec8d]
-    mass_damping: wp.array2d[vec8d]
-    gravity: wp.array2d[vec8d]
+        sums.friction[i, e] = sums.friction[i, e] - share * wp.dot(L, step.entry_slip[i, e])
 
 
 @wp.kernel
@@ -386,19 +402,15 @@ def propagate(
     instances: Instances,
     basis: Basis,
     motion: Motion,
-    chunk: wp.array3d[vec8d],  # sums over points and entries of what the start of the step feels
+    arrays: NewtonArrays,  # chunks: sums over points and entries of what the start of the step feels
     gravity: wp.array[wp.vec3],
-    q: wp.array2d[vec8d],
     costate: wp.array2d[vec8d],
     driven: wp.array2d[vec8d],  # H^T lambda at the driven functions
     dt: wp.float64,
-    # In and out:
-    q_bar: wp.array2d[vec8d],  # dL/dq_t; becomes dL/d(q_driven)
-    qd_bar: wp.array2d[vec8d],
-    q_bar_1: wp.array2d[vec8d],  # of the step before
-    qd_bar_1: wp.array2d[vec8d],
-    q_bar_2: wp.array2d[vec8d],
-    qd_bar_2: wp.array2d[vec8d],
+    t: int,
+    # In and out, (T + 2, ...): row t + 2 is dL/dq_t, which becomes dL/d(q_driven); before it those of the steps before
+    q_bar: wp.array3d[vec8d],
+    qd_bar: wp.array3d[vec8d],
     sums: Sums,
 ):
     """Subtract lambda^T dr/d(q_(t-1), v_(t-1), q_(t-2), v_(t-2), m, alpha, g)."""
@@ -412,20 +424,22 @@ def propagate(
     L = costate[i, e]
     start = vec8d()
     if LANES * b < instances.function_count[i]:
-        for k in range(chunk.shape[1]):
-            start = start - chunk[i, k, e]
-    q_rate = m * rate * (rate + alpha) * L - rate * qd_bar[i, e]
+        for k in range(arrays.gradient_chunk.shape[1]):
+            start = start - arrays.gradient_chunk[i, k, e]
+    q_rate = m * rate * (rate + alpha) * L - rate * qd_bar[t + 2, i, e]
     qd_rate = m * rate * L
     third = wp.float64(0.0)
     if motion.rate[i] > wp.float64(1.0):
         third = wp.float64(1.0) / wp.float64(3.0)
-    q_bar_1[i, e] = q_bar_1[i, e] + start + (wp.float64(1.0) + third) * q_rate
-    qd_bar_1[i, e] = qd_bar_1[i, e] + (wp.float64(1.0) + third) * qd_rate
+    q_bar[t + 1, i, e] = q_bar[t + 1, i, e] + start + (wp.float64(1.0) + third) * q_rate
+    qd_bar[t + 1, i, e] = qd_bar[t + 1, i, e] + (wp.float64(1.0) + third) * qd_rate
     if third > wp.float64(0.0):
-        q_bar_2[i, e] = q_bar_2[i, e] - third * q_rate
-        qd_bar_2[i, e] = qd_bar_2[i, e] - third * qd_rate
-    q_bar[i, e] = q_bar[i, e] - free_part(q_bar[i, e], instances.driven_count[i] - LANES * b) - driven[i, e]
+        q_bar[t, i, e] = q_bar[t, i, e] - third * q_rate
+        qd_bar[t, i, e] = qd_bar[t, i, e] - third * qd_rate
+    here = q_bar[t + 2, i, e]
+    q_bar[t + 2, i, e] = here - free_part(here, instances.driven_count[i] - LANES * b) - driven[i, e]
 
+    q = arrays.q
     travel = rate * (q[i, e] - motion.q_rate[i, e])
     mean = basis.mean[instances.asset[i], b]
     g = wp.float64(gravity[wp.max(instances.world[i], 0)][axis])
@@ -439,19 +453,9 @@ def propagate(
 def sum_gradients(
     instances: Instances,
     density: wp.array[float],
-    log_modulus: wp.array2d[wp.float64],
-    poissons_ratio: wp.array2d[wp.float64],
-    viscosity: wp.array2d[wp.float64],
-    friction: wp.array2d[wp.float64],
     sums: Sums,
-    # Out, (instance_count,):
-    youngs_modulus_out: wp.array[wp.float64],
-    poissons_ratio_out: wp.array[wp.float64],
-    viscosity_out: wp.array[wp.float64],
-    friction_out: wp.array[wp.float64],
-    density_out: wp.array[wp.float64],
-    mass_damping_out: wp.array[wp.float64],
-    gravity_out: wp.array[wp.vec3d],
+    # Out:
+    totals: Totals,
 ):
     """Sum over points, entries and functions, in order."""
     i = wp.tid()
@@ -459,16 +463,16 @@ def sum_gradients(
     nu = wp.float64(0.0)
     tau = wp.float64(0.0)
     for p in range(instances.point_count[i]):
-        modulus += log_modulus[i, p]
-        nu += poissons_ratio[i, p]
-        tau += viscosity[i, p]
-    youngs_modulus_out[i] = modulus / wp.float64(instances.youngs_modulus[i])
-    poissons_ratio_out[i] = nu
-    viscosity_out[i] = tau
+        modulus += sums.log_modulus[i, p]
+        nu += sums.poissons_ratio[i, p]
+        tau += sums.viscosity[i, p]
+    totals.youngs_modulus[i] = modulus / wp.float64(instances.youngs_modulus[i])
+    totals.poissons_ratio[i] = nu
+    totals.viscosity[i] = tau
     c = wp.float64(0.0)
-    for e in range(friction.shape[1]):
-        c += friction[i, e]
-    friction_out[i] = c
+    for e in range(sums.friction.shape[1]):
+        c += sums.friction[i, e]
+    totals.friction[i] = c
     mass = wp.float64(0.0)
     alpha = wp.float64(0.0)
     g = wp.vec3d()
@@ -478,6 +482,6 @@ def sum_gradients(
             mass += sums.mass[i, e][lane]
             alpha += sums.mass_damping[i, e][lane]
             g[e / stride] += sums.gravity[i, e][lane]
-    density_out[i] = instances.mass[i] / wp.float64(density[i]) * mass
-    mass_damping_out[i] = alpha
-    gravity_out[i] = g
+    totals.density[i] = instances.mass[i] / wp.float64(density[i]) * mass
+    totals.mass_damping[i] = alpha
+    totals.gravity[i] = g

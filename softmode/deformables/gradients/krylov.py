@@ -6,17 +6,28 @@ stops after any vector: 15 products with H a step at its best cycle length inste
 until the worst has converged, so that a world of a batch would not have the bits of a single world.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable
 
 import warp as wp
 
 from softmode.deformables.gradients import krylov_kernels as kernels
-from softmode.deformables.model.lane_kernels import vec8, vec8d
+from softmode.deformables.model.tables import allocate
 from softmode.deformables.solver.solver_reduced import SolverReduced
 
 Apply = Callable[[wp.array, wp.array, wp.array], None]
 """Writes the product of the matrix and a direction: active worlds, direction, product."""
+
+_AXES = {
+    "": "instance",
+    "world_running": "world",
+    "any_running": "1",
+    "basis": "vector instance unknown",
+    "triangle": "instance length length",
+    "rotation": "instance length",
+    "tail": "instance vector",
+    "search product work": "instance unknown",
+    "rows": "instance number",
+}
 
 
 class Gmres:
@@ -31,22 +42,17 @@ class Gmres:
     def __init__(self, solver: SolverReduced, *, cycle_length: int, cycle_max: int) -> None:
         """Allocate everything once."""
         self.solver, self.cycle_length, self.cycle_max = solver, cycle_length, cycle_max
-        self.device, count, length = solver.model.device, solver.instance_count, cycle_length
-        k = kernels.Krylov()
-        k.active, k.running, k.column, k.count = (self._zeros((count,), int) for _ in range(4))
-        k.world_running, k.any_running = self._zeros((solver.world_count,), int), self._zeros((1,), int)
-        k.target, k.error = (self._zeros((count,), wp.float64) for _ in range(2))
-        k.basis = self._zeros((length + 1, *solver.tables.unknowns), vec8d)
-        k.triangle = self._zeros((count, length, length), wp.float64)
-        k.rotation, k.tail = self._zeros((count, length), wp.vec2d), self._zeros((count, length + 1), wp.float64)
-        k.search, k.product = (self._zeros(solver.tables.unknowns, vec8d) for _ in range(2))
-        k.factored, k.diagonal = solver.tables.system.matrix, solver.tables.system.diagonal
-        k.pattern = solver.tables.system.pattern
-        k.work, k.rows = (
-            self._zeros(solver.tables.unknowns, vec8),
-            self._zeros((count, 3 * solver.tables.layout.stride), float),
-        )
-        self._krylov = k
+        tables = solver.tables
+        sizes = {
+            "instance": solver.instance_count,
+            "world": solver.world_count,
+            "unknown": 3 * tables.layout.block_count,
+            "number": 3 * tables.layout.stride,
+            "length": cycle_length,
+            "vector": cycle_length + 1,
+        }
+        given = {"systems": tables.system.table}
+        self._krylov = allocate(kernels.Krylov, _AXES, sizes, solver.model.device, given=given)
 
     @property
     def error(self) -> wp.array:
@@ -68,8 +74,8 @@ class Gmres:
             solution: x, likewise; zero at driven functions.
             tolerance: Relative residual.
         """
-        k = self._krylov
-        every = wp.ones(self.solver.world_count, dtype=int, device=self.device)
+        k, t, count = self._krylov, self.solver.tables, self.solver.instance_count
+        every = wp.ones(self.solver.world_count, dtype=int, device=self.solver.model.device)
 
         def clear() -> None:
             k.world_running.zero_()
@@ -77,14 +83,13 @@ class Gmres:
 
         def begin(first: bool) -> None:
             clear()
-            inputs = [self.solver.tables.instances, wp.float64(tolerance), int(first), self.solver.tables.team, right]
-            self._launch(kernels.begin_cycle, inputs, [k, solution])
+            given = (wp.float64(tolerance), int(first), t.team, right)
+            t.launch_teams(kernels.begin_cycle, count, t.instances, *given, k, solution)
 
         def extend() -> None:
             apply(k.world_running, k.search, k.product)
             clear()
-            inputs = [self.solver.tables.instances, self.cycle_length, self.solver.tables.team]
-            self._launch(kernels.extend_cycle, inputs, [k, solution])
+            t.launch_teams(kernels.extend_cycle, count, t.instances, self.cycle_length, t.team, k, solution)
 
         begin(first=True)
         for _ in range(self.cycle_max):
@@ -93,12 +98,3 @@ class Gmres:
             begin(first=False)
             if not int(k.any_running.numpy()[0]):
                 break
-
-    def _zeros(self, shape: Sequence[int], dtype: type) -> Any:
-        return wp.zeros(tuple(shape), dtype=dtype, device=self.device)
-
-    def _launch(self, kernel: Callable[..., None], inputs: list[Any], outputs: Sequence[Any]) -> None:
-        """Launch one team of threads per instance."""
-        team = self.solver.tables.team
-        dim = (self.solver.instance_count, team)
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=list(outputs), block_dim=team, device=self.device)

@@ -7,14 +7,15 @@ single systems give.
 
 import warp as wp
 
+from softmode.deformables.model.declare import struct
 from softmode.deformables.model.lane_kernels import LANES, barrier, free_part, team_sum, vec8, vec8d
 from softmode.deformables.model.struct_kernels import Instances
-from softmode.deformables.solver.factor_kernels import back_substitute
+from softmode.deformables.solver.factor_kernels import Systems, back_substitute
 
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.struct
+@struct
 class Krylov:
     """GMRES of every instance, shape (instance_count,) where not said."""
 
@@ -32,9 +33,7 @@ class Krylov:
     tail: wp.array2d[wp.float64]  # (instance_count, cycle_length + 1), the rotated right-hand side
     search: wp.array2d[vec8d]  # M^-1 of the newest vector
     product: wp.array2d[vec8d]  # H^T of the search direction, or of the solution
-    factored: wp.array3d[vec8]  # (instance_count, N, ...), rows of U: M = U^T U is the solver's matrix
-    diagonal: wp.array2d[vec8]  # (instance_count, N), diagonal blocks of U, inverse pivots on the diagonal
-    pattern: wp.array3d[int]  # (instance_count, 1, 1), see ``factor``
+    systems: Systems  # factored: M = U^T U is the solver's matrix
     work: wp.array2d[vec8]  # (instance_count, N / 8)
     rows: wp.array2d[float]  # (instance_count, N)
 
@@ -53,7 +52,7 @@ def precondition(k: Krylov, i: int, lane: int, team: int, size: wp.float64, righ
         first = LANES * block
         y = k.work[i, block]
         for a in range(8):
-            d = k.diagonal[i, first + a]
+            d = k.systems.diagonal[i, first + a]
             value = y[a] * d[a]
             y[a] = value
             for b in range(8):
@@ -65,10 +64,10 @@ def precondition(k: Krylov, i: int, lane: int, team: int, size: wp.float64, righ
         for l in range(block + 1 + lane, blocks, team):
             rest = k.work[i, l]
             for a in range(8):
-                rest = rest - y[a] * k.factored[i, first + a, l]
+                rest = rest - y[a] * k.systems.matrix[i, first + a, l]
             k.work[i, l] = rest
         barrier()
-    back_substitute(k.factored, k.diagonal, k.pattern, k.rows, k.work, i, lane, team)
+    back_substitute(k.systems.matrix, k.systems.diagonal, k.systems.pattern, k.rows, k.work, i, lane, team)
     for l in range(lane, blocks, team):
         k.search[i, l] = size * vec8d(k.work[i, l])
 

@@ -36,7 +36,7 @@ def detect(tables: StepTables, state: newton.State, control: SoftControl, dt: fl
         t.pairs.detect(t.motion, t.samples, t.newton, soft(state), constraints, dt=float(dt))
     if t.layout.part_count > 1:
         dim = (t.layout.world_count, t.layout.part_count)
-        t.launch(assembly.relate_pairs, dim, t.instances, t.newton, constraints, t.system.relation)
+        t.launch(assembly.relate_pairs, dim, t.step, t.system.relation)
         t.system.order_parts()
         place = (t.instances, t.newton, t.system.place, 3 * t.layout.block_count)
         t.launch(assembly.place_parts, t.layout.instance_count, *place)
@@ -46,8 +46,7 @@ def detect(tables: StepTables, state: newton.State, control: SoftControl, dt: fl
 def adapt(tables: StepTables, dt: float) -> None:
     """Let bodies in contact or attached to a rigid body take an Euler step, whatever the integrator."""
     if tables.options.integrator == "bdf2":
-        inputs = (tables.instances, tables.constraints, wp.float64(dt), tables.motion)
-        tables.launch(fall_back_to_euler, tables.unknowns, *inputs)
+        tables.launch(fall_back_to_euler, tables.unknowns, tables.newton_step(dt))
 
 
 def differentiate_constraints(tables: StepTables) -> None:

@@ -5,6 +5,7 @@ import warp as wp
 
 from softmode.deformables.model.declare import Kernel, launch, launch_teams
 from softmode.deformables.model.lane_kernels import LANES, TEAM, pad, vec8
+from softmode.deformables.model.tables import allocate
 from softmode.deformables.solver import factor_kernels as kernels
 
 
@@ -23,31 +24,28 @@ class BlockCholesky:
         self, system_world: wp.array, size: int, column_count: int, device: wp.Device, part_count: int = 1
     ) -> None:
         """Allocate everything once."""
-        self.system_world = system_world
-        self.system_count = system_world.shape[0]
-        self.size = size
-        self.block_count = size // LANES
-        self.column_block_count = pad(column_count) // LANES
-        self.device = device
+        self.system_count, self.size, self.device = system_world.shape[0], size, device
         self.pattern = wp.zeros((self.system_count, part_count, part_count), dtype=int, device=device)
         """Which parts are related where they are placed, upper triangle; the diagonal is not read."""
         self.relation = wp.zeros_like(self.pattern)
         """The same by number, symmetric; the diagonal says which parts exist, the first ones. For ``order_parts``."""
         self.place = wp.array(np.tile(np.arange(part_count), (self.system_count, 1)), dtype=int, device=device)
         """Where each part is placed in the system."""
-        total = self.block_count + self.column_block_count
-        self.matrix = wp.zeros((self.system_count, size, total), dtype=vec8, device=device)
-        shape = (self.system_count, size, LANES * total)
+        width = size + pad(column_count)
+        self.matrix = wp.zeros((self.system_count, size, width // LANES), dtype=vec8, device=device)
+        shape = (self.system_count, size, width)
         self.scalars = wp.array(ptr=self.matrix.ptr, dtype=float, shape=shape, device=device, copy=False)
         """The same memory as ``matrix``, number by number."""
         self.team, self.width, self.unit = 1, LANES, self.matrix
         if wp.get_device(device).is_cuda:
-            self.team, self.width, self.unit = min(-(-LANES * total // TEAM) * TEAM, 8 * TEAM), 1, self.scalars
+            self.team, self.width, self.unit = min(-(-width // TEAM) * TEAM, 8 * TEAM), 1, self.scalars
         self._factor = wp.overload(kernels.factor, {"unit": self.unit})
-        self.indefinite = wp.zeros(self.system_count, dtype=int, device=device)
-        self.diagonal = wp.zeros((self.system_count, size), dtype=vec8, device=device)
-        self.right = wp.zeros((self.system_count, size), dtype=float, device=device)
-        self.solution = wp.zeros((self.system_count, self.block_count), dtype=vec8, device=device)
+        given = {"world": system_world, "matrix": self.matrix, "scalars": self.scalars, "pattern": self.pattern}
+        sizes = {"system": self.system_count, "row": size, "block": size // LANES}
+        axes = {"indefinite": "system", "diagonal right": "system row", "solution": "system block"}
+        self.table = allocate(kernels.Systems, axes, sizes, device, given=given)
+        """All of it, for kernels."""
+        self.indefinite = self.table.indefinite
 
     def order_parts(self) -> None:
         """Choose ``place`` for the parts related by ``relation``; complete both that and ``pattern`` by the fill."""
@@ -58,9 +56,7 @@ class BlockCholesky:
 
         Sets ``indefinite`` where a pivot had to be raised.
         """
-        parts = (self.block_count // self.pattern.shape[1], self.pattern, self.team, self.width)
-        system = (self.matrix, self.unit, self.diagonal, self.indefinite)
-        self._launch(self._factor, active, self.block_count, *parts, *system)
+        self._launch(self._factor, active, self.team, self.width, self.unit, self.table)
 
     def solve(self, active: wp.array, column: int, tail: wp.array, tail_count: int) -> wp.array:
         """Return x of U x = y - Y tail, shape (system_count, N / 8) of 8-vectors.
@@ -71,10 +67,9 @@ class BlockCholesky:
             tail: Unknowns already known, shape (world_count, tail_count); Y are the first right-hand columns.
             tail_count: How many.
         """
-        system = (self.matrix, self.diagonal, self.pattern, tail, tail_count, self.right)
-        self._launch(kernels.solve, active, self.block_count, column, self.team, *system, self.solution)
-        return self.solution
+        self._launch(kernels.solve, active, column, self.team, tail, tail_count, self.table)
+        return self.table.solution
 
-    def _launch(self, kernel: Kernel, active: wp.array, *arguments: object) -> None:
+    def _launch(self, kernel: Kernel, *arguments: object) -> None:
         """Launch one team per system."""
-        launch_teams(self.device, kernel, self.system_count, self.team, self.system_world, active, *arguments)
+        launch_teams(self.device, kernel, self.system_count, self.team, *arguments)

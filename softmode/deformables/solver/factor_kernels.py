@@ -19,10 +19,24 @@ from typing import Any
 
 import warp as wp
 
-from softmode.deformables.model.declare import kernel_over
+from softmode.deformables.model.declare import kernel_over, struct
 from softmode.deformables.model.lane_kernels import LANES, barrier, mat88, sum8, vec8
 
 wp.set_module_options({"enable_backward": False})
+
+
+@struct
+class Systems:
+    """Systems of one size, N unknowns in parts, with M right-hand columns, a multiple of eight."""
+
+    world: wp.array[int]  # (system_count,)
+    matrix: wp.array3d[vec8]  # (system_count, N, (N + M) / 8), of the first N columns the upper triangle
+    scalars: wp.array3d[float]  # (system_count, N, N + M), the same memory number by number
+    pattern: wp.array3d[int]  # (system_count, part_count, part_count), which parts are related, upper triangle
+    diagonal: wp.array2d[vec8]  # (system_count, N): diagonal blocks of U with inverse pivots
+    indefinite: wp.array[int]  # (system_count,), 1 where a pivot had to be raised
+    right: wp.array2d[float]  # (system_count, N), scratch of the solution
+    solution: wp.array2d[vec8]  # (system_count, N / 8)
 
 
 @wp.func
@@ -32,27 +46,35 @@ def related(pattern: wp.array3d[int], i: int, part: int, other: int):
 
 
 @wp.func
+def eight_of(entry: vec8):
+    """Return room for eight rows of an entry that is a block of eight columns."""
+    return mat88()
+
+
+@wp.func
+def eight_of(entry: float):  # pyright: ignore[reportRedeclaration]  # noqa: F811
+    """Return room for eight rows of an entry that is a number."""
+    return vec8()
+
+
+@wp.func
 def factor_system(
-    # Selection:
-    system_world: wp.array[int],  # (system_count,)
     active: wp.array[int],  # (world_count,)
-    block_count: int,
-    part_blocks: int,  # blocks of rows per part
-    pattern: wp.array3d[int],  # (system_count, part_count, part_count), upper triangle
     team: int,
     width: int,
-    # In and out, the same memory in blocks of eight columns, and in units of ``width`` = 8 (vec8) or 1 (float) columns:
-    matrix: wp.array3d[vec8],  # (system_count, N, (N + M) / 8)
+    # In and out, the same memory as ``matrix`` in units of ``width`` = 8 (vec8) or 1 (float) columns:
     unit: wp.array3d[Any],  # (system_count, N, (N + M) / width)
-    # Out:
-    diagonal_out: wp.array2d[vec8],  # (system_count, N): diagonal blocks of U with inverse pivots
-    indefinite_out: wp.array[int],  # (system_count,), 1 where a pivot had to be raised
+    systems: Systems,
     i: int,
     member: int,
 ):
     """Factor row block by row block: subtract what is above (left-looking), then solve with the diagonal block."""
-    if active[system_world[i]] == 0:
+    if active[systems.world[i]] == 0:
         return
+    matrix = systems.matrix
+    pattern = systems.pattern
+    block_count = systems.solution.shape[1]
+    part_blocks = block_count / pattern.shape[1]
     total = unit.shape[2]
     indefinite = int(0)
     for block in range(block_count):
@@ -62,14 +84,9 @@ def factor_system(
             other = width * l / (LANES * part_blocks)
             if not related(pattern, i, part, other):
                 continue
-            r0 = unit[i, first, l]
-            r1 = unit[i, first + 1, l]
-            r2 = unit[i, first + 2, l]
-            r3 = unit[i, first + 3, l]
-            r4 = unit[i, first + 4, l]
-            r5 = unit[i, first + 5, l]
-            r6 = unit[i, first + 6, l]
-            r7 = unit[i, first + 7, l]
+            r = eight_of(unit[i, first, l])
+            for a in range(LANES):
+                r[a] = unit[i, first + a, l]
             # one flat loop: inside a second one the sums do not stay in registers, and cost seven times as much on CPU
             above = int(0)
             while above < block:
@@ -77,27 +94,15 @@ def factor_system(
                 if not (related(pattern, i, before, part) and related(pattern, i, before, other)):
                     above = part_blocks * (before + 1)
                     continue
-                for a in range(8):
+                for a in range(LANES):
                     s = LANES * above + a
                     u = matrix[i, s, block]
                     v = unit[i, s, l]
-                    r0 = r0 - u[0] * v
-                    r1 = r1 - u[1] * v
-                    r2 = r2 - u[2] * v
-                    r3 = r3 - u[3] * v
-                    r4 = r4 - u[4] * v
-                    r5 = r5 - u[5] * v
-                    r6 = r6 - u[6] * v
-                    r7 = r7 - u[7] * v
+                    for b in range(LANES):
+                        r[b] = r[b] - u[b] * v
                 above += 1
-            unit[i, first, l] = r0
-            unit[i, first + 1, l] = r1
-            unit[i, first + 2, l] = r2
-            unit[i, first + 3, l] = r3
-            unit[i, first + 4, l] = r4
-            unit[i, first + 5, l] = r5
-            unit[i, first + 6, l] = r6
-            unit[i, first + 7, l] = r7
+            for a in range(LANES):
+                unit[i, first + a, l] = r[a]
         barrier()
         # every thread factors its own copy of the diagonal block (inverse pivots): cheaper than waiting for one
         U = mat88()
@@ -118,34 +123,20 @@ def factor_system(
                 diagonal = vec8()
                 for b in range(8):
                     diagonal[b] = U[a, b]
-                diagonal_out[i, first + a] = diagonal
+                systems.diagonal[i, first + a] = diagonal
         for l in range((first + LANES) / width + member, total, team):
             if not related(pattern, i, part, width * l / (LANES * part_blocks)):
                 continue
-            x0 = U[0, 0] * unit[i, first, l]
-            x1 = U[1, 1] * (unit[i, first + 1, l] - U[0, 1] * x0)
-            x2 = U[2, 2] * (unit[i, first + 2, l] - U[0, 2] * x0 - U[1, 2] * x1)
-            x3 = unit[i, first + 3, l] - U[0, 3] * x0 - U[1, 3] * x1 - U[2, 3] * x2
-            x3 = U[3, 3] * x3
-            x4 = unit[i, first + 4, l] - U[0, 4] * x0 - U[1, 4] * x1 - U[2, 4] * x2 - U[3, 4] * x3
-            x4 = U[4, 4] * x4
-            x5 = unit[i, first + 5, l] - U[0, 5] * x0 - U[1, 5] * x1 - U[2, 5] * x2 - U[3, 5] * x3 - U[4, 5] * x4
-            x5 = U[5, 5] * x5
-            x6 = unit[i, first + 6, l] - U[0, 6] * x0 - U[1, 6] * x1 - U[2, 6] * x2 - U[3, 6] * x3 - U[4, 6] * x4
-            x6 = U[6, 6] * (x6 - U[5, 6] * x5)
-            x7 = unit[i, first + 7, l] - U[0, 7] * x0 - U[1, 7] * x1 - U[2, 7] * x2 - U[3, 7] * x3 - U[4, 7] * x4
-            x7 = U[7, 7] * (x7 - U[5, 7] * x5 - U[6, 7] * x6)
-            unit[i, first, l] = x0
-            unit[i, first + 1, l] = x1
-            unit[i, first + 2, l] = x2
-            unit[i, first + 3, l] = x3
-            unit[i, first + 4, l] = x4
-            unit[i, first + 5, l] = x5
-            unit[i, first + 6, l] = x6
-            unit[i, first + 7, l] = x7
+            x = eight_of(unit[i, first, l])
+            for a in range(LANES):
+                value = unit[i, first + a, l]
+                for b in range(a):
+                    value = value - U[b, a] * x[b]
+                x[a] = U[a, a] * value
+                unit[i, first + a, l] = x[a]
         barrier()
     if member == 0:
-        indefinite_out[i] = indefinite
+        systems.indefinite[i] = indefinite
 
 
 factor = kernel_over(factor_system, "factor", "i", "member")
@@ -187,37 +178,28 @@ def back_substitute(
 
 @wp.func
 def solve_system(
-    # Selection:
-    system_world: wp.array[int],
     active: wp.array[int],
-    block_count: int,
     column: int,
     team: int,
-    # Factor:
-    matrix: wp.array3d[vec8],  # (system_count, N, (N + M) / 8)
-    diagonal: wp.array2d[vec8],  # (system_count, N)
-    pattern: wp.array3d[int],
-    # Schur correction:
-    tail: wp.array2d[wp.float64],  # (world_count, tail_count): unknowns already known
+    tail: wp.array2d[wp.float64],  # (world_count, ...): unknowns already known
     tail_count: int,
-    # Scratch:
-    right: wp.array2d[float],  # (system_count, N)
-    # Out:
-    solution_out: wp.array2d[vec8],  # (system_count, N / 8)
+    # In and out:
+    systems: Systems,
     i: int,
     member: int,
 ):
     """Solve U x = y - Y t from the last row up; y is right-hand column ``column``, Y the ``tail_count`` first ones."""
-    world = system_world[i]
+    world = systems.world[i]
     if active[world] == 0:
         return
+    block_count = systems.solution.shape[1]
     for row in range(member, LANES * block_count, team):
-        value = matrix[i, row, block_count + column / 8][column % 8]
+        value = systems.matrix[i, row, block_count + column / 8][column % 8]
         for j in range(tail_count):
-            value -= matrix[i, row, block_count + j / 8][j % 8] * float(tail[world, j])
-        right[i, row] = value
+            value -= systems.matrix[i, row, block_count + j / 8][j % 8] * float(tail[world, j])
+        systems.right[i, row] = value
     barrier()
-    back_substitute(matrix, diagonal, pattern, right, solution_out, i, member, team)
+    back_substitute(systems.matrix, systems.diagonal, systems.pattern, systems.right, systems.solution, i, member, team)
 
 
 solve = kernel_over(solve_system, "solve", "i", "member")

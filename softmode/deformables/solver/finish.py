@@ -20,15 +20,10 @@ def finish(tables: StepTables, state: newton.State, dt: float, *, prescribed: bo
         dt: Step [s].
         prescribed: As for :func:`softmode.deformables.solver.detect.detect`.
     """
-    t, out, layout, q = tables, soft(state), tables.layout, tables.arrays.q
-    blocks, worlds = layout.block_count, layout.world_count
-    t.launch_teams(kernels.check_state, worlds, t.instances, t.points, t.rigid.table, t.team, blocks, q, t.newton)
-    t.launch(
-        kernels.end_step,
-        (layout.instance_count, layout.stride),
-        *(t.instances, t.motion, t.constraints, t.newton.status, q, blocks, wp.float64(dt)),
-        *(out.q, out.qd, out.q_before, out.qd_before, out.dt_before),
-    )
+    t, out, worlds, step = tables, soft(state), tables.layout.world_count, tables.newton_step(dt)
+    t.launch_teams(kernels.check_state, worlds, step, t.team)
+    every = (t.layout.instance_count, t.layout.stride)
+    t.launch(kernels.end_step, every, step, out.q, out.qd, out.q_before, out.qd_before, out.dt_before)
     if t.model.shape_count:
         sticking = (t.instances, t.shapes, t.samples, t.constraints, int(prescribed))
         t.launch(memory_kernels.remember_slip, t.samples.position.shape, *sticking, out.stick_shape, out.stick_point)

@@ -7,7 +7,7 @@ hide it. The system stays in shared memory from its assembly to its solution; lo
 
 import warp as wp
 
-from softmode.deformables.model.lane_kernels import vec8, vec8d
+from softmode.deformables.solver.iteration_kernels import NewtonStep
 
 SHARED_SIZE = 72
 """Most unknowns of a system in shared memory, and"""
@@ -28,11 +28,12 @@ def _sized(snippet: str) -> str:
     __shared__ __align__(16) float D[SHARED_SIZE * 8];
     __shared__ float right[SHARED_SIZE];
     const int stride = SHARED_WIDTH;
-    const int N = size;
-    const int W = width;
-    float* g = (float*)scalars.data + (size_t)i * N * W;
+    const int N = step.arrays.systems.scalars.shape[1];
+    const int W = step.arrays.systems.scalars.shape[2];
+    float* g = (float*)step.arrays.systems.scalars.data + (size_t)i * N * W;
     if (mode == 0) {
-        const float* K = (const float*)stiffness.data + (size_t)i * stiffness.shape[1] * N * N;
+        const int chunks = step.arrays.stiffness.shape[1];
+        const float* K = (const float*)step.arrays.stiffness.data + (size_t)i * chunks * N * N;
         const int quads = N / 4;
         #pragma unroll 4
         for (int t = member; t < N * quads; t += team) {
@@ -40,7 +41,7 @@ def _sized(snippet: str) -> str:
             const int first = 4 * (t - row * quads);
             if (first >= (row & ~7)) {
                 float4 value = *(const float4*)&K[row * N + first];
-                for (int chunk = 1; chunk < stiffness.shape[1]; ++chunk) {
+                for (int chunk = 1; chunk < chunks; ++chunk) {
                     const float4 more = *(const float4*)&K[(size_t)chunk * N * N + row * N + first];
                     value.x += more.x; value.y += more.y; value.z += more.z; value.w += more.w;
                 }
@@ -60,9 +61,11 @@ def _sized(snippet: str) -> str:
         }
         __syncthreads();
         const int blocks = N / 24;
-        const int* rows = (const int*)constraint_row.data + (size_t)i * constraint_row.shape[1];
-        const float* H = (const float*)constraint_hessian.data + (size_t)i * constraint_hessian.shape[1] * 9;
-        const float* basis = (const float*)basis_row.data;
+        const int constraint_count = step.constraints.count.data[i];
+        const int* rows = (const int*)step.constraints.row.data + (size_t)i * step.constraints.row.shape[1];
+        const int room = step.constraints.hessian.shape[1];
+        const float* H = (const float*)step.constraints.hessian.data + (size_t)i * room * 9;
+        const float* values = (const float*)step.basis.row.data;
         // half blocks, 4 x 8: of the components (c, d), rows 4 k of the functions, columns 8 m
         for (int t = member; t < 9 * 2 * blocks * blocks; t += team) {
             const int c = t / (6 * blocks * blocks);
@@ -78,7 +81,7 @@ def _sized(snippet: str) -> str:
             }
             #pragma unroll 4
             for (int e = 0; e < constraint_count; ++e) {
-                const float* r = basis + (size_t)rows[e] * 8 * blocks;
+                const float* r = values + (size_t)rows[e] * 8 * blocks;
                 const float h = H[9 * e + 3 * c + d];
                 const float4 u = *(const float4*)&r[4 * k];
                 const float4 v = *(const float4*)&r[8 * m];
@@ -159,17 +162,18 @@ def _sized(snippet: str) -> str:
             }
             __syncthreads();
         }
-        if (member == 0) indefinite.data[i] = bad;
+        if (member == 0) step.arrays.systems.indefinite.data[i] = bad;
         return;
     }
-    const double* t = (const double*)tail.data + (size_t)world * tail.shape[1];
+    const int tail_count = step.rigid.count.data[world];
+    const double* t = (const double*)step.rigid.direction.data + (size_t)world * step.rigid.direction.shape[1];
     for (int row = member; row < N; row += team) {
-        float value = A[row * stride + N + column];
+        float value = A[row * stride + N + step.options.rigid_max];
         for (int j = 0; j < tail_count; ++j) value -= A[row * stride + N + j] * (float)t[j];
         right[row] = value;
     }
     __syncthreads();
-    float* out = (float*)solution.data + (size_t)i * N;
+    float* out = (float*)step.arrays.direction.data + (size_t)i * N;
     for (int first = N - 8; first >= 0; first -= 8) {
         float x[8];
         #pragma unroll
@@ -196,20 +200,8 @@ def _sized(snippet: str) -> str:
 )
 def shared_system(
     mode: int,
-    stiffness: wp.array4d[vec8],  # (instance_count, chunk_count, size, size / 8), upper triangle
     inertia: float,
-    constraint_row: wp.array2d[int],
-    constraint_hessian: wp.array2d[wp.mat33],
-    constraint_count: int,
-    basis_row: wp.array2d[vec8],
-    scalars: wp.array3d[float],  # (system_count, size, width), from column ``size`` on B, and after mode 0 U^-T B
-    size: int,
-    width: int,
-    indefinite: wp.array[int],  # (system_count,)
-    column: int,
-    tail: wp.array2d[wp.float64],  # (world_count, ...): unknowns already known
-    tail_count: int,
-    solution: wp.array2d[vec8],  # (system_count, size / 8)
+    step: NewtonStep,  # the matrices hold from column N on B, and after mode 0 U^-T B
     i: int,
     world: int,
     member: int,
@@ -222,18 +214,21 @@ def shared_system(
 @wp.func_native(
     snippet="""
 #if defined(__CUDA_ARCH__)
-    const int blocks = basis_row.shape[1];
+    const int blocks = step.basis.row.shape[1];
     const int n = 8 * blocks;
-    const double* P = (const double*)stress.data + (size_t)i * stress.shape[1] * 9;
-    const double* F = (const double*)constraint_force.data + (size_t)i * constraint_force.shape[1] * 3;
-    const int* rows = (const int*)constraint_row.data + (size_t)i * constraint_row.shape[1];
-    const float* basis = (const float*)basis_row.data;
-    double* out = (double*)chunk.data + (size_t)i * chunk.shape[1] * 3 * n;
+    const int first_point = step.instances.point_start.data[i];
+    const int point_count = step.instances.point_count.data[i];
+    const int constraint_count = step.constraints.count.data[i];
+    const double* P = (const double*)step.points.stress.data + (size_t)i * step.points.stress.shape[1] * 9;
+    const double* F = (const double*)step.constraints.force.data + (size_t)i * step.constraints.force.shape[1] * 3;
+    const int* rows = (const int*)step.constraints.row.data + (size_t)i * step.constraints.row.shape[1];
+    const float* values = (const float*)step.basis.row.data;
+    double* out = (double*)step.arrays.gradient_chunk.data + (size_t)i * step.arrays.gradient_chunk.shape[1] * 3 * n;
     for (int t = member; t < 3 * n; t += team) {
         const int axis = t / n;
         const int k = t - axis * n;
         // points in memory one after another, three rows of n functions each
-        const float* G = (const float*)gradient.data + (size_t)first_point * 3 * n + k;
+        const float* G = (const float*)step.basis.gradient_across.data + (size_t)first_point * 3 * n + k;
         double value = 0.0;
         #pragma unroll 8
         for (int p = 0; p < point_count; ++p) {
@@ -242,22 +237,14 @@ def shared_system(
             value += P[9 * p + 3 * axis + 2] * (double)G[3 * n * p + 2 * n];
         }
         #pragma unroll 8
-        for (int e = 0; e < constraint_count; ++e) value -= F[3 * e + axis] * (double)basis[(size_t)rows[e] * n + k];
+        for (int e = 0; e < constraint_count; ++e) value -= F[3 * e + axis] * (double)values[(size_t)rows[e] * n + k];
         out[t] = value;
     }
 #endif
 """
 )
 def sum_forces_of(
-    stress: wp.array2d[wp.mat33d],  # (instance_count, point_max)
-    gradient: wp.array3d[vec8],  # ``basis.gradient_across``, on CUDA with blocks side by side
-    constraint_row: wp.array2d[int],
-    constraint_force: wp.array2d[wp.vec3d],
-    constraint_count: int,
-    basis_row: wp.array2d[vec8],
-    first_point: int,
-    point_count: int,
-    chunk: wp.array3d[vec8d],  # (instance_count, 1, 3 block_count)
+    step: NewtonStep,
     i: int,
     member: int,
     team: int,

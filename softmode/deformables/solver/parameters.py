@@ -140,15 +140,10 @@ def _checked(name: str, values: Any, like: Any) -> wp.array:
     Raises:
         ConfigError: If it is not one.
     """
-    if (
-        not isinstance(values, wp.array)
-        or values.dtype != wp.float32
-        or values.shape != like.shape
-        or values.device != like.device
-    ):
+    found: Any = type(values)
+    if isinstance(values, wp.array):
         given: Any = values
-        found = (
-            f"{given.dtype.__name__} {given.shape} on {given.device}" if isinstance(values, wp.array) else type(values)
-        )
-        raise ConfigError(f"{name} must be a wp.array of float32, shape {like.shape}, on {like.device}, got {found}")
-    return values
+        if (given.dtype, given.shape, given.device) == (wp.float32, like.shape, like.device):
+            return given
+        found = f"{given.dtype.__name__} {given.shape} on {given.device}"
+    raise ConfigError(f"{name} must be a wp.array of float32, shape {like.shape}, on {like.device}, got {found}")

@@ -1,7 +1,6 @@
 """First phase of a step: read the state, and predict where the bodies go without contact."""
 
 import newton
-import warp as wp
 
 from softmode.deformables.model.namespaces import SoftControl, soft
 from softmode.deformables.solver import step_kernels as kernels
@@ -17,11 +16,9 @@ def predict(tables: StepTables, state: newton.State, control: SoftControl, dt: f
         control: Where driven functions are to be at its end.
         dt: Step [s].
     """
-    data, chunk = soft(state), tables.arrays.gradient_chunk
-    count, blocks, bodies = tables.layout.instance_count, tables.layout.block_count, (tables.instances, tables.basis)
-    dim = (count, chunk.shape[1], blocks)
-    tables.launch(kernels.sum_external, dim, *bodies, state.particle_f, chunk.shape[1], chunk)
+    data, step, blocks = soft(state), tables.newton_step(dt), tables.layout.block_count
+    count, chunks = tables.layout.instance_count, tables.arrays.gradient_chunk.shape[1]
+    tables.launch(kernels.sum_external, (count, chunks, blocks), step, state.particle_f)
     before = (data.q, data.qd, data.q_before, data.qd_before, data.dt_before)
-    given = (tables.model.gravity, *before, control.q_driven, chunk, wp.float64(dt))
     bdf2 = int(tables.options.integrator == "bdf2")
-    tables.launch(kernels.begin_step, (count, blocks), *bodies, *given, bdf2, tables.motion, tables.arrays.q)
+    tables.launch(kernels.begin_step, (count, blocks), step, tables.model.gravity, *before, control.q_driven, bdf2)

@@ -14,6 +14,7 @@ import warp as wp
 
 from softmode.deformables.model.declare import kernel_over, struct
 from softmode.deformables.model.struct_kernels import Rigid
+from softmode.deformables.solver.iteration_kernels import NewtonStep
 
 wp.set_module_options({"enable_backward": False})
 
@@ -280,33 +281,27 @@ def evaluate_cone(rigid: Rigid, w: int, head: int, r: wp.array2d[wp.float64], dt
 
 @wp.func
 def evaluate_row(
-    selected: wp.array[int],
-    r: wp.array2d[wp.float64],
-    dt: wp.float64,
-    derivatives: int,
-    # In and out:
-    rigid: Rigid,
-    w: int,
-    k: int,
+    step: NewtonStep, selected: wp.array[int], r: wp.array2d[wp.float64], derivatives: int, w: int, k: int
 ):
     """Evaluate the rows at r: energy, force and s'' J."""
-    if selected[w] == 0 or k >= rigid.row_count[w]:
+    dt = step.options.dt
+    if selected[w] == 0 or k >= step.rigid.row_count[w]:
         return
-    kind = rigid.row_kind[w, k]
+    kind = step.rigid.row_kind[w, k]
     if kind == ELLIPTIC:
-        evaluate_cone(rigid, w, k, r, dt, derivatives)
+        evaluate_cone(step.rigid, w, k, r, dt, derivatives)
     elif kind != MEMBER:
-        start = rigid.row_start[w, k]
-        D = rigid.row_stiffness[w, k]
-        loss = rigid.row_limit[w, k]
-        change = displaced(rigid, w, k, r, dt)
+        start = step.rigid.row_start[w, k]
+        D = step.rigid.row_stiffness[w, k]
+        loss = step.rigid.row_limit[w, k]
+        change = displaced(step.rigid, w, k, r, dt)
         cost_start, slope_start, _curvature_start = row_cost(kind, start, D, loss)
         cost, slope, curvature = row_cost(kind, start + change, D, loss)
-        rigid.row_energy[w, k] = dt * dt * (cost - cost_start - slope_start * change)
-        rigid.row_force[w, k] = slope - slope_start
+        step.rigid.row_energy[w, k] = dt * dt * (cost - cost_start - slope_start * change)
+        step.rigid.row_force[w, k] = slope - slope_start
         if derivatives != 0:
-            for j in range(rigid.count[w]):
-                rigid.row_coupling[w, k, j] = curvature / (dt * dt) * wp.float64(rigid.row_jacobian[w, k, j])
+            for j in range(step.rigid.count[w]):
+                step.rigid.row_coupling[w, k, j] = curvature / (dt * dt) * wp.float64(step.rigid.row_jacobian[w, k, j])
 
 
 evaluate_rows = kernel_over(evaluate_row, "evaluate_rows", "w", "k")

@@ -3,20 +3,15 @@
 import warp as wp
 
 from softmode.deformables.model.declare import kernel_over
-from softmode.deformables.model.lane_kernels import barrier, team_sum, vec8, vec8d
+from softmode.deformables.model.lane_kernels import barrier, team_sum, vec8d
 from softmode.deformables.model.status import WORLD_ITERATION_LIMIT, WORLD_NO_DESCENT, WORLD_NOT_FINITE
 from softmode.deformables.model.struct_kernels import (
-    Basis,
     Instances,
-    Motion,
-    NewtonState,
-    PointConstraints,
-    Points,
-    Rigid,
     has_contacts,
     hessian_key,
     pushes,
 )
+from softmode.deformables.solver.iteration_kernels import NewtonOptions, NewtonStep
 
 wp.set_module_options({"enable_backward": False})
 
@@ -40,127 +35,91 @@ Newton's steps halve the penetration, and double ones end it."""
 
 
 @wp.func
-def potential_share(
-    state: NewtonState,
-    instances: Instances,
-    motion: Motion,
-    points: Points,
-    constraints: PointConstraints,
-    rigid: Rigid,
-    q: wp.array2d[vec8d],
-    r: wp.array2d[wp.float64],
-    dt: wp.float64,
-    w: int,
-    member: int,
-    team: int,
-):
+def potential_share(step: NewtonStep, q: wp.array2d[vec8d], r: wp.array2d[wp.float64], w: int, member: int, team: int):
     """Return one thread's share of the incremental potential of a world [J], in a fixed order."""
+    dt = step.options.dt
     half = wp.float64(0.5)
     total = wp.float64(0.0)
-    for i in range(state.instance_start[w], state.instance_start[w + 1]):
-        c = motion.rate[i]
-        inertial = half * instances.mass[i] * c * c / (dt * dt)
-        damping = half * instances.mass[i] * wp.float64(instances.mass_damping[i]) * c / dt
+    for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
+        c = step.motion.rate[i]
+        inertial = half * step.instances.mass[i] * c * c / (dt * dt)
+        damping = half * step.instances.mass[i] * wp.float64(step.instances.mass_damping[i]) * c / dt
         for e in range(member, q.shape[1], team):
             x = q[i, e]
-            away = x - motion.q_inertial[i, e]
-            moved = x - motion.q_rate[i, e]
-            step = x - motion.q_start[i, e]
-            total += inertial * wp.dot(away, away) + damping * wp.dot(moved, moved) - wp.dot(motion.force[i, e], step)
-        for p in range(member, instances.point_count[i], team):
-            total += points.energy[i, p]
-        for e in range(member, constraints.count[i], team):
-            total += constraints.energy[i, e]
-    for j in range(member, rigid.count[w], team):
-        for l in range(rigid.count[w]):
+            away = x - step.motion.q_inertial[i, e]
+            moved = x - step.motion.q_rate[i, e]
+            ahead = x - step.motion.q_start[i, e]
             total += (
-                half * (r[w, j] - rigid.predicted[w, j]) * rigid.inertia[w, j, l] * (r[w, l] - rigid.predicted[w, l])
+                inertial * wp.dot(away, away) + damping * wp.dot(moved, moved) - wp.dot(step.motion.force[i, e], ahead)
             )
-    for k in range(member, rigid.row_count[w], team):
-        total += rigid.row_energy[w, k]
+        for p in range(member, step.instances.point_count[i], team):
+            total += step.points.energy[i, p]
+        for e in range(member, step.constraints.count[i], team):
+            total += step.constraints.energy[i, e]
+    for j in range(member, step.rigid.count[w], team):
+        for l in range(step.rigid.count[w]):
+            total += (
+                half
+                * (r[w, j] - step.rigid.predicted[w, j])
+                * step.rigid.inertia[w, j, l]
+                * (r[w, l] - step.rigid.predicted[w, l])
+            )
+    for k in range(member, step.rigid.row_count[w], team):
+        total += step.rigid.row_energy[w, k]
     return total
 
 
 @wp.func
-def check_convergence(
-    instances: Instances,
-    motion: Motion,
-    points: Points,
-    constraints: PointConstraints,
-    rigid: Rigid,
-    team: int,
-    iteration_max: int,
-    force_tolerance: wp.float64,
-    # State in:
-    gradient: wp.array2d[vec8d],
-    q: wp.array2d[vec8d],
-    dt: wp.float64,
-    # In and out:
-    state: NewtonState,
-    w: int,
-    member: int,
-):
+def check_convergence(step: NewtonStep, team: int, w: int, member: int):
     """Sum the potential; stop a world whose last step was small and whose residual is small near its contacts.
 
     The second condition matters in contact: within a step's tolerance friction goes from one side of its cone to the
     other, and a residual is momentum that the other body receives and this one does not.
     """
-    if state.active[w] == 0:
+    if step.state.active[w] == 0:
         return
-    share = potential_share(state, instances, motion, points, constraints, rigid, q, rigid.r, dt, w, member, team)
+    q = step.arrays.q
+    gradient = step.arrays.gradient
+    dt = step.options.dt
+    share = potential_share(step, step.arrays.q, step.rigid.r, w, member, team)
     potential = team_sum(share)
-    done = state.last[w]
-    for i in range(state.instance_start[w], state.instance_start[w + 1]):
-        if done == 1 and state.iteration[w] > 0 and pushes(instances, constraints, i):
+    done = step.state.last[w]
+    for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
+        if done == 1 and step.state.iteration[w] > 0 and pushes(step.instances, step.constraints, i):
             residual = wp.float64(0.0)
             external = wp.float64(0.0)
             scale = wp.float64(0.0)
             for e in range(member, q.shape[1], team):
                 residual += wp.dot(gradient[i, e], gradient[i, e])
-                external += wp.dot(motion.force[i, e], motion.force[i, e])
-            for e in range(member, constraints.count[i], team):
-                scale += wp.length(constraints.force[i, e])
+                external += wp.dot(step.motion.force[i, e], step.motion.force[i, e])
+            for e in range(member, step.constraints.count[i], team):
+                scale += wp.length(step.constraints.force[i, e])
             residual = team_sum(residual)
             scale = wp.sqrt(team_sum(external)) + team_sum(scale)
-            floor = wp.float64(1.0e-5) * instances.mass[i] * wp.float64(instances.tolerance[i]) / (dt * dt)
-            if not (wp.sqrt(residual) <= force_tolerance * scale + floor):
+            floor = wp.float64(1.0e-5) * step.instances.mass[i] * wp.float64(step.instances.tolerance[i]) / (dt * dt)
+            if not (wp.sqrt(residual) <= step.options.force_tolerance * scale + floor):
                 done = 0
     if member != 0:
         return
-    state.potential[w] = potential
+    step.state.potential[w] = potential
     if wp.isnan(potential):
-        state.active[w] = 0
-        state.status[w] = state.status[w] | WORLD_NOT_FINITE
+        step.state.active[w] = 0
+        step.state.status[w] = step.state.status[w] | WORLD_NOT_FINITE
         return
-    if state.iteration[w] == 0:
+    if step.state.iteration[w] == 0:
         return
     if done == 1:
-        state.active[w] = 0
-    elif state.iteration[w] >= iteration_max:
-        state.active[w] = 0
-        state.status[w] = state.status[w] | WORLD_ITERATION_LIMIT
+        step.state.active[w] = 0
+    elif step.state.iteration[w] >= step.options.iteration_max:
+        step.state.active[w] = 0
+        step.state.status[w] = step.state.status[w] | WORLD_ITERATION_LIMIT
 
 
 check_iterates = kernel_over(check_convergence, "check_iterates", "w", "member")
 
 
 @wp.func
-def start_line_search(
-    instances: Instances,
-    constraints: PointConstraints,
-    rigid: Rigid,
-    rigid_tolerance: wp.array[float],  # (world_count,) [m or rad]
-    stick_range: wp.float64,  # [m]
-    team: int,
-    # State in:
-    gradient: wp.array2d[vec8d],
-    direction: wp.array2d[vec8],
-    indefinite: wp.array[int],  # (system_count,)
-    # In and out:
-    state: NewtonState,
-    w: int,
-    member: int,
-):
+def start_line_search(step: NewtonStep, team: int, w: int, member: int):
     """Compute the slope g . d of each active world and start its line search at alpha = 1.
 
     Where Newton's own Hessian turns out to be indefinite the world stays put and takes the projected one next.
@@ -169,255 +128,211 @@ def start_line_search(
     potential drowns in rounding. If the residual is still too large after it, the next small step is searched for:
     between sticking and slipping, full steps may go round in circles.
     """
-    if state.active[w] == 0:
+    if step.state.active[w] == 0:
         if member == 0:
-            state.searching[w] = 0
+            step.state.searching[w] = 0
         return
     slope = wp.float64(0.0)
     last = int(1)
     unsound = int(0)
-    for i in range(state.instance_start[w], state.instance_start[w + 1]):
-        if state.project[w] == 0 and indefinite[instances.system[i]] != 0:
+    for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
+        if step.state.project[w] == 0 and step.arrays.systems.indefinite[step.instances.system[i]] != 0:
             unsound = 1
         moved = wp.float64(0.0)
-        for e in range(member, gradient.shape[1], team):
-            d = vec8d(direction[i, e])
-            slope += wp.dot(gradient[i, e], d)
+        for e in range(member, step.arrays.gradient.shape[1], team):
+            d = vec8d(step.arrays.direction[i, e])
+            slope += wp.dot(step.arrays.gradient[i, e], d)
             moved += wp.dot(d, d)
         moved = team_sum(moved)
-        limit = wp.float64(instances.tolerance[i])
-        if has_contacts(instances, constraints, i):
-            limit = wp.min(limit, wp.float64(0.1) * stick_range)
+        limit = wp.float64(step.instances.tolerance[i])
+        if has_contacts(step.instances, step.constraints, i):
+            limit = wp.min(limit, wp.float64(0.1) * step.options.stick_range)
         if not (wp.sqrt(moved) <= limit):
             last = 0
     slope = team_sum(slope)
     if member != 0:
         return
-    state.searching[w] = 0
-    for j in range(rigid.count[w]):
-        slope += rigid.gradient[w, j] * rigid.direction[w, j]
+    step.state.searching[w] = 0
+    for j in range(step.rigid.count[w]):
+        slope += step.rigid.gradient[w, j] * step.rigid.direction[w, j]
         # dofs that take part are in contact: a light body moves where the soft one stays
-        limit = wp.min(wp.float64(rigid_tolerance[w]), wp.float64(0.01) * stick_range)
-        if not (wp.abs(rigid.direction[w, j]) <= limit):
+        limit = wp.min(wp.float64(step.arrays.rigid_tolerance[w]), wp.float64(0.01) * step.options.stick_range)
+        if not (wp.abs(step.rigid.direction[w, j]) <= limit):
             last = 0
-    state.slope[w] = slope
-    state.step_length[w] = wp.float64(1.0)
-    small_again = wp.where(state.iteration[w] > 0, state.last[w], 0)
-    state.last[w] = last
+    step.state.slope[w] = slope
+    step.state.step_length[w] = wp.float64(1.0)
+    small_again = wp.where(step.state.iteration[w] > 0, step.state.last[w], 0)
+    step.state.last[w] = last
     if unsound == 1:
-        state.step_length[w] = wp.float64(0.0)
-        state.last[w] = 0
-        state.failures[w] = state.failures[w] + 1
-    elif last == 1 and state.project[w] != 0 and state.iteration[w] < PROJECTED_ITERATIONS:
+        step.state.step_length[w] = wp.float64(0.0)
+        step.state.last[w] = 0
+        step.state.failures[w] = step.state.failures[w] + 1
+    elif last == 1 and step.state.project[w] != 0 and step.state.iteration[w] < PROJECTED_ITERATIONS:
         # too stiff a matrix takes small steps: that says nothing of the distance to the minimum
-        state.last[w] = 0
+        step.state.last[w] = 0
     elif last == 0 or small_again == 1:
-        state.searching[w] = 1
-        wp.atomic_max(state.any_searching, 0, 1)
+        step.state.searching[w] = 1
+        wp.atomic_max(step.state.any_searching, 0, 1)
 
 
 start_line_searches = kernel_over(start_line_search, "start_line_searches", "w", "member")
 
 
 @wp.kernel
-def trial_functions(
-    instances: Instances,
-    state: NewtonState,
-    q: wp.array2d[vec8d],
-    direction: wp.array2d[vec8],
-    # Out:
-    q_out: wp.array2d[vec8d],
-):
+def trial_functions(step: NewtonStep):
     """Set q_trial = q + alpha dq."""
     i, e = wp.tid()
-    w = instances.world[i]
-    if state.searching[w] == 0:
+    w = step.instances.world[i]
+    if step.state.searching[w] == 0:
         return
-    q_out[i, e] = q[i, e] + state.step_length[w] * vec8d(direction[i, e])
+    step.arrays.q_trial[i, e] = step.arrays.q[i, e] + step.state.step_length[w] * vec8d(step.arrays.direction[i, e])
 
 
 @wp.kernel
-def trial_rigid(
-    state: NewtonState,
-    # In and out:
-    rigid: Rigid,
-):
+def trial_rigid(step: NewtonStep):
     """Set r_trial = r + alpha dr."""
     w, j = wp.tid()
-    if state.searching[w] == 0 or j >= rigid.count[w]:
+    if step.state.searching[w] == 0 or j >= step.rigid.count[w]:
         return
-    rigid.trial[w, j] = rigid.r[w, j] + state.step_length[w] * rigid.direction[w, j]
+    step.rigid.trial[w, j] = step.rigid.r[w, j] + step.state.step_length[w] * step.rigid.direction[w, j]
 
 
 @wp.func
-def check_trial(
-    instances: Instances,
-    motion: Motion,
-    points: Points,
-    constraints: PointConstraints,
-    rigid: Rigid,
-    team: int,
-    step_length_min: wp.float64,
-    # State in:
-    q: wp.array2d[vec8d],
-    dt: wp.float64,
-    # In and out:
-    state: NewtonState,
-    w: int,
-    member: int,
-):
+def check_trial(step: NewtonStep, team: int, w: int, member: int):
     """Accept a trial that lowers the potential enough (Armijo, up to rounding) or halve the step; give up if short.
 
     Where a full step has lowered it by more than a quadratic would have, take the better of that and twice the step.
     """
-    if state.searching[w] == 0:
+    if step.state.searching[w] == 0:
         return
-    share = potential_share(state, instances, motion, points, constraints, rigid, q, rigid.trial, dt, w, member, team)
+    share = potential_share(step, step.arrays.q_trial, step.rigid.trial, w, member, team)
     trial = team_sum(share)
     if member != 0:
         return
-    potential = state.potential[w]
+    potential = step.state.potential[w]
     rounding = wp.float64(1.0e-12) * wp.abs(potential)
-    alpha = state.step_length[w]
+    alpha = step.state.step_length[w]
     if alpha > wp.float64(1.0):
-        state.searching[w] = 0
-        if not (trial < state.reached[w]):
-            state.step_length[w] = wp.float64(1.0)
+        step.state.searching[w] = 0
+        if not (trial < step.state.reached[w]):
+            step.state.step_length[w] = wp.float64(1.0)
         return
-    if alpha == wp.float64(1.0) and trial < potential + EXTENDED_DECREASE * state.slope[w] - rounding:
-        state.reached[w] = trial
-        state.step_length[w] = wp.float64(2.0)
-        wp.atomic_max(state.any_searching, 0, 1)
+    if alpha == wp.float64(1.0) and trial < potential + EXTENDED_DECREASE * step.state.slope[w] - rounding:
+        step.state.reached[w] = trial
+        step.state.step_length[w] = wp.float64(2.0)
+        wp.atomic_max(step.state.any_searching, 0, 1)
         return
-    if trial <= potential + SUFFICIENT_DECREASE * alpha * state.slope[w] + rounding:
-        state.searching[w] = 0
+    if trial <= potential + SUFFICIENT_DECREASE * alpha * step.state.slope[w] + rounding:
+        step.state.searching[w] = 0
         return
     alpha *= wp.float64(0.5)
-    if alpha < step_length_min:
+    if alpha < step.options.step_length_min:
         alpha = wp.float64(0.0)
-        state.searching[w] = 0
+        step.state.searching[w] = 0
     else:
-        wp.atomic_max(state.any_searching, 0, 1)
-    state.step_length[w] = alpha
+        wp.atomic_max(step.state.any_searching, 0, 1)
+    step.state.step_length[w] = alpha
 
 
 check_trials = kernel_over(check_trial, "check_trials", "w", "member")
 
 
 @wp.func
-def refresh_limit(instances: Instances, i: int, refresh_distance: float, dt: float):
+def refresh_limit(instances: Instances, i: int, options: NewtonOptions):
     """Return how far a body may move, in strain and rotation, before its elastic Hessian is refreshed [m], rms."""
+    dt = float(options.dt)
     inertia = instances.inertia[i] / (dt * dt * instances.youngs_modulus[i])
-    return wp.float64(wp.min(refresh_distance, INERTIA_SHARE * inertia) * instances.size[i])
+    return wp.float64(wp.min(options.refresh_distance, INERTIA_SHARE * inertia) * instances.size[i])
 
 
 @wp.kernel
-def reuse_hessians(
-    instances: Instances,
-    basis: Basis,
-    refresh_distance: float,  # in sizes
-    dt: float,
-    team: int,
-    q: wp.array2d[vec8d],
-    # In and out:
-    state: NewtonState,
-):
+def reuse_hessians(step: NewtonStep, team: int):
     """Start with the elastic Hessian of the step before where no body has bent or turned since.
 
     The distance leaves out the translation: the basis is mass-orthonormal, so that its coordinates are the basis' mean.
     """
     w, member = wp.tid()
-    keep = state.cached[w]
-    for i in range(state.instance_start[w], state.instance_start[w + 1]):
+    keep = step.state.cached[w]
+    q = step.arrays.q
+    for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
         stride = q.shape[1] / 3
         moved = wp.float64(0.0)
         mean = wp.vec3d()
         for e in range(member, q.shape[1], team):
-            d = q[i, e] - state.cached_q[i, e]
+            d = q[i, e] - step.state.cached_q[i, e]
             moved += wp.dot(d, d)
-            mean[e / stride] = mean[e / stride] + wp.dot(d, basis.mean[instances.asset[i], e % stride])
+            mean[e / stride] = mean[e / stride] + wp.dot(d, step.basis.mean[step.instances.asset[i], e % stride])
         for axis in range(3):
             part = team_sum(mean[axis])
             mean[axis] = part
         moved = team_sum(moved) - wp.length_sq(mean)
-        limit = refresh_limit(instances, i, refresh_distance, dt)
-        if not (moved <= limit * limit) or not (state.cached_key[i] == hessian_key(instances, i, dt)):
+        limit = refresh_limit(step.instances, i, step.options)
+        if not (moved <= limit * limit) or not (
+            step.state.cached_key[i] == hessian_key(step.instances, i, float(step.options.dt))
+        ):
             keep = 0
     if member == 0:
-        state.refresh[w] = 1 - keep
+        step.state.refresh[w] = 1 - keep
 
 
 @wp.func
-def accept_step(
-    instances: Instances,
-    rigid: Rigid,
-    team: int,
-    refresh_interval: int,
-    refresh_distance: float,  # in sizes
-    dt: float,
-    # State in:
-    direction: wp.array2d[vec8],
-    # In and out:
-    q: wp.array2d[vec8d],
-    state: NewtonState,
-    w: int,
-    member: int,
-):
+def accept_step(step: NewtonStep, team: int, w: int, member: int):
     """Take the accepted step; say whether the stiffness is to be refreshed and how friction is to be linearised.
 
     A world that touches nothing is done with a step below the tolerance; near contacts the residual decides.
     """
-    if state.active[w] == 0:
+    if step.state.active[w] == 0:
         return
-    alpha = state.step_length[w]
-    refreshed = state.refresh[w]
+    alpha = step.state.step_length[w]
+    q = step.arrays.q
+    refreshed = step.state.refresh[w]
     far = int(0)
     away = int(0)
-    for i in range(state.instance_start[w], state.instance_start[w + 1]):
+    for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
         moved = wp.float64(0.0)
         for e in range(member, q.shape[1], team):
-            d = vec8d(direction[i, e])
+            d = vec8d(step.arrays.direction[i, e])
             moved += wp.dot(d, d)
             if refreshed != 0:
-                state.cached_q[i, e] = q[i, e]
+                step.state.cached_q[i, e] = q[i, e]
             if alpha > wp.float64(0.0):
                 q[i, e] = q[i, e] + alpha * d
         moved = team_sum(moved)
-        if alpha * wp.sqrt(moved) > refresh_limit(instances, i, refresh_distance, dt):
+        if alpha * wp.sqrt(moved) > refresh_limit(step.instances, i, step.options):
             far = 1
         if refreshed != 0 and member == 0:
-            state.cached_key[i] = hessian_key(instances, i, dt)
-        if alpha * wp.sqrt(moved) > wp.float64(PROJECTED_DISTANCE * instances.size[i]):
+            step.state.cached_key[i] = hessian_key(step.instances, i, float(step.options.dt))
+        if alpha * wp.sqrt(moved) > wp.float64(PROJECTED_DISTANCE * step.instances.size[i]):
             away = 1
-    for j in range(member, rigid.count[w], team):
+    for j in range(member, step.rigid.count[w], team):
         if alpha > wp.float64(0.0):
-            rigid.r[w, j] = rigid.r[w, j] + alpha * rigid.direction[w, j]
+            step.rigid.r[w, j] = step.rigid.r[w, j] + alpha * step.rigid.direction[w, j]
     barrier()
     if member != 0:
         return
-    state.iteration[w] = state.iteration[w] + 1
+    step.state.iteration[w] = step.state.iteration[w] + 1
     if refreshed != 0:
-        state.cached[w] = 1 - state.project[w]
-    stale = state.refresh[w] == 0 or state.project[w] == 0
-    state.refresh[w] = far
-    slow = state.iteration[w] >= 2 * refresh_interval
-    if slow or state.iteration[w] % refresh_interval == 0 or alpha == wp.float64(0.0):
-        state.refresh[w] = 1
+        step.state.cached[w] = 1 - step.state.project[w]
+    stale = step.state.refresh[w] == 0 or step.state.project[w] == 0
+    step.state.refresh[w] = far
+    slow = step.state.iteration[w] >= 2 * step.options.refresh_interval
+    if slow or step.state.iteration[w] % step.options.refresh_interval == 0 or alpha == wp.float64(0.0):
+        step.state.refresh[w] = 1
     if alpha == wp.float64(0.0) or (slow and away == 1):
-        state.project[w] = 1
-    elif state.project[w] != 0 and away == 0 and state.failures[w] < FAILURES:
-        state.project[w] = 0
-        state.refresh[w] = 1
-    state.exact[w] = 0
+        step.state.project[w] = 1
+    elif step.state.project[w] != 0 and away == 0 and step.state.failures[w] < FAILURES:
+        step.state.project[w] = 0
+        step.state.refresh[w] = 1
+    step.state.exact[w] = 0
     if alpha >= wp.float64(1.0):
-        state.exact[w] = 1
-    if alpha == wp.float64(0.0) and state.last[w] == 0 and not stale:
-        state.active[w] = 0
-        state.status[w] = state.status[w] | WORLD_NO_DESCENT
-    elif state.last[w] == 1 and state.in_contact[w] == 0:
-        state.active[w] = 0
+        step.state.exact[w] = 1
+    if alpha == wp.float64(0.0) and step.state.last[w] == 0 and not stale:
+        step.state.active[w] = 0
+        step.state.status[w] = step.state.status[w] | WORLD_NO_DESCENT
+    elif step.state.last[w] == 1 and step.state.in_contact[w] == 0:
+        step.state.active[w] = 0
     else:
-        wp.atomic_max(state.any_active, 0, 1)
+        wp.atomic_max(step.state.any_active, 0, 1)
 
 
 accept_steps = kernel_over(accept_step, "accept_steps", "w", "member")

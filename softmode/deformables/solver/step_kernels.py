@@ -18,6 +18,7 @@ Precision: basis data float32; q, energy and residual float64; the Newton direct
 
 import warp as wp
 
+from softmode.deformables.contact.penalty_kernels import normal_potential, slip_potential
 from softmode.deformables.materials.hessian_kernels import hessian
 from softmode.deformables.materials.material_kernels import (
     MaterialModel,
@@ -34,16 +35,13 @@ from softmode.deformables.model.status import WORLD_COLLAPSED, WORLD_NOT_FINITE
 from softmode.deformables.model.struct_kernels import (
     Basis,
     Instances,
-    Motion,
-    NewtonState,
-    PointConstraints,
-    Points,
-    Rigid,
     blocks_of,
     has_contacts,
     in_mask,
+    interpolate_change,
     pushes,
 )
+from softmode.deformables.solver.iteration_kernels import NewtonStep, add_outer_3d, mat38d
 
 wp.set_module_options({"enable_backward": False})
 
@@ -59,35 +57,25 @@ COLLAPSED_SHARE = wp.constant(0.1)
 
 @wp.kernel
 def sum_external(
-    instances: Instances,
-    basis: Basis,
+    step: NewtonStep,
     particle_f: wp.array[wp.vec3],  # (particle_count,) [N]
-    chunk_count: int,
-    # Out:
-    chunk_out: wp.array3d[vec8d],  # (instance_count, chunk_count, 3 block_count) [N]
 ):
     """Sum b_k f over one chunk of the surface samples."""
     i, chunk, b = wp.tid()
-    stride = basis.row.shape[1]
-    x = vec8d()
-    y = vec8d()
-    z = vec8d()
-    count = instances.sample_count[i]
+    stride = step.basis.row.shape[1]
+    chunk_count = step.arrays.gradient_chunk.shape[1]
+    total = mat38d()
+    count = step.instances.sample_count[i]
     for s in range(chunk * count / chunk_count, (chunk + 1) * count / chunk_count):
-        f = wp.vec3d(particle_f[instances.particle_start[i] + s])
-        value = vec8d(basis.row[instances.row_start[i] + s, b])
-        x = x + f[0] * value
-        y = y + f[1] * value
-        z = z + f[2] * value
-    chunk_out[i, chunk, b] = x
-    chunk_out[i, chunk, stride + b] = y
-    chunk_out[i, chunk, 2 * stride + b] = z
+        f = wp.vec3d(particle_f[step.instances.particle_start[i] + s])
+        total = add_outer_3d(total, f, vec8d(step.basis.row[step.instances.row_start[i] + s, b]))
+    for axis in range(3):
+        step.arrays.gradient_chunk[i, chunk, axis * stride + b] = total[axis]
 
 
 @wp.kernel
 def begin_step(
-    instances: Instances,
-    basis: Basis,
+    step: NewtonStep,
     # Model and state in:
     gravity: wp.array[wp.vec3],  # (world_count,) [m/s^2]
     q_in: wp.array[wp.vec3d],  # (function_total,) [m]
@@ -96,28 +84,24 @@ def begin_step(
     qd_before: wp.array[wp.vec3d],  # v_(n-1)
     dt_before: wp.array[wp.float64],  # (instance_count,) [s], 0 where there was no step before
     q_driven: wp.array[wp.vec3d],  # (function_total,), where the driven functions are to be at the end of the step
-    external: wp.array3d[vec8d],  # (instance_count, chunk_count, 3 block_count) [N]
-    dt: wp.float64,
     bdf2: int,
-    # Out:
-    motion: Motion,
-    q_out: wp.array2d[vec8d],
 ):
     """Read the state, predict where the body goes, and add gravity to the external forces."""
+    dt = step.options.dt
     i, b = wp.tid()
-    n = instances.function_count[i]
+    n = step.instances.function_count[i]
     if LANES * b >= n:
         return
-    stride = basis.row.shape[1]
-    first = instances.function_start[i] + LANES * b
-    driven = instances.driven_count[i] - LANES * b
+    stride = step.basis.row.shape[1]
+    first = step.instances.function_start[i] + LANES * b
+    driven = step.instances.driven_count[i] - LANES * b
     again = wp.abs(dt_before[i] - dt) < wp.float64(1.0e-6) * dt
     c = wp.float64(1.0)
     if again and bdf2 != 0:
         c = wp.float64(1.5)
     # Newton starts from the motion that goes on; a material that forbids inversion wants a feasible start
     ahead = wp.float64(1.0)
-    if instances.material_model[i] == NEEDS_FEASIBLE_START:
+    if step.instances.material_model[i] == NEEDS_FEASIBLE_START:
         ahead = wp.float64(0.0)
     third = wp.float64(1.0) / wp.float64(3.0)
     for axis in range(3):
@@ -143,96 +127,75 @@ def begin_step(
                     start[lane] = q_driven[first + lane][axis]
                     change[lane] = wp.float64(0.0)
         e = axis * stride + b
-        motion.q_start[i, e] = q
-        motion.qd_start[i, e] = qd
-        motion.q_rate[i, e] = q_rate
-        motion.q_inertial[i, e] = q_rate + dt / c * qd_rate
-        motion.change[i, e] = change
-        q_out[i, e] = start
-    motion.rate[i] = c
-    weight = instances.mass[i] * vec8d(basis.mean[instances.asset[i], b])
-    g = wp.vec3d(gravity[wp.max(instances.world[i], 0)])
-    fx = g[0] * weight
-    fy = g[1] * weight
-    fz = g[2] * weight
-    for chunk in range(external.shape[1]):
-        fx = fx + external[i, chunk, b]
-        fy = fy + external[i, chunk, stride + b]
-        fz = fz + external[i, chunk, 2 * stride + b]
-    motion.force[i, b] = fx
-    motion.force[i, stride + b] = fy
-    motion.force[i, 2 * stride + b] = fz
+        step.motion.q_start[i, e] = q
+        step.motion.qd_start[i, e] = qd
+        step.motion.q_rate[i, e] = q_rate
+        step.motion.q_inertial[i, e] = q_rate + dt / c * qd_rate
+        step.motion.change[i, e] = change
+        step.arrays.q[i, e] = start
+    step.motion.rate[i] = c
+    weight = step.instances.mass[i] * vec8d(step.basis.mean[step.instances.asset[i], b])
+    g = wp.vec3d(gravity[wp.max(step.instances.world[i], 0)])
+    for axis in range(3):
+        force = g[axis] * weight
+        for chunk in range(step.arrays.gradient_chunk.shape[1]):
+            force = force + step.arrays.gradient_chunk[i, chunk, axis * stride + b]
+        step.motion.force[i, axis * stride + b] = force
 
 
 @wp.kernel
-def fall_back_to_euler(
-    instances: Instances,
-    constraints: PointConstraints,
-    dt: wp.float64,
-    # In and out:
-    motion: Motion,
-):
+def fall_back_to_euler(step: NewtonStep):
     """Let a body near a shape, or fixed to a rigid body, take an Euler step.
 
     BDF2 would carry its velocity across the jump of an impact; and the rigid body takes Euler steps, in which the same
     force changes its momentum by another amount.
     """
     i, e = wp.tid()
-    if not pushes(instances, constraints, i):
+    if not pushes(step.instances, step.constraints, i):
         return
-    motion.rate[i] = wp.float64(1.0)
-    motion.q_rate[i, e] = motion.q_start[i, e]
-    motion.q_inertial[i, e] = motion.q_start[i, e] + dt * motion.qd_start[i, e]
+    step.motion.rate[i] = wp.float64(1.0)
+    step.motion.q_rate[i, e] = step.motion.q_start[i, e]
+    step.motion.q_inertial[i, e] = step.motion.q_start[i, e] + step.options.dt * step.motion.qd_start[i, e]
 
 
 @wp.kernel
-def begin_newton(
-    state: NewtonState,
-    instances: Instances,
-    constraints: PointConstraints,
-):
+def begin_newton(step: NewtonStep):
     """Start Newton's iteration in every world."""
     w = wp.tid()
     in_contact = int(0)
-    for i in range(state.instance_start[w], state.instance_start[w + 1]):
-        if pushes(instances, constraints, i):
+    for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
+        if pushes(step.instances, step.constraints, i):
             in_contact = 1
-    state.in_contact[w] = in_contact
-    state.active[w] = 1
-    state.refresh[w] = 1
-    state.project[w] = 0
-    state.failures[w] = 0
-    state.exact[w] = 0
-    state.iteration[w] = 0
-    state.any_active[0] = 1
+    step.state.in_contact[w] = in_contact
+    step.state.active[w] = 1
+    step.state.refresh[w] = 1
+    step.state.project[w] = 0
+    step.state.failures[w] = 0
+    step.state.exact[w] = 0
+    step.state.iteration[w] = 0
+    step.state.any_active[0] = 1
 
 
 @wp.kernel
-def extrapolate(
-    instances: Instances,
-    motion: Motion,
-    constraints: PointConstraints,
-    dt: wp.float64,
-    # In and out:
-    q: wp.array2d[vec8d],
-):
+def extrapolate(step: NewtonStep):
     """Let a body that touches nothing start Newton with the acceleration of the step before as well.
 
     Only where velocities change by less than half in a step: a jerky motion would be thrown from one valley of the
     potential into another, step by step. And not a body so stiff that a step's rotation meets little else than its
     inertia: there a start up the elastic valley costs more iterations than it saves.
     """
+    dt = step.options.dt
     i, e = wp.tid()
-    if has_contacts(instances, constraints, i):
+    if has_contacts(step.instances, step.constraints, i):
         return
     change = wp.float64(0.0)
     moved = wp.float64(0.0)
-    for k in range(q.shape[1]):
-        change += wp.dot(motion.change[i, k], motion.change[i, k])
-        moved += wp.dot(motion.qd_start[i, k], motion.qd_start[i, k])
-    inertia = wp.float64(instances.inertia[i]) / (dt * dt * wp.float64(instances.youngs_modulus[i]))
+    for k in range(step.arrays.q.shape[1]):
+        change += wp.dot(step.motion.change[i, k], step.motion.change[i, k])
+        moved += wp.dot(step.motion.qd_start[i, k], step.motion.qd_start[i, k])
+    inertia = wp.float64(step.instances.inertia[i]) / (dt * dt * wp.float64(step.instances.youngs_modulus[i]))
     if inertia > EXTRAPOLATION_INERTIA and change < wp.float64(0.25) * dt * dt * moved:
-        q[i, e] = q[i, e] + motion.change[i, e]
+        step.arrays.q[i, e] = step.arrays.q[i, e] + step.motion.change[i, e]
 
 
 @wp.func
@@ -249,17 +212,11 @@ def material_of(instances: Instances, basis: Basis, i: int, point: int):
 
 @wp.func
 def evaluate_point(
-    instances: Instances,
-    basis: Basis,
-    motion: Motion,
+    step: NewtonStep,
     # State in:
     selected: wp.array[int],  # (world_count,)
     q: wp.array2d[vec8d],
-    dt: wp.float64,
     derivatives: int,
-    state: NewtonState,
-    # Out:
-    points: Points,
     i: int,
     p: int,
 ):
@@ -267,26 +224,29 @@ def evaluate_point(
 
     A body of scale s has V_p s^3 and the elastic F_p / s: each derivative takes one s off.
     """
-    if selected[instances.world[i]] == 0 or p >= instances.point_count[i]:
+    dt = step.options.dt
+    if selected[step.instances.world[i]] == 0 or p >= step.instances.point_count[i]:
         return
-    point = instances.point_start[i] + p
-    parameters = material_of(instances, basis, i, point)
-    s = wp.float64(instances.scale[i])
-    weight = s * basis.point_weight[point]
+    point = step.instances.point_start[i] + p
+    parameters = material_of(step.instances, step.basis, i, point)
+    s = wp.float64(step.instances.scale[i])
+    weight = s * step.basis.point_weight[point]
 
-    G = elastic_gradient(basis.gradient, q, i, point, instances.function_count[i], s)
+    G = elastic_gradient(step.basis.gradient, q, i, point, step.instances.function_count[i], s)
     G_start = G
-    if instances.viscosity[i] > 0.0:
-        G_start = elastic_gradient(basis.gradient, motion.q_start, i, point, instances.function_count[i], s)
-    points.energy[i, p] = s * s * weight * energy(parameters, G, G_start, dt)
+    if step.instances.viscosity[i] > 0.0:
+        G_start = elastic_gradient(
+            step.basis.gradient, step.motion.q_start, i, point, step.instances.function_count[i], s
+        )
+    step.points.energy[i, p] = s * s * weight * energy(parameters, G, G_start, dt)
     if derivatives != 0:
-        points.stress[i, p] = s * weight * stress(parameters, G, G_start, dt)
-        points.volume_ratio[i, p] = float(wp.float64(1.0) + determinant_minus_one(G))
-    if derivatives != 0 and state.refresh[instances.world[i]] != 0:
-        C = float(weight) * hessian(parameters, G, G_start, dt, state.project[instances.world[i]])
+        step.points.stress[i, p] = s * weight * stress(parameters, G, G_start, dt)
+        step.points.volume_ratio[i, p] = float(wp.float64(1.0) + determinant_minus_one(G))
+    if derivatives != 0 and step.state.refresh[step.instances.world[i]] != 0:
+        C = float(weight) * hessian(parameters, G, G_start, dt, step.state.project[step.instances.world[i]])
         for pair in range(6):
             r = 3 * pair
-            points.hessian[i, pair, p] = wp.mat33(
+            step.points.hessian[i, pair, p] = wp.mat33(
                 C[r, 0], C[r, 1], C[r, 2], C[r + 1, 0], C[r + 1, 1], C[r + 1, 2], C[r + 2, 0], C[r + 2, 1], C[r + 2, 2]
             )
 
@@ -295,91 +255,128 @@ evaluate_points = kernel_over(evaluate_point, "evaluate_points", "i", "p")
 
 
 @wp.func
-def sum_force_block(
-    instances: Instances,
-    basis: Basis,
-    points: Points,
-    constraints: PointConstraints,
-    active: wp.array[int],
-    chunk_count: int,
-    # Out:
-    chunk_out: wp.array3d[vec8d],  # (instance_count, chunk_count, 3 block_count) [N]
+def evaluate_constraint(
+    step: NewtonStep,
+    # State in:
+    selected: wp.array[int],
+    q: wp.array2d[vec8d],
+    r: wp.array2d[wp.float64],
+    derivatives: int,
     i: int,
-    chunk: int,
-    b: int,
+    e: int,
 ):
-    """Sum V P grad b_k over one chunk of the points, less b_k f over one chunk of the constraints."""
-    if active[instances.world[i]] == 0 or LANES * b >= instances.function_count[i]:
+    """Evaluate pins and contacts at displacement d = sum_k b_k (q_k - q_nk) - J r, less that of a soft partner.
+
+    A contact of two soft bodies is a constraint of each, which has one half of its energy and all of its force.
+    """
+    w = step.instances.world[i]
+    if selected[w] == 0 or e >= step.constraints.count[i]:
         return
-    stride = basis.row.shape[1]
-    x = vec8d()
-    y = vec8d()
-    z = vec8d()
-    first = instances.point_start[i]
-    count = instances.point_count[i]
+    row = step.constraints.row[i, e]
+    d = interpolate_change(step.basis.row, row, q, step.motion.q_start, i, step.instances.function_count[i])
+    smoothing = step.instances.smoothing[i]
+    share = wp.float64(1.0)
+    if e >= step.constraints.count[i] - step.constraints.pair_count[i]:
+        j = step.constraints.partner[i, e]
+        if j >= 0:
+            row = step.constraints.partner_row[i, e]
+            d -= interpolate_change(step.basis.row, row, q, step.motion.q_start, j, step.instances.function_count[j])
+            smoothing = wp.min(smoothing, step.instances.smoothing[j])
+            share = wp.float64(0.5)
+    for k in range(step.constraints.dof_begin[i, e], step.constraints.dof_end[i, e]):
+        d -= r[w, k] * wp.vec3d(step.constraints.jacobian[i, e, k])
+    stiffness = step.constraints.stiffness[i, e]
+    identity = wp.identity(n=3, dtype=wp.float64)
+    H = stiffness * identity
+    if e < step.instances.pin_count[i]:
+        x = step.constraints.offset[i, e] + d
+        step.constraints.energy[i, e] = wp.float64(0.5) * stiffness * wp.length_sq(x)
+        step.constraints.force[i, e] = -stiffness * x
+    else:
+        n = step.constraints.normal[i, e]
+        total = step.constraints.offset[i, e] + d
+        psi, slope, curvature = normal_potential(-wp.dot(n, total), wp.float64(smoothing))
+        if derivatives != 0 and step.state.iteration[w] <= step.state.friction_lag:
+            held = slope
+            if step.state.iteration[w] == 0:
+                # in an impact the first guess lies far too deep: friction of such a force would be too stiff to solve
+                gap = wp.min(wp.dot(n, step.constraints.offset[i, e]), wp.float64(0.0))
+                deep = wp.float64(smoothing) - wp.float64(2.0) * gap
+                _psi, most, _curvature = normal_potential(deep, wp.float64(smoothing))
+                held = wp.min(slope, most)
+            step.constraints.normal_force[i, e] = stiffness * held
+        normal_force = step.constraints.normal_force[i, e]
+        # offset = gap n + memory - drift of the shape: the tangential part is the slip
+        t = total - wp.dot(n, total) * n
+        y = wp.length(t)
+        limit = step.constraints.friction[i, e] * normal_force
+        stick = step.constraints.stick[i, e]
+        f0, secant, tangent = slip_potential(y, limit, stick, step.options.stick_range)
+        step.constraints.slip[i, e] = t
+        step.constraints.energy[i, e] = share * (stiffness * psi + f0)
+        step.constraints.force[i, e] = stiffness * slope * n - secant * t
+        # f0 is concave in y^2, so the quadratic of the secant's curvature lies above it and its steps cannot overshoot,
+        # from however far away; the potential's own curvature along the slip converges faster once the state is close
+        N = wp.outer(n, n)
+        H = stiffness * curvature * N + secant * (identity - N)
+        if step.state.exact[w] != 0 and y > wp.float64(1.0e-9) * step.options.stick_range:
+            H += (tangent - secant) / (y * y) * wp.outer(t, t)
+    if derivatives != 0:
+        step.constraints.hessian[i, e] = wp.mat33(H)
+        for k in range(step.constraints.dof_begin[i, e], step.constraints.dof_end[i, e]):
+            step.constraints.coupling[i, e, k] = wp.mat33(H) * step.constraints.jacobian[i, e, k]
+
+
+evaluate_constraints = kernel_over(evaluate_constraint, "evaluate_constraints", "i", "e")
+
+
+@wp.func
+def sum_force_block(step: NewtonStep, active: wp.array[int], i: int, chunk: int, b: int):
+    """Sum V P grad b_k over one chunk of the points, less b_k f over one chunk of the constraints."""
+    if active[step.instances.world[i]] == 0 or LANES * b >= step.instances.function_count[i]:
+        return
+    stride = step.basis.row.shape[1]
+    chunk_count = step.arrays.gradient_chunk.shape[1]
+    total = mat38d()
+    first = step.instances.point_start[i]
+    count = step.instances.point_count[i]
     for p in range(chunk * count / chunk_count, (chunk + 1) * count / chunk_count):
-        P = points.stress[i, p]
-        gx = vec8d(basis.gradient_across[b, first + p, 0])
-        gy = vec8d(basis.gradient_across[b, first + p, 1])
-        gz = vec8d(basis.gradient_across[b, first + p, 2])
-        x = x + P[0, 0] * gx
-        x = x + P[0, 1] * gy
-        x = x + P[0, 2] * gz
-        y = y + P[1, 0] * gx
-        y = y + P[1, 1] * gy
-        y = y + P[1, 2] * gz
-        z = z + P[2, 0] * gx
-        z = z + P[2, 1] * gy
-        z = z + P[2, 2] * gz
-    count = constraints.count[i]
+        P = wp.transpose(step.points.stress[i, p])
+        for k in range(3):
+            total = add_outer_3d(total, P[k], vec8d(step.basis.gradient_across[b, first + p, k]))
+    count = step.constraints.count[i]
     for e in range(chunk * count / chunk_count, (chunk + 1) * count / chunk_count):
-        f = constraints.force[i, e]
-        value = vec8d(basis.row[constraints.row[i, e], b])
-        x = x - f[0] * value
-        y = y - f[1] * value
-        z = z - f[2] * value
-    chunk_out[i, chunk, b] = x
-    chunk_out[i, chunk, stride + b] = y
-    chunk_out[i, chunk, 2 * stride + b] = z
+        total = add_outer_3d(total, -step.constraints.force[i, e], vec8d(step.basis.row[step.constraints.row[i, e], b]))
+    for axis in range(3):
+        step.arrays.gradient_chunk[i, chunk, axis * stride + b] = total[axis]
 
 
 sum_forces = kernel_over(sum_force_block, "sum_forces", "i", "chunk", "b")
 
 
 @wp.func
-def gradient_block(
-    instances: Instances,
-    basis: Basis,
-    motion: Motion,
-    active: wp.array[int],
-    chunk: wp.array3d[vec8d],
-    q: wp.array2d[vec8d],
-    dt: wp.float64,
-    # Out:
-    gradient_out: wp.array2d[vec8d],  # [N]; zero for driven functions
-    reaction_out: wp.array2d[vec8d],  # [N]; what holds the driven functions, zero for the others
-    i: int,
-    e: int,
-):
+def gradient_block(step: NewtonStep, i: int, e: int):
     """Compute g = m c^2/dt^2 (q - q_inertial) + m alpha c/dt (q - q_rate) - f + sum_p V P grad b - sum_e b f_e."""
-    stride = basis.row.shape[1]
+    dt = step.options.dt
+    stride = step.basis.row.shape[1]
     b = e % stride
-    if active[instances.world[i]] == 0 or LANES * b >= instances.function_count[i]:
+    if step.state.active[step.instances.world[i]] == 0 or LANES * b >= step.instances.function_count[i]:
         return
-    c = motion.rate[i]
-    mass = instances.mass[i]
-    damping = mass * wp.float64(instances.mass_damping[i]) * c / dt
-    g = mass * c * c / (dt * dt) * (q[i, e] - motion.q_inertial[i, e])
-    g = g + damping * (q[i, e] - motion.q_rate[i, e]) - motion.force[i, e]
-    for k in range(chunk.shape[1]):
-        g = g + chunk[i, k, e]
+    q = step.arrays.q
+    c = step.motion.rate[i]
+    mass = step.instances.mass[i]
+    damping = mass * wp.float64(step.instances.mass_damping[i]) * c / dt
+    g = mass * c * c / (dt * dt) * (q[i, e] - step.motion.q_inertial[i, e])
+    g = g + damping * (q[i, e] - step.motion.q_rate[i, e]) - step.motion.force[i, e]
+    for k in range(step.arrays.gradient_chunk.shape[1]):
+        g = g + step.arrays.gradient_chunk[i, k, e]
     reaction = vec8d()
     for lane in range(LANES):
-        if LANES * b + lane < instances.driven_count[i]:
+        if LANES * b + lane < step.instances.driven_count[i]:
             reaction[lane] = g[lane]
             g[lane] = wp.float64(0.0)
-    gradient_out[i, e] = g
-    reaction_out[i, e] = reaction
+    step.arrays.gradient[i, e] = g
+    step.arrays.reaction[i, e] = reaction
 
 
 sum_gradient = kernel_over(gradient_block, "sum_gradient", "i", "e")
@@ -387,14 +384,7 @@ sum_gradient = kernel_over(gradient_block, "sum_gradient", "i", "e")
 
 @wp.kernel
 def end_step(
-    instances: Instances,
-    motion: Motion,
-    constraints: PointConstraints,
-    # State in:
-    status: wp.array[int],
-    q: wp.array2d[vec8d],
-    stride: int,
-    dt: wp.float64,
+    step: NewtonStep,
     # Out:
     q_out: wp.array[wp.vec3d],
     qd_out: wp.array[wp.vec3d],
@@ -406,69 +396,61 @@ def end_step(
 
     After a step near a shape there is no step before: the next one starts over with implicit Euler.
     """
+    dt = step.options.dt
     i, k = wp.tid()
-    if k >= instances.function_count[i]:
+    if k >= step.instances.function_count[i]:
         return
     b = k / LANES
     lane = k % LANES
-    failed = (status[instances.world[i]] & WORLD_NOT_FINITE) != 0
+    stride = step.basis.row.shape[1]
+    failed = (step.state.status[step.instances.world[i]] & WORLD_NOT_FINITE) != 0
     before = wp.vec3d()
     qd_before = wp.vec3d()
     now = wp.vec3d()
     qd = wp.vec3d()
     for axis in range(3):
         e = axis * stride + b
-        before[axis] = motion.q_start[i, e][lane]
-        qd_before[axis] = motion.qd_start[i, e][lane]
-        now[axis] = q[i, e][lane]
-        qd[axis] = motion.rate[i] / dt * (now[axis] - motion.q_rate[i, e][lane])
+        before[axis] = step.motion.q_start[i, e][lane]
+        qd_before[axis] = step.motion.qd_start[i, e][lane]
+        now[axis] = step.arrays.q[i, e][lane]
+        qd[axis] = step.motion.rate[i] / dt * (now[axis] - step.motion.q_rate[i, e][lane])
     if failed:
         now = before
         qd = wp.vec3d()
-    out = instances.function_start[i] + k
+    out = step.instances.function_start[i] + k
     q_out[out] = now
     qd_out[out] = qd
     q_before_out[out] = before
     qd_before_out[out] = qd_before
     if k == 0:
-        fresh = failed or has_contacts(instances, constraints, i)
+        fresh = failed or has_contacts(step.instances, step.constraints, i)
         dt_before_out[i] = wp.where(fresh, wp.float64(0.0), dt)
 
 
 @wp.kernel
-def check_state(
-    instances: Instances,
-    points: Points,
-    rigid: Rigid,
-    team: int,
-    stride: int,
-    # State in:
-    q: wp.array2d[vec8d],
-    # In and out:
-    state: NewtonState,
-):
+def check_state(step: NewtonStep, team: int):
     """Flag a world whose unknowns are not all finite, or one of whose bodies has collapsed."""
     w, member = wp.tid()
     total = wp.float64(0.0)
     if member == 0:
-        for j in range(rigid.count[w]):
-            total += wp.abs(rigid.r[w, j])
+        for j in range(step.rigid.count[w]):
+            total += wp.abs(step.rigid.r[w, j])
     collapsed = float(0.0)
-    for i in range(state.instance_start[w], state.instance_start[w + 1]):
-        for e in range(member, 3 * stride, team):
-            total += wp.dot(q[i, e], q[i, e])
-        share = 1.0 / (COLLAPSED_SHARE * float(instances.point_count[i]))
+    for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
+        for e in range(member, step.arrays.q.shape[1], team):
+            total += wp.dot(step.arrays.q[i, e], step.arrays.q[i, e])
+        share = 1.0 / (COLLAPSED_SHARE * float(step.instances.point_count[i]))
         flat = float(0.0)
-        for p in range(member, instances.point_count[i], team):
-            if points.volume_ratio[i, p] < COLLAPSED_RATIO:
+        for p in range(member, step.instances.point_count[i], team):
+            if step.points.volume_ratio[i, p] < COLLAPSED_RATIO:
                 flat += share
         collapsed = wp.max(collapsed, float(team_sum(wp.float64(flat))))
     total = team_sum(total)
     if member == 0:
         if not wp.isfinite(total):
-            state.status[w] = state.status[w] | WORLD_NOT_FINITE
+            step.state.status[w] = step.state.status[w] | WORLD_NOT_FINITE
         if collapsed > 1.0:
-            state.status[w] = state.status[w] | WORLD_COLLAPSED
+            step.state.status[w] = step.state.status[w] | WORLD_COLLAPSED
 
 
 @wp.kernel

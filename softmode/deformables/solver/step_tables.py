@@ -15,7 +15,7 @@ from softmode.deformables.contact.detection_kernels import Shapes
 from softmode.deformables.contact.pairs import SoftPairs
 from softmode.deformables.contact.shape_tables import candidate_shapes, shape_table
 from softmode.deformables.model.declare import WRENCH, Kernel, launch, launch_teams
-from softmode.deformables.model.lane_kernels import team_size, vec8
+from softmode.deformables.model.lane_kernels import team_size
 from softmode.deformables.model.layout import Layout, lay_out, lay_out_bases, lay_out_instances
 from softmode.deformables.model.namespaces import SoftModel, soft
 from softmode.deformables.model.rigid_dofs import RigidDofs
@@ -34,6 +34,7 @@ from softmode.deformables.model.tables import allocate
 from softmode.deformables.solver import fused_newton_kernels as fused
 from softmode.deformables.solver.factor import BlockCholesky
 from softmode.deformables.solver.fused_system_kernels import SHARED_SIZE, SHARED_WIDTH
+from softmode.deformables.solver.iteration_kernels import NewtonArrays, NewtonOptions, NewtonStep
 from softmode.deformables.solver.options import SolverReducedOptions
 from softmode.deformables.solver.systems import join_systems
 
@@ -91,8 +92,10 @@ class StepTables:
     """Pins and contacts."""
     newton: NewtonState
     """Where Newton's iteration stands."""
-    arrays: fused.NewtonArrays
+    arrays: NewtonArrays
     """Iterates, gradient, Hessian and the linear systems."""
+    step: NewtonStep
+    """All of these, for Newton's kernels."""
     rigid: RigidDofs
     """Joint dofs that take part in the solve."""
     shapes: Shapes
@@ -138,6 +141,17 @@ class StepTables:
     def pin_arrays(self) -> tuple[wp.array | None, wp.array | None]:
         """Which rigid bodies the pins follow and how stiffly, None where there are no pins."""
         return getattr(self.parameters, "pin_body", None), getattr(self.parameters, "pin_stiffness", None)
+
+    def newton_step(self, dt: float) -> NewtonStep:
+        """Return what Newton's iteration reads and writes in a step of ``dt`` [s]."""
+        options, given = self.options, NewtonOptions()
+        for name in ("iteration_max", "force_tolerance", "step_length_min"):
+            setattr(given, name, getattr(options, name))
+        given.refresh_interval, given.refresh_distance = options.stiffness_renewal, options.renewal_distance
+        given.stick_range, given.dt = options.stick_velocity * dt, dt
+        given.rigid_max, given.factor_width, given.shared = self.rigid.count_max, self.system.width, int(self.shared)
+        self.step.options = given
+        return self.step
 
     def launch(self, kernel: Kernel, dim: int | Sequence[int], *arguments: object, block_dim: int = 256) -> None:
         """Launch a kernel on the model's device; see :func:`softmode.deformables.model.declare.launch`."""
@@ -210,26 +224,28 @@ def allocate_tables(
         "pin_block": blocks if layout.pin_max else 1,
     }
     given = {"instance_start": layout.instance_start, "friction_lag": options.friction_lag}
-    of_system = {
-        "rigid_tolerance": scaled.rigid_tolerance,
-        "system_start": system_start,
-        "direction": system.solution if layout.part_count == 1 else wp.zeros((count, 3 * blocks), vec8, device=device),
+    of_system = {"rigid_tolerance": scaled.rigid_tolerance, "system_start": system_start, "systems": system.table}
+    if layout.part_count == 1:
+        of_system["direction"] = system.table.solution
+    structs: dict[str, Any] = {
+        "instances": instances,
+        "basis": basis,
+        "motion": allocate(Motion, _MOTION, sizes, device, fill={"rate": 1}),
+        "points": allocate(Points, _POINTS, sizes, device, fill={"volume_ratio": 1}),
+        "constraints": allocate(PointConstraints, _CONSTRAINTS, sizes, device),
+        "arrays": allocate(NewtonArrays, _ARRAYS, sizes, device, given=of_system),
     }
-    for name in ("system_world", "matrix", "scalars", "pattern", "diagonal", "indefinite", "right"):
-        of_system[name] = getattr(system, name)
+    state = allocate(NewtonState, _NEWTON, sizes, device, given=given)
+    step = allocate(NewtonStep, "", {}, device, given={**structs, "rigid": rigid.table, "state": state})
     return StepTables(
         model=model,
         options=options,
         layout=layout,
-        instances=instances,
-        basis=basis,
         scaled=scaled,
-        motion=allocate(Motion, _MOTION, sizes, device, fill={"rate": 1}),
-        points=allocate(Points, _POINTS, sizes, device, fill={"volume_ratio": 1}),
         samples=allocate(Samples, _SAMPLES, sizes, device, fill={"constraint": -1}),
-        constraints=allocate(PointConstraints, _CONSTRAINTS, sizes, device),
-        newton=allocate(NewtonState, _NEWTON, sizes, device, given=given),
-        arrays=allocate(fused.NewtonArrays, _ARRAYS, sizes, device, given=of_system),
+        **structs,
+        newton=state,
+        step=step,
         rigid=rigid,
         shapes=shapes,
         meshes=meshes,

@@ -1,0 +1,86 @@
+"""What Newton's iteration goes by and what its phases hand on, and sums of outer products in blocks of eight."""
+
+from typing import Any
+
+import warp as wp
+
+from softmode.deformables.model.declare import struct
+from softmode.deformables.model.lane_kernels import LANES, mat88, vec8, vec8d
+from softmode.deformables.model.struct_kernels import (
+    Basis,
+    Instances,
+    Motion,
+    NewtonState,
+    PointConstraints,
+    Points,
+    Rigid,
+)
+from softmode.deformables.solver.factor_kernels import Systems
+
+wp.set_module_options({"enable_backward": False})
+
+mat38d: Any = wp.types.matrix(shape=(3, LANES), dtype=wp.float64)
+
+
+@struct
+class NewtonOptions:
+    """How the iteration goes, see ``SolverReducedOptions``."""
+
+    iteration_max: int
+    force_tolerance: wp.float64
+    stick_range: wp.float64  # eps of the friction potential for this step [m]
+    step_length_min: wp.float64
+    refresh_interval: int
+    refresh_distance: float  # in sizes
+    rigid_max: int  # joint dofs that there is room for
+    shared: int  # 1 where every world has one system, which fits in shared memory
+    factor_width: int  # columns that a thread of the factorisation takes at a time
+    dt: wp.float64
+
+
+@struct
+class NewtonArrays:
+    """What the phases hand on, shape (instance_count, 3 block_count) where not said."""
+
+    q: wp.array2d[vec8d]
+    q_trial: wp.array2d[vec8d]
+    gradient: wp.array2d[vec8d]  # [N]; zero for driven functions
+    reaction: wp.array2d[vec8d]  # [N]; what holds the driven functions, zero for the others
+    gradient_chunk: wp.array3d[vec8d]  # (instance_count, chunk_count, 3 block_count) [N]
+    stiffness: wp.array4d[vec8]  # (instance_count, chunk_count, 3 stride, 3 block_count), upper triangle
+    pins: wp.array3d[vec8]  # (instance_count, stride, block_count), upper triangle
+    rigid_tolerance: wp.array[float]  # (world_count,) [m or rad]
+    system_start: wp.array[int]  # (world_count + 1,)
+    systems: Systems
+    direction: wp.array2d[vec8]
+
+
+@struct
+class NewtonStep:
+    """All that Newton's iteration reads and writes in a step."""
+
+    instances: Instances
+    basis: Basis
+    motion: Motion
+    points: Points
+    constraints: PointConstraints
+    rigid: Rigid
+    state: NewtonState
+    options: NewtonOptions
+    arrays: NewtonArrays
+
+
+@wp.func
+def add_outer(block: mat88, left: vec8, right: vec8):
+    """Return block + left right^T, in one update per row: see ``lane_kernels``."""
+    for a in range(LANES):
+        block[a] = block[a] + left[a] * right
+    return block
+
+
+@wp.func
+def add_outer_3d(block: mat38d, left: wp.vec3d, right: vec8d):
+    """Return block + left right^T, likewise, for three components."""
+    for a in range(3):
+        block[a] = block[a] + left[a] * right
+    return block
