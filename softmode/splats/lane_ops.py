@@ -6,6 +6,9 @@ of a warp exist because Warp moves a vec4 as four numbers, where a GPU has instr
 
 import warp as wp
 
+# pyright: reportReturnType=false
+# Functions of native code have no body.
+
 BLOCK_WARPS = 4
 """Warps of a block in kernels that use `queue_address` and `stage_address`."""
 QUEUE = 1120
@@ -28,25 +31,21 @@ def by_device(cuda: str, host: str = "") -> str:
 @wp.func_native(by_device("return __ffs(word) - 1;", "return __builtin_ctz(word);"))
 def lowest_bit(word: wp.uint32) -> int:
     """Return the position of the lowest set bit of a word that is not zero."""
-    ...
 
 
 @wp.func_native(by_device("return 31 - __clz(word);", "return 31 - __builtin_clz(word);"))
 def highest_bit(word: wp.uint32) -> int:
     """Return the position of the highest set bit of a word that is not zero."""
-    ...
 
 
 @wp.func_native(by_device("return __popc(word);", "return __builtin_popcount(word);"))
 def bit_count(word: wp.uint32) -> int:
     """Return the number of set bits."""
-    ...
 
 
 @wp.func_native(by_device("return __ballot_sync(0xffffffffu, flag);", "return flag;"))
 def ballot(flag: bool) -> wp.uint32:
     """Return the word whose bit i is the flag of lane i."""
-    ...
 
 
 @wp.func_native(
@@ -63,13 +62,11 @@ def ballot(flag: bool) -> wp.uint32:
 )
 def lane_scan(value: int, lane: int) -> int:
     """Return the sum of the values of the lanes up to and including this one."""
-    ...
 
 
 @wp.func_native(by_device("return __shfl_sync(0xffffffffu, value, 31);", "return value;"))
 def last_lane(value: int) -> int:
     """Return the value of lane 31."""
-    ...
 
 
 @wp.func_native(
@@ -83,7 +80,6 @@ def last_lane(value: int) -> int:
 )
 def lane_sum(value: float) -> float:
     """Return the sum of the values of all lanes."""
-    ...
 
 
 @wp.func_native(
@@ -97,7 +93,6 @@ def lane_sum(value: float) -> float:
 )
 def lane_max(value: int) -> int:
     """Return the largest value of all lanes."""
-    ...
 
 
 @wp.func_native(by_device("__syncwarp();"))
@@ -122,7 +117,6 @@ def sync_block() -> None:
 )
 def exp2(x: float) -> float:
     """Return 2^x, to two units in the last place."""
-    ...
 
 
 @wp.func_native(
@@ -136,7 +130,6 @@ def exp2(x: float) -> float:
 )
 def load4(source: wp.array[wp.vec4], i: int) -> wp.vec4:
     """Return element i of an array that the kernel does not write, in one load."""
-    ...
 
 
 @wp.func_native(
@@ -150,7 +143,6 @@ def load4(source: wp.array[wp.vec4], i: int) -> wp.vec4:
 )
 def queue_address() -> wp.uint64:
     """Return this warp's QUEUE uint16 of shared memory."""
-    ...
 
 
 @wp.func_native(by_device("reinterpret_cast<unsigned short*>(address)[i] = (unsigned short)value;"))
@@ -161,7 +153,6 @@ def queue_put(address: wp.uint64, i: int, value: int) -> None:
 @wp.func_native(by_device("return reinterpret_cast<unsigned short*>(address)[i];", "return 0;"))
 def queue_get(address: wp.uint64, i: int) -> int:
     """Read an entry of the warp's queue."""
-    ...
 
 
 @wp.func_native(
@@ -175,7 +166,6 @@ def queue_get(address: wp.uint64, i: int) -> int:
 )
 def stage_address() -> wp.uint64:
     """Return this warp's STAGE vec4 of shared memory."""
-    ...
 
 
 @wp.func_native(
@@ -196,7 +186,6 @@ def stage_put(address: wp.uint64, i: int, value: wp.vec4) -> None:
 )
 def stage_get(address: wp.uint64, i: int) -> wp.vec4:
     """Read an entry of the warp's stage."""
-    ...
 
 
 @wp.func_native(
@@ -211,4 +200,3 @@ def stage_get(address: wp.uint64, i: int) -> wp.vec4:
 )
 def keep(x: float) -> float:
     """Return x from a register: the compiler would otherwise compute it anew in every turn of a loop."""
-    ...
