@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 from softmode.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from softmode.splats.camera import CameraOptions, SplatCamera
+    from softmode.splats.camera import SplatCamera
+    from softmode.splats.camera_options import CameraOptions, ShadowOptions
     from softmode.splats.camera_randomization import CameraRandomization, ViewVariation
     from softmode.splats.colored_mesh import ColoredMesh
     from softmode.splats.components import split_components
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from softmode.splats.rasterizer_torch import render
     from softmode.splats.reference_views import orbit_poses, render_mesh
     from softmode.splats.rigid_splats import RigidSplats, RigidSplatsSkin
-    from softmode.splats.shadow import ShadowOptions
     from softmode.splats.splats import Splats, up_rotation
     from softmode.splats.threaded_rasterizer import ThreadedRasterizer
 

@@ -14,87 +14,78 @@ from softmode.splats.blend_cpu_kernels import (
     LANES,
     PATIENCE,
     ROW,
-    _in_lanes,
     add_weighted,
     has_light,
+    in_lanes,
     light_after,
     light_before,
     seen_from_tile,
     splat_alpha,
     tile_mat,
+    tile_place,
     vec16,
 )
 from softmode.splats.blend_cpu_kernels import TILE_THREADS as TILE_THREADS
 from softmode.splats.lane_ops import highest_bit, lowest_bit
-from softmode.splats.rasterizer_kernels import TILE, Frame
+from softmode.splats.rasterizer_kernels import TILE, Frame, ImageLoss, asked_of_pixel
 
 wp.set_module_options({"enable_backward": False})
 
 NEVER = wp.constant(1.0e30)
 
 
-@wp.func_native(_in_lanes("stop after", "result = after < 0.0f ? __builtin_elementwise_min(stop, (lanes)rank) : stop;"))
+@wp.func_native(in_lanes("stop after", "result = after < 0.0f ? __builtin_elementwise_min(stop, (lanes)rank) : stop;"))
 def end_where_finished(stop_in: vec16, after_in: vec16, rank: float) -> vec16:
     """Return the rank at which each pixel ended."""
-    ...
 
 
-@wp.func_native(_in_lanes("light stop", "result = stop > rank ? light : (lanes)-1.0f;"))
+@wp.func_native(in_lanes("light stop", "result = stop > rank ? light : (lanes)-1.0f;"))
 def light_if_open(light_in: vec16, stop_in: vec16, rank: float) -> vec16:
     """Return the transmittance, -1 where the pixel ends before the splat."""
-    ...
 
 
-@wp.func_native(_in_lanes("light alpha", "result = light / (1.0f - alpha);"))
+@wp.func_native(in_lanes("light alpha", "result = light / (1.0f - alpha);"))
 def light_in_front(light_in: vec16, alpha_in: vec16) -> vec16:
     """Return the transmittance in front of the splat from that behind it."""
-    ...
 
 
-@wp.func_native(_in_lanes("red green blue behind", "result = red * r + green * g + (blue * b - behind);"))
+@wp.func_native(in_lanes("red green blue behind", "result = red * r + green * g + (blue * b - behind);"))
 def color_difference(
     red_in: vec16, green_in: vec16, blue_in: vec16, behind_in: vec16, r: float, g: float, b: float
 ) -> vec16:
     """Return what the loss asks of the splat's colour, less that of what is seen behind it."""
-    ...
 
 
-@wp.func_native(_in_lanes("total far seen", "result = total + far * (depth - seen);"))
+@wp.func_native(in_lanes("total far seen", "result = total + far * (depth - seen);"))
 def add_depth(total_in: vec16, far_in: vec16, seen_in: vec16, depth: float) -> vec16:
     """Add what the loss asks of the splat's depth, counted from the depth that is seen."""
-    ...
 
 
 @wp.func_native(
-    _in_lanes("weight alpha difference", f"result = alpha < {ALPHA_MAX_TEXT} ? weight * difference : (lanes)0.0f;")
+    in_lanes("weight alpha difference", f"result = alpha < {ALPHA_MAX_TEXT} ? weight * difference : (lanes)0.0f;")
 )
 def by_log_alpha(weight_in: vec16, alpha_in: vec16, difference_in: vec16) -> vec16:
     """Return the loss by the logarithm of alpha, zero where alpha is cut."""
-    ...
 
 
-@wp.func_native(_in_lanes("x y", "result = x * y;"))
+@wp.func_native(in_lanes("x y", "result = x * y;"))
 def product(x_in: vec16, y_in: vec16) -> vec16:
     """Return x y."""
-    ...
 
 
-@wp.func_native(_in_lanes("total x y", "result = total + x * y;"))
+@wp.func_native(in_lanes("total x y", "result = total + x * y;"))
 def add_product(total_in: vec16, x_in: vec16, y_in: vec16) -> vec16:
     """Return total + x y, fused."""
-    ...
 
 
-@wp.func_native(_in_lanes("", f"{ROW} result = row - v;"))
+@wp.func_native(in_lanes("", f"{ROW} result = row - v;"))
 def offset_y(v: float) -> vec16:
     """Return dy = y - v."""
-    ...
 
 
-@wp.func_native(_in_lanes("dy", f"{COLUMN} result = (column - u) - tilt * dy;"))
+@wp.func_native(in_lanes("dy", f"{COLUMN} result = (column - u) - tilt * dy;"))
 def offset_x(dy_in: vec16, u: float, tilt: float) -> vec16:
     """Return dx = x - u - tilt dy."""
-    ...
 
 
 @wp.func_native(
@@ -111,13 +102,11 @@ def offset_x(dy_in: vec16, u: float, tilt: float) -> vec16:
 )
 def lane_total(x_in: vec16) -> float:
     """Return the sum over the lanes."""
-    ...
 
 
-@wp.func_native(_in_lanes("x y", "result = __builtin_elementwise_max(x, y);"))
+@wp.func_native(in_lanes("x y", "result = __builtin_elementwise_max(x, y);"))
 def larger(x_in: vec16, y_in: vec16) -> vec16:
     """Return the larger of x and y."""
-    ...
 
 
 @wp.func_native(
@@ -130,23 +119,16 @@ def larger(x_in: vec16, y_in: vec16) -> vec16:
 )
 def lane_max(x_in: vec16) -> float:
     """Return the largest lane."""
-    ...
 
 
 @functools.cache
-def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool) -> wp.Kernel:
+def blend_adjoint_kernel(has_mesh: bool, has_depth: bool) -> wp.Kernel:
     """Return the adjoint of `blend_cpu_kernels.blend_kernel`; `blend_adjoint_cuda_kernels` has the equations."""
 
     @wp.kernel(enable_backward=False, module="unique")
     def _blend_adjoint(
         frame: Frame,
-        # Images as rendered:
-        depth: wp.array3d[float],
-        coverage: wp.array3d[float],  # alpha as rendered
-        # Loss by the images, (view_count, height, width):
-        loss_rgb: wp.array3d[wp.vec3],
-        loss_alpha: wp.array3d[float],
-        loss_depth: wp.array3d[float],
+        images: ImageLoss,
         # Loss by the projected splats, added to:
         center_out: wp.array[wp.vec4],  # by u, v, forward depth; the last entry is not used
         shape_out: wp.array[wp.vec4],
@@ -154,13 +136,7 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool) -> wp
     ):
         """Accumulate the loss by center, shape and colour of each (view, splat)."""
         tile = wp.tid()
-        view = tile / (frame.tile_count[0] * frame.tile_count[1])
-        in_view = tile - view * frame.tile_count[0] * frame.tile_count[1]
-        left = (in_view % frame.tile_count[0]) * TILE
-        top = (in_view / frame.tile_count[0]) * TILE
-        columns = wp.min(TILE, frame.size[0] - left)
-        rows = wp.min(TILE, frame.size[1] - top)
-        pairs = (rows + 1) / 2  # not a constant, or Warp would unroll the loops over it
+        view, left, top, columns, rows, pairs = tile_place(frame, tile)
 
         light = tile_mat(-1.0)  # transmittance; its negative once the pixel is finished
         stop = tile_mat(NEVER)  # rank at which the pixel ends; exact below 2^24
@@ -171,13 +147,12 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool) -> wp
         far = tile_mat()
         seen = tile_mat()
         behind = tile_mat()
-        background_rgb = frame.background[view % frame.background.shape[0]]
         for y in range(rows):
             for x in range(columns):
                 pair = y / 2
                 lane = TILE * (y % 2) + x
                 light[pair, lane] = 1.0
-                loss = loss_rgb[view, top + y, left + x]
+                loss = images.loss_rgb[view, top + y, left + x]
                 red[pair, lane] = loss[0]
                 green[pair, lane] = loss[1]
                 blue[pair, lane] = loss[2]
@@ -185,24 +160,10 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool) -> wp
                     there = frame.mesh_depth[view, top + y, left + x]
                     if there > 0.0:
                         limit[pair, lane] = there
-                    background_rgb = frame.mesh_rgb[view, top + y, left + x]
-                asked = wp.dot(loss, background_rgb)
-                if wp.static(has_alpha):
-                    asked -= loss_alpha[view, top + y, left + x]
-                if wp.static(has_depth):
-                    # The weights of a depth sum to its total, so depth may be counted from what is seen: exact, and
-                    # free of the difference between a sum and its total times the mean.
-                    middle = depth[view, top + y, left + x]
-                    total = coverage[view, top + y, left + x]
-                    if limit[pair, lane] < 1.0e29:
-                        total = 1.0
-                    if total > 0.0:
-                        share = loss_depth[view, top + y, left + x] / wp.max(total, 1.0e-6)
-                        far[pair, lane] = share
-                        seen[pair, lane] = middle
-                        if limit[pair, lane] < 1.0e29:
-                            asked += share * (limit[pair, lane] - middle)
+                asked, share, middle = asked_of_pixel(frame, images, view, top + y, left + x, limit[pair, lane])
                 behind[pair, lane] = asked
+                far[pair, lane] = share
+                seen[pair, lane] = middle
 
         # Front to back: light left, and the rank at which each pixel ends.
         first = view * frame.splat_count

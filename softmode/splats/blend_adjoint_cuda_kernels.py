@@ -6,13 +6,21 @@ import warp as wp
 
 from softmode.splats.blend_cuda_kernels import COLUMNS, ROWS, TILE_THREADS
 from softmode.splats.lane_ops import ballot, highest_bit, lane_max, lane_sum, lowest_bit
-from softmode.splats.rasterizer_kernels import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN, Frame
+from softmode.splats.rasterizer_kernels import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    TILE,
+    TRANSMITTANCE_MIN,
+    Frame,
+    ImageLoss,
+    asked_of_pixel,
+)
 
 wp.set_module_options({"enable_backward": False})
 
 
 @functools.cache
-def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool, lanes: int = 32) -> wp.Kernel:
+def blend_adjoint_kernel(has_mesh: bool, has_depth: bool, lanes: int = 32) -> wp.Kernel:
     """Return the adjoint of the blend, whose warps own COLUMNS x ROWS pixels, one per lane.
 
     A warp first walks its list front to back as the blend does, for the light that is left and where each pixel ends;
@@ -28,13 +36,7 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool, lanes
     @wp.kernel(enable_backward=False, module="unique")
     def _blend_adjoint(
         frame: Frame,
-        # Images as rendered:
-        depth: wp.array3d[float],
-        coverage: wp.array3d[float],  # alpha as rendered
-        # Loss by the images, (view_count, height, width):
-        loss_rgb: wp.array3d[wp.vec3],
-        loss_alpha: wp.array3d[float],
-        loss_depth: wp.array3d[float],
+        images: ImageLoss,
         # Loss by the projected splats, added to:
         center_out: wp.array[wp.vec4],  # by u, v, forward depth; the last entry is not used
         shape_out: wp.array[wp.vec4],
@@ -99,24 +101,8 @@ def blend_adjoint_kernel(has_mesh: bool, has_alpha: bool, has_depth: bool, lanes
         seen = float(0.0)
         behind = float(0.0)
         if inside:
-            loss = loss_rgb[view, row, column]
-            if wp.static(has_mesh):
-                behind = wp.dot(loss, frame.mesh_rgb[view, row, column])
-            else:
-                behind = wp.dot(loss, frame.background[view % frame.background.shape[0]])
-            if wp.static(has_alpha):
-                behind -= loss_alpha[view, row, column]
-            if wp.static(has_depth):
-                # The weights of a depth sum to its total, so depth may be counted from what is seen: exact, and free
-                # of the difference between a sum and its total times the mean.
-                seen = depth[view, row, column]
-                total = coverage[view, row, column]
-                if limit < 1.0e29:
-                    total = 1.0
-                if total > 0.0:
-                    far = loss_depth[view, row, column] / wp.max(total, 1.0e-6)
-                if limit < 1.0e29:
-                    behind += far * (limit - seen)
+            loss = images.loss_rgb[view, row, column]
+            behind, far, seen = asked_of_pixel(frame, images, view, row, column, limit)
 
         # Back to front.
         end = last

@@ -37,7 +37,7 @@ COLUMN = f"const lanes column = {{{', '.join(str(lane % TILE) for lane in range(
 ROW = f"const lanes row = {{{', '.join(str(lane // TILE) for lane in range(LANES))}}};"
 
 
-def _in_lanes(arguments: str, expression: str) -> str:
+def in_lanes(arguments: str, expression: str) -> str:
     """Return a snippet that loads vector arguments into registers and returns the lanes computed from them."""
     names = arguments.split()
     loads = "".join(f"    lanes {name}; __builtin_memcpy(&{name}, &{name}_in, sizeof(lanes));\n" for name in names)
@@ -55,7 +55,7 @@ def _in_lanes(arguments: str, expression: str) -> str:
 
 
 @wp.func_native(
-    _in_lanes(
+    in_lanes(
         "light",
         f"""
     {COLUMN}
@@ -82,21 +82,17 @@ def _in_lanes(arguments: str, expression: str) -> str:
 )
 def splat_alpha(light_in: vec16, u: float, v: float, tilt: float, a: float, b: float, peak: float) -> vec16:
     """Return min(0.99, 2^(peak - a dx^2 - b dy^2)), zero below 1/255 and where the pixel is finished."""
-    ...
 
 
 @wp.func_native(
-    _in_lanes(
-        "light alpha", f"result = light - alpha * light < {TRANSMITTANCE_MIN_TEXT} ? (lanes)0.0f : alpha * light;"
-    )
+    in_lanes("light alpha", f"result = light - alpha * light < {TRANSMITTANCE_MIN_TEXT} ? (lanes)0.0f : alpha * light;")
 )
 def splat_weight(light_in: vec16, alpha_in: vec16) -> vec16:
     """Return alpha T, zero where the splat would take more than the last of the light."""
-    ...
 
 
 @wp.func_native(
-    _in_lanes(
+    in_lanes(
         "light alpha",
         f"""
     lanes after = light - alpha * light;
@@ -106,31 +102,38 @@ def splat_weight(light_in: vec16, alpha_in: vec16) -> vec16:
 )
 def light_after(light_in: vec16, alpha_in: vec16) -> vec16:
     """Return the transmittance behind the splat, or minus that before it where the pixel is now finished."""
-    ...
 
 
-@wp.func_native(_in_lanes("light limit", "result = depth > limit ? -__builtin_elementwise_abs(light) : light;"))
+@wp.func_native(in_lanes("light limit", "result = depth > limit ? -__builtin_elementwise_abs(light) : light;"))
 def light_before(light_in: vec16, limit_in: vec16, depth: float) -> vec16:
     """Return the transmittance, made negative where a mesh is in front of the splat."""
-    ...
 
 
-@wp.func_native(_in_lanes("total weight", "result = total + weight * value;"))
+@wp.func_native(in_lanes("total weight", "result = total + weight * value;"))
 def add_weighted(total_in: vec16, weight_in: vec16, value: float) -> vec16:
     """Return total + weight * value, fused."""
-    ...
 
 
-@wp.func_native(_in_lanes("x y old", "result = x > y ? (lanes)value : old;"))
+@wp.func_native(in_lanes("x y old", "result = x > y ? (lanes)value : old;"))
 def replace_where_greater(x_in: vec16, y_in: vec16, value: float, old_in: vec16) -> vec16:
     """Return value where x > y, else old."""
-    ...
 
 
-@wp.func_native(_in_lanes("light after old", "result = ((light > 0.5f) & (after <= 0.5f)) ? (lanes)depth : old;"))
+@wp.func_native(in_lanes("light after old", "result = ((light > 0.5f) & (after <= 0.5f)) ? (lanes)depth : old;"))
 def depth_at_half(light_in: vec16, after_in: vec16, depth: float, old_in: vec16) -> vec16:
     """Return the splat's depth where the transmittance falls through one half, else old."""
-    ...
+
+
+@wp.func
+def tile_place(frame: Frame, tile: int):
+    """Return a tile's view, the column and row where it begins, and how many columns, rows and pairs of rows it has."""
+    view = tile / (frame.tile_count[0] * frame.tile_count[1])
+    in_view = tile - view * frame.tile_count[0] * frame.tile_count[1]
+    left = (in_view % frame.tile_count[0]) * TILE
+    top = (in_view / frame.tile_count[0]) * TILE
+    rows = wp.min(TILE, frame.size[1] - top)
+    # The pairs are no constant, or Warp would unroll the loops over them and compile for 5 s.
+    return view, left, top, wp.min(TILE, frame.size[0] - left), rows, (rows + 1) / 2
 
 
 @wp.func
@@ -174,13 +177,7 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
     ):
         """Blend front to back: C = sum_i c_i alpha_i T_i + T c_behind."""
         tile = wp.tid()
-        view = tile / (frame.tile_count[0] * frame.tile_count[1])
-        in_view = tile - view * frame.tile_count[0] * frame.tile_count[1]
-        left = (in_view % frame.tile_count[0]) * TILE
-        top = (in_view / frame.tile_count[0]) * TILE
-        columns = wp.min(TILE, frame.size[0] - left)
-        rows = wp.min(TILE, frame.size[1] - top)
-        pairs = (rows + 1) / 2  # not a constant, or Warp would unroll the loops over it and compile for 5 s
+        view, left, top, columns, rows, pairs = tile_place(frame, tile)
 
         light = tile_mat(1.0)  # transmittance; its negative once the pixel is finished
         if rows < TILE or columns < TILE:

@@ -5,9 +5,8 @@ Cameras are pinholes with the OpenCV frame, see `softmode.splats.pinhole`.
 """
 
 import fnmatch
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, Literal, get_args
 
 import newton
@@ -15,55 +14,22 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from softmode.deformables.model.declare import launch
 from softmode.errors import ConfigError
 from softmode.splats import camera_kernels as kernels
 from softmode.splats.camera_labels import segmentation_table
-from softmode.splats.camera_meshes import MeshImages, MeshLight
+from softmode.splats.camera_meshes import MeshImages
+from softmode.splats.camera_options import CameraOptions
 from softmode.splats.camera_randomization import CameraRandomization, ViewVariation
 from softmode.splats.pinhole import PinholeCamera, Vector
 from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
 from softmode.splats.rigid_splats import world_bodies
-from softmode.splats.shadow import ShadowOptions, SplatShadow
+from softmode.splats.shadow import SplatShadow
 
 __all__ = ["CameraOptions", "CameraRandomization", "Output", "PinholeCamera", "SplatCamera"]
 
 Output = Literal["rgb", "depth", "median_depth", "alpha", "object_id", "segmentation"]
 """What a camera writes."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class CameraOptions:
-    """How the scene is lit and drawn."""
-
-    sky: tuple[Vector, Vector] = ((0.93, 0.94, 0.95), (0.62, 0.72, 0.83))
-    """Background at and below the horizon, and straight up; sRGB 0..1."""
-    light_direction: Vector = (-0.25, 0.5, -1.0)
-    """Direction in which the sunlight travels."""
-    light_color: Vector = (0.72, 0.70, 0.66)
-    """Linear radiance of the sunlight."""
-    ambient: tuple[Vector, Vector] = ((0.30, 0.31, 0.34), (0.16, 0.15, 0.14))
-    """Linear ambient radiance from above and from below."""
-    shadows: bool = True
-    """Meshes cast shadows on meshes."""
-    splat_shadow: ShadowOptions | None = field(default_factory=ShadowOptions)
-    """Shadow that the splats cast on the meshes; None for none."""
-    mesh_samples: int = 1
-    """Rays per pixel for the meshes: 1, or 4 for smooth edges at about twice the cost."""
-    segmentation: bool = False
-    """Write which object or shape is seen."""
-    lens_per_world: bool = False
-    """Meshes follow intrinsics that differ between worlds (`SplatCamera.intrinsics`); a randomised lens implies it."""
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        colors = (*self.sky, self.light_color, *self.ambient)
-        if not all(math.isfinite(x) and x >= 0.0 for color in colors for x in color):
-            raise ConfigError(f"sky, light_color and ambient must be finite and >= 0, got {colors}")
-        length = math.hypot(*self.light_direction)
-        if not (math.isfinite(length) and length > 1e-6):
-            raise ConfigError(f"light_direction {self.light_direction} has no direction", hint="Down is (0, 0, -1)")
-        if self.mesh_samples not in (1, 4):
-            raise ConfigError(f"mesh_samples is {self.mesh_samples}", hint="Take 1, or 4 for smooth edges of meshes")
 
 
 class SplatCamera:
@@ -142,14 +108,13 @@ class SplatCamera:
             splat_gain=self.variation.splat_gain,
         )
         self._sensor_pose = wp.zeros(views, dtype=wp.transform, device=self.device)
-        self._light = MeshLight(
-            direction=self.options.light_direction,
-            color=self.options.light_color,
-            ambient=self.options.ambient,
-            shadows=self.options.shadows,
-            samples=self.options.mesh_samples,
+        self._meshes = MeshImages(
+            model,
+            self.cameras,
+            self.options,
+            lens_per_world=self.options.lens_per_world or self.variation.randomization.changes_lens,
+            surface=splats is not None and self.options.splat_shadow is not None,
         )
-        self._meshes = self._make_meshes()
         shape = (views, self.height, self.width)
         self._mesh_rgb = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         self.rgb = wp.zeros((*shape, 3), dtype=wp.uint8, device=self.device)
@@ -163,20 +128,8 @@ class SplatCamera:
                 splats.means.shape[1], views, self.width, self.height, options=drawn, device=self.device
             )
             if self.options.splat_shadow is not None:
-                self._shadow = SplatShadow(worlds, self._light, options=self.options.splat_shadow, device=self.device)
+                self._shadow = SplatShadow(worlds, self.options, self.options.splat_shadow, device=self.device)
         self._init_segmentation()
-
-    def _make_meshes(self) -> MeshImages:
-        """Build the sensor of the meshes."""
-        options = self.options
-        return MeshImages(
-            self.model,
-            self.cameras,
-            self._light,
-            lens_per_world=options.lens_per_world or self.variation.randomization.changes_lens,
-            shape_index=options.segmentation,
-            surface=self.splats is not None and options.splat_shadow is not None,
-        )
 
     def _init_segmentation(self) -> None:
         """Name all ids and allocate their image."""
@@ -186,10 +139,7 @@ class SplatCamera:
         self._segmentation: wp.array | None = None
         if self.options.segmentation:
             self._shape_segment = wp.array(table, dtype=wp.int32, device=self.device)
-            shape = (self.view_count, self.height, self.width)
-            self._segmentation = wp.full(shape, value=-1, dtype=wp.int32, device=self.device)
-            self._no_image = wp.zeros((1, 1, 1), dtype=wp.float32, device=self.device)
-            self._no_ids = wp.zeros((1, 1, 1), dtype=wp.int32, device=self.device)
+            self._segmentation = wp.full(self._mesh_rgb.shape, value=-1, dtype=wp.int32, device=self.device)
 
     @property
     def depth(self) -> wp.array:
@@ -284,13 +234,7 @@ class SplatCamera:
                     f"{what} must be a wp.array of wp.vec3 of shape (1,) or ({self.world_count},)",
                     hint="For poses known on the host: camera.poses(name).assign(...), or PinholeCamera.look_at",
                 )
-        wp.launch(
-            kernels.look_at,
-            dim=self.world_count,
-            inputs=[position, target, wp.vec3(*up)],
-            outputs=[self.poses(name)],
-            device=self.device,
-        )
+        launch(self.device, kernels.look_at, self.world_count, position, target, wp.vec3(*up), self.poses(name))
 
     @property
     def mesh_rgb(self) -> wp.array:
@@ -329,48 +273,28 @@ class SplatCamera:
         Args:
             state: Where the bodies are.
         """
-        size, meshes, variation = (self.view_count, self.height, self.width), self._meshes, self.variation
-        wp.launch(
-            kernels.place_cameras,
-            dim=self.view_count,
-            inputs=[self._poses, variation.offset, self._body, state.body_q],
-            outputs=[self.views.world_to_camera, self._sensor_pose],
-            device=self.device,
-        )
-        meshes.render(state, self._sensor_pose, self.views.intrinsics)
-        wp.launch(
-            kernels.unpack_meshes,
-            dim=size,
-            inputs=[
-                meshes.packed, meshes.depth, meshes.active, meshes.lens_per_world,
-                self.views.world, self._sensor_pose, self.views.intrinsics,
-                variation.horizon, variation.zenith, variation.light_gain,
-            ],
-            outputs=[self._mesh_rgb, meshes.depth],
-            device=self.device,
+        views, meshes, variation, pose = self.views, self._meshes, self.variation, self._sensor_pose
+        size, placed = self._mesh_rgb.shape, (views.world_to_camera, pose)
+        given = (self._poses, variation.offset, self._body, state.body_q)
+        launch(self.device, kernels.place_cameras, self.view_count, *given, *placed)
+        meshes.render(state, pose, views.intrinsics)
+        launch(
+            self.device, kernels.unpack_meshes, size,
+            meshes.packed, meshes.depth, meshes.active, meshes.lens_per_world,
+            views.world, pose, views.intrinsics,
+            variation.horizon, variation.zenith, variation.light_gain,
+            self._mesh_rgb, meshes.depth,
         )  # fmt: skip
-        rgb = self._mesh_rgb
+        rgb, alpha, object_id = self._mesh_rgb, None, None
         if self.rasterizer is not None and self.splats is not None:
             if self._shadow is not None and meshes.active:
-                self._shadow.cast(self.splats, self.views, self._sensor_pose, meshes, self._mesh_rgb)
-            self.rasterizer.render(self.splats, self.views, mesh_rgb=self._mesh_rgb, mesh_depth=meshes.depth)
-            rgb = self.rasterizer.rgb
-        wp.launch(kernels.pack_bytes, dim=size, inputs=[rgb], outputs=[self.rgb], device=self.device)
+                self._shadow.cast(self.splats, views, pose, meshes, self._mesh_rgb)
+            self.rasterizer.render(self.splats, views, mesh_rgb=self._mesh_rgb, mesh_depth=meshes.depth)
+            rgb, alpha, object_id = self.rasterizer.rgb, self.rasterizer.alpha, self.rasterizer.object_id
+        launch(self.device, kernels.pack_bytes, size, rgb, self.rgb)
         if self._segmentation is not None:
-            drawn = self.rasterizer
-            wp.launch(
-                kernels.segment,
-                dim=size,
-                inputs=[
-                    drawn is not None,
-                    self._no_image if drawn is None else drawn.alpha,
-                    self._no_ids if drawn is None else drawn.object_id,
-                    meshes.shape_index,
-                    self._shape_segment,
-                ],
-                outputs=[self._segmentation],
-                device=self.device,
-            )
+            shapes = (meshes.shape_index, self._shape_segment)
+            launch(self.device, kernels.segment, size, alpha, object_id, *shapes, self._segmentation)
 
 
 def _carriers(model: newton.Model, camera: PinholeCamera) -> np.ndarray:

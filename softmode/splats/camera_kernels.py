@@ -145,8 +145,7 @@ def unpack_meshes(
 
 @wp.kernel
 def segment(
-    # Splats:
-    has_splats: bool,
+    # Splats; of size zero without:
     alpha: wp.array3d[float],
     object_id: wp.array3d[int],
     # Meshes:
@@ -162,7 +161,7 @@ def segment(
         shape = shape_index[view, row, column]
         if shape < wp.uint32(shape_segment.shape[0]):
             found = shape_segment[int(shape)]
-    if has_splats:
+    if alpha.shape[0] > 0:
         if alpha[view, row, column] > 0.5:
             found = object_id[view, row, column]
     segment_out[view, row, column] = found

@@ -7,7 +7,6 @@ launch per camera for all worlds; the second keeps a pose and a world of 32 B pe
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import newton
@@ -16,24 +15,10 @@ import warp as wp
 from newton.sensors import SensorCamera
 from numpy.typing import NDArray
 
+from softmode.deformables.model.declare import launch
 from softmode.splats import camera_kernels as kernels
-from softmode.splats.pinhole import PinholeCamera, Vector
-
-
-@dataclass(frozen=True, kw_only=True)
-class MeshLight:
-    """Light on the meshes of all worlds, and how finely they are drawn."""
-
-    direction: Vector
-    """Direction in which the sunlight travels."""
-    color: Vector
-    """Linear radiance of the sunlight."""
-    ambient: tuple[Vector, Vector]
-    """Linear ambient radiance from above and from below."""
-    shadows: bool
-    """Meshes cast shadows on meshes."""
-    samples: int
-    """Rays per pixel, 1 or 4."""
+from softmode.splats.camera_options import CameraOptions
+from softmode.splats.pinhole import PinholeCamera
 
 
 class MeshImages:
@@ -42,9 +27,8 @@ class MeshImages:
     Args:
         model: The model; what its shape BVH holds is drawn.
         cameras: The cameras, all of one size.
-        light: Light and sampling.
+        options: Light and sampling, and whether to write which shape is seen.
         lens_per_world: Worlds have intrinsics of their own.
-        shape_index: Write which shape is seen.
         surface: Write albedo and normal of what is seen.
     """
 
@@ -52,11 +36,10 @@ class MeshImages:
         self,
         model: newton.Model,
         cameras: Sequence[PinholeCamera],
-        light: MeshLight,
+        options: CameraOptions,
         *,
-        lens_per_world: bool = False,
-        shape_index: bool = False,
-        surface: bool = False,
+        lens_per_world: bool,
+        surface: bool,
     ) -> None:
         """Allocate the images and build Newton's sensor."""
         self.model, self.lens_per_world = model, lens_per_world
@@ -67,7 +50,7 @@ class MeshImages:
         self.depth = wp.zeros(shape, dtype=wp.float32, device=device)
         """Depth [m], 0 where no mesh is: along the axis of the camera, or of each pixel with `lens_per_world`."""
         self.shape_index = wp.full(
-            shape if shape_index else (1, 1, 1), value=0xFFFFFFFF, dtype=wp.uint32, device=device
+            shape if options.segmentation else (1, 1, 1), value=0xFFFFFFFF, dtype=wp.uint32, device=device
         )
         """Shape per pixel, 0xFFFFFFFF where none is."""
         part = shape if surface else (1, 1, 1)
@@ -75,21 +58,25 @@ class MeshImages:
         """Colours without light RGBA, 8 bit each, sRGB."""
         self.normal = wp.zeros(part, dtype=wp.vec3, device=device)
         """Surface normals in the world."""
-        self._wants_shape, self._wants_surface = shape_index, surface
+        self._wants_shape, self._wants_surface = options.segmentation, surface
         self._sensor: SensorCamera | None = None
         if model.shape_count == 0 or model.bvh_shapes is None:
             return
         self._sensor = SensorCamera(model, load_textures=False)
-        x, y, z = np.asarray(light.direction) / np.linalg.norm(light.direction)
-        self._sensor.create_default_light(enable_shadows=light.shadows, direction=wp.vec3f(x, y, z), color=light.color)
-        self._sensor.set_ambient_light(*light.ambient)
+        direction = wp.vec3f(*(np.asarray(options.light_direction) / np.linalg.norm(options.light_direction)))
+        self._sensor.create_default_light(
+            enable_shadows=options.shadows, direction=direction, color=options.light_color
+        )
+        self._sensor.set_ambient_light(*options.ambient)
         self._config = SensorCamera.RenderConfig(
             enable_particles=False,
-            enable_shadows=light.shadows,
-            anti_aliasing=SensorCamera.AntiAliasing.NONE if light.samples == 1 else SensorCamera.AntiAliasing.MSAA,
+            enable_shadows=options.shadows,
+            anti_aliasing=SensorCamera.AntiAliasing.NONE
+            if options.mesh_samples == 1
+            else SensorCamera.AntiAliasing.MSAA,
         )
         # The first sample of a bundle sits in the middle: the sensor shades there.
-        spread = [(0.5, 0.5)] if light.samples == 1 else [(0.5, 0.5), (0.17, 0.33), (0.67, 0.17), (0.83, 0.72)]
+        spread = [(0.5, 0.5)] if options.mesh_samples == 1 else [(0.5, 0.5), (0.17, 0.33), (0.67, 0.17), (0.83, 0.72)]
         self._rays: list[Any] = [
             wp.array(_rays(camera, np.asarray(spread), lens_per_world), dtype=wp.vec3, device=device)
             for camera in cameras
@@ -119,32 +106,18 @@ class MeshImages:
         for index, rays in enumerate(self._rays):
             part = slice(index * self._worlds, (index + 1) * self._worlds)
             pose, worlds = _part(sensor_pose, part), None
-            images = [_part(image, part) for image in (self.packed, self.depth)]
-            images.append(_part(self.shape_index, part) if self._wants_shape else None)
-            images += [_part(a, part) if self._wants_surface else None for a in (self.albedo, self.normal)]
+            wanted = (True, True, self._wants_shape, self._wants_surface, self._wants_surface)
+            images = (self.packed, self.depth, self.shape_index, self.albedo, self.normal)
+            images = [_part(image, part) if write else None for image, write in zip(images, wanted, strict=True)]
             if self.lens_per_world:
-                wp.launch(
-                    kernels.aim_pixels,
-                    dim=self._pixel_pose.shape,
-                    inputs=[pose, _part(intrinsics, part)],
-                    outputs=[self._pixel_pose],
-                    device=self.model.device,
-                )
+                lens, device = _part(intrinsics, part), self.model.device
+                launch(device, kernels.aim_pixels, self._pixel_pose.shape, pose, lens, self._pixel_pose)
                 count = self._pixel_world.shape[0]
                 pose, worlds = self._pixel_pose.flatten(), self._pixel_world
                 images = [None if image is None else image.reshape((count, 1, 1)) for image in images]
-            self._sensor.update(
-                state,
-                pose,
-                rays,
-                color_image=images[0],
-                forward_depth_image=images[1],
-                shape_index_image=images[2],
-                albedo_image=images[3],
-                normal_image=images[4],
-                world_indices=worlds,
-                render_config=self._config,
-            )
+            names = ("color", "forward_depth", "shape_index", "albedo", "normal")
+            outputs: dict[str, Any] = {f"{name}_image": image for name, image in zip(names, images, strict=True)}
+            self._sensor.update(state, pose, rays, **outputs, world_indices=worlds, render_config=self._config)
 
 
 def _part(array: wp.array, part: slice) -> Any:

@@ -13,6 +13,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from softmode.checks import require_number
+from softmode.deformables.model.declare import launch
 from softmode.errors import ConfigError
 from softmode.splats import camera_randomization_kernels as kernels
 
@@ -145,20 +146,8 @@ class ViewVariation:
                 f"world_mask must be a wp.array of wp.bool of shape ({self.world_count},)",
                 hint="Pass wp.array(mask, dtype=wp.bool, device=model.device)",
             )
-        ranges = self.randomization
         mask = self._all if world_mask is None else world_mask
-        wp.launch(
-            kernels.draw_views,
-            dim=self._views,
-            inputs=[
-                mask, self._seed, self._episode, self._lenses, self._sky[0], self._sky[1],
-                ranges.rotation, ranges.translation, ranges.focal, ranges.principal_point, ranges.sky,
-                ranges.light, ranges.light_tint,
-                ranges.splat_opacity, ranges.splat_brightness, ranges.splat_tint,
-            ],
-            outputs=[
-                self.offset, self.intrinsics, self.horizon, self.zenith, self.light_gain, self.splat_gain,
-            ],
-            device=self.device,
-        )  # fmt: skip
-        wp.launch(kernels.count_draw, dim=self.world_count, inputs=[mask], outputs=[self._episode], device=self.device)
+        drawn = (self.offset, self.intrinsics, self.horizon, self.zenith, self.light_gain, self.splat_gain)
+        given = (mask, self._seed, self._episode, self._lenses, *self._sky, *vars(self.randomization).values())
+        launch(self.device, kernels.draw_views, self._views, *given, *drawn)  # half widths in the order of the fields
+        launch(self.device, kernels.count_draw, self.world_count, mask, self._episode)

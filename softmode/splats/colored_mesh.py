@@ -67,15 +67,11 @@ class ColoredMesh:
         """
         import trimesh
 
-        parts: list[tuple[Any, NDArray[np.float64]]] = []
+        parts: list[tuple[Any, NDArray[np.float64]]] = [(source, np.eye(4))]
         if isinstance(source, trimesh.Scene):
-            for node in source.graph.nodes_geometry:
-                transform, key = source.graph[node]
-                parts.append((source.geometry[key], np.asarray(transform)))
-        else:
-            parts.append((source, np.eye(4)))
-        corners, colors, uvs, index, textures = [], [], [], [], []
-        known: dict[int, int] = {}
+            nodes = [source.graph[node] for node in source.graph.nodes_geometry]
+            parts = [(source.geometry[key], np.asarray(transform)) for transform, key in nodes]
+        gathered, textures, known = [], [], {}
         for mesh, transform in parts:
             if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
                 continue
@@ -87,17 +83,15 @@ class ColoredMesh:
                 chosen = known.setdefault(id(image), len(textures))
                 if chosen == len(textures):
                     textures.append(_pixels(image, name))
-            corners.append(placed[faces])
-            colors.append(color)
-            uvs.append(uv)
-            index.append(np.full(len(faces), chosen))
-        if not corners:
+            gathered.append((placed[faces], color, uv, np.full(len(faces), chosen)))
+        if not gathered:
             raise AssetError(f"{name}: holds no triangles", hint="Export a triangle mesh, not points or curves")
+        corners, colors, uvs, index = (np.concatenate(arrays) for arrays in zip(*gathered, strict=True))
         return cls(
-            corners=np.concatenate(corners).astype(np.float32),
-            corner_colors=np.concatenate(colors).astype(np.float32),
-            corner_uvs=np.concatenate(uvs).astype(np.float32),
-            texture_index=np.concatenate(index).astype(np.int32),
+            corners=corners.astype(np.float32),
+            corner_colors=colors.astype(np.float32),
+            corner_uvs=uvs.astype(np.float32),
+            texture_index=index.astype(np.int32),
             textures=tuple(textures),
             name=name,
         )

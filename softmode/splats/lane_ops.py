@@ -6,6 +6,9 @@ of a warp exist because Warp moves a vec4 as four numbers, where a GPU has instr
 
 import warp as wp
 
+# pyright: reportReturnType=false
+# Functions of native code have no body.
+
 BLOCK_WARPS = 4
 """Warps of a block in kernels that use `queue_address` and `stage_address`."""
 QUEUE = 1120
@@ -14,267 +17,186 @@ STAGE = 96
 """Entries of a warp's stage: three for each of 32 splats."""
 
 
-@wp.func_native(
-    snippet="""
+def by_device(cuda: str, host: str = "") -> str:
+    """Return native code that is one thing on CUDA and another on CPU."""
+    return f"""
 #if defined(__CUDA_ARCH__)
-    return __ffs(word) - 1;
+    {cuda}
 #else
-    return __builtin_ctz(word);
+    {host}
 #endif
 """
-)
+
+
+@wp.func_native(by_device("return __ffs(word) - 1;", "return __builtin_ctz(word);"))
 def lowest_bit(word: wp.uint32) -> int:
     """Return the position of the lowest set bit of a word that is not zero."""
-    ...
 
 
-@wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    return 31 - __clz(word);
-#else
-    return 31 - __builtin_clz(word);
-#endif
-"""
-)
+@wp.func_native(by_device("return 31 - __clz(word);", "return 31 - __builtin_clz(word);"))
 def highest_bit(word: wp.uint32) -> int:
     """Return the position of the highest set bit of a word that is not zero."""
-    ...
 
 
-@wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    return __popc(word);
-#else
-    return __builtin_popcount(word);
-#endif
-"""
-)
+@wp.func_native(by_device("return __popc(word);", "return __builtin_popcount(word);"))
 def bit_count(word: wp.uint32) -> int:
     """Return the number of set bits."""
-    ...
 
 
-@wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    return __ballot_sync(0xffffffffu, flag);
-#else
-    return flag;
-#endif
-"""
-)
+@wp.func_native(by_device("return __ballot_sync(0xffffffffu, flag);", "return flag;"))
 def ballot(flag: bool) -> wp.uint32:
     """Return the word whose bit i is the flag of lane i."""
-    ...
 
 
 @wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
+    by_device(
+        """
     for (int step = 1; step < 32; step *= 2) {
         const int other = __shfl_up_sync(0xffffffffu, value, step);
         if (lane >= step) value += other;
     }
-#endif
     return value;
-"""
+""",
+        "return value;",
+    )
 )
 def lane_scan(value: int, lane: int) -> int:
     """Return the sum of the values of the lanes up to and including this one."""
-    ...
 
 
-@wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    return __shfl_sync(0xffffffffu, value, 31);
-#else
-    return value;
-#endif
-"""
-)
+@wp.func_native(by_device("return __shfl_sync(0xffffffffu, value, 31);", "return value;"))
 def last_lane(value: int) -> int:
     """Return the value of lane 31."""
-    ...
 
 
 @wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    for (int step = 16; step > 0; step /= 2) {
-        value += __shfl_xor_sync(0xffffffffu, value, step);
-    }
-#endif
+    by_device(
+        """
+    for (int step = 16; step > 0; step /= 2) value += __shfl_xor_sync(0xffffffffu, value, step);
     return value;
-"""
+""",
+        "return value;",
+    )
 )
 def lane_sum(value: float) -> float:
     """Return the sum of the values of all lanes."""
-    ...
 
 
 @wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    for (int step = 16; step > 0; step /= 2) {
-        value = max(value, __shfl_xor_sync(0xffffffffu, value, step));
-    }
-#endif
+    by_device(
+        """
+    for (int step = 16; step > 0; step /= 2) value = max(value, __shfl_xor_sync(0xffffffffu, value, step));
     return value;
-"""
+""",
+        "return value;",
+    )
 )
 def lane_max(value: int) -> int:
     """Return the largest value of all lanes."""
-    ...
 
 
-@wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    __syncwarp();
-#endif
-"""
-)
+@wp.func_native(by_device("__syncwarp();"))
 def sync_lanes() -> None:
     """Make what the lanes wrote to memory visible to each other."""
 
 
-@wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    __syncthreads();
-#endif
-"""
-)
+@wp.func_native(by_device("__syncthreads();"))
 def sync_block() -> None:
     """Wait for the other threads of the block."""
 
 
 @wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
+    by_device(
+        """
     float result;
     asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(result) : "f"(x));
     return result;
-#else
-    return exp2f(x);
-#endif
-"""
+""",
+        "return exp2f(x);",
+    )
 )
 def exp2(x: float) -> float:
     """Return 2^x, to two units in the last place."""
-    ...
 
 
 @wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
+    by_device(
+        """
     const float4 v = __ldg(reinterpret_cast<const float4*>(source.data + i));
     return wp::vec4(v.x, v.y, v.z, v.w);
-#else
-    return source.data[i];
-#endif
-"""
+""",
+        "return source.data[i];",
+    )
 )
 def load4(source: wp.array[wp.vec4], i: int) -> wp.vec4:
     """Return element i of an array that the kernel does not write, in one load."""
-    ...
 
 
 @wp.func_native(
-    snippet=f"""
-#if defined(__CUDA_ARCH__)
+    by_device(
+        f"""
     __shared__ unsigned short queue[{BLOCK_WARPS} * {QUEUE}];
     return reinterpret_cast<uint64_t>(queue + (threadIdx.x >> 5) * {QUEUE});
-#else
-    return 0;
-#endif
-"""
+""",
+        "return 0;",
+    )
 )
 def queue_address() -> wp.uint64:
     """Return this warp's QUEUE uint16 of shared memory."""
-    ...
 
 
-@wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    reinterpret_cast<unsigned short*>(address)[i] = (unsigned short)value;
-#endif
-"""
-)
+@wp.func_native(by_device("reinterpret_cast<unsigned short*>(address)[i] = (unsigned short)value;"))
 def queue_put(address: wp.uint64, i: int, value: int) -> None:
     """Write an entry of the warp's queue."""
 
 
-@wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    return reinterpret_cast<unsigned short*>(address)[i];
-#else
-    return 0;
-#endif
-"""
-)
+@wp.func_native(by_device("return reinterpret_cast<unsigned short*>(address)[i];", "return 0;"))
 def queue_get(address: wp.uint64, i: int) -> int:
     """Read an entry of the warp's queue."""
-    ...
 
 
 @wp.func_native(
-    snippet=f"""
-#if defined(__CUDA_ARCH__)
+    by_device(
+        f"""
     __shared__ float4 stage[{BLOCK_WARPS} * {STAGE}];
     return reinterpret_cast<uint64_t>(stage + (threadIdx.x >> 5) * {STAGE});
-#else
-    return 0;
-#endif
-"""
+""",
+        "return 0;",
+    )
 )
 def stage_address() -> wp.uint64:
     """Return this warp's STAGE vec4 of shared memory."""
-    ...
 
 
 @wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    reinterpret_cast<float4*>(address)[i] = make_float4(value[0], value[1], value[2], value[3]);
-#endif
-"""
+    by_device("reinterpret_cast<float4*>(address)[i] = make_float4(value[0], value[1], value[2], value[3]);")
 )
 def stage_put(address: wp.uint64, i: int, value: wp.vec4) -> None:
     """Write an entry of the warp's stage."""
 
 
 @wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
+    by_device(
+        """
     const float4 v = reinterpret_cast<const float4*>(address)[i];
     return wp::vec4(v.x, v.y, v.z, v.w);
-#else
-    return wp::vec4();
-#endif
-"""
+""",
+        "return wp::vec4();",
+    )
 )
 def stage_get(address: wp.uint64, i: int) -> wp.vec4:
     """Read an entry of the warp's stage."""
-    ...
 
 
 @wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
+    by_device(
+        """
     float result;
     asm volatile("mov.f32 %0, %1;" : "=f"(result) : "f"(x));
     return result;
-#else
-    return x;
-#endif
-"""
+""",
+        "return x;",
+    )
 )
 def keep(x: float) -> float:
     """Return x from a register: the compiler would otherwise compute it anew in every turn of a loop."""
-    ...

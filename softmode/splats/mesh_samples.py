@@ -61,19 +61,21 @@ def sample_mesh(mesh: ColoredMesh, count: int, *, seed: int = 0) -> Splats:
     np.add.at(total, nearest, np.concatenate([colors, np.ones((drawn, 1))], axis=1))
     colors = total[:, :3] / total[:, 3:]
 
-    normal = normals[kept]
-    other = np.where(np.abs(normal[:, :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
-    first = np.cross(normal, other)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    frame = np.stack([first, np.cross(normal, first), normal], axis=2)
     return Splats(
         means=points[kept],
-        quats=quats_from_rotations(frame),
+        quats=quats_from_rotations(frames_of(normals[kept])),
         scales=np.tile(spacing * np.array([TANGENTIAL_SCALE, TANGENTIAL_SCALE, NORMAL_SCALE]), (count, 1)),
         opacities=np.full(count, OPACITY),
         sh=((colors - 0.5) / SH_DC)[:, None],
         name=mesh.name,
     )
+
+
+def frames_of(normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return orthogonal frames (N, 3, 3) whose last column is a unit normal, each of shape (N, 3)."""
+    first = np.cross(normals, np.where(np.abs(normals[:, :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.asarray(np.stack([first, np.cross(normals, first), normals], axis=2), dtype=np.float64)
 
 
 def eliminate_samples(

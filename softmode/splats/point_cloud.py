@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 from softmode.errors import AssetError
 from softmode.files import read_arrays
 from softmode.splats.formats.common import sh_from_colors
+from softmode.splats.mesh_samples import frames_of
 from softmode.splats.splats import MAX_SPLATS, Splats, quats_from_rotations
 
 GREY = 0.62
@@ -123,10 +124,7 @@ def splats_from_points(
 def _frames(normals: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return orthogonal frames (N, 3, 3) whose last column is the normal."""
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    normal = np.where(length > 1e-12, normals / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
-    side = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
-    return np.stack([side, np.cross(normal, side), normal], axis=2)
+    return frames_of(np.where(length > 1e-12, normals / np.maximum(length, 1e-12), [0.0, 0.0, 1.0]))
 
 
 def _array(name: str, value: ArrayLike, count: int | None) -> NDArray[np.float64]:

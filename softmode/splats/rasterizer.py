@@ -20,11 +20,12 @@ import numpy as np
 import warp as wp
 
 from softmode.checks import require_number
+from softmode.deformables.model.declare import launch
 from softmode.errors import ConfigError
 from softmode.splats import blend_cpu_kernels, blend_cuda_kernels, cover_cuda_kernels, depth_sort_kernels
 from softmode.splats import rasterizer_kernels as kernels
 from softmode.splats.pinhole import MAX_EDGE, PinholeCamera
-from softmode.splats.splats import MAX_SPLATS, Splats
+from softmode.splats.splats import MAX_SPLATS, Splats, padded_sh
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,15 +102,12 @@ class SplatArrays:
         if sh_degree is not None:
             hint = "Pass None for that of the objects"
             require_number("sh_degree", sh_degree, at_least=0, at_most=3, hint=hint)
-        degree = max(splats.sh_degree for splats in objects) if sh_degree is None else sh_degree
-        width = (degree + 1) ** 2
-        sh = [splats.sh[:, :width] for splats in objects]
-        sh = np.concatenate([np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0))) for part in sh])
+        sh = padded_sh(objects, None if sh_degree is None else (sh_degree + 1) ** 2)
         s = np.concatenate([splats.covariances() for splats in objects])
         six = np.stack([s[:, 0, 0], s[:, 0, 1], s[:, 0, 2], s[:, 1, 1], s[:, 1, 2], s[:, 2, 2]], axis=1)
         means = np.concatenate([splats.means for splats in objects])
         index = np.repeat(np.arange(len(objects), dtype=np.int32), [splats.count for splats in objects])
-        turns = (world_count, len(means)) if degree > 0 else (1, 1)
+        turns = (world_count, len(means)) if sh.shape[1] > 1 else (1, 1)
 
         def worlds(array: np.ndarray) -> np.ndarray:
             return np.repeat(array.astype(np.float32)[None], world_count, axis=0)
@@ -176,6 +174,10 @@ class ViewArrays:
             world=wp.array(shown, dtype=wp.int32, device=device),
             background=wp.array([background], dtype=wp.vec3, device=device),
         )
+
+
+SHARED_BY_VIEWS = ("background", "splat_gain")
+"""Arrays of `ViewArrays` that may have one row for all views."""
 
 
 def require_shapes(expected: Iterable[tuple[str, wp.array | None, tuple[int, ...] | None]], hint: str) -> None:
@@ -268,8 +270,6 @@ class SplatRasterizer:
         self.frame: object = None
         """Stands for the frame that `render` drew last; replays of a captured graph leave it as it is."""
         self._no_gain = wp.ones(1, dtype=wp.vec4, device=self.device)
-        self._no_rgb = allocate((1, 1, 1), dtype=wp.vec3)
-        self._no_depth = allocate((1, 1, 1), dtype=wp.float32)
 
     def render(
         self,
@@ -303,92 +303,68 @@ class SplatRasterizer:
         self, splats: SplatArrays, views: ViewArrays, mesh_rgb: wp.array | None, mesh_depth: wp.array | None
     ) -> None:
         """Raise a ConfigError unless kernels find in every array what they will read."""
-        count, turned = self.splat_count, splats.sh.shape[2] > 1
-        degrees = [k for k in (1, 4, 9, 16) if k >= splats.sh.shape[2]]
-        shared: list[wp.array] = [splats.means, splats.covariances, splats.opacities, splats.sh]
-        if turned:
-            shared.append(splats.rotations)
-        worlds = max(array.shape[0] for array in shared)
+        count, coefficients = self.splat_count, splats.sh.shape[2]
+        tails: dict[str, tuple[int, ...]] = dict.fromkeys(("means", "covariances", "opacities"), (count,))
+        tails["sh"] = (count, next((k for k in (1, 4, 9, 16) if k >= coefficients), 16))
+        if coefficients > 1:
+            tails["rotations"] = (count,)
+        worlds = max(getattr(splats, name).shape[0] for name in tails)
         images = None if mesh_rgb is None and mesh_depth is None else (self.view_count, self.height, self.width)
 
         def rows(array: wp.array, count: int) -> int:
             return 1 if array.shape[0] == 1 else count
 
-        gain = views.splat_gain
-        expected = (
-            ("splats.means", splats.means, (rows(splats.means, worlds), count)),
-            ("splats.covariances", splats.covariances, (rows(splats.covariances, worlds), count)),
-            ("splats.opacities", splats.opacities, (rows(splats.opacities, worlds), count)),
-            ("splats.sh", splats.sh, (rows(splats.sh, worlds), count, degrees[0] if degrees else 16)),
-            ("splats.rotations", splats.rotations, (rows(splats.rotations, worlds), count) if turned else None),
-            ("splats.object_index", splats.object_index, (count,)),
-            ("views.world_to_camera", views.world_to_camera, (self.view_count,)),
-            ("views.intrinsics", views.intrinsics, (self.view_count,)),
-            ("views.world", views.world, (self.view_count,)),
-            ("views.background", views.background, (rows(views.background, self.view_count),)),
-            ("views.splat_gain", gain, None if gain is None else (rows(gain, self.view_count),)),
-            ("mesh_rgb", mesh_rgb, images),
-            ("mesh_depth", mesh_depth, images),
-        )
+        expected: list[tuple[str, wp.array | None, tuple[int, ...] | None]] = []
+        for name, tail in tails.items():
+            array = getattr(splats, name)
+            expected.append((f"splats.{name}", array, (rows(array, worlds), *tail)))
+        expected.append(("splats.object_index", splats.object_index, (count,)))
+        for name, array in vars(views).items():
+            if array is not None:
+                shared = name in SHARED_BY_VIEWS
+                expected.append(
+                    (f"views.{name}", array, (rows(array, self.view_count) if shared else self.view_count,))
+                )
+        expected += [("mesh_rgb", mesh_rgb, images), ("mesh_depth", mesh_depth, images)]
         require_shapes(
             expected, "Size the rasteriser for these arrays; arrays have one row, or one for every world or view"
         )
 
     def _project(self, splats: SplatArrays, views: ViewArrays) -> None:
         options = self.options
-        wp.launch(
-            kernels.project,
-            dim=self.view_count * self.splat_count,
-            inputs=[
-                splats.means, splats.covariances, splats.opacities, splats.sh, splats.rotations,
-                views.world_to_camera, views.intrinsics, views.world,
-                self._no_gain if views.splat_gain is None else views.splat_gain,
-                wp.vec2i(self.width, self.height), options.near, options.pixel_variance, options.antialiased,
-            ],
-            outputs=[self._center, self._shape, self._color, self._box, self._depth_key, self._order],
-            device=self.device,
+        launch(
+            self.device, kernels.project, self.view_count * self.splat_count, *self._projected(splats, views),
+            wp.vec2i(self.width, self.height), options.near, options.pixel_variance, options.antialiased,
+            self._center, self._shape, self._color, self._box, self._depth_key, self._order,
         )  # fmt: skip
 
+    def _projected(self, splats: SplatArrays, views: ViewArrays) -> tuple[wp.array, ...]:
+        """Return the splats and views as the projection and its adjoint take them."""
+        gain = self._no_gain if views.splat_gain is None else views.splat_gain
+        moved = (splats.means, splats.covariances, splats.opacities, splats.sh, splats.rotations)
+        return (*moved, views.world_to_camera, views.intrinsics, views.world, gain)
+
     def _sort(self) -> None:
-        if self.device.is_cuda and self.splat_count <= depth_sort_kernels.CAPACITY:
-            block_dim = depth_sort_kernels.BLOCK_DIM
-            wp.launch(
-                depth_sort_kernels.sort_kernel(-(-self.splat_count // block_dim)),
-                dim=(self.view_count, block_dim),
-                inputs=[self._depth_key, self.splat_count],
-                outputs=[self._order],
-                device=self.device,
-                block_dim=block_dim,
-            )
-            return
-        total = self.splat_count * self.view_count
-        if self.view_count == 1:
+        total, count, block_dim = self.splat_count * self.view_count, self.splat_count, depth_sort_kernels.BLOCK_DIM
+        if self.device.is_cuda and count <= depth_sort_kernels.CAPACITY:
+            sort, keys = depth_sort_kernels.sort_kernel(-(-count // block_dim)), (self._depth_key, count, self._order)
+            launch(self.device, sort, (self.view_count, block_dim), *keys, block_dim=block_dim)
+        elif self.view_count == 1:
             wp.utils.radix_sort_pairs(self._depth_key, self._order, total, end_bit=31)
-            return
-        wp.utils.segmented_sort_pairs(self._depth_key, self._order, total, self._view_start)
+        else:
+            wp.utils.segmented_sort_pairs(self._depth_key, self._order, total, self._view_start)
 
     def _cover_tiles(self) -> None:
-        tiles = self.tile_count[0] * self.tile_count[1]
+        tiles, given = self.tile_count[0] * self.tile_count[1], (self._order, self._box, self.splat_count)
         words = cover_cuda_kernels.words_per_block(tiles) if self.device.is_cuda else 0
         if words:
-            block_dim = cover_cuda_kernels.BLOCK_DIM
-            wp.launch(
-                cover_cuda_kernels.cover_kernel(tiles, words),
-                dim=self.view_count * -(-self._cover.shape[1] // words) * block_dim,
-                inputs=[self._order, self._box, self.splat_count, self.tile_count[0]],
-                outputs=[self._cover],
-                device=self.device,
-                block_dim=block_dim,
-            )
+            cover, block_dim = cover_cuda_kernels.cover_kernel(tiles, words), cover_cuda_kernels.BLOCK_DIM
+            dim = self.view_count * -(-self._cover.shape[1] // words) * block_dim
+            launch(self.device, cover, dim, *given, self.tile_count[0], self._cover, block_dim=block_dim)
             return
         self._cover.zero_()
-        wp.launch(
-            kernels.cover_tiles,
-            dim=self.view_count * self.splat_count,
-            inputs=[self._order, self._box, self.splat_count, wp.vec2i(*self.tile_count)],
-            outputs=[self._cover],
-            device=self.device,
-        )
+        dim, tile_count = self.view_count * self.splat_count, wp.vec2i(*self.tile_count)
+        launch(self.device, kernels.cover_tiles, dim, *given, tile_count, self._cover)
 
     def _blend(
         self, splats: SplatArrays, views: ViewArrays, mesh_rgb: wp.array | None, mesh_depth: wp.array | None
@@ -396,14 +372,10 @@ class SplatRasterizer:
         options = self.options
         variant = (mesh_depth is not None, options.object_ids, options.median_depth)
         blend = blend_cpu_kernels if self.device.is_cpu else blend_cuda_kernels
-        wp.launch(
-            blend.blend_kernel(*variant),
-            dim=self._cover.shape[0] * blend.TILE_THREADS,
-            inputs=[self._frame(views, mesh_rgb, mesh_depth), splats.object_index],
-            outputs=[self.rgb, self.depth, self.alpha, self.object_id, self.median_depth],
-            device=self.device,
-            block_dim=blend_cuda_kernels.BLOCK_DIM,
-        )
+        dim, block_dim = self._cover.shape[0] * blend.TILE_THREADS, blend_cuda_kernels.BLOCK_DIM
+        read = (self._frame(views, mesh_rgb, mesh_depth), splats.object_index)
+        images = (self.rgb, self.depth, self.alpha, self.object_id, self.median_depth)
+        launch(self.device, blend.blend_kernel(*variant), dim, *read, *images, block_dim=block_dim)
 
     def _frame(self, views: ViewArrays, mesh_rgb: wp.array | None, mesh_depth: wp.array | None) -> Any:
         """Return the `Frame` that a blend reads."""
@@ -411,8 +383,7 @@ class SplatRasterizer:
         frame.order, frame.cover = self._order, self._cover
         frame.center, frame.shape, frame.color = self._center, self._shape, self._color
         frame.background = views.background
-        frame.mesh_rgb = self._no_rgb if mesh_rgb is None else mesh_rgb
-        frame.mesh_depth = self._no_depth if mesh_depth is None else mesh_depth
+        frame.mesh_rgb, frame.mesh_depth = mesh_rgb, mesh_depth
         frame.splat_count = self.splat_count
         frame.size = wp.vec2i(self.width, self.height)
         frame.tile_count = wp.vec2i(*self.tile_count)

@@ -16,9 +16,11 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import expm
 
+from softmode.deformables.model.declare import launch
 from softmode.splats import blend_adjoint_cpu_kernels, blend_adjoint_cuda_kernels, projection_adjoint_kernels
 from softmode.splats.blend_cuda_kernels import BLOCK_DIM
 from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays, require_shapes
+from softmode.splats.rasterizer_kernels import ImageLoss
 
 
 def exp_twist(twist: ArrayLike) -> NDArray[np.float64]:
@@ -88,7 +90,6 @@ class AdjointRasterizer:
         self._color = allocate(view_count * count, dtype=wp.vec3)
         self._camera = allocate((view_count, count) if camera else (1, 1), dtype=projection_adjoint_kernels.vec10)
         self._lanes = 1 if self.device.is_cpu else 64
-        self._no_image = allocate((1, 1, 1), dtype=wp.float32)
         self.gradients = RasterizerGradients(
             means=wp.zeros_like(splats.means, requires_grad=False),
             covariances=wp.zeros_like(splats.covariances, requires_grad=False),
@@ -138,11 +139,7 @@ class AdjointRasterizer:
             ("loss_depth", loss_depth, None if loss_depth is None else images),
             ("mesh_rgb", mesh_rgb, meshes),
             ("mesh_depth", mesh_depth, meshes),
-            ("splats.means", splats.means, out.means.shape),
-            ("splats.covariances", splats.covariances, out.covariances.shape),
-            ("splats.opacities", splats.opacities, out.opacities.shape),
-            ("splats.sh", splats.sh, out.sh.shape),
-            ("splats.rotations", splats.rotations, out.rotations.shape),
+            *((f"splats.{k}", v, getattr(out, k).shape) for k, v in vars(splats).items() if k != "object_index"),
             ("views.world_to_camera", views.world_to_camera, (r.view_count,)),
             ("views.background", views.background, out.background.shape),
         )
@@ -152,13 +149,8 @@ class AdjointRasterizer:
         self._blend(views, loss_rgb, loss_alpha, loss_depth, mesh_rgb, mesh_depth)
         self._project(splats, views)
         if mesh_rgb is None:
-            wp.launch(
-                projection_adjoint_kernels.background_adjoint,
-                dim=(r.view_count, self._lanes),
-                inputs=[r.alpha, loss_rgb, self._lanes],
-                outputs=[out.background],
-                device=self.device,
-            )
+            dim, seen = (r.view_count, self._lanes), (r.alpha, loss_rgb, self._lanes)
+            launch(self.device, projection_adjoint_kernels.background_adjoint, dim, *seen, out.background)
         return out
 
     def _blend(
@@ -171,43 +163,24 @@ class AdjointRasterizer:
         mesh_depth: wp.array | None,
     ) -> None:
         r = self.rasterizer
-        variant = (mesh_depth is not None, loss_alpha is not None, loss_depth is not None)
+        variant = (mesh_depth is not None, loss_depth is not None)
         blend = blend_adjoint_cpu_kernels if self.device.is_cpu else blend_adjoint_cuda_kernels
-        wp.launch(
-            blend.blend_adjoint_kernel(*variant),
-            dim=r._cover.shape[0] * blend.TILE_THREADS,
-            inputs=[
-                r._frame(views, mesh_rgb, mesh_depth), r.depth, r.alpha, loss_rgb,
-                loss_alpha if loss_alpha is not None else self._no_image,
-                loss_depth if loss_depth is not None else self._no_image,
-            ],
-            outputs=[self._center, self._shape, self._color],
-            device=self.device,
-            block_dim=BLOCK_DIM,
-        )  # fmt: skip
+        dim, out = r._cover.shape[0] * blend.TILE_THREADS, (self._center, self._shape, self._color)
+        images = ImageLoss()
+        images.depth, images.alpha = r.depth, r.alpha
+        images.loss_rgb, images.loss_alpha, images.loss_depth = loss_rgb, loss_alpha, loss_depth
+        frame = r._frame(views, mesh_rgb, mesh_depth)
+        launch(self.device, blend.blend_adjoint_kernel(*variant), dim, frame, images, *out, block_dim=BLOCK_DIM)
 
     def _project(self, splats: SplatArrays, views: ViewArrays) -> None:
         r, out = self.rasterizer, self.gradients
-        wp.launch(
-            projection_adjoint_kernels.project_adjoint,
-            dim=(r.view_count, r.splat_count),
-            inputs=[
-                splats.means, splats.covariances, splats.opacities, splats.sh, splats.rotations,
-                views.world_to_camera, views.intrinsics, views.world,
-                r._no_gain if views.splat_gain is None else views.splat_gain,
-                wp.vec2i(r.width, r.height), r.options.pixel_variance, r.options.antialiased, self.camera,
-                r._color, self._center, self._shape, self._color,
-            ],
-            outputs=[
-                out.means, out.covariances, out.opacities, out.sh, out.rotations, self._camera,
-            ],
-            device=self.device,
+        launch(
+            self.device, projection_adjoint_kernels.project_adjoint, (r.view_count, r.splat_count),
+            *r._projected(splats, views),
+            wp.vec2i(r.width, r.height), r.options.pixel_variance, r.options.antialiased, self.camera,
+            r._color, self._center, self._shape, self._color,
+            out.means, out.covariances, out.opacities, out.sh, out.rotations, self._camera,
         )  # fmt: skip
         if self.camera:
-            wp.launch(
-                projection_adjoint_kernels.camera_adjoint,
-                dim=(r.view_count, self._lanes),
-                inputs=[self._camera, self._lanes],
-                outputs=[out.twist, out.intrinsics],
-                device=self.device,
-            )
+            dim, given = (r.view_count, self._lanes), (self._camera, self._lanes)
+            launch(self.device, projection_adjoint_kernels.camera_adjoint, dim, *given, out.twist, out.intrinsics)

@@ -34,10 +34,47 @@ class Frame:
     tile_count: wp.vec2i
 
 
+@wp.struct
+class ImageLoss:
+    """Images as rendered and the loss by them, shape (view_count, height, width); of size zero where not asked for."""
+
+    depth: wp.array3d[float]  # [m]
+    alpha: wp.array3d[float]
+    loss_rgb: wp.array3d[wp.vec3]
+    loss_alpha: wp.array3d[float]
+    loss_depth: wp.array3d[float]  # [1/m]
+
+
 @wp.func
 def row_of(world: int, rows: int):
     """Return the row of a table with one row for all worlds or one for each."""
     return wp.where(rows == 1, 0, world)
+
+
+@wp.func
+def asked_of_pixel(frame: Frame, images: ImageLoss, view: int, row: int, column: int, limit: float):
+    """Return the loss by light that passes all splats, that by the sum of weighted depths, and the depth that is seen.
+
+    The weights of a depth sum to its total, so depth may be counted from what is seen: exact, and free of the
+    difference between a sum and its total times the mean. Losses of size zero are not asked for; `limit` is the depth
+    of the mesh, 1e30 without.
+    """
+    background = frame.background[view % frame.background.shape[0]]
+    if frame.mesh_rgb.shape[0] > 0:
+        background = frame.mesh_rgb[view, row, column]
+    behind = wp.dot(images.loss_rgb[view, row, column], background)
+    if images.loss_alpha.shape[0] > 0:
+        behind -= images.loss_alpha[view, row, column]
+    far = float(0.0)
+    seen = float(0.0)
+    if images.loss_depth.shape[0] > 0:
+        seen = images.depth[view, row, column]
+        total = wp.where(limit < 1.0e29, 1.0, images.alpha[view, row, column])
+        if total > 0.0:
+            far = images.loss_depth[view, row, column] / wp.max(total, 1.0e-6)
+        if limit < 1.0e29:
+            behind += far * (limit - seen)
+    return behind, far, seen
 
 
 @wp.func

@@ -6,11 +6,13 @@ no vertex colours, one texture per shape and 8 bits per channel; the tests compa
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from softmode.deformables.model.declare import launch
 from softmode.errors import ConfigError
 from softmode.splats import reference_view_kernels as kernels
 from softmode.splats.colored_mesh import ColoredMesh
@@ -104,10 +106,12 @@ def render_mesh(
     poses = np.asarray(world_to_camera, dtype=np.float32)
     lenses = np.array(np.broadcast_to(np.asarray(intrinsics, dtype=np.float32), (len(poses), 4)))
     faces = len(mesh.corners)
-    solid = wp.Mesh(
-        points=wp.array(mesh.corners.reshape(-1, 3), dtype=wp.vec3, device=device),
-        indices=wp.array(np.arange(3 * faces, dtype=np.int32), dtype=wp.int32, device=device),
-    )
+
+    def upload(values: ArrayLike, dtype: Any) -> wp.array:
+        return wp.array(np.asarray(values), dtype=dtype, device=device)
+
+    corners = upload(mesh.corners.reshape(-1, 3), wp.vec3)
+    solid = wp.Mesh(points=corners, indices=upload(np.arange(3 * faces, dtype=np.int32), wp.int32))
     sizes = [image.shape[0] * image.shape[1] for image in mesh.textures] or [1]
     firsts = np.cumsum([0, *sizes[:-1]])
     places = [(first, image.shape[1], image.shape[0]) for first, image in zip(firsts, mesh.textures, strict=False)]
@@ -115,21 +119,10 @@ def render_mesh(
     shape = (len(poses), height, width)
     rgb = wp.zeros(shape, dtype=wp.vec3, device=device)
     alpha = wp.zeros(shape, dtype=wp.float32, device=device)
-    wp.launch(
-        kernels.trace_mesh,
-        dim=shape,
-        inputs=[
-            solid.id,
-            wp.array(mesh.corner_colors.reshape(-1, 3), dtype=wp.vec3, device=device),
-            wp.array(mesh.corner_uvs.reshape(-1, 2), dtype=wp.vec2, device=device),
-            wp.array(mesh.texture_index, dtype=wp.int32, device=device),
-            wp.array(np.array(places or [(0, 1, 1)], dtype=np.int32), dtype=wp.vec3i, device=device),
-            wp.array(pixels, dtype=wp.vec3ub, device=device),
-            wp.array(poses, dtype=wp.mat44, device=device),
-            wp.array(lenses, dtype=wp.vec4, device=device),
-            samples,
-        ],
-        outputs=[rgb, alpha],
-        device=device,
-    )
+    launch(
+        wp.get_device(device), kernels.trace_mesh, shape, solid.id,
+        upload(mesh.corner_colors.reshape(-1, 3), wp.vec3), upload(mesh.corner_uvs.reshape(-1, 2), wp.vec2),
+        upload(mesh.texture_index, wp.int32), upload(np.array(places or [(0, 1, 1)], dtype=np.int32), wp.vec3i),
+        upload(pixels, wp.vec3ub), upload(poses, wp.mat44), upload(lenses, wp.vec4), samples, rgb, alpha,
+    )  # fmt: skip
     return ReferenceViews(world_to_camera=poses, intrinsics=lenses, rgb=rgb, alpha=alpha)

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 from newton import ShapeFlags
 
+from softmode.deformables.model.declare import launch
 from softmode.errors import ConfigError
 from softmode.splats import rigid_splats_kernels as kernels
 from softmode.splats.rasterizer import SplatArrays
@@ -96,13 +97,9 @@ class RigidSplatsSkin:
                 f"{first} on in each of {worlds} worlds",
                 hint="Build them by SplatArrays.from_splats([*soft, *skin.objects], world_count=model.world_count)",
             )
-        wp.launch(
-            kernels.move_rigid_splats,
-            dim=(worlds, self.count),
-            inputs=[self._means, self._covariances, self._owner, self._body, state.body_q, first],
-            outputs=[arrays.means, arrays.covariances, arrays.rotations],
-            device=self.device,
-        )
+        rest = (self._means, self._covariances, self._owner, self._body)
+        moved = (arrays.means, arrays.covariances, arrays.rotations)
+        launch(self.device, kernels.move_rigid_splats, (worlds, self.count), *rest, state.body_q, first, *moved)
 
 
 def world_bodies(model: newton.Model, label: str, what: str) -> np.ndarray:

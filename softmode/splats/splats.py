@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -155,10 +155,7 @@ class Splats:
         return replace(self, sh=self.sh[:, : (degree + 1) ** 2])
 
     def transformed(
-        self,
-        rotation: ArrayLike | None = None,
-        translation: ArrayLike = (0.0, 0.0, 0.0),
-        scale: float = 1.0,
+        self, rotation: ArrayLike | None = None, translation: ArrayLike = (0.0, 0.0, 0.0), scale: float = 1.0
     ) -> Splats:
         """Return the splats after x -> scale * rotation @ x + translation; view-dependent colour turns along.
 
@@ -243,11 +240,7 @@ class Splats:
         return np.broadcast_to(matrices, (self.count, 3, 3))
 
     def _placed(
-        self,
-        means: ArrayLike,
-        frames: NDArray[np.float64],
-        scales: NDArray[np.float64],
-        rotations: NDArray[np.float64],
+        self, means: ArrayLike, frames: NDArray[np.float64], scales: NDArray[np.float64], rotations: NDArray[np.float64]
     ) -> Splats:
         """Return the splats with new centres, frames and scales; `rotations` turn the view-dependent colour."""
         centres = np.asarray(means, dtype=np.float64)
@@ -300,6 +293,18 @@ def multiply_quats(left: ArrayLike, right: ArrayLike) -> NDArray[np.float64]:
     xyz = a[..., 3:] * b[..., :3] + b[..., 3:] * a[..., :3] + np.cross(a[..., :3], b[..., :3])
     w = a[..., 3:] * b[..., 3:] - (a[..., :3] * b[..., :3]).sum(axis=-1, keepdims=True)
     return np.concatenate([xyz, w], axis=-1)
+
+
+def padded_sh(parts: Sequence[Splats], width: int | None = None) -> NDArray[np.float32]:
+    """Return the coefficients of several sets, one after another, with zeros above the degree of each.
+
+    Args:
+        parts: The sets.
+        width: Number of coefficients per splat, higher ones are cut; None for the most of any set.
+    """
+    width = max(part.sh.shape[1] for part in parts) if width is None else width
+    cut = [part.sh[:, :width] for part in parts]
+    return np.concatenate([np.pad(sh, ((0, 0), (0, width - sh.shape[1]), (0, 0))) for sh in cut])
 
 
 def sh_basis(directions: ArrayLike, count: int) -> NDArray[np.float64]:

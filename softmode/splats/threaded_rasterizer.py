@@ -18,7 +18,7 @@ import warp as wp
 
 from softmode.checks import require_number
 from softmode.errors import ConfigError
-from softmode.splats.rasterizer import RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
+from softmode.splats.rasterizer import SHARED_BY_VIEWS, RasterizerOptions, SplatArrays, SplatRasterizer, ViewArrays
 
 OUTPUTS = ("rgb", "depth", "alpha", "object_id", "median_depth")
 
@@ -136,15 +136,9 @@ class ThreadedRasterizer:
         self, splats: SplatArrays, views: ViewArrays, mesh_rgb: wp.array | None, mesh_depth: wp.array | None
     ) -> list[Callable[[], None]]:
         """Return what each thread has to do."""
-        for name, array, shared in (
-            ("views.world_to_camera", views.world_to_camera, False),
-            ("views.intrinsics", views.intrinsics, False),
-            ("views.world", views.world, False),
-            ("views.background", views.background, True),
-            ("views.splat_gain", views.splat_gain, True),
-            ("mesh_rgb", mesh_rgb, False),
-            ("mesh_depth", mesh_depth, False),
-        ):
+        given = {f"views.{name}": array for name, array in vars(views).items()}
+        for name, array in {**given, "mesh_rgb": mesh_rgb, "mesh_depth": mesh_depth}.items():
+            shared = name.removeprefix("views.") in SHARED_BY_VIEWS
             if array is not None and array.shape[0] != self.view_count and not (shared and array.shape[0] == 1):
                 raise ConfigError(
                     f"{name} has shape {tuple(array.shape)}, expected {self.view_count} views",
@@ -155,13 +149,7 @@ class ThreadedRasterizer:
             return array if array is None or array.shape[0] == 1 else array[part]
 
         def job(part: SplatRasterizer, s: slice) -> Callable[[], None]:
-            own = ViewArrays(
-                world_to_camera=cut(views.world_to_camera, s),
-                intrinsics=cut(views.intrinsics, s),
-                world=cut(views.world, s),
-                background=cut(views.background, s),
-                splat_gain=cut(views.splat_gain, s),
-            )
+            own = ViewArrays(**{name: cut(array, s) for name, array in vars(views).items()})
             rgb, depth = cut(mesh_rgb, s), cut(mesh_depth, s)
             return lambda: part.render(splats, own, mesh_rgb=rgb, mesh_depth=depth)
 

@@ -29,19 +29,8 @@ REEXPORT = "The file is damaged or incomplete: copy or export it again"
 """The remedy for a file that contradicts itself."""
 _LIGHTEN = "If the file is damaged, copy or export it again; if it is merely large, import a part of it"
 _CHILD = Path(__file__).with_name("child") / "__main__.py"
-_DTYPES = {
-    "f": "<f4",
-    "e": "<f2",
-    "d": "<f8",
-    "i": "<i4",
-    "I": "<u4",
-    "l": "<i8",
-    "q": "<i8",
-    "L": "<u8",
-    "Q": "<u8",
-    "B": "u1",
-    "?": "?",
-}
+_KINDS = tuple("fediIlqLQB?")
+"""Types of numbers that an answer may hold, as `memoryview.format` and numpy call them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,7 +183,9 @@ def read_answer(path: str, name: str) -> Answer:
             described = json.loads(file.readline())
             left = os.stat(path).st_size - file.tell()
             for kind, shape in described.pop("arrays"):
-                dtype = np.dtype(_DTYPES[kind])
+                if kind not in _KINDS:
+                    raise ValueError(f"an array of type {kind!r}")
+                dtype = np.dtype(kind)
                 count = int(np.prod(shape, dtype=np.int64))
                 left -= count * dtype.itemsize
                 if count < 0 or left < 0:

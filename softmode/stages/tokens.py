@@ -17,23 +17,14 @@ BODY_API = "PhysicsDeformableBodyAPI"
 VOLUME_SIM_API = "PhysicsVolumeDeformableSimAPI"
 SURFACE_SIM_API = "PhysicsSurfaceDeformableSimAPI"
 POINTS_SIM_API = "NewtonPointsDeformableSimAPI"
-MATERIAL_API = "PhysicsMaterialAPI"
-"""Density and friction, of rigid and of soft things."""
 VOLUME_MATERIAL_API = "PhysicsVolumeDeformableMaterialAPI"
 """Young's modulus, Poisson's ratio and density of a soft solid."""
-SURFACE_MATERIAL_API = "PhysicsSurfaceDeformableMaterialAPI"
-MASS_API = "PhysicsMassAPI"
 
-# Attributes of the proposal, in the stage's units: mass / (length * time^2), none, mass / length^3, mass.
+# Attributes of the proposal, in the stage's units: mass / (length * time^2), none, mass, mass.
 YOUNGS_MODULUS = "physics:youngsModulus"
 POISSONS_RATIO = "physics:poissonsRatio"
-DENSITY = "physics:density"
 MASS = "physics:mass"
 MASSES = "physics:masses"
-DYNAMIC_FRICTION = "physics:dynamicFriction"
-STATIC_FRICTION = "physics:staticFriction"
-BODY_ENABLED = "physics:bodyEnabled"
-STARTING_VELOCITY = "physics:velocity"
 MATERIAL_PURPOSE = "physics"
 """Purpose of the binding to a physics material: the relationship `material:binding:physics`."""
 
@@ -88,13 +79,3 @@ HANDLES_QUADRATIC = "softmode:handles:quadratic"
 KAOLIN_SKINNED_API = "KaolinSkinnedPhysicsAPI"
 KAOLIN_MATERIAL_API = "KaolinPhysicsMaterialAPI"
 KAOLIN_PREFIX = "kaolin_skinned_physics:"
-KAOLIN_FIELDS = (
-    "pts",
-    "yms",
-    "prs",
-    "rhos",
-    "appx_vol",
-    "skinning_weights",
-    "dwdx",
-    "renderable_skinning_weights",
-)

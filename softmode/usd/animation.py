@@ -11,12 +11,12 @@ import contextlib
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.checks import require_number
+from softmode.checks import require_choice, require_number
 from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model.authoring import MATERIAL_FIELDS, body_key
@@ -41,6 +41,7 @@ from softmode.usd.writer import (
     set_points,
 )
 
+Mode = Literal["handles", "baked"]
 _SAVE_BYTES = 64e6
 """After so many bytes of baked samples the layer is saved, which takes them out of memory."""
 
@@ -53,7 +54,7 @@ class UsdAnimationOptions:
         ConfigError: If a value lies outside its range.
     """
 
-    mode: Literal["handles", "baked"] = "handles"
+    mode: Mode = "handles"
     """What is sampled: handle matrices only, a kilobyte per frame and body; or also all positions, orientations and
     scales of splats, 40 bytes for each splat and frame, which any viewer of splats plays."""
     fps: float = 30.0
@@ -68,12 +69,9 @@ class UsdAnimationOptions:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        if self.mode not in ("handles", "baked"):
-            raise ConfigError(f"mode is {self.mode!r}", hint="use 'handles' or 'baked'")
-        if not (np.isfinite(self.fps) and self.fps > 0.0):
-            raise ConfigError(f"fps must be positive and finite, got {self.fps}", hint="use 30")
-        if self.sh_degree not in (None, 0, 1, 2, 3):
-            raise ConfigError(f"sh_degree is {self.sh_degree!r}", hint="use 0, 1, 2, 3 or None")
+        require_choice("mode", self.mode, get_args(Mode))
+        require_number("fps", self.fps, above=0.0, hint="use 30")
+        require_choice("sh_degree", self.sh_degree, (None, 0, 1, 2, 3))
 
 
 class UsdAnimation:
@@ -211,23 +209,14 @@ class UsdAnimation:
         placed = []
         for i, given, q in zip(self._instances, self._bodies, states, strict=True):
             values = {name: shortest(columns[name][i]) for name in MATERIAL_FIELDS}
+            material = Material(model=MaterialModel(int(columns["material_model"][i])), **values)
             rotation, translation = rigid_motion(given.body, q)
             splats = given.splats
             if splats is not None and self.options.sh_degree is not None:
                 splats = splats.with_sh_degree(min(self.options.sh_degree, splats.sh_degree))
-            placed.append(
-                dataclasses.replace(
-                    given,
-                    object=dataclasses.replace(
-                        given.object,
-                        material=Material(model=MaterialModel(int(columns["material_model"][i])), **values),
-                        splats=splats,
-                    ),
-                    position=tuple(translation.tolist()),
-                    rotation=rotation,
-                    scale=float(columns["scale"][i]),
-                )
-            )
+            thing = dataclasses.replace(given.object, material=material, splats=splats)
+            place = {"position": tuple(translation.tolist()), "rotation": rotation}
+            placed.append(dataclasses.replace(given, object=thing, **place, scale=float(columns["scale"][i])))
         return tuple(placed)
 
     def publish(self) -> None:

@@ -145,11 +145,9 @@ def _add_rest(builder: newton.ModelBuilder, crate: str, name: str, options: dict
         return builder.add_usd(crate, **options)
     except (SoftmodeError, ImportError):
         raise
-    except TypeError as error:
-        if "unexpected keyword" in str(error):
+    except (TypeError, ValueError, RuntimeError, KeyError, IndexError, AttributeError, ArithmeticError) as error:
+        if isinstance(error, TypeError) and "unexpected keyword" in str(error):
             raise ConfigError(f"newton_options: {error}", hint="see newton.ModelBuilder.add_usd") from error
-        raise AssetError(f"OpenUSD file {name}: Newton cannot import it ({error})", hint=_NEWTON_HINT) from error
-    except (ValueError, RuntimeError, KeyError, IndexError, AttributeError, ArithmeticError) as error:
         raise AssetError(f"OpenUSD file {name}: Newton cannot import it ({error})", hint=_NEWTON_HINT) from error
 
 

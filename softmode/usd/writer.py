@@ -22,6 +22,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from softmode.checks import require_choice
 from softmode.deformables.materials.material import Material
 from softmode.errors import ConfigError
 from softmode.objects.placed import Placed
@@ -53,17 +54,12 @@ class UsdExportOptions:
 
     def __post_init__(self) -> None:
         """Check the names."""
-        if self.weights not in ("float", "half", "none"):
-            raise ConfigError(f"weights is {self.weights!r}", hint="use 'float', 'half' or 'none'")
-        if self.splats not in ("float", "half"):
-            raise ConfigError(f"splats is {self.splats!r}", hint="use 'float' or 'half'")
+        require_choice("weights", self.weights, ("float", "half", "none"))
+        require_choice("splats", self.splats, ("float", "half"))
 
 
 def write_usd(
-    path: str | os.PathLike[str],
-    bodies: Placed | Sequence[Placed],
-    *,
-    options: UsdExportOptions | None = None,
+    path: str | os.PathLike[str], bodies: Placed | Sequence[Placed], *, options: UsdExportOptions | None = None
 ) -> None:
     """Write soft bodies as one OpenUSD stage; the file appears complete or not at all.
 
@@ -112,11 +108,10 @@ def save(layer: Layer) -> None:
 
 def new_stage(layer: Layer) -> Any:
     """Return a stage on a layer, in metres with z up, with an Xform /World as its default prim."""
-    Usd, UsdGeom = openusd("Usd", "UsdGeom")
+    Usd, UsdGeom, UsdPhysics = openusd("Usd", "UsdGeom", "UsdPhysics")
     stage = Usd.Stage.Open(layer)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    (UsdPhysics,) = openusd("UsdPhysics")
     UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
     world = UsdGeom.Xform.Define(stage, "/World")
     Usd.ModelAPI(world.GetPrim()).SetKind("assembly")
@@ -227,15 +222,11 @@ def _author_reduced(prim: Prim, placed: Placed) -> None:
     attribute(prim, tokens.FORMAT, "String", tokens.BUNDLE_FORMAT, **text)
     attribute(prim, tokens.BODY_HEADER, "String", header, **text)
     attribute(prim, tokens.BODY_SHA256, "String", digest, **text)
-    kinds = {
-        "double[]": ("DoubleArray", Vt.DoubleArray),
-        "float[]": ("FloatArray", Vt.FloatArray),
-        "int64[]": ("Int64Array", Vt.Int64Array),
-    }
+    kinds = {"double[]": "DoubleArray", "float[]": "FloatArray", "int64[]": "Int64Array"}
     for name, array in arrays.items():
         if array.size:
-            kind, maker = kinds[DTYPES[array.dtype.str]]
-            attribute(prim, tokens.BODY_PREFIX + name, kind, maker.FromNumpy(array), **text)
+            kind = kinds[DTYPES[array.dtype.str]]
+            attribute(prim, tokens.BODY_PREFIX + name, kind, getattr(Vt, kind).FromNumpy(array), **text)
     for field in dataclasses.fields(Material):
         value = getattr(placed.material, field.name)
         if field.name == "model":
@@ -296,10 +287,7 @@ def _author_kaolin(prim: Prim, placed: Placed, weights: NDArray[np.float32] | No
     """Author Kaolin's attributes on the prim whose points are drawn."""
     schemas = {
         tokens.KAOLIN_MATERIAL_API: ("kaolin_physics_material:", kaolin.material_values(placed.body, placed.material)),
-        tokens.KAOLIN_SKINNED_API: (
-            tokens.KAOLIN_PREFIX,
-            kaolin.skinned_values(placed.body, placed.material, weights),
-        ),
+        tokens.KAOLIN_SKINNED_API: (tokens.KAOLIN_PREFIX, kaolin.skinned_values(placed.body, placed.material, weights)),
     }
     for schema, (prefix, values) in schemas.items():
         prim.AddAppliedSchema(f"{schema}:default")

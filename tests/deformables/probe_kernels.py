@@ -4,9 +4,8 @@ import warp as wp
 
 from softmode.deformables.contact import penalty_kernels as contact
 from softmode.deformables.contact import shape_query_kernels as shape_queries
-from softmode.deformables.materials import material as materials
-from softmode.deformables.materials.hessian_kernels import HessianBlocks
-from softmode.deformables.materials.material_kernels import MaterialParameters
+from softmode.deformables.materials.hessian_kernels import HessianBlocks, hessian, stress_derivative
+from softmode.deformables.materials.material_kernels import MaterialParameters, energy, stress
 from softmode.deformables.materials.singular_value_kernels import positive_part, singular_values
 
 wp.set_module_options({"enable_backward": False})
@@ -28,10 +27,10 @@ def evaluate_materials(
 ):
     """Evaluate energy, stress, its derivative in a direction, and the Hessian at every G = F - I."""
     i = wp.tid()
-    energy_out[i] = materials.energy(parameters, G[i], G_start[i], dt)
-    stress_out[i] = materials.stress(parameters, G[i], G_start[i], dt)
-    derivative_out[i] = materials.stress_derivative(parameters, G[i], G_start[i], dt, direction[i])
-    hessian_out[i] = materials.hessian(parameters, G[i], G_start[i], dt, project)
+    energy_out[i] = energy(parameters, G[i], G_start[i], dt)
+    stress_out[i] = stress(parameters, G[i], G_start[i], dt)
+    derivative_out[i] = stress_derivative(parameters, G[i], G_start[i], dt, direction[i])
+    hessian_out[i] = hessian(parameters, G[i], G_start[i], dt, project)
 
 
 @wp.kernel

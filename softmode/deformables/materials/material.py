@@ -42,41 +42,8 @@ angular frequency omega of the body at rest has the damping ratio zeta = alpha /
 from dataclasses import dataclass
 
 from softmode.checks import require_fields, require_number
-from softmode.deformables.materials.hessian_kernels import HessianBlocks, hessian, stress_derivative
-from softmode.deformables.materials.material_kernels import (
-    MaterialModel,
-    MaterialParameters,
-    cofactor,
-    determinant_minus_one,
-    energy,
-    green_strain,
-    hooke_energy,
-    hooke_stress,
-    invariant_derivatives,
-    lame,
-    strain_measure,
-    stress,
-)
+from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.errors import MaterialError
-
-__all__ = [
-    "HessianBlocks",
-    "Material",
-    "MaterialModel",
-    "MaterialParameters",
-    "cofactor",
-    "determinant_minus_one",
-    "energy",
-    "green_strain",
-    "hessian",
-    "hooke_energy",
-    "hooke_stress",
-    "invariant_derivatives",
-    "lame",
-    "strain_measure",
-    "stress",
-    "stress_derivative",
-]
 
 
 @dataclass(frozen=True, kw_only=True)

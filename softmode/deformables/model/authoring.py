@@ -44,42 +44,35 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
     for name in ("instance", "function", "pin"):
         builder.add_custom_frequency(newton.ModelBuilder.CustomFrequency(name=name, namespace=NAMESPACE))
 
-    def declare(name: str, dtype: Any, frequency: Any, **options: Any) -> None:
-        builder.add_custom_attribute(
-            attribute(name=name, dtype=dtype, frequency=frequency, namespace=NAMESPACE, **options)
-        )
+    def declare(names: str, dtype: Any, frequency: Any, **options: Any) -> None:
+        for name in names.split():
+            builder.add_custom_attribute(
+                attribute(name=name, dtype=dtype, frequency=frequency, namespace=NAMESPACE, **options)
+            )
 
+    state, control = {"assignment": assignment.STATE}, {"assignment": assignment.CONTROL}
     declare("instance_world", wp.int32, _INSTANCE, references="world")
     declare("body_key", wp.int64, _INSTANCE)
     declare("function_start", wp.int32, _INSTANCE, references=_FUNCTION)
     declare("particle_start", wp.int32, _INSTANCE, references="particle")
-    declare("material_model", wp.int32, _INSTANCE)
-    for name in MATERIAL_FIELDS:
-        declare(name, wp.float32, _INSTANCE)
-    declare("scale", wp.float32, _INSTANCE, default=1.0)
-    declare("placed_scale", wp.float32, _INSTANCE, default=1.0)  # what q and qd of the model were made for
-    declare("contact_stiffness", wp.float32, _INSTANCE)  # 0: follows the body, see ``contact``
-    declare("contact_radius", wp.float32, _INSTANCE)
-    declare("self_contact", wp.int32, _INSTANCE)
-    declare("q", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
-    declare("qd", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
-    # the step before, for BDF2 and for Newton's start; dt_before = 0 says that there is none
-    declare("q_before", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
-    declare("qd_before", wp.vec3d, _FUNCTION, assignment=assignment.STATE)
-    declare("dt_before", wp.float64, _INSTANCE, assignment=assignment.STATE)
-    # friction's memory: the shapes that a surface sample sticks to, and where (see ``stick_kernels``)
-    particle = newton.Model.AttributeFrequency.PARTICLE
-    declare("stick_shape", wp.vec2i, particle, default=wp.vec2i(-1, -1), assignment=assignment.STATE)
-    declare("stick_point", mat23d, particle, assignment=assignment.STATE)
+    declare("material_model self_contact", wp.int32, _INSTANCE)
+    # a contact_stiffness of 0 follows the body, see ``contact``
+    declare(" ".join(MATERIAL_FIELDS) + " contact_stiffness contact_radius", wp.float32, _INSTANCE)
+    declare("scale placed_scale", wp.float32, _INSTANCE, default=1.0)  # the latter: what the model's q and qd are for
+    # q_before, qd_before: the step before, for BDF2 and for Newton's start; dt_before = 0 says that there is none
+    declare("q qd q_before qd_before", wp.vec3d, _FUNCTION, **state)
+    declare("dt_before", wp.float64, _INSTANCE, **state)
+    # friction's memory: the shapes that a surface sample sticks to, and where (see ``stick_kernels``);
     # and the soft bodies of its world that it sticks to, counted within the world, with its slip at rest
-    declare("stick_partner", wp.vec2i, particle, default=wp.vec2i(-1, -1), assignment=assignment.STATE)
-    declare("stick_slip", mat23d, particle, assignment=assignment.STATE)
-    declare("q_driven", wp.vec3d, _FUNCTION, assignment=assignment.CONTROL)
+    particle = newton.Model.AttributeFrequency.PARTICLE
+    declare("stick_shape stick_partner", wp.vec2i, particle, default=wp.vec2i(-1, -1), **state)
+    declare("stick_point stick_slip", mat23d, particle, **state)
+    declare("q_driven", wp.vec3d, _FUNCTION, **control)
     declare("pin_instance", wp.int32, _PIN, references=_INSTANCE)
     declare("pin_body", wp.int32, _PIN, references="body")
     declare("pin_point", wp.vec3d, _PIN)
     declare("pin_stiffness", wp.float32, _PIN)
-    declare("pin_target", wp.vec3d, _PIN, assignment=assignment.CONTROL)
+    declare("pin_target", wp.vec3d, _PIN, **control)
 
 
 def bulk_stiffness(body: ReducedBody, youngs_modulus: float, poissons_ratio: float, scale: float = 1.0) -> float:
@@ -194,9 +187,8 @@ def add_reduced_body(
         "contact_stiffness": float(stiffness),
         "contact_radius": float(contact_radius),
         "self_contact": int(self_contact),
+        **{name: getattr(material, name) for name in MATERIAL_FIELDS},
     }
-    for name in MATERIAL_FIELDS:
-        values[name] = getattr(material, name)
     index = builder.add_custom_values(**{f"{NAMESPACE}:{name}": value for name, value in values.items()})
     return index[f"{NAMESPACE}:function_start"]
 

@@ -131,21 +131,17 @@ def lay_out(model: newton.Model, bodies: Sequence[ReducedBody], *, pair_max: int
 def lay_out_instances(model: newton.Model, layout: Layout) -> Instances:
     """Allocate where each instance finds its data; what follows from scale and density is computed later."""
     data, bodies, asset = soft(model), layout.bodies, layout.asset
-    counts = {
-        name: np.array([getattr(body, of) for body in bodies])
-        for name, of in (
-            ("function_count", "function_count"),
-            ("driven_count", "driven_count"),
-            ("point_count", "point_count"),
-            ("sample_count", "surface_count"),
-        )
-    }
-    given: dict[str, Any] = {name: count[asset] for name, count in counts.items()}
-    given |= {
+    names = ("function_count", "driven_count", "point_count", "surface_count")
+    functions, driven, points, samples = (np.array([getattr(body, name) for body in bodies]) for name in names)
+    given: dict[str, Any] = {
         "world": layout.instance_world,
         "asset": asset,
-        "point_start": starts_of(counts["point_count"])[asset],
-        "row_start": starts_of(counts["sample_count"])[asset],
+        "function_count": functions[asset],
+        "driven_count": driven[asset],
+        "point_count": points[asset],
+        "sample_count": samples[asset],
+        "point_start": starts_of(points)[asset],
+        "row_start": starts_of(samples)[asset],
         "pin_count": layout.pin_count,
         "pin_start": starts_of(layout.pin_count),
         "link_pin_count": np.zeros(len(asset), int),

@@ -109,6 +109,14 @@ def admissible(value: float, current: float, limits: wp.vec2, bit: int):
     return inside, wp.where(inside == value, 0, bit)
 
 
+@wp.func
+def write_admissible(given: wp.array[float], own: wp.array[float], i: int, limits: wp.vec2, bit: int):
+    """Write a parameter of an instance, clamped; return the bit where it had to be."""
+    value, found = admissible(given[i], own[i], limits, bit)
+    own[i] = value
+    return found
+
+
 @wp.kernel
 def write_parameters(
     instances: Instances,
@@ -130,17 +138,10 @@ def write_parameters(
     i = wp.tid()
     if not in_mask(instance_world[i], world_mask):
         return
-    value, flags = admissible(given.youngs_modulus[i], parameters.youngs_modulus[i], youngs_modulus, 1)
-    parameters.youngs_modulus[i] = value
-    value, bit = admissible(given.poissons_ratio[i], parameters.poissons_ratio[i], poissons_ratio, 2)
-    parameters.poissons_ratio[i] = value
-    flags = flags | bit
-    value, bit = admissible(given.density[i], parameters.density[i], density, 4)
-    parameters.density[i] = value
-    flags = flags | bit
-    value, bit = admissible(given.friction[i], parameters.friction[i], friction, 8)
-    parameters.friction[i] = value
-    flags = flags | bit
+    flags = write_admissible(given.youngs_modulus, parameters.youngs_modulus, i, youngs_modulus, 1)
+    flags |= write_admissible(given.poissons_ratio, parameters.poissons_ratio, i, poissons_ratio, 2)
+    flags |= write_admissible(given.density, parameters.density, i, density, 4)
+    flags |= write_admissible(given.friction, parameters.friction, i, friction, 8)
     value, bit = admissible(given.scale[i], parameters.scale[i], scale, 16)
     flags = flags | bit
     if instances.pin_count[i] > 0 or instances.driven_count[i] > 0:

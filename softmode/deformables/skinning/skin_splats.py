@@ -157,27 +157,18 @@ class SkinSplats:
                 wp.zeros(worlds, dtype=wp.vec3d, device=self.device),
                 wp.zeros((worlds, self.function_count), dtype=wp.vec4, device=self.device),
             )
-        motion = self._motion[worlds]
+        offset, moved = self._motion[worlds]
         lanes = 32 if self.device.is_cuda else 1
-        wp.launch(
-            kernels.split_motion,
-            dim=(worlds, lanes),
-            inputs=[self.mean_basis, function_start, q, lanes],
-            outputs=[*motion],
-            device=self.device,
-        )
-        inputs = [self.rest_means, self.rest_covariances, self.basis, self.stretch_limit, *motion, first_splat]
-        outputs = [means, covariances, rotations]
+        inputs = [self.mean_basis, function_start, q, lanes]
+        wp.launch(kernels.split_motion, (worlds, lanes), inputs, [offset, moved], device=self.device)
+        skin = kernels.Skin()
+        skin.rest_mean, skin.rest_covariance, skin.basis = self.rest_means, self.rest_covariances, self.basis
+        skin.stretch_limit, skin.first_splat, skin.offset, skin.q = self.stretch_limit, first_splat, offset, moved
+        skin.mean, skin.covariance, skin.rotation = means, covariances, rotations
         if self.device.is_cpu and self.count >= cpu_kernels.BLOCK:
             blocks = -(-self.count // cpu_kernels.BLOCK)
-            wp.launch(cpu_kernels.skin_blocks, (blocks, worlds), inputs, outputs, device=self.device)
+            wp.launch(cpu_kernels.skin_blocks, (blocks, worlds), [skin], device=self.device)
             return
         together = 4 if self.device.is_cuda and worlds > 1 else 1
-        wp.launch(
-            kernels.skin_kernel(together),
-            dim=(-(-worlds // together), self.count),
-            inputs=inputs,
-            outputs=outputs,
-            device=self.device,
-            block_dim=128,
-        )
+        dim = (-(-worlds // together), self.count)
+        wp.launch(kernels.skin_kernel(together), dim, [skin], device=self.device, block_dim=128)

@@ -63,41 +63,24 @@ class AdjointSkinning:
         shape = (self.world_count, max(first_splat + skin.count, loss_means.shape[-1]))
         if loss_rotations is not None and loss_rotations.shape == (1, 1) != shape:
             loss_rotations = None
-        given: list[tuple[str, Any, tuple[int, ...]]] = [
-            ("function_start", function_start, (self.world_count,)),
-            ("loss_means", loss_means, shape),
-            ("loss_covariances", loss_covariances, shape),
-            ("loss_q", loss_q, q.shape),
-        ]
-        if loss_rotations is not None:
-            given.append(("loss_rotations", loss_rotations, shape))
-        for name, array, expected in given:
-            if tuple(array.shape) != tuple(expected):
+        expected: dict[str, tuple[Any, tuple[int, ...]]] = {
+            "function_start": (function_start, (self.world_count,)),
+            "loss_means": (loss_means, shape),
+            "loss_covariances": (loss_covariances, shape),
+            "loss_q": (loss_q, q.shape),
+            "loss_rotations": (loss_rotations, shape),
+        }
+        for name, (array, wanted) in expected.items():
+            if array is not None and tuple(array.shape) != tuple(wanted):
                 raise BasisError(
-                    f"{name} has shape {tuple(array.shape)}, expected {tuple(expected)}",
+                    f"{name} has shape {tuple(array.shape)}, expected {tuple(wanted)}",
                     hint="Give the gradients of the arrays that launch wrote",
                 )
-        wp.launch(
-            kernels.gradient_adjoint,
-            dim=(self.world_count, skin.count),
-            inputs=[
-                skin.rest_covariances, skin.basis, skin.stretch_limit, function_start, q, first_splat,
-                loss_covariances, loss_rotations,
-            ],
-            outputs=[self._gradient],
-            device=skin.device,
-        )  # fmt: skip
-        wp.launch(
-            kernels.sum_splats,
-            dim=(self.world_count, -(-skin.function_count // 4), self._lane.shape[1]),
-            inputs=[skin.basis, skin.mean_basis, first_splat, loss_means, self._gradient],
-            outputs=[self._lane],
-            device=skin.device,
-        )
-        wp.launch(
-            kernels.add_lanes,
-            dim=(self.world_count, skin.function_count),
-            inputs=[self._lane, function_start],
-            outputs=[loss_q],
-            device=skin.device,
-        )
+        rest = [skin.rest_covariances, skin.basis, skin.stretch_limit, function_start, q, first_splat]
+        dim, device, losses = (self.world_count, skin.count), skin.device, [loss_covariances, loss_rotations]
+        wp.launch(kernels.gradient_adjoint, dim, [*rest, *losses], [self._gradient], device=device)
+        dim = (self.world_count, -(-skin.function_count // 4), self._lane.shape[1])
+        inputs = [skin.basis, skin.mean_basis, first_splat, loss_means, self._gradient]
+        wp.launch(kernels.sum_splats, dim, inputs, [self._lane], device=device)
+        dim = (self.world_count, skin.function_count)
+        wp.launch(kernels.add_lanes, dim, [self._lane, function_start], [loss_q], device=device)

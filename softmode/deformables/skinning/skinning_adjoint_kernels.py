@@ -81,17 +81,10 @@ def gradient_adjoint(
     """Write the loss by F of every splat: 2 G F Sigma for F Sigma F^T, G symmetric, and that of its rotation."""
     world, i = wp.tid()
     start = function_start[world]
-    r0 = wp.vec3(1.0, 0.0, 0.0)
-    r1 = wp.vec3(0.0, 1.0, 0.0)
-    r2 = wp.vec3(0.0, 0.0, 1.0)
+    f = wp.identity(n=3, dtype=float)
     for k in range(basis.shape[0]):
         b = basis[k, i]
-        q = q_in[start + k]
-        gradient = wp.vec3(b[0], b[1], b[2])
-        r0 += float(q[0]) * gradient
-        r1 += float(q[1]) * gradient
-        r2 += float(q[2]) * gradient
-    f = wp.matrix_from_rows(r0, r1, r2)
+        f += wp.outer(wp.vec3(q_in[start + k]), wp.vec3(b[0], b[1], b[2]))
     g = covariance_loss[world, first_splat + i]
     # An off-diagonal entry is stored once and stands for two.
     loss = symmetric_matrix(vec6(g[0], 0.5 * g[1], 0.5 * g[2], g[3], 0.5 * g[4], g[5]))

@@ -22,7 +22,6 @@ vec6 = wp.types.vector(length=6, dtype=wp.float32)
 )
 def load4(source: wp.array2d[wp.vec4], row: int, column: int) -> wp.vec4:
     """Return an element of a contiguous array that the kernel does not write, in one load."""
-    ...
 
 
 @wp.func
@@ -102,7 +101,6 @@ def polar_rotation(f: wp.mat33) -> wp.quat:
 )
 def sum_over_lanes(value: wp.float64) -> wp.float64:
     """Return the sum over the threads of a warp, to each of them; on CPU the value itself."""
-    ...
 
 
 @wp.kernel
@@ -133,33 +131,44 @@ def split_motion(
         offset_out[world] = offset
 
 
+@wp.struct
+class Skin:
+    """Splats of one object with the basis that moves them, how they move, and where they go."""
+
+    rest_mean: wp.array[wp.vec3]  # (splat_count,) [m]
+    rest_covariance: wp.array[vec6]  # (splat_count,) [m^2]
+    basis: wp.array2d[wp.vec4]  # (function_count, splat_count) grad b [1/m], b less its average
+    stretch_limit: float
+    offset: wp.array[wp.vec3d]  # (world_count,) [m]
+    q: wp.array2d[wp.vec4]  # (world_count, function_count) [m]
+    first_splat: int
+    # Out:
+    mean: wp.array2d[wp.vec3]  # (world_count, >= first_splat + splat_count) [m]
+    covariance: wp.array2d[vec6]  # like mean [m^2]
+    rotation: wp.array2d[wp.quat]  # like mean, or of size zero: not wanted
+
+
 @wp.func
-def write_splat(
-    row0: wp.vec4,
-    row1: wp.vec4,
-    row2: wp.vec4,
-    rest_mean: wp.vec3,
-    rest_covariance: vec6,
-    stretch_limit: float,
-    offset: wp.vec3d,
-    world: int,
-    column: int,
-    mean_out: wp.array2d[wp.vec3],
-    covariance_out: wp.array2d[vec6],
-    rotation_out: wp.array2d[wp.quat],
-):
+def write_splat(skin: Skin, row0: wp.vec4, row1: wp.vec4, row2: wp.vec4, world: int, i: int):
     """Write x, F Sigma F^T and, if wanted, the rotation of F from the rows (grad u_d, u_d) of the displacement."""
     gradient = wp.mat33(
         1.0 + row0[0], row0[1], row0[2], row1[0], 1.0 + row1[1], row1[2], row2[0], row2[1], 1.0 + row2[2]
     )  # fmt: skip
-    if rotation_out.shape[0] > 0:
-        rotation_out[world, column] = polar_rotation(gradient)
-    f = limited_stretch(gradient, stretch_limit)
-    s = f * symmetric_matrix(rest_covariance) * wp.transpose(f)
-    x = offset + wp.vec3d(wp.float64(rest_mean[0]), wp.float64(rest_mean[1]), wp.float64(rest_mean[2]))
+    column = skin.first_splat + i
+    if skin.rotation.shape[0] > 0:
+        skin.rotation[world, column] = polar_rotation(gradient)
+    f = limited_stretch(gradient, skin.stretch_limit)
+    s = f * symmetric_matrix(skin.rest_covariance[i]) * wp.transpose(f)
+    x = skin.offset[world] + wp.vec3d(skin.rest_mean[i])
     x = x + wp.vec3d(wp.float64(row0[3]), wp.float64(row1[3]), wp.float64(row2[3]))
-    mean_out[world, column] = wp.vec3(float(x[0]), float(x[1]), float(x[2]))
-    covariance_out[world, column] = vec6(s[0, 0], s[0, 1], s[0, 2], s[1, 1], s[1, 2], s[2, 2])
+    skin.mean[world, column] = wp.vec3(x)
+    skin.covariance[world, column] = vec6(s[0, 0], s[0, 1], s[0, 2], s[1, 1], s[1, 2], s[2, 2])
+
+
+@wp.func
+def add_rows(x: wp.vec4, y: wp.vec4, z: wp.vec4, q: wp.vec4, b: wp.vec4):
+    """Return the three rows with a function's part of the displacement added."""
+    return x + q[0] * b, y + q[1] * b, z + q[2] * b
 
 
 @functools.cache
@@ -171,24 +180,10 @@ def skin_kernel(worlds: int) -> wp.Kernel:
     """
 
     @wp.kernel(enable_backward=False, module="unique")
-    def _skin(
-        # Object:
-        rest_mean: wp.array[wp.vec3],  # (splat_count,) [m]
-        rest_covariance: wp.array[vec6],  # (splat_count,) [m^2]
-        basis: wp.array2d[wp.vec4],  # (function_count, splat_count) grad b [1/m], b less its average
-        stretch_limit: float,
-        # State in:
-        offset: wp.array[wp.vec3d],  # (world_count,) [m]
-        q_in: wp.array2d[wp.vec4],  # (world_count, function_count) [m]
-        # Out:
-        first_splat: int,
-        mean_out: wp.array2d[wp.vec3],  # (world_count, >= first_splat + splat_count) [m]
-        covariance_out: wp.array2d[vec6],  # (world_count, >= first_splat + splat_count) [m^2]
-        rotation_out: wp.array2d[wp.quat],  # like mean_out, or of size zero: not wanted
-    ):
+    def _skin(skin: Skin):
         """Compute x = X + sum_k b_k q_k, F Sigma F^T and, if wanted, the rotation of F."""
         group, i = wp.tid()
-        world_count = offset.shape[0]
+        world_count = skin.offset.shape[0]
         w0 = worlds * group
         # The last group may be incomplete: it repeats its last world.
         w1 = wp.min(w0 + 1, world_count - 1)
@@ -206,43 +201,20 @@ def skin_kernel(worlds: int) -> wp.Kernel:
         d0 = wp.vec4()
         d1 = wp.vec4()
         d2 = wp.vec4()
-        for k in range(basis.shape[0]):
-            b = load4(basis, k, i)
-            q = load4(q_in, w0, k)
-            a0 = a0 + q[0] * b
-            a1 = a1 + q[1] * b
-            a2 = a2 + q[2] * b
+        for k in range(skin.basis.shape[0]):
+            b = load4(skin.basis, k, i)
+            a0, a1, a2 = add_rows(a0, a1, a2, load4(skin.q, w0, k), b)
             if wp.static(worlds > 1):
-                q = load4(q_in, w1, k)
-                b0 = b0 + q[0] * b
-                b1 = b1 + q[1] * b
-                b2 = b2 + q[2] * b
-                q = load4(q_in, w2, k)
-                c0 = c0 + q[0] * b
-                c1 = c1 + q[1] * b
-                c2 = c2 + q[2] * b
-                q = load4(q_in, w3, k)
-                d0 = d0 + q[0] * b
-                d1 = d1 + q[1] * b
-                d2 = d2 + q[2] * b
-        x = rest_mean[i]
-        s = rest_covariance[i]
-        column = first_splat + i
-        write_splat(
-            a0, a1, a2, x, s, stretch_limit, offset[w0], w0, column, mean_out, covariance_out, rotation_out
-        )  # fmt: skip
+                b0, b1, b2 = add_rows(b0, b1, b2, load4(skin.q, w1, k), b)
+                c0, c1, c2 = add_rows(c0, c1, c2, load4(skin.q, w2, k), b)
+                d0, d1, d2 = add_rows(d0, d1, d2, load4(skin.q, w3, k), b)
+        write_splat(skin, a0, a1, a2, w0, i)
         if wp.static(worlds > 1):
             if w0 + 1 < world_count:
-                write_splat(
-                    b0, b1, b2, x, s, stretch_limit, offset[w1], w1, column, mean_out, covariance_out, rotation_out
-                )  # fmt: skip
+                write_splat(skin, b0, b1, b2, w1, i)
             if w0 + 2 < world_count:
-                write_splat(
-                    c0, c1, c2, x, s, stretch_limit, offset[w2], w2, column, mean_out, covariance_out, rotation_out
-                )  # fmt: skip
+                write_splat(skin, c0, c1, c2, w2, i)
             if w0 + 3 < world_count:
-                write_splat(
-                    d0, d1, d2, x, s, stretch_limit, offset[w3], w3, column, mean_out, covariance_out, rotation_out
-                )  # fmt: skip
+                write_splat(skin, d0, d1, d2, w3, i)
 
     return _skin

@@ -8,7 +8,7 @@ the part has when it is taken; one that *pulls* is one point on a damped spring.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import newton
 import numpy as np
@@ -170,17 +170,13 @@ class Grips:
         X = np.asarray(rest_points, dtype=np.float64)
         if X.ndim != 2 or X.shape[1] != 3 or not len(X) or not np.isfinite(X).all() or (pulls and len(X) != 1):
             raise ConfigError(f"rest_points must be finite, shape (n > 0, 3), one for a pull, got {X.shape}")
-        free = [g for g in range(self.grip_max) if g not in self._held]
         left = self.slot_count - sum(len(grip.offsets) for grip in self._held.values())
-        if not free or len(X) > left:
+        if len(self._held) >= self.grip_max or len(X) > left:
             raise ConfigError(f"no room for a grip of {len(X)} points, {left} are left", hint="let go of another")
-        rows = self.body.evaluate(X)[0].astype(np.float32).astype(np.float64)
+        rows = self._rows(X)
         x = X + rows @ self._coordinates(state)
         centre = x.mean(axis=0)
-        self._held[free[0]] = Grip(rest_points=X, rows=rows, offsets=x - centre, pulls=pulls)
-        self._set_poses(free[0], centre)
-        self._write_slots()
-        return free[0]
+        return self._hold(Grip(rest_points=X, rows=rows, offsets=x - centre, pulls=pulls), centre, _IDENTITY)
 
     def restore(self, grip: Grip, position: ArrayLike, rotation: Sequence[float] = _IDENTITY) -> int:
         """Take a grip up again on this body, which may be another build of the same asset.
@@ -193,12 +189,8 @@ class Grips:
         Returns:
             Number of the grip.
         """
-        free = [g for g in range(self.grip_max) if g not in self._held]
-        rows = self.body.evaluate(grip.rest_points)[0].astype(np.float32).astype(np.float64)
-        self._held[free[0]] = Grip(rest_points=grip.rest_points, rows=rows, offsets=grip.offsets, pulls=grip.pulls)
-        self._set_poses(free[0], np.asarray(position, float), rotation)
-        self._write_slots()
-        return free[0]
+        grip = replace(grip, rows=self._rows(grip.rest_points))
+        return self._hold(grip, np.asarray(position, float), rotation)
 
     def let_go(self, grip: int) -> None:
         """Let go of a grip.
@@ -240,8 +232,8 @@ class Grips:
     def pose(self, grip: int, *, goal: bool = False) -> tuple[Array, Array]:
         """Return where a grip is, or shall be: position [m] (3,) and quaternion (x, y, z, w), (4,)."""
         self._checked(grip)
-        place, turn = (self.table.goal_position, self.table.goal_rotation) if goal else (None, None)
-        place, turn = place or self.table.position, turn or self.table.rotation
+        table = self.table
+        place, turn = (table.goal_position, table.goal_rotation) if goal else (table.position, table.rotation)
         return place.numpy()[grip].astype(np.float64), turn.numpy()[grip].astype(np.float64)
 
     def points(self, grip: int, state: newton.State) -> Array:
@@ -281,16 +273,23 @@ class Grips:
         q = soft(state).q[start : start + self.body.function_count]
         return q.numpy().astype(np.float64)
 
-    def _set_poses(self, grip: int, position: Array, rotation: Sequence[float] = _IDENTITY) -> None:
-        """Put a grip where it starts, at rest."""
+    def _rows(self, rest_points: Array) -> Array:
+        """Return the functions at rest points, shape (n, function_count), as the solver's float32 has them."""
+        return self.body.evaluate(rest_points)[0].astype(np.float32).astype(np.float64)
+
+    def _hold(self, grip: Grip, position: Array, rotation: Sequence[float]) -> int:
+        """Put a grip where it starts, at rest, under the first number that is free; return that."""
+        number = next(g for g in range(self.grip_max) if g not in self._held)
+        self._held[number] = grip
         table, turn = self.table, np.asarray(rotation, np.float64)[None]
-        for array, value in (
-            (table.position, position[None]),
-            (table.goal_position, position[None]),
-            (table.rotation, turn),
-            (table.goal_rotation, turn),
+        for arrays, value in (
+            ((table.position, table.goal_position), position[None]),
+            ((table.rotation, table.goal_rotation), turn),
         ):
-            array[grip : grip + 1].assign(value)
+            for array in arrays:
+                array[number : number + 1].assign(value)
+        self._write_slots()
+        return number
 
     def _write_slots(self) -> None:
         """Write the points of all grips, one after another, into the tables of pins."""

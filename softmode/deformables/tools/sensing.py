@@ -129,18 +129,16 @@ class SurfacePressure:
         if np.ptp(assets):
             raise ConfigError(f"soft body {soft} is not the same in every world", hint="replicate one builder")
         self.area = layout.bodies[assets[0]].surface_areas.copy()
-        shape, vector = (worlds, len(self.area)), wp.vec3d
-        self._normal_force, self._friction = (wp.zeros(shape, dtype=vector, device=device) for _ in range(2))
-        pairs = view.pairs
-        self._surface_normal = (
-            pairs.surface_normal if pairs is not None else wp.zeros((1, 1), dtype=wp.vec3, device=device)
-        )
+        shape = (worlds, len(self.area))
+        self._normal_force, self._friction = (wp.zeros(shape, dtype=wp.vec3d, device=device) for _ in range(2))
+        self._surface_normal = None if view.pairs is None else view.pairs.surface_normal
         self._sample = wp.zeros((worlds, view.constraint_max), dtype=int, device=device)
         self.pressure = wp.zeros(shape, dtype=float, device=device)
         self.traction, self.normal = (wp.zeros(shape, dtype=wp.vec3, device=device) for _ in range(2))
-        self._patch = patch = allocate(kernels.Patch, "world", {"world": worlds}, device)
-        self.total_force, self.total_force_friction, self.total_torque = patch.force, patch.friction, patch.torque
-        self.total_position, self.total_normal, self.total_area = patch.position, patch.normal, patch.area
+        self._patch = patch = _readings((worlds, 1, 1), device)
+        self.total_force, self.total_force_friction = patch.force.reshape(worlds), patch.friction.reshape(worlds)
+        self.total_torque, self.total_position = patch.torque.reshape(worlds), patch.position.reshape(worlds)
+        self.total_normal, self.total_area = patch.normal.reshape(worlds), patch.area.reshape(worlds)
 
     def update(self) -> None:
         """Read the contacts of the last step."""

@@ -19,26 +19,30 @@ wp.set_module_options({"enable_backward": False})
 
 @struct
 class Readings:
-    """What a contact sensor reads, shape (world_count, link_count, soft_count); world frame."""
+    """What a sensor of contact reads, shape (world_count, link_count, soft_count); world frame.
 
-    force: wp.array3d[wp.vec3]  # on the link [N]
+    Of a link with soft bodies; or, in shape (world_count, 1, 1), of a soft body with everything.
+    """
+
+    force: wp.array3d[wp.vec3]  # on the link, or the soft body [N]
     friction: wp.array3d[wp.vec3]  # its tangential part [N]
-    torque: wp.array3d[wp.vec3]  # about the link's centre of mass [N m]
+    torque: wp.array3d[wp.vec3]  # about the centre of mass [N m]
     position: wp.array3d[wp.vec3]  # centre of pressure [m]
-    normal: wp.array3d[wp.vec3]  # mean normal, out of the link
+    normal: wp.array3d[wp.vec3]  # mean normal, out of the link or into the soft body
     area: wp.array3d[float]  # [m^2]
 
 
 @struct
-class Patch:
-    """Contact of one soft body with everything, shape (world_count,); world frame."""
+class Touch:
+    """Contact as it is summed up: what `Readings` become."""
 
-    force: wp.array[wp.vec3]  # [N]
-    friction: wp.array[wp.vec3]  # [N]
-    torque: wp.array[wp.vec3]  # about the body's centre of mass [N m]
-    position: wp.array[wp.vec3]  # centre of pressure [m]
-    normal: wp.array[wp.vec3]
-    area: wp.array[float]  # [m^2]
+    force: wp.vec3d  # [N]
+    friction: wp.vec3d  # [N]
+    torque: wp.vec3d  # [N m]
+    position: wp.vec3d  # sum over the contacts, weighted by normal force [N m]
+    normal: wp.vec3d  # likewise [N]
+    weight: wp.float64  # [N]
+    area: wp.float64  # [m^2]
 
 
 @wp.func
@@ -84,6 +88,35 @@ def mean_of(total: wp.vec3d, weight: wp.float64):
     return wp.where(weight > wp.float64(0.0), total / wp.max(weight, wp.float64(1.0e-300)), wp.vec3d())
 
 
+@wp.func
+def add_force(touch: Touch, f: wp.vec3d, friction: wp.vec3d, arm: wp.vec3d):
+    """Return the sums with a force on the body that is read."""
+    touch.force += f
+    touch.friction += friction
+    touch.torque += wp.cross(arm, f)
+    return touch
+
+
+@wp.func
+def add_pressure(touch: Touch, pressing: wp.float64, x: wp.vec3d, n: wp.vec3d):
+    """Return the sums with a normal force at a place."""
+    touch.weight += pressing
+    touch.position += pressing * x
+    touch.normal += pressing * n
+    return touch
+
+
+@wp.func
+def write_readings(out: Readings, w: int, l: int, column: int, touch: Touch):
+    """Write the sums and means of a contact."""
+    out.force[w, l, column] = wp.vec3(touch.force)
+    out.friction[w, l, column] = wp.vec3(touch.friction)
+    out.torque[w, l, column] = wp.vec3(touch.torque)
+    out.position[w, l, column] = wp.vec3(mean_of(touch.position, touch.weight))
+    out.normal[w, l, column] = wp.vec3(wp.normalize(touch.normal))
+    out.area[w, l, column] = float(touch.area)
+
+
 @wp.kernel
 def read_contacts(
     instances: Instances,
@@ -105,13 +138,7 @@ def read_contacts(
         begin = begin + soft[column]
         end = begin + 1
     body = link_body[w, l]
-    force = wp.vec3d()
-    friction = wp.vec3d()
-    torque = wp.vec3d()
-    position = wp.vec3d()
-    normal = wp.vec3d()
-    weight = wp.float64(0.0)
-    area = wp.float64(0.0)
+    touch = Touch()
     for i in range(begin, end):
         first = instances.pin_count[i]
         for e in range(first, constraints.count[i]):
@@ -127,31 +154,15 @@ def read_contacts(
             arm = wp.vec3d(constraints.arm[i, e])
             if body < 0:
                 arm = x
-            force -= f
-            friction -= f - pressing * n
-            torque -= wp.cross(arm, f)
+            touch = add_force(touch, -f, -(f - pressing * n), arm)
             if pressing > wp.float64(0.0):
-                weight += pressing
-                position += pressing * x
-                normal += pressing * n
+                touch = add_pressure(touch, pressing, x, n)
                 if first_of_sample(constraints, first, i, e):
-                    area += wp.float64(sample_area(instances.scale[i], basis.row_area[constraints.row[i, e]]))
-    position = mean_of(position, weight)
-    normal = wp.normalize(normal)
+                    touch.area += wp.float64(sample_area(instances.scale[i], basis.row_area[constraints.row[i, e]]))
     if column < soft.shape[0]:
-        matrix_out.force[w, l, column] = wp.vec3(force)
-        matrix_out.friction[w, l, column] = wp.vec3(friction)
-        matrix_out.torque[w, l, column] = wp.vec3(torque)
-        matrix_out.position[w, l, column] = wp.vec3(position)
-        matrix_out.normal[w, l, column] = wp.vec3(normal)
-        matrix_out.area[w, l, column] = float(area)
+        write_readings(matrix_out, w, l, column, touch)
     else:
-        total_out.force[w, l, 0] = wp.vec3(force)
-        total_out.friction[w, l, 0] = wp.vec3(friction)
-        total_out.torque[w, l, 0] = wp.vec3(torque)
-        total_out.position[w, l, 0] = wp.vec3(position)
-        total_out.normal[w, l, 0] = wp.vec3(normal)
-        total_out.area[w, l, 0] = float(area)
+        write_readings(total_out, w, l, 0, touch)
 
 
 @wp.kernel
@@ -232,7 +243,7 @@ def gather_pressure(
     normal_force: wp.array2d[wp.vec3d],  # (world_count, sample_count) [N]
     friction: wp.array2d[wp.vec3d],  # (world_count, sample_count) [N]
     # Out:
-    patch_out: Patch,
+    patch_out: Readings,  # shape (world_count, 1, 1)
 ):
     """Sum the contact forces on each surface sample, and on the body."""
     w = wp.tid()
@@ -243,13 +254,7 @@ def gather_pressure(
         mean = basis.mean[instances.asset[i], b]
         for axis in range(3):
             centre[axis] += sum8d(wp.cw_mul(mean, motion.q_start[i, axis * stride + b]))
-    total = wp.vec3d()
-    tangential = wp.vec3d()
-    torque = wp.vec3d()
-    position = wp.vec3d()
-    normal = wp.vec3d()
-    weight = wp.float64(0.0)
-    area = wp.float64(0.0)
+    touch = Touch()
     for e in range(instances.pin_count[i], constraints.count[i]):
         f = constraints.force[i, e]
         if is_internal(constraints, i, e) or not wp.isfinite(wp.length_sq(f)):
@@ -257,25 +262,16 @@ def gather_pressure(
         n = constraints.normal[i, e]
         pressing = normal_part(constraints, i, e)
         x = point_of(instances, basis, motion, constraints, i, e)
-        total += f
-        tangential += f - pressing * n
-        torque += wp.cross(x - centre, f)
+        touch = add_force(touch, f, f - pressing * n, x - centre)
         if pressing > wp.float64(0.0):
-            weight += pressing
-            position += pressing * x
-            normal += pressing * n
+            touch = add_pressure(touch, pressing, x, n)
         s = sample[w, e]
         before = wp.length_sq(normal_force[w, s])
         normal_force[w, s] = normal_force[w, s] + pressing * n
         friction[w, s] = friction[w, s] + (f - pressing * n)
         if before == wp.float64(0.0) and pressing > wp.float64(0.0):
-            area += wp.float64(sample_area(instances.scale[i], basis.row_area[instances.row_start[i] + s]))
-    patch_out.force[w] = wp.vec3(total)
-    patch_out.friction[w] = wp.vec3(tangential)
-    patch_out.torque[w] = wp.vec3(torque)
-    patch_out.position[w] = wp.vec3(mean_of(position, weight))
-    patch_out.normal[w] = wp.vec3(wp.normalize(normal))
-    patch_out.area[w] = float(area)
+            touch.area += wp.float64(sample_area(instances.scale[i], basis.row_area[instances.row_start[i] + s]))
+    write_readings(patch_out, w, 0, 0, touch)
 
 
 @wp.kernel

@@ -113,9 +113,7 @@ def write_splats(path: str | os.PathLike[str], splats: Splats, *, up: UpAxis = "
     suffix = next((known for known in _WRITERS if file.name.lower().endswith(known)), None)
     if suffix is None:
         raise unreadable(
-            file,
-            f"cannot write {file.suffix.lower() or '(no suffix)'!r}",
-            hint=f"Writable are {', '.join(WRITABLE)}",
+            file, f"cannot write {file.suffix.lower() or '(no suffix)'!r}", hint=f"Writable are {', '.join(WRITABLE)}"
         )
     if up != "+z":
         if suffix in _USD:

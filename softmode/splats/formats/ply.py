@@ -16,13 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.files import whole_file
-from softmode.splats.formats.common import (
-    check_count,
-    exp_scales,
-    read_exactly,
-    sigmoid,
-    unreadable,
-)
+from softmode.splats.formats.common import check_count, exp_scales, read_exactly, sigmoid, unreadable
 from softmode.splats.formats.compressed_ply import decode_compressed
 from softmode.splats.splats import Splats
 
@@ -69,18 +63,14 @@ def read_ply(path: str | os.PathLike[str]) -> Splats:
     file_path = Path(path)
     with open(file_path, "rb") as file:
         elements, offset = _parse_header(file.read(_HEADER_LIMIT), str(file_path))
-        vertex = next((element for element in elements if element.name == "vertex"), None)
-        if vertex is None or [element.name for element in elements] not in (
-            ["vertex"],
-            ["chunk", "vertex"],
-            ["chunk", "vertex", "sh"],
-        ):
+        names = [element.name for element in elements]
+        if names not in (["vertex"], ["chunk", "vertex"], ["chunk", "vertex", "sh"]):
             raise unreadable(
                 file_path,
-                f"elements {[element.name for element in elements][:8]}, expected 'vertex', or "
-                "'chunk', 'vertex' and 'sh'",
+                f"elements {names[:8]}, expected 'vertex', or 'chunk', 'vertex' and 'sh'",
                 hint="Only splat .ply files can be read; sample a mesh with `softmode splat from-mesh`",
             )
+        vertex = elements[names.index("vertex")]
         check_count(vertex.count, str(file_path))
         if len(elements) == 1:
             _check_columns(vertex, str(file_path))

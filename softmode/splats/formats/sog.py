@@ -20,13 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from softmode.errors import AssetError
-from softmode.splats.formats.common import (
-    FREE_BYTES,
-    MAX_RATIO,
-    exp_scales,
-    quats_from_smallest_three,
-    unreadable,
-)
+from softmode.splats.formats.common import FREE_BYTES, MAX_RATIO, exp_scales, quats_from_smallest_three, unreadable
 from softmode.splats.splats import MAX_SPLATS, Splats
 
 _META_LIMIT = 16 * 1024 * 1024
@@ -76,9 +70,7 @@ def _folder_reader(folder: Path, meta: str = "meta.json") -> _Reader:
         file = folder / (meta if name == "meta.json" else name)
         if not file.is_file():
             raise unreadable(
-                folder / meta,
-                f"member {name} is missing",
-                hint="Copy the whole folder, with all .webp files",
+                folder / meta, f"member {name} is missing", hint="Copy the whole folder, with all .webp files"
             )
         with open(file, "rb") as stream:
             data = stream.read(limit + 1)

@@ -44,7 +44,7 @@ _EXTENSION_LIMIT = 1024 * 1024
 _DC_SCALE = 0.15
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class _Header:
     """What the header of any version says."""
 
@@ -79,11 +79,8 @@ def read_spz(path: str | os.PathLike[str]) -> Splats:
     file_path = Path(path)
     with open(file_path, "rb") as file:
         data = read_exactly(file, os.fstat(file.fileno()).st_size, file_path)
-    if data[:2] == b"\x1f\x8b":
-        header, arrays = _unpack_gzip(data, str(file_path))
-    else:
-        header, arrays = _unpack_zstd(data, str(file_path))
-    return _decode(header, arrays, str(file_path))
+    unpack = _unpack_gzip if data[:2] == b"\x1f\x8b" else _unpack_zstd
+    return _decode(*unpack(data, str(file_path)), str(file_path))
 
 
 def _check_header(fields: tuple[Any, ...], versions: range, packed_size: int, path: str) -> _Header:
@@ -101,13 +98,7 @@ def _check_header(fields: tuple[Any, ...], versions: range, packed_size: int, pa
         raise unreadable(
             path, f"spherical-harmonic degree {degree} and {fractional_bits} fractional bits, expected at most 4 and 30"
         )
-    header = _Header(
-        version=version,
-        count=check_count(count, path),
-        degree=degree,
-        fractional_bits=fractional_bits,
-        flags=flags,
-    )
+    header = _Header(version, check_count(count, path), degree, fractional_bits, flags)
     if sum(header.sizes().values()) > max(FREE_BYTES, MAX_RATIO * packed_size):
         raise unreadable(path, f"{packed_size} bytes cannot hold the {count} splats that the header declares")
     return header

@@ -10,11 +10,11 @@ Reference:
 
 from __future__ import annotations
 
-import importlib
 import os
 import shutil
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +25,9 @@ from softmode.checks import require_number
 from softmode.errors import AssetError, ConfigError, MissingExtraError
 from softmode.files import whole_file
 from softmode.splats.formats.common import REEXPORT, typed_errors, unreadable
-from softmode.splats.splats import MAX_SPLATS, Splats, UpAxis, rotate_sh, up_rotation
+from softmode.splats.splats import MAX_SPLATS, Splats, UpAxis, padded_sh, rotate_sh, up_rotation
 from softmode.stages import process
+from softmode.stages.openusd import pxr
 
 _LIMITS = process.Limits(memory=128 * 2.0**20, memory_per_byte=16.0, seconds=1.0)
 """Splats alone need little: 16 bytes for each of the file is generous."""
@@ -137,14 +138,8 @@ def placed(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
     if not (np.isfinite(matrix).all() and abs(determinant) > 0.0):
         raise AssetError(f"{splats.name}: its transform is singular", hint="Give the prim scales other than zero")
     if determinant < 0.0:  # mirrored: a reflection of x first, then a map that keeps handedness
-        splats = Splats(
-            means=splats.means * np.array([-1.0, 1.0, 1.0]),
-            quats=splats.quats * np.array([1.0, -1.0, -1.0, 1.0]),
-            scales=splats.scales,
-            opacities=splats.opacities,
-            sh=rotate_sh(splats.sh, _MIRROR),
-            name=splats.name,
-        )
+        means, quats = splats.means * np.array([-1.0, 1.0, 1.0]), splats.quats * np.array([1.0, -1.0, -1.0, 1.0])
+        splats = replace(splats, means=means, quats=quats, sh=rotate_sh(splats.sh, _MIRROR))
         linear = linear @ _MIRROR
     scale = abs(determinant) ** (1.0 / 3.0)
     if np.allclose(linear @ linear.T, scale**2 * np.eye(3), atol=1e-6 * scale**2):
@@ -156,15 +151,9 @@ def joined(parts: list[Splats], name: str) -> Splats:
     """Return several sets of splats as one of the highest degree among them."""
     if len(parts) == 1:
         return parts[0]
-    width = max(part.sh.shape[1] for part in parts)
-    return Splats(
-        means=np.concatenate([part.means for part in parts]),
-        quats=np.concatenate([part.quats for part in parts]),
-        scales=np.concatenate([part.scales for part in parts]),
-        opacities=np.concatenate([part.opacities for part in parts]),
-        sh=np.concatenate([np.pad(part.sh, ((0, 0), (0, width - part.sh.shape[1]), (0, 0))) for part in parts]),
-        name=name,
-    )
+    columns = ("means", "quats", "scales", "opacities")
+    joint = {column: np.concatenate([getattr(part, column) for part in parts]) for column in columns}
+    return Splats(**joint, sh=padded_sh(parts), name=name)
 
 
 def write_usd(path: str | os.PathLike[str], splats: Splats | Sequence[Splats], *, fps: float = 24.0) -> None:
@@ -206,9 +195,7 @@ def write_usd(path: str | os.PathLike[str], splats: Splats | Sequence[Splats], *
 
 def _build_layer(frames: list[Splats], fps: float) -> Any:
     """Return an anonymous layer with the prim `/Splats`."""
-    # By name: usd-core has no type stubs, a type checker takes its modules for empty.
-    pxr: list[Any] = [importlib.import_module(f"pxr.{name}") for name in ("Sdf", "Usd", "UsdGeom")]
-    Sdf, Usd, UsdGeom = pxr
+    Sdf, Usd, UsdGeom = pxr("Sdf", "Usd", "UsdGeom")
     layer = Sdf.Layer.CreateAnonymous(".usdc")
     stage = Usd.Stage.Open(layer)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
@@ -234,7 +221,7 @@ def _build_layer(frames: list[Splats], fps: float) -> Any:
 
 def define_splats(stage: Any, path: str, sh_degree: int) -> Any:
     """Define a `ParticleField3DGaussianSplat` without values on a stage and return it."""
-    UsdVol = importlib.import_module("pxr.UsdVol")
+    (UsdVol,) = pxr("UsdVol")
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         raise MissingExtraError(
             "the installed usd-core has no ParticleField3DGaussianSplat",
@@ -278,8 +265,7 @@ def set_splat_column(
         time_code: When; None for always.
         half: Author the variant of half precision, `positionsh` beside `positions`; an extent has none.
     """
-    Usd = importlib.import_module("pxr.Usd")
-    Vt = importlib.import_module("pxr.Vt")
+    Usd, Vt = pxr("Usd", "Vt")
     half = half and name != "extent"
     kind = {"orientations": "Quat{}Array", "opacities": "{}Array"}.get(name, "Vec3{}Array")
     number = ("Half" if half else "Float") if name == "opacities" else ("h" if half else "f")

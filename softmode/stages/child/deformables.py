@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 from .. import tokens
 from ..openusd import Prim, Stage, Value, pxr
@@ -155,13 +154,8 @@ def _collect(prim: Prim, root: Prim, roots: set[Value], owned: list[Prim]) -> No
     if prim != root and (prim.GetPath() in roots or any(name in _FOREIGN for name in applied(prim))):
         return
     owned.append(prim)
-    for child in prim.GetFilteredChildren(_everything()):
+    for child in prim.GetFilteredChildren(pxr("Usd")[0].TraverseInstanceProxies()):
         _collect(child, root, roots, owned)
-
-
-def _everything() -> Any:
-    """Return the predicate of all prims that count, instances entered."""
-    return pxr("Usd")[0].TraverseInstanceProxies()
 
 
 def visible(prim: Prim) -> bool:

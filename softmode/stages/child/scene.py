@@ -50,10 +50,7 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
                 "body_matrix": flat(transforms.GetLocalToWorldTransform(body.prim)),
                 "shape": geometry_of(geometry, time, arrays),
                 "meshes": [
-                    {
-                        "matrix": flat(transforms.GetLocalToWorldTransform(mesh)),
-                        **geometry_of(mesh, time, arrays),
-                    }
+                    {"matrix": flat(transforms.GetLocalToWorldTransform(mesh)), **geometry_of(mesh, time, arrays)}
                     for mesh in body.meshes
                 ],
                 "splats": [read_splats(prim) for prim in body.splats],
@@ -121,11 +118,7 @@ def geometry_of(prim: Prim, time: Value, arrays: Arrays) -> dict[str, Any]:
 
 def _scalar(prim: Prim, other: Prim, name: str) -> float | None:
     """Return an authored number of a body or its geometry that is not zero, the value that says "not given"."""
-    for owner in (prim, other):
-        value, _ = _authored(owner, name)
-        if value:
-            return value
-    return None
+    return next((value for value, _ in (_authored(owner, name) for owner in (prim, other)) if value), None)
 
 
 def _authored(prim: Prim, name: str) -> tuple[float | None, str]:
