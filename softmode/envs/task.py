@@ -76,6 +76,10 @@ class Task:
     """Makes the policy that `--policy scripted` plays, from observation to action, for an environment."""
     point_count: ClassVar[int] = 16
     """Surface points of the object in the observation."""
+    kernels: ClassVar[Any] = None
+    """Device side that `observe` and `evaluate` launch, a module with kernels of these names and a struct `Plan`: first
+    columns of parameters (`drawn`) and segments (`columns`), and what has the name of an attribute of the task, its
+    configuration, the controller's options or the first object. None where a task overrides both methods."""
 
     def __init__(
         self,
@@ -125,6 +129,13 @@ class Task:
         """Leading columns of the observation that do not see the object: proprioception and goal."""
         self._allocate()
         self.build()
+        if self.kernels is not None:
+            columns = {
+                "drawn": self.table.columns_in(self.kernels.Drawn),
+                "columns": self.layout.columns_in(self.kernels.Columns),
+            }
+            self.plan = filled(self.kernels.Plan, self, config, config.scene.control, soft, **columns)
+            """What the task's own kernels know beside the state."""
         self.reset()
         self._step()  # compiles what the graph needs
         self.graph = captured(self._step, self.device)
@@ -239,13 +250,17 @@ class Task:
 
     def clear(self) -> None:
         """Reset `held`, and counters of the subclass, in the worlds of `scene.world_mask`."""
-        self.launch(kernels.forget_held, [self.scene.world_mask], [self.held])
+        self.launch(kernels.forget, [self.scene.world_mask, 0], [self.held])
 
     def observe(self) -> None:
         """Write the goal segments of `observation` and the `metrics`, functions of the state alone."""
+        if self.kernels is not None:
+            self.launch(self.kernels.observe, [self.state, self.plan], [self.result])
 
     def evaluate(self) -> None:
         """Write `terms`, `success` and, for failures of the task's own, `failure` (an `EndReason`); once per step."""
+        if self.kernels is not None:
+            self.launch(self.kernels.evaluate, [self.state, self.plan], [self.result])
 
     def marker(self) -> Splats | None:
         """Return the splats that mark the goal in pictures; `observe` writes `scene.marker_place`."""
@@ -285,7 +300,9 @@ class Task:
         dim = self.world_count if dim is None else dim
         wp.launch(kernel, dim=dim, inputs=list(inputs), outputs=list(outputs), device=self.device)
 
-    def place_object(self, index: int, position: str, yaw: str, ground: float = 0.0) -> None:
+    def place_object(
+        self, index: int, position: str, yaw: str, *, ground: float = 0.0, turn: float = 0.0, shift: float = 0.0
+    ) -> None:
         """Put an object down.
 
         Args:
@@ -293,14 +310,18 @@ class Task:
             position: The parameter that says where its centre is [m].
             yaw: The one that says its rotation about the vertical [rad].
             ground: Height over the table of what it stands on [m].
+            turn: What is added to the yaw [rad].
+            shift: From the centre of the unscaled object to what lies at the position, along the yaw [m].
         """
         scene, column = self.scene, self.table.column
-        columns = filled(kernels.Placement, position=column(position), yaw=column(yaw), scale=column("scale"))
-        self.launch(
-            kernels.place_object,
-            [scene.world_mask, self.state, columns, scene.objects[index].height, GAP + ground, index],
-            [scene.place_position, scene.place_yaw],
+        place = filled(
+            kernels.Placement,
+            scene.objects[index],
+            **{"position": column(position), "yaw": column(yaw), "scale": column("scale")},
+            **{"turn": turn, "shift": shift, "gap": GAP + ground, "object_index": index},
         )
+        outputs = [scene.place_position, scene.place_yaw]
+        self.launch(kernels.place_object, [scene.world_mask, self.state, place], outputs)
 
     # -- episodes -----------------------------------------------------------------------------------------------------
 
@@ -367,9 +388,8 @@ class Task:
 
     def write_observation(self) -> None:
         """Write the observation and the metrics of all worlds."""
-        arm, body = (self.layout.columns_in(struct) for struct in (kernels.ArmColumns, kernels.ObjectColumns))
-        self.launch(kernels.observe_arm, [self.state, self._arm, arm], [self.observation])
-        self.launch(kernels.observe_object, [self.state, body], [self.observation])
+        columns = self.layout.columns_in(kernels.Columns)
+        self.launch(kernels.observe, [self.state, self._arm, columns], [self.observation])
         self.observe()
         self.launch(kernels.bound_observation, [self._low, self._high], [self.observation, self.finite])
 
