@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from softmode.envs.structs import StructType, filled
+from softmode.deformables.model.structs import StructType, filled
 from softmode.robots.arm import ARM_JOINT_COUNT
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from softmode.envs.structs import StructType, filled
+from softmode.deformables.model.structs import StructType, filled
 from softmode.errors import ConfigError
 
 

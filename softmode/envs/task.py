@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.build.build_body import Progress
 from softmode.deformables.model import status as bits
+from softmode.deformables.model.structs import filled
 from softmode.deformables.solver.parameters import set_parameters
 from softmode.envs import task_kernels as kernels
 from softmode.envs.cameras import overview, square_camera, wrist_camera
@@ -22,7 +23,6 @@ from softmode.envs.end_reason import EndReason
 from softmode.envs.observation import PROPRIOCEPTION, ObservationLayout, Segment, object_part
 from softmode.envs.parameters import Parameter, ParameterTable
 from softmode.envs.reward_kernels import StepResult, WorldState
-from softmode.envs.structs import filled
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.scenes.table_scene import GAP, TableScene, TableSceneConfig
 from softmode.splats.camera import CameraOptions

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -251,16 +252,12 @@ def add_arm(
     gripper = arm.gripper
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
     base = wp.transform(*xform) if xform is not None else wp.transform()
-    bodies: list[int] = []
-    joints: list[int] = []
-    shapes: list[int] = []
-    added: list[int] = []
+    bodies, joints, shapes, added = ([] for _ in range(4))
     coord_start, dof_start = builder.joint_coord_count, builder.joint_dof_count
     weight = {"mujoco:gravcomp": 1.0} if arm.gravity_compensation else {}
 
     def add_parts(body: int, parts: Sequence[Part], mass: float, name: str, pose: wp.transform) -> list[int]:
-        density = mass / sum(part.volume for part in parts)
-        added = []
+        density, added = mass / sum(part.volume for part in parts), []
         for part in parts:
             config = newton.ModelBuilder.ShapeConfig(
                 density=density,
@@ -272,18 +269,14 @@ def add_arm(
         shapes.extend(added)
         return added
 
-    def add_link(mass: float, name: str) -> int:
-        body = builder.add_link(label=f"{label}/{name}", custom_attributes=weight)
-        bodies.append(body)
-        return body
-
     add_parts(-1, base_parts(), 1.0, "base", base)
     offsets, axes, links = arm_links(arm.shoulder_height, arm.upper_arm_length, arm.forearm_length, arm.flange_length)
     links.append(hand_parts(arm.hand_length, gripper.stroke))
     home = arm.home_joint_q
     for k in range(ARM_JOINT_COUNT):
         mount = wp.transform(wp.vec3(0.0, 0.0, offsets[k]), wp.quat_identity())
-        body = add_link(arm.link_masses[k], f"link{k + 1}")
+        body = builder.add_link(label=f"{label}/link{k + 1}", custom_attributes=weight)
+        bodies.append(body)
         added = add_parts(body, links[k], arm.link_masses[k], f"link{k + 1}", wp.transform())
         joints.append(
             builder.add_joint_revolute(
@@ -306,20 +299,13 @@ def add_arm(
                 label=f"{label}/joint{k + 1}",
             )
         )
-    palm = added[-1]
-    hand = bodies[-1]
-    fingers: list[int] = []
-    pads: list[int] = []
+    palm, hand = added[-1], bodies[-1]
+    fingers, pads = [], []
     for side, name in ((1.0, "left"), (-1.0, "right")):
         body = builder.add_link(label=f"{label}/finger_{name}", custom_attributes=weight)
         fingers.append(body)
-        added = add_parts(
-            body,
-            finger_parts(gripper.pad_size, gripper.finger_length, side),
-            gripper.finger_mass,
-            f"finger_{name}",
-            wp.transform(),
-        )
+        parts = finger_parts(gripper.pad_size, gripper.finger_length, side)
+        added = add_parts(body, parts, gripper.finger_mass, f"finger_{name}", wp.transform())
         pads.append(added[0])
         for shape in added:
             builder.add_shape_collision_filter_pair(shape, palm)
@@ -344,12 +330,10 @@ def add_arm(
                 label=f"{label}/finger_joint_{name}",
             )
         )
-    left, right = builder.body_shapes[fingers[0]], builder.body_shapes[fingers[1]]
-    for a in left:
-        for b in right:
-            builder.add_shape_collision_filter_pair(a, b)
+    for pair in itertools.product(*(builder.body_shapes[finger] for finger in fingers)):
+        builder.add_shape_collision_filter_pair(*pair)
     builder.add_articulation(joints, label=label)
-    builder.joint_q[coord_start : coord_start + len(home)] = [float(value) for value in home]
+    builder.joint_q[coord_start : coord_start + len(home)] = home.tolist()
     return ArmIndices(
         description=arm,
         articulation=builder.articulation_count - 1,

@@ -24,21 +24,9 @@ from softmode.robots.assets import RobotAsset
 from softmode.robots.description import JointDrive, RobotGripper, ToolPose
 
 _TOOL_NAMES = (
-    "pinch",
-    "pinch_site",
-    "grasp_site",
-    "gripperframe",
-    "link_tcp",
-    "tcp",
-    "tool",
-    "tool0",
-    "end_effector",
-    "ee",
-    "gripper",
-    "attachment_site",
-    "hand",
-    "Fixed_Jaw",
-)
+    "pinch pinch_site grasp_site gripperframe link_tcp tcp tool tool0 end_effector ee gripper attachment_site hand "
+    "Fixed_Jaw"
+).split()
 """Names of sites, then of bodies, that are taken for the tool when none is given; the first one present."""
 _DRIVE_FREQUENCY = 8.0
 """Natural frequency of the drives of a file that has no actuators [Hz]."""

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from softmode.deformables.model.structs import filled
 from softmode.envs.end_reason import EndReason
-from softmode.envs.structs import filled
 from softmode.envs.tasks.shape_soft import kernels
 from softmode.envs.tasks.shape_soft.config import ShapeSoftConfig
 from softmode.envs.tensors import Tensor

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from softmode.deformables.model.structs import filled
 from softmode.envs.markers import dots
 from softmode.envs.observation import PROPRIOCEPTION, Segment
 from softmode.envs.parameters import Parameter
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.structs import filled
 from softmode.envs.task import Task
 from softmode.envs.tasks.shape_soft import kernels
 from softmode.envs.tasks.shape_soft.config import ShapeSoftConfig
