@@ -24,6 +24,7 @@ from softmode.envs.observation import PROPRIOCEPTION, ObservationLayout, Segment
 from softmode.envs.parameters import Parameter, ParameterTable
 from softmode.envs.reward_kernels import StepResult, WorldState
 from softmode.envs.task_config import ObservationType, TaskConfig
+from softmode.scenes.capture import capture_graph
 from softmode.scenes.table_scene import GAP, TableScene, TableSceneConfig
 from softmode.splats.camera import CameraOptions
 from softmode.splats.pinhole import PinholeCamera
@@ -137,8 +138,7 @@ class Task:
             self.plan = filled(self.kernels.Plan, self, config, config.scene.control, soft, **columns)
             """What the task's own kernels know beside the state."""
         self.reset()
-        self._step()  # compiles what the graph needs
-        self.graph = captured(self._step, self.device)
+        self.graph = capture_graph(self._step, self.device)
         """The step as a captured graph."""
 
     def column(self, segment: str) -> int:
@@ -485,11 +485,3 @@ class Task:
         if self.obs_type == "pixels_agent_pos":
             spaces["agent_pos"] = self.layout.space(slice(0, self.agent_size))
         return spaces["pixels"] if list(spaces) == ["pixels"] else gym.spaces.Dict(spaces)
-
-
-def captured(launches: Callable[[], None], device: wp.Device) -> wp.Graph:
-    """Return what a function launches as a graph."""
-    with wp.ScopedCapture(device=device) as capture:
-        launches()
-    assert capture.graph is not None
-    return capture.graph

@@ -36,6 +36,9 @@ class LocalWorlds:
         self.action_space = self.task.action_space
         self.observation_space = self.task.observation_space()
 
+    def connect(self) -> None:
+        """Do nothing: the task is built."""
+
     def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64], options: dict[str, NDArray[np.float32]]) -> None:
         """Start episodes in the masked worlds; a seed below 0 lets the world's draws go on."""
         for some, value in ((mask & (seeds >= 0), seeds), (mask & (seeds < 0), None)):
