@@ -199,12 +199,9 @@ def _check_batch_size(one: VectorEnv, many: VectorEnv, reference: list[Event], s
         if theirs.done.any() or mine.done.any():
             break
         if not equal(mine.observation[0], theirs.observation[0]) or not equal(mine.reward[:1], theirs.reward[:1]):
-            raise EnvironmentCheckError(
-                f"call {index} returns something else with num_envs=1 than in world 0 of {many.num_envs}",
-                rule="batch size",
-                world=0,
-                hint="let nothing that a world computes depend on how many worlds there are",
-            )
+            message = f"call {index} returns something else with num_envs=1 than in world 0 of {many.num_envs}"
+            hint = "let nothing that a world computes depend on how many worlds there are"
+            raise EnvironmentCheckError(message, rule="batch size", world=0, hint=hint)
 
 
 def _check_close(env: VectorEnv) -> None:
@@ -216,8 +213,6 @@ def _check_close(env: VectorEnv) -> None:
     try:
         env.close()
     except Exception as error:
-        raise EnvironmentCheckError(
-            f"the second close() raises {type(error).__name__}: {error}",
-            rule="close",
-            hint="return at once where self.closed is set",
-        ) from error
+        message = f"the second close() raises {type(error).__name__}: {error}"
+        hint = "return at once where self.closed is set"
+        raise EnvironmentCheckError(message, rule="close", hint=hint) from error

@@ -90,11 +90,8 @@ def wrong_shape(run: Reference) -> str | None:
         except Exception as error:
             _refused(run, error, _quiet_step(run), f"an action of {name}")
         else:
-            raise EnvironmentCheckError(
-                f"an action of {name} is accepted",
-                rule="bad actions",
-                hint="compare the action's shape with action_space.shape and raise a ValueError that names both",
-            )
+            hint = "compare the action's shape with action_space.shape and raise a ValueError that names both"
+            raise EnvironmentCheckError(f"an action of {name} is accepted", rule="bad actions", hint=hint)
     return "the shape of a single world's action is left to the single environments" if subject.composed else None
 
 
@@ -132,11 +129,9 @@ def _refused(run: Reference, error: Exception, at: int, what: str) -> None:
     """Check that an error is a refusal and that nothing moved."""
     subject = run.subject
     if not isinstance(error, REFUSALS):
-        raise EnvironmentCheckError(
-            f"{what} raises {type(error).__name__}: {error}",
-            rule="bad actions",
-            hint="check actions first and raise a ValueError or TypeError that says what was expected",
-        ) from error
+        message = f"{what} raises {type(error).__name__}: {error}"
+        hint = "check actions first and raise a ValueError or TypeError that says what was expected"
+        raise EnvironmentCheckError(message, rule="bad actions", hint=hint) from error
     if subject.composed:
         return  # single environments are stepped in turn, so those before the bad one have moved
     run.same_worlds(

@@ -116,11 +116,8 @@ class Subject:
                 "step wrote into the action it was given", rule="no shared buffers", hint="copy actions before changes"
             )
         if not isinstance(returned, tuple) or len(returned) != 5:
-            raise EnvironmentCheckError(
-                f"step returned {type(returned).__name__}",
-                rule="observations",
-                hint="return (observation, reward, terminated, truncated, infos)",
-            )
+            hint = "return (observation, reward, terminated, truncated, infos)"
+            raise EnvironmentCheckError(f"step returned {type(returned).__name__}", rule="observations", hint=hint)
         observation, *scalars, infos = returned
         batch = as_numpy(observation)
         check_observation(self.env, batch, "step", lenient)
@@ -209,19 +206,13 @@ class Subject:
         for world in np.flatnonzero(done):
             last = world_of(event.infos["final_obs"], int(world))
             if not self.env.single_observation_space.contains(last):
-                raise EnvironmentCheckError(
-                    f"infos['final_obs'] holds {last!r}, outside {self.env.single_observation_space}",
-                    rule="autoreset",
-                    world=int(world),
-                    hint="put the last observation of the ended episode there",
-                )
+                message = f"infos['final_obs'] holds {last!r}, outside {self.env.single_observation_space}"
+                hint = "put the last observation of the ended episode there"
+                raise EnvironmentCheckError(message, rule="autoreset", world=int(world), hint=hint)
             if not isinstance(event.infos["final_info"], Mapping | np.ndarray):
-                raise EnvironmentCheckError(
-                    f"infos['final_info'] is a {type(event.infos['final_info']).__name__}",
-                    rule="autoreset",
-                    world=int(world),
-                    hint="make it a dict of arrays with masks, as the infos are",
-                )
+                message = f"infos['final_info'] is a {type(event.infos['final_info']).__name__}"
+                hint = "make it a dict of arrays with masks, as the infos are"
+                raise EnvironmentCheckError(message, rule="autoreset", world=int(world), hint=hint)
 
 
 def _overwrite(returned: object) -> None:
