@@ -37,10 +37,8 @@ class Parameter:
             np.isfinite(a) and np.isfinite(b) and a <= b for a, b in zip(self.low, self.high, strict=False)
         )
         if not ordered or (self.log and min(self.low) <= 0.0):
-            raise ConfigError(
-                f"{self.name} ranges from {self.low} to {self.high}",
-                hint="give finite bounds, low <= high" + (", above 0" if self.log else ""),
-            )
+            hint = "give finite bounds, low <= high" + (", above 0" if self.log else "")
+            raise ConfigError(f"{self.name} ranges from {self.low} to {self.high}", hint=hint)
 
     @property
     def size(self) -> int:
@@ -129,8 +127,6 @@ def _checked(parameter: Parameter, value: object, world_count: int) -> NDArray[n
     least = np.array(parameter.low if parameter.least is None else parameter.least, np.float32)
     most = np.array(parameter.high if parameter.most is None else parameter.most, np.float32)
     if not ((numbers >= least) & (numbers <= most)).all():
-        raise ConfigError(
-            f"{parameter.name} = {value!r} lies outside its range",
-            hint=f"stay within {least.tolist()} to {most.tolist()}",
-        )
+        hint = f"stay within {least.tolist()} to {most.tolist()}"
+        raise ConfigError(f"{parameter.name} = {value!r} lies outside its range", hint=hint)
     return numbers

@@ -246,10 +246,8 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             return np.ones(self.num_envs, bool)
         mask = host_array(mask) if isinstance(mask, Tensor) else np.asarray(mask)
         if mask.dtype != bool or mask.shape != (self.num_envs,) or not mask.any():
-            raise ConfigError(
-                f"reset_mask is {mask.dtype} of shape {mask.shape}",
-                hint=f"give booleans of shape ({self.num_envs},), at least one of them True",
-            )
+            hint = f"give booleans of shape ({self.num_envs},), at least one of them True"
+            raise ConfigError(f"reset_mask is {mask.dtype} of shape {mask.shape}", hint=hint)
         if self._random is None and not mask.all():
             raise ConfigError("the first reset is partial", hint="call reset() for all worlds once")
         return mask

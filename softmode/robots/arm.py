@@ -118,10 +118,8 @@ class ArmDescription:
         require_fields(self, ("joint_lower", "joint_upper"), count=joints)
         require_fields(self, ("home_position",), count=3)
         if not all(low < high for low, high in zip(self.joint_lower, self.joint_upper, strict=True)):
-            raise ConfigError(
-                f"joint_lower {self.joint_lower} is not below joint_upper {self.joint_upper}",
-                hint="give each joint a range in rad, lower before upper",
-            )
+            hint = "give each joint a range in rad, lower before upper"
+            raise ConfigError(f"joint_lower {self.joint_lower} is not below joint_upper {self.joint_upper}", hint=hint)
         require_choice("touch", self.touch, ("gripper", "all"))
         require_fields(self, ("home_opening",), at_least=0.0, at_most=self.gripper.stroke, unit="m")
         self.joint_q_over(self.home_position)

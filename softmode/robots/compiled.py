@@ -49,10 +49,8 @@ class CompiledRobot:
         for j, name in enumerate(self.joint_names):
             if int(model.jnt_type[j]) not in scalar:
                 kind = self.mujoco.mjtJoint(int(model.jnt_type[j])).name.removeprefix("mjJNT_").lower()
-                raise AssetError(
-                    f"robot file {self.asset.path}: joint {name!r} is a {kind} joint",
-                    hint="use a robot on a fixed base whose joints are hinges and slides",
-                )
+                hint = "use a robot on a fixed base whose joints are hinges and slides"
+                raise AssetError(f"robot file {self.asset.path}: joint {name!r} is a {kind} joint", hint=hint)
         for b in range(model.nbody):
             if model.body_jntnum[b] > 1:
                 raise AssetError(
@@ -87,10 +85,8 @@ class CompiledRobot:
             return np.clip(values, self.lower, self.upper)
         values = np.asarray(given, float)
         if values.shape != (len(self.joint_names),) or not np.all(np.isfinite(values)):
-            raise ConfigError(
-                f"home has shape {values.shape} or holds a value that is not finite",
-                hint=f"give one number for each of {', '.join(self.joint_names)}",
-            )
+            hint = f"give one number for each of {', '.join(self.joint_names)}"
+            raise ConfigError(f"home has shape {values.shape} or holds a value that is not finite", hint=hint)
         return values
 
     def data(self, joint_q: np.ndarray) -> Any:

@@ -67,10 +67,8 @@ class ArmControlOptions:
         require_number("iterations", self.iterations, at_least=1, hint="six are enough for any action")
         lower, upper = self.workspace_lower, self.workspace_upper
         if not all(a < b for a, b in zip(lower, upper, strict=True)):
-            raise ConfigError(
-                f"workspace_lower {lower} is not below workspace_upper {upper}",
-                hint="give two corners (x, y, z) in metres, lower before upper",
-            )
+            hint = "give two corners (x, y, z) in metres, lower before upper"
+            raise ConfigError(f"workspace_lower {lower} is not below workspace_upper {upper}", hint=hint)
 
     @property
     def action_size(self) -> int:
@@ -172,10 +170,8 @@ class ArmController:
             state: The measured state, for the anti-windup.
         """
         if action.shape != (self.world_count, self.options.action_size):
-            raise ConfigError(
-                f"action has shape {tuple(action.shape)}",
-                hint=f"expected ({self.world_count}, {self.options.action_size}) in mode {self.options.mode!r}",
-            )
+            hint = f"expected ({self.world_count}, {self.options.action_size}) in mode {self.options.mode!r}"
+            raise ConfigError(f"action has shape {tuple(action.shape)}", hint=hint)
         arguments = (self._chain, self._settings, action, state.joint_q, self._command)
         launch(self._device, kernels.move_command, self.world_count, *arguments)
 

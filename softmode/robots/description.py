@@ -131,10 +131,8 @@ class RobotDescription:
             ConfigError: If the robot has no gripper.
         """
         if self.gripper is None:
-            raise ConfigError(
-                f"robot {self.name!r} has no gripper",
-                hint="name its joints: load(..., gripper={'joint': (closed, open)})",
-            )
+            hint = "name its joints: load(..., gripper={'joint': (closed, open)})"
+            raise ConfigError(f"robot {self.name!r} has no gripper", hint=hint)
         values = self.home_joint_q if joint_q is None else np.array(joint_q, float)
         for name, closed, wide in zip(self.gripper.joints, self.gripper.closed, self.gripper.open, strict=True):
             values[self.joint_names.index(name)] = closed + opening * (wide - closed)

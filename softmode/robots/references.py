@@ -109,10 +109,8 @@ def _resolve(values: list[str], bases: list[Path], root: Path, file: Path, tag: 
     existing = [candidate for candidate in candidates if candidate.exists()]
     outside = [candidate for candidate in existing or candidates if not candidate.is_relative_to(inside)]
     if outside:
-        raise AssetError(
-            f"{file}: {tag} refers to {asked!r}, which lies outside the asset root {root}",
-            hint="copy the file into the folder, or pass asset_root= the folder that holds the whole robot",
-        )
+        hint = "copy the file into the folder, or pass asset_root= the folder that holds the whole robot"
+        raise AssetError(f"{file}: {tag} refers to {asked!r}, which lies outside the asset root {root}", hint=hint)
     if not existing:
         raise AssetError(f"{file}: {tag} refers to {asked!r}, which does not exist", hint="put the file in its place")
     return existing[0]

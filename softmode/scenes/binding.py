@@ -140,9 +140,7 @@ def _function_starts(model: newton.Model, count: int, worlds: Sequence[int] | No
     data = soft(model)
     owner, every = data.instance_world.numpy(), max(int(model.world_count), 1)
     if len(owner) != every * count or (every > 1 and not np.array_equal(owner, np.repeat(np.arange(every), count))):
-        raise ConfigError(
-            f"objects names {count} soft bodies, the model has {len(owner)} in {every} worlds",
-            hint="give one object, or None, per soft body of a world, in the order in which they were added",
-        )
+        hint = "give one object, or None, per soft body of a world, in the order in which they were added"
+        raise ConfigError(f"objects names {count} soft bodies, the model has {len(owner)} in {every} worlds", hint=hint)
     starts = np.asarray(data.function_start.numpy(), dtype=np.int32).reshape(every, count)
     return starts if worlds is None else starts[list(worlds)]

@@ -47,10 +47,8 @@ class StableBaselinesVecEnv(VecEnv):
         """Start new episodes in all worlds, with the seeds and options set before."""
         options = self._options[0]
         if any(other != options for other in self._options):
-            raise ConfigError(
-                "the options of the worlds differ",
-                hint="give set_options one dict; an array in it holds a value per world",
-            )
+            hint = "give set_options one dict; an array in it holds a value per world"
+            raise ConfigError("the options of the worlds differ", hint=hint)
         seeds = None if all(seed is None for seed in self._seeds) else self._seeds
         observation, infos = self.env.reset(seed=seeds, options=dict(options) or None)  # type: ignore[arg-type]
         self.reset_infos = infos_of_worlds(_host(infos), self.num_envs)

@@ -207,10 +207,8 @@ class PlaceInBin(Task):
             abs(x - self.rim[0]) - x_range - a - config.bin.wall, abs(y - self.rim[1]) - y_range - b - config.bin.wall
         )
         if apart < toy:
-            raise ConfigError(
-                f"a toy of radius {toy:.3f} m may start in the bin's wall",
-                hint="move scene.object_position or bin.position, or make position_range smaller",
-            )
+            hint = "move scene.object_position or bin.position, or make position_range smaller"
+            raise ConfigError(f"a toy of radius {toy:.3f} m may start in the bin's wall", hint=hint)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add place [m] and yaw [rad] of every other object."""
