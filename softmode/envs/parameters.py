@@ -62,11 +62,8 @@ class ParameterTable:
         """Lay out the columns and upload their ranges."""
         self.parameters = {parameter.name: parameter for parameter in parameters}
         self.world_count = world_count
-        self._column: dict[str, int] = {}
-        columns = 0
-        for name, parameter in self.parameters.items():
-            self._column[name] = columns
-            columns += parameter.size
+        ends = np.cumsum([parameter.size for parameter in self.parameters.values()]).tolist()
+        self._column = dict(zip(self.parameters, [0, *ends], strict=False))
 
         def upload(rows: list[np.ndarray], dtype: type) -> wp.array:
             return wp.array(np.concatenate(rows), dtype=dtype, device=device)
@@ -75,7 +72,7 @@ class ParameterTable:
         self.low = upload([np.array(p.low, np.float32) for p in chosen], float)
         self.high = upload([np.array(p.high, np.float32) for p in chosen], float)
         self.log = upload([np.full(p.size, p.log) for p in chosen], wp.bool)
-        self.values = wp.zeros((world_count, columns), dtype=float, device=device)
+        self.values = wp.zeros((world_count, ends[-1]), dtype=float, device=device)
 
     def column(self, name: str) -> int:
         """Return the first column of a parameter."""

@@ -29,16 +29,7 @@ def observation_arrays(task: Task, *, final: bool = False) -> Tree:
 
 def info_arrays(task: Task, *, final: bool = False) -> dict[str, Tree]:
     """Return the infos of all worlds; with `final`, those of the episodes that ended in this step."""
-    solver = task.scene.solver
-    now = (task.success, task.metrics, task.table.values, task.observation, solver.status)
-    ended = (
-        task.final_success,
-        task.final_metrics,
-        task.final_parameters,
-        task.final_observation,
-        task.final_status,
-    )
-    success, metrics, parameters, vector, status = ended if final else now
+    success, metrics, parameters, vector, status = (task.final_outcome if final else task.outcome).values()
     return {
         "is_success": success,
         "reward_terms": {name: columns_of(task.terms, k) for k, name in enumerate(task.term_names)},

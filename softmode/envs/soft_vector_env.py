@@ -122,7 +122,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         shards = checked_processes(processes, self.num_envs, self.device, output)
         edges = np.linspace(0, self.num_envs, shards + 1).astype(int)
         self._slices = [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
-        given = {
+        common = {
             "config": config,
             "obs_type": obs_type,
             "limit": int(max_episode_steps or 0),
@@ -131,7 +131,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             "device": str(self.device),
             "progress": progress,
         }
-        arguments = [{**given, "world_count": part.stop - part.start} for part in self._slices]
+        arguments = [{**common, "world_count": part.stop - part.start} for part in self._slices]
         self._worlds: list[Any] = []
         try:
             for part in arguments:

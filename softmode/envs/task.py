@@ -156,13 +156,21 @@ class Task:
         self.held = zeros(dtype=int)
         """Control steps in a row in which the goal was met, counted by `evaluate`."""
         self.terminated, self.truncated, self.success, self.done, self.finite = (zeros(dtype=wp.bool) for _ in range(5))
-        self.final_success = zeros(dtype=wp.bool)
-        self.observation, self.final_observation = zeros(len(self.low)), zeros(len(self.low))
+        self.observation = zeros(len(self.low))
         self.reward = zeros()
         self.terms = zeros(max(len(self.term_names), 1))
-        self.metrics, self.final_metrics = (zeros(max(len(self.metric_names), 1)) for _ in range(2))
-        self.final_parameters = wp.zeros_like(self.table.values)
-        self.final_status = wp.zeros_like(self.scene.solver.status)
+        self.metrics = zeros(max(len(self.metric_names), 1))
+        self.outcome: dict[str, wp.array] = {
+            "success": self.success,
+            "metrics": self.metrics,
+            "parameters": self.table.values,
+            "observation": self.observation,
+            "status": self.scene.solver.status,
+        }
+        """What a step came to."""
+        self.final_outcome = {name: wp.zeros_like(array) for name, array in self.outcome.items()}
+        """What the last step of the last episode came to, before the reset of SAME_STEP."""
+        self.final_observation = self.final_outcome["observation"]
         self.never = zeros(dtype=wp.bool)
         """A mask of no world."""
         self._fresh = zeros(dtype=wp.bool)
@@ -422,11 +430,8 @@ class Task:
             if self.autoreset_mode == AutoresetMode.SAME_STEP:
                 if self.images:
                     wp.capture_if(self.any_done, on_true=self._keep_pictures)
-                wp.copy(self.final_observation, self.observation)
-                wp.copy(self.final_metrics, self.metrics)
-                wp.copy(self.final_success, self.success)
-                wp.copy(self.final_parameters, self.table.values)
-                wp.copy(self.final_status, scene.solver.status)
+                for name, now in self.outcome.items():
+                    wp.copy(self.final_outcome[name], now)
                 wp.copy(self._fresh, self.done)
                 self.restart(self._fresh)
                 self.write_observation()

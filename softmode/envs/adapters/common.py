@@ -46,17 +46,10 @@ def checked_env(env: object, adapter: str, *, output: str | None = None) -> Vect
 
 
 def to_numpy(tree: object) -> Any:
-    """Return a tree of arrays or tensors as NumPy arrays on the host."""
+    """Return a tree of arrays or tensors as NumPy arrays on the host; arrays of objects stay."""
     if isinstance(tree, Mapping):
         return {key: to_numpy(value) for key, value in tree.items()}
     return host_array(tree) if isinstance(tree, Tensor) else np.asarray(tree)
-
-
-def take(tree: Any, world: int) -> Any:
-    """Return one world of a tree of arrays."""
-    if isinstance(tree, Mapping):
-        return {key: take(value, world) for key, value in tree.items()}
-    return tree[world]
 
 
 def infos_of_worlds(infos: Mapping[str, Any], num_envs: int) -> list[dict[str, Any]]:

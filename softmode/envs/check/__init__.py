@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from gymnasium.vector import VectorEnv
 
@@ -113,8 +113,8 @@ def check_vector_env(
 
     if isinstance(env, VectorEnv):
         report, _ = check(env)
-        reason = {"batch size": "give a function to check it", "close": "give a function to check it"}
-        return _extended(report, skipped=reason)
+        reasons = dict.fromkeys(("batch size", "close"), "give a function to check it")
+        return replace(report, skipped=report.skipped | reasons)
     if not callable(env):
         check(env)
     assert not isinstance(env, VectorEnv)
@@ -138,7 +138,7 @@ def check_vector_env(
     if "close" not in skip:
         _check_close(many)
     done = tuple(name for name in ("batch size", "close") if name not in skip)
-    return _extended(report, checked=done)
+    return replace(report, checked=report.checked + done)
 
 
 def _time_limit(env: VectorEnv) -> int | None:
@@ -171,20 +171,6 @@ def _apply(subject: Subject, run: Reference, skip: Collection[str]) -> VectorEnv
         checked=tuple(checked),
         skipped=skipped,
         notes=tuple(notes),
-    )
-
-
-def _extended(
-    report: VectorEnvReport, *, checked: tuple[str, ...] = (), skipped: dict[str, str] | None = None
-) -> VectorEnvReport:
-    """Add to a report."""
-    return VectorEnvReport(
-        env=report.env,
-        num_envs=report.num_envs,
-        autoreset_mode=report.autoreset_mode,
-        checked=report.checked + checked,
-        skipped=report.skipped | (skipped or {}),
-        notes=report.notes,
     )
 
 

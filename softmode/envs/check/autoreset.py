@@ -7,7 +7,8 @@ from gymnasium.vector import AutoresetMode
 
 from softmode.envs.check.episodes import Event
 from softmode.envs.check.reference import MASK_HINT, Reference, Skip
-from softmode.envs.check.values import equal, world_of
+from softmode.envs.check.values import equal
+from softmode.envs.tensors import world_of
 from softmode.errors import EnvironmentCheckError
 
 

@@ -25,9 +25,9 @@ from softmode.envs.check.values import (
     equal,
     leaves,
     like,
-    world_of,
     worlds,
 )
+from softmode.envs.tensors import world_of
 from softmode.errors import EnvironmentCheckError
 
 

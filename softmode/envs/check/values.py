@@ -90,15 +90,6 @@ def worlds(env: VectorEnv, batch: Any) -> list[Any]:
     return list(iterate(env.observation_space, batch))
 
 
-def world_of(values: Any, world: int) -> Any:
-    """Return world ``world`` of info values: a dict of arrays, an array of objects, or one array for all worlds."""
-    if isinstance(values, Mapping):
-        return {key: world_of(item, world) for key, item in values.items()}
-    if isinstance(values, tuple):
-        return tuple(world_of(item, world) for item in values)
-    return values[world]
-
-
 # -- rules ------------------------------------------------------------------------------------------------------------
 
 

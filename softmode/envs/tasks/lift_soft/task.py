@@ -87,19 +87,11 @@ class LiftSoft(Task):
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the goal: x, y [m] and how far to rise [m]."""
         config = self.config
-        middle = np.array([*config.scene.object_position, config.goal_height])
-        low, high = middle - config.goal_range, middle + config.goal_range
+        middle, half = np.array([*config.scene.object_position, config.goal_height]), np.array(config.goal_range)
+        low, high = tuple((middle - half).tolist()), tuple((middle + half).tolist())
         control = config.scene.control
-        return (
-            *super().parameters(),
-            Parameter(
-                name="goal",
-                low=tuple(low.tolist()),
-                high=tuple(high.tolist()),
-                least=(*control.workspace_lower[:2], 0.01),
-                most=(*control.workspace_upper[:2], 0.4),
-            ),
-        )
+        least, most = (*control.workspace_lower[:2], 0.01), (*control.workspace_upper[:2], 0.4)
+        return (*super().parameters(), Parameter(name="goal", low=low, high=high, least=least, most=most))
 
     def goal_segments(self) -> tuple[Segment, ...]:
         """The goal's position [m]."""

@@ -121,13 +121,11 @@ class PushSoft(Task):
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the goal: distance [m] and direction [rad] from the object, and the angle to turn [rad]."""
         config = self.config
-        low, high = np.transpose((config.goal_distance, config.goal_direction)).tolist()
+        low, high = zip(config.goal_distance, config.goal_direction, strict=True)
         low_yaw, high_yaw = config.goal_yaw
         return (
             *super().parameters(),
-            Parameter(
-                name="goal", low=tuple(low), high=tuple(high), least=(0.0, -2.0 * np.pi), most=(0.5, 2.0 * np.pi)
-            ),
+            Parameter(name="goal", low=low, high=high, least=(0.0, -2.0 * np.pi), most=(0.5, 2.0 * np.pi)),
             Parameter(name="goal_yaw", low=(low_yaw,), high=(high_yaw,), least=(-2.0 * np.pi,), most=(2.0 * np.pi,)),
         )
 

@@ -55,15 +55,9 @@ class ShapeSoft(Task):
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the goal: displacement of the free end [m] and direction [rad]."""
         config = self.config
-        low, high = np.transpose((config.goal_displacement, config.goal_direction)).tolist()
-        goal = Parameter(
-            name="goal",
-            low=tuple(low),
-            high=tuple(high),
-            least=(0.0, -2.0 * np.pi),
-            most=(config.goal_displacement[1], 2.0 * np.pi),
-        )
-        return (*super().parameters(), goal)
+        low, high = zip(config.goal_displacement, config.goal_direction, strict=True)
+        least, most = (0.0, -2.0 * np.pi), (config.goal_displacement[1], 2.0 * np.pi)
+        return (*super().parameters(), Parameter(name="goal", low=low, high=high, least=least, most=most))
 
     def goal_segments(self) -> tuple[Segment, ...]:
         """The points of the target shape [m]."""
