@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
@@ -10,6 +9,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softmode.envs.task import Task
+from softmode.envs.tensors import map_tree
 
 Tree = wp.array | dict[str, "Tree"]
 """An array whose first axis is the world, or a dict of such trees."""
@@ -47,13 +47,6 @@ def info_arrays(task: Task, *, final: bool = False) -> dict[str, Tree]:
 def columns_of(array: wp.array, columns: int | slice) -> wp.array:
     """Return a view of one column, shape (world_count,), or of several."""
     return cast(wp.array, array[:, columns])
-
-
-def map_tree(function: Callable[[Any], Any], tree: Any) -> Any:
-    """Return a tree of the results of a function on each leaf; a dict is a branch, all else a leaf."""
-    if isinstance(tree, dict):
-        return {name: map_tree(function, value) for name, value in tree.items()}
-    return function(tree)
 
 
 def take(tree: Tree, world: int, *, scalars: bool = False) -> Any:

@@ -29,10 +29,9 @@ from softmode.envs.arguments import (
     world_seed,
 )
 from softmode.envs.parameters import check_options
-from softmode.envs.results import map_tree
 from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
-from softmode.envs.tensors import Tensor, host_array
+from softmode.envs.tensors import Tensor, host_array, map_tree
 from softmode.envs.worlds import LocalWorlds, RemoteWorlds
 from softmode.errors import ConfigError, MissingExtraError
 

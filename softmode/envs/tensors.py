@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -32,6 +32,16 @@ class Tensor(Protocol):
 def host_array(tensor: Tensor) -> np.ndarray:
     """Return a tensor as an array on the host."""
     return tensor.detach().cpu().numpy()
+
+
+def map_tree(function: Callable[[Any], Any], tree: Any) -> Any:
+    """Return a tree of the results of a function on each leaf; mappings, tuples and lists are branches."""
+    if isinstance(tree, Mapping):
+        return {name: map_tree(function, value) for name, value in tree.items()}
+    if isinstance(tree, tuple | list):
+        items = [map_tree(function, value) for value in tree]
+        return type(tree)(*items) if hasattr(tree, "_fields") else type(tree)(items)
+    return function(tree)
 
 
 def world_of(values: Any, world: int) -> Any:

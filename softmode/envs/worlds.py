@@ -15,8 +15,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from softmode.envs.results import info_arrays, map_tree, observation_arrays, render_worlds
+from softmode.envs.results import info_arrays, observation_arrays, render_worlds
 from softmode.envs.task import Task
+from softmode.envs.tensors import map_tree
 from softmode.errors import SoftmodeError, WorkerError
 
 

@@ -98,9 +98,8 @@ class BoundSplats:
         """Move the splats by the coordinates q of all instances [m], flat vec3d; capturable after a first time."""
         arrays = self.arrays
         for (skin, start), columns in zip(self._skins, self.columns, strict=False):
-            skin.launch(
-                q, start, arrays.means, arrays.covariances, rotations=arrays.rotations, first_splat=columns.start
-            )
+            moved = (arrays.means, arrays.covariances)
+            skin.launch(q, start, *moved, rotations=arrays.rotations, first_splat=columns.start)
 
     def frames(self) -> dict[tuple[int, int], SplatFrame]:
         """Return the splats as they are by place of the world in `worlds` and object; reads from the device."""

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, iterate
 from numpy.typing import NDArray
 
-from softmode.envs.tensors import Tensor, host_array
+from softmode.envs.tensors import Tensor, host_array, map_tree
 from softmode.errors import EnvironmentCheckError
 
 
@@ -22,11 +22,11 @@ def as_numpy(value: object) -> Any:
 
     Libraries are recognised by their arrays' methods, so none is imported.
     """
-    if isinstance(value, Mapping):
-        return {key: as_numpy(item) for key, item in value.items()}
-    if isinstance(value, tuple | list):
-        items = map(as_numpy, value)
-        return type(value)(*items) if hasattr(value, "_fields") else type(value)(items)
+    return map_tree(_copied, value)
+
+
+def _copied(value: Any) -> Any:
+    """Return a leaf of a tree as a NumPy copy."""
     if isinstance(value, Tensor):
         return host_array(value).copy()
     if isinstance(value, np.ndarray) and value.dtype == object:
@@ -59,11 +59,7 @@ def like(action: object, sample: object) -> Any:
     if not isinstance(sample, Tensor):
         return action
     torch = sys.modules["torch"]  # it is there: the environment returned one of its tensors
-    if isinstance(action, Mapping):
-        return {key: like(item, sample) for key, item in action.items()}
-    if isinstance(action, tuple):
-        return tuple(like(item, sample) for item in action)
-    return torch.as_tensor(np.array(action), device=sample.device)
+    return map_tree(lambda item: torch.as_tensor(np.array(item), device=sample.device), action)
 
 
 def equal(a: object, b: object) -> bool:

@@ -39,12 +39,7 @@ class Plan:
 
 
 @wp.kernel
-def observe(
-    state: WorldState,
-    plan: Plan,
-    # Out:
-    result: StepResult,
-):
+def observe(state: WorldState, plan: Plan, result: StepResult):
     """Write the goal, relative to the object and as a position, the rise and the distance."""
     w = wp.tid()
     rest_height = plan.height * state.parameters[w, plan.drawn.scale]
@@ -61,12 +56,7 @@ def observe(
 
 
 @wp.kernel
-def evaluate(
-    state: WorldState,
-    plan: Plan,
-    # In, out:
-    result: StepResult,
-):
+def evaluate(state: WorldState, plan: Plan, result: StepResult):
     """Reward reaching, grasping, lifting, nearing the goal, and staying there."""
     w = wp.tid()
     offset = state.object_position[w, 0] - tool_position(state, w)

@@ -58,12 +58,7 @@ def beyond(x: wp.vec3, centre: wp.vec3, half: wp.vec2):
 
 
 @wp.kernel
-def observe(
-    state: WorldState,
-    plan: Plan,
-    # Out:
-    result: StepResult,
-):
+def observe(state: WorldState, plan: Plan, result: StepResult):
     """Write the ways to the bin and to the other objects, the distance, and how many of these are inside."""
     w = wp.tid()
     rim = plan.rim
@@ -83,12 +78,7 @@ def observe(
 
 
 @wp.kernel
-def evaluate(
-    state: WorldState,
-    plan: Plan,
-    # In, out:
-    result: StepResult,
-):
+def evaluate(state: WorldState, plan: Plan, result: StepResult):
     """Reward grasping, lifting, carrying, lowering, letting go and leaving the object at rest."""
     w = wp.tid()
     rim = plan.rim

@@ -46,12 +46,7 @@ class Plan:
 
 
 @wp.kernel
-def observe(
-    state: WorldState,
-    plan: Plan,
-    # Out:
-    result: StepResult,
-):
+def observe(state: WorldState, plan: Plan, result: StepResult):
     """Write goal force, contact force and their difference; the metrics; and the marker over the plan."""
     w = wp.tid()
     goal = state.parameters[w, plan.drawn.goal_force]
@@ -74,12 +69,7 @@ def observe(
 
 
 @wp.kernel
-def evaluate(
-    state: WorldState,
-    plan: Plan,
-    # In, out:
-    result: StepResult,
-):
+def evaluate(state: WorldState, plan: Plan, result: StepResult):
     """Reward reaching the middle of the pad, the right force, and keeping it; punish far too much."""
     w = wp.tid()
     goal = state.parameters[w, plan.drawn.goal_force]

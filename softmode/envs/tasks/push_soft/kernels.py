@@ -53,12 +53,7 @@ class Plan:
 
 
 @wp.kernel
-def observe(
-    state: WorldState,
-    plan: Plan,
-    # Out:
-    result: StepResult,
-):
+def observe(state: WorldState, plan: Plan, result: StepResult):
     """Write the goal, the ways of object and tool, distance and error of yaw."""
     w = wp.tid()
     reach = state.parameters[w, plan.drawn.goal]
@@ -99,12 +94,7 @@ def observe(
 
 
 @wp.kernel
-def evaluate(
-    state: WorldState,
-    plan: Plan,
-    # In, out:
-    result: StepResult,
-):
+def evaluate(state: WorldState, plan: Plan, result: StepResult):
     """Reward getting behind the object, moving it to the goal, and leaving it there."""
     w = wp.tid()
     distance = result.metrics[w, Metric.goal_distance]

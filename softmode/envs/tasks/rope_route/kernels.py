@@ -89,12 +89,7 @@ def trace_axis(
 
 
 @wp.kernel
-def observe(
-    state: WorldState,
-    plan: Plan,
-    # Out:
-    result: StepResult,
-):
+def observe(state: WorldState, plan: Plan, result: StepResult):
     """Write goal and sides; the rope's end, what there is to grasp, and the winding; the metrics and the marker."""
     w = wp.tid()
     tool = tool_position(state, w)
@@ -131,12 +126,7 @@ def observe(
 
 
 @wp.kernel
-def evaluate(
-    state: WorldState,
-    plan: Plan,
-    # In, out:
-    result: StepResult,
-):
+def evaluate(state: WorldState, plan: Plan, result: StepResult):
     """Reward reaching, grasping, passing every peg on its side, nearing the goal, and being there."""
     w = wp.tid()
     near = result.metrics[w, Metric.grasp_distance]

@@ -124,12 +124,7 @@ def reward_terms(error: float, rules: Rules):
 
 
 @wp.kernel
-def observe_points(
-    state: WorldState,
-    plan: Plan,
-    # Out:
-    result: StepResult,
-):
+def observe_points(state: WorldState, plan: Plan, result: StepResult):
     """Write a point of the target shape and where it is now, relative to the foot on the table."""
     w, i = wp.tid()
     now = surface_point(state, w, i) - foot_position(state, plan, w)
@@ -138,12 +133,7 @@ def observe_points(
 
 
 @wp.kernel
-def observe(
-    state: WorldState,
-    plan: Plan,
-    # In, out:
-    result: StepResult,
-):
+def observe(state: WorldState, plan: Plan, result: StepResult):
     """Write the error, and proprioception once more."""
     w = wp.tid()
     for k in range(plan.arm_size):
@@ -170,12 +160,7 @@ def shape_marker(
 
 
 @wp.kernel
-def evaluate(
-    state: WorldState,
-    plan: Plan,
-    # In, out:
-    result: StepResult,
-):
+def evaluate(state: WorldState, plan: Plan, result: StepResult):
     """Reward nearness to the target shape, and being there."""
     w = wp.tid()
     seen = result.observation  # bounded by now, as the goals are that learners compute rewards from
