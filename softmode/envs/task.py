@@ -102,13 +102,13 @@ class Task:
             cameras.append(self.observation_camera())
         if render:
             cameras += self.render_cameras()
+        labelled = "segmentation" in config.image_outputs
+        options = CameraOptions(mesh_samples=config.mesh_samples, segmentation=labelled)
         self.scene = TableScene(
             self.scene_config(),
             world_count=world_count,
             cameras=cameras,
-            camera_options=CameraOptions(
-                mesh_samples=config.mesh_samples, segmentation="segmentation" in config.image_outputs
-            ),
+            camera_options=options,
             camera_randomization=config.camera_randomization,
             marker=self.marker() if cameras else None,
             device=device,
@@ -321,13 +321,10 @@ class Task:
             turn: What is added to the yaw [rad].
             shift: From the centre of the unscaled object to what lies at the position, along the yaw [m].
         """
-        scene, column = self.scene, self.table.column
-        place = filled(
-            kernels.Placement,
-            scene.objects[index],
-            **{"position": column(position), "yaw": column(yaw), "scale": column("scale")},
-            **{"turn": turn, "shift": shift, "gap": GAP + ground, "object_index": index},
-        )
+        scene, names = self.scene, {"position": position, "yaw": yaw, "scale": "scale"}
+        columns = {field: self.table.column(name) for field, name in names.items()}
+        given = {"turn": turn, "shift": shift, "gap": GAP + ground, "object_index": index}
+        place = filled(kernels.Placement, scene.objects[index], **columns, **given)
         outputs = [scene.place_position, scene.place_yaw]
         self.launch(kernels.place_object, [scene.world_mask, self.state, place], outputs)
 
@@ -374,11 +371,8 @@ class Task:
     def _draw(self) -> None:
         """Draw the parameters of the worlds in `scene.world_mask`."""
         table = self.table
-        self.launch(
-            kernels.draw_parameters,
-            [self.scene.world_mask, self.seed, table.low, table.high, table.log],
-            [self.episode, table.values],
-        )
+        inputs = [self.scene.world_mask, self.seed, table.low, table.high, table.log]
+        self.launch(kernels.draw_parameters, inputs, [self.episode, table.values])
 
     def _start(self) -> None:
         """Set those worlds up from their parameters."""
@@ -450,11 +444,8 @@ class Task:
         self.any_done.zero_()
         self.evaluate()
         status, lowest = scene.solver.status, scene.soft.height - FALL
-        self.launch(
-            kernels.finish_step,
-            [fresh, self.limit, bits.WORLD_NOT_FINITE, status, self.finite, self.state, lowest],
-            [self.result, self._episode],
-        )
+        inputs = [fresh, self.limit, bits.WORLD_NOT_FINITE, status, self.finite, self.state, lowest]
+        self.launch(kernels.finish_step, inputs, [self.result, self._episode])
 
     def _keep_pictures(self) -> None:
         """Draw the last picture of the episodes that end."""

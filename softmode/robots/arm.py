@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import newton
 import numpy as np
@@ -267,6 +267,10 @@ def add_arm(
         shapes.extend(added)
         return added
 
+    def add_joint(add: Callable[..., int], body: int, name: str, **settings: Any) -> None:
+        position = newton.JointTargetMode.POSITION
+        joints.append(add(child=body, friction=0.0, actuator_mode=position, label=f"{label}/{name}", **settings))
+
     add_parts(-1, base_parts(), 1.0, "base", base)
     offsets, axes, links = arm_links(arm.shoulder_height, arm.upper_arm_length, arm.forearm_length, arm.flange_length)
     links.append(hand_parts(arm.hand_length, gripper.stroke))
@@ -276,26 +280,23 @@ def add_arm(
         body = builder.add_link(label=f"{label}/link{k + 1}", custom_attributes=weight)
         bodies.append(body)
         added = add_parts(body, links[k], arm.link_masses[k], f"link{k + 1}", wp.transform())
-        joints.append(
-            builder.add_joint_revolute(
-                parent=bodies[k - 1] if k else -1,
-                child=body,
-                parent_xform=mount if k else base * mount,
-                axis=axes[k],
-                limit_lower=arm.joint_lower[k],
-                limit_upper=arm.joint_upper[k],
-                limit_ke=_JOINT_STOP_STIFFNESS,
-                limit_kd=12.0 * math.sqrt(_JOINT_STOP_STIFFNESS * max(arm.armatures[k], 0.05)),
-                target_q=home[k],
-                target_ke=arm.drive_stiffnesses[k],
-                target_kd=arm.drive_dampings[k],
-                effort_limit=arm.effort_limits[k],
-                armature=arm.armatures[k],
-                damping=arm.dampings[k],
-                friction=0.0,
-                actuator_mode=newton.JointTargetMode.POSITION,
-                label=f"{label}/joint{k + 1}",
-            )
+        add_joint(
+            builder.add_joint_revolute,
+            body,
+            f"joint{k + 1}",
+            parent=bodies[k - 1] if k else -1,
+            parent_xform=mount if k else base * mount,
+            axis=axes[k],
+            limit_lower=arm.joint_lower[k],
+            limit_upper=arm.joint_upper[k],
+            limit_ke=_JOINT_STOP_STIFFNESS,
+            limit_kd=12.0 * math.sqrt(_JOINT_STOP_STIFFNESS * max(arm.armatures[k], 0.05)),
+            target_q=home[k],
+            target_ke=arm.drive_stiffnesses[k],
+            target_kd=arm.drive_dampings[k],
+            effort_limit=arm.effort_limits[k],
+            armature=arm.armatures[k],
+            damping=arm.dampings[k],
         )
     palm, hand = added[-1], bodies[-1]
     fingers, pads = [], []
@@ -307,26 +308,23 @@ def add_arm(
         pads.append(added[0])
         for shape in added:
             builder.add_shape_collision_filter_pair(shape, palm)
-        joints.append(
-            builder.add_joint_prismatic(
-                parent=hand,
-                child=body,
-                parent_xform=wp.transform(wp.vec3(0.0, 0.0, arm.hand_length), wp.quat_identity()),
-                axis=wp.vec3(0.0, side, 0.0),
-                limit_lower=0.0,
-                limit_upper=0.5 * gripper.stroke,
-                limit_ke=_FINGER_STOP_STIFFNESS,
-                limit_kd=_FINGER_STOP_DAMPING,
-                target_q=home[-1],
-                target_ke=gripper.drive_stiffness,
-                target_kd=gripper.drive_damping,
-                effort_limit=gripper.force_limit,
-                armature=gripper.armature,
-                damping=gripper.damping,
-                friction=0.0,
-                actuator_mode=newton.JointTargetMode.POSITION,
-                label=f"{label}/finger_joint_{name}",
-            )
+        add_joint(
+            builder.add_joint_prismatic,
+            body,
+            f"finger_joint_{name}",
+            parent=hand,
+            parent_xform=wp.transform(wp.vec3(0.0, 0.0, arm.hand_length), wp.quat_identity()),
+            axis=wp.vec3(0.0, side, 0.0),
+            limit_lower=0.0,
+            limit_upper=0.5 * gripper.stroke,
+            limit_ke=_FINGER_STOP_STIFFNESS,
+            limit_kd=_FINGER_STOP_DAMPING,
+            target_q=home[-1],
+            target_ke=gripper.drive_stiffness,
+            target_kd=gripper.drive_damping,
+            effort_limit=gripper.force_limit,
+            armature=gripper.armature,
+            damping=gripper.damping,
         )
     for pair in itertools.product(*(builder.body_shapes[finger] for finger in fingers)):
         builder.add_shape_collision_filter_pair(*pair)

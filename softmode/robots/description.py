@@ -226,15 +226,12 @@ class RobotDescription:
     ) -> dict[str, int]:
         """Give what was imported its names; return the body of every link."""
         links, moving = len(self.link_names), len(self.joint_names)
-        counts = (
-            builder.body_count - first_body,
-            builder.joint_count - first_joint,
-            builder.joint_dof_count - first_dof,
-        )
+        found = (builder.body_count - first_body, builder.joint_count - first_joint)
+        dofs = builder.joint_dof_count - first_dof
         # Newton imports bodies depth first, as MuJoCo numbers them, each with one joint to its parent.
-        if counts != (links, links, moving):
+        if (*found, dofs) != (links, links, moving):
             raise AssetError(
-                f"robot {self.name!r}: Newton imported {counts[0]} bodies, {counts[1]} joints and {counts[2]} dofs, "
+                f"robot {self.name!r}: Newton imported {found[0]} bodies, {found[1]} joints and {dofs} dofs, "
                 f"expected {links}, {links} and {moving}",
                 hint="the file holds something that Newton reads differently from MuJoCo; simplify it",
             )

@@ -98,14 +98,13 @@ class Subject:
             raise EnvironmentCheckError(
                 f"reset returned {type(returned).__name__}", rule="observations", hint="return (observation, infos)"
             )
-        observation, infos = returned
-        self._sample = next((array for _, array in leaves(observation)), None)
-        batch = as_numpy(observation)
+        self._sample = next((array for _, array in leaves(returned[0])), None)
+        batch, infos = map(as_numpy, returned)
         check_observation(self.env, batch, "reset")
-        self._check_infos(infos)
+        check_infos(self.num_envs, infos, self._forms)
         none = np.zeros(self.num_envs, np.bool_)
         zeros = np.zeros(self.num_envs)
-        return Event(worlds(self.env, batch), zeros, none, none, as_numpy(infos), returned, False)
+        return Event(worlds(self.env, batch), zeros, none, none, infos, returned, False)
 
     def step(self, action: Any, *, lenient: int | None = None) -> Event:
         """Step and check what comes back; the values of world ``lenient`` may be anything."""
@@ -118,10 +117,8 @@ class Subject:
         if not isinstance(returned, tuple) or len(returned) != 5:
             hint = "return (observation, reward, terminated, truncated, infos)"
             raise EnvironmentCheckError(f"step returned {type(returned).__name__}", rule="observations", hint=hint)
-        observation, *scalars, infos = returned
-        batch = as_numpy(observation)
+        batch, reward, terminated, truncated, infos = map(as_numpy, returned)
         check_observation(self.env, batch, "step", lenient)
-        reward, terminated, truncated = map(as_numpy, scalars)
         checked = reward
         if lenient is not None and isinstance(reward, np.ndarray) and reward.shape == (self.num_envs,):
             checked = reward.copy()
@@ -129,9 +126,9 @@ class Subject:
         check_reward(self.env, checked)
         check_flag(self.env, terminated, "terminated")
         check_flag(self.env, truncated, "truncated")
-        check_kinds(observation, dict(zip(("reward", "terminated", "truncated"), scalars, strict=True)))
-        self._check_infos(infos)
-        event = Event(worlds(self.env, batch), reward, terminated, truncated, as_numpy(infos), returned, True)
+        check_kinds(returned[0], dict(zip(("reward", "terminated", "truncated"), returned[1:4], strict=True)))
+        check_infos(self.num_envs, infos, self._forms)
+        event = Event(worlds(self.env, batch), reward, terminated, truncated, infos, returned, True)
         if self.mode is AutoresetMode.SAME_STEP:
             self._check_final(event)
         return event
@@ -185,10 +182,6 @@ class Subject:
             if not equal(item, mine):
                 return self.replace_action(action, world, item)
         return action
-
-    def _check_infos(self, infos: object) -> None:
-        """Check masks and forms."""
-        check_infos(self.num_envs, as_numpy(infos), self._forms)
 
     def _check_final(self, event: Event) -> None:
         """Rule ``autoreset``, SAME_STEP: the ended episodes' last observations and infos are in the infos."""
