@@ -12,13 +12,14 @@ from newton.solvers import SolverMuJoCo
 from softmode.checks import require_number
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
-from softmode.deformables.model.authoring import add_reduced_body, register_custom_attributes
+from softmode.deformables.model.authoring import register_custom_attributes
 from softmode.deformables.model.declare import launch
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.objects.config import ObjectConfig
 from softmode.objects.loader import Progress, load
+from softmode.objects.placed import Placed
 from softmode.objects.soft_object import SoftObject
 from softmode.robots.arm import ArmDescription, add_arm
 from softmode.robots.control import ArmController, ArmControlOptions
@@ -157,11 +158,8 @@ class TableScene:
         for fixture in (table, *config.fixtures):
             add_fixture(world, fixture)
         for thing in self.objects:
-            place = (*config.object_position, thing.height)
-            radius = thing.contact_radius
-            instance = add_reduced_body(
-                world, thing.body, material=config.material, position=place, contact_radius=radius
-            )
+            placed = Placed(object=thing, position=(*config.object_position, thing.height))
+            instance = placed.add_to(world, material=config.material)
             if config.grip_slots:
                 add_grip_slots(world, instance, config.grip_slots)
         builder = newton.ModelBuilder()
