@@ -54,10 +54,8 @@ def checked_config(wanted: type[TaskConfig], config: TaskConfig | None, given: S
     require_choice("render_mode", given.render_mode, (*RENDER_MODES, None))
     require_choice("control_mode", given.control_mode, (*CONTROL_MODES, None))
     if config is not None and not isinstance(config, wanted):
-        raise ConfigError(
-            f"config is a {type(config).__name__}",
-            hint=f"pass {wanted.__name__}(image_size=128), of {wanted.__module__}",
-        )
+        hint = f"pass {wanted.__name__}(image_size=128), of {wanted.__module__}"
+        raise ConfigError(f"config is a {type(config).__name__}", hint=hint)
     if config is not None and given.preset is not None:
         raise ConfigError(f"preset {given.preset!r} and config exclude each other", hint="give one of them")
     if config is None:
@@ -120,10 +118,8 @@ def checked_actions(actions: object, space: gym.Space) -> NDArray[np.float32]:
     except (TypeError, ValueError) as error:
         raise ConfigError(f"action is no array of numbers: {error}", hint="give one number per entry") from error
     if numbers.shape != space.shape:
-        raise ConfigError(
-            f"action has shape {numbers.shape}, expected {space.shape}",
-            hint="give one number in [-1, 1] per entry of env.action_space",
-        )
+        hint = "give one number in [-1, 1] per entry of env.action_space"
+        raise ConfigError(f"action has shape {numbers.shape}, expected {space.shape}", hint=hint)
     if not np.isfinite(numbers).all():
         where = f" of worlds {np.flatnonzero(~np.isfinite(numbers).all(axis=1)).tolist()}" if numbers.ndim > 1 else ""
         raise ConfigError(f"action{where} holds NaN or infinity", hint="check the policy that produced it")
@@ -155,10 +151,8 @@ def checked_processes(processes: object, num_envs: int, device: wp.Device, outpu
     """
     count = checked_count("processes", processes)
     if count > 1 and (not device.is_cpu or output != "numpy"):
-        raise ConfigError(
-            f"processes is {count} on {device} with output {output!r}",
-            hint="several processes serve CPU and numpy only; leave processes at 1",
-        )
+        hint = "several processes serve CPU and numpy only; leave processes at 1"
+        raise ConfigError(f"processes is {count} on {device} with output {output!r}", hint=hint)
     return min(count, num_envs)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from softmode.envs.structs import StructType, filled
+from softmode.deformables.model.structs import StructType, filled
 from softmode.robots.arm import ARM_JOINT_COUNT
 
 
@@ -85,15 +85,9 @@ class ObservationLayout:
         """Return the first column of a segment."""
         return self.segments[segment][0].start
 
-    def columns_in(self, struct: StructType, **absent: int) -> Any:
-        """Return a struct of a kernel whose fields are the first columns of the segments of their names.
-
-        Args:
-            struct: The struct.
-            absent: Values of fields whose segment may be missing.
-        """
-        starts = {name: columns.start for name, (columns, _) in self.segments.items()}
-        return filled(struct, **{**absent, **starts})
+    def columns_in(self, struct: StructType) -> Any:
+        """Return a struct of a kernel whose fields are the first columns of the segments of their names."""
+        return filled(struct, **{name: self.column(name) for name in self.segments})
 
     def space(self, columns: slice) -> gym.spaces.Box:
         """Return the space of some columns."""

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from softmode.envs.structs import StructType, filled
+from softmode.deformables.model.structs import StructType, filled
 from softmode.errors import ConfigError
 
 
@@ -37,10 +37,8 @@ class Parameter:
             np.isfinite(a) and np.isfinite(b) and a <= b for a, b in zip(self.low, self.high, strict=False)
         )
         if not ordered or (self.log and min(self.low) <= 0.0):
-            raise ConfigError(
-                f"{self.name} ranges from {self.low} to {self.high}",
-                hint="give finite bounds, low <= high" + (", above 0" if self.log else ""),
-            )
+            hint = "give finite bounds, low <= high" + (", above 0" if self.log else "")
+            raise ConfigError(f"{self.name} ranges from {self.low} to {self.high}", hint=hint)
 
     @property
     def size(self) -> int:
@@ -64,11 +62,8 @@ class ParameterTable:
         """Lay out the columns and upload their ranges."""
         self.parameters = {parameter.name: parameter for parameter in parameters}
         self.world_count = world_count
-        self._column: dict[str, int] = {}
-        columns = 0
-        for name, parameter in self.parameters.items():
-            self._column[name] = columns
-            columns += parameter.size
+        ends = np.cumsum([parameter.size for parameter in self.parameters.values()]).tolist()
+        self._column = dict(zip(self.parameters, [0, *ends], strict=False))
 
         def upload(rows: list[np.ndarray], dtype: type) -> wp.array:
             return wp.array(np.concatenate(rows), dtype=dtype, device=device)
@@ -77,7 +72,7 @@ class ParameterTable:
         self.low = upload([np.array(p.low, np.float32) for p in chosen], float)
         self.high = upload([np.array(p.high, np.float32) for p in chosen], float)
         self.log = upload([np.full(p.size, p.log) for p in chosen], wp.bool)
-        self.values = wp.zeros((world_count, columns), dtype=float, device=device)
+        self.values = wp.zeros((world_count, ends[-1]), dtype=float, device=device)
 
     def column(self, name: str) -> int:
         """Return the first column of a parameter."""
@@ -129,8 +124,6 @@ def _checked(parameter: Parameter, value: object, world_count: int) -> NDArray[n
     least = np.array(parameter.low if parameter.least is None else parameter.least, np.float32)
     most = np.array(parameter.high if parameter.most is None else parameter.most, np.float32)
     if not ((numbers >= least) & (numbers <= most)).all():
-        raise ConfigError(
-            f"{parameter.name} = {value!r} lies outside its range",
-            hint=f"stay within {least.tolist()} to {most.tolist()}",
-        )
+        hint = f"stay within {least.tolist()} to {most.tolist()}"
+        raise ConfigError(f"{parameter.name} = {value!r} lies outside its range", hint=hint)
     return numbers

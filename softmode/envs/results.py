@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
@@ -10,6 +9,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softmode.envs.task import Task
+from softmode.envs.tensors import map_tree
 
 Tree = wp.array | dict[str, "Tree"]
 """An array whose first axis is the world, or a dict of such trees."""
@@ -29,16 +29,7 @@ def observation_arrays(task: Task, *, final: bool = False) -> Tree:
 
 def info_arrays(task: Task, *, final: bool = False) -> dict[str, Tree]:
     """Return the infos of all worlds; with `final`, those of the episodes that ended in this step."""
-    solver = task.scene.solver
-    now = (task.success, task.metrics, task.table.values, task.observation, solver.status)
-    ended = (
-        task.final_success,
-        task.final_metrics,
-        task.final_parameters,
-        task.final_observation,
-        task.final_status,
-    )
-    success, metrics, parameters, vector, status = ended if final else now
+    success, metrics, parameters, vector, status = (task.final_outcome if final else task.outcome).values()
     return {
         "is_success": success,
         "reward_terms": {name: columns_of(task.terms, k) for k, name in enumerate(task.term_names)},
@@ -56,13 +47,6 @@ def info_arrays(task: Task, *, final: bool = False) -> dict[str, Tree]:
 def columns_of(array: wp.array, columns: int | slice) -> wp.array:
     """Return a view of one column, shape (world_count,), or of several."""
     return cast(wp.array, array[:, columns])
-
-
-def map_tree(function: Callable[[Any], Any], tree: Any) -> Any:
-    """Return a tree of the results of a function on each leaf; a dict is a branch, all else a leaf."""
-    if isinstance(tree, dict):
-        return {name: map_tree(function, value) for name, value in tree.items()}
-    return function(tree)
 
 
 def take(tree: Tree, world: int, *, scalars: bool = False) -> Any:

@@ -1,5 +1,7 @@
 """What the kernels of all tasks read and write, and what a touch, a grasp and a held goal are."""
 
+from typing import Any
+
 import warp as wp
 
 TOUCH_FORCE = wp.constant(0.02)
@@ -34,6 +36,13 @@ class StepResult:
     failure: wp.array[int]  # an EndReason
     held: wp.array[int]  # control steps in a row in which the goal was met
     marker_place: wp.array[wp.transform]
+
+
+@wp.func
+def write(table: wp.array2d[float], world: int, column: int, values: Any):
+    """Write a vector into columns that follow each other."""
+    for k in range(len(values)):
+        table[world, column + k] = values[k]
 
 
 @wp.func

@@ -37,7 +37,5 @@ def scripted_policy(env: gym.Env) -> Callable[[Any], Any]:
         if base.__name__ in _POLICIES:
             module, _, name = _POLICIES[base.__name__].partition(":")
             return getattr(importlib.import_module(f"softmode.envs.tasks.{module}"), name)(env)
-    raise ConfigError(
-        f"there is no scripted policy for {env}",
-        hint=f"there is one for {', '.join(_POLICIES)}; a task of yours may set scripted_policy",
-    )
+    hint = f"there is one for {', '.join(_POLICIES)}; a task of yours may set scripted_policy"
+    raise ConfigError(f"there is no scripted policy for {env}", hint=hint)

@@ -38,12 +38,7 @@ class ScriptedGrasp(ScriptedPolicy):
     """Control steps after which closing without a grip is given up."""
 
     def __init__(
-        self,
-        env: gym.Env,
-        way: Callable[[Vector], Vector],
-        *,
-        squeeze: float = 5.0,
-        least_force: float = 1.5,
+        self, env: gym.Env, way: Callable[[Vector], Vector], *, squeeze: float = 5.0, least_force: float = 1.5
     ) -> None:
         """Remember the environment and plan nothing yet."""
         super().__init__(env)
@@ -61,11 +56,6 @@ class ScriptedGrasp(ScriptedPolicy):
     def holds(self) -> bool:
         """Whether the object is held and moved."""
         return self._phase == "lift"
-
-    @property
-    def grip(self) -> float:
-        """The gripper's entry of the last action."""
-        return self._grip
 
     def _start(self, phase: str) -> None:
         """Enter a phase."""

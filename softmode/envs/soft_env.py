@@ -92,12 +92,7 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
     ) -> None:
         """Build the scene and the spaces."""
         given = Shortcuts(
-            obs_type=obs_type,
-            render_mode=render_mode,
-            control_mode=control_mode,
-            splat=splat,
-            size=size,
-            preset=preset,
+            obs_type=obs_type, render_mode=render_mode, control_mode=control_mode, splat=splat, size=size, preset=preset
         )
         # What a copy is made from when the environment is pickled; a callback cannot travel.
         place = None if device is None else str(device)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -29,15 +29,11 @@ from softmode.envs.arguments import (
     world_seed,
 )
 from softmode.envs.parameters import check_options
-from softmode.envs.results import map_tree
 from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
-from softmode.envs.tensors import Tensor, host_array
+from softmode.envs.tensors import Tensor, host_array, map_tree
 from softmode.envs.worlds import LocalWorlds, RemoteWorlds
 from softmode.errors import ConfigError, MissingExtraError
-
-if TYPE_CHECKING:
-    pass
 
 Output = Literal["numpy", "torch"]
 
@@ -107,12 +103,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             known = ", ".join(f"AutoresetMode.{choice.name}" for choice in AutoresetMode)
             raise ConfigError(f"autoreset_mode is {autoreset_mode!r}", hint=f"use one of {known}") from error
         given = Shortcuts(
-            obs_type=obs_type,
-            render_mode=render_mode,
-            control_mode=control_mode,
-            splat=splat,
-            size=size,
-            preset=preset,
+            obs_type=obs_type, render_mode=render_mode, control_mode=control_mode, splat=splat, size=size, preset=preset
         )
         config = checked_config(self.task_class.config_class, config, given)
         if output == "torch":
@@ -124,41 +115,31 @@ class SoftVectorEnv(gym.vector.VectorEnv):
                 ) from error
         self.config, self.obs_type, self.render_mode, self.output = config, obs_type, render_mode, output
         self.autoreset_mode = mode
-        self.metadata = {
-            **self.metadata,
-            "render_fps": round(config.scene.control_hz),
-            "autoreset_mode": mode,
-        }
+        self.metadata = {**self.metadata, "render_fps": round(config.scene.control_hz), "autoreset_mode": mode}
         self.device = checked_device(device)
         self.max_episode_steps = max_episode_steps
         shards = checked_processes(processes, self.num_envs, self.device, output)
         edges = np.linspace(0, self.num_envs, shards + 1).astype(int)
         self._slices = [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
-        arguments = [
-            {
-                "config": config,
-                "obs_type": obs_type,
-                "world_count": part.stop - part.start,
-                "limit": int(max_episode_steps or 0),
-                "autoreset_mode": mode,
-                "render": render_mode is not None,
-                "device": str(self.device),
-                "progress": progress,
-            }
-            for part in self._slices
-        ]
+        common = {
+            "config": config,
+            "obs_type": obs_type,
+            "limit": int(max_episode_steps or 0),
+            "autoreset_mode": mode,
+            "render": render_mode is not None,
+            "device": str(self.device),
+            "progress": progress,
+        }
+        arguments = [{**common, "world_count": part.stop - part.start} for part in self._slices]
         self._worlds: list[Any] = []
-        if shards == 1:
-            self._worlds = [LocalWorlds(self.task_class, arguments[0])]
-        else:
-            try:
-                for part in arguments:
-                    self._worlds.append(RemoteWorlds(self.task_class, part))
-                for worlds in self._worlds:
-                    worlds.connect()
-            except BaseException:
-                self.close_extras()
-                raise
+        try:
+            for part in arguments:
+                self._worlds.append((LocalWorlds if shards == 1 else RemoteWorlds)(self.task_class, part))
+            for worlds in self._worlds:
+                worlds.connect()
+        except BaseException:
+            self.close_extras()
+            raise
         self._random: list[np.random.Generator] | None = None
         self._streams: dict[int, Any] = {}
         self._results: list[dict[str, Any]] = []
@@ -264,10 +245,8 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             return np.ones(self.num_envs, bool)
         mask = host_array(mask) if isinstance(mask, Tensor) else np.asarray(mask)
         if mask.dtype != bool or mask.shape != (self.num_envs,) or not mask.any():
-            raise ConfigError(
-                f"reset_mask is {mask.dtype} of shape {mask.shape}",
-                hint=f"give booleans of shape ({self.num_envs},), at least one of them True",
-            )
+            hint = f"give booleans of shape ({self.num_envs},), at least one of them True"
+            raise ConfigError(f"reset_mask is {mask.dtype} of shape {mask.shape}", hint=hint)
         if self._random is None and not mask.all():
             raise ConfigError("the first reset is partial", hint="call reset() for all worlds once")
         return mask

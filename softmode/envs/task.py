@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.build.build_body import Progress
 from softmode.deformables.model import status as bits
+from softmode.deformables.model.structs import filled
 from softmode.deformables.solver.parameters import set_parameters
 from softmode.envs import task_kernels as kernels
 from softmode.envs.cameras import overview, square_camera, wrist_camera
@@ -22,8 +23,8 @@ from softmode.envs.end_reason import EndReason
 from softmode.envs.observation import PROPRIOCEPTION, ObservationLayout, Segment, object_part
 from softmode.envs.parameters import Parameter, ParameterTable
 from softmode.envs.reward_kernels import StepResult, WorldState
-from softmode.envs.structs import filled
 from softmode.envs.task_config import ObservationType, TaskConfig
+from softmode.scenes.capture import capture_graph
 from softmode.scenes.table_scene import GAP, TableScene, TableSceneConfig
 from softmode.splats.camera import CameraOptions
 from softmode.splats.pinhole import PinholeCamera
@@ -76,6 +77,10 @@ class Task:
     """Makes the policy that `--policy scripted` plays, from observation to action, for an environment."""
     point_count: ClassVar[int] = 16
     """Surface points of the object in the observation."""
+    kernels: ClassVar[Any] = None
+    """Device side that `observe` and `evaluate` launch, a module with kernels of these names and a struct `Plan`: first
+    columns of parameters (`drawn`) and segments (`columns`), and what has the name of an attribute of the task, its
+    configuration, the controller's options or the first object. None where a task overrides both methods."""
 
     def __init__(
         self,
@@ -97,13 +102,13 @@ class Task:
             cameras.append(self.observation_camera())
         if render:
             cameras += self.render_cameras()
+        labelled = "segmentation" in config.image_outputs
+        options = CameraOptions(mesh_samples=config.mesh_samples, segmentation=labelled)
         self.scene = TableScene(
             self.scene_config(),
             world_count=world_count,
             cameras=cameras,
-            camera_options=CameraOptions(
-                mesh_samples=config.mesh_samples, segmentation="segmentation" in config.image_outputs
-            ),
+            camera_options=options,
             camera_randomization=config.camera_randomization,
             marker=self.marker() if cameras else None,
             device=device,
@@ -125,9 +130,15 @@ class Task:
         """Leading columns of the observation that do not see the object: proprioception and goal."""
         self._allocate()
         self.build()
+        if self.kernels is not None:
+            columns = {
+                "drawn": self.table.columns_in(self.kernels.Drawn),
+                "columns": self.layout.columns_in(self.kernels.Columns),
+            }
+            self.plan = filled(self.kernels.Plan, self, config, config.scene.control, soft, **columns)
+            """What the task's own kernels know beside the state."""
         self.reset()
-        self._step()  # compiles what the graph needs
-        self.graph = captured(self._step, self.device)
+        self.graph = capture_graph(self._step, self.device)
         """The step as a captured graph."""
 
     def column(self, segment: str) -> int:
@@ -145,13 +156,21 @@ class Task:
         self.held = zeros(dtype=int)
         """Control steps in a row in which the goal was met, counted by `evaluate`."""
         self.terminated, self.truncated, self.success, self.done, self.finite = (zeros(dtype=wp.bool) for _ in range(5))
-        self.final_success = zeros(dtype=wp.bool)
-        self.observation, self.final_observation = zeros(len(self.low)), zeros(len(self.low))
+        self.observation = zeros(len(self.low))
         self.reward = zeros()
         self.terms = zeros(max(len(self.term_names), 1))
-        self.metrics, self.final_metrics = (zeros(max(len(self.metric_names), 1)) for _ in range(2))
-        self.final_parameters = wp.zeros_like(self.table.values)
-        self.final_status = wp.zeros_like(self.scene.solver.status)
+        self.metrics = zeros(max(len(self.metric_names), 1))
+        self.outcome: dict[str, wp.array] = {
+            "success": self.success,
+            "metrics": self.metrics,
+            "parameters": self.table.values,
+            "observation": self.observation,
+            "status": self.scene.solver.status,
+        }
+        """What a step came to."""
+        self.final_outcome = {name: wp.zeros_like(array) for name, array in self.outcome.items()}
+        """What the last step of the last episode came to, before the reset of SAME_STEP."""
+        self.final_observation = self.final_outcome["observation"]
         self.never = zeros(dtype=wp.bool)
         """A mask of no world."""
         self._fresh = zeros(dtype=wp.bool)
@@ -239,13 +258,17 @@ class Task:
 
     def clear(self) -> None:
         """Reset `held`, and counters of the subclass, in the worlds of `scene.world_mask`."""
-        self.launch(kernels.forget_held, [self.scene.world_mask], [self.held])
+        self.launch(kernels.forget, [self.scene.world_mask, 0], [self.held])
 
     def observe(self) -> None:
         """Write the goal segments of `observation` and the `metrics`, functions of the state alone."""
+        if self.kernels is not None:
+            self.launch(self.kernels.observe, [self.state, self.plan], [self.result])
 
     def evaluate(self) -> None:
         """Write `terms`, `success` and, for failures of the task's own, `failure` (an `EndReason`); once per step."""
+        if self.kernels is not None:
+            self.launch(self.kernels.evaluate, [self.state, self.plan], [self.result])
 
     def marker(self) -> Splats | None:
         """Return the splats that mark the goal in pictures; `observe` writes `scene.marker_place`."""
@@ -285,7 +308,9 @@ class Task:
         dim = self.world_count if dim is None else dim
         wp.launch(kernel, dim=dim, inputs=list(inputs), outputs=list(outputs), device=self.device)
 
-    def place_object(self, index: int, position: str, yaw: str, ground: float = 0.0) -> None:
+    def place_object(
+        self, index: int, position: str, yaw: str, *, ground: float = 0.0, turn: float = 0.0, shift: float = 0.0
+    ) -> None:
         """Put an object down.
 
         Args:
@@ -293,14 +318,15 @@ class Task:
             position: The parameter that says where its centre is [m].
             yaw: The one that says its rotation about the vertical [rad].
             ground: Height over the table of what it stands on [m].
+            turn: What is added to the yaw [rad].
+            shift: From the centre of the unscaled object to what lies at the position, along the yaw [m].
         """
-        scene, column = self.scene, self.table.column
-        columns = filled(kernels.Placement, position=column(position), yaw=column(yaw), scale=column("scale"))
-        self.launch(
-            kernels.place_object,
-            [scene.world_mask, self.state, columns, scene.objects[index].height, GAP + ground, index],
-            [scene.place_position, scene.place_yaw],
-        )
+        scene, names = self.scene, {"position": position, "yaw": yaw, "scale": "scale"}
+        columns = {field: self.table.column(name) for field, name in names.items()}
+        given = {"turn": turn, "shift": shift, "gap": GAP + ground, "object_index": index}
+        place = filled(kernels.Placement, scene.objects[index], **columns, **given)
+        outputs = [scene.place_position, scene.place_yaw]
+        self.launch(kernels.place_object, [scene.world_mask, self.state, place], outputs)
 
     # -- episodes -----------------------------------------------------------------------------------------------------
 
@@ -345,11 +371,8 @@ class Task:
     def _draw(self) -> None:
         """Draw the parameters of the worlds in `scene.world_mask`."""
         table = self.table
-        self.launch(
-            kernels.draw_parameters,
-            [self.scene.world_mask, self.seed, table.low, table.high, table.log],
-            [self.episode, table.values],
-        )
+        inputs = [self.scene.world_mask, self.seed, table.low, table.high, table.log]
+        self.launch(kernels.draw_parameters, inputs, [self.episode, table.values])
 
     def _start(self) -> None:
         """Set those worlds up from their parameters."""
@@ -367,9 +390,8 @@ class Task:
 
     def write_observation(self) -> None:
         """Write the observation and the metrics of all worlds."""
-        arm, body = (self.layout.columns_in(struct) for struct in (kernels.ArmColumns, kernels.ObjectColumns))
-        self.launch(kernels.observe_arm, [self.state, self._arm, arm], [self.observation])
-        self.launch(kernels.observe_object, [self.state, body], [self.observation])
+        columns = self.layout.columns_in(kernels.Columns)
+        self.launch(kernels.observe, [self.state, self._arm, columns], [self.observation])
         self.observe()
         self.launch(kernels.bound_observation, [self._low, self._high], [self.observation, self.finite])
 
@@ -402,11 +424,8 @@ class Task:
             if self.autoreset_mode == AutoresetMode.SAME_STEP:
                 if self.images:
                     wp.capture_if(self.any_done, on_true=self._keep_pictures)
-                wp.copy(self.final_observation, self.observation)
-                wp.copy(self.final_metrics, self.metrics)
-                wp.copy(self.final_success, self.success)
-                wp.copy(self.final_parameters, self.table.values)
-                wp.copy(self.final_status, scene.solver.status)
+                for name, now in self.outcome.items():
+                    wp.copy(self.final_outcome[name], now)
                 wp.copy(self._fresh, self.done)
                 self.restart(self._fresh)
                 self.write_observation()
@@ -425,11 +444,8 @@ class Task:
         self.any_done.zero_()
         self.evaluate()
         status, lowest = scene.solver.status, scene.soft.height - FALL
-        self.launch(
-            kernels.finish_step,
-            [fresh, self.limit, bits.WORLD_NOT_FINITE, status, self.finite, self.state, lowest],
-            [self.result, self._episode],
-        )
+        inputs = [fresh, self.limit, bits.WORLD_NOT_FINITE, status, self.finite, self.state, lowest]
+        self.launch(kernels.finish_step, inputs, [self.result, self._episode])
 
     def _keep_pictures(self) -> None:
         """Draw the last picture of the episodes that end."""
@@ -465,11 +481,3 @@ class Task:
         if self.obs_type == "pixels_agent_pos":
             spaces["agent_pos"] = self.layout.space(slice(0, self.agent_size))
         return spaces["pixels"] if list(spaces) == ["pixels"] else gym.spaces.Dict(spaces)
-
-
-def captured(launches: Callable[[], None], device: wp.Device) -> wp.Graph:
-    """Return what a function launches as a graph."""
-    with wp.ScopedCapture(device=device) as capture:
-        launches()
-    assert capture.graph is not None
-    return capture.graph

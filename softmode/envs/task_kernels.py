@@ -1,9 +1,11 @@
 """Device side of a task: draws at reset, proprioception and object in the observation, ends of episodes."""
 
+from typing import Any
+
 import warp as wp
 
 from softmode.envs.end_reason import EndReason
-from softmode.envs.reward_kernels import StepResult, WorldState, surface_point, tool_position
+from softmode.envs.reward_kernels import StepResult, WorldState, surface_point, tool_position, write
 from softmode.robots.arm import ARM_JOINT_COUNT
 
 wp.set_module_options({"enable_backward": False})
@@ -25,8 +27,8 @@ class ArmState:
 
 
 @wp.struct
-class ArmColumns:
-    """First columns of the proprioception."""
+class Columns:
+    """First columns of the proprioception and of object 0."""
 
     tool_position: int
     tool_heading: int
@@ -36,12 +38,6 @@ class ArmColumns:
     command_lead: int
     command_turn: int
     command_opening: int
-
-
-@wp.struct
-class ObjectColumns:
-    """First columns of object 0."""
-
     object_position: int
     object_velocity: int
     object_offset: int
@@ -55,6 +51,11 @@ class Placement:
     position: int  # of x and y [m]
     yaw: int  # [rad]
     scale: int
+    turn: float  # what is added to the yaw [rad]
+    shift: float  # from the unscaled object's centre to what lies at the position, along the yaw [m]
+    height: float  # of the unscaled object's centre [m]
+    gap: float  # [m]
+    object_index: int
 
 
 @wp.struct
@@ -103,10 +104,7 @@ def draw_parameters(
 def place_object(
     world_mask: wp.array[wp.bool],
     state: WorldState,
-    drawn: Placement,
-    height: float,  # of the unscaled object's centre [m]
-    gap: float,  # [m]
-    object_index: int,
+    place: Placement,
     # Out, per instance:
     position_out: wp.array[wp.vec3d],
     yaw_out: wp.array[wp.float64],
@@ -115,11 +113,14 @@ def place_object(
     w = wp.tid()
     if not world_mask[w]:
         return
-    x = wp.float64(state.parameters[w, drawn.position])
-    y = wp.float64(state.parameters[w, drawn.position + 1])
-    z = wp.float64(height * state.parameters[w, drawn.scale] + gap)
-    position_out[w * state.stride + object_index] = wp.vec3d(x, y, z)
-    yaw_out[w * state.stride + object_index] = wp.float64(state.parameters[w, drawn.yaw])
+    scale = state.parameters[w, place.scale]
+    yaw = place.turn + state.parameters[w, place.yaw]
+    x = state.parameters[w, place.position] - scale * place.shift * wp.cos(yaw)
+    y = state.parameters[w, place.position + 1] - scale * place.shift * wp.sin(yaw)
+    z = place.height * scale + place.gap
+    i = w * state.stride + place.object_index
+    position_out[i] = wp.vec3d(wp.float64(x), wp.float64(y), wp.float64(z))
+    yaw_out[i] = wp.float64(yaw)
 
 
 @wp.kernel
@@ -136,57 +137,42 @@ def spread_materials(
 
 
 @wp.kernel
-def observe_arm(
+def observe(
     state: WorldState,
     arm: ArmState,
-    column: ArmColumns,
+    column: Columns,
     # Out:
     observation: wp.array2d[float],
 ):
-    """Write proprioception: tool, heading, opening, finger forces, joints, and how far the command leads."""
+    """Write what every observation has.
+
+    Proprioception: tool, heading, opening, finger forces, joints, and how far the command leads. Object 0: centre,
+    velocity, centre relative to the tool, and surface points relative to the centre.
+    """
     w = wp.tid()
     p = tool_position(state, w)
     forward = wp.quat_rotate(wp.transform_get_rotation(state.tool_pose[w]), wp.vec3(1.0, 0.0, 0.0))
     length = wp.max(wp.sqrt(forward[0] * forward[0] + forward[1] * forward[1]), 1.0e-9)
     c = -forward[0] / length
     s = -forward[1] / length
-    lead = arm.target_position[w] - p
-    for k in range(3):
-        observation[w, column.tool_position + k] = p[k]
-        observation[w, column.command_lead + k] = lead[k]
-    observation[w, column.tool_heading] = c
-    observation[w, column.tool_heading + 1] = s
+    write(observation, w, column.tool_position, p)
+    write(observation, w, column.tool_heading, wp.vec2(c, s))
     observation[w, column.opening] = arm.opening[w]
     for f in range(2):
         observation[w, column.finger_force + f] = wp.length(state.finger_force[w, f])
     start = arm.coord_start[w]
     for j in range(ARM_JOINT_COUNT):
         observation[w, column.joint_angles + j] = arm.joint_q[start + j]
+    write(observation, w, column.command_lead, arm.target_position[w] - p)
     # sine of the angle from the measured heading to the commanded one
     observation[w, column.command_turn] = c * wp.sin(arm.target_yaw[w]) - s * wp.cos(arm.target_yaw[w])
     observation[w, column.command_opening] = arm.commanded_q[w, _LEFT] + arm.commanded_q[w, _RIGHT]
-
-
-@wp.kernel
-def observe_object(
-    state: WorldState,
-    column: ObjectColumns,
-    # Out:
-    observation: wp.array2d[float],
-):
-    """Write centre, velocity, centre relative to the tool, and surface points relative to the centre of object 0."""
-    w = wp.tid()
     x = state.object_position[w, 0]
-    v = state.object_velocity[w, 0]
-    offset = x - tool_position(state, w)
-    for k in range(3):
-        observation[w, column.object_position + k] = x[k]
-        observation[w, column.object_velocity + k] = v[k]
-        observation[w, column.object_offset + k] = offset[k]
+    write(observation, w, column.object_position, x)
+    write(observation, w, column.object_velocity, state.object_velocity[w, 0])
+    write(observation, w, column.object_offset, x - p)
     for i in range(state.points.shape[0]):
-        r = surface_point(state, w, i) - x
-        for k in range(3):
-            observation[w, column.object_points + 3 * i + k] = r[k]
+        write(observation, w, column.object_points + 3 * i, surface_point(state, w, i) - x)
 
 
 @wp.kernel
@@ -228,15 +214,16 @@ def clear_worlds(
 
 
 @wp.kernel
-def forget_held(
+def forget(
     world_mask: wp.array[wp.bool],
+    value: Any,
     # Out:
-    held: wp.array[int],
+    kept: wp.array[Any],
 ):
-    """Forget for how many steps the goal was met."""
+    """Set what is kept from step to step back to a value."""
     w = wp.tid()
     if world_mask[w]:
-        held[w] = 0
+        kept[w] = value
 
 
 @wp.kernel
@@ -254,15 +241,7 @@ def finish_step(
 ):
     """Sum the reward, count the step and decide whether the episode ends."""
     w = wp.tid()
-    if fresh[w]:
-        episode.reward[w] = 0.0
-        episode.terminated[w] = False
-        episode.truncated[w] = False
-        episode.end[w] = EndReason.RUNNING
-        episode.done[w] = False
-        for t in range(result.terms.shape[1]):
-            result.terms[w, t] = 0.0
-        return
+    played = not fresh[w]
     why = result.failure[w]
     if not (state.object_position[w, 0][2] >= lowest):
         why = EndReason.DROPPED
@@ -270,21 +249,22 @@ def finish_step(
         why = EndReason.DIVERGED
     total = float(0.0)
     for t in range(result.terms.shape[1]):
-        if not wp.isfinite(result.terms[w, t]):
+        if not (played and wp.isfinite(result.terms[w, t])):
             result.terms[w, t] = 0.0
         total += result.terms[w, t]
-    steps = episode.elapsed[w] + 1
+    if played:
+        episode.elapsed[w] += 1
+    else:
+        why = EndReason.RUNNING
     failed = why != EndReason.RUNNING
-    late = limit > 0 and steps >= limit
-    episode.elapsed[w] = steps
-    result.failure[w] = why
+    late = played and limit > 0 and episode.elapsed[w] >= limit
+    over = failed or late
     episode.reward[w] = total
     episode.terminated[w] = failed
     episode.truncated[w] = late
     episode.end[w] = why
     if late and not failed:
         episode.end[w] = EndReason.TIME_LIMIT
-    over = failed or late
     episode.done[w] = over
     if over:
         wp.atomic_max(episode.any_done, 0, 1)

@@ -1,7 +1,8 @@
-"""What the environments use of torch's tensors, without importing torch."""
+"""What the environments use of torch's tensors, without importing torch; one world of a tree of arrays."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -31,3 +32,22 @@ class Tensor(Protocol):
 def host_array(tensor: Tensor) -> np.ndarray:
     """Return a tensor as an array on the host."""
     return tensor.detach().cpu().numpy()
+
+
+def map_tree(function: Callable[[Any], Any], tree: Any) -> Any:
+    """Return a tree of the results of a function on each leaf; mappings, tuples and lists are branches."""
+    if isinstance(tree, Mapping):
+        return {name: map_tree(function, value) for name, value in tree.items()}
+    if isinstance(tree, tuple | list):
+        items = [map_tree(function, value) for value in tree]
+        return type(tree)(*items) if hasattr(tree, "_fields") else type(tree)(items)
+    return function(tree)
+
+
+def world_of(values: Any, world: int) -> Any:
+    """Return world ``world`` of info values: a dict of arrays, an array of objects, or one array for all worlds."""
+    if isinstance(values, Mapping):
+        return {key: world_of(item, world) for key, item in values.items()}
+    if isinstance(values, tuple):
+        return tuple(world_of(item, world) for item in values)
+    return values[world]

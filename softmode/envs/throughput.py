@@ -14,8 +14,9 @@ import warp as wp
 from softmode.envs.arguments import checked_device
 from softmode.envs.reward_kernels import TOUCH_FORCE
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.task import Task, captured
+from softmode.envs.task import Task
 from softmode.errors import ConfigError
+from softmode.scenes.capture import capture_graph
 
 Actions = Literal["random", "grasp"]
 
@@ -187,19 +188,15 @@ def stage_times(task: Task, repeats: int = 20) -> dict[str, float]:
         task.write_observation()
         task.finish(task.never)
 
-    def reset() -> None:
-        task.restart(task.never)
-
     parts: dict[str, Callable[[], None]] = {
         "physics": scene.control_step,
         "observe and judge": judging,
-        "masked reset": reset,
+        "masked reset": lambda: task.restart(task.never),
     }
     if task.images:
         parts["camera"] = task.draw_pictures
-    graphs: dict[str, wp.Graph] = {"whole step": task.graph}
-    for name, part in parts.items():
-        graphs[name] = captured(part, task.device)
+    graphs = {"whole step": task.graph}
+    graphs |= {name: capture_graph(part, task.device) for name, part in parts.items()}
     spent: dict[str, list[float]] = {name: [] for name in graphs}
     for _ in range(repeats + 2):  # in turn, so that all see the same states
         for name, graph in graphs.items():

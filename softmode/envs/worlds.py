@@ -15,8 +15,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from softmode.envs.results import info_arrays, map_tree, observation_arrays, render_worlds
+from softmode.envs.results import info_arrays, observation_arrays, render_worlds
 from softmode.envs.task import Task
+from softmode.envs.tensors import map_tree
 from softmode.errors import SoftmodeError, WorkerError
 
 
@@ -35,6 +36,9 @@ class LocalWorlds:
         self.segments = {name: columns for name, (columns, _) in self.task.segments.items()}
         self.action_space = self.task.action_space
         self.observation_space = self.task.observation_space()
+
+    def connect(self) -> None:
+        """Do nothing: the task is built."""
 
     def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64], options: dict[str, NDArray[np.float32]]) -> None:
         """Start episodes in the masked worlds; a seed below 0 lets the world's draws go on."""

@@ -88,10 +88,8 @@ class ObjectConfig:
                 hint="give one of them",
             )
         if self.body is not None and self.clamped_height > 0.0:
-            raise ConfigError(
-                f"clamped_height is {self.clamped_height} m for a body that is built",
-                hint="build it with a region for its foot: softmode body build FILE --region foot=...",
-            )
+            hint = "build it with a region for its foot: softmode body build FILE --region foot=..."
+            raise ConfigError(f"clamped_height is {self.clamped_height} m for a body that is built", hint=hint)
         self._check_extents()
         if self.colors is not None:
             if self.shape == "plush" and self.mesh is None:
@@ -102,16 +100,12 @@ class ObjectConfig:
     def _check_extents(self) -> None:
         """Check that a shape has extents that fit it, and nothing else has any."""
         if (self.extents is None) != (self.shape == "plush"):
-            raise ConfigError(
-                f"shape {self.shape!r} with extents {self.extents}",
-                hint="give a box, cylinder, capsule or sphere three lengths in metres, and anything else a size",
-            )
+            hint = "give a box, cylinder, capsule or sphere three lengths in metres, and anything else a size"
+            raise ConfigError(f"shape {self.shape!r} with extents {self.extents}", hint=hint)
         if self.extents is None or self.shape == "plush":
             return
         if len(self.extents) != 3 or not all(1.0e-3 <= x <= 2.0 for x in self.extents):
             raise ConfigError(f"extents must be three lengths in 0.001..2 m, got {self.extents!r}")
         if find_axis(self.shape, self.extents) is None:
-            raise ConfigError(
-                f"extents {self.extents} are not those of a {self.shape}",
-                hint="give a sphere three equal lengths, a cylinder two, a capsule two and a third not below them",
-            )
+            hint = "give a sphere three equal lengths, a cylinder two, a capsule two and a third not below them"
+            raise ConfigError(f"extents {self.extents} are not those of a {self.shape}", hint=hint)

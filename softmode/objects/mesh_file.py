@@ -33,15 +33,11 @@ def read_mesh(path: str | os.PathLike[str]) -> ColoredMesh:
         raise AssetError(f"{name}: no such file", hint="Check the path")
     known = sorted(set(trimesh.available_formats()))
     if file.suffix.lower().lstrip(".") not in known:
-        raise AssetError(
-            f"{name}: unknown kind {file.suffix or '(no suffix)'!r}",
-            hint=f"Readable here are {', '.join('.' + kind for kind in known)}; convert others to .glb",
-        )
+        hint = f"Readable here are {', '.join('.' + kind for kind in known)}; convert others to .glb"
+        raise AssetError(f"{name}: unknown kind {file.suffix or '(no suffix)'!r}", hint=hint)
     try:
         scene = trimesh.load_scene(file)
     except Exception as error:  # its readers raise whatever a damaged file leads them to
-        raise AssetError(
-            f"{name}: cannot be read ({type(error).__name__}: {error})",
-            hint="The file is damaged or incomplete: copy or export it again",
-        ) from error
+        hint = "The file is damaged or incomplete: copy or export it again"
+        raise AssetError(f"{name}: cannot be read ({type(error).__name__}: {error})", hint=hint) from error
     return ColoredMesh.from_trimesh(scene, name=name)

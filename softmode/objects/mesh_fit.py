@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from softmode.deformables.model.declare import launch
 from softmode.errors import ConfigError
 from softmode.objects import mesh_fit_kernels as kernels
 from softmode.objects.mesh_file import read_mesh
@@ -185,11 +186,8 @@ class _Fit:
             upload(np.log(opacity / (1.0 - opacity)), wp.float32),
             upload(splats.sh[:, 0], wp.vec3),
         )
-        self.moments = (
-            wp.zeros(count, dtype=kernels.vec13, device=self.device),
-            wp.zeros(count, dtype=kernels.vec13, device=self.device),
-            wp.zeros(count, dtype=wp.int32, device=self.device),
-        )
+        kinds = (kernels.vec13, kernels.vec13, wp.int32)
+        self.moments = tuple(wp.zeros(count, dtype=kind, device=self.device) for kind in kinds)
         self.arrays = SplatArrays.from_splats([splats], device=self.device)
         size = options.size
         self.rasterizer = SplatRasterizer(count, options.views_per_step, size, size, device=self.device)
@@ -203,13 +201,8 @@ class _Fit:
     def compose(self) -> None:
         """Bring the splats up to date with the parameters."""
         splats = self.arrays
-        wp.launch(
-            kernels.compose_splats,
-            dim=self.count,
-            inputs=[*self.parameters],
-            outputs=[splats.means, splats.covariances, splats.opacities, splats.sh],
-            device=self.device,
-        )
+        outputs = (splats.means, splats.covariances, splats.opacities, splats.sh)
+        launch(self.device, kernels.compose_splats, self.count, *self.parameters, *outputs)
 
     def step(
         self, pictures: ReferenceViews, chosen: NDArray[np.int64], background: NDArray[np.float64], elapsed: float
@@ -227,33 +220,20 @@ class _Fit:
         self.rasterizer.render(self.arrays, views)
         shape = self.rasterizer.rgb.shape
         self.loss.zero_()
-        wp.launch(
-            kernels.image_loss,
-            dim=shape,
-            inputs=[
-                self.rasterizer.rgb, pictures.rgb, pictures.alpha,
-                wp.array(chosen.astype(np.int32), dtype=wp.int32, device=self.device), views.background,
-                1.0 / float(3 * np.prod(shape)),
-            ],
-            outputs=[self.loss_rgb, self.loss],
-            device=self.device,
-        )  # fmt: skip
+        reference = wp.array(chosen.astype(np.int32), dtype=wp.int32, device=self.device)
+        drawn = (self.rasterizer.rgb, pictures.rgb, pictures.alpha, reference, views.background)
+        scale = 1.0 / float(3 * np.prod(shape))
+        launch(self.device, kernels.image_loss, shape, *drawn, scale, self.loss_rgb, self.loss)
         if self.adjoint is None:
             self.adjoint = AdjointRasterizer(self.rasterizer, self.arrays, views, camera=False)
         gradients = self.adjoint.backward(self.arrays, views, loss_rgb=self.loss_rgb)
         rates = self.options.rates
         fall = rates.final + (1.0 - rates.final) * 0.5 * (1.0 + np.cos(np.pi * elapsed))
         per_part = (self.spacing * rates.center, rates.rotation, rates.scale, rates.opacity, rates.color)
-        wp.launch(
-            kernels.adam_step,
-            dim=self.count,
-            inputs=[
-                gradients.means, gradients.covariances, gradients.opacities, gradients.sh,
-                kernels.vec13(*(fall * np.repeat(per_part, (3, 3, 3, 1, 3)))), *self.bounds,
-                *self.parameters, *self.moments,
-            ],
-            device=self.device,
-        )  # fmt: skip
+        down = (gradients.means, gradients.covariances, gradients.opacities, gradients.sh)
+        rate = kernels.vec13(*(fall * np.repeat(per_part, (3, 3, 3, 1, 3))))
+        moved = (*self.parameters, *self.moments)
+        launch(self.device, kernels.adam_step, self.count, *down, rate, *self.bounds, *moved)
         return self.loss
 
     def psnr(self, pictures: ReferenceViews) -> float:

@@ -180,8 +180,6 @@ def _cropped_splats(config: ObjectConfig, given: str | Path | Splats) -> tuple[S
     inside = (splats.means >= config.crop[:3]).all(axis=1) & (splats.means <= config.crop[3:]).all(axis=1)
     if not inside.any():
         low, high = np.round(splats.bounds(), 3).tolist()
-        raise AssetError(
-            f"{splats.name}: no splat lies inside crop {config.crop}",
-            hint=f"the splats fill {low} to {high} once turned up",
-        )
+        hint = f"the splats fill {low} to {high} once turned up"
+        raise AssetError(f"{splats.name}: no splat lies inside crop {config.crop}", hint=hint)
     return splats.subset(inside), name

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import newton
 import numpy as np
@@ -117,10 +118,8 @@ class ArmDescription:
         require_fields(self, ("joint_lower", "joint_upper"), count=joints)
         require_fields(self, ("home_position",), count=3)
         if not all(low < high for low, high in zip(self.joint_lower, self.joint_upper, strict=True)):
-            raise ConfigError(
-                f"joint_lower {self.joint_lower} is not below joint_upper {self.joint_upper}",
-                hint="give each joint a range in rad, lower before upper",
-            )
+            hint = "give each joint a range in rad, lower before upper"
+            raise ConfigError(f"joint_lower {self.joint_lower} is not below joint_upper {self.joint_upper}", hint=hint)
         require_choice("touch", self.touch, ("gripper", "all"))
         require_fields(self, ("home_opening",), at_least=0.0, at_most=self.gripper.stroke, unit="m")
         self.joint_q_over(self.home_position)
@@ -251,16 +250,12 @@ def add_arm(
     gripper = arm.gripper
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
     base = wp.transform(*xform) if xform is not None else wp.transform()
-    bodies: list[int] = []
-    joints: list[int] = []
-    shapes: list[int] = []
-    added: list[int] = []
+    bodies, joints, shapes, added = ([] for _ in range(4))
     coord_start, dof_start = builder.joint_coord_count, builder.joint_dof_count
     weight = {"mujoco:gravcomp": 1.0} if arm.gravity_compensation else {}
 
     def add_parts(body: int, parts: Sequence[Part], mass: float, name: str, pose: wp.transform) -> list[int]:
-        density = mass / sum(part.volume for part in parts)
-        added = []
+        density, added = mass / sum(part.volume for part in parts), []
         for part in parts:
             config = newton.ModelBuilder.ShapeConfig(
                 density=density,
@@ -272,10 +267,9 @@ def add_arm(
         shapes.extend(added)
         return added
 
-    def add_link(mass: float, name: str) -> int:
-        body = builder.add_link(label=f"{label}/{name}", custom_attributes=weight)
-        bodies.append(body)
-        return body
+    def add_joint(add: Callable[..., int], body: int, name: str, **settings: Any) -> None:
+        position = newton.JointTargetMode.POSITION
+        joints.append(add(child=body, friction=0.0, actuator_mode=position, label=f"{label}/{name}", **settings))
 
     add_parts(-1, base_parts(), 1.0, "base", base)
     offsets, axes, links = arm_links(arm.shoulder_height, arm.upper_arm_length, arm.forearm_length, arm.flange_length)
@@ -283,73 +277,59 @@ def add_arm(
     home = arm.home_joint_q
     for k in range(ARM_JOINT_COUNT):
         mount = wp.transform(wp.vec3(0.0, 0.0, offsets[k]), wp.quat_identity())
-        body = add_link(arm.link_masses[k], f"link{k + 1}")
+        body = builder.add_link(label=f"{label}/link{k + 1}", custom_attributes=weight)
+        bodies.append(body)
         added = add_parts(body, links[k], arm.link_masses[k], f"link{k + 1}", wp.transform())
-        joints.append(
-            builder.add_joint_revolute(
-                parent=bodies[k - 1] if k else -1,
-                child=body,
-                parent_xform=mount if k else base * mount,
-                axis=axes[k],
-                limit_lower=arm.joint_lower[k],
-                limit_upper=arm.joint_upper[k],
-                limit_ke=_JOINT_STOP_STIFFNESS,
-                limit_kd=12.0 * math.sqrt(_JOINT_STOP_STIFFNESS * max(arm.armatures[k], 0.05)),
-                target_q=home[k],
-                target_ke=arm.drive_stiffnesses[k],
-                target_kd=arm.drive_dampings[k],
-                effort_limit=arm.effort_limits[k],
-                armature=arm.armatures[k],
-                damping=arm.dampings[k],
-                friction=0.0,
-                actuator_mode=newton.JointTargetMode.POSITION,
-                label=f"{label}/joint{k + 1}",
-            )
+        add_joint(
+            builder.add_joint_revolute,
+            body,
+            f"joint{k + 1}",
+            parent=bodies[k - 1] if k else -1,
+            parent_xform=mount if k else base * mount,
+            axis=axes[k],
+            limit_lower=arm.joint_lower[k],
+            limit_upper=arm.joint_upper[k],
+            limit_ke=_JOINT_STOP_STIFFNESS,
+            limit_kd=12.0 * math.sqrt(_JOINT_STOP_STIFFNESS * max(arm.armatures[k], 0.05)),
+            target_q=home[k],
+            target_ke=arm.drive_stiffnesses[k],
+            target_kd=arm.drive_dampings[k],
+            effort_limit=arm.effort_limits[k],
+            armature=arm.armatures[k],
+            damping=arm.dampings[k],
         )
-    palm = added[-1]
-    hand = bodies[-1]
-    fingers: list[int] = []
-    pads: list[int] = []
+    palm, hand = added[-1], bodies[-1]
+    fingers, pads = [], []
     for side, name in ((1.0, "left"), (-1.0, "right")):
         body = builder.add_link(label=f"{label}/finger_{name}", custom_attributes=weight)
         fingers.append(body)
-        added = add_parts(
-            body,
-            finger_parts(gripper.pad_size, gripper.finger_length, side),
-            gripper.finger_mass,
-            f"finger_{name}",
-            wp.transform(),
-        )
+        parts = finger_parts(gripper.pad_size, gripper.finger_length, side)
+        added = add_parts(body, parts, gripper.finger_mass, f"finger_{name}", wp.transform())
         pads.append(added[0])
         for shape in added:
             builder.add_shape_collision_filter_pair(shape, palm)
-        joints.append(
-            builder.add_joint_prismatic(
-                parent=hand,
-                child=body,
-                parent_xform=wp.transform(wp.vec3(0.0, 0.0, arm.hand_length), wp.quat_identity()),
-                axis=wp.vec3(0.0, side, 0.0),
-                limit_lower=0.0,
-                limit_upper=0.5 * gripper.stroke,
-                limit_ke=_FINGER_STOP_STIFFNESS,
-                limit_kd=_FINGER_STOP_DAMPING,
-                target_q=home[-1],
-                target_ke=gripper.drive_stiffness,
-                target_kd=gripper.drive_damping,
-                effort_limit=gripper.force_limit,
-                armature=gripper.armature,
-                damping=gripper.damping,
-                friction=0.0,
-                actuator_mode=newton.JointTargetMode.POSITION,
-                label=f"{label}/finger_joint_{name}",
-            )
+        add_joint(
+            builder.add_joint_prismatic,
+            body,
+            f"finger_joint_{name}",
+            parent=hand,
+            parent_xform=wp.transform(wp.vec3(0.0, 0.0, arm.hand_length), wp.quat_identity()),
+            axis=wp.vec3(0.0, side, 0.0),
+            limit_lower=0.0,
+            limit_upper=0.5 * gripper.stroke,
+            limit_ke=_FINGER_STOP_STIFFNESS,
+            limit_kd=_FINGER_STOP_DAMPING,
+            target_q=home[-1],
+            target_ke=gripper.drive_stiffness,
+            target_kd=gripper.drive_damping,
+            effort_limit=gripper.force_limit,
+            armature=gripper.armature,
+            damping=gripper.damping,
         )
-    left, right = builder.body_shapes[fingers[0]], builder.body_shapes[fingers[1]]
-    for a in left:
-        for b in right:
-            builder.add_shape_collision_filter_pair(a, b)
+    for pair in itertools.product(*(builder.body_shapes[finger] for finger in fingers)):
+        builder.add_shape_collision_filter_pair(*pair)
     builder.add_articulation(joints, label=label)
-    builder.joint_q[coord_start : coord_start + len(home)] = [float(value) for value in home]
+    builder.joint_q[coord_start : coord_start + len(home)] = home.tolist()
     return ArmIndices(
         description=arm,
         articulation=builder.articulation_count - 1,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import newton
@@ -48,14 +48,8 @@ def base_parts() -> list[Part]:
     middle = 0.5 * (0.025 + _PEDESTAL_HEIGHT)
     return [
         Part(kind="box", center=(0.0, 0.0, 0.0125), size=(0.105, 0.095, 0.0125), color=_GRAPHITE, name="plate"),
-        Part(kind="cylinder", center=(0.0, 0.0, middle), size=(0.078, middle - 0.025), color=_WHITE, name="pedestal"),
-        Part(
-            kind="cylinder",
-            center=(0.0, 0.0, _PEDESTAL_HEIGHT + 0.004),
-            size=(0.074, 0.004),
-            color=_ACCENT,
-            name="ring",
-        ),
+        _cylinder(middle, 0.078, middle - 0.025, name="pedestal"),
+        _cylinder(_PEDESTAL_HEIGHT + 0.004, 0.074, 0.004, _ACCENT, name="ring"),
     ]
 
 
@@ -79,32 +73,21 @@ def arm_links(
     offsets = [_PEDESTAL_HEIGHT, neck, half_upper, half_upper, half_fore, half_fore, flange_length]
     axes = [along_z, along_y, along_z, along_y, along_z, along_y, along_z]
 
-    def sleeve(length: float, radius: float, color: tuple[float, float, float] = _WHITE) -> Part:
+    def sleeve(length: float, radius: float) -> Part:
         """A tube from the link's origin along z, without caps."""
-        return Part(kind="cylinder", center=(0.0, 0.0, 0.5 * length), size=(radius, 0.5 * length), color=color)
+        return _cylinder(0.5 * length, radius, 0.5 * length)
 
     def hub(z: float, radius: float, half: float) -> list[Part]:
         """A joint housing across the arm with coloured end caps."""
-        caps = [
-            Part(
-                kind="cylinder",
-                center=(0.0, side * (half + 0.006), z),
-                size=(0.8 * radius, 0.006),
-                color=_ACCENT,
-                axis="y",
-            )
-            for side in (1.0, -1.0)
-        ]
-        return [Part(kind="cylinder", center=(0.0, 0.0, z), size=(radius, half), color=_GRAPHITE, axis="y"), *caps]
-
-    def ring(z: float, radius: float) -> Part:
-        return Part(kind="cylinder", center=(0.0, 0.0, z), size=(radius, 0.004), color=_STEEL)
+        cap = _cylinder(z, 0.8 * radius, 0.006, _ACCENT, axis="y")
+        caps = [replace(cap, center=(0.0, side * (half + 0.006), z)) for side in (1.0, -1.0)]
+        return [_cylinder(z, radius, half, _GRAPHITE, axis="y"), *caps]
 
     links = [
         [sleeve(neck, 0.068), *hub(neck, 0.070, 0.068)],
-        [_capsule_along_z(0.0, half_upper, 0.058), ring(half_upper, 0.056)],
+        [_capsule_along_z(0.0, half_upper, 0.058), _cylinder(half_upper, 0.056, 0.004, _STEEL)],
         [_capsule_along_z(0.0, half_upper, 0.054), *hub(half_upper, 0.060, 0.060)],
-        [_capsule_along_z(0.0, half_fore, 0.050), ring(half_fore, 0.048)],
+        [_capsule_along_z(0.0, half_fore, 0.050), _cylinder(half_fore, 0.048, 0.004, _STEEL)],
         [_capsule_along_z(0.0, half_fore, 0.046), *hub(half_fore, 0.050, 0.050)],
         [_capsule_along_z(0.0, 0.4 * flange_length, 0.042), sleeve(flange_length - 0.004, 0.040)],
     ]
@@ -114,28 +97,14 @@ def arm_links(
 def hand_parts(length: float, stroke: float) -> list[Part]:
     """Return the shapes of the hand, `length` [m] long, for fingers of a `stroke` [m]; the last one is the palm."""
     half_width = 0.5 * stroke + 0.022
-    half_height = max(0.5 * (length - 0.026), 0.005)
+    half_height, middle = max(0.5 * (length - 0.026), 0.005), 0.5 * (length + 0.026)
+    side = _cylinder(middle, 0.026, half_height, _GRAPHITE, name="side")
+    palm = (0.026, half_width, half_height)
     return [
-        Part(kind="cylinder", center=(0.0, 0.0, 0.010), size=(0.040, 0.010), color=_STEEL, name="flange"),
-        Part(kind="cylinder", center=(0.0, 0.0, 0.024), size=(0.036, 0.006), color=_ACCENT, name="ring"),
-        *(
-            Part(
-                kind="cylinder",
-                center=(0.0, side * half_width, 0.5 * (length + 0.026)),
-                size=(0.026, half_height),
-                color=_GRAPHITE,
-                name="side",
-            )
-            for side in (1.0, -1.0)
-        ),
-        Part(
-            kind="box",
-            center=(0.0, 0.0, 0.5 * (length + 0.026)),
-            size=(0.026, half_width, half_height),
-            color=_WHITE,
-            touch=True,
-            name="palm",
-        ),
+        _cylinder(0.010, 0.040, 0.010, _STEEL, name="flange"),
+        _cylinder(0.024, 0.036, 0.006, _ACCENT, name="ring"),
+        *(replace(side, center=(0.0, sign * half_width, middle)) for sign in (1.0, -1.0)),
+        Part(kind="box", center=(0.0, 0.0, middle), size=palm, touch=True, name="palm"),
     ]
 
 
@@ -148,32 +117,32 @@ def finger_parts(pad_size: tuple[float, float, float], length: float, side: floa
         side: 1 for the left finger, -1 for the right one.
     """
     width, thickness, height = pad_size
-    back = 0.009
+    half, back = 0.5 * length - 0.001, 0.009
+
+    def box(name: str, y: float, z: float, size: tuple[float, ...], color: tuple[float, float, float]) -> Part:
+        """A box beside the plane in which the fingers meet; soft bodies touch it, but for the carriage."""
+        touch = name != "carriage"
+        return Part(kind="box", center=(0.0, side * y, z), size=size, color=color, touch=touch, name=name)
+
+    pad = (0.5 * width, 0.5 * thickness, 0.5 * height)
     return [
-        Part(
-            kind="box",
-            center=(0.0, side * 0.5 * thickness, length - 0.5 * height),
-            size=(0.5 * width, 0.5 * thickness, 0.5 * height),
-            color=_RUBBER,
-            touch=True,
-            name="pad",
-        ),
-        Part(
-            kind="box",
-            center=(0.0, side * (thickness + 0.5 * back), 0.5 * length - 0.001),
-            size=(0.46 * width, 0.5 * back, 0.5 * length - 0.001),
-            color=_STEEL,
-            touch=True,
-            name="finger",
-        ),
-        Part(
-            kind="box",
-            center=(0.0, side * (thickness + 0.010), 0.006),
-            size=(0.6 * width, 0.014, 0.006),
-            color=_GRAPHITE,
-            name="carriage",
-        ),
+        box("pad", 0.5 * thickness, length - 0.5 * height, pad, _RUBBER),
+        box("finger", thickness + 0.5 * back, half, (0.46 * width, 0.5 * back, half), _STEEL),
+        box("carriage", thickness + 0.010, 0.006, (0.6 * width, 0.014, 0.006), _GRAPHITE),
     ]
+
+
+def _cylinder(
+    z: float,
+    radius: float,
+    half: float,
+    color: tuple[float, float, float] = _WHITE,
+    *,
+    axis: Literal["y", "z"] = "z",
+    name: str = "",
+) -> Part:
+    """Return a cylinder whose centre lies on the link's z axis."""
+    return Part(kind="cylinder", center=(0.0, 0.0, z), size=(radius, half), color=color, axis=axis, name=name)
 
 
 def _capsule_along_z(start: float, end: float, radius: float) -> Part:

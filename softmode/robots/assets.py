@@ -182,10 +182,8 @@ def _aloha_arm() -> RobotAsset:
     """Return the left arm of the ALOHA station."""
     path = _aloha_path()
     if path is None:
-        raise AssetError(
-            f"robot {ALOHA_ARM!r} is not in the installed mujoco-warp",
-            hint="load 'vx300s', which is the same arm, or give the path of an MJCF or URDF file",
-        )
+        hint = "load 'vx300s', which is the same arm, or give the path of an MJCF or URDF file"
+        raise AssetError(f"robot {ALOHA_ARM!r} is not in the installed mujoco-warp", hint=hint)
     return RobotAsset(
         name=ALOHA_ARM, path=path, root="left\\base_link", end_effector="left\\gripper", asset_root=path.parent
     )

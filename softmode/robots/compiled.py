@@ -24,21 +24,9 @@ from softmode.robots.assets import RobotAsset
 from softmode.robots.description import JointDrive, RobotGripper, ToolPose
 
 _TOOL_NAMES = (
-    "pinch",
-    "pinch_site",
-    "grasp_site",
-    "gripperframe",
-    "link_tcp",
-    "tcp",
-    "tool",
-    "tool0",
-    "end_effector",
-    "ee",
-    "gripper",
-    "attachment_site",
-    "hand",
-    "Fixed_Jaw",
-)
+    "pinch pinch_site grasp_site gripperframe link_tcp tcp tool tool0 end_effector ee gripper attachment_site hand "
+    "Fixed_Jaw"
+).split()
 """Names of sites, then of bodies, that are taken for the tool when none is given; the first one present."""
 _DRIVE_FREQUENCY = 8.0
 """Natural frequency of the drives of a file that has no actuators [Hz]."""
@@ -61,10 +49,8 @@ class CompiledRobot:
         for j, name in enumerate(self.joint_names):
             if int(model.jnt_type[j]) not in scalar:
                 kind = self.mujoco.mjtJoint(int(model.jnt_type[j])).name.removeprefix("mjJNT_").lower()
-                raise AssetError(
-                    f"robot file {self.asset.path}: joint {name!r} is a {kind} joint",
-                    hint="use a robot on a fixed base whose joints are hinges and slides",
-                )
+                hint = "use a robot on a fixed base whose joints are hinges and slides"
+                raise AssetError(f"robot file {self.asset.path}: joint {name!r} is a {kind} joint", hint=hint)
         for b in range(model.nbody):
             if model.body_jntnum[b] > 1:
                 raise AssetError(
@@ -99,10 +85,8 @@ class CompiledRobot:
             return np.clip(values, self.lower, self.upper)
         values = np.asarray(given, float)
         if values.shape != (len(self.joint_names),) or not np.all(np.isfinite(values)):
-            raise ConfigError(
-                f"home has shape {values.shape} or holds a value that is not finite",
-                hint=f"give one number for each of {', '.join(self.joint_names)}",
-            )
+            hint = f"give one number for each of {', '.join(self.joint_names)}"
+            raise ConfigError(f"home has shape {values.shape} or holds a value that is not finite", hint=hint)
         return values
 
     def data(self, joint_q: np.ndarray) -> Any:

@@ -17,6 +17,8 @@ import numpy as np
 import warp as wp
 
 from softmode.checks import require_choice, require_fields, require_number
+from softmode.deformables.model.declare import launch
+from softmode.deformables.model.structs import filled
 from softmode.errors import ConfigError
 from softmode.robots import control_kernels as kernels
 from softmode.robots.arm import ARM_JOINT_COUNT, ArmIndices
@@ -65,10 +67,8 @@ class ArmControlOptions:
         require_number("iterations", self.iterations, at_least=1, hint="six are enough for any action")
         lower, upper = self.workspace_lower, self.workspace_upper
         if not all(a < b for a, b in zip(lower, upper, strict=True)):
-            raise ConfigError(
-                f"workspace_lower {lower} is not below workspace_upper {upper}",
-                hint="give two corners (x, y, z) in metres, lower before upper",
-            )
+            hint = "give two corners (x, y, z) in metres, lower before upper"
+            raise ConfigError(f"workspace_lower {lower} is not below workspace_upper {upper}", hint=hint)
 
     @property
     def action_size(self) -> int:
@@ -122,50 +122,31 @@ class ArmController:
             offset = start[:w] if start[w] > start[0] else np.zeros(w, dtype=np.int32)
             return wp.array(offset + first, dtype=wp.int32, device=device)
 
-        self._joint_start = starts(model.joint_world_start, arm.joint_start)
         self.coord_start = starts(model.joint_coord_world_start, arm.coord_start)
-        self._dof_start = starts(model.joint_dof_world_start, arm.dof_start)
-        description = arm.description
-        self._chain = kernels.Chain()
-        self._chain.joint_parent_pose = model.joint_X_p
-        self._chain.joint_axis = model.joint_axis
-        self._chain.lower = model.joint_limit_lower
-        self._chain.upper = model.joint_limit_upper
-        self._chain.joint_start = self._joint_start
-        self._chain.coord_start = self.coord_start
-        self._chain.dof_start = self._dof_start
-        self._chain.tool_length = description.tool_length
-        self._chain.home = kernels.vec7(*description.home_joint_q[:ARM_JOINT_COUNT].tolist())
-        self._settings = self._make_settings()
+        description, gripper = arm.description, arm.description.gripper
+        self._chain = filled(
+            kernels.Chain,
+            model,
+            description,
+            joint_start=starts(model.joint_world_start, arm.joint_start),
+            coord_start=self.coord_start,
+            dof_start=starts(model.joint_dof_world_start, arm.dof_start),
+            home=kernels.vec7(*description.home_joint_q[:ARM_JOINT_COUNT].tolist()),
+        )
+        # Both drives saturate at an opening error of twice force_limit / stiffness.
+        lead = self.options.squeeze_lead * 2.0 * gripper.force_limit / gripper.drive_stiffness
+        joint_mode = int(self.options.mode == "joint_delta")
+        self._settings = filled(kernels.Settings, self.options, gripper, joint_mode=joint_mode, opening_lead=lead)
         self.commanded_q = wp.zeros((w, ARM_JOINT_COUNT + 2), dtype=wp.float32, device=device)
-        self._previous_q = wp.zeros_like(self.commanded_q)
         self.tool_pose = wp.zeros(w, dtype=wp.transform, device=device)
         self.opening = wp.zeros(w, dtype=wp.float32, device=device)
         self.target_position = wp.zeros(w, dtype=wp.vec3, device=device)
         self.target_yaw = wp.zeros(w, dtype=wp.float32, device=device)
-        self._command = [
-            self.commanded_q,
-            self._previous_q,
-            self.target_position,
-            self.target_yaw,
-            self.tool_pose,
-            self.opening,
-        ]
+        self._command = filled(kernels.Command, self, previous_q=wp.zeros_like(self.commanded_q))
         """What moves when the command does."""
         self._everywhere = wp.ones(w, dtype=wp.bool, device=device)
         self._device = device
         self._reset(model.joint_q, self._everywhere)
-
-    def _make_settings(self):
-        options, gripper = self.options, self.arm.description.gripper
-        settings = kernels.Settings()
-        for name in kernels.Settings.vars.keys() & vars(options).keys():
-            setattr(settings, name, getattr(options, name))
-        settings.joint_mode = int(options.mode == "joint_delta")
-        settings.stroke = gripper.stroke
-        # Both drives saturate at an opening error of twice force_limit / stiffness.
-        settings.opening_lead = options.squeeze_lead * 2.0 * gripper.force_limit / gripper.drive_stiffness
-        return settings
 
     def reset(self, state: newton.State, world_mask: wp.array | None = None) -> None:
         """Set the command to the measured configuration.
@@ -177,13 +158,7 @@ class ArmController:
         self._reset(state.joint_q, world_mask if world_mask is not None else self._everywhere)
 
     def _reset(self, joint_q: wp.array | None, world_mask: wp.array) -> None:
-        wp.launch(
-            kernels.reset_command,
-            dim=self.world_count,
-            inputs=[self._chain, joint_q, world_mask],
-            outputs=self._command,
-            device=self._device,
-        )
+        launch(self._device, kernels.reset_command, self.world_count, self._chain, joint_q, world_mask, self._command)
 
     def command(self, action: wp.array, state: newton.State) -> None:
         """Move the commanded configuration by one action per world.
@@ -195,17 +170,10 @@ class ArmController:
             state: The measured state, for the anti-windup.
         """
         if action.shape != (self.world_count, self.options.action_size):
-            raise ConfigError(
-                f"action has shape {tuple(action.shape)}",
-                hint=f"expected ({self.world_count}, {self.options.action_size}) in mode {self.options.mode!r}",
-            )
-        wp.launch(
-            kernels.move_command,
-            dim=self.world_count,
-            inputs=[self._chain, self._settings, action, state.joint_q],
-            outputs=self._command,
-            device=self._device,
-        )
+            hint = f"expected ({self.world_count}, {self.options.action_size}) in mode {self.options.mode!r}"
+            raise ConfigError(f"action has shape {tuple(action.shape)}", hint=hint)
+        arguments = (self._chain, self._settings, action, state.joint_q, self._command)
+        launch(self._device, kernels.move_command, self.world_count, *arguments)
 
     def write_targets(self, control: newton.Control, fraction: float = 1.0) -> None:
         """Write the drives' position targets, on the line from the previous command to the present one.
@@ -214,20 +182,9 @@ class ArmController:
             control: Where joint_target_q is written.
             fraction: Share of the control step that the targets should have covered, 0 to 1.
         """
-        wp.launch(
-            kernels.write_targets,
-            dim=(self.world_count, ARM_JOINT_COUNT + 2),
-            inputs=[self.coord_start, self._previous_q, self.commanded_q, fraction],
-            outputs=[control.joint_target_q],
-            device=self._device,
-        )
+        dim = (self.world_count, ARM_JOINT_COUNT + 2)
+        launch(self._device, kernels.write_targets, dim, self._chain, self._command, fraction, control.joint_target_q)
 
     def measure(self, state: newton.State) -> None:
         """Update `tool_pose` and `opening` from the measured joint coordinates."""
-        wp.launch(
-            kernels.measure,
-            dim=self.world_count,
-            inputs=[self._chain, state.joint_q],
-            outputs=[self.tool_pose, self.opening],
-            device=self._device,
-        )
+        launch(self._device, kernels.measure, self.world_count, self._chain, state.joint_q, self._command)

@@ -9,30 +9,24 @@ wp.set_module_options({"enable_backward": False})
 _N = wp.constant(ARM_JOINT_COUNT)
 
 
-class vec7(wp.types.vector(length=ARM_JOINT_COUNT, dtype=wp.float32)):
-    """One number per arm joint."""
-
-
-class mat67(wp.types.matrix(shape=(6, ARM_JOINT_COUNT), dtype=wp.float32)):
-    """A tool Jacobian: three rows of translation, three of rotation."""
-
-
-class mat66(wp.types.matrix(shape=(6, 6), dtype=wp.float32)):
-    """The normal matrix of the tool."""
-
-
-class vec6(wp.types.vector(length=6, dtype=wp.float32)):
-    """A tool error: translation, then rotation."""
+vec7 = wp.types.vector(length=ARM_JOINT_COUNT, dtype=wp.float32)
+"""One number per arm joint."""
+mat67 = wp.types.matrix(shape=(6, ARM_JOINT_COUNT), dtype=wp.float32)
+"""A tool Jacobian: three rows of translation, three of rotation."""
+mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float32)
+"""The normal matrix of the tool."""
+vec6 = wp.types.vector(length=6, dtype=wp.float32)
+"""A tool error: translation, then rotation."""
 
 
 @wp.struct
 class Chain:
     """The arm in the model's arrays; the world's first indices, then seven joints and two fingers in a row."""
 
-    joint_parent_pose: wp.array[wp.transform]
+    joint_X_p: wp.array[wp.transform]  # pose of the joint in its parent
     joint_axis: wp.array[wp.vec3]
-    lower: wp.array[float]
-    upper: wp.array[float]
+    joint_limit_lower: wp.array[float]
+    joint_limit_upper: wp.array[float]
     joint_start: wp.array[int]
     coord_start: wp.array[int]
     dof_start: wp.array[int]
@@ -61,6 +55,18 @@ class Settings:
     iterations: wp.int32
 
 
+@wp.struct
+class Command:
+    """What an action moves, and the measured tool beside it, world first; see `ArmController`."""
+
+    commanded_q: wp.array2d[float]
+    previous_q: wp.array2d[float]
+    target_position: wp.array[wp.vec3]
+    target_yaw: wp.array[float]
+    tool_pose: wp.array[wp.transform]
+    opening: wp.array[float]
+
+
 @wp.func
 def _forward(chain: Chain, world: int, q: vec7):
     """Return the tool's pose at joint angles q."""
@@ -69,7 +75,7 @@ def _forward(chain: Chain, world: int, q: vec7):
     dof = chain.dof_start[world]
     for k in range(_N):
         turn = wp.quat_from_axis_angle(chain.joint_axis[dof + k], q[k])
-        pose = pose * chain.joint_parent_pose[joint + k] * wp.transform(wp.vec3(), turn)
+        pose = pose * chain.joint_X_p[joint + k] * wp.transform(wp.vec3(), turn)
     return pose * wp.transform(wp.vec3(0.0, 0.0, chain.tool_length), wp.quat_identity())
 
 
@@ -82,7 +88,7 @@ def _jacobian(chain: Chain, world: int, q: vec7, rotation_weight: float):
     joint = chain.joint_start[world]
     dof = chain.dof_start[world]
     for k in range(_N):
-        pose = pose * chain.joint_parent_pose[joint + k]
+        pose = pose * chain.joint_X_p[joint + k]
         axis = wp.transform_vector(pose, chain.joint_axis[dof + k])
         lever = wp.cross(axis, tool - wp.transform_get_translation(pose))
         for i in range(3):
@@ -221,12 +227,7 @@ def reset_command(
     joint_q_in: wp.array[float],
     world_mask: wp.array[wp.bool],
     # Out:
-    commanded_q_out: wp.array2d[float],
-    previous_q_out: wp.array2d[float],
-    target_position_out: wp.array[wp.vec3],
-    target_yaw_out: wp.array[float],
-    tool_pose_out: wp.array[wp.transform],
-    opening_out: wp.array[float],
+    command: Command,
 ):
     """Set the command of the masked worlds to the measured configuration."""
     world = wp.tid()
@@ -235,12 +236,12 @@ def reset_command(
     pose = _forward(chain, world, _read_arm(chain, world, joint_q_in))
     for k in range(_N + 2):
         value = joint_q_in[chain.coord_start[world] + k]
-        commanded_q_out[world, k] = value
-        previous_q_out[world, k] = value
-    target_position_out[world] = wp.transform_get_translation(pose)
-    target_yaw_out[world] = _tool_yaw(wp.transform_get_rotation(pose))
-    tool_pose_out[world] = pose
-    opening_out[world] = _read_opening(chain, world, joint_q_in)
+        command.commanded_q[world, k] = value
+        command.previous_q[world, k] = value
+    command.target_position[world] = wp.transform_get_translation(pose)
+    command.target_yaw[world] = _tool_yaw(wp.transform_get_rotation(pose))
+    command.tool_pose[world] = pose
+    command.opening[world] = _read_opening(chain, world, joint_q_in)
 
 
 @wp.kernel
@@ -251,30 +252,25 @@ def move_command(
     # State in:
     action: wp.array2d[float],
     joint_q_in: wp.array[float],
-    # Out:
-    commanded_q_out: wp.array2d[float],
-    previous_q_out: wp.array2d[float],
-    target_position_out: wp.array[wp.vec3],
-    target_yaw_out: wp.array[float],
-    tool_pose_out: wp.array[wp.transform],
-    opening_out: wp.array[float],
+    # In, out:
+    command: Command,
 ):
     """Apply one action to the command: move, clamp to workspace and lead, solve for the joints, move the gripper."""
     world = wp.tid()
     dof = chain.dof_start[world]
     measured = _read_arm(chain, world, joint_q_in)
     measured_pose = _forward(chain, world, measured)
-    tool_pose_out[world] = measured_pose
+    command.tool_pose[world] = measured_pose
     measured_position = wp.transform_get_translation(measured_pose)
     q = vec7()
     low = vec7()
     high = vec7()
     for k in range(_N + 2):
-        previous_q_out[world, k] = commanded_q_out[world, k]
+        command.previous_q[world, k] = command.commanded_q[world, k]
     for k in range(_N):
-        q[k] = commanded_q_out[world, k]
-        low[k] = chain.lower[dof + k]
-        high[k] = chain.upper[dof + k]
+        q[k] = command.commanded_q[world, k]
+        low[k] = chain.joint_limit_lower[dof + k]
+        high[k] = chain.joint_limit_upper[dof + k]
 
     q_before = vec7(q)
     if settings.joint_mode == 1:
@@ -292,17 +288,17 @@ def move_command(
                 q = q_before
             pose = _forward(chain, world, q)
             position = wp.transform_get_translation(pose)
-        target_position_out[world] = position
-        target_yaw_out[world] = _tool_yaw(wp.transform_get_rotation(pose))
+        command.target_position[world] = position
+        command.target_yaw[world] = _tool_yaw(wp.transform_get_rotation(pose))
     else:
         move = wp.vec3(_clean(action[world, 0]), _clean(action[world, 1]), _clean(action[world, 2]))
-        position = target_position_out[world] + settings.translation_scale * move
+        position = command.target_position[world] + settings.translation_scale * move
         ahead = position - measured_position
         distance = wp.length(ahead)
         if distance > settings.max_lead:
             position = measured_position + ahead * (settings.max_lead / distance)
         position = _clamp_into(position, settings.workspace_lower, settings.workspace_upper)
-        yaw = target_yaw_out[world] + settings.rotation_scale * _clean(action[world, 3])
+        yaw = command.target_yaw[world] + settings.rotation_scale * _clean(action[world, 3])
         measured_yaw = _tool_yaw(wp.transform_get_rotation(measured_pose))
         turn = yaw - measured_yaw
         turn = turn - 2.0 * wp.pi * wp.round(turn / (2.0 * wp.pi))
@@ -320,37 +316,36 @@ def move_command(
         missing = missing - 2.0 * wp.pi * wp.round(missing / (2.0 * wp.pi))
         if wp.abs(missing) > 0.01:
             yaw = attained_yaw
-        target_position_out[world] = position
-        target_yaw_out[world] = yaw
+        command.target_position[world] = position
+        command.target_yaw[world] = yaw
 
     for k in range(_N):
-        commanded_q_out[world, k] = q[k]
+        command.commanded_q[world, k] = q[k]
     measured_opening = _read_opening(chain, world, joint_q_in)
-    opening_out[world] = measured_opening
+    command.opening[world] = measured_opening
     # The range of commands starts below zero, so that the drives reach their limit on thin objects too.
     lead = settings.opening_lead
     wanted = wp.lerp(-lead, settings.stroke, 0.5 * (1.0 + _clean(action[world, action.shape[1] - 1])))
-    opening = commanded_q_out[world, _N] + commanded_q_out[world, _N + 1]
+    opening = command.commanded_q[world, _N] + command.commanded_q[world, _N + 1]
     opening = opening + wp.clamp(wanted - opening, -settings.opening_rate, settings.opening_rate)
     # The lead is taken from both fingers together: with equal targets an off-centre grasp is pushed back to the middle.
     opening = wp.clamp(opening, measured_opening - lead, measured_opening + lead)
-    commanded_q_out[world, _N] = 0.5 * opening
-    commanded_q_out[world, _N + 1] = 0.5 * opening
+    command.commanded_q[world, _N] = 0.5 * opening
+    command.commanded_q[world, _N + 1] = 0.5 * opening
 
 
 @wp.kernel
 def write_targets(
-    # Command:
-    coord_start: wp.array[int],
-    previous_q: wp.array2d[float],
-    commanded_q: wp.array2d[float],
+    chain: Chain,
+    command: Command,
     fraction: float,
     # Out:
     joint_target_q_out: wp.array[float],
 ):
     """Interpolate the position targets between two commands."""
     world, k = wp.tid()
-    joint_target_q_out[coord_start[world] + k] = wp.lerp(previous_q[world, k], commanded_q[world, k], fraction)
+    target = wp.lerp(command.previous_q[world, k], command.commanded_q[world, k], fraction)
+    joint_target_q_out[chain.coord_start[world] + k] = target
 
 
 @wp.kernel
@@ -360,10 +355,9 @@ def measure(
     # State in:
     joint_q_in: wp.array[float],
     # Out:
-    tool_pose_out: wp.array[wp.transform],
-    opening_out: wp.array[float],
+    command: Command,
 ):
     """Compute the tool's pose and the distance between the pads."""
     world = wp.tid()
-    tool_pose_out[world] = _forward(chain, world, _read_arm(chain, world, joint_q_in))
-    opening_out[world] = _read_opening(chain, world, joint_q_in)
+    command.tool_pose[world] = _forward(chain, world, _read_arm(chain, world, joint_q_in))
+    command.opening[world] = _read_opening(chain, world, joint_q_in)

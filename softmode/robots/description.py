@@ -131,10 +131,8 @@ class RobotDescription:
             ConfigError: If the robot has no gripper.
         """
         if self.gripper is None:
-            raise ConfigError(
-                f"robot {self.name!r} has no gripper",
-                hint="name its joints: load(..., gripper={'joint': (closed, open)})",
-            )
+            hint = "name its joints: load(..., gripper={'joint': (closed, open)})"
+            raise ConfigError(f"robot {self.name!r} has no gripper", hint=hint)
         values = self.home_joint_q if joint_q is None else np.array(joint_q, float)
         for name, closed, wide in zip(self.gripper.joints, self.gripper.closed, self.gripper.open, strict=True):
             values[self.joint_names.index(name)] = closed + opening * (wide - closed)
@@ -228,15 +226,12 @@ class RobotDescription:
     ) -> dict[str, int]:
         """Give what was imported its names; return the body of every link."""
         links, moving = len(self.link_names), len(self.joint_names)
-        counts = (
-            builder.body_count - first_body,
-            builder.joint_count - first_joint,
-            builder.joint_dof_count - first_dof,
-        )
+        found = (builder.body_count - first_body, builder.joint_count - first_joint)
+        dofs = builder.joint_dof_count - first_dof
         # Newton imports bodies depth first, as MuJoCo numbers them, each with one joint to its parent.
-        if counts != (links, links, moving):
+        if (*found, dofs) != (links, links, moving):
             raise AssetError(
-                f"robot {self.name!r}: Newton imported {counts[0]} bodies, {counts[1]} joints and {counts[2]} dofs, "
+                f"robot {self.name!r}: Newton imported {found[0]} bodies, {found[1]} joints and {dofs} dofs, "
                 f"expected {links}, {links} and {moving}",
                 hint="the file holds something that Newton reads differently from MuJoCo; simplify it",
             )

@@ -159,7 +159,7 @@ def _prepare_urdf(tree: ElementTree.Element, asset: RobotAsset) -> str:
             if value.startswith("package://"):
                 package, _, value = value.removeprefix("package://").partition("/")
                 bases = [asset.asset_root / package, asset.asset_root]
-            file = resolve_inside(value, bases, asset.asset_root, asset.path, "<mesh>")
+            file = resolve_inside([value], bases, asset.asset_root, asset.path, "<mesh>")
             mesh.set("filename", str(file))
     for texture in tree.iter("texture"):
         texture.attrib.pop("filename", None)

@@ -83,19 +83,15 @@ def check_references(path: Path, root: Path) -> None:
                     value = PurePosixPath(value.replace("\\", "/")).name
                 places = textures if element.tag in _TEXTURE_TAGS else meshes
                 joined = [str(PurePosixPath(folder) / value) for folder in dict.fromkeys([*places, ""])]
-                _resolve(joined, [path.parent, file.parent], root, file, f"<{element.tag}>")
+                resolve_inside(joined, [path.parent, file.parent], root, file, f"<{element.tag}>")
 
 
-def resolve_inside(value: str, bases: list[Path], root: Path, file: Path, tag: str) -> Path:
-    """Return the file that a reference means, the first that exists from one of the base folders.
+def resolve_inside(values: list[str], bases: list[Path], root: Path, file: Path, tag: str) -> Path:
+    """Return the file that a reference means, the first spelling that exists from one of the base folders.
 
     Raises:
         AssetError: If the reference is absolute or a URL, leaves ``root``, or leads nowhere.
     """
-    return _resolve([value], bases, root, file, tag)
-
-
-def _resolve(values: list[str], bases: list[Path], root: Path, file: Path, tag: str) -> Path:
     asked = values[-1]
     if any("://" in value for value in values) or asked.startswith("file:"):
         raise AssetError(
@@ -109,10 +105,8 @@ def _resolve(values: list[str], bases: list[Path], root: Path, file: Path, tag: 
     existing = [candidate for candidate in candidates if candidate.exists()]
     outside = [candidate for candidate in existing or candidates if not candidate.is_relative_to(inside)]
     if outside:
-        raise AssetError(
-            f"{file}: {tag} refers to {asked!r}, which lies outside the asset root {root}",
-            hint="copy the file into the folder, or pass asset_root= the folder that holds the whole robot",
-        )
+        hint = "copy the file into the folder, or pass asset_root= the folder that holds the whole robot"
+        raise AssetError(f"{file}: {tag} refers to {asked!r}, which lies outside the asset root {root}", hint=hint)
     if not existing:
         raise AssetError(f"{file}: {tag} refers to {asked!r}, which does not exist", hint="put the file in its place")
     return existing[0]
@@ -133,5 +127,5 @@ def _collect(
         for element in tree.iter(tag):
             value = element.get("file")
             if value:
-                nested = resolve_inside(value, [main, file.parent], root, file, f"<{tag}>")
+                nested = resolve_inside([value], [main, file.parent], root, file, f"<{tag}>")
                 _collect(nested, main, root, trees, (*above, real))

@@ -98,9 +98,8 @@ class BoundSplats:
         """Move the splats by the coordinates q of all instances [m], flat vec3d; capturable after a first time."""
         arrays = self.arrays
         for (skin, start), columns in zip(self._skins, self.columns, strict=False):
-            skin.launch(
-                q, start, arrays.means, arrays.covariances, rotations=arrays.rotations, first_splat=columns.start
-            )
+            moved = (arrays.means, arrays.covariances)
+            skin.launch(q, start, *moved, rotations=arrays.rotations, first_splat=columns.start)
 
     def frames(self) -> dict[tuple[int, int], SplatFrame]:
         """Return the splats as they are by place of the world in `worlds` and object; reads from the device."""
@@ -140,9 +139,7 @@ def _function_starts(model: newton.Model, count: int, worlds: Sequence[int] | No
     data = soft(model)
     owner, every = data.instance_world.numpy(), max(int(model.world_count), 1)
     if len(owner) != every * count or (every > 1 and not np.array_equal(owner, np.repeat(np.arange(every), count))):
-        raise ConfigError(
-            f"objects names {count} soft bodies, the model has {len(owner)} in {every} worlds",
-            hint="give one object, or None, per soft body of a world, in the order in which they were added",
-        )
+        hint = "give one object, or None, per soft body of a world, in the order in which they were added"
+        raise ConfigError(f"objects names {count} soft bodies, the model has {len(owner)} in {every} worlds", hint=hint)
     starts = np.asarray(data.function_start.numpy(), dtype=np.int32).reshape(every, count)
     return starts if worlds is None else starts[list(worlds)]

@@ -45,10 +45,8 @@ class Fixture:
             raise ConfigError(f"fixture {self.label!r} is a {self.shape!r}", hint=f"use one of {', '.join(_SIZES)}")
         count = len(_SIZES[self.shape])
         if len(self.size) != count or not all(0.0 < x < np.inf for x in self.size):
-            raise ConfigError(
-                f"fixture {self.label!r} has size {self.size}",
-                hint=f"give {count} positive lengths [m] for a {self.shape}",
-            )
+            hint = f"give {count} positive lengths [m] for a {self.shape}"
+            raise ConfigError(f"fixture {self.label!r} has size {self.size}", hint=hint)
         if not np.isfinite(self.position).all():
             raise ConfigError(f"fixture {self.label!r} stands at {self.position}", hint="give finite coordinates [m]")
 

@@ -140,20 +140,20 @@ def _triangles(
     z_axis: Any = newton.Axis.Z
     plain: dict[str, Any] = {"compute_inertia": False, "compute_uvs": False}
     rings = {"num_latitudes": SEGMENTS, "num_longitudes": SEGMENTS}
-    if kind == GeoType.PLANE:
-        mesh = newton.Mesh.create_plane(x if x > 0.0 else plane_extent, y if y > 0.0 else plane_extent, **plain)
-    elif kind == GeoType.SPHERE:
-        mesh = newton.Mesh.create_sphere(x, **rings, **plain)
-    elif kind == GeoType.ELLIPSOID:
-        mesh = newton.Mesh.create_ellipsoid(x, y, z, **rings, **plain)
-    elif kind == GeoType.BOX:
-        mesh = newton.Mesh.create_box(x, y, z, duplicate_vertices=True, **plain)
-    elif kind == GeoType.CAPSULE:
-        mesh = newton.Mesh.create_capsule(x, y, up_axis=z_axis, segments=SEGMENTS, **plain)
-    elif kind == GeoType.CYLINDER:
-        mesh = newton.Mesh.create_cylinder(x, y, up_axis=z_axis, segments=SEGMENTS, barrel_radius=z, **plain)
-    elif kind == GeoType.CONE:
-        mesh = newton.Mesh.create_cone(x, y, up_axis=z_axis, segments=SEGMENTS, **plain)
+    tube = {"up_axis": z_axis, "segments": SEGMENTS}
+    width, depth = (edge if edge > 0.0 else plane_extent for edge in (x, y))
+    made = {
+        GeoType.PLANE: (newton.Mesh.create_plane, (width, depth), {}),
+        GeoType.SPHERE: (newton.Mesh.create_sphere, (x,), rings),
+        GeoType.ELLIPSOID: (newton.Mesh.create_ellipsoid, (x, y, z), rings),
+        GeoType.BOX: (newton.Mesh.create_box, (x, y, z), {"duplicate_vertices": True}),
+        GeoType.CAPSULE: (newton.Mesh.create_capsule, (x, y), tube),
+        GeoType.CYLINDER: (newton.Mesh.create_cylinder, (x, y), tube | {"barrel_radius": z}),
+        GeoType.CONE: (newton.Mesh.create_cone, (x, y), tube),
+    }
+    if kind in made:
+        create, size, options = made[kind]
+        mesh = create(*size, **options, **plain)
     elif kind == GeoType.HFIELD and source is not None:
         heights = source.min_z + source.data * (source.max_z - source.min_z)
         mesh = newton.Mesh.create_heightfield(  # x runs along its rows, along the columns of a Heightfield

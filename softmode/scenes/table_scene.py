@@ -12,12 +12,14 @@ from newton.solvers import SolverMuJoCo
 from softmode.checks import require_number
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
-from softmode.deformables.model.authoring import add_reduced_body, register_custom_attributes
+from softmode.deformables.model.authoring import register_custom_attributes
+from softmode.deformables.model.declare import launch
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.objects.config import ObjectConfig
 from softmode.objects.loader import Progress, load
+from softmode.objects.placed import Placed
 from softmode.objects.soft_object import SoftObject
 from softmode.robots.arm import ArmDescription, add_arm
 from softmode.robots.control import ArmController, ArmControlOptions
@@ -119,7 +121,8 @@ class TableScene:
         self.marker_place = wp.zeros(world_count, dtype=wp.transform, device=self.device)
         """Where the marker is drawn, transform, shape (world_count,)."""
         self.marker_place.fill_(wp.transform_identity())
-        self._marker = marker
+        self.marker = marker
+        """Splats that mark a place in pictures, as they were given; the last ones of `splats`."""
         self.splats: BoundSplats | None = None
         """The splats of the objects, then those of the marker, as cameras see them; None without cameras."""
         self.cameras: dict[tuple[int, int], SplatCamera] = {}
@@ -142,11 +145,6 @@ class TableScene:
         """The first soft object."""
         return self.objects[0]
 
-    @property
-    def marker(self) -> Splats | None:
-        """Splats that mark a place in pictures, as they were given; the last ones of `splats`."""
-        return self._marker
-
     # -- construction -------------------------------------------------------------------------------------------------
 
     def _build_model(self) -> None:
@@ -154,23 +152,14 @@ class TableScene:
         config = self.config
         world = newton.ModelBuilder()
         self.arm = add_arm(world, config.arm)
-        table = Fixture(
-            label="table",
-            size=(0.5, 0.6, 0.03),
-            position=(0.35, 0.0, -0.03),
-            color=(0.42, 0.48, 0.54),
-            friction=config.table_friction,
-        )
+        place, size = (0.35, 0.0, -0.03), (0.5, 0.6, 0.03)
+        slate = (0.42, 0.48, 0.54)
+        table = Fixture(label="table", position=place, size=size, color=slate, friction=config.table_friction)
         for fixture in (table, *config.fixtures):
             add_fixture(world, fixture)
-        for thing, kind in zip(self.objects, (config.object, *config.others), strict=True):
-            instance = add_reduced_body(
-                world,
-                thing.body,
-                material=config.material,
-                position=(*config.object_position, thing.height),
-                contact_radius=kind.contact_radius,
-            )
+        for thing in self.objects:
+            placed = Placed(object=thing, position=(*config.object_position, thing.height))
+            instance = placed.add_to(world, material=config.material)
             if config.grip_slots:
                 add_grip_slots(world, instance, config.grip_slots)
         builder = newton.ModelBuilder()
@@ -183,8 +172,8 @@ class TableScene:
         """Make the coupled solver, the controller and the buffers of a control step."""
         config, model, worlds = self.config, self.model, self.world_count
         rigid = SolverMuJoCo(model, njmax=config.constraint_max, nconmax=config.rigid_contact_max)
-        bodies = list({id(thing.body): thing.body for thing in self.objects}.values())
-        self.solver = SolverCoupledReduced(model, bodies, options=config.solver, rigid=rigid)
+        distinct = list({id(thing.body): thing.body for thing in self.objects}.values())
+        self.solver = SolverCoupledReduced(model, distinct, options=config.solver, rigid=rigid)
         self.state: Any = model.state()
         self._scratch: Any = model.state()
         self.control: Any = model.control()
@@ -197,7 +186,7 @@ class TableScene:
             for i in range(instances if slots else 0)
         )
         """Grips of each instance, world by world, that pull and hold it while the scene runs; none without slots."""
-        device = self.device
+        device, bodies = self.device, [thing.body for thing in self.objects]
         self.actions = wp.zeros((worlds, config.control.action_size), dtype=float, device=device)
         self.object_position = wp.zeros((worlds, len(self.objects)), dtype=wp.vec3, device=device)
         """Centre of mass of each soft object [m], shape (world_count, objects)."""
@@ -207,7 +196,6 @@ class TableScene:
         starts = model.body_world_start.numpy()[:worlds]
         fingers = starts[:, None] + np.asarray(self.arm.finger_bodies)[None]
         self._finger_body = wp.array(fingers, dtype=int, device=device)
-        bodies = [thing.body for thing in self.objects]
         self._linear = [wp.array(body.linear_coordinates, dtype=wp.float64, device=device) for body in bodies]
         self._mean_basis = [wp.array(body.mean_basis, dtype=wp.float64, device=device) for body in bodies]
         self.world_mask = wp.ones(worlds, dtype=wp.bool, device=device)
@@ -258,15 +246,11 @@ class TableScene:
         worlds, data, state = self.world_count, self.model.softmode, self.state
         wp.copy(self._solver_mask, self.world_mask, count=worlds)
         self.solver.reset(state, self._solver_mask)
-        place = (self.world_mask, self.place_position, self.place_yaw)
+        place = (self.world_mask, self.place_position, self.place_yaw, data.scale)
         for o, linear in enumerate(self._linear):
-            wp.launch(
-                kernels.place_objects,
-                dim=(worlds, linear.shape[0]),
-                inputs=[data.function_start, len(self.objects), o, linear, *place, data.scale],
-                outputs=[state.softmode.q, state.softmode.qd, self.control.softmode.q_driven],
-                device=self.device,
-            )
+            instances = (data.function_start, len(self.objects), o, linear)
+            outputs = (state.softmode.q, state.softmode.qd, self.control.softmode.q_driven)
+            launch(self.device, kernels.place_objects, (worlds, linear.shape[0]), *instances, *place, *outputs)
         self.solver.update_particles(state)
         self.controller.reset(state, self.world_mask)
         self.controller.write_targets(self.control)
@@ -312,20 +296,11 @@ class TableScene:
         data, state, worlds = self.model.softmode, self.state, self.world_count
         self.controller.measure(state)
         for o, mean_basis in enumerate(self._mean_basis):
-            wp.launch(
-                kernels.observe_objects,
-                dim=worlds,
-                inputs=[data.function_start, len(self.objects), o, mean_basis, state.softmode.q, state.softmode.qd],
-                outputs=[self.object_position, self.object_velocity],
-                device=self.device,
-            )
-        wp.launch(
-            kernels.observe_fingers,
-            dim=(worlds, 2),
-            inputs=[self._finger_body, self.solver.body_wrench],
-            outputs=[self.finger_force],
-            device=self.device,
-        )
+            instances = (data.function_start, len(self.objects), o, mean_basis)
+            arrays = (state.softmode.q, state.softmode.qd, self.object_position, self.object_velocity)
+            launch(self.device, kernels.observe_objects, worlds, *instances, *arrays)
+        fingers = (self._finger_body, self.solver.body_wrench, self.finger_force)
+        launch(self.device, kernels.observe_fingers, (worlds, 2), *fingers)
 
     def render(self, size: tuple[int, int]) -> SplatCamera:
         """Draw every camera of one image size and return it; its arrays are overwritten by the next frame."""
@@ -339,14 +314,10 @@ class TableScene:
         """Move the splats and draw one frame; capturable after a first frame."""
         if self.splats is not None:
             self.splats.update(self.state)
-            if self._marker is not None:
-                wp.launch(
-                    kernels.place_marker,
-                    dim=(self.world_count, self._marker.count),
-                    inputs=[self.marker_points, self.marker_place, self.splats.columns[-1].start],
-                    outputs=[self.splats.arrays.means],
-                    device=self.device,
-                )
+            if self.marker is not None:
+                dim, first = (self.world_count, self.marker.count), self.splats.columns[-1].start
+                arrays = (self.marker_points, self.marker_place, first, self.splats.arrays.means)
+                launch(self.device, kernels.place_marker, dim, *arrays)
         camera.render(self.state)
 
     # -- reading ------------------------------------------------------------------------------------------------------

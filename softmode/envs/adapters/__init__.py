@@ -6,8 +6,9 @@ imported when its adapter is first asked for.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from softmode.lazy import lazy_names
 
 if TYPE_CHECKING:
     from softmode.envs.adapters.rsl_rl import RslRlVecEnv
@@ -16,15 +17,4 @@ if TYPE_CHECKING:
 
 __all__ = ["RslRlVecEnv", "SkrlWrapper", "StableBaselinesVecEnv"]
 
-_MODULES = {"RslRlVecEnv": "rsl_rl", "SkrlWrapper": "skrl", "StableBaselinesVecEnv": "stable_baselines"}
-
-
-def __getattr__(name: str) -> Any:
-    """Import an adapter.
-
-    Raises:
-        MissingExtraError: If its library is not installed.
-    """
-    if name in _MODULES:
-        return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__ = lazy_names(__name__)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from softmode.envs.tensors import Tensor, host_array
+from softmode.envs.tensors import Tensor, host_array, map_tree
 from softmode.errors import ConfigError, MissingExtraError
 
 
@@ -46,17 +46,8 @@ def checked_env(env: object, adapter: str, *, output: str | None = None) -> Vect
 
 
 def to_numpy(tree: object) -> Any:
-    """Return a tree of arrays or tensors as NumPy arrays on the host."""
-    if isinstance(tree, Mapping):
-        return {key: to_numpy(value) for key, value in tree.items()}
-    return host_array(tree) if isinstance(tree, Tensor) else np.asarray(tree)
-
-
-def take(tree: Any, world: int) -> Any:
-    """Return one world of a tree of arrays."""
-    if isinstance(tree, Mapping):
-        return {key: take(value, world) for key, value in tree.items()}
-    return tree[world]
+    """Return a tree of arrays or tensors as NumPy arrays on the host; arrays of objects stay."""
+    return map_tree(lambda leaf: host_array(leaf) if isinstance(leaf, Tensor) else np.asarray(leaf), tree)
 
 
 def infos_of_worlds(infos: Mapping[str, Any], num_envs: int) -> list[dict[str, Any]]:

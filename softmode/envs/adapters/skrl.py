@@ -8,6 +8,7 @@ import gymnasium as gym
 from gymnasium.vector import VectorEnv
 
 from softmode.envs.adapters.common import checked_env, missing
+from softmode.envs.tensors import map_tree
 
 try:
     import torch
@@ -90,13 +91,8 @@ class SkrlWrapper(Wrapper):
             for name, value in now.items()
             if not name.startswith("_")
         }
-        return (
-            self._observations,
-            reward.view(-1, 1),
-            terminated.view(-1, 1),
-            truncated.view(-1, 1),
-            self._infos,
-        )
+        reward, terminated, truncated = (value.view(-1, 1) for value in (reward, terminated, truncated))
+        return self._observations, reward, terminated, truncated, self._infos
 
     def state(self) -> torch.Tensor | None:
         """Return the full state (num_envs, D) where the observation is pixels, else None."""
@@ -113,6 +109,4 @@ class SkrlWrapper(Wrapper):
 
 def _floats(observation: Any) -> Any:
     """Return an observation with its bytes and whole numbers as float32, which models take; floats stay themselves."""
-    if isinstance(observation, dict):
-        return {key: _floats(value) for key, value in observation.items()}
-    return observation if observation.is_floating_point() else observation.float()
+    return map_tree(lambda leaf: leaf if leaf.is_floating_point() else leaf.float(), observation)

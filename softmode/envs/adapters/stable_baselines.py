@@ -9,7 +9,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from softmode.envs.adapters.common import checked_env, infos_of_worlds, missing, take, to_numpy
+from softmode.envs.adapters.common import checked_env, infos_of_worlds, missing, to_numpy
+from softmode.envs.tensors import world_of
 from softmode.errors import ConfigError
 
 try:
@@ -47,13 +48,11 @@ class StableBaselinesVecEnv(VecEnv):
         """Start new episodes in all worlds, with the seeds and options set before."""
         options = self._options[0]
         if any(other != options for other in self._options):
-            raise ConfigError(
-                "the options of the worlds differ",
-                hint="give set_options one dict; an array in it holds a value per world",
-            )
+            hint = "give set_options one dict; an array in it holds a value per world"
+            raise ConfigError("the options of the worlds differ", hint=hint)
         seeds = None if all(seed is None for seed in self._seeds) else self._seeds
         observation, infos = self.env.reset(seed=seeds, options=dict(options) or None)  # type: ignore[arg-type]
-        self.reset_infos = infos_of_worlds(_host(infos), self.num_envs)
+        self.reset_infos = infos_of_worlds(to_numpy(infos), self.num_envs)
         self._reset_seeds()
         self._reset_options()
         return to_numpy(observation)
@@ -65,7 +64,7 @@ class StableBaselinesVecEnv(VecEnv):
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Make the step and return observations, rewards, dones and one info per world."""
         observation, reward, terminated, truncated, infos = self.env.step(self._actions)
-        terminated, truncated, infos = to_numpy(terminated), to_numpy(truncated), _host(infos)
+        terminated, truncated, infos = map(to_numpy, (terminated, truncated, infos))
         last, ended, _, _ = (infos.pop(key, {}) for key in ("final_obs", "final_info", "_final_obs", "_final_info"))
         worlds = infos_of_worlds(infos, self.num_envs)
         done = terminated | truncated
@@ -73,7 +72,7 @@ class StableBaselinesVecEnv(VecEnv):
             ends = infos_of_worlds(ended, self.num_envs)
             for i in np.flatnonzero(done):
                 self.reset_infos[i] = worlds[i]
-                worlds[i] = {**ends[i], "terminal_observation": take(last, int(i))}
+                worlds[i] = {**ends[i], "terminal_observation": world_of(last, int(i))}
         for info, late in zip(worlds, (truncated & ~terminated).tolist(), strict=True):
             info["TimeLimit.truncated"] = late
         return to_numpy(observation), to_numpy(reward).astype(np.float32), done, worlds
@@ -117,8 +116,3 @@ class StableBaselinesVecEnv(VecEnv):
     def _owner(self, name: str) -> Any:
         """Return the wrapper that has an attribute, or the environment inside all of them."""
         return self.env if hasattr(self.env, name) else self.env.unwrapped
-
-
-def _host(infos: dict[str, Any]) -> dict[str, Any]:
-    """Return infos as NumPy arrays; arrays of objects stay."""
-    return {key: _host(value) if isinstance(value, dict) else to_numpy(value) for key, value in infos.items()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from gymnasium.vector import VectorEnv
 
@@ -113,8 +113,8 @@ def check_vector_env(
 
     if isinstance(env, VectorEnv):
         report, _ = check(env)
-        reason = {"batch size": "give a function to check it", "close": "give a function to check it"}
-        return _extended(report, skipped=reason)
+        reasons = dict.fromkeys(("batch size", "close"), "give a function to check it")
+        return replace(report, skipped=report.skipped | reasons)
     if not callable(env):
         check(env)
     assert not isinstance(env, VectorEnv)
@@ -138,7 +138,7 @@ def check_vector_env(
     if "close" not in skip:
         _check_close(many)
     done = tuple(name for name in ("batch size", "close") if name not in skip)
-    return _extended(report, checked=done)
+    return replace(report, checked=report.checked + done)
 
 
 def _time_limit(env: VectorEnv) -> int | None:
@@ -174,20 +174,6 @@ def _apply(subject: Subject, run: Reference, skip: Collection[str]) -> VectorEnv
     )
 
 
-def _extended(
-    report: VectorEnvReport, *, checked: tuple[str, ...] = (), skipped: dict[str, str] | None = None
-) -> VectorEnvReport:
-    """Add to a report."""
-    return VectorEnvReport(
-        env=report.env,
-        num_envs=report.num_envs,
-        autoreset_mode=report.autoreset_mode,
-        checked=report.checked + checked,
-        skipped=report.skipped | (skipped or {}),
-        notes=report.notes,
-    )
-
-
 def _check_batch_size(one: VectorEnv, many: VectorEnv, reference: list[Event], steps: int, seed: int) -> None:
     """Rule ``batch size``: world 0 of many is the single world."""
     alone, among = (Subject(env, steps=steps, seed=seed) for env in (one, many))
@@ -199,12 +185,9 @@ def _check_batch_size(one: VectorEnv, many: VectorEnv, reference: list[Event], s
         if theirs.done.any() or mine.done.any():
             break
         if not equal(mine.observation[0], theirs.observation[0]) or not equal(mine.reward[:1], theirs.reward[:1]):
-            raise EnvironmentCheckError(
-                f"call {index} returns something else with num_envs=1 than in world 0 of {many.num_envs}",
-                rule="batch size",
-                world=0,
-                hint="let nothing that a world computes depend on how many worlds there are",
-            )
+            message = f"call {index} returns something else with num_envs=1 than in world 0 of {many.num_envs}"
+            hint = "let nothing that a world computes depend on how many worlds there are"
+            raise EnvironmentCheckError(message, rule="batch size", world=0, hint=hint)
 
 
 def _check_close(env: VectorEnv) -> None:
@@ -216,8 +199,6 @@ def _check_close(env: VectorEnv) -> None:
     try:
         env.close()
     except Exception as error:
-        raise EnvironmentCheckError(
-            f"the second close() raises {type(error).__name__}: {error}",
-            rule="close",
-            hint="return at once where self.closed is set",
-        ) from error
+        message = f"the second close() raises {type(error).__name__}: {error}"
+        hint = "return at once where self.closed is set"
+        raise EnvironmentCheckError(message, rule="close", hint=hint) from error

@@ -28,13 +28,9 @@ def nan_action(run: Reference) -> str | None:
         np.full_like(subject.action_of(subject.actions[at], world), np.nan),
     )
     subject.run(at)
-    note = None
-    try:
-        event = _quietly(run, bad, lenient=world)
-    except EnvironmentCheckError:
-        raise
-    except Exception as error:
-        _refused(run, error, at, "NaN")
+    note, event = None, _tried(run, bad, lenient=world)
+    if isinstance(event, Exception):
+        _refused(run, event, at, "NaN")
     else:
         what = f"NaN in the action of world {world}"
         run.same_worlds(run.steps[at], event, "bad actions", what, _NAN, without=world, same=True)
@@ -53,12 +49,9 @@ def large_action(run: Reference) -> None:
     for sign in (1.0, -1.0):
         bound = np.where(np.isfinite(space.high), np.abs(space.high), 1.0)
         subject.run(0)
-        try:
-            _quietly(run, (sign * (10.0 * bound + 10.0)).astype(space.dtype))
-        except EnvironmentCheckError:
-            raise
-        except REFUSALS:
-            pass
+        found = _tried(run, (sign * (10.0 * bound + 10.0)).astype(space.dtype))
+        if isinstance(found, Exception) and not isinstance(found, REFUSALS):
+            raise found
     run.same_worlds(
         run.events[0],
         subject.reset(seed=subject.seed),
@@ -79,22 +72,14 @@ def wrong_shape(run: Reference) -> str | None:
         shapes = {f"{subject.num_envs + 1} worlds": np.concatenate([action[:1], action])}
         if action.ndim > 1 and not subject.composed:
             shapes["one number more"] = np.concatenate([action, action[..., :1]], axis=-1)
-        if not subject.composed and action.ndim > 1:
             shapes["no axis of worlds"] = action[0]
     for name, bad in shapes.items():
         subject.run(_quiet_step(run))
-        try:
-            _quietly(run, bad)
-        except EnvironmentCheckError:
-            raise
-        except Exception as error:
-            _refused(run, error, _quiet_step(run), f"an action of {name}")
-        else:
-            raise EnvironmentCheckError(
-                f"an action of {name} is accepted",
-                rule="bad actions",
-                hint="compare the action's shape with action_space.shape and raise a ValueError that names both",
-            )
+        found = _tried(run, bad)
+        if not isinstance(found, Exception):
+            hint = "compare the action's shape with action_space.shape and raise a ValueError that names both"
+            raise EnvironmentCheckError(f"an action of {name} is accepted", rule="bad actions", hint=hint)
+        _refused(run, found, _quiet_step(run), f"an action of {name}")
     return "the shape of a single world's action is left to the single environments" if subject.composed else None
 
 
@@ -113,30 +98,29 @@ def _not_async(run: Reference) -> None:
 
 def _quiet_step(run: Reference) -> int:
     """Return the index of an early step in which no episode ends."""
-    return next((i for i in (2, 1, 0) if i < len(run.steps) and _no_end(run, i)), 0)
+    first = len(run.steps) if run.first_end is None else run.first_end
+    return max(min(first - 1, 2), 0)
 
 
-def _no_end(run: Reference, index: int) -> bool:
-    """Whether no episode ended up to a step."""
-    return not any(event.done.any() for event in run.steps[: index + 1])
-
-
-def _quietly(run: Reference, action: Any, lenient: int | None = None) -> Event:
-    """Step without the warnings that bad numbers cause."""
+def _tried(run: Reference, action: Any, lenient: int | None = None) -> Event | Exception:
+    """Step without the warnings that bad numbers cause; return what came back, or the error of the environment."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return run.subject.step(action, lenient=lenient)
+        try:
+            return run.subject.step(action, lenient=lenient)
+        except EnvironmentCheckError:
+            raise
+        except Exception as error:
+            return error
 
 
 def _refused(run: Reference, error: Exception, at: int, what: str) -> None:
     """Check that an error is a refusal and that nothing moved."""
     subject = run.subject
     if not isinstance(error, REFUSALS):
-        raise EnvironmentCheckError(
-            f"{what} raises {type(error).__name__}: {error}",
-            rule="bad actions",
-            hint="check actions first and raise a ValueError or TypeError that says what was expected",
-        ) from error
+        message = f"{what} raises {type(error).__name__}: {error}"
+        hint = "check actions first and raise a ValueError or TypeError that says what was expected"
+        raise EnvironmentCheckError(message, rule="bad actions", hint=hint) from error
     if subject.composed:
         return  # single environments are stepped in turn, so those before the bad one have moved
     run.same_worlds(

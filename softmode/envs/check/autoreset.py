@@ -7,7 +7,8 @@ from gymnasium.vector import AutoresetMode
 
 from softmode.envs.check.episodes import Event
 from softmode.envs.check.reference import MASK_HINT, Reference, Skip
-from softmode.envs.check.values import equal, world_of
+from softmode.envs.check.values import equal
+from softmode.envs.tensors import world_of
 from softmode.errors import EnvironmentCheckError
 
 
@@ -45,12 +46,9 @@ def _next_step(run: Reference) -> None:
         for mine, other in zip(run.events, subject.run(end + 3, actions=actions), strict=False):
             part = mine.differs(other, int(world))
             if part:
-                raise EnvironmentCheckError(
-                    f"the {part} depends on the action given in the step that resets the world",
-                    rule="autoreset",
-                    world=int(world),
-                    hint="in NEXT_STEP mode ignore the action of a world that is being reset",
-                )
+                message = f"the {part} depends on the action given in the step that resets the world"
+                hint = "in NEXT_STEP mode ignore the action of a world that is being reset"
+                raise EnvironmentCheckError(message, rule="autoreset", world=int(world), hint=hint)
         _restarted(run, int(world), run.steps[end + 1], after=end + 1)
 
 
@@ -85,12 +83,8 @@ def _disabled(run: Reference) -> None:
         if event.done[world]:
             _restarted(run, world, after, after=end + 1)
         elif not equal(event.observation[world], after.observation[world]):
-            raise EnvironmentCheckError(
-                "a reset that its mask excludes it from changed its observation",
-                rule="isolation",
-                world=world,
-                hint=MASK_HINT,
-            )
+            message = "a reset that its mask excludes it from changed its observation"
+            raise EnvironmentCheckError(message, rule="isolation", world=world, hint=MASK_HINT)
 
 
 def _restarted(run: Reference, world: int, event: Event, *, after: int) -> None:
@@ -138,12 +132,9 @@ def time_limit(run: Reference) -> None:
                 )
             early = event.truncated[world] and length[world] < run.limit
             if early:
-                raise EnvironmentCheckError(
-                    f"an episode is truncated after {length[world]} steps, max_episode_steps is {run.limit}",
-                    rule="time limit",
-                    world=world,
-                    hint="restart the count when a world is reset",
-                )
+                message = f"an episode is truncated after {length[world]} steps, max_episode_steps is {run.limit}"
+                hint = "restart the count when a world is reset"
+                raise EnvironmentCheckError(message, rule="time limit", world=world, hint=hint)
             reached |= bool(length[world] == run.limit)
         pending = event.done if run.subject.mode is AutoresetMode.NEXT_STEP else np.zeros_like(pending)
         if run.subject.mode is not AutoresetMode.NEXT_STEP:

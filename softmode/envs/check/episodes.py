@@ -25,9 +25,9 @@ from softmode.envs.check.values import (
     equal,
     leaves,
     like,
-    world_of,
     worlds,
 )
+from softmode.envs.tensors import world_of
 from softmode.errors import EnvironmentCheckError
 
 
@@ -98,14 +98,13 @@ class Subject:
             raise EnvironmentCheckError(
                 f"reset returned {type(returned).__name__}", rule="observations", hint="return (observation, infos)"
             )
-        observation, infos = returned
-        self._sample = next((array for _, array in leaves(observation)), None)
-        batch = as_numpy(observation)
+        self._sample = next((array for _, array in leaves(returned[0])), None)
+        batch, infos = map(as_numpy, returned)
         check_observation(self.env, batch, "reset")
-        self._check_infos(infos)
+        check_infos(self.num_envs, infos, self._forms)
         none = np.zeros(self.num_envs, np.bool_)
         zeros = np.zeros(self.num_envs)
-        return Event(worlds(self.env, batch), zeros, none, none, as_numpy(infos), returned, False)
+        return Event(worlds(self.env, batch), zeros, none, none, infos, returned, False)
 
     def step(self, action: Any, *, lenient: int | None = None) -> Event:
         """Step and check what comes back; the values of world ``lenient`` may be anything."""
@@ -116,15 +115,10 @@ class Subject:
                 "step wrote into the action it was given", rule="no shared buffers", hint="copy actions before changes"
             )
         if not isinstance(returned, tuple) or len(returned) != 5:
-            raise EnvironmentCheckError(
-                f"step returned {type(returned).__name__}",
-                rule="observations",
-                hint="return (observation, reward, terminated, truncated, infos)",
-            )
-        observation, *scalars, infos = returned
-        batch = as_numpy(observation)
+            hint = "return (observation, reward, terminated, truncated, infos)"
+            raise EnvironmentCheckError(f"step returned {type(returned).__name__}", rule="observations", hint=hint)
+        batch, reward, terminated, truncated, infos = map(as_numpy, returned)
         check_observation(self.env, batch, "step", lenient)
-        reward, terminated, truncated = map(as_numpy, scalars)
         checked = reward
         if lenient is not None and isinstance(reward, np.ndarray) and reward.shape == (self.num_envs,):
             checked = reward.copy()
@@ -132,9 +126,9 @@ class Subject:
         check_reward(self.env, checked)
         check_flag(self.env, terminated, "terminated")
         check_flag(self.env, truncated, "truncated")
-        check_kinds(observation, dict(zip(("reward", "terminated", "truncated"), scalars, strict=True)))
-        self._check_infos(infos)
-        event = Event(worlds(self.env, batch), reward, terminated, truncated, as_numpy(infos), returned, True)
+        check_kinds(returned[0], dict(zip(("reward", "terminated", "truncated"), returned[1:4], strict=True)))
+        check_infos(self.num_envs, infos, self._forms)
+        event = Event(worlds(self.env, batch), reward, terminated, truncated, infos, returned, True)
         if self.mode is AutoresetMode.SAME_STEP:
             self._check_final(event)
         return event
@@ -189,10 +183,6 @@ class Subject:
                 return self.replace_action(action, world, item)
         return action
 
-    def _check_infos(self, infos: object) -> None:
-        """Check masks and forms."""
-        check_infos(self.num_envs, as_numpy(infos), self._forms)
-
     def _check_final(self, event: Event) -> None:
         """Rule ``autoreset``, SAME_STEP: the ended episodes' last observations and infos are in the infos."""
         done = event.done
@@ -209,19 +199,13 @@ class Subject:
         for world in np.flatnonzero(done):
             last = world_of(event.infos["final_obs"], int(world))
             if not self.env.single_observation_space.contains(last):
-                raise EnvironmentCheckError(
-                    f"infos['final_obs'] holds {last!r}, outside {self.env.single_observation_space}",
-                    rule="autoreset",
-                    world=int(world),
-                    hint="put the last observation of the ended episode there",
-                )
+                message = f"infos['final_obs'] holds {last!r}, outside {self.env.single_observation_space}"
+                hint = "put the last observation of the ended episode there"
+                raise EnvironmentCheckError(message, rule="autoreset", world=int(world), hint=hint)
             if not isinstance(event.infos["final_info"], Mapping | np.ndarray):
-                raise EnvironmentCheckError(
-                    f"infos['final_info'] is a {type(event.infos['final_info']).__name__}",
-                    rule="autoreset",
-                    world=int(world),
-                    hint="make it a dict of arrays with masks, as the infos are",
-                )
+                message = f"infos['final_info'] is a {type(event.infos['final_info']).__name__}"
+                hint = "make it a dict of arrays with masks, as the infos are"
+                raise EnvironmentCheckError(message, rule="autoreset", world=int(world), hint=hint)
 
 
 def _overwrite(returned: object) -> None:

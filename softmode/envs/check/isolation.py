@@ -56,19 +56,11 @@ def partial_reset(run: Reference) -> None:
     if not any(kept) and equal(full.observation, event.observation) and subject.mode is not AutoresetMode.DISABLED:
         raise Skip("reset_mask is ignored, which only DISABLED mode forbids")
     if not all(kept):
-        raise EnvironmentCheckError(
-            f"a reset of world {world} changed its observation",
-            rule="isolation",
-            world=kept.index(False),
-            hint=MASK_HINT,
-        )
+        message = f"a reset of world {world} changed its observation"
+        raise EnvironmentCheckError(message, rule="isolation", world=kept.index(False), hint=MASK_HINT)
     if run.exchangeable and not equal(full.observation[world], event.observation[world]):
-        raise EnvironmentCheckError(
-            "reset by its mask it sees something else than after a reset of all worlds",
-            rule="isolation",
-            world=world,
-            hint=MASK_HINT,
-        )
+        message = "reset by its mask it sees something else than after a reset of all worlds"
+        raise EnvironmentCheckError(message, rule="isolation", world=world, hint=MASK_HINT)
     # `start` is at most the first end, so events and steps still agree in number.
     for mine, action in zip(run.steps[start:], subject.actions[start : start + DEPTH], strict=False):
         other = subject.step(action)
@@ -83,11 +75,8 @@ def no_shared_buffers(run: Reference) -> None:
     for index, (arrays, copies) in enumerate(zip(kept, run.copies, strict=True)):
         for (path, array), (_, copy) in zip(arrays, copies, strict=True):
             if bits(array) != copy:
-                raise EnvironmentCheckError(
-                    f"{_part(path, run.events[index])} of call {index} changed after it was returned",
-                    rule="no shared buffers",
-                    hint=_OWN,
-                )
+                message = f"{_part(path, run.events[index])} of call {index} changed after it was returned"
+                raise EnvironmentCheckError(message, rule="no shared buffers", hint=_OWN)
     for index in range(1, min(len(kept), 6)):
         for path, array in kept[index]:
             for earlier, other in kept[index - 1]:

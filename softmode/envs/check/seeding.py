@@ -55,12 +55,8 @@ def seed_list(run: Reference) -> None:
         turned = subject.reset(seed=seeds[::-1])
         for world in range(subject.num_envs):
             if not equal(turned.observation[world], listed.observation[-1 - world]):
-                raise EnvironmentCheckError(
-                    f"reset(seed={seeds[::-1]}) does not start it from seed {seeds[-1 - world]}",
-                    rule="seeding",
-                    world=world,
-                    hint=_SEED_LIST,
-                )
+                message = f"reset(seed={seeds[::-1]}) does not start it from seed {seeds[-1 - world]}"
+                raise EnvironmentCheckError(message, rule="seeding", world=world, hint=_SEED_LIST)
 
 
 def seed_none(run: Reference) -> None:

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, iterate
 from numpy.typing import NDArray
 
-from softmode.envs.tensors import Tensor, host_array
+from softmode.envs.tensors import Tensor, host_array, map_tree
 from softmode.errors import EnvironmentCheckError
 
 
@@ -22,11 +22,11 @@ def as_numpy(value: object) -> Any:
 
     Libraries are recognised by their arrays' methods, so none is imported.
     """
-    if isinstance(value, Mapping):
-        return {key: as_numpy(item) for key, item in value.items()}
-    if isinstance(value, tuple | list):
-        items = map(as_numpy, value)
-        return type(value)(*items) if hasattr(value, "_fields") else type(value)(items)
+    return map_tree(_copied, value)
+
+
+def _copied(value: Any) -> Any:
+    """Return a leaf of a tree as a NumPy copy."""
     if isinstance(value, Tensor):
         return host_array(value).copy()
     if isinstance(value, np.ndarray) and value.dtype == object:
@@ -59,11 +59,7 @@ def like(action: object, sample: object) -> Any:
     if not isinstance(sample, Tensor):
         return action
     torch = sys.modules["torch"]  # it is there: the environment returned one of its tensors
-    if isinstance(action, Mapping):
-        return {key: like(item, sample) for key, item in action.items()}
-    if isinstance(action, tuple):
-        return tuple(like(item, sample) for item in action)
-    return torch.as_tensor(np.array(action), device=sample.device)
+    return map_tree(lambda item: torch.as_tensor(np.array(item), device=sample.device), action)
 
 
 def equal(a: object, b: object) -> bool:
@@ -90,15 +86,6 @@ def worlds(env: VectorEnv, batch: Any) -> list[Any]:
     return list(iterate(env.observation_space, batch))
 
 
-def world_of(values: Any, world: int) -> Any:
-    """Return world ``world`` of info values: a dict of arrays, an array of objects, or one array for all worlds."""
-    if isinstance(values, Mapping):
-        return {key: world_of(item, world) for key, item in values.items()}
-    if isinstance(values, tuple):
-        return tuple(world_of(item, world) for item in values)
-    return values[world]
-
-
 # -- rules ------------------------------------------------------------------------------------------------------------
 
 
@@ -120,22 +107,16 @@ def check_spaces(env: VectorEnv) -> None:
         # Gymnasium's own way of saying that bounds differ from world to world.
         different = getattr(env.unwrapped, "observation_mode", "same") != "same" and name == "observation_space"
         if not (is_space_dtype_shape_equiv(batched, wanted) if different else batched == wanted):
-            raise EnvironmentCheckError(
-                f"{name} is {batched}, expected {wanted}",
-                rule="spaces",
-                hint=f"use gymnasium.vector.utils.batch_space(single_{name}, num_envs)",
-            )
+            hint = f"use gymnasium.vector.utils.batch_space(single_{name}, num_envs)"
+            raise EnvironmentCheckError(f"{name} is {batched}, expected {wanted}", rule="spaces", hint=hint)
 
 
 def check_metadata(env: VectorEnv) -> AutoresetMode:
     """Rule ``autoreset mode``: metadata says how finished worlds restart."""
     mode = env.metadata.get("autoreset_mode")
     if not isinstance(mode, AutoresetMode):
-        raise EnvironmentCheckError(
-            f"metadata['autoreset_mode'] is {mode!r}",
-            rule="autoreset mode",
-            hint="set it to a member of gymnasium.vector.AutoresetMode, in the instance's own copy of metadata",
-        )
+        hint = "set it to a member of gymnasium.vector.AutoresetMode, in the instance's own copy of metadata"
+        raise EnvironmentCheckError(f"metadata['autoreset_mode'] is {mode!r}", rule="autoreset mode", hint=hint)
     return mode
 
 
@@ -165,12 +146,8 @@ def check_observation(env: VectorEnv, batch: Any, call: str, lenient: int | None
         return
     for world, item in enumerate(items):
         if world != lenient and not env.single_observation_space.contains(item):
-            raise EnvironmentCheckError(
-                f"{call} returned an observation outside {env.single_observation_space}: {item!r}",
-                rule="observations",
-                world=world,
-                hint=_INSIDE,
-            )
+            message = f"{call} returned an observation outside {env.single_observation_space}: {item!r}"
+            raise EnvironmentCheckError(message, rule="observations", world=world, hint=_INSIDE)
     if lenient is None:
         raise EnvironmentCheckError(
             f"{call} returned {shapes}, not contained in {env.observation_space}", rule="observations", hint=_INSIDE
@@ -195,39 +172,29 @@ def _check_dtypes(space: gym.Space, batch: object, call: str, path: str = "") ->
         for index, (part, item) in enumerate(zip(space.spaces, batch, strict=False)):
             _check_dtypes(part, item, call, f"{path}[{index}]")
     elif isinstance(space, gym.spaces.Box) and getattr(batch, "dtype", None) != space.dtype:
-        raise EnvironmentCheckError(
-            f"{call} returned{path} {_describe(batch)}, expected dtype {space.dtype}",
-            rule="observations",
-            hint="give the arrays the dtype of the space",
-        )
+        message = f"{call} returned{path} {_describe(batch)}, expected dtype {space.dtype}"
+        hint = "give the arrays the dtype of the space"
+        raise EnvironmentCheckError(message, rule="observations", hint=hint)
 
 
 def check_reward(env: VectorEnv, reward: object) -> None:
     """Rule ``rewards``: floats, one per world, finite."""
     if not isinstance(reward, np.ndarray) or reward.shape != (env.num_envs,) or reward.dtype.kind != "f":
-        raise EnvironmentCheckError(
-            f"step returned {_describe(reward)} as reward, expected floats of shape ({env.num_envs},)",
-            rule="rewards",
-            hint="return one floating-point array with a reward for every world",
-        )
+        message = f"step returned {_describe(reward)} as reward, expected floats of shape ({env.num_envs},)"
+        hint = "return one floating-point array with a reward for every world"
+        raise EnvironmentCheckError(message, rule="rewards", hint=hint)
     if not np.isfinite(reward).all():
         world = int(np.flatnonzero(~np.isfinite(reward))[0])
-        raise EnvironmentCheckError(
-            f"the reward is {reward[world]}",
-            rule="rewards",
-            world=world,
-            hint="end the episode of a world that diverges and give it a finite reward",
-        )
+        hint = "end the episode of a world that diverges and give it a finite reward"
+        raise EnvironmentCheckError(f"the reward is {reward[world]}", rule="rewards", world=world, hint=hint)
 
 
 def check_flag(env: VectorEnv, flag: object, name: str) -> None:
     """Rule ``flags``: booleans, one per world."""
     if not isinstance(flag, np.ndarray) or flag.shape != (env.num_envs,) or flag.dtype != np.bool_:
-        raise EnvironmentCheckError(
-            f"step returned {_describe(flag)} as {name}, expected bool of shape ({env.num_envs},)",
-            rule="flags",
-            hint=f"return {name} as one boolean array",
-        )
+        message = f"step returned {_describe(flag)} as {name}, expected bool of shape ({env.num_envs},)"
+        hint = f"return {name} as one boolean array"
+        raise EnvironmentCheckError(message, rule="flags", hint=hint)
 
 
 def check_kinds(observation: object, others: Mapping[str, object]) -> None:
@@ -257,11 +224,8 @@ def check_infos(
         path: Where in the infos this dict lies.
     """
     if not isinstance(infos, Mapping):
-        raise EnvironmentCheckError(
-            f"{path} is a {type(infos).__name__}",
-            rule="info masks",
-            hint="return a dict of arrays, not a list of dicts",
-        )
+        hint = "return a dict of arrays, not a list of dicts"
+        raise EnvironmentCheckError(f"{path} is a {type(infos).__name__}", rule="info masks", hint=hint)
     for key, values in infos.items():
         if not isinstance(key, str):
             raise EnvironmentCheckError(
@@ -270,19 +234,15 @@ def check_infos(
         where = f"{path}[{key!r}]"
         if key.startswith("_") and key[1:] in infos:
             if not isinstance(values, np.ndarray) or values.dtype != np.bool_ or values.shape != (num_envs,):
-                raise EnvironmentCheckError(
-                    f"{where} is {_describe(values)}, expected a mask: bool of shape ({num_envs},)",
-                    rule="info masks",
-                    hint=f"set {where}[i] to whether world i has {key[1:]!r}",
-                )
+                message = f"{where} is {_describe(values)}, expected a mask: bool of shape ({num_envs},)"
+                hint = f"set {where}[i] to whether world i has {key[1:]!r}"
+                raise EnvironmentCheckError(message, rule="info masks", hint=hint)
             continue
         # Inside a dict, whose own mask says it all, masks may be missing: Gymnasium's RecordEpisodeStatistics has none.
         if f"_{key}" not in infos and (path == "infos" or key.startswith("_")):
-            raise EnvironmentCheckError(
-                f"{where} has no mask {'_' + key!r}" if not key.startswith("_") else f"{where} masks nothing",
-                rule="info masks",
-                hint="pair every key with a boolean mask of its name after an underscore, as VectorEnv._add_info does",
-            )
+            message = f"{where} has no mask {'_' + key!r}" if not key.startswith("_") else f"{where} masks nothing"
+            hint = "pair every key with a boolean mask of its name after an underscore, as VectorEnv._add_info does"
+            raise EnvironmentCheckError(message, rule="info masks", hint=hint)
         if isinstance(values, Mapping) and key != "final_obs":
             check_infos(num_envs, values, seen, where)
             continue
@@ -290,11 +250,9 @@ def check_infos(
             if all(array.shape[:1] == (num_envs,) for _, array in leaves(values)):
                 continue
         if not isinstance(values, np.ndarray) or values.shape[:1] != (num_envs,):
-            raise EnvironmentCheckError(
-                f"{where} is {_describe(values)}, expected an array of {num_envs} values",
-                rule="info masks",
-                hint="return one array per key, the world being its first axis",
-            )
+            message = f"{where} is {_describe(values)}, expected an array of {num_envs} values"
+            hint = "return one array per key, the world being its first axis"
+            raise EnvironmentCheckError(message, rule="info masks", hint=hint)
         _check_same_form(values, seen, where)
 
 
@@ -305,8 +263,6 @@ def _check_same_form(values: NDArray[Any], seen: dict[str, tuple[tuple[int, ...]
     form = (values.shape, values.dtype)
     if seen.setdefault(where, form) != form:
         before = seen[where]
-        raise EnvironmentCheckError(
-            f"{where} is {form[1]}{form[0]}, and was {before[1]}{before[0]} before",
-            rule="info masks",
-            hint="give a key the same shape and dtype in every call",
-        )
+        message = f"{where} is {form[1]}{form[0]}, and was {before[1]}{before[0]} before"
+        hint = "give a key the same shape and dtype in every call"
+        raise EnvironmentCheckError(message, rule="info masks", hint=hint)

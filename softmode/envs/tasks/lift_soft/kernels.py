@@ -4,7 +4,7 @@ from enum import IntEnum
 
 import warp as wp
 
-from softmode.envs.reward_kernels import StepResult, WorldState, count_held, grasped, tool_position
+from softmode.envs.reward_kernels import StepResult, WorldState, count_held, grasped, tool_position, write
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,46 +28,35 @@ class Columns:
 
 
 @wp.struct
-class Rules:
-    """When the goal is met."""
+class Plan:
+    """Columns, what is lifted, and when the goal is met."""
 
+    drawn: Drawn
+    columns: Columns
+    height: float  # of the unscaled object's centre at rest [m]
     goal_tolerance: float  # [m]
     hold_steps: int
 
 
 @wp.kernel
-def observe(
-    state: WorldState,
-    drawn: Drawn,
-    column: Columns,
-    height: float,  # of the unscaled object's centre at rest [m]
-    # Out:
-    result: StepResult,
-):
+def observe(state: WorldState, plan: Plan, result: StepResult):
     """Write the goal, relative to the object and as a position, the rise and the distance."""
     w = wp.tid()
-    rest_height = height * state.parameters[w, drawn.scale]
+    rest_height = plan.height * state.parameters[w, plan.drawn.scale]
     goal = wp.vec3(
-        state.parameters[w, drawn.goal],
-        state.parameters[w, drawn.goal + 1],
-        rest_height + state.parameters[w, drawn.goal + 2],
+        state.parameters[w, plan.drawn.goal],
+        state.parameters[w, plan.drawn.goal + 1],
+        rest_height + state.parameters[w, plan.drawn.goal + 2],
     )
     x = state.object_position[w, 0]
-    for k in range(3):
-        result.observation[w, column.goal + k] = goal[k]
+    write(result.observation, w, plan.columns.goal, goal)
     result.metrics[w, Metric.object_height] = x[2] - rest_height
     result.metrics[w, Metric.goal_distance] = wp.length(goal - x)
     result.marker_place[w] = wp.transform(goal, wp.quat_identity())
 
 
 @wp.kernel
-def evaluate(
-    state: WorldState,
-    drawn: Drawn,
-    rules: Rules,
-    # In, out:
-    result: StepResult,
-):
+def evaluate(state: WorldState, plan: Plan, result: StepResult):
     """Reward reaching, grasping, lifting, nearing the goal, and staying there."""
     w = wp.tid()
     offset = state.object_position[w, 0] - tool_position(state, w)
@@ -75,11 +64,11 @@ def evaluate(
     grasp = wp.where(held_by_both, 1.0, 0.0)
     rise = result.metrics[w, Metric.object_height]
     distance = result.metrics[w, Metric.goal_distance]
-    there = held_by_both and distance <= rules.goal_tolerance
-    lifted = wp.clamp(rise / wp.max(state.parameters[w, drawn.goal + 2], 1.0e-3), 0.0, 1.0)
+    there = held_by_both and distance <= plan.goal_tolerance
+    lifted = wp.clamp(rise / wp.max(state.parameters[w, plan.drawn.goal + 2], 1.0e-3), 0.0, 1.0)
     result.terms[w, Term.reach] = 1.0 - wp.tanh(6.0 * wp.length(offset))
     result.terms[w, Term.grasp] = 0.5 * grasp
     result.terms[w, Term.lift] = 1.0 * lifted * grasp
     result.terms[w, Term.goal] = 2.0 * lifted * grasp * (1.0 - wp.tanh(10.0 * distance))
     result.terms[w, Term.hold] = wp.where(there, 2.0, 0.0)
-    count_held(there, rules.hold_steps, result, w)
+    count_held(there, plan.hold_steps, result, w)

@@ -15,7 +15,6 @@ from softmode.envs.parameters import Parameter
 from softmode.envs.presets import rl_scene
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.structs import filled
 from softmode.envs.task import Task
 from softmode.envs.task_config import TaskConfig
 from softmode.envs.tasks.lift_soft import kernels
@@ -81,43 +80,22 @@ class LiftSoft(Task):
 
     config: LiftSoftConfig
     config_class = LiftSoftConfig
+    kernels = kernels
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
-
-    def build(self) -> None:
-        """Look the columns up."""
-        self._drawn = self.table.columns_in(kernels.Drawn)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the goal: x, y [m] and how far to rise [m]."""
         config = self.config
-        middle = np.array([*config.scene.object_position, config.goal_height])
-        low, high = middle - config.goal_range, middle + config.goal_range
+        middle, half = np.array([*config.scene.object_position, config.goal_height]), np.array(config.goal_range)
+        low, high = tuple((middle - half).tolist()), tuple((middle + half).tolist())
         control = config.scene.control
-        return (
-            *super().parameters(),
-            Parameter(
-                name="goal",
-                low=tuple(low.tolist()),
-                high=tuple(high.tolist()),
-                least=(*control.workspace_lower[:2], 0.01),
-                most=(*control.workspace_upper[:2], 0.4),
-            ),
-        )
+        least, most = (*control.workspace_lower[:2], 0.01), (*control.workspace_upper[:2], 0.4)
+        return (*super().parameters(), Parameter(name="goal", low=low, high=high, least=least, most=most))
 
     def goal_segments(self) -> tuple[Segment, ...]:
         """The goal's position [m]."""
         return (Segment("goal", 3, -2.0, 2.0),)
-
-    def observe(self) -> None:
-        """Write goal, rise and distance."""
-        columns = self.layout.columns_in(kernels.Columns)
-        self.launch(kernels.observe, [self.state, self._drawn, columns, self.scene.soft.height], [self.result])
-
-    def evaluate(self) -> None:
-        """Judge the grasp and the height."""
-        rules = filled(kernels.Rules, self.config)
-        self.launch(kernels.evaluate, [self.state, self._drawn, rules], [self.result])
 
     def marker(self) -> Splats:
         """Return a small ball."""

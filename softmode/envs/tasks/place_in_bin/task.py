@@ -18,7 +18,6 @@ from softmode.envs.parameters import Parameter
 from softmode.envs.presets import RL_SOLVER
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.structs import filled
 from softmode.envs.task import Task
 from softmode.envs.task_config import TaskConfig
 from softmode.envs.tasks.place_in_bin import kernels
@@ -163,6 +162,7 @@ class PlaceInBin(Task):
 
     config: PlaceInBinConfig
     config_class = PlaceInBinConfig
+    kernels = kernels
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
 
@@ -181,15 +181,9 @@ class PlaceInBin(Task):
         self.highest = given.height + self.config.rim_allowance
         """Height of its centre below which an object is in the bin [m]."""
         points = [thing.body.surface_points for thing in self.scene.objects]
-        self._container = filled(
-            kernels.BinShape,
-            self,
-            given,
-            margin=0.3 * min(self.half),
-            height=self.scene.soft.height,
-            radius=float(np.linalg.norm(points[0], axis=1).max()),
-            clearance=CLEARANCE,
-        )
+        self.wall, self.floor, self.margin, self.clearance = given.wall, given.floor, 0.3 * min(self.half), CLEARANCE
+        self.radius = float(np.linalg.norm(points[0], axis=1).max())
+        self.other_offsets = self.column("other_offsets") if self.config.scene.others else 0
         scale = (self.config.scale_range or (1.0, 1.0))[1]
         self._check_room([scale * float(np.linalg.norm(x[:, :2], axis=1).max()) for x in points])
 
@@ -213,10 +207,8 @@ class PlaceInBin(Task):
             abs(x - self.rim[0]) - x_range - a - config.bin.wall, abs(y - self.rim[1]) - y_range - b - config.bin.wall
         )
         if apart < toy:
-            raise ConfigError(
-                f"a toy of radius {toy:.3f} m may start in the bin's wall",
-                hint="move scene.object_position or bin.position, or make position_range smaller",
-            )
+            hint = "move scene.object_position or bin.position, or make position_range smaller"
+            raise ConfigError(f"a toy of radius {toy:.3f} m may start in the bin's wall", hint=hint)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add place [m] and yaw [rad] of every other object."""
@@ -253,17 +245,7 @@ class PlaceInBin(Task):
         """Put the toy on the table and the others into the bin."""
         super().place()
         for k in range(1, len(self.scene.objects)):
-            self.place_object(k, f"other_position_{k}", f"other_yaw_{k}", self.config.bin.floor)
-
-    def observe(self) -> None:
-        """Write ways and distances."""
-        columns = self.layout.columns_in(kernels.Columns, other_offsets=0)
-        self.launch(kernels.observe, [self.state, columns, self._container], [self.result])
-
-    def evaluate(self) -> None:
-        """Judge where everything is."""
-        drawn, rules = self.table.columns_in(kernels.Drawn), filled(kernels.Rules, self.config)
-        self.launch(kernels.evaluate, [self.state, drawn, self._container, rules], [self.result])
+            self.place_object(k, f"other_position_{k}", f"other_yaw_{k}", ground=self.floor)
 
     def front_camera(self, name: str, edge: int) -> PinholeCamera:
         """Return the camera that looks over the rim into the bin, with pictures of `edge` x `edge` pixels."""

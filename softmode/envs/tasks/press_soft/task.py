@@ -16,7 +16,6 @@ from softmode.envs.parameters import Parameter
 from softmode.envs.presets import RL_SOLVER
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.structs import filled
 from softmode.envs.task import Task
 from softmode.envs.task_config import TaskConfig
 from softmode.envs.tasks.press_soft import kernels
@@ -38,8 +37,6 @@ CLEARANCE = 0.005
 """What has to remain of it over a pad that is scaled up [m]."""
 MOST_FORCE = 100.0
 """Greatest goal force that may be asked for [N]."""
-GAUGE = 0.01
-"""Height of the marker over the pad per newton that is missing [m/N]."""
 
 
 def press_scene() -> TableSceneConfig:
@@ -120,12 +117,9 @@ class PressSoft(Task):
 
     config: PressSoftConfig
     config_class = PressSoftConfig
+    kernels = kernels
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
-
-    def build(self) -> None:
-        """Look the columns up."""
-        self._drawn = self.table.columns_in(kernels.Drawn)
 
     @property
     def top(self) -> float:
@@ -168,18 +162,8 @@ class PressSoft(Task):
             Segment("missing_force", 1, -200.0, 200.0),
         )
 
-    def observe(self) -> None:
-        """Write the forces, the indentation and the distance from the middle."""
-        columns, pad = self.layout.columns_in(kernels.Columns), filled(kernels.Pad, self, gauge=GAUGE)
-        self.launch(kernels.observe, [self.state, self._drawn, columns, pad], [self.result])
-
-    def evaluate(self) -> None:
-        """Judge place and force."""
-        rules = filled(kernels.Rules, self.config)
-        self.launch(kernels.evaluate, [self.state, self._drawn, rules], [self.result])
-
     def marker(self) -> Splats:
-        """Return a small ball; it hangs beside the pad, over its top by `GAUGE` per newton that is missing."""
+        """Return a small ball; it hangs beside the pad, over its top by `kernels.GAUGE` per newton that is missing."""
         return sphere_marker(0.006)
 
     def front_camera(self, name: str, edge: int) -> PinholeCamera:

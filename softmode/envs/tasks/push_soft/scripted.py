@@ -67,7 +67,7 @@ class ScriptedPush(ScriptedPolicy):
             if self._yaw is None or abs(along + back) > 2.0 * self.CLEARANCE:
                 self._yaw = _across(towards, yaw)
             start = centre[:2] - (back + self.CLEARANCE) * towards
-            move = self._way_behind(tool, np.array([*start, low]), along < 0.0 and -along > back, centre, size)
+            move = self._way_behind(tool, np.array([*start, low]), along < 0.0 and -along > back, size)
             if np.linalg.norm(move) < self.LATERAL / 2.0 and abs(self._yaw - yaw) < 0.1:
                 self._phase = "push"
             return self._evenly(move, self._yaw - yaw)
@@ -80,17 +80,14 @@ class ScriptedPush(ScriptedPolicy):
         move = np.array([*(ahead * towards + sideways), low - tool[2]])
         return self._evenly(move, self._yaw - yaw)
 
-    def _way_behind(self, tool: Vector, goal: Vector, is_behind: bool, centre: Vector, size: float) -> Vector:
+    def _way_behind(self, tool: Vector, goal: Vector, is_behind: bool, size: float) -> Vector:
         """Return the move to the place behind the object: straight if it is free, else up, across and down."""
         above = 2.0 * self.scene.soft.height * size + 0.5 * self.arm.gripper.pad_size[2] + 0.012
         move = goal - tool
-        if is_behind and tool[2] < above - 0.005:
+        low = tool[2] < above - 0.005
+        if (is_behind and low) or np.linalg.norm(move[:2]) < 0.006:
             return move
-        if np.linalg.norm(move[:2]) < 0.006:
-            return move
-        if tool[2] < above - 0.005:
-            return np.array([0.0, 0.0, above - tool[2]])
-        return np.array([*move[:2], above - tool[2]])
+        return np.array([*((0.0, 0.0) if low else move[:2]), above - tool[2]])
 
     def _evenly(self, move: Vector, turn: float) -> NDArray[np.float32]:
         """Return the action for a move [m], shortened without a change of direction, and a turn [rad] of the tool."""

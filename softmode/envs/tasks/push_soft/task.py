@@ -17,9 +17,9 @@ from softmode.envs.parameters import Parameter
 from softmode.envs.presets import RL_SOLVER
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.structs import filled
 from softmode.envs.task import Task
 from softmode.envs.task_config import TaskConfig
+from softmode.envs.task_kernels import forget
 from softmode.envs.tasks.push_soft import kernels
 from softmode.objects.config import ObjectConfig
 from softmode.objects.loader import load
@@ -102,6 +102,7 @@ class PushSoft(Task):
 
     config: PushSoftConfig
     config_class = PushSoftConfig
+    kernels = kernels
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
 
@@ -109,25 +110,22 @@ class PushSoft(Task):
         """Allocate what the reward remembers."""
         self.before = wp.zeros(self.world_count, dtype=float, device=self.device)
         body = self.scene.soft.body
-        rest = body.surface_points[self.points]
-        self._rest = wp.array(rest, dtype=wp.vec3, device=self.device)
+        self.rest = wp.array(body.surface_points[self.points], dtype=wp.vec3, device=self.device)
+        self.yaw_tolerance = -1.0 if self.config.yaw_tolerance is None else self.config.yaw_tolerance
         pad = self.config.scene.arm.gripper.pad_size
         self.push_distance = float(np.linalg.norm(body.surface_points[:, :2], axis=1).max() + 0.5 * pad[0])
         """From the centre of the unscaled object to the tool that pushes it [m]."""
         self.push_height = self.config.scene.control.workspace_lower[2] + 0.006
         """Height of the tool that pushes [m]."""
-        self._columns = self.layout.columns_in(kernels.Columns)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the goal: distance [m] and direction [rad] from the object, and the angle to turn [rad]."""
         config = self.config
-        low, high = np.transpose((config.goal_distance, config.goal_direction)).tolist()
+        low, high = zip(config.goal_distance, config.goal_direction, strict=True)
         low_yaw, high_yaw = config.goal_yaw
         return (
             *super().parameters(),
-            Parameter(
-                name="goal", low=tuple(low), high=tuple(high), least=(0.0, -2.0 * np.pi), most=(0.5, 2.0 * np.pi)
-            ),
+            Parameter(name="goal", low=low, high=high, least=(0.0, -2.0 * np.pi), most=(0.5, 2.0 * np.pi)),
             Parameter(name="goal_yaw", low=(low_yaw,), high=(high_yaw,), least=(-2.0 * np.pi,), most=(2.0 * np.pi,)),
         )
 
@@ -150,18 +148,7 @@ class PushSoft(Task):
     def clear(self) -> None:
         """Forget how long the object rested and where it was."""
         super().clear()
-        self.launch(kernels.forget_distance, [self.scene.world_mask], [self.before])
-
-    def observe(self) -> None:
-        """Write goal, ways and errors."""
-        drawn, push = self.table.columns_in(kernels.Drawn), filled(kernels.Push, self)
-        self.launch(kernels.observe, [self.state, drawn, self._columns, push, self._rest], [self.result])
-
-    def evaluate(self) -> None:
-        """Judge the place, the speed and the way so far."""
-        config, yaw = self.config, self.config.yaw_tolerance
-        rules = filled(kernels.Rules, config, config.scene.control, yaw_tolerance=-1.0 if yaw is None else yaw)
-        self.launch(kernels.evaluate, [self.state, self._columns, rules], [self.result, self.before])
+        self.launch(forget, [self.scene.world_mask, -1.0], [self.before])
 
     def marker(self) -> Splats:
         """Return the outline of the object, to be drawn on the table."""

@@ -16,16 +16,14 @@ from softmode.envs.observation import Segment
 from softmode.envs.parameters import Parameter
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.structs import filled
 from softmode.envs.task import Task
 from softmode.envs.task_config import TaskConfig
-from softmode.envs.task_kernels import Placement
 from softmode.envs.tasks.rope_route import kernels
 from softmode.errors import ConfigError
 from softmode.objects.presets import ROPE, ROPE_MATERIAL
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
-from softmode.scenes.table_scene import GAP, Fixture, TableSceneConfig
+from softmode.scenes.table_scene import Fixture, TableSceneConfig
 from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
 
@@ -139,6 +137,7 @@ class RopeRoute(Task):
 
     config: RopeRouteConfig
     config_class = RopeRouteConfig
+    kernels = kernels
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
 
@@ -157,9 +156,7 @@ class RopeRoute(Task):
         """Points on the axis, from tail to end [m], shape (world_count, AXIS_POINTS)."""
         self.peg_height = min(peg.position[2] + peg.size[1] for peg in self.config.pegs)
         """Height of the lowest peg's top [m]."""
-        pegs = wp.array([peg.position[:2] for peg in self.config.pegs], dtype=wp.vec2, device=device)
-        self._rope = filled(kernels.Rope, self, height=self.scene.soft.height, peg_position=pegs)
-        self._columns = self.layout.columns_in(kernels.Columns)
+        self.peg_position = wp.array([peg.position[:2] for peg in self.config.pegs], dtype=wp.vec2, device=device)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the side of the first peg, and the goal: aside of the last peg, and beyond it [m]."""
@@ -189,24 +186,13 @@ class RopeRoute(Task):
         )
 
     def place(self) -> None:
-        """Put the rope down."""
-        scene, columns = self.scene, self.table.columns_in(Placement)
-        self.launch(
-            kernels.place_rope,
-            [scene.world_mask, self.state, columns, self._rope, GAP],
-            [scene.place_position, scene.place_yaw],
-        )
+        """Put the rope down along y, its end where the position says."""
+        self.place_object(0, "position", "yaw", turn=0.5 * np.pi, shift=self.half_length)
 
     def observe(self) -> None:
         """Trace the axis and write goal, end and winding."""
         self.launch(kernels.trace_axis, [self.state, self._rest, self._basis], [self.axis], self.axis.shape)
-        drawn = self.table.columns_in(kernels.Drawn)
-        self.launch(kernels.observe, [self.state, drawn, self._columns, self._rope], [self.result])
-
-    def evaluate(self) -> None:
-        """Judge the route and the end's place."""
-        rules = filled(kernels.Rules, self.config)
-        self.launch(kernels.evaluate, [self.state, self._columns, self._rope, rules], [self.result])
+        super().observe()
 
     def marker(self) -> Splats:
         """Return a ball."""

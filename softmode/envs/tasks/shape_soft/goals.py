@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from softmode.deformables.model.structs import filled
 from softmode.envs.end_reason import EndReason
-from softmode.envs.structs import filled
 from softmode.envs.tasks.shape_soft import kernels
 from softmode.envs.tasks.shape_soft.config import ShapeSoftConfig
 from softmode.envs.tensors import Tensor
@@ -55,10 +55,8 @@ class GoalMethods:
             pair = tuple(np.asarray(goal, np.float32) for goal in pair)
         leading = tuple(pair[0].shape[:-1])
         if any(tuple(goal.shape) != (*leading, size) for goal in pair):
-            raise ConfigError(
-                f"goals have shapes {tuple(pair[0].shape)} and {tuple(pair[1].shape)}",
-                hint=f"give both the same shape (..., {size})",
-            )
+            hint = f"give both the same shape (..., {size})"
+            raise ConfigError(f"goals have shapes {tuple(pair[0].shape)} and {tuple(pair[1].shape)}", hint=hint)
         if not isinstance(pair[0], Tensor):
             goals = [wp.array(goal.reshape(-1, size), dtype=float, device=self.device) for goal in pair]
             return self._launch(goals).numpy().reshape(leading)[()]

@@ -4,7 +4,7 @@ from enum import IntEnum
 
 import warp as wp
 
-from softmode.envs.reward_kernels import StepResult, WorldState, count_held, surface_point
+from softmode.envs.reward_kernels import StepResult, WorldState, count_held, surface_point, write
 
 wp.set_module_options({"enable_backward": False})
 
@@ -51,25 +51,36 @@ class Rules:
     hold_steps: int
 
 
+@wp.struct
+class Plan:
+    """Columns, the recorded press, and what the reward depends on."""
+
+    drawn: Drawn
+    columns: Columns
+    target: Target
+    rules: Rules
+    arm_size: int  # how much proprioception is
+
+
 @wp.func
-def target_point(state: WorldState, drawn: Drawn, target: Target, w: int, i: int):
+def target_point(state: WorldState, plan: Plan, w: int, i: int):
     """Return a point of the target shape: the press that was recorded, turned about the vertical.
 
     A post at yaw psi that is pressed in direction alpha + 90 degrees: R(alpha) x(R(psi - alpha) X), x the press.
     """
-    directions = target.points.shape[0]
-    levels = target.points.shape[1]
-    alpha = state.parameters[w, drawn.goal + 1] - 0.25 * TURN
-    turns = (state.parameters[w, drawn.yaw] - alpha) / TURN
+    directions = plan.target.points.shape[0]
+    levels = plan.target.points.shape[1]
+    alpha = state.parameters[w, plan.drawn.goal + 1] - 0.25 * TURN
+    turns = (state.parameters[w, plan.drawn.yaw] - alpha) / TURN
     at = (turns - wp.floor(turns)) * float(directions)
     j = wp.min(int(at), directions - 1)
     u = at - float(j)
-    depth = wp.clamp(state.parameters[w, drawn.goal] / target.displacement_max, 0.0, 1.0) * float(levels - 1)
+    depth = wp.clamp(state.parameters[w, plan.drawn.goal] / plan.target.displacement_max, 0.0, 1.0) * float(levels - 1)
     k = wp.min(int(depth), levels - 2)
     v = depth - float(k)
     m = (j + 1) % directions
-    near = (1.0 - v) * target.points[j, k, i] + v * target.points[j, k + 1, i]
-    far = (1.0 - v) * target.points[m, k, i] + v * target.points[m, k + 1, i]
+    near = (1.0 - v) * plan.target.points[j, k, i] + v * plan.target.points[j, k + 1, i]
+    far = (1.0 - v) * plan.target.points[m, k, i] + v * plan.target.points[m, k + 1, i]
     x = (1.0 - u) * near + u * far
     c = wp.cos(alpha)
     s = wp.sin(alpha)
@@ -77,9 +88,9 @@ def target_point(state: WorldState, drawn: Drawn, target: Target, w: int, i: int
 
 
 @wp.func
-def foot_position(state: WorldState, drawn: Drawn, w: int):
+def foot_position(state: WorldState, plan: Plan, w: int):
     """Return the middle of the foot, on the table [m]."""
-    return wp.vec3(state.parameters[w, drawn.position], state.parameters[w, drawn.position + 1], 0.0)
+    return wp.vec3(state.parameters[w, plan.drawn.position], state.parameters[w, plan.drawn.position + 1], 0.0)
 
 
 @wp.func
@@ -113,45 +124,29 @@ def reward_terms(error: float, rules: Rules):
 
 
 @wp.kernel
-def observe_points(
-    state: WorldState,
-    drawn: Drawn,
-    column: Columns,
-    target: Target,
-    # Out:
-    result: StepResult,
-):
+def observe_points(state: WorldState, plan: Plan, result: StepResult):
     """Write a point of the target shape and where it is now, relative to the foot on the table."""
     w, i = wp.tid()
-    x = target_point(state, drawn, target, w, i)
-    now = surface_point(state, w, i) - foot_position(state, drawn, w)
-    for a in range(3):
-        result.observation[w, column.desired_goal + 3 * i + a] = x[a]
-        result.observation[w, column.achieved_goal + 3 * i + a] = now[a]
+    now = surface_point(state, w, i) - foot_position(state, plan, w)
+    write(result.observation, w, plan.columns.desired_goal + 3 * i, target_point(state, plan, w, i))
+    write(result.observation, w, plan.columns.achieved_goal + 3 * i, now)
 
 
 @wp.kernel
-def observe(
-    column: Columns,
-    arm_size: int,
-    rules: Rules,
-    # In, out:
-    result: StepResult,
-):
+def observe(state: WorldState, plan: Plan, result: StepResult):
     """Write the error, and proprioception once more."""
     w = wp.tid()
-    for k in range(arm_size):
-        result.observation[w, column.arm + k] = result.observation[w, column.tool_position + k]
+    for k in range(plan.arm_size):
+        result.observation[w, plan.columns.arm + k] = result.observation[w, plan.columns.tool_position + k]
     seen = result.observation
-    error = shape_error(seen, column.achieved_goal, seen, column.desired_goal, rules.point_count, w)
+    error = shape_error(seen, plan.columns.achieved_goal, seen, plan.columns.desired_goal, plan.rules.point_count, w)
     result.metrics[w, Metric.shape_error] = error
 
 
 @wp.kernel
 def shape_marker(
     state: WorldState,
-    drawn: Drawn,
-    target: Target,
+    plan: Plan,
     first: int,  # of the marker's points in the table
     # Out:
     marker_points: wp.array2d[wp.vec3],
@@ -159,26 +154,21 @@ def shape_marker(
 ):
     """Bend the marker into the target shape."""
     w, i = wp.tid()
-    marker_points[w, i] = target_point(state, drawn, target, w, first + i)
+    marker_points[w, i] = target_point(state, plan, w, first + i)
     if i == 0:
-        result.marker_place[w] = wp.transform(foot_position(state, drawn, w), wp.quat_identity())
+        result.marker_place[w] = wp.transform(foot_position(state, plan, w), wp.quat_identity())
 
 
 @wp.kernel
-def evaluate(
-    column: Columns,
-    rules: Rules,
-    # In, out:
-    result: StepResult,
-):
+def evaluate(state: WorldState, plan: Plan, result: StepResult):
     """Reward nearness to the target shape, and being there."""
     w = wp.tid()
-    seen = result.observation
-    error = shape_error(seen, column.achieved_goal, seen, column.desired_goal, rules.point_count, w)
-    pair = reward_terms(error, rules)
+    seen = result.observation  # bounded by now, as the goals are that learners compute rewards from
+    error = shape_error(seen, plan.columns.achieved_goal, seen, plan.columns.desired_goal, plan.rules.point_count, w)
+    pair = reward_terms(error, plan.rules)
     result.terms[w, Term.shape] = pair[0]
     result.terms[w, Term.there] = pair[1]
-    count_held(error <= rules.goal_tolerance, rules.hold_steps, result, w)
+    count_held(error <= plan.rules.goal_tolerance, plan.rules.hold_steps, result, w)
 
 
 @wp.kernel

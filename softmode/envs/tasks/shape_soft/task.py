@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from softmode.deformables.model.structs import filled
 from softmode.envs.markers import dots
 from softmode.envs.observation import PROPRIOCEPTION, Segment
 from softmode.envs.parameters import Parameter
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.structs import filled
 from softmode.envs.task import Task
 from softmode.envs.tasks.shape_soft import kernels
 from softmode.envs.tasks.shape_soft.config import ShapeSoftConfig
@@ -35,6 +35,7 @@ class ShapeSoft(Task):
 
     config: ShapeSoftConfig
     config_class = ShapeSoftConfig
+    kernels = kernels
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
     point_count = POINTS
@@ -48,20 +49,15 @@ class ShapeSoft(Task):
             rest = np.concatenate([rest, body.surface_points])
             scene.marker_points = wp.zeros((self.world_count, body.surface_count), dtype=wp.vec3, device=self.device)
         self.targets = ShapeTargets.from_press(body, press, rest, self.device)
-        self._columns, self._rules = self.layout.columns_in(kernels.Columns), reward_rules(self.config)
+        self.target, self.rules = filled(kernels.Target, self.targets), reward_rules(self.config)
+        self.arm_size = self.segments["arm"][1].size
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the goal: displacement of the free end [m] and direction [rad]."""
         config = self.config
-        low, high = np.transpose((config.goal_displacement, config.goal_direction)).tolist()
-        goal = Parameter(
-            name="goal",
-            low=tuple(low),
-            high=tuple(high),
-            least=(0.0, -2.0 * np.pi),
-            most=(config.goal_displacement[1], 2.0 * np.pi),
-        )
-        return (*super().parameters(), goal)
+        low, high = zip(config.goal_displacement, config.goal_direction, strict=True)
+        least, most = (0.0, -2.0 * np.pi), (config.goal_displacement[1], 2.0 * np.pi)
+        return (*super().parameters(), Parameter(name="goal", low=low, high=high, least=least, most=most))
 
     def goal_segments(self) -> tuple[Segment, ...]:
         """The points of the target shape [m]."""
@@ -82,18 +78,12 @@ class ShapeSoft(Task):
 
     def observe(self) -> None:
         """Write both goals and the error."""
-        scene, columns, shape = self.scene, self._columns, (self.world_count, self.point_count)
-        drawn, target = self.table.columns_in(kernels.Drawn), filled(kernels.Target, self.targets)
-        self.launch(kernels.observe_points, [self.state, drawn, columns, target], [self.result], shape)
-        self.launch(kernels.observe, [columns, self.segments["arm"][1].size, self._rules], [self.result])
-        if scene.cameras:
-            points = scene.marker_points
-            inputs = [self.state, drawn, target, self.point_count]
+        shape = (self.world_count, self.point_count)
+        self.launch(kernels.observe_points, [self.state, self.plan], [self.result], shape)
+        super().observe()
+        if self.scene.cameras:
+            points, inputs = self.scene.marker_points, [self.state, self.plan, self.point_count]
             self.launch(kernels.shape_marker, inputs, [points, self.result], points.shape)
-
-    def evaluate(self) -> None:
-        """Judge the shape."""
-        self.launch(kernels.evaluate, [self._columns, self._rules], [self.result])
 
     def marker(self) -> Splats:
         """Return the surface of the post; `observe` bends it."""
