@@ -14,7 +14,7 @@ from softmode.cli.record import Record
 from softmode.cli.splat import SplatConvert, SplatFromMesh, SplatInfo
 from softmode.cli.train import Evaluate, Export, Train
 from softmode.cli.view import View
-from softmode.errors import MissingExtraError, SoftmodeError
+from softmode.errors import SoftmodeError, needs_extra
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -23,12 +23,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"softmode {__version__}")
         return 0
     try:
-        try:
+        with needs_extra("demo", "the command line needs tyro"):
             import tyro
-        except ImportError as error:
-            raise MissingExtraError(
-                "the command line needs tyro", hint="install it with: pip install 'softmode[demo]'"
-            ) from error
         splat = Annotated[
             Annotated[SplatFromMesh, tyro.conf.subcommand("from-mesh")]
             | Annotated[SplatInfo, tyro.conf.subcommand("info")]

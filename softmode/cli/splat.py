@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from softmode.checks import require_number
+from softmode.cli.common import bar_interval, quiet_warp, warp_device
 from softmode.errors import AssetError
 from softmode.files import check_place
 
@@ -44,7 +45,6 @@ class SplatFromMesh:
 
         from tqdm import tqdm
 
-        from softmode.cli.common import bar_interval, quiet_warp, warp_device
         from softmode.objects.mesh_file import read_mesh
         from softmode.splats.formats import write_splats
 

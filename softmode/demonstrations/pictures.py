@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.errors import AssetError, MissingExtraError
+from softmode.errors import AssetError, needs_extra
 from softmode.files import storage_errors
 
 _SPACE = "free some space"
@@ -56,12 +56,8 @@ def decode_png(data: bytes, shape: tuple[int, ...], what: str) -> NDArray[np.uin
 
 def ffmpeg() -> Any:
     """Return imageio_ffmpeg, or raise MissingExtraError."""
-    try:
+    with needs_extra("data", "films need imageio-ffmpeg", otherwise=", or store PNG pictures"):
         import imageio_ffmpeg
-    except ImportError as error:
-        raise MissingExtraError(
-            "films need imageio-ffmpeg", hint="install it with: pip install 'softmode[data]', or store PNG pictures"
-        ) from error
     return imageio_ffmpeg
 
 

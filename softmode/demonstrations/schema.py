@@ -19,7 +19,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from softmode.errors import ConfigError, MissingExtraError
+from softmode.errors import ConfigError, needs_extra
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -132,13 +132,9 @@ def feature_from_json(entry: Mapping[str, Any]) -> Feature:
 
 def arrow() -> Any:
     """Return pyarrow, or raise MissingExtraError."""
-    try:
+    with needs_extra("data", "datasets need pyarrow"):
         import pyarrow
         import pyarrow.parquet
-    except ImportError as error:
-        raise MissingExtraError(
-            "datasets need pyarrow", hint="install it with: pip install 'softmode[data]'"
-        ) from error
     return pyarrow
 
 

@@ -12,14 +12,10 @@ import gymnasium as gym
 import numpy as np
 
 from softmode.checks import require_number
-from softmode.errors import CheckpointError, ConfigError, MissingExtraError
+from softmode.errors import CheckpointError, ConfigError, needs_extra
 
-try:
+with needs_extra("rl", "trained policies need torch"):
     import torch
-except ImportError as error:
-    raise MissingExtraError(
-        "trained policies need torch", hint="install it with: pip install 'softmode[rl]'"
-    ) from error
 
 from softmode.learning.checkpoints import Checkpoint, check_env, read_checkpoint
 from softmode.learning.distributed import local_device

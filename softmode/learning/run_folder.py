@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from softmode.errors import MissingExtraError, RunError
+from softmode.errors import RunError, needs_extra
 from softmode.files import storage_errors, whole_file
 
 CONFIG, PROGRESS, LATEST, BEST = "config.json", "progress.csv", "latest.npz", "best.npz"
@@ -137,12 +137,8 @@ class RunFolder:
         Raises:
             MissingExtraError: If tensorboard is not installed.
         """
-        try:
+        with needs_extra("rl", "TensorBoard scalars need tensorboard"):
             from torch.utils.tensorboard import SummaryWriter
-        except ImportError as error:
-            raise MissingExtraError(
-                "TensorBoard scalars need tensorboard", hint="install it with: pip install 'softmode[rl]'"
-            ) from error
         self._writer = SummaryWriter(os.fspath(self.path / "tensorboard"), purge_step=purge_after)
 
     def close(self) -> None:

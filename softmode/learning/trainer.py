@@ -15,12 +15,10 @@ import gymnasium as gym
 import numpy as np
 
 from softmode import __version__
-from softmode.errors import CheckpointError, ConfigError, MissingExtraError, RunError, TrainingDiverged
+from softmode.errors import CheckpointError, ConfigError, MissingExtraError, RunError, TrainingDiverged, needs_extra
 
-try:
+with needs_extra("rl", "training needs torch"):
     import torch
-except ImportError as error:
-    raise MissingExtraError("training needs torch", hint="install it with: pip install 'softmode[rl]'") from error
 
 from softmode.learning.checkpoints import Checkpoint, check_env, read_checkpoint, same_env, write_checkpoint
 from softmode.learning.distributed import Ranks, local_device

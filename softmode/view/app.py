@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.checks import require_number
-from softmode.errors import ConfigError, MissingExtraError, SoftmodeError
+from softmode.errors import ConfigError, SoftmodeError, needs_extra
 from softmode.view.panel import Command, MouseMode, Panel
 from softmode.view.stage import Stage
 
@@ -290,12 +290,8 @@ def _forward(wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _viser() -> Any:
     """Import viser."""
-    try:
+    with needs_extra("viz", "the browser tool needs viser"):
         import viser
-    except ImportError as error:
-        raise MissingExtraError(
-            "the browser tool needs viser", hint="install it with: pip install 'softmode[viz]'"
-        ) from error
     return viser
 
 

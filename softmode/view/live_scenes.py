@@ -19,7 +19,7 @@ from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.materials.material import Material
 from softmode.deformables.tools.grips import GripOptions
 from softmode.errors import ConfigError
-from softmode.learning.players import POLICIES, check_policy, policy_factory, trained_policy
+from softmode.learning.players import check_policy, policy_factory, trained_policy
 from softmode.objects.config import ObjectConfig
 from softmode.objects.placed import Placed
 from softmode.objects.soft_object import SoftObject
@@ -172,7 +172,7 @@ class EnvScene:
             raise ConfigError(f"config is a {type(config).__name__}", hint=f"{name} takes a {kind.__name__}")
         require_number("seed", seed, at_least=0, at_most=SEED_MAX)
         check_policy(policy)
-        trained = None if policy in POLICIES else trained_policy(policy, name)
+        trained = trained_policy(policy, name)
         given = dict(trained.env_options) if trained else {}
         learnt = config_of(kind, given.pop("config", {}))
         base = learnt if config is None else config

@@ -16,7 +16,7 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.build.cubature import POISSON_RATIO
 from softmode.deformables.build.reduced_stiffness import elastic_modes, reduced_stiffness
 from softmode.deformables.build.report import BodyReport
-from softmode.errors import ConfigError, MissingExtraError
+from softmode.errors import ConfigError, needs_extra
 from softmode.files import whole_file
 from softmode.splats.splats import SH_DC, Splats
 
@@ -93,13 +93,9 @@ def write_body_picture(
         ConfigError: If the name is not that of a .png.
         StorageError: If it cannot be written.
     """
-    try:
+    with needs_extra("viz", "the picture of a body needs matplotlib"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtraError(
-            "the picture of a body needs matplotlib", hint="install it with: pip install 'softmode[viz]'"
-        ) from error
     from PIL import Image
 
     target = Path(path)

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from softmode.errors import ConfigError, MissingExtraError
+from softmode.errors import ConfigError, needs_extra
 from softmode.files import PendingFile
 
 if TYPE_CHECKING:
@@ -31,14 +31,9 @@ class Film:
 
     def __init__(self, path: Path) -> None:
         """Claim a temporary file beside ``path``."""
-        try:
+        with needs_extra("demo", "writing a video needs imageio and imageio-ffmpeg"):
             import imageio.v2  # noqa: F401
             import imageio_ffmpeg  # noqa: F401
-        except ImportError as error:
-            raise MissingExtraError(
-                "writing a video needs imageio and imageio-ffmpeg",
-                hint="install them with: pip install 'softmode[demo]'",
-            ) from error
         if path.suffix.lower() != ".mp4":
             raise ConfigError(f"video {path} is no .mp4 file", hint="name it like out/lift.mp4")
         self.path = path
