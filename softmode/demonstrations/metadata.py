@@ -12,7 +12,7 @@ import numpy as np
 
 from softmode.demonstrations import schema
 from softmode.demonstrations.schema import INDEX_FEATURES, Feature
-from softmode.demonstrations.statistics import QUANTILES, Statistics
+from softmode.demonstrations.statistics import QUANTILES, Statistics, combine
 from softmode.errors import AssetError, ConfigError
 
 LARGEST_JSON = 64 << 20
@@ -46,10 +46,17 @@ class Metadata:
 
     def data_table(self, row: Mapping[str, Any]) -> Any:
         """Return the table that holds an episode's frames; raises AssetError if it does not."""
-        path = self.folder / schema.DATA_PATH.format(
-            chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]
-        )
-        return read_table(path)
+        return read_table(self.folder / schema.DATA_PATH.format(**file_of(row, "data")))
+
+    def combined(self) -> dict[str, Statistics]:
+        """Return the statistics over all episodes by feature."""
+        names = self.statistics[0] if self.statistics else {}
+        return {name: combine([part[name] for part in self.statistics]) for name in names}
+
+
+def file_of(row: Mapping[str, Any], kind: str) -> dict[str, int]:
+    """Return the place of a file that an episode's row names; see :func:`softmode.demonstrations.schema.place_of`."""
+    return {key: row[f"{kind}/{key}"] for key in ("chunk_index", "file_index")}
 
 
 def read_json(path: Path) -> dict[str, Any]:

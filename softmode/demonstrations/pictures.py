@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
@@ -124,7 +124,7 @@ class FilmWriter:
             self._sink.close()
 
 
-def read_film(path: Path, shape: tuple[int, ...]) -> Iterator[NDArray[np.uint8]]:
+def read_film(path: Path, shape: tuple[int, ...]) -> Generator[NDArray[np.uint8], None, None]:
     """Yield the pictures of a film one after the other.
 
     Args:

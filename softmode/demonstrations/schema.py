@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
+from softmode.checks import require_choice
 from softmode.errors import ConfigError, needs_extra
 
 if TYPE_CHECKING:
@@ -34,6 +35,12 @@ EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.par
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 INFO_PATH, STATISTICS_PATH, TASKS_PATH = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"
 IMAGE_NAMES = ("height", "width", "channels")
+
+
+def place_of(number: int) -> dict[str, int]:
+    """Return the chunk of a file and its number within, by their names in the templates of paths."""
+    chunk, within = divmod(number, CHUNK_SIZE)
+    return {"chunk_index": chunk, "file_index": within}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +60,7 @@ class Feature:
 
     def __post_init__(self) -> None:
         """Check the combination."""
-        if self.dtype not in get_args(FeatureType):
-            raise ConfigError(f"feature type {self.dtype!r} is unknown", hint=f"use one of {get_args(FeatureType)}")
+        require_choice("feature type", self.dtype, get_args(FeatureType))
         if not all(type(edge) is int and 0 < edge <= 1 << 20 for edge in self.shape):
             raise ConfigError(f"feature shape {self.shape} must hold positive whole numbers")
         if self.is_picture:
@@ -77,10 +83,7 @@ class Feature:
 
 INDEX_FEATURES = {
     "timestamp": Feature(dtype="float32", shape=(1,)),
-    "frame_index": Feature(dtype="int64", shape=(1,)),
-    "episode_index": Feature(dtype="int64", shape=(1,)),
-    "index": Feature(dtype="int64", shape=(1,)),
-    "task_index": Feature(dtype="int64", shape=(1,)),
+    **{n: Feature(dtype="int64", shape=(1,)) for n in ("frame_index", "episode_index", "index", "task_index")},
 }
 """Columns that every dataset has and that the writer fills in: time within the episode [s], number of the frame within
 its episode, of the episode, of the frame within the dataset, and of the task."""
@@ -162,27 +165,14 @@ def tasks_schema() -> pa.Schema:
     """Return the schema of the table of tasks, a pandas frame whose index is the sentence."""
     pa = arrow()
 
-    def column(name: str | None, field: str, kind: str, numpy_kind: str) -> dict[str, Any]:
-        return {
-            "name": name,
-            "field_name": field,
-            "pandas_type": kind,
-            "numpy_type": numpy_kind,
-            "metadata": None,
-        }
+    def column(name: str | None, field: str | None, kind: str, numpy_kind: str, metadata: Any = None) -> dict[str, Any]:
+        kinds = {"pandas_type": kind, "numpy_type": numpy_kind}
+        return {"name": name, "field_name": field, **kinds, "metadata": metadata}
 
     index = "__index_level_0__"
     pandas = {
         "index_columns": [index],
-        "column_indexes": [
-            {
-                "name": None,
-                "field_name": None,
-                "pandas_type": "unicode",
-                "numpy_type": "object",
-                "metadata": {"encoding": "UTF-8"},
-            }
-        ],
+        "column_indexes": [column(None, None, "unicode", "object", {"encoding": "UTF-8"})],
         "columns": [column("task_index", "task_index", "int64", "int64"), column(None, index, "unicode", "object")],
         "creator": {"library": "pyarrow", "version": pa.__version__},
         "pandas_version": "2.2.0",

@@ -13,7 +13,7 @@ from typing import Any
 
 from softmode.demonstrations import schema
 from softmode.demonstrations.episode import Episode
-from softmode.demonstrations.metadata import Metadata, read_metadata
+from softmode.demonstrations.metadata import Metadata, file_of, read_metadata
 from softmode.demonstrations.schema import INDEX_FEATURES, Feature
 from softmode.demonstrations.statistics import Statistics, combine
 from softmode.demonstrations.tables import listed, rows_table, tasks_table, write_json, write_table
@@ -141,26 +141,18 @@ class DatasetWriter:
         self._robot_type = found.robot_type
         if not found.rows:
             return
-        self._statistics = {name: combine([row[name] for row in found.statistics]) for name in found.statistics[0]}
+        self._statistics = found.combined()
         last = found.rows[-1]
-        if (last["meta/episodes/chunk_index"], last["meta/episodes/file_index"]) != (
-            last["data/chunk_index"],
-            last["data/file_index"],
-        ):
+        file = file_of(last, "data")
+        if file_of(last, "meta/episodes") != file or not (table := found.data_table(last)).schema.equals(self._schema):
             raise ConfigError(f"{self.folder} was written by another program", hint="record into another folder")
-        self._file = last["data/chunk_index"] * schema.CHUNK_SIZE + last["data/file_index"]
-        videos = [row for row in (last.get(f"videos/{name}/file_index") for name in self.features) if row is not None]
-        if videos:
+        self._file = file["chunk_index"] * schema.CHUNK_SIZE + file["file_index"]
+        if any(last.get(f"videos/{name}/file_index") is not None for name in self.features):
             self._films_done = self._episode_count - 1
-        table = found.data_table(last)
-        if not table.schema.equals(self._schema):
-            raise ConfigError(f"{self.folder} was written by another program", hint="record into another folder")
-        here = [row for row in found.rows if row["data/file_index"] == last["data/file_index"]]
-        here = [row for row in here if row["data/chunk_index"] == last["data/chunk_index"]]
-        first = here[0]["dataset_from_index"]
-        for row in here:  # what a killed recording left behind the last episode is not taken over
-            self._rows.append({key: value for key, value in row.items()})
-            self._tables.append(table.slice(row["dataset_from_index"] - first, row["length"]))
+        self._rows = [row for row in found.rows if file_of(row, "data") == file]
+        first = self._rows[0]["dataset_from_index"]
+        # What a killed recording left behind the last episode is not taken over.
+        self._tables = [table.slice(row["dataset_from_index"] - first, row["length"]) for row in self._rows]
 
     # -- frames -------------------------------------------------------------------------------------------------------
 
@@ -261,23 +253,17 @@ class DatasetWriter:
 
         stage = self._root / STAGE
         stage.mkdir(exist_ok=True)
-        moves: list[tuple[Path, str]] = []
-        for name, film in episode.films.items():
-            chunk, within = divmod(film_number, schema.CHUNK_SIZE)
-            path = schema.VIDEO_PATH.format(video_key=name, chunk_index=chunk, file_index=within)
-            moves.append((film.path, path))
-        where = {"chunk_index": file // schema.CHUNK_SIZE, "file_index": file % schema.CHUNK_SIZE}
-        moves.append((write_table(stage / "data.parquet", tables), schema.DATA_PATH.format(**where)))
+        where, films = schema.place_of(file), schema.place_of(film_number)
+        moves = {schema.VIDEO_PATH.format(video_key=k, **films): film.path for k, film in episode.films.items()}
+        moves[schema.DATA_PATH.format(**where)] = write_table(stage / "data.parquet", tables)
         if len(tasks) > len(self._tasks):
-            moves.append((write_table(stage / "tasks.parquet", [tasks_table(tasks)]), schema.TASKS_PATH))
-        moves.append(
-            (write_table(stage / "episodes.parquet", [rows_table(rows)]), schema.EPISODES_PATH.format(**where))
-        )
-        moves.append((write_json(stage / "stats.json", listed(total)), schema.STATISTICS_PATH))
-        moves.append((write_json(stage / "info.json", self._info(number + 1, start + count, tasks)), schema.INFO_PATH))
-        for source, _ in moves:
+            moves[schema.TASKS_PATH] = write_table(stage / "tasks.parquet", [tasks_table(tasks)])
+        moves[schema.EPISODES_PATH.format(**where)] = write_table(stage / "episodes.parquet", [rows_table(rows)])
+        moves[schema.STATISTICS_PATH] = write_json(stage / "stats.json", listed(total))
+        moves[schema.INFO_PATH] = write_json(stage / "info.json", self._info(number + 1, start + count, tasks))
+        for source in moves.values():
             sync(source)
-        for source, target in moves:
+        for target, source in moves.items():
             (self._root / target).parent.mkdir(parents=True, exist_ok=True)
             os.replace(source, self._root / target)
         if self._is_new:
