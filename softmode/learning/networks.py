@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import torch
@@ -158,15 +159,7 @@ class Critic(nn.Module):
         self.reads_state = privileged > 0 or not interface.pictures
         if self.reads_state:
             vectors = {PRIVILEGED: privileged} if privileged else interface.vectors
-            self.encoder = Encoder(
-                Interface(
-                    vectors=vectors,
-                    pictures={},
-                    action_low=interface.action_low,
-                    action_high=interface.action_high,
-                ),
-                options,
-            )
+            self.encoder = Encoder(dataclasses.replace(interface, vectors=vectors, pictures={}), options)
             shared = self.encoder.size
         self.value = mlp(shared, options.hidden, 1, options.activation, 1.0)
 
