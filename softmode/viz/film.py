@@ -59,14 +59,8 @@ class Film:
         if self._writer is None:
             import imageio.v2 as imageio
 
-            self._writer = imageio.get_writer(
-                self._file.temporary,
-                format="FFMPEG",
-                fps=fps,
-                codec="libx264",
-                quality=8,
-                macro_block_size=8,  # type: ignore[arg-type]
-            )
+            how: dict[str, Any] = {"format": "FFMPEG", "codec": "libx264", "quality": 8, "macro_block_size": 8}
+            self._writer = imageio.get_writer(self._file.temporary, fps=fps, **how)
         self._writer.append_data(frame)
         if self._count % self._stride == 0:
             self._frames.append(frame)

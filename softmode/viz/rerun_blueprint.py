@@ -37,13 +37,8 @@ def make_blueprint(worlds: Sequence[str], objects: Sequence[str], cameras: Seque
         line_grid=False,
         eye_controls=rrb.EyeControls3D(position=position, look_target=target, eye_up=(0.0, 0.0, 1.0)),
     )
-    pictures = [
-        rrb.Spatial2DView(
-            name=f"{w}{name}", origin=f"/{w}scene/camera/{name}", contents=[f"+ /{w}scene/camera/{name}/rgb"]
-        )
-        for w in worlds
-        for name in cameras
-    ]
+    shown = [(f"{w}{name}", f"/{w}scene/camera/{name}") for w in worlds for name in cameras]
+    pictures = [rrb.Spatial2DView(name=name, origin=path, contents=[f"+ {path}/rgb"]) for name, path in shown]
     views = [curves("energies [J]", "energy/**")]
     if task:
         views = [curves("reward", "reward/**"), *views, curves("success and metrics", "success", "metrics/**")]
