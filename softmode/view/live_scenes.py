@@ -12,7 +12,6 @@ from typing import Any, get_args
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from softmode.checks import SEED_MAX, require_choice, require_number
 from softmode.deformables.body.rkpm import sample_farthest
@@ -28,7 +27,7 @@ from softmode.scenes.splat_scene import SplatScene
 from softmode.scenes.table_scene import TableScene
 from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
-from softmode.view.live_types import HoldName, LiveOptions, SceneName
+from softmode.view.live_types import HoldName, LiveOptions, SceneName, Vector
 
 BLOCK_STEPS = 2
 """Physics steps of a block of an object without an environment; even, there and back between two states."""
@@ -36,14 +35,11 @@ HELD_PART = 0.12
 """Part of its height by which a hanging object is held."""
 
 
-def grip_slots(options: LiveOptions) -> int:
-    """Return the points of an object that pins and the drag may need at a time; what it hangs by is a pin more."""
-    return (options.pin_max + 1) * options.pin_points + 1
-
-
-def strength_of(options: LiveOptions) -> GripOptions:
-    """Return how stiff the grips of a session are."""
-    return GripOptions(pull_stiffness=options.drag_stiffness, pull_rate=options.drag_rate)
+def grips_of(options: LiveOptions) -> dict[str, Any]:
+    """Return how many points of an object pins and the drag may need at a time, and how stiff the grips are."""
+    strength = GripOptions(pull_stiffness=options.drag_stiffness, pull_rate=options.drag_rate)
+    slots = (options.pin_max + 1) * options.pin_points + 1  # what it hangs by is a pin more
+    return {"grip_slots": slots, "grip_options": strength}
 
 
 class ObjectScene:
@@ -93,9 +89,8 @@ class ObjectScene:
             [replace(found, object=replace(thing, material=material), position=position)],
             dt=options.substep,
             steps_per_frame=BLOCK_STEPS,
-            grip_slots=grip_slots(options),
-            grip_options=strength_of(options),
             device=device,
+            **grips_of(options),
         )
         self.step()  # compiles
         self.reset()
@@ -115,7 +110,7 @@ class ObjectScene:
             points = held_points(self.scene.objects[0], self._hold, self._pin_points)
             self.scene.grips[0].take(points, self.scene.state)
 
-    def marker_place(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def marker_place(self) -> tuple[Vector, Vector]:
         """Return no centres: there is no marker."""
         return np.zeros((0, 3)), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
@@ -123,7 +118,7 @@ class ObjectScene:
         """Nothing is held open."""
 
 
-def held_points(thing: SoftObject, hold: HoldName, count: int) -> NDArray[np.float64]:
+def held_points(thing: SoftObject, hold: HoldName, count: int) -> Vector:
     """Return the surface samples by which a hanging object is held, spread over its top or base, shape (n, 3)."""
     sign = 1.0 if hold == "top" else -1.0
     X = thing.body.surface_points
@@ -176,10 +171,8 @@ class EnvScene:
         given = dict(trained.env_options) if trained else {}
         learnt = config_of(kind, given.pop("config", {}))
         base = learnt if config is None else config
-        given_scene = replace(base.scene, grip_slots=grip_slots(options), grip_options=strength_of(options))
-        if source is not None:
-            given_scene = replace(given_scene, object=source)
-        base = replace(base, scene=given_scene)
+        changed = grips_of(options) if source is None else {**grips_of(options), "object": source}
+        base = replace(base, scene=replace(base.scene, **changed))
         # with cameras, so that the goal's marker is kept up to date
         given |= {"config": base, "device": device, "progress": progress, "render_mode": "rgb_array"}
         self._env: Any = gym.make(name, **given, disable_env_checker=True)
@@ -219,7 +212,7 @@ class EnvScene:
         self.terms = {name: 0.0 for name in info["reward_terms"]}
         self.success = bool(info["is_success"])
 
-    def marker_place(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def marker_place(self) -> tuple[Vector, Vector]:
         """Return the centres of the goal's marker and its pose."""
         if self.marker is None:
             return np.zeros((0, 3)), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])

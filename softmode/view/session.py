@@ -24,6 +24,7 @@ from softmode.objects.config import ObjectConfig
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.host import host
 from softmode.scenes.meshes import SceneMesh, scene_meshes
+from softmode.splats.pinhole import PinholeCamera
 from softmode.view import live_parameters
 from softmode.view.coordinates import carry_over, coordinates
 from softmode.view.hands import Hands
@@ -449,12 +450,11 @@ class LiveSession:
         """
         if self._recorder is not None:
             raise ConfigError(f"{self._recorder.path} is being recorded", hint="stop that recording first")
-        self._recorder = make_recorder(
-            Path(path),
-            self._scene,
-            self._picture,
-            lambda: live_camera(self._live.viewpoints, self.bounds(), position, target, edge),
-        )
+
+        def camera() -> PinholeCamera:
+            return live_camera(self._live.viewpoints, self.bounds(), position, target, edge)
+
+        self._recorder = make_recorder(Path(path), self._scene, self._picture, camera)
         self._record_from = self._clock
         self._record()
 
