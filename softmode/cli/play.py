@@ -94,14 +94,9 @@ def _play(options: Play, film: Film | None) -> int:
         if not any(Path(wp.config.kernel_cache_dir or "").glob("wp_softmode.deformables.solver.step_kernels_*")):
             print("compiling kernels (first run only, a minute or two)", file=sys.stderr, flush=True)
         with BuildBar() as progress:
-            env = gym.make(
-                options.env,
-                render_mode="rgb_array" if film or options.rerun else None,
-                config=_task_config(options, given.pop("config", {})),
-                **given,
-                device=warp_device(options.device),
-                progress=progress,
-            )
+            config = _task_config(options, given.pop("config", {}))
+            given |= {"config": config, "device": warp_device(options.device), "progress": progress}
+            env = gym.make(options.env, render_mode="rgb_array" if film or options.rerun else None, **given)
         try:
             if trained:
                 trained.check(env)

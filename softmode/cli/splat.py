@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from softmode.checks import require_number
 from softmode.cli.common import bar_interval, quiet_warp, warp_device
@@ -51,13 +51,8 @@ class SplatFromMesh:
         with quiet_warp():
             from softmode.objects.mesh_fit import FitOptions, splats_from_mesh
 
-            options = FitOptions(
-                iterations=self.iterations,
-                size=self.pixels,
-                view_count=self.views,
-                held_out_count=max(self.views // 4, 1),
-                seed=self.seed,
-            )
+            views: dict[str, Any] = {"view_count": self.views, "held_out_count": max(self.views // 4, 1)}
+            options = FitOptions(iterations=self.iterations, size=self.pixels, seed=self.seed, **views)
             mesh = read_mesh(self.mesh)
             print(f"{mesh.name}: {len(mesh.corners)} triangles, {len(mesh.textures)} textures", flush=True)
             with tqdm(total=options.iterations, desc="fitting", unit="step", mininterval=bar_interval()) as bar:

@@ -186,13 +186,8 @@ def _read_episodes(
             if not all(type(value) is int and 0 <= value < 1_000_000 for value in whole):
                 raise ValueError(f"episode {number} names files {whole}")
             end = stop
-            statistics.append(
-                {
-                    name: {key: np.array(row[f"stats/{name}/{key}"]) for key in _KEYS}
-                    for name in features
-                    if f"stats/{name}/count" in row
-                }
-            )
+            told = [name for name in features if f"stats/{name}/count" in row]
+            statistics.append({name: {key: np.array(row[f"stats/{name}/{key}"]) for key in _KEYS} for name in told})
     except (KeyError, TypeError, ValueError) as error:
         raise AssetError(f"{folder / 'meta' / 'episodes'} is damaged: {error!r}", hint=REMEDY) from error
     if (len(rows), end) != (episodes, frames):

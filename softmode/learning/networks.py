@@ -102,12 +102,11 @@ class Encoder(nn.Module):
         super().__init__()
         self.normalize = options.normalize_observations
         self.moments = nn.ModuleDict({key: RunningMoments((size,)) for key, size in sorted(interface.vectors.items())})
-        self.pictures = nn.ModuleDict(
-            {
-                key: PictureEncoder(shape, options.encoder, options.features, options.mixed_precision)
-                for key, shape in sorted(interface.pictures.items())
-            }
-        )
+        pictures = {
+            key: PictureEncoder(shape, options.encoder, options.features, options.mixed_precision)
+            for key, shape in sorted(interface.pictures.items())
+        }
+        self.pictures = nn.ModuleDict(pictures)
         self.size = sum(interface.vectors.values()) + options.features * len(interface.pictures)
 
     def forward(self, observation: Observation) -> torch.Tensor:

@@ -33,12 +33,11 @@ from softmode.learning.train_options import DEFAULT_STEPS, TrainOptions, TrainRe
 from softmode.learning.training_log import WINDOW, TrainingLog, describe
 from softmode.learning.vector_tensors import TensorVectorEnv
 
+Report = Callable[[str], None]
 MakeVectorEnv = Callable[[str, int, torch.device, dict[str, Any]], gym.vector.VectorEnv]
 
 
-def train(
-    options: TrainOptions, *, make: MakeVectorEnv = make_vector_env, report: Callable[[str], None] = print
-) -> TrainResult:
+def train(options: TrainOptions, *, make: MakeVectorEnv = make_vector_env, report: Report = print) -> TrainResult:
     """Train a policy.
 
     Under torchrun every process steps its own worlds, gradients are averaged, and the first process writes.
@@ -108,12 +107,7 @@ class _Run:
     """The state of a run."""
 
     def __init__(
-        self,
-        options: TrainOptions,
-        env: TensorVectorEnv,
-        ranks: Ranks,
-        start: Checkpoint | None,
-        report: Callable[[str], None],
+        self, options: TrainOptions, env: TensorVectorEnv, ranks: Ranks, start: Checkpoint | None, report: Report
     ) -> None:
         self.options, self.env, self.ranks, self.device = options, env, ranks, env.device
         self.report = report if ranks.rank == 0 else lambda line: None
@@ -136,8 +130,8 @@ class _Run:
         self.ppo = PPO(self.model, self.hyperparameters, ranks, self._teacher())
         if start is not None:
             self._load(start)
-        options_ = self.hyperparameters
-        self.collector = Collector(env, self.model, first, options_.rollout_steps, options_.discount)
+        steps, discount = self.hyperparameters.rollout_steps, self.hyperparameters.discount
+        self.collector = Collector(env, self.model, first, steps, discount)
         self.log = TrainingLog(self.collector.statistics, self.ppo, ranks)
         self.generator = torch.Generator(self.device)
         self.guard = NanGuard() if options.nan_guard else None
@@ -207,11 +201,8 @@ class _Run:
             ) from error
 
     def _modules(self) -> dict[str, torch.nn.Module]:
-        modules: dict[str, torch.nn.Module] = {
-            "actor": self.model.actor,
-            "critic": self.model.critic,
-            "reward": self.ppo.reward_moments,
-        }
+        modules: dict[str, torch.nn.Module] = {"actor": self.model.actor, "critic": self.model.critic}
+        modules["reward"] = self.ppo.reward_moments
         return modules | ({} if self.model.predict is None else {"predict": self.model.predict})
 
     def _open_folder(self) -> RunFolder:
