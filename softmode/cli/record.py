@@ -107,12 +107,11 @@ class Record:
                     bar.close()
                     _tell_interrupted(writer, self.episodes - (writer.episode_count - before), self.seed + played)
                     return 130
-                total = writer.episode_count
         finally:
             env.close()
         print(
             f"{result.successes} of {result.episodes} recorded episodes succeeded, {result.attempts} were played; "
-            f"{out} holds {total} episodes"
+            f"{out} holds {writer.episode_count} episodes"
         )
         return 0
 

@@ -82,7 +82,7 @@ def read_dataset(
     if unknown:
         raise ConfigError(f"the dataset has no features {unknown}", hint=f"use some of {', '.join(found.features)}")
     kinds = {name: found.features[name] for name in wanted}
-    size = found.frame_count * sum(_bytes(kind) for kind in kinds.values())
+    size = found.frame_count * sum(int(np.prod(kind.shape)) * _type(kind).itemsize for kind in kinds.values())
     if size > max_bytes:
         raise AssetError(
             f"{found.folder} takes {size} bytes in memory, more than {max_bytes}",
@@ -107,11 +107,6 @@ def read_dataset(
         episode_stop=stops,
         statistics=found.combined(),
     )
-
-
-def _bytes(kind: Feature) -> int:
-    """Return the bytes of a feature per frame."""
-    return int(np.prod(kind.shape)) * (1 if kind.is_picture else np.dtype(kind.dtype).itemsize)
 
 
 def _read_data(found: Metadata, kinds: Mapping[str, Feature]) -> dict[str, NDArray[Any]]:

@@ -1,4 +1,4 @@
-"""The LeRobot v3.0 dataset format: file layout, features, and the schemas of its tables.
+"""The LeRobot v3.0 dataset format: file layout, features, the schemas of its tables, and how they are written.
 
 A dataset is a folder::
 
@@ -15,11 +15,13 @@ Reference: the format that ``lerobot`` 0.4 (https://github.com/huggingface/lerob
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from softmode.checks import require_choice
+from softmode.demonstrations.statistics import Statistics
 from softmode.errors import ConfigError, needs_extra
 
 if TYPE_CHECKING:
@@ -103,14 +105,9 @@ def check_features(features: Mapping[str, Feature]) -> None:
 
 def feature_to_json(feature: Feature, fps: int) -> dict[str, Any]:
     """Return how info.json describes a feature."""
-    names = feature.names
-    if feature.is_picture and names is None:
-        names = IMAGE_NAMES
-    entry: dict[str, Any] = {
-        "dtype": feature.dtype,
-        "shape": list(feature.shape),
-        "names": None if names is None else list(names),
-    }
+    names = IMAGE_NAMES if feature.is_picture and feature.names is None else feature.names
+    shape, names = list(feature.shape), None if names is None else list(names)
+    entry: dict[str, Any] = {"dtype": feature.dtype, "shape": shape, "names": names}
     if feature.dtype == "video":
         entry["info"] = {
             "video.height": feature.shape[0],
@@ -180,3 +177,33 @@ def tasks_schema() -> pa.Schema:
     return pa.schema(
         [pa.field("task_index", pa.int64()), pa.field(index, pa.string())], metadata={"pandas": json.dumps(pandas)}
     )
+
+
+def tasks_table(tasks: Mapping[str, int]) -> Any:
+    """Return the table of tasks."""
+    return arrow().table([list(tasks.values()), list(tasks)], schema=tasks_schema())
+
+
+def rows_table(rows: list[dict[str, Any]]) -> Any:
+    """Return the table of episodes."""
+    return arrow().table({key: [row[key] for row in rows] for key in rows[0]})
+
+
+def write_table(path: Path, tables: Sequence[Any]) -> Path:
+    """Write tables of one schema as a Parquet file with a row group for each."""
+    pq = arrow().parquet
+    with pq.ParquetWriter(path, tables[0].schema, compression="snappy", write_page_checksum=True) as writer:
+        for table in tables:
+            writer.write_table(table)
+    return path
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> Path:
+    """Write a JSON file."""
+    path.write_text(json.dumps(content, indent=4, ensure_ascii=False, allow_nan=False), encoding="utf-8")
+    return path
+
+
+def listed(statistics: Mapping[str, Statistics]) -> dict[str, dict[str, Any]]:
+    """Return statistics as lists."""
+    return {name: {key: value.tolist() for key, value in values.items()} for name, values in statistics.items()}

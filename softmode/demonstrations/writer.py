@@ -14,9 +14,8 @@ from typing import Any
 from softmode.demonstrations import schema
 from softmode.demonstrations.episode import Episode
 from softmode.demonstrations.metadata import Metadata, file_of, read_metadata
-from softmode.demonstrations.schema import INDEX_FEATURES, Feature
+from softmode.demonstrations.schema import INDEX_FEATURES, Feature, write_json, write_table
 from softmode.demonstrations.statistics import Statistics, combine
-from softmode.demonstrations.tables import listed, rows_table, tasks_table, write_json, write_table
 from softmode.errors import ConfigError
 from softmode.files import storage_errors, sync
 
@@ -88,7 +87,10 @@ class DatasetWriter:
         self._file = 0
         self._tasks: dict[str, int] = {}
         self._statistics: dict[str, Statistics] = {}
-        self._episode_count = self._frame_count = 0
+        self.episode_count = 0
+        """Episodes in the dataset."""
+        self.frame_count = 0
+        """Frames in the dataset, those of the present episode not counted."""
         self._films_done = -1  # number of the last film
         self._root, self._is_new, self._lock = self.folder, False, None
         self._made: list[Path] = []
@@ -137,7 +139,7 @@ class DatasetWriter:
                 hint="record into another folder",
             )
         self._tasks = {task: number for number, task in enumerate(found.tasks)}
-        self._episode_count, self._frame_count = found.episode_count, found.frame_count
+        self.episode_count, self.frame_count = found.episode_count, found.frame_count
         self._robot_type = found.robot_type
         if not found.rows:
             return
@@ -148,7 +150,7 @@ class DatasetWriter:
             raise ConfigError(f"{self.folder} was written by another program", hint="record into another folder")
         self._file = file["chunk_index"] * schema.CHUNK_SIZE + file["file_index"]
         if any(last.get(f"videos/{name}/file_index") is not None for name in self.features):
-            self._films_done = self._episode_count - 1
+            self._films_done = self.episode_count - 1
         self._rows = [row for row in found.rows if file_of(row, "data") == file]
         first = self._rows[0]["dataset_from_index"]
         # What a killed recording left behind the last episode is not taken over.
@@ -159,16 +161,6 @@ class DatasetWriter:
     def _begin(self) -> None:
         """Begin an episode."""
         self._episode = Episode(self.features, self._fps, self._root / STAGE)
-
-    @property
-    def episode_count(self) -> int:
-        """Episodes in the dataset."""
-        return self._episode_count
-
-    @property
-    def frame_count(self) -> int:
-        """Frames in the dataset, those of the present episode not counted."""
-        return self._frame_count
 
     def add_frame(self, frame: Mapping[str, Any]) -> None:
         """Append a frame to the present episode.
@@ -221,7 +213,7 @@ class DatasetWriter:
             raise ConfigError("the episode has no frames", hint="add some before saving it")
         if not isinstance(task, str) or not task.strip():
             raise ConfigError(f"the task is {task!r}", hint="describe it in words")
-        what = f"another episode of dataset {self.folder}, whose {self._episode_count} are complete,"
+        what = f"another episode of dataset {self.folder}, whose {self.episode_count} are complete,"
         try:
             with storage_errors(what, hint="free some space and append"):
                 self._save(task)
@@ -229,11 +221,11 @@ class DatasetWriter:
             self.discard_episode()
             raise
         self._begin()
-        return self._episode_count - 1
+        return self.episode_count - 1
 
     def _save(self, task: str) -> None:
         """Stage the files of the dataset with the present episode, then put them in place."""
-        episode, number, start = self._episode, self._episode_count, self._frame_count
+        episode, number, start = self._episode, self.episode_count, self.frame_count
         count = episode.length
         tasks = {**self._tasks}
         tasks.setdefault(task, len(tasks))
@@ -257,9 +249,9 @@ class DatasetWriter:
         moves = {schema.VIDEO_PATH.format(video_key=k, **films): film.path for k, film in episode.films.items()}
         moves[schema.DATA_PATH.format(**where)] = write_table(stage / "data.parquet", tables)
         if len(tasks) > len(self._tasks):
-            moves[schema.TASKS_PATH] = write_table(stage / "tasks.parquet", [tasks_table(tasks)])
-        moves[schema.EPISODES_PATH.format(**where)] = write_table(stage / "episodes.parquet", [rows_table(rows)])
-        moves[schema.STATISTICS_PATH] = write_json(stage / "stats.json", listed(total))
+            moves[schema.TASKS_PATH] = write_table(stage / "tasks.parquet", [schema.tasks_table(tasks)])
+        moves[schema.EPISODES_PATH.format(**where)] = write_table(stage / "episodes.parquet", [schema.rows_table(rows)])
+        moves[schema.STATISTICS_PATH] = write_json(stage / "stats.json", schema.listed(total))
         moves[schema.INFO_PATH] = write_json(stage / "info.json", self._info(number + 1, start + count, tasks))
         for source in moves.values():
             sync(source)
@@ -272,7 +264,7 @@ class DatasetWriter:
             self._root, self._is_new, self._made = self.folder, False, []
         self._rows, self._tables, self._file = rows, tables, file
         self._tasks, self._statistics = tasks, total
-        self._episode_count, self._frame_count = number + 1, start + count
+        self.episode_count, self.frame_count = number + 1, start + count
         self._films_done = film_number
 
     def _row(

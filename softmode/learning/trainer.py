@@ -249,9 +249,7 @@ class _Run:
             "hyperparameters": self.hyperparameters.to_json(),
             "versions": {
                 "softmode": __version__,
-                "torch": torch.__version__,
-                "gymnasium": gym.__version__,
-                "numpy": np.__version__,
+                **{package.__name__: package.__version__ for package in (torch, gym, np)},
                 "python": platform.python_version(),
             },
             "command": sys.argv,

@@ -134,14 +134,10 @@ class Stage:
         distance = KDTree(samples).query(picture.means)[0]
         near = distance[distance < 0.25 * self.size]  # an environment has other splats too
         radius = 1.3 * float(np.quantile(near, 0.95)) if len(near) else 0.1 * self.size
+        turns = np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (len(samples), 1))
+        places: dict[str, Any] = {"batched_wxyzs": turns, "batched_positions": samples.astype(np.float32)}
         self._grips = self._server.scene.add_batched_glb(
-            "/grips",
-            _invisible_sphere(radius),
-            batched_wxyzs=np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (len(samples), 1)),
-            batched_positions=samples.astype(np.float32),
-            lod="off",
-            cast_shadow=False,
-            receive_shadow=False,
+            "/grips", _invisible_sphere(radius), **places, lod="off", cast_shadow=False, receive_shadow=False
         )
         self._grips.on_drag("left")(on_drag)
         self._on_click = on_click
@@ -176,13 +172,9 @@ class Stage:
 
     def _add_gizmo(self, number: int, position: Vector, wxyz: Vector) -> Any:
         """Add the gizmo that moves a pin."""
+        pose: dict[str, Any] = {"position": tuple(position), "wxyz": tuple(wxyz)}
         gizmo = self._server.scene.add_transform_controls(
-            f"/pins/{number}",
-            scale=0.4 * self.size,
-            position=tuple(position),
-            wxyz=tuple(wxyz),
-            depth_test=False,
-            opacity=0.7,
+            f"/pins/{number}", scale=0.4 * self.size, **pose, depth_test=False, opacity=0.7
         )
 
         async def moved(event: Any) -> None:
