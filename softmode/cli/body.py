@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from softmode.checks import require_fields
-from softmode.cli.common import quiet_warp, short_name
+from softmode.cli.common import quiet_warp, same_fields, short_name
 from softmode.errors import ConfigError
 from softmode.files import check_place
 
@@ -165,27 +165,19 @@ def _examined(options: _Asset) -> tuple[ReducedBody, Splats, BodyReport]:
         return found.body, splats, report_body(found.body, splats=splats.means)
     if kind == "mesh" and (options.crop is not None or options.part != "thickest"):
         raise ConfigError(f"{options.file} is a mesh; crop and part are for splats", hint="leave them out")
-    build = BuildOptions(
-        mode_count=options.modes,
-        kernel_count=options.kernels,
-        handles=options.handles,
-        poissons_ratio=options.poissons_ratio,
-        rank_tolerance=RANK_TOLERANCE if options.rank_tolerance is None else options.rank_tolerance,
-        cubature_count=options.points,
-        seed=options.seed,
-    )
+    given = same_fields(options, BuildOptions)
+    given |= {"mode_count": options.modes, "kernel_count": options.kernels, "cubature_count": options.points}
+    if options.rank_tolerance is None:
+        given["rank_tolerance"] = RANK_TOLERANCE
     found, quadrature = build_object(
         options.file,
         regions=[_region(text) for text in options.region],
         stiffness=[_stiffer(text) for text in options.stiffness],
         size=ObjectConfig.size if options.size is None else options.size,
-        up=options.up,
-        crop=options.crop,
-        part=options.part,
-        pose=options.pose,
+        **{name: getattr(options, name) for name in ("up", "crop", "part", "pose")},
         surface_count=options.surface,
         splat_count=options.splats,
-        build=build,
+        build=BuildOptions(**given),
     )
     splats = found.visible_splats
     return found.body, splats, report_body(found.body, quadrature=quadrature, splats=splats.means)

@@ -92,17 +92,8 @@ class Record:
                     bar.update(recorded - bar.n)
 
                 try:
-                    result = record_episodes(
-                        env,
-                        policy,
-                        writer,
-                        episodes=self.episodes,
-                        task=purpose(self.env),
-                        seed=self.seed,
-                        noise=self.noise,
-                        only_successes=self.only_successes,
-                        progress=tell,
-                    )
+                    how = {name: getattr(self, name) for name in ("episodes", "seed", "noise", "only_successes")}
+                    result = record_episodes(env, policy, writer, task=purpose(self.env), progress=tell, **how)
                 except KeyboardInterrupt:
                     bar.close()
                     _tell_interrupted(writer, self.episodes - (writer.episode_count - before), self.seed + played)

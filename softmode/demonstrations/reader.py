@@ -98,10 +98,7 @@ def read_dataset(
     for name in INDEX_FEATURES:
         columns[name] = columns[name][:, 0]
     return Dataset(
-        fps=found.fps,
-        robot_type=found.robot_type,
-        features=found.features,
-        tasks=found.tasks,
+        **{name: getattr(found, name) for name in ("fps", "robot_type", "features", "tasks")},
         columns={name: columns[name] for name in wanted},
         episode_start=starts,
         episode_stop=stops,

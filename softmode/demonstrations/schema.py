@@ -109,16 +109,9 @@ def feature_to_json(feature: Feature, fps: int) -> dict[str, Any]:
     shape, names = list(feature.shape), None if names is None else list(names)
     entry: dict[str, Any] = {"dtype": feature.dtype, "shape": shape, "names": names}
     if feature.dtype == "video":
-        entry["info"] = {
-            "video.height": feature.shape[0],
-            "video.width": feature.shape[1],
-            "video.codec": "h264",
-            "video.pix_fmt": "yuv420p",
-            "video.is_depth_map": False,
-            "video.fps": fps,
-            "video.channels": 3,
-            "has_audio": False,
-        }
+        entry["info"] = {"video.height": shape[0], "video.width": shape[1]}
+        entry["info"] |= {"video.codec": "h264", "video.pix_fmt": "yuv420p", "video.is_depth_map": False}
+        entry["info"] |= {"video.fps": fps, "video.channels": 3, "has_audio": False}
     return entry
 
 

@@ -271,23 +271,15 @@ class DatasetWriter:
         self, number: int, task: str, start: int, count: int, file: int, film: int, found: Mapping[str, Statistics]
     ) -> dict[str, Any]:
         """Return the row of an episode."""
-        chunk, within = divmod(file, schema.CHUNK_SIZE)
-        row: dict[str, Any] = {
-            "episode_index": number,
-            "tasks": [task],
-            "length": count,
-            "data/chunk_index": chunk,
-            "data/file_index": within,
-            "dataset_from_index": start,
-            "dataset_to_index": start + count,
-        }
+        row: dict[str, Any] = {"episode_index": number, "tasks": [task], "length": count}
+        row |= {f"data/{key}": value for key, value in schema.place_of(file).items()}
+        row |= {"dataset_from_index": start, "dataset_to_index": start + count}
         for name in self._episode.films:
-            row[f"videos/{name}/chunk_index"], row[f"videos/{name}/file_index"] = divmod(film, schema.CHUNK_SIZE)
-            row[f"videos/{name}/from_timestamp"] = 0.0
-            row[f"videos/{name}/to_timestamp"] = count / self._fps
+            row |= {f"videos/{name}/{key}": value for key, value in schema.place_of(film).items()}
+            row |= {f"videos/{name}/from_timestamp": 0.0, f"videos/{name}/to_timestamp": count / self._fps}
         for name, values in found.items():
-            row.update({f"stats/{name}/{key}": value.tolist() for key, value in values.items()})
-        return row | {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": within}
+            row |= {f"stats/{name}/{key}": value.tolist() for key, value in values.items()}
+        return row | {f"meta/episodes/{key}": value for key, value in schema.place_of(file).items()}
 
     def _info(self, episodes: int, frames: int, tasks: Mapping[str, int]) -> dict[str, Any]:
         """Return the content of info.json."""

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from softmode.learning.distributed import Ranks
 from softmode.learning.moments import RunningMoments
-from softmode.learning.networks import ActorCritic, Observation
-from softmode.learning.vector_tensors import Step, TensorVectorEnv, with_privileged
+from softmode.learning.networks import PRIVILEGED, ActorCritic, Observation
+from softmode.learning.vector_tensors import Step, TensorVectorEnv
 
 
 class Rollout:
@@ -124,8 +124,10 @@ class Collector:
             running.masked_fill_(where, 0.0)
 
     def _seen(self, observation: Observation) -> Observation:
+        """Return the observation, the full state beside it where there is one that the critic reads."""
         reads = self.model.critic.reads_state and bool(self.model.actor.encoder.pictures)
-        return with_privileged(observation, self.env.privileged() if reads else None)
+        state = self.env.privileged() if reads else None
+        return observation if state is None else {**observation, PRIVILEGED: state}
 
     @torch.no_grad()
     def collect(self, generator: torch.Generator) -> Rollout:

@@ -274,14 +274,9 @@ class _Run:
                 self.env_steps += per_rollout
                 row, progress, any_bad = self.log.read(losses, bad, self._progress())
                 now = time.perf_counter()
-                row = {
-                    "iteration": self.iteration,
-                    "env_steps": self.env_steps,
-                    "seconds": self._seconds(),
-                    "steps_per_second": per_rollout / (now - clock),
-                    "update_share": (now - collected) / (now - clock),
-                    **row,
-                }
+                told = {"iteration": self.iteration, "env_steps": self.env_steps, "seconds": self._seconds()}
+                told |= {"steps_per_second": per_rollout / (now - clock)}
+                row = {**told, "update_share": (now - collected) / (now - clock), **row}
                 if any_bad or row["skipped_updates"]:
                     raise self._diverged(rollout, any_bad, bool(bad))
                 if self.guard:
@@ -346,21 +341,16 @@ class _Run:
         for prefix, module in self._modules().items():
             arrays |= {f"{prefix}.{key}": value.cpu().numpy() for key, value in module.state_dict().items()}
         arrays |= {f"optimizer.{key}": value.cpu().numpy() for key, value in self.ppo.optimizer.state().items()}
+        progress = {"iteration": self.iteration, "env_steps": self.env_steps, "seconds": self._seconds()}
+        progress |= {"seed": self.options.seed, "resumed": self.resumed}
+        progress |= {"best_success": self.best[0], "best_return": self.best[1]}
         checkpoint = Checkpoint(
             env=self.options.env,
             env_options=self.options.env_options,
             interface=self.env.interface,
             privileged=self.privileged,
             hyperparameters=self.hyperparameters,
-            progress={
-                "iteration": self.iteration,
-                "env_steps": self.env_steps,
-                "seconds": self._seconds(),
-                "seed": self.options.seed,
-                "resumed": self.resumed,
-                "best_success": self.best[0],
-                "best_return": self.best[1],
-            },
+            progress=progress,
             arrays=arrays,
         )
         with self.folder.writing(name):

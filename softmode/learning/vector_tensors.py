@@ -10,7 +10,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 from softmode.errors import ConfigError
-from softmode.learning.networks import PRIVILEGED, Observation
+from softmode.learning.networks import Observation
 from softmode.learning.spaces import Interface
 
 
@@ -144,8 +144,3 @@ class TensorVectorEnv:
                     for key, value in observation.items()
                 }
         return self._observation(final)
-
-
-def with_privileged(observation: Observation, state: torch.Tensor | None) -> Observation:
-    """Return the observation, the full state beside it where there is one."""
-    return observation if state is None else {**observation, PRIVILEGED: state}

@@ -84,14 +84,9 @@ class ObjectScene:
             table = [Fixture(label="table", size=(half, half, 0.1 * half), position=below, color=(0.42, 0.48, 0.54))]
         height = float(thing.body.bounds[1, 2] - thing.body.bounds[0, 2])
         position = (0.0, 0.0, found.scale * (thing.height + 0.6 * height))
-        self.scene = SplatScene(
-            table,
-            [replace(found, object=replace(thing, material=material), position=position)],
-            dt=options.substep,
-            steps_per_frame=BLOCK_STEPS,
-            device=device,
-            **grips_of(options),
-        )
+        placed = replace(found, object=replace(thing, material=material), position=position)
+        given = {"dt": options.substep, "steps_per_frame": BLOCK_STEPS, **grips_of(options)}
+        self.scene = SplatScene(table, [placed], device=device, **given)
         self.step()  # compiles
         self.reset()
 
