@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+
 
 class SoftmodeError(Exception):
     """Base of all errors that softmode raises on purpose.
@@ -42,6 +45,24 @@ class ConfigError(SoftmodeError, ValueError):
 
 class MissingExtraError(SoftmodeError, ImportError):
     """An optional dependency is absent."""
+
+
+@contextlib.contextmanager
+def needs_extra(extra: str, message: str, *, otherwise: str = "") -> Iterator[None]:
+    """Turn a failed import in a block into the error that names the extra to install.
+
+    Args:
+        extra: The extra of softmode that brings the package.
+        message: What needs which package.
+        otherwise: What else helps, put behind the remedy.
+
+    Raises:
+        MissingExtraError: If the block raises ImportError.
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise MissingExtraError(message, hint=f"install it with: pip install 'softmode[{extra}]'{otherwise}") from error
 
 
 class StorageError(SoftmodeError, OSError):

@@ -11,7 +11,6 @@ import secrets
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -107,9 +106,7 @@ class PendingFile:
         """Return the file."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         """Publish after a block without an error, discard otherwise."""
         try:
             with storage_errors(self._what):

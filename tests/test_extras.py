@@ -138,6 +138,10 @@ def test_import_errors_become_missing_extra_errors() -> None:
     doors = 0
     for path in SOURCES:
         for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.With):
+                found = re.match(r"needs_extra\('(.+?)'", ast.unparse(node.items[0].context_expr))
+                assert found is None or found[1] in EXTRAS, f"{path}:{node.lineno}: softmode[{found[1]}]"
+                doors += found is not None
             if not isinstance(node, ast.Try) or _imported(node) <= sys.stdlib_module_names:
                 continue
             for handler in node.handlers:

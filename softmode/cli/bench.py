@@ -55,15 +55,8 @@ class Bench:
             if self.image_size is not None:
                 config = dataclasses.replace(config, image_size=self.image_size)
             given: dict[str, Any] = {"obs_type": self.obs_type, "config": config, "processes": self.processes}
-            output = self.output or ("torch" if device.is_cuda else "numpy")
+            given |= {"device": str(device), "output": self.output or ("torch" if device.is_cuda else "numpy")}
+            how = {"steps": self.steps, "warmup": self.warmup, "actions": self.actions, "stages": self.stages}
             for count in self.num_envs:
-                report_throughput(
-                    self.env,
-                    count,
-                    {**given, "device": str(device), "output": output},
-                    steps=self.steps,
-                    warmup=self.warmup,
-                    actions=self.actions,
-                    stages=self.stages,
-                )
+                report_throughput(self.env, count, given, **how)
         return 0

@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from softmode.checks import require_fields
-from softmode.cli.common import short_name
+from softmode.cli.common import quiet_warp, same_fields, short_name
 from softmode.errors import ConfigError
 from softmode.files import check_place
 
 if TYPE_CHECKING:
     from softmode.deformables.body.reduced_body import ReducedBody
     from softmode.deformables.body.regions import Region
-    from softmode.deformables.build.quadrature_grid import Quadrature
     from softmode.deformables.build.report import BodyReport
     from softmode.objects.object_build import StifferBox
     from softmode.splats.splats import Splats
@@ -61,6 +60,17 @@ class _Asset:
     seed: int = 0
     """Seed of every random choice of the build."""
 
+    def target(self, path: Path | None, suffix: str) -> Path:
+        """Return what to write, beside the file if nothing is said; refuse it before any work if that cannot be."""
+        stem = self.file.parent.name if self.file.name == "meta.json" else self.file.stem
+        path = self.file.with_name(f"{stem}{suffix}") if path is None else path
+        if path.suffix.lower() != suffix:
+            raise ConfigError(f"out {path} is no {suffix} file", hint=f"name it like toy{suffix}")
+        check_place(path, "file", make_folders=False)
+        if path.exists() and self.file.exists() and path.samefile(self.file):
+            raise ConfigError(f"{path} is the file that is read", hint="choose another name with --out")
+        return path
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BodyBuild(_Asset):
@@ -72,14 +82,12 @@ class BodyBuild(_Asset):
 
     def run(self) -> int:
         """Build, write, say what is wrong; return 0."""
-        stem = self.file.parent.name if self.file.name == "meta.json" else self.file.stem
-        out = self.out if self.out is not None else self.file.with_name(f"{stem}.npz")
-        _check_target(out, ".npz", self.file)
+        out = self.target(self.out, ".npz")
         from softmode.objects.object_file import write_object
 
-        body, splats, quadrature = _load(self)
+        body, splats, report = _examined(self)
         write_object(out, body, splats)
-        _print_report(_report(body, splats, quadrature), measures=False)
+        _print_report(report, measures=False)
         print(
             f"wrote {body.name!r} to {out}: {body.function_count} functions, {body.point_count} cubature points, "
             f"{body.surface_count} surface samples, {splats.count} splats; built in {body.build_seconds:.2f} s"
@@ -100,15 +108,11 @@ class BodyShow(_Asset):
 
     def run(self) -> int:
         """Draw, print, return 0."""
-        stem = self.file.parent.name if self.file.name == "meta.json" else self.file.stem
-        out = self.out if self.out is not None else self.file.with_name(f"{stem}.png")
-        _check_target(out, ".png", self.file)
+        out = self.target(self.out, ".png")
         require_fields(self, ("youngs_modulus", "density"), above=0.0)
-        from softmode.cli.common import quiet_warp
         from softmode.viz.body_picture import mode_frequencies, write_body_picture
 
-        body, splats, quadrature = _load(self)
-        report = _report(body, splats, quadrature)
+        body, splats, report = _examined(self)
         material = {"youngs_modulus": self.youngs_modulus, "density": self.density}
         with quiet_warp():
             write_body_picture(out, body, splats, report, **material)
@@ -128,17 +132,17 @@ class BodyCheck(_Asset):
 
     def run(self) -> int:
         """Measure, print findings with remedies, return the exit code."""
-        body, splats, quadrature = _load(self)
-        report = _report(body, splats, quadrature)
+        body, _, report = _examined(self)
         _print_report(report, measures=True)
         print(f"{body.name}: {('all is well', 'usable, with warnings', 'broken')[report.severity]}")
         return report.severity
 
 
-def _load(options: _Asset) -> tuple[ReducedBody, Splats, Quadrature | None]:
-    """Return a body with its splats: read, or built from its asset, then also with what it was built from."""
+def _examined(options: _Asset) -> tuple[ReducedBody, Splats, BodyReport]:
+    """Return a body with its splats and its report: read, or built from its asset."""
     from softmode.deformables.build.functions import RANK_TOLERANCE
     from softmode.deformables.build.options import BuildOptions
+    from softmode.deformables.build.report import report_body
     from softmode.objects.config import ObjectConfig
     from softmode.objects.loader import load
     from softmode.objects.object_build import build_object
@@ -157,39 +161,26 @@ def _load(options: _Asset) -> tuple[ReducedBody, Splats, Quadrature | None]:
                 hint="give the file that it was built from",
             )
         found = load(options.file)
-        return found.body, found.visible_splats, None
+        splats = found.visible_splats
+        return found.body, splats, report_body(found.body, splats=splats.means)
     if kind == "mesh" and (options.crop is not None or options.part != "thickest"):
         raise ConfigError(f"{options.file} is a mesh; crop and part are for splats", hint="leave them out")
-    build = BuildOptions(
-        mode_count=options.modes,
-        kernel_count=options.kernels,
-        handles=options.handles,
-        poissons_ratio=options.poissons_ratio,
-        rank_tolerance=RANK_TOLERANCE if options.rank_tolerance is None else options.rank_tolerance,
-        cubature_count=options.points,
-        seed=options.seed,
-    )
+    given = same_fields(options, BuildOptions)
+    given |= {"mode_count": options.modes, "kernel_count": options.kernels, "cubature_count": options.points}
+    if options.rank_tolerance is None:
+        given["rank_tolerance"] = RANK_TOLERANCE
     found, quadrature = build_object(
         options.file,
         regions=[_region(text) for text in options.region],
         stiffness=[_stiffer(text) for text in options.stiffness],
         size=ObjectConfig.size if options.size is None else options.size,
-        up=options.up,
-        crop=options.crop,
-        part=options.part,
-        pose=options.pose,
+        **{name: getattr(options, name) for name in ("up", "crop", "part", "pose")},
         surface_count=options.surface,
         splat_count=options.splats,
-        build=build,
+        build=BuildOptions(**given),
     )
-    return found.body, found.visible_splats, quadrature
-
-
-def _report(body: ReducedBody, splats: Splats, quadrature: Quadrature | None) -> BodyReport:
-    """Examine a body with its splats."""
-    from softmode.deformables.build.report import report_body
-
-    return report_body(body, quadrature=quadrature, splats=splats.means)
+    splats = found.visible_splats
+    return found.body, splats, report_body(found.body, quadrature=quadrature, splats=splats.means)
 
 
 def _print_report(report: BodyReport, *, measures: bool) -> None:
@@ -231,12 +222,3 @@ def _stiffer(text: str) -> StifferBox:
 
     _, (x0, y0, z0, x1, y1, z1, factor) = _named_numbers("stiffness", text, (7,))
     return StifferBox(box=(x0, y0, z0, x1, y1, z1), factor=factor)
-
-
-def _check_target(path: Path, suffix: str, source: Path) -> None:
-    """Refuse a file that cannot be written, or that is the source, before any work is done."""
-    if path.suffix.lower() != suffix:
-        raise ConfigError(f"out {path} is no {suffix} file", hint=f"name it like toy{suffix}")
-    check_place(path, "file", make_folders=False)
-    if path.exists() and source.exists() and path.samefile(source):
-        raise ConfigError(f"{path} is the file that is read", hint="choose another name with --out")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Iterator
+from dataclasses import fields
 from typing import Any
 
 from softmode.errors import ConfigError
@@ -42,6 +43,11 @@ def warp_device(name: str | None) -> Any:
     except (ValueError, RuntimeError) as error:
         known = ", ".join(str(device) for device in wp.get_devices())
         raise ConfigError(f"device {name!r} is not available", hint=f"use one of {known}") from error
+
+
+def same_fields(options: Any, kind: type) -> dict[str, Any]:
+    """Return the fields of a dataclass that the options of a command have too, by name."""
+    return {field.name: getattr(options, field.name) for field in fields(kind) if hasattr(options, field.name)}
 
 
 def bar_interval() -> float:

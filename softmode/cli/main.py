@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 from softmode import __version__
 from softmode.cli.bench import Bench
@@ -14,7 +16,7 @@ from softmode.cli.record import Record
 from softmode.cli.splat import SplatConvert, SplatFromMesh, SplatInfo
 from softmode.cli.train import Evaluate, Export, Train
 from softmode.cli.view import View
-from softmode.errors import MissingExtraError, SoftmodeError
+from softmode.errors import SoftmodeError, needs_extra
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -23,41 +25,23 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"softmode {__version__}")
         return 0
     try:
-        try:
+        with needs_extra("demo", "the command line needs tyro"):
             import tyro
-        except ImportError as error:
-            raise MissingExtraError(
-                "the command line needs tyro", hint="install it with: pip install 'softmode[demo]'"
-            ) from error
-        splat = Annotated[
-            Annotated[SplatFromMesh, tyro.conf.subcommand("from-mesh")]
-            | Annotated[SplatInfo, tyro.conf.subcommand("info")]
-            | Annotated[SplatConvert, tyro.conf.subcommand("convert")],
-            tyro.conf.subcommand("splat", description="Make, inspect and convert splat files."),
-        ]
-        body = Annotated[
-            Annotated[BodyBuild, tyro.conf.subcommand("build")]
-            | Annotated[BodyShow, tyro.conf.subcommand("show")]
-            | Annotated[BodyCheck, tyro.conf.subcommand("check")],
-            tyro.conf.subcommand("body", description="Build, draw and check the bodies of soft objects."),
-        ]
-        command = tyro.cli(
-            Annotated[Play, tyro.conf.subcommand("play")]
-            | Annotated[Train, tyro.conf.subcommand("train")]
-            | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-            | Annotated[Export, tyro.conf.subcommand("export")]
-            | Annotated[Bench, tyro.conf.subcommand("bench")]
-            | Annotated[Record, tyro.conf.subcommand("record")]
-            | Annotated[View, tyro.conf.subcommand("view")]
-            | Annotated[ListEnvs, tyro.conf.subcommand("list-envs")]
-            | Annotated[Robots, tyro.conf.subcommand("robots")]
-            | splat  # type: ignore[arg-type]
-            | body,  # type: ignore[arg-type]
-            prog="softmode",
-            args=arguments,
-            config=(tyro.conf.PositionalRequiredArgs,),
-        )
-        return command.run()
+        subcommand = tyro.conf.subcommand
+
+        def one_of(commands: dict[str, type]) -> Any:
+            """Return the choice among commands by name."""
+            return functools.reduce(
+                operator.or_, (Annotated[kind, subcommand(name)] for name, kind in commands.items())
+            )
+
+        kinds = one_of({"play": Play, "train": Train, "evaluate": Evaluate, "export": Export, "bench": Bench})
+        kinds |= one_of({"record": Record, "view": View, "list-envs": ListEnvs, "robots": Robots})
+        splat = one_of({"from-mesh": SplatFromMesh, "info": SplatInfo, "convert": SplatConvert})
+        kinds |= Annotated[splat, subcommand("splat", description="Make, inspect and convert splat files.")]
+        body = one_of({"build": BodyBuild, "show": BodyShow, "check": BodyCheck})
+        kinds |= Annotated[body, subcommand("body", description="Build, draw and check the bodies of soft objects.")]
+        return tyro.cli(kinds, prog="softmode", args=arguments, config=(tyro.conf.PositionalRequiredArgs,)).run()
     except SoftmodeError as error:
         print(f"softmode: error: {error}", file=sys.stderr)
         return 2

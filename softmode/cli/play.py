@@ -15,7 +15,7 @@ from softmode.checks import require_number
 from softmode.cli.common import BuildBar, bar_interval, quiet_warp, warp_device
 from softmode.envs.catalogue import config_class, registered_id
 from softmode.errors import ConfigError, MaterialError
-from softmode.learning.players import POLICIES, check_policy, policy_factory, policy_file
+from softmode.learning.players import check_policy, policy_factory, trained_policy
 from softmode.viz.film import Film
 
 if TYPE_CHECKING:
@@ -64,33 +64,22 @@ class Play:
 
     def run(self) -> int:
         """Play; return the exit code."""
-        return play(self)
+        check_policy(self.policy)
+        registered_id(self.env)
+        require_number("episodes", self.episodes, at_least=1, hint="give a count like 3")
+        require_number("seed", self.seed, at_least=0, hint="give a whole number like 0")
+        if (modulus := self.youngs_modulus) is not None:
+            require_number("youngs-modulus", modulus, above=0.0, hint="give it in Pa, like 2e5", error=MaterialError)
+        if self.rerun is not None:
+            from softmode.viz.rerun_stream import check_target
 
+            check_target(self.rerun)
+        if self.usd is not None:
+            from softmode.usd.openusd import check_stage
 
-def play(options: Play) -> int:
-    """Play episodes; see :class:`Play`."""
-    check_policy(options.policy)
-    registered_id(options.env)
-    require_number("episodes", options.episodes, at_least=1, hint="give a count like 3")
-    require_number("seed", options.seed, at_least=0, hint="give a whole number like 0")
-    if (modulus := options.youngs_modulus) is not None:
-        require_number("youngs-modulus", modulus, above=0.0, hint="give it in Pa, like 2e5", error=MaterialError)
-    if options.rerun is not None:
-        from softmode.viz.rerun_stream import check_target
-
-        check_target(options.rerun)
-    if options.usd is not None:
-        from softmode.usd.openusd import check_stage
-
-        check_stage(options.usd)
-    film = None
-    try:
-        if options.video is not None:
-            film = Film(options.video)
-        return _play(options, film)
-    finally:
-        if film:
-            film.discard()
+            check_stage(self.usd)
+        with contextlib.nullcontext() if self.video is None else Film(self.video) as film:
+            return _play(self, film)
 
 
 def _play(options: Play, film: Film | None) -> int:
@@ -99,20 +88,15 @@ def _play(options: Play, film: Film | None) -> int:
     import warp as wp
 
     started = time.perf_counter()
-    trained = None if options.policy in POLICIES else policy_file(options.policy, options.env)
+    trained = trained_policy(options.policy, options.env)
     given = dict(trained.env_options) if trained else {}
     with quiet_warp():
         if not any(Path(wp.config.kernel_cache_dir or "").glob("wp_softmode.deformables.solver.step_kernels_*")):
             print("compiling kernels (first run only, a minute or two)", file=sys.stderr, flush=True)
         with BuildBar() as progress:
-            env = gym.make(
-                options.env,
-                render_mode="rgb_array" if film or options.rerun else None,
-                config=_task_config(options, given.pop("config", {})),
-                **given,
-                device=warp_device(options.device),
-                progress=progress,
-            )
+            config = _task_config(options, given.pop("config", {}))
+            given |= {"config": config, "device": warp_device(options.device), "progress": progress}
+            env = gym.make(options.env, render_mode="rgb_array" if film or options.rerun else None, **given)
         try:
             if trained:
                 trained.check(env)

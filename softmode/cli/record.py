@@ -51,75 +51,60 @@ class Record:
 
     def run(self) -> int:
         """Record; return the exit code."""
-        return record(self)
+        short_name = registered_id(self.env).rpartition("/")[2]
+        check_policy(self.policy)
+        out = Path("out", short_name) if self.out is None else self.out
+        if not self.append and out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise ConfigError(f"{out} exists", hint="choose another folder, or give --append")
 
+        import gymnasium as gym
+        from tqdm import tqdm
 
-def record(options: Record) -> int:
-    """Record episodes; see :class:`Record`."""
-    short_name = registered_id(options.env).rpartition("/")[2]
-    check_policy(options.policy)
-    out = Path("out", short_name) if options.out is None else options.out
-    if not options.append and out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ConfigError(f"{out} exists", hint="choose another folder, or give --append")
+        from softmode.demonstrations.recording import check_recording, environment_features, record_episodes
+        from softmode.demonstrations.writer import DatasetWriter
 
-    import gymnasium as gym
-    from tqdm import tqdm
+        check_recording(self.episodes, self.seed, self.noise)
+        trained = trained_policy(self.policy, self.env)
+        given: dict[str, Any] = {"obs_type": "pixels_agent_pos"}
+        if trained is not None:
+            from softmode.learning.environments import with_config
 
-    from softmode.demonstrations.recording import check_recording, environment_features, record_episodes
-    from softmode.demonstrations.writer import DatasetWriter
+            given = dict(with_config(self.env, trained.env_options))
+        if self.obs_type is not None:
+            given["obs_type"] = self.obs_type
+        with quiet_warp():
+            env = gym.make(self.env, **given, device=warp_device(self.device))
+        try:
+            policy = policy_factory(self.policy, env, trained)
+            features = environment_features(env, pictures=self.pictures)
+            fps = int(env.metadata["render_fps"])
+            with (
+                DatasetWriter(out, features, fps=fps, robot_type=ROBOT, append=self.append) as writer,
+                tqdm(total=self.episodes, desc="recording", unit="episode", mininterval=bar_interval()) as bar,
+            ):
+                before = writer.episode_count
+                played = 0
 
-    check_recording(options.episodes, options.seed, options.noise)
-    trained = trained_policy(options.policy, options.env)
-    given: dict[str, Any] = {"obs_type": "pixels_agent_pos"}
-    if trained is not None:
-        from softmode.learning.environments import with_config
+                def tell(seed: int, success: bool, recorded: int) -> None:
+                    nonlocal played
+                    played = seed + 1 - self.seed
+                    bar.set_postfix_str(f"seed {seed}: {'success' if success else 'no success'}")
+                    bar.update(recorded - bar.n)
 
-        given = dict(with_config(options.env, trained.env_options))
-    if options.obs_type is not None:
-        given["obs_type"] = options.obs_type
-    with quiet_warp():
-        env = gym.make(options.env, **given, device=warp_device(options.device))
-    try:
-        policy = policy_factory(options.policy, env, trained)
-        features = environment_features(env, pictures=options.pictures)
-        fps = int(env.metadata["render_fps"])
-        with (
-            DatasetWriter(out, features, fps=fps, robot_type=ROBOT, append=options.append) as writer,
-            tqdm(total=options.episodes, desc="recording", unit="episode", mininterval=bar_interval()) as bar,
-        ):
-            before = writer.episode_count
-            played = 0
-
-            def tell(seed: int, success: bool, recorded: int) -> None:
-                nonlocal played
-                played = seed + 1 - options.seed
-                bar.set_postfix_str(f"seed {seed}: {'success' if success else 'no success'}")
-                bar.update(recorded - bar.n)
-
-            try:
-                result = record_episodes(
-                    env,
-                    policy,
-                    writer,
-                    episodes=options.episodes,
-                    task=purpose(options.env),
-                    seed=options.seed,
-                    noise=options.noise,
-                    only_successes=options.only_successes,
-                    progress=tell,
-                )
-            except KeyboardInterrupt:
-                bar.close()
-                _tell_interrupted(writer, options.episodes - (writer.episode_count - before), options.seed + played)
-                return 130
-            total = writer.episode_count
-    finally:
-        env.close()
-    print(
-        f"{result.successes} of {result.episodes} recorded episodes succeeded, {result.attempts} were played; "
-        f"{out} holds {total} episodes"
-    )
-    return 0
+                try:
+                    how = {name: getattr(self, name) for name in ("episodes", "seed", "noise", "only_successes")}
+                    result = record_episodes(env, policy, writer, task=purpose(self.env), progress=tell, **how)
+                except KeyboardInterrupt:
+                    bar.close()
+                    _tell_interrupted(writer, self.episodes - (writer.episode_count - before), self.seed + played)
+                    return 130
+        finally:
+            env.close()
+        print(
+            f"{result.successes} of {result.episodes} recorded episodes succeeded, {result.attempts} were played; "
+            f"{out} holds {writer.episode_count} episodes"
+        )
+        return 0
 
 
 def _tell_interrupted(writer: DatasetWriter, missing: int, seed: int) -> None:

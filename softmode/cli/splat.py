@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from softmode.checks import require_number
+from softmode.cli.common import bar_interval, quiet_warp, warp_device
 from softmode.errors import AssetError
 from softmode.files import check_place
 
@@ -44,20 +45,14 @@ class SplatFromMesh:
 
         from tqdm import tqdm
 
-        from softmode.cli.common import bar_interval, quiet_warp, warp_device
         from softmode.objects.mesh_file import read_mesh
         from softmode.splats.formats import write_splats
 
         with quiet_warp():
             from softmode.objects.mesh_fit import FitOptions, splats_from_mesh
 
-            options = FitOptions(
-                iterations=self.iterations,
-                size=self.pixels,
-                view_count=self.views,
-                held_out_count=max(self.views // 4, 1),
-                seed=self.seed,
-            )
+            views: dict[str, Any] = {"view_count": self.views, "held_out_count": max(self.views // 4, 1)}
+            options = FitOptions(iterations=self.iterations, size=self.pixels, seed=self.seed, **views)
             mesh = read_mesh(self.mesh)
             print(f"{mesh.name}: {len(mesh.corners)} triangles, {len(mesh.textures)} textures", flush=True)
             with tqdm(total=options.iterations, desc="fitting", unit="step", mininterval=bar_interval()) as bar:

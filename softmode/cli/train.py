@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from softmode.checks import require_number
-from softmode.cli.common import quiet_warp
+from softmode.cli.common import quiet_warp, same_fields
 from softmode.errors import ConfigError
 from softmode.learning.players import require_torch
 
@@ -60,34 +60,16 @@ class Train:
         from softmode.learning.train_options import TrainOptions
         from softmode.learning.trainer import train
 
-        options = TrainOptions(
-            env=self.env,
-            num_envs=self.num_envs,
-            device=self.device,
-            seed=self.seed,
-            total_steps=None if self.total_steps is None else int(self.total_steps),
-            time_limit=self.time_limit,
-            env_options=self._env_options(),
-            overrides=parse_overrides(self.set),
-            run_dir=self.run_dir,
-            name=self.name,
-            resume=self.resume,
-            init=self.init,
-            teacher=self.teacher,
-            nan_guard=self.nan_guard,
-            eval_episodes=self.eval_episodes,
-            checkpoint_seconds=self.checkpoint_seconds,
-        )
+        given = same_fields(self, TrainOptions)
+        given["env_options"] = parse_env_options(self.env_options, self.obs_type)
+        given["total_steps"] = None if self.total_steps is None else int(self.total_steps)
+        options = TrainOptions(**given, overrides=parse_overrides(self.set))
         with quiet_warp():
             try:
                 train(options, report=lambda line: print(line, flush=True))
             except KeyboardInterrupt:
                 return 130
         return 0
-
-    def _env_options(self) -> dict[str, Any]:
-        options = parse_env_options(self.env_options)
-        return options if self.obs_type is None else {**options, "obs_type": self.obs_type}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -120,9 +102,7 @@ class Evaluate:
 
         require_number("num_envs", self.num_envs, at_least=1, hint="give a count like 16")
         policy = load_policy(self.policy, self.device)
-        options = {**policy.env_options, **parse_env_options(self.env_options)}
-        if self.obs_type is not None:
-            options["obs_type"] = self.obs_type
+        options = {**policy.env_options, **parse_env_options(self.env_options, self.obs_type)}
         device = local_device(self.device)
         with quiet_warp():
             env = make_vector_env(self.env, self.num_envs, device, options)
@@ -157,8 +137,8 @@ class Export:
         return 0
 
 
-def parse_env_options(text: str) -> dict[str, Any]:
-    """Return the keyword arguments in a JSON object.
+def parse_env_options(text: str, obs_type: str | None = None) -> dict[str, Any]:
+    """Return the keyword arguments in a JSON object, ``obs_type`` among them where it is given.
 
     Raises:
         ConfigError: If it is none.
@@ -169,7 +149,7 @@ def parse_env_options(text: str) -> dict[str, Any]:
         raise ConfigError(f"env-options is no JSON ({error})", hint='write it like {"obs_type": "state"}') from error
     if not isinstance(options, dict):
         raise ConfigError("env-options is no JSON object", hint='write it like {"obs_type": "state"}')
-    return options
+    return options if obs_type is None else {**options, "obs_type": obs_type}
 
 
 def parse_overrides(pairs: tuple[str, ...]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 from softmode import ENVIRONMENTS
 from softmode.checks import require_number
+from softmode.cli.common import BuildBar, quiet_warp, same_fields, warp_device
 from softmode.errors import AssetError, ConfigError
 
 if TYPE_CHECKING:
@@ -53,56 +54,42 @@ class View:
 
     def run(self) -> int:
         """Serve; return the exit code."""
-        return view(self)
+        from softmode.view.app import ViewApp, ViewOptions
 
-
-def view(options: View) -> int:
-    """Serve a session until Ctrl-C; see :class:`View`."""
-    from softmode.view.app import ViewApp, ViewOptions
-
-    if options.duration is not None:
-        require_number("duration", options.duration, above=0.0, hint="give seconds, like 60")
-    served = ViewOptions(
-        host=options.host,
-        port=options.port,
-        frame_rate=options.frame_rate,
-        record_folder=options.record_folder,
-        record_as=options.record_as,
-    )
-    served.check()  # a building that takes a minute need not come first
-    from softmode.cli.common import quiet_warp
-
-    with quiet_warp():
-        session = _session(options)
-        try:
-            with ViewApp(session, served) as app:
-                print(f"softmode: open {app.url} in a browser; Ctrl-C ends it", flush=True)
-                if not served.is_local:
-                    print(
-                        f"softmode: warning: listening at {options.host}: anyone who reaches port "
-                        f"{app.url.rpartition(':')[2]} of this machine can drive this session, without a password",
-                        file=sys.stderr,
-                    )
-                if options.open:
-                    _open(app.url)
-                try:
-                    app.run(options.duration)
-                except KeyboardInterrupt:
-                    print("softmode: stopped", file=sys.stderr)
-                if session.status().recording:
-                    print(f"softmode: wrote {session.stop_recording()}")
-        except KeyboardInterrupt:
-            print("softmode: stopped", file=sys.stderr)
-        finally:
-            session.close()
-    return 0
+        if self.duration is not None:
+            require_number("duration", self.duration, above=0.0, hint="give seconds, like 60")
+        served = ViewOptions(**same_fields(self, ViewOptions))
+        served.check()  # a building that takes a minute need not come first
+        with quiet_warp():
+            session = _session(self)
+            try:
+                with ViewApp(session, served) as app:
+                    print(f"softmode: open {app.url} in a browser; Ctrl-C ends it", flush=True)
+                    if not served.is_local:
+                        print(
+                            f"softmode: warning: listening at {self.host}: anyone who reaches port "
+                            f"{app.url.rpartition(':')[2]} of this machine can drive this session, without a password",
+                            file=sys.stderr,
+                        )
+                    if self.open:
+                        _open(app.url)
+                    try:
+                        app.run(self.duration)
+                    except KeyboardInterrupt:
+                        print("softmode: stopped", file=sys.stderr)
+                    if session.status().recording:
+                        print(f"softmode: wrote {session.stop_recording()}")
+            except KeyboardInterrupt:
+                print("softmode: stopped", file=sys.stderr)
+            finally:
+                session.close()
+        return 0
 
 
 def _session(options: View) -> LiveSession:
     """Make the session that was asked for."""
     from gymnasium.envs.registration import registry
 
-    from softmode.cli.common import BuildBar, warp_device
     from softmode.envs.catalogue import registered_id
     from softmode.view.session import LiveSession
 

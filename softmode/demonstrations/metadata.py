@@ -12,7 +12,7 @@ import numpy as np
 
 from softmode.demonstrations import schema
 from softmode.demonstrations.schema import INDEX_FEATURES, Feature
-from softmode.demonstrations.statistics import QUANTILES, Statistics
+from softmode.demonstrations.statistics import QUANTILES, Statistics, combine
 from softmode.errors import AssetError, ConfigError
 
 LARGEST_JSON = 64 << 20
@@ -46,10 +46,17 @@ class Metadata:
 
     def data_table(self, row: Mapping[str, Any]) -> Any:
         """Return the table that holds an episode's frames; raises AssetError if it does not."""
-        path = self.folder / schema.DATA_PATH.format(
-            chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]
-        )
-        return read_table(path)
+        return read_table(self.folder / schema.DATA_PATH.format(**file_of(row, "data")))
+
+    def combined(self) -> dict[str, Statistics]:
+        """Return the statistics over all episodes by feature."""
+        names = self.statistics[0] if self.statistics else {}
+        return {name: combine([part[name] for part in self.statistics]) for name in names}
+
+
+def file_of(row: Mapping[str, Any], kind: str) -> dict[str, int]:
+    """Return the place of a file that an episode's row names; see :func:`softmode.demonstrations.schema.place_of`."""
+    return {key: row[f"{kind}/{key}"] for key in ("chunk_index", "file_index")}
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -179,13 +186,8 @@ def _read_episodes(
             if not all(type(value) is int and 0 <= value < 1_000_000 for value in whole):
                 raise ValueError(f"episode {number} names files {whole}")
             end = stop
-            statistics.append(
-                {
-                    name: {key: np.array(row[f"stats/{name}/{key}"]) for key in _KEYS}
-                    for name in features
-                    if f"stats/{name}/count" in row
-                }
-            )
+            told = [name for name in features if f"stats/{name}/count" in row]
+            statistics.append({name: {key: np.array(row[f"stats/{name}/{key}"]) for key in _KEYS} for name in told})
     except (KeyError, TypeError, ValueError) as error:
         raise AssetError(f"{folder / 'meta' / 'episodes'} is damaged: {error!r}", hint=REMEDY) from error
     if (len(rows), end) != (episodes, frames):

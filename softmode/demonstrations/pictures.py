@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.errors import AssetError, MissingExtraError
+from softmode.errors import AssetError, needs_extra
 from softmode.files import storage_errors
 
-_SPACE = "free some space"
+_SPACE, _AGAIN = "free some space", "record the dataset again"
 
 
 def encode_png(picture: NDArray[np.uint8]) -> bytes:
@@ -42,26 +42,19 @@ def decode_png(data: bytes, shape: tuple[int, ...], what: str) -> NDArray[np.uin
     try:
         with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
             if (image.height, image.width) != shape[:2] or image.mode != "RGB":
-                raise AssetError(
-                    f"{what} is a {image.width} x {image.height} {image.mode} picture, expected "
-                    f"{shape[1]} x {shape[0]} RGB",
-                    hint="record the dataset again",
-                )
+                found = f"{image.width} x {image.height} {image.mode}"
+                raise AssetError(f"{what} is a {found} picture, expected {shape[1]} x {shape[0]} RGB", hint=_AGAIN)
             return np.asarray(image, np.uint8)
     except (OSError, ValueError, SyntaxError, EOFError) as error:
         if isinstance(error, AssetError):
             raise
-        raise AssetError(f"{what} is no readable PNG picture: {error}", hint="record the dataset again") from error
+        raise AssetError(f"{what} is no readable PNG picture: {error}", hint=_AGAIN) from error
 
 
 def ffmpeg() -> Any:
     """Return imageio_ffmpeg, or raise MissingExtraError."""
-    try:
+    with needs_extra("data", "films need imageio-ffmpeg", otherwise=", or store PNG pictures"):
         import imageio_ffmpeg
-    except ImportError as error:
-        raise MissingExtraError(
-            "films need imageio-ffmpeg", hint="install it with: pip install 'softmode[data]', or store PNG pictures"
-        ) from error
     return imageio_ffmpeg
 
 
@@ -81,17 +74,9 @@ class FilmWriter:
         """Start the encoder."""
         self.path = path
         self._count = 0
-        self._sink: Any = ffmpeg().write_frames(
-            str(path),
-            (width, height),
-            fps=fps,
-            codec="libx264",
-            pix_fmt_out="yuv420p",
-            quality=None,
-            macro_block_size=2,
-            ffmpeg_log_level="error",
-            output_params=["-crf", "18", "-g", "2", "-bf", "0"],
-        )
+        how = {"codec": "libx264", "pix_fmt_out": "yuv420p", "quality": None, "macro_block_size": 2}
+        how |= {"output_params": ["-crf", "18", "-g", "2", "-bf", "0"], "ffmpeg_log_level": "error"}
+        self._sink: Any = ffmpeg().write_frames(str(path), (width, height), fps=fps, **how)
         self._sink.send(None)
 
     def add(self, picture: NDArray[np.uint8]) -> None:
@@ -128,7 +113,7 @@ class FilmWriter:
             self._sink.close()
 
 
-def read_film(path: Path, shape: tuple[int, ...]) -> Iterator[NDArray[np.uint8]]:
+def read_film(path: Path, shape: tuple[int, ...]) -> Generator[NDArray[np.uint8], None, None]:
     """Yield the pictures of a film one after the other.
 
     Args:
@@ -144,14 +129,11 @@ def read_film(path: Path, shape: tuple[int, ...]) -> Iterator[NDArray[np.uint8]]
         frames = ffmpeg().read_frames(str(path), pix_fmt="rgb24", input_params=["-f", "mov"])
         width, height = next(frames)["size"]
         if (height, width) != shape[:2]:
-            raise AssetError(
-                f"film {path} is {width} x {height}, expected {shape[1]} x {shape[0]}",
-                hint="record the dataset again",
-            )
+            raise AssetError(f"film {path} is {width} x {height}, expected {shape[1]} x {shape[0]}", hint=_AGAIN)
         for frame in frames:
             yield np.frombuffer(frame, np.uint8).reshape(shape)
     except (OSError, RuntimeError, KeyError, StopIteration) as error:
-        raise AssetError(f"film {path} cannot be decoded: {error}", hint="record the dataset again") from error
+        raise AssetError(f"film {path} cannot be decoded: {error}", hint=_AGAIN) from error
     finally:
         if frames is not None:
             frames.close()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -12,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.demonstrations import schema
-from softmode.demonstrations.metadata import REMEDY, Metadata, read_metadata
+from softmode.demonstrations.metadata import REMEDY, Metadata, file_of, read_metadata
 from softmode.demonstrations.pictures import decode_png, read_film
 from softmode.demonstrations.schema import INDEX_FEATURES, Feature
-from softmode.demonstrations.statistics import Statistics, combine
+from softmode.demonstrations.statistics import Statistics
 from softmode.errors import AssetError, ConfigError
 
 
@@ -80,7 +82,7 @@ def read_dataset(
     if unknown:
         raise ConfigError(f"the dataset has no features {unknown}", hint=f"use some of {', '.join(found.features)}")
     kinds = {name: found.features[name] for name in wanted}
-    size = found.frame_count * sum(_bytes(kind) for kind in kinds.values())
+    size = found.frame_count * sum(int(np.prod(kind.shape)) * _type(kind).itemsize for kind in kinds.values())
     if size > max_bytes:
         raise AssetError(
             f"{found.folder} takes {size} bytes in memory, more than {max_bytes}",
@@ -95,46 +97,27 @@ def read_dataset(
             columns[name] = _read_video(found, name, kind)
     for name in INDEX_FEATURES:
         columns[name] = columns[name][:, 0]
-    statistics = {}
-    if found.statistics:
-        statistics = {name: combine([part[name] for part in found.statistics]) for name in found.statistics[0]}
     return Dataset(
-        fps=found.fps,
-        robot_type=found.robot_type,
-        features=found.features,
-        tasks=found.tasks,
+        **{name: getattr(found, name) for name in ("fps", "robot_type", "features", "tasks")},
         columns={name: columns[name] for name in wanted},
         episode_start=starts,
         episode_stop=stops,
-        statistics=statistics,
+        statistics=found.combined(),
     )
-
-
-def _bytes(kind: Feature) -> int:
-    """Return the bytes of a feature per frame."""
-    return int(np.prod(kind.shape)) * (1 if kind.is_picture else np.dtype(kind.dtype).itemsize)
 
 
 def _read_data(found: Metadata, kinds: Mapping[str, Feature]) -> dict[str, NDArray[Any]]:
     """Return the columns that the data files hold."""
     parts: dict[str, list[NDArray[Any]]] = {name: [] for name in kinds}
-    k = 0
-    while k < len(found.rows):
-        file = (found.rows[k]["data/chunk_index"], found.rows[k]["data/file_index"])
-        last = k
-        while last + 1 < len(found.rows) and file == (
-            found.rows[last + 1]["data/chunk_index"],
-            found.rows[last + 1]["data/file_index"],
-        ):
-            last += 1
-        count = found.rows[last]["dataset_to_index"] - found.rows[k]["dataset_from_index"]
-        table = found.data_table(found.rows[k])
+    for file, group in itertools.groupby(found.rows, lambda row: tuple(file_of(row, "data").values())):
+        rows = list(group)
+        count = rows[-1]["dataset_to_index"] - rows[0]["dataset_from_index"]
+        table = found.data_table(rows[0])
         if table.num_rows < count:
             raise AssetError(f"{found.folder}: data file {file} holds {table.num_rows} of {count} frames", hint=REMEDY)
         table = table.slice(0, count)
         for name, kind in kinds.items():
             parts[name].append(_column(table, name, kind, found.folder))
-        k = last + 1
     empty = {name: np.empty((0, *kind.shape), _type(kind)) for name, kind in kinds.items()}
     return {name: np.concatenate([empty[name], *values]) for name, values in parts.items()}
 
@@ -190,26 +173,16 @@ def _check_indices(
 def _read_video(found: Metadata, name: str, kind: Feature) -> NDArray[np.uint8]:
     """Return the pictures of a camera whose films are files of their own."""
     pictures = np.empty((found.frame_count, *kind.shape), np.uint8)
-    k = 0
-    while k < len(found.rows):
-        where = {"chunk_index": f"videos/{name}/chunk_index", "file_index": f"videos/{name}/file_index"}
-        file = {key: found.rows[k][column] for key, column in where.items()}
-        path = found.folder / schema.VIDEO_PATH.format(video_key=name, **file)
-        film, shown = read_film(path, kind.shape), 0
-        try:
-            while k < len(found.rows) and file == {key: found.rows[k][column] for key, column in where.items()}:
-                row = found.rows[k]
+    for file, rows in itertools.groupby(found.rows, lambda row: file_of(row, f"videos/{name}")):
+        path, shown = found.folder / schema.VIDEO_PATH.format(video_key=name, **file), 0
+        with contextlib.closing(read_film(path, kind.shape)) as film:
+            for row in rows:
                 first = round(row[f"videos/{name}/from_timestamp"] * found.fps)
-                for frame in range(first + row["length"]):
-                    if frame < shown:
-                        continue
+                for frame in range(shown, first + row["length"]):
                     picture = next(film, None)
                     if picture is None:
                         raise AssetError(f"{path} ends before frame {frame}", hint=REMEDY)
                     shown += 1
                     if frame >= first:
                         pictures[row["dataset_from_index"] + frame - first] = picture
-                k += 1
-        finally:
-            film.close()  # type: ignore[attr-defined]
     return pictures

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.spaces import Box
 
 from softmode.checks import SEED_MAX, require_number
 from softmode.demonstrations.schema import Feature
@@ -51,22 +52,18 @@ def environment_features(
         ConfigError: If its observations or actions are something else.
     """
     space, actions = env.observation_space, env.action_space
-    if not isinstance(actions, gym.spaces.Box) or len(actions.shape) != 1:
+    if not isinstance(actions, Box) or len(actions.shape) != 1:
         raise ConfigError(f"actions {actions} are no vector", hint="record an environment of this package")
     parts = dict(space.spaces) if isinstance(space, gym.spaces.Dict) else {"": space}
+    task = getattr(env.unwrapped, "task", None)
     features: dict[str, Feature] = {}
     for key, part in parts.items():
-        if (
-            isinstance(part, gym.spaces.Box)
-            and part.dtype == np.uint8
-            and len(part.shape) == 3
-            and key in ("", "pixels")
-        ):
+        if isinstance(part, Box) and part.dtype == np.uint8 and len(part.shape) == 3 and key in ("", "pixels"):
             kind = "video" if pictures == "video" else "image"
             features[f"observation.images.{camera}"] = Feature(dtype=kind, shape=part.shape)
-        elif isinstance(part, gym.spaces.Box) and len(part.shape) == 1 and key in ("", "agent_pos"):
-            names = _names(env)
-            count, total = _agent_size(env), part.shape[0]
+        elif isinstance(part, Box) and len(part.shape) == 1 and key in ("", "agent_pos"):
+            # The leading numbers are the robot's own; all, if the environment does not tell.
+            names, count, total = _names(task), getattr(task, "agent_size", 1 << 30), part.shape[0]
             for name, columns in (
                 ("observation.state", slice(0, min(count, total))),
                 ("observation.environment_state", slice(count, total)),
@@ -87,15 +84,9 @@ def environment_features(
     }
 
 
-def _agent_size(env: gym.Env) -> int:
-    """Return how many leading numbers of a state are the robot's own; all, if the environment does not tell."""
-    task = getattr(env.unwrapped, "task", None)
-    return getattr(task, "agent_size", 1 << 30)
-
-
-def _names(env: gym.Env) -> tuple[str, ...] | None:
+def _names(task: object) -> tuple[str, ...] | None:
     """Return a name for every number of a state, or None if the environment does not tell."""
-    segments = getattr(getattr(env.unwrapped, "task", None), "segments", None)
+    segments = getattr(task, "segments", None)
     if not isinstance(segments, Mapping):
         return None
     return tuple(f"{name}.{k}" for name, (part, _) in segments.items() for k in range(part.stop - part.start))

@@ -1,4 +1,4 @@
-"""The LeRobot v3.0 dataset format: file layout, features, and the schemas of its tables.
+"""The LeRobot v3.0 dataset format: file layout, features, the schemas of its tables, and how they are written.
 
 A dataset is a folder::
 
@@ -15,11 +15,14 @@ Reference: the format that ``lerobot`` 0.4 (https://github.com/huggingface/lerob
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from softmode.errors import ConfigError, MissingExtraError
+from softmode.checks import require_choice
+from softmode.demonstrations.statistics import Statistics
+from softmode.errors import ConfigError, needs_extra
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -34,6 +37,12 @@ EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.par
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 INFO_PATH, STATISTICS_PATH, TASKS_PATH = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"
 IMAGE_NAMES = ("height", "width", "channels")
+
+
+def place_of(number: int) -> dict[str, int]:
+    """Return the chunk of a file and its number within, by their names in the templates of paths."""
+    chunk, within = divmod(number, CHUNK_SIZE)
+    return {"chunk_index": chunk, "file_index": within}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +62,7 @@ class Feature:
 
     def __post_init__(self) -> None:
         """Check the combination."""
-        if self.dtype not in get_args(FeatureType):
-            raise ConfigError(f"feature type {self.dtype!r} is unknown", hint=f"use one of {get_args(FeatureType)}")
+        require_choice("feature type", self.dtype, get_args(FeatureType))
         if not all(type(edge) is int and 0 < edge <= 1 << 20 for edge in self.shape):
             raise ConfigError(f"feature shape {self.shape} must hold positive whole numbers")
         if self.is_picture:
@@ -77,10 +85,7 @@ class Feature:
 
 INDEX_FEATURES = {
     "timestamp": Feature(dtype="float32", shape=(1,)),
-    "frame_index": Feature(dtype="int64", shape=(1,)),
-    "episode_index": Feature(dtype="int64", shape=(1,)),
-    "index": Feature(dtype="int64", shape=(1,)),
-    "task_index": Feature(dtype="int64", shape=(1,)),
+    **{n: Feature(dtype="int64", shape=(1,)) for n in ("frame_index", "episode_index", "index", "task_index")},
 }
 """Columns that every dataset has and that the writer fills in: time within the episode [s], number of the frame within
 its episode, of the episode, of the frame within the dataset, and of the task."""
@@ -100,25 +105,13 @@ def check_features(features: Mapping[str, Feature]) -> None:
 
 def feature_to_json(feature: Feature, fps: int) -> dict[str, Any]:
     """Return how info.json describes a feature."""
-    names = feature.names
-    if feature.is_picture and names is None:
-        names = IMAGE_NAMES
-    entry: dict[str, Any] = {
-        "dtype": feature.dtype,
-        "shape": list(feature.shape),
-        "names": None if names is None else list(names),
-    }
+    names = IMAGE_NAMES if feature.is_picture and feature.names is None else feature.names
+    shape, names = list(feature.shape), None if names is None else list(names)
+    entry: dict[str, Any] = {"dtype": feature.dtype, "shape": shape, "names": names}
     if feature.dtype == "video":
-        entry["info"] = {
-            "video.height": feature.shape[0],
-            "video.width": feature.shape[1],
-            "video.codec": "h264",
-            "video.pix_fmt": "yuv420p",
-            "video.is_depth_map": False,
-            "video.fps": fps,
-            "video.channels": 3,
-            "has_audio": False,
-        }
+        entry["info"] = {"video.height": shape[0], "video.width": shape[1]}
+        entry["info"] |= {"video.codec": "h264", "video.pix_fmt": "yuv420p", "video.is_depth_map": False}
+        entry["info"] |= {"video.fps": fps, "video.channels": 3, "has_audio": False}
     return entry
 
 
@@ -132,13 +125,9 @@ def feature_from_json(entry: Mapping[str, Any]) -> Feature:
 
 def arrow() -> Any:
     """Return pyarrow, or raise MissingExtraError."""
-    try:
+    with needs_extra("data", "datasets need pyarrow"):
         import pyarrow
         import pyarrow.parquet
-    except ImportError as error:
-        raise MissingExtraError(
-            "datasets need pyarrow", hint="install it with: pip install 'softmode[data]'"
-        ) from error
     return pyarrow
 
 
@@ -166,27 +155,14 @@ def tasks_schema() -> pa.Schema:
     """Return the schema of the table of tasks, a pandas frame whose index is the sentence."""
     pa = arrow()
 
-    def column(name: str | None, field: str, kind: str, numpy_kind: str) -> dict[str, Any]:
-        return {
-            "name": name,
-            "field_name": field,
-            "pandas_type": kind,
-            "numpy_type": numpy_kind,
-            "metadata": None,
-        }
+    def column(name: str | None, field: str | None, kind: str, numpy_kind: str, metadata: Any = None) -> dict[str, Any]:
+        kinds = {"pandas_type": kind, "numpy_type": numpy_kind}
+        return {"name": name, "field_name": field, **kinds, "metadata": metadata}
 
     index = "__index_level_0__"
     pandas = {
         "index_columns": [index],
-        "column_indexes": [
-            {
-                "name": None,
-                "field_name": None,
-                "pandas_type": "unicode",
-                "numpy_type": "object",
-                "metadata": {"encoding": "UTF-8"},
-            }
-        ],
+        "column_indexes": [column(None, None, "unicode", "object", {"encoding": "UTF-8"})],
         "columns": [column("task_index", "task_index", "int64", "int64"), column(None, index, "unicode", "object")],
         "creator": {"library": "pyarrow", "version": pa.__version__},
         "pandas_version": "2.2.0",
@@ -194,3 +170,33 @@ def tasks_schema() -> pa.Schema:
     return pa.schema(
         [pa.field("task_index", pa.int64()), pa.field(index, pa.string())], metadata={"pandas": json.dumps(pandas)}
     )
+
+
+def tasks_table(tasks: Mapping[str, int]) -> Any:
+    """Return the table of tasks."""
+    return arrow().table([list(tasks.values()), list(tasks)], schema=tasks_schema())
+
+
+def rows_table(rows: list[dict[str, Any]]) -> Any:
+    """Return the table of episodes."""
+    return arrow().table({key: [row[key] for row in rows] for key in rows[0]})
+
+
+def write_table(path: Path, tables: Sequence[Any]) -> Path:
+    """Write tables of one schema as a Parquet file with a row group for each."""
+    pq = arrow().parquet
+    with pq.ParquetWriter(path, tables[0].schema, compression="snappy", write_page_checksum=True) as writer:
+        for table in tables:
+            writer.write_table(table)
+    return path
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> Path:
+    """Write a JSON file."""
+    path.write_text(json.dumps(content, indent=4, ensure_ascii=False, allow_nan=False), encoding="utf-8")
+    return path
+
+
+def listed(statistics: Mapping[str, Statistics]) -> dict[str, dict[str, Any]]:
+    """Return statistics as lists."""
+    return {name: {key: value.tolist() for key, value in values.items()} for name, values in statistics.items()}

@@ -13,10 +13,9 @@ from typing import Any
 
 from softmode.demonstrations import schema
 from softmode.demonstrations.episode import Episode
-from softmode.demonstrations.metadata import Metadata, read_metadata
-from softmode.demonstrations.schema import INDEX_FEATURES, Feature
+from softmode.demonstrations.metadata import Metadata, file_of, read_metadata
+from softmode.demonstrations.schema import INDEX_FEATURES, Feature, write_json, write_table
 from softmode.demonstrations.statistics import Statistics, combine
-from softmode.demonstrations.tables import listed, rows_table, tasks_table, write_json, write_table
 from softmode.errors import ConfigError
 from softmode.files import storage_errors, sync
 
@@ -88,7 +87,10 @@ class DatasetWriter:
         self._file = 0
         self._tasks: dict[str, int] = {}
         self._statistics: dict[str, Statistics] = {}
-        self._episode_count = self._frame_count = 0
+        self.episode_count = 0
+        """Episodes in the dataset."""
+        self.frame_count = 0
+        """Frames in the dataset, those of the present episode not counted."""
         self._films_done = -1  # number of the last film
         self._root, self._is_new, self._lock = self.folder, False, None
         self._made: list[Path] = []
@@ -137,46 +139,28 @@ class DatasetWriter:
                 hint="record into another folder",
             )
         self._tasks = {task: number for number, task in enumerate(found.tasks)}
-        self._episode_count, self._frame_count = found.episode_count, found.frame_count
+        self.episode_count, self.frame_count = found.episode_count, found.frame_count
         self._robot_type = found.robot_type
         if not found.rows:
             return
-        self._statistics = {name: combine([row[name] for row in found.statistics]) for name in found.statistics[0]}
+        self._statistics = found.combined()
         last = found.rows[-1]
-        if (last["meta/episodes/chunk_index"], last["meta/episodes/file_index"]) != (
-            last["data/chunk_index"],
-            last["data/file_index"],
-        ):
+        file = file_of(last, "data")
+        if file_of(last, "meta/episodes") != file or not (table := found.data_table(last)).schema.equals(self._schema):
             raise ConfigError(f"{self.folder} was written by another program", hint="record into another folder")
-        self._file = last["data/chunk_index"] * schema.CHUNK_SIZE + last["data/file_index"]
-        videos = [row for row in (last.get(f"videos/{name}/file_index") for name in self.features) if row is not None]
-        if videos:
-            self._films_done = self._episode_count - 1
-        table = found.data_table(last)
-        if not table.schema.equals(self._schema):
-            raise ConfigError(f"{self.folder} was written by another program", hint="record into another folder")
-        here = [row for row in found.rows if row["data/file_index"] == last["data/file_index"]]
-        here = [row for row in here if row["data/chunk_index"] == last["data/chunk_index"]]
-        first = here[0]["dataset_from_index"]
-        for row in here:  # what a killed recording left behind the last episode is not taken over
-            self._rows.append({key: value for key, value in row.items()})
-            self._tables.append(table.slice(row["dataset_from_index"] - first, row["length"]))
+        self._file = file["chunk_index"] * schema.CHUNK_SIZE + file["file_index"]
+        if any(last.get(f"videos/{name}/file_index") is not None for name in self.features):
+            self._films_done = self.episode_count - 1
+        self._rows = [row for row in found.rows if file_of(row, "data") == file]
+        first = self._rows[0]["dataset_from_index"]
+        # What a killed recording left behind the last episode is not taken over.
+        self._tables = [table.slice(row["dataset_from_index"] - first, row["length"]) for row in self._rows]
 
     # -- frames -------------------------------------------------------------------------------------------------------
 
     def _begin(self) -> None:
         """Begin an episode."""
         self._episode = Episode(self.features, self._fps, self._root / STAGE)
-
-    @property
-    def episode_count(self) -> int:
-        """Episodes in the dataset."""
-        return self._episode_count
-
-    @property
-    def frame_count(self) -> int:
-        """Frames in the dataset, those of the present episode not counted."""
-        return self._frame_count
 
     def add_frame(self, frame: Mapping[str, Any]) -> None:
         """Append a frame to the present episode.
@@ -229,7 +213,7 @@ class DatasetWriter:
             raise ConfigError("the episode has no frames", hint="add some before saving it")
         if not isinstance(task, str) or not task.strip():
             raise ConfigError(f"the task is {task!r}", hint="describe it in words")
-        what = f"another episode of dataset {self.folder}, whose {self._episode_count} are complete,"
+        what = f"another episode of dataset {self.folder}, whose {self.episode_count} are complete,"
         try:
             with storage_errors(what, hint="free some space and append"):
                 self._save(task)
@@ -237,11 +221,11 @@ class DatasetWriter:
             self.discard_episode()
             raise
         self._begin()
-        return self._episode_count - 1
+        return self.episode_count - 1
 
     def _save(self, task: str) -> None:
         """Stage the files of the dataset with the present episode, then put them in place."""
-        episode, number, start = self._episode, self._episode_count, self._frame_count
+        episode, number, start = self._episode, self.episode_count, self.frame_count
         count = episode.length
         tasks = {**self._tasks}
         tasks.setdefault(task, len(tasks))
@@ -261,23 +245,17 @@ class DatasetWriter:
 
         stage = self._root / STAGE
         stage.mkdir(exist_ok=True)
-        moves: list[tuple[Path, str]] = []
-        for name, film in episode.films.items():
-            chunk, within = divmod(film_number, schema.CHUNK_SIZE)
-            path = schema.VIDEO_PATH.format(video_key=name, chunk_index=chunk, file_index=within)
-            moves.append((film.path, path))
-        where = {"chunk_index": file // schema.CHUNK_SIZE, "file_index": file % schema.CHUNK_SIZE}
-        moves.append((write_table(stage / "data.parquet", tables), schema.DATA_PATH.format(**where)))
+        where, films = schema.place_of(file), schema.place_of(film_number)
+        moves = {schema.VIDEO_PATH.format(video_key=k, **films): film.path for k, film in episode.films.items()}
+        moves[schema.DATA_PATH.format(**where)] = write_table(stage / "data.parquet", tables)
         if len(tasks) > len(self._tasks):
-            moves.append((write_table(stage / "tasks.parquet", [tasks_table(tasks)]), schema.TASKS_PATH))
-        moves.append(
-            (write_table(stage / "episodes.parquet", [rows_table(rows)]), schema.EPISODES_PATH.format(**where))
-        )
-        moves.append((write_json(stage / "stats.json", listed(total)), schema.STATISTICS_PATH))
-        moves.append((write_json(stage / "info.json", self._info(number + 1, start + count, tasks)), schema.INFO_PATH))
-        for source, _ in moves:
+            moves[schema.TASKS_PATH] = write_table(stage / "tasks.parquet", [schema.tasks_table(tasks)])
+        moves[schema.EPISODES_PATH.format(**where)] = write_table(stage / "episodes.parquet", [schema.rows_table(rows)])
+        moves[schema.STATISTICS_PATH] = write_json(stage / "stats.json", schema.listed(total))
+        moves[schema.INFO_PATH] = write_json(stage / "info.json", self._info(number + 1, start + count, tasks))
+        for source in moves.values():
             sync(source)
-        for source, target in moves:
+        for target, source in moves.items():
             (self._root / target).parent.mkdir(parents=True, exist_ok=True)
             os.replace(source, self._root / target)
         if self._is_new:
@@ -286,30 +264,22 @@ class DatasetWriter:
             self._root, self._is_new, self._made = self.folder, False, []
         self._rows, self._tables, self._file = rows, tables, file
         self._tasks, self._statistics = tasks, total
-        self._episode_count, self._frame_count = number + 1, start + count
+        self.episode_count, self.frame_count = number + 1, start + count
         self._films_done = film_number
 
     def _row(
         self, number: int, task: str, start: int, count: int, file: int, film: int, found: Mapping[str, Statistics]
     ) -> dict[str, Any]:
         """Return the row of an episode."""
-        chunk, within = divmod(file, schema.CHUNK_SIZE)
-        row: dict[str, Any] = {
-            "episode_index": number,
-            "tasks": [task],
-            "length": count,
-            "data/chunk_index": chunk,
-            "data/file_index": within,
-            "dataset_from_index": start,
-            "dataset_to_index": start + count,
-        }
+        row: dict[str, Any] = {"episode_index": number, "tasks": [task], "length": count}
+        row |= {f"data/{key}": value for key, value in schema.place_of(file).items()}
+        row |= {"dataset_from_index": start, "dataset_to_index": start + count}
         for name in self._episode.films:
-            row[f"videos/{name}/chunk_index"], row[f"videos/{name}/file_index"] = divmod(film, schema.CHUNK_SIZE)
-            row[f"videos/{name}/from_timestamp"] = 0.0
-            row[f"videos/{name}/to_timestamp"] = count / self._fps
+            row |= {f"videos/{name}/{key}": value for key, value in schema.place_of(film).items()}
+            row |= {f"videos/{name}/from_timestamp": 0.0, f"videos/{name}/to_timestamp": count / self._fps}
         for name, values in found.items():
-            row.update({f"stats/{name}/{key}": value.tolist() for key, value in values.items()})
-        return row | {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": within}
+            row |= {f"stats/{name}/{key}": value.tolist() for key, value in values.items()}
+        return row | {f"meta/episodes/{key}": value for key, value in schema.place_of(file).items()}
 
     def _info(self, episodes: int, frames: int, tasks: Mapping[str, int]) -> dict[str, Any]:
         """Return the content of info.json."""

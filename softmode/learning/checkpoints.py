@@ -53,18 +53,8 @@ def write_checkpoint(checkpoint: Checkpoint, path: str | os.PathLike[str]) -> No
     Raises:
         StorageError: If it cannot be written; what was there before stays.
     """
-    header = {
-        "format": FORMAT,
-        "version": FORMAT_VERSION,
-        "softmode": __version__,
-        "env": checkpoint.env,
-        "env_options": checkpoint.env_options,
-        "interface": checkpoint.interface.to_json(),
-        "privileged": checkpoint.privileged,
-        "hyperparameters": checkpoint.hyperparameters.to_json(),
-        "progress": checkpoint.progress,
-        "arrays": sorted(checkpoint.arrays),
-    }
+    said = dataclasses.asdict(dataclasses.replace(checkpoint, arrays={})) | {"arrays": sorted(checkpoint.arrays)}
+    header = {"format": FORMAT, "version": FORMAT_VERSION, "softmode": __version__, **said}
     write_archive(path, header, checkpoint.arrays, "checkpoint")
 
 
@@ -94,15 +84,10 @@ def read_checkpoint(path: str | os.PathLike[str]) -> Checkpoint:
         for name, array in stored.items():
             if not np.all(np.isfinite(array)):
                 raise ValueError(f"{name} is not finite")
-        return Checkpoint(
-            env=header["env"],
-            env_options=env_options,
-            interface=Interface.from_json(header["interface"]),
-            privileged=privileged,
-            hyperparameters=Hyperparameters.from_json(header["hyperparameters"]),
-            progress=progress,
-            arrays=stored,
-        )
+        interface = Interface.from_json(header["interface"])
+        hyperparameters = Hyperparameters.from_json(header["hyperparameters"])
+        said = {name: header[name] for name in ("env", "env_options", "privileged", "progress")}
+        return Checkpoint(**said, interface=interface, hyperparameters=hyperparameters, arrays=stored)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, ConfigError) as error:
         raise CheckpointError(f"checkpoint {path}: damaged ({error})", hint=hint) from error
 
@@ -129,5 +114,5 @@ def check_env(checkpoint: Checkpoint, path: object, env: str | None, interface: 
 
 
 def _describe(interface: Interface) -> str:
-    seen = {**interface.vectors, **interface.pictures}
+    seen = interface.vectors | interface.pictures
     return f"observation {seen}, action {interface.action_size} in {interface.action_low} to {interface.action_high}"

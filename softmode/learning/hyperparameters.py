@@ -6,8 +6,9 @@ import dataclasses
 import typing
 from typing import Any, Literal
 
-from softmode.checks import require_fields, require_number
+from softmode.checks import require_choice, require_fields, require_number
 from softmode.errors import ConfigError
+from softmode.learning.config_values import config_of
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -97,8 +98,7 @@ class Hyperparameters:
         _require("hidden", self.hidden, all(_is_count(width) for width in self.hidden), "widths >= 1")
         hints = typing.get_type_hints(type(self))
         for name in ("schedule", "activation", "encoder", "bound"):
-            choices = typing.get_args(hints[name])
-            _require(name, getattr(self, name), getattr(self, name) in choices, f"one of {', '.join(choices)}")
+            require_choice(name, getattr(self, name), typing.get_args(hints[name]))
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields as JSON values."""
@@ -111,14 +111,7 @@ class Hyperparameters:
         Raises:
             ConfigError: If a field is unknown or has another type.
         """
-        known = {field.name for field in dataclasses.fields(cls)}
-        unknown = sorted(set(values) - known) if isinstance(values, dict) else [repr(values)]
-        if unknown:
-            raise ConfigError(f"unknown hyperparameter {unknown[0]}", hint=f"use one of {', '.join(sorted(known))}")
-        try:
-            return cls(**{**values, "hidden": tuple(values.get("hidden", cls.hidden))})
-        except TypeError as error:
-            raise ConfigError(f"a hyperparameter has another type ({error})", hint="give numbers") from error
+        return config_of(cls, values)
 
 
 def preset(num_envs: int, *, pixels: bool = False) -> Hyperparameters:

@@ -77,9 +77,5 @@ class NanGuard:
     def _series(rollout: Rollout) -> dict[str, torch.Tensor]:
         series = {f"observation_{key}": value[:-1] for key, value in rollout.observation.items()}
         series |= {f"next_observation_{key}": value[1:] for key, value in rollout.observation.items()}
-        return series | {
-            "action": rollout.sample,
-            "reward": rollout.reward,
-            "terminated": rollout.terminated,
-            "truncated": rollout.truncated,
-        }
+        ends = {"terminated": rollout.terminated, "truncated": rollout.truncated}
+        return series | {"action": rollout.sample, "reward": rollout.reward, **ends}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import torch
@@ -101,12 +102,11 @@ class Encoder(nn.Module):
         super().__init__()
         self.normalize = options.normalize_observations
         self.moments = nn.ModuleDict({key: RunningMoments((size,)) for key, size in sorted(interface.vectors.items())})
-        self.pictures = nn.ModuleDict(
-            {
-                key: PictureEncoder(shape, options.encoder, options.features, options.mixed_precision)
-                for key, shape in sorted(interface.pictures.items())
-            }
-        )
+        pictures = {
+            key: PictureEncoder(shape, options.encoder, options.features, options.mixed_precision)
+            for key, shape in sorted(interface.pictures.items())
+        }
+        self.pictures = nn.ModuleDict(pictures)
         self.size = sum(interface.vectors.values()) + options.features * len(interface.pictures)
 
     def forward(self, observation: Observation) -> torch.Tensor:
@@ -158,15 +158,7 @@ class Critic(nn.Module):
         self.reads_state = privileged > 0 or not interface.pictures
         if self.reads_state:
             vectors = {PRIVILEGED: privileged} if privileged else interface.vectors
-            self.encoder = Encoder(
-                Interface(
-                    vectors=vectors,
-                    pictures={},
-                    action_low=interface.action_low,
-                    action_high=interface.action_high,
-                ),
-                options,
-            )
+            self.encoder = Encoder(dataclasses.replace(interface, vectors=vectors, pictures={}), options)
             shared = self.encoder.size
         self.value = mlp(shared, options.hidden, 1, options.activation, 1.0)
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from softmode.errors import CheckpointError, ConfigError, MissingExtraError
+from softmode.errors import CheckpointError, ConfigError, needs_extra
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -39,7 +39,16 @@ def trained_policy(name: str, env: str) -> Policy | None:
         CheckpointError: If the file is missing, damaged, foreign, or of another environment.
         MissingExtraError: If torch is not installed.
     """
-    return None if name in POLICIES else policy_file(name, env)
+    if name in POLICIES:
+        return None
+    require_torch()
+    from softmode.learning.checkpoints import same_env
+    from softmode.learning.policy import load_policy
+
+    policy = load_policy(name)
+    if not same_env(policy.env, env):
+        raise CheckpointError(f"checkpoint {name} is of {policy.env}, not of {env}", hint=f"play {policy.env}")
+    return policy
 
 
 def policy_factory(name: str, env: gym.Env, trained: Policy | None = None) -> Callable[[int], Player]:
@@ -80,26 +89,7 @@ def policy_factory(name: str, env: gym.Env, trained: Policy | None = None) -> Ca
     return lambda seed: player
 
 
-def policy_file(path: str, env: str) -> Policy:
-    """Return the policy in a checkpoint of an environment.
-
-    Raises:
-        CheckpointError: If the file is missing, damaged, foreign, or of another environment.
-        MissingExtraError: If torch is not installed.
-    """
-    require_torch()
-    from softmode.learning.checkpoints import same_env
-    from softmode.learning.policy import load_policy
-
-    policy = load_policy(path)
-    if not same_env(policy.env, env):
-        raise CheckpointError(f"checkpoint {path} is of {policy.env}, not of {env}", hint=f"play {policy.env}")
-    return policy
-
-
 def require_torch() -> None:
     """Raise MissingExtraError where torch is not installed."""
-    try:
+    with needs_extra("rl", "training needs torch"):
         import torch  # noqa: F401
-    except ImportError as error:
-        raise MissingExtraError("training needs torch", hint="install it with: pip install 'softmode[rl]'") from error

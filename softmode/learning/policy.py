@@ -12,21 +12,17 @@ import gymnasium as gym
 import numpy as np
 
 from softmode.checks import require_number
-from softmode.errors import CheckpointError, ConfigError, MissingExtraError
+from softmode.errors import CheckpointError, ConfigError, needs_extra
 
-try:
+with needs_extra("rl", "trained policies need torch"):
     import torch
-except ImportError as error:
-    raise MissingExtraError(
-        "trained policies need torch", hint="install it with: pip install 'softmode[rl]'"
-    ) from error
 
 from softmode.learning.checkpoints import Checkpoint, check_env, read_checkpoint
 from softmode.learning.distributed import local_device
 from softmode.learning.environments import with_config
-from softmode.learning.networks import Actor, Observation
+from softmode.learning.networks import Actor
 from softmode.learning.spaces import Interface
-from softmode.learning.vector_tensors import TensorVectorEnv
+from softmode.learning.vector_tensors import TensorVectorEnv, action_range, tensors_of
 
 EVALUATION_SEED = 1_000_000_000
 """First seed of evaluation episodes; training draws its seeds below."""
@@ -54,9 +50,7 @@ class Policy:
         self.interface = checkpoint.interface
         self.checkpoint, self.device, self._path = checkpoint, device, path
         self.actor = actor_of(checkpoint, device, path)
-        low = torch.tensor(self.interface.action_low, device=device)
-        high = torch.tensor(self.interface.action_high, device=device)
-        self._center, self._half = (high + low) / 2.0, (high - low) / 2.0
+        self._center, self._half = action_range(self.interface, device)
 
     def make(self, **options: Any) -> gym.Env:
         """Return the environment of the policy, with the options it was trained with and further ones."""
@@ -74,23 +68,14 @@ class Policy:
     @torch.no_grad()
     def __call__(self, observation: Any) -> Any:
         """Return the action for one observation or a batch of them."""
-        if not isinstance(observation, dict):
-            key = next(iter((*self.interface.vectors, *self.interface.pictures)))
-            observation = {key: observation}
-        ranks = {**dict.fromkeys(self.interface.vectors, 1), **dict.fromkeys(self.interface.pictures, 3)}
         try:
-            tensors: Observation = {
-                key: torch.as_tensor(observation[key], device=self.device).to(
-                    torch.uint8 if key in self.interface.pictures else torch.float32
-                )
-                for key in ranks
-            }
+            tensors = tensors_of(observation, self.interface, self.device)
         except KeyError as error:
             raise ConfigError(f"the observation has no {error}", hint="use the obs_type of the policy's run") from error
-        single = all(tensors[key].ndim == rank for key, rank in ranks.items())
+        shapes = {**{key: (size,) for key, size in self.interface.vectors.items()}, **self.interface.pictures}
+        single = all(tensors[key].ndim == len(shape) for key, shape in shapes.items())
         if single:
             tensors = {key: value[None] for key, value in tensors.items()}
-        shapes = {**{key: (size,) for key, size in self.interface.vectors.items()}, **self.interface.pictures}
         for key, shape in shapes.items():
             if tuple(tensors[key].shape[1:]) != shape:
                 raise ConfigError(
@@ -99,7 +84,7 @@ class Policy:
                 )
         action = self._center + self._half * self.actor(tensors)
         action = action[0] if single else action
-        given = next(iter(observation.values()))
+        given = next(iter(observation.values())) if isinstance(observation, dict) else observation
         return action if isinstance(given, torch.Tensor) else action.cpu().numpy()
 
 

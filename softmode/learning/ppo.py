@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import torch
+from torch import Tensor
 
 from softmode.learning.distributed import Ranks
 from softmode.learning.hyperparameters import Hyperparameters
@@ -42,7 +43,7 @@ class PPO:
         device = self.optimizer.value.device
         self.reward_moments = RunningMoments(()).to(device)
 
-    def advantages(self, rollout: Rollout) -> tuple[torch.Tensor, torch.Tensor]:
+    def advantages(self, rollout: Rollout) -> tuple[Tensor, Tensor]:
         """Return advantages and values, shape (steps, n), in units of scaled rewards."""
         options = self.options
         flat = {key: observed.flatten(0, 1) for key, observed in rollout.observation.items()}
@@ -59,7 +60,7 @@ class PPO:
         )
         return advantage, values[:-1]
 
-    def update(self, rollout: Rollout, generator: torch.Generator, progress: float, train_actor: bool) -> torch.Tensor:
+    def update(self, rollout: Rollout, generator: torch.Generator, progress: float, train_actor: bool) -> Tensor:
         """Improve actor and critic with a rollout; return means of :attr:`LOSSES` on the device.
 
         Args:
@@ -81,7 +82,6 @@ class PPO:
         weight = valid * (valid.numel() * self.ranks.count / moments[0])
         old = _log_probability(rollout.sample, rollout.mean, rollout.log_std)
         columns = [x.flatten(0, 1) for x in (weight, advantage, value, target, old, rollout.sample, rollout.mean)]
-        entropy_weight = options.entropy_coefficient * (1.0 - 0.9 * progress)
         if options.schedule == "linear":
             optimizer.learning_rate.fill_(options.learning_rate * (1.0 - 0.95 * progress))
         sums = torch.zeros(len(self.LOSSES), device=value.device)
@@ -91,7 +91,7 @@ class PPO:
             for index in order.chunk(options.minibatches):
                 parts = [column[index] for column in columns]
                 optimizer.zero()
-                losses = self._losses(rollout, index, parts, entropy_weight, train_actor, 1.0 - progress)
+                losses = self._losses(rollout, index, parts, progress, train_actor)
                 divergence = optimizer.average(losses[3], self.ranks)
                 if options.schedule == "adaptive" and train_actor:
                     optimizer.adapt(divergence, options.desired_kl, (MIN_LEARNING_RATE, options.max_learning_rate))
@@ -101,14 +101,8 @@ class PPO:
         return sums / (options.epochs * min(options.minibatches, total))
 
     def _losses(
-        self,
-        rollout: Rollout,
-        index: torch.Tensor,
-        parts: list[torch.Tensor],
-        entropy_weight: float,
-        train_actor: bool,
-        remaining: float,
-    ) -> torch.Tensor:
+        self, rollout: Rollout, index: Tensor, parts: list[Tensor], progress: float, train_actor: bool
+    ) -> Tensor:
         """Add the gradients of a minibatch; return its losses."""
         options, model = self.options, self.model
         weight, advantage, old_value, target, old, sample, old_mean = parts
@@ -128,7 +122,7 @@ class PPO:
         value_loss = (weight * error).mean()
         loss = options.value_coefficient * value_loss
         if train_actor:
-            loss = loss + policy_loss - entropy_weight * entropy
+            loss = loss + policy_loss - options.entropy_coefficient * (1.0 - 0.9 * progress) * entropy
             if options.bound == "clamp" and options.bound_coefficient:
                 outside = (mean.abs() - 1.0).clamp(min=0.0).square().sum(-1)
                 loss = loss + options.bound_coefficient * (weight * outside).mean()
@@ -136,7 +130,7 @@ class PPO:
             with torch.no_grad():
                 shown = self.teacher.mean(self.teacher.encoder({STATE: observation[PRIVILEGED]})).clamp(-1.0, 1.0)
             apart = (mean - shown).square().sum(-1)
-            loss = loss + options.teacher_coefficient * remaining * (weight * apart).mean()
+            loss = loss + options.teacher_coefficient * (1.0 - progress) * (weight * apart).mean()
         prediction_loss = torch.zeros_like(loss)
         if model.predict is not None:
             state = model.critic.encoder.moments[PRIVILEGED](observation[PRIVILEGED])
@@ -150,15 +144,13 @@ class PPO:
             return torch.stack([policy_loss, value_loss, entropy, divergence, zero, far, prediction_loss]).detach()
 
 
-def _log_probability(sample: torch.Tensor, mean: torch.Tensor, log_std: torch.Tensor) -> torch.Tensor:
+def _log_probability(sample: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
     """Return the log density of samples of a diagonal Gaussian; a squashing after it cancels in ratios."""
     scaled = (sample - mean) * (-log_std).exp()
     return -(0.5 * scaled.square() + log_std + 0.5 * math.log(2.0 * math.pi)).sum(-1)
 
 
-def _divergence(
-    mean: torch.Tensor, log_std: torch.Tensor, new_mean: torch.Tensor, new_log_std: torch.Tensor
-) -> torch.Tensor:
+def _divergence(mean: Tensor, log_std: Tensor, new_mean: Tensor, new_log_std: Tensor) -> Tensor:
     """Return the Kullback-Leibler divergence of the new from the old diagonal Gaussian."""
     square = (log_std.exp().square() + (mean - new_mean).square()) / (2.0 * new_log_std.exp().square())
     return (new_log_std - log_std + square - 0.5).sum(-1)

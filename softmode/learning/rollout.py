@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from softmode.learning.distributed import Ranks
 from softmode.learning.moments import RunningMoments
-from softmode.learning.networks import ActorCritic, Observation
-from softmode.learning.vector_tensors import Step, TensorVectorEnv, with_privileged
+from softmode.learning.networks import PRIVILEGED, ActorCritic, Observation
+from softmode.learning.vector_tensors import Step, TensorVectorEnv
 
 
 class Rollout:
@@ -41,7 +42,7 @@ class Rollout:
         for key, value in observation.items():
             self.observation[key][t].copy_(value)
 
-    def flat(self, index: torch.Tensor) -> Observation:
+    def flat(self, index: Tensor) -> Observation:
         """Return the observations of the transitions ``index`` (into steps times worlds)."""
         return {key: value[:-1].flatten(0, 1)[index] for key, value in self.observation.items()}
 
@@ -54,10 +55,10 @@ class EpisodeStatistics:
         self.episode_return = torch.zeros(count, device=device)
         self.episode_length = torch.zeros(count, device=device)
         self.sums = torch.zeros(5, device=device)  # episodes, returns, lengths, successes, valid steps
-        self.term_sums: dict[str, torch.Tensor] = {}
+        self.term_sums: dict[str, Tensor] = {}
         self.knows_success = False
 
-    def add(self, step: Step, valid: torch.Tensor) -> None:
+    def add(self, step: Step, valid: Tensor) -> None:
         """Count a step of all worlds; ``valid`` is 0 where it only reset a world."""
         done = (step.terminated | step.truncated).float()
         self.episode_return += step.reward * valid
@@ -73,7 +74,7 @@ class EpisodeStatistics:
                 self.term_sums[name] = torch.zeros((), device=done.device)
             self.term_sums[name] += (value * valid).sum()
 
-    def take(self) -> torch.Tensor:
+    def take(self) -> Tensor:
         """Return the sums, terms of the reward behind the first five, and start again."""
         taken = torch.cat([self.sums, *(value[None] for value in self.term_sums.values())])
         self.sums.zero_()
@@ -123,8 +124,10 @@ class Collector:
             running.masked_fill_(where, 0.0)
 
     def _seen(self, observation: Observation) -> Observation:
+        """Return the observation, the full state beside it where there is one that the critic reads."""
         reads = self.model.critic.reads_state and bool(self.model.actor.encoder.pictures)
-        return with_privileged(observation, self.env.privileged() if reads else None)
+        state = self.env.privileged() if reads else None
+        return observation if state is None else {**observation, PRIVILEGED: state}
 
     @torch.no_grad()
     def collect(self, generator: torch.Generator) -> Rollout:
@@ -171,14 +174,8 @@ class Collector:
 
 
 def generalized_advantage(
-    reward: torch.Tensor,
-    value: torch.Tensor,
-    next_value: torch.Tensor,
-    terminated: torch.Tensor,
-    done: torch.Tensor,
-    discount: float,
-    decay: float,
-) -> torch.Tensor:
+    reward: Tensor, value: Tensor, next_value: Tensor, terminated: Tensor, done: Tensor, discount: float, decay: float
+) -> Tensor:
     """Return advantages by generalised advantage estimation (Schulman et al. 2016, equation 16).
 
     A terminated episode has no value beyond its end; a truncated one has that of its last state, so ``next_value`` must

@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from softmode.errors import MissingExtraError, RunError
+from softmode.errors import RunError, needs_extra
 from softmode.files import storage_errors, whole_file
 
 CONFIG, PROGRESS, LATEST, BEST = "config.json", "progress.csv", "latest.npz", "best.npz"
@@ -36,14 +36,10 @@ class RunFolder:
         self.path = path
         self._writer: Any = None
         self._columns: list[str] | None = None
-        if not writes:
-            return
-        if resume:
-            if not (path / CONFIG).is_file() or not (path / LATEST).is_file():
-                raise RunError(
-                    f"{path} holds no run to go on with ({CONFIG} and {LATEST})",
-                    hint="give the folder of a run, or drop --resume to start one",
-                )
+        if resume and writes and not ((path / CONFIG).is_file() and (path / LATEST).is_file()):
+            hint = "give the folder of a run, or drop --resume to start one"
+            raise RunError(f"{path} holds no run to go on with ({CONFIG} and {LATEST})", hint=hint)
+        if resume or not writes:
             return
         if path.exists():
             raise RunError(f"run folder {path} exists", hint="choose another one, or go on with its run: --resume")
@@ -114,19 +110,19 @@ class RunFolder:
         Raises:
             RunError: If it cannot be written.
         """
-        with self.writing(PROGRESS):
+        with self.writing(PROGRESS), (self.path / PROGRESS).open("a" if self._columns else "w") as file:
             if self._columns is None:
                 self._columns = list(row)
-                (self.path / PROGRESS).write_text(",".join(self._columns) + "\n")
+                file.write(",".join(self._columns) + "\n")
             cells = (row.get(name) for name in self._columns)
             texts = ("" if cell is None else f"{cell:.6g}" if isinstance(cell, float) else str(cell) for cell in cells)
-            with (self.path / PROGRESS).open("a") as file:
-                file.write(",".join(texts) + "\n")
-        if self._writer is not None:
-            with self.writing("tensorboard"):
-                for name, value in row.items():
-                    if value is not None and name not in ("iteration", "env_steps"):
-                        self._writer.add_scalar(name, value, row["env_steps"])
+            file.write(",".join(texts) + "\n")
+        if self._writer is None:
+            return
+        with self.writing("tensorboard"):
+            for name, value in row.items():
+                if value is not None and name not in ("iteration", "env_steps"):
+                    self._writer.add_scalar(name, value, row["env_steps"])
 
     def start_tensorboard(self, purge_after: int | None) -> None:
         """Write scalars for TensorBoard too.
@@ -137,12 +133,8 @@ class RunFolder:
         Raises:
             MissingExtraError: If tensorboard is not installed.
         """
-        try:
+        with needs_extra("rl", "TensorBoard scalars need tensorboard"):
             from torch.utils.tensorboard import SummaryWriter
-        except ImportError as error:
-            raise MissingExtraError(
-                "TensorBoard scalars need tensorboard", hint="install it with: pip install 'softmode[rl]'"
-            ) from error
         self._writer = SummaryWriter(os.fspath(self.path / "tensorboard"), purge_step=purge_after)
 
     def close(self) -> None:

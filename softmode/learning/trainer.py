@@ -15,12 +15,10 @@ import gymnasium as gym
 import numpy as np
 
 from softmode import __version__
-from softmode.errors import CheckpointError, ConfigError, MissingExtraError, RunError, TrainingDiverged
+from softmode.errors import CheckpointError, ConfigError, MissingExtraError, RunError, TrainingDiverged, needs_extra
 
-try:
+with needs_extra("rl", "training needs torch"):
     import torch
-except ImportError as error:
-    raise MissingExtraError("training needs torch", hint="install it with: pip install 'softmode[rl]'") from error
 
 from softmode.learning.checkpoints import Checkpoint, check_env, read_checkpoint, same_env, write_checkpoint
 from softmode.learning.distributed import Ranks, local_device
@@ -35,12 +33,11 @@ from softmode.learning.train_options import DEFAULT_STEPS, TrainOptions, TrainRe
 from softmode.learning.training_log import WINDOW, TrainingLog, describe
 from softmode.learning.vector_tensors import TensorVectorEnv
 
+Report = Callable[[str], None]
 MakeVectorEnv = Callable[[str, int, torch.device, dict[str, Any]], gym.vector.VectorEnv]
 
 
-def train(
-    options: TrainOptions, *, make: MakeVectorEnv = make_vector_env, report: Callable[[str], None] = print
-) -> TrainResult:
+def train(options: TrainOptions, *, make: MakeVectorEnv = make_vector_env, report: Report = print) -> TrainResult:
     """Train a policy.
 
     Under torchrun every process steps its own worlds, gradients are averaged, and the first process writes.
@@ -110,12 +107,7 @@ class _Run:
     """The state of a run."""
 
     def __init__(
-        self,
-        options: TrainOptions,
-        env: TensorVectorEnv,
-        ranks: Ranks,
-        start: Checkpoint | None,
-        report: Callable[[str], None],
+        self, options: TrainOptions, env: TensorVectorEnv, ranks: Ranks, start: Checkpoint | None, report: Report
     ) -> None:
         self.options, self.env, self.ranks, self.device = options, env, ranks, env.device
         self.report = report if ranks.rank == 0 else lambda line: None
@@ -138,8 +130,8 @@ class _Run:
         self.ppo = PPO(self.model, self.hyperparameters, ranks, self._teacher())
         if start is not None:
             self._load(start)
-        options_ = self.hyperparameters
-        self.collector = Collector(env, self.model, first, options_.rollout_steps, options_.discount)
+        steps, discount = self.hyperparameters.rollout_steps, self.hyperparameters.discount
+        self.collector = Collector(env, self.model, first, steps, discount)
         self.log = TrainingLog(self.collector.statistics, self.ppo, ranks)
         self.generator = torch.Generator(self.device)
         self.guard = NanGuard() if options.nan_guard else None
@@ -209,11 +201,8 @@ class _Run:
             ) from error
 
     def _modules(self) -> dict[str, torch.nn.Module]:
-        modules: dict[str, torch.nn.Module] = {
-            "actor": self.model.actor,
-            "critic": self.model.critic,
-            "reward": self.ppo.reward_moments,
-        }
+        modules: dict[str, torch.nn.Module] = {"actor": self.model.actor, "critic": self.model.critic}
+        modules["reward"] = self.ppo.reward_moments
         return modules | ({} if self.model.predict is None else {"predict": self.model.predict})
 
     def _open_folder(self) -> RunFolder:
@@ -260,9 +249,7 @@ class _Run:
             "hyperparameters": self.hyperparameters.to_json(),
             "versions": {
                 "softmode": __version__,
-                "torch": torch.__version__,
-                "gymnasium": gym.__version__,
-                "numpy": np.__version__,
+                **{package.__name__: package.__version__ for package in (torch, gym, np)},
                 "python": platform.python_version(),
             },
             "command": sys.argv,
@@ -287,14 +274,9 @@ class _Run:
                 self.env_steps += per_rollout
                 row, progress, any_bad = self.log.read(losses, bad, self._progress())
                 now = time.perf_counter()
-                row = {
-                    "iteration": self.iteration,
-                    "env_steps": self.env_steps,
-                    "seconds": self._seconds(),
-                    "steps_per_second": per_rollout / (now - clock),
-                    "update_share": (now - collected) / (now - clock),
-                    **row,
-                }
+                told = {"iteration": self.iteration, "env_steps": self.env_steps, "seconds": self._seconds()}
+                told |= {"steps_per_second": per_rollout / (now - clock)}
+                row = {**told, "update_share": (now - collected) / (now - clock), **row}
                 if any_bad or row["skipped_updates"]:
                     raise self._diverged(rollout, any_bad, bool(bad))
                 if self.guard:
@@ -359,21 +341,16 @@ class _Run:
         for prefix, module in self._modules().items():
             arrays |= {f"{prefix}.{key}": value.cpu().numpy() for key, value in module.state_dict().items()}
         arrays |= {f"optimizer.{key}": value.cpu().numpy() for key, value in self.ppo.optimizer.state().items()}
+        progress = {"iteration": self.iteration, "env_steps": self.env_steps, "seconds": self._seconds()}
+        progress |= {"seed": self.options.seed, "resumed": self.resumed}
+        progress |= {"best_success": self.best[0], "best_return": self.best[1]}
         checkpoint = Checkpoint(
             env=self.options.env,
             env_options=self.options.env_options,
             interface=self.env.interface,
             privileged=self.privileged,
             hyperparameters=self.hyperparameters,
-            progress={
-                "iteration": self.iteration,
-                "env_steps": self.env_steps,
-                "seconds": self._seconds(),
-                "seed": self.options.seed,
-                "resumed": self.resumed,
-                "best_success": self.best[0],
-                "best_return": self.best[1],
-            },
+            progress=progress,
             arrays=arrays,
         )
         with self.folder.writing(name):

@@ -10,7 +10,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 from softmode.errors import ConfigError
-from softmode.learning.networks import PRIVILEGED, Observation
+from softmode.learning.networks import Observation
 from softmode.learning.spaces import Interface
 
 
@@ -25,6 +25,23 @@ class Step(NamedTuple):
     success: torch.Tensor | None  # (n,) float32, of the state before a reset
     terms: dict[str, torch.Tensor]  # terms of the reward, (n,) float32 each
     raw: Any  # the observation as the environment gave it
+
+
+def tensors_of(observation: Any, interface: Interface, device: torch.device) -> Observation:
+    """Return the parts of an observation, of one world or many, as tensors: pictures of bytes, vectors of floats.
+
+    Raises:
+        KeyError: If one is missing.
+    """
+    kinds = {**dict.fromkeys(interface.vectors, torch.float32), **dict.fromkeys(interface.pictures, torch.uint8)}
+    parts = observation if isinstance(observation, dict) else {next(iter(kinds)): observation}
+    return {key: torch.as_tensor(parts[key], device=device).to(kind) for key, kind in kinds.items()}
+
+
+def action_range(interface: Interface, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the middle of the range of the action and half its width."""
+    low, high = (torch.tensor(bound, device=device) for bound in (interface.action_low, interface.action_high))
+    return (high + low) / 2.0, (high - low) / 2.0
 
 
 class TensorVectorEnv:
@@ -49,9 +66,7 @@ class TensorVectorEnv:
         self.same_step = mode == AutoresetMode.SAME_STEP
         self.interface = Interface.of(env)
         self.count = env.num_envs
-        low = torch.tensor(self.interface.action_low, device=device)
-        high = torch.tensor(self.interface.action_high, device=device)
-        self._center, self._half = (high + low) / 2.0, (high - low) / 2.0
+        self._center, self._half = action_range(self.interface, device)
         self._tensors: bool | None = None
         self._single = not isinstance(env.single_observation_space, gym.spaces.Dict)
 
@@ -111,14 +126,10 @@ class TensorVectorEnv:
         return torch.as_tensor(value, device=self.device).to(dtype)
 
     def _observation(self, observation: Any) -> Observation:
-        if self._single:
-            key = next(iter((*self.interface.vectors, *self.interface.pictures)))
-            observation = {key: observation}
         if self._tensors is None:
-            self._tensors = all(isinstance(value, torch.Tensor) for value in observation.values())
-        out = {key: self._tensor(observation[key], torch.float32) for key in self.interface.vectors}
-        out |= {key: self._tensor(observation[key], torch.uint8) for key in self.interface.pictures}
-        return out
+            parts = observation.values() if isinstance(observation, dict) else [observation]
+            self._tensors = all(isinstance(value, torch.Tensor) for value in parts)
+        return tensors_of(observation, self.interface, self.device)
 
     def _final(self, final: Any, observation: Any) -> Observation:
         """Return last observations of all worlds; those of worlds that go on mean nothing."""
@@ -133,8 +144,3 @@ class TensorVectorEnv:
                     for key, value in observation.items()
                 }
         return self._observation(final)
-
-
-def with_privileged(observation: Observation, state: torch.Tensor | None) -> Observation:
-    """Return the observation, the full state beside it where there is one."""
-    return observation if state is None else {**observation, PRIVILEGED: state}

@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from softmode.checks import require_number
-from softmode.errors import ConfigError, MissingExtraError, SoftmodeError
+from softmode.errors import ConfigError, SoftmodeError, needs_extra
+from softmode.view.live_types import Vector
 from softmode.view.panel import Command, MouseMode, Panel
 from softmode.view.stage import Stage
 
@@ -102,11 +102,7 @@ class ViewApp:
                 self._server, session, on_drag=self._on_drag, on_click=self._on_click, on_pin=self._on_pin
             )
             self._panel = Panel(
-                self._server,
-                session,
-                submit=self.submit,
-                on_mode=self._on_mode,
-                record_path=self._record_path,
+                self._server, session, submit=self.submit, on_mode=self._on_mode, record_path=self._record_path
             )
         except BaseException:
             self.close()
@@ -206,7 +202,7 @@ class ViewApp:
 
         self.submit(pin)
 
-    def _on_pin(self, number: int, position: NDArray[np.float64], wxyz: NDArray[np.float64]) -> None:
+    def _on_pin(self, number: int, position: Vector, wxyz: Vector) -> None:
         """Queue the motion of a gizmo."""
 
         def move(session: LiveSession) -> None:
@@ -222,14 +218,7 @@ class ViewApp:
         self._stage.set_clickable(mode == "pin")
 
     def _do_drag(
-        self,
-        session: LiveSession,
-        client: int,
-        phase: str,
-        eye: NDArray[np.float64],
-        forward: NDArray[np.float64],
-        start: NDArray[np.float64],
-        end: NDArray[np.float64],
+        self, session: LiveSession, client: int, phase: str, eye: Vector, forward: Vector, start: Vector, end: Vector
     ) -> None:
         """Begin, follow or end a drag; one at a time, the first one's."""
         if phase == "start":
@@ -278,11 +267,11 @@ class _Drag:
     """Of the gripped point before the camera [m]."""
     pin: int | None
     """The pin that is moved, None for a pull."""
-    offset: NDArray[np.float64]
+    offset: Vector
     """From the gripped point to the centre of the pin [m]."""
 
 
-def _forward(wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
+def _forward(wxyz: Vector) -> Vector:
     """Return the direction in which a camera looks, the third axis of its frame."""
     w, x, y, z = wxyz / np.linalg.norm(wxyz)
     return np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
@@ -290,12 +279,8 @@ def _forward(wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _viser() -> Any:
     """Import viser."""
-    try:
+    with needs_extra("viz", "the browser tool needs viser"):
         import viser
-    except ImportError as error:
-        raise MissingExtraError(
-            "the browser tool needs viser", hint="install it with: pip install 'softmode[viz]'"
-        ) from error
     return viser
 
 
@@ -355,8 +340,6 @@ def _replaced(module: Any, name: str, value: Any) -> Iterator[None]:
         setattr(module, name, before)
 
 
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def _quiet() -> contextlib.AbstractContextManager[Any]:
     """Keep viser's greetings from the terminal."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        yield
+    return contextlib.redirect_stdout(io.StringIO())

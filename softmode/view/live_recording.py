@@ -76,11 +76,5 @@ class LiveRecording:
     def save(self, path: Path) -> None:
         """Write it to a file."""
         with path.open("wb") as file:
-            np.savez_compressed(
-                file,
-                format=np.array(_FORMAT),
-                times=self.times,
-                q=self.q,
-                body_q=self.body_q,
-                fingerprints=np.array(self.fingerprints),
-            )
+            arrays = {"format": np.array(_FORMAT), **vars(self), "fingerprints": np.array(self.fingerprints)}
+            np.savez_compressed(file, **arrays)

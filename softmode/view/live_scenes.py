@@ -12,14 +12,13 @@ from typing import Any, get_args
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from softmode.checks import SEED_MAX, require_choice, require_number
 from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.materials.material import Material
 from softmode.deformables.tools.grips import GripOptions
 from softmode.errors import ConfigError
-from softmode.learning.players import POLICIES, check_policy, policy_factory, trained_policy
+from softmode.learning.players import check_policy, policy_factory, trained_policy
 from softmode.objects.config import ObjectConfig
 from softmode.objects.placed import Placed
 from softmode.objects.soft_object import SoftObject
@@ -28,7 +27,7 @@ from softmode.scenes.splat_scene import SplatScene
 from softmode.scenes.table_scene import TableScene
 from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
-from softmode.view.live_types import HoldName, LiveOptions, SceneName
+from softmode.view.live_types import HoldName, LiveOptions, SceneName, Vector
 
 BLOCK_STEPS = 2
 """Physics steps of a block of an object without an environment; even, there and back between two states."""
@@ -36,14 +35,11 @@ HELD_PART = 0.12
 """Part of its height by which a hanging object is held."""
 
 
-def grip_slots(options: LiveOptions) -> int:
-    """Return the points of an object that pins and the drag may need at a time; what it hangs by is a pin more."""
-    return (options.pin_max + 1) * options.pin_points + 1
-
-
-def strength_of(options: LiveOptions) -> GripOptions:
-    """Return how stiff the grips of a session are."""
-    return GripOptions(pull_stiffness=options.drag_stiffness, pull_rate=options.drag_rate)
+def grips_of(options: LiveOptions) -> dict[str, Any]:
+    """Return how many points of an object pins and the drag may need at a time, and how stiff the grips are."""
+    strength = GripOptions(pull_stiffness=options.drag_stiffness, pull_rate=options.drag_rate)
+    slots = (options.pin_max + 1) * options.pin_points + 1  # what it hangs by is a pin more
+    return {"grip_slots": slots, "grip_options": strength}
 
 
 class ObjectScene:
@@ -88,15 +84,9 @@ class ObjectScene:
             table = [Fixture(label="table", size=(half, half, 0.1 * half), position=below, color=(0.42, 0.48, 0.54))]
         height = float(thing.body.bounds[1, 2] - thing.body.bounds[0, 2])
         position = (0.0, 0.0, found.scale * (thing.height + 0.6 * height))
-        self.scene = SplatScene(
-            table,
-            [replace(found, object=replace(thing, material=material), position=position)],
-            dt=options.substep,
-            steps_per_frame=BLOCK_STEPS,
-            grip_slots=grip_slots(options),
-            grip_options=strength_of(options),
-            device=device,
-        )
+        placed = replace(found, object=replace(thing, material=material), position=position)
+        given = {"dt": options.substep, "steps_per_frame": BLOCK_STEPS, **grips_of(options)}
+        self.scene = SplatScene(table, [placed], device=device, **given)
         self.step()  # compiles
         self.reset()
 
@@ -115,7 +105,7 @@ class ObjectScene:
             points = held_points(self.scene.objects[0], self._hold, self._pin_points)
             self.scene.grips[0].take(points, self.scene.state)
 
-    def marker_place(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def marker_place(self) -> tuple[Vector, Vector]:
         """Return no centres: there is no marker."""
         return np.zeros((0, 3)), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
@@ -123,7 +113,7 @@ class ObjectScene:
         """Nothing is held open."""
 
 
-def held_points(thing: SoftObject, hold: HoldName, count: int) -> NDArray[np.float64]:
+def held_points(thing: SoftObject, hold: HoldName, count: int) -> Vector:
     """Return the surface samples by which a hanging object is held, spread over its top or base, shape (n, 3)."""
     sign = 1.0 if hold == "top" else -1.0
     X = thing.body.surface_points
@@ -172,14 +162,12 @@ class EnvScene:
             raise ConfigError(f"config is a {type(config).__name__}", hint=f"{name} takes a {kind.__name__}")
         require_number("seed", seed, at_least=0, at_most=SEED_MAX)
         check_policy(policy)
-        trained = None if policy in POLICIES else trained_policy(policy, name)
+        trained = trained_policy(policy, name)
         given = dict(trained.env_options) if trained else {}
         learnt = config_of(kind, given.pop("config", {}))
         base = learnt if config is None else config
-        given_scene = replace(base.scene, grip_slots=grip_slots(options), grip_options=strength_of(options))
-        if source is not None:
-            given_scene = replace(given_scene, object=source)
-        base = replace(base, scene=given_scene)
+        changed = grips_of(options) if source is None else {**grips_of(options), "object": source}
+        base = replace(base, scene=replace(base.scene, **changed))
         # with cameras, so that the goal's marker is kept up to date
         given |= {"config": base, "device": device, "progress": progress, "render_mode": "rgb_array"}
         self._env: Any = gym.make(name, **given, disable_env_checker=True)
@@ -219,7 +207,7 @@ class EnvScene:
         self.terms = {name: 0.0 for name in info["reward_terms"]}
         self.success = bool(info["is_success"])
 
-    def marker_place(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def marker_place(self) -> tuple[Vector, Vector]:
         """Return the centres of the goal's marker and its pose."""
         if self.marker is None:
             return np.zeros((0, 3)), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])

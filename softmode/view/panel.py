@@ -25,18 +25,19 @@ FOLLOW_PAUSE = 1.0
 """How long a slider that was moved by hand is left alone [s]."""
 MODULUS_MARKS = ((3.0, "1 k"), (4.0, "10 k"), (5.0, "100 k"), (6.0, "1 M"), (7.0, "10 M"))
 PLOT_POINTS = 150
+HANDLE_COUNTS = (2, 4, 8, 12, 16, 24)
+"""Numbers of handles on offer, beside the present one."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Slider:
     """One parameter of the session on a slider."""
 
     label: str
     parameter: str
     """What it sets, by its name in `LiveParameters`."""
-    low: float
-    high: float
-    step: float
+    limits: tuple[float, float, float]
+    """Lowest value, highest value and step."""
     read: Callable[[Any], float] = float
     """From the parameter to the slider."""
     write: Callable[[float], float] = float
@@ -48,45 +49,23 @@ class Slider:
         """Give the session what the slider shows."""
         session.set_parameters(**{self.parameter: self.write(value)})
 
+    def inside(self, value: float) -> float:
+        """Return the value in the slider's range that is nearest."""
+        return min(max(value, self.limits[0]), self.limits[1])
+
     def shown(self, now: LiveParameters) -> float:
         """Return the value to show, in the slider's range and without the noise of single precision."""
-        return round(min(max(self.read(getattr(now, self.parameter)), self.low), self.high), 5)
+        return round(self.inside(self.read(getattr(now, self.parameter))), 5)
 
 
 SLIDERS = (
-    Slider(
-        label="log10 E [Pa]",
-        parameter="youngs_modulus",
-        low=3.0,
-        high=7.0,
-        step=0.05,
-        read=math.log10,
-        write=lambda value: 10.0**value,
-        marks=MODULUS_MARKS,
-    ),
-    Slider(label="nu", parameter="poissons_ratio", low=0.0, high=0.49, step=0.01, hint="Poisson's ratio"),
-    Slider(label="density", parameter="density", low=50.0, high=3000.0, step=10.0, hint="kg/m^3"),
-    Slider(
-        label="viscosity [ms]",
-        parameter="viscosity",
-        low=0.0,
-        high=50.0,
-        step=0.5,
-        read=lambda value: 1e3 * value,
-        write=lambda value: 1e-3 * value,
-        hint="damps deformation",
-    ),
-    Slider(label="air drag [1/s]", parameter="mass_damping", low=0.0, high=10.0, step=0.1, hint="damps all motion"),
-    Slider(label="friction", parameter="friction", low=0.0, high=2.0, step=0.05, hint="Coulomb's coefficient"),
-    Slider(
-        label="gravity",
-        parameter="gravity",
-        low=0.0,
-        high=20.0,
-        step=0.01,
-        read=lambda value: math.hypot(*value),
-        hint="m/s^2, downwards",
-    ),
+    Slider("log10 E [Pa]", "youngs_modulus", (3.0, 7.0, 0.05), math.log10, lambda x: 10.0**x, marks=MODULUS_MARKS),
+    Slider("nu", "poissons_ratio", (0.0, 0.49, 0.01), hint="Poisson's ratio"),
+    Slider("density", "density", (50.0, 3000.0, 10.0), hint="kg/m^3"),
+    Slider("viscosity [ms]", "viscosity", (0.0, 50.0, 0.5), lambda x: 1e3 * x, lambda x: 1e-3 * x, "damps deformation"),
+    Slider("air drag [1/s]", "mass_damping", (0.0, 10.0, 0.1), hint="damps all motion"),
+    Slider("friction", "friction", (0.0, 2.0, 0.05), hint="Coulomb's coefficient"),
+    Slider("gravity", "gravity", (0.0, 20.0, 0.01), lambda x: math.hypot(*x), hint="m/s^2, downwards"),
 )
 
 
@@ -156,12 +135,8 @@ class Panel:
     def _add_mouse(self) -> None:
         """What the mouse does on the object, and the way back."""
         gui = self._gui
-        mode = gui.add_dropdown(
-            "mouse",
-            ("drag", "pin"),
-            initial_value="drag",
-            hint="drag: pull the object. pin: hold the region that is clicked",
-        )
+        hint = "drag: pull the object. pin: hold the region that is clicked"
+        mode = gui.add_dropdown("mouse", ("drag", "pin"), initial_value="drag", hint=hint)
 
         @mode.on_update
         async def _(_: Any) -> None:
@@ -191,22 +166,11 @@ class Panel:
         gui, now = self._gui, session.parameters
         with gui.add_folder("material"):
             for slider in SLIDERS:
-                handle = gui.add_slider(
-                    slider.label,
-                    slider.low,
-                    slider.high,
-                    slider.step,
-                    slider.shown(now),
-                    hint=slider.hint,
-                    marks=slider.marks,
-                )
-                self._connect(slider, handle)
-        handles = gui.add_dropdown(
-            "handles",
-            _handle_choices(now.handles),
-            initial_value=str(now.handles),
-            hint="skinning eigenmodes; another number builds the object anew",
-        )
+                says = {"hint": slider.hint, "marks": slider.marks}
+                self._connect(slider, gui.add_slider(slider.label, *slider.limits, slider.shown(now), **says))
+        choices = tuple(str(count) for count in sorted({*HANDLE_COUNTS, now.handles}))
+        hint = "skinning eigenmodes; another number builds the object anew"
+        handles = gui.add_dropdown("handles", choices, initial_value=str(now.handles), hint=hint)
 
         @handles.on_update
         async def _(event: Any) -> None:
@@ -231,7 +195,7 @@ class Panel:
         async def changed(event: Any) -> None:
             if event.client is None:  # not a person: the slider follows the session
                 return
-            value = min(max(float(handle.value), slider.low), slider.high)  # a page may send anything
+            value = slider.inside(float(handle.value))  # a page may send anything
             self._touched[slider] = time.monotonic()
             self._submit(lambda session: slider.set(session, value))
 
@@ -240,11 +204,8 @@ class Panel:
     def _follow(self, now: LiveParameters) -> None:
         """Let sliders that nobody moves show what the session has: an environment draws anew in each episode."""
         for slider, handle in self._sliders.items():
-            value = slider.shown(now)
-            if (
-                abs(handle.value - value) > 0.5 * slider.step
-                and time.monotonic() - self._touched[slider] > FOLLOW_PAUSE
-            ):
+            value, idle = slider.shown(now), time.monotonic() - self._touched[slider]
+            if abs(handle.value - value) > 0.5 * slider.limits[2] and idle > FOLLOW_PAUSE:
                 handle.value = value
         if self._handles.value != str(now.handles) and str(now.handles) in self._handles.options:
             self._handles.value = str(now.handles)
@@ -256,20 +217,11 @@ class Panel:
         gui = self._gui
         self._message = gui.add_markdown("")
         self._text = gui.add_markdown("")
-        colors = ("#1f77b4", "#d62728", "#2ca02c")
-        self._plot = gui.add_uplot(
-            tuple(np.zeros(2) for _ in range(4)),
-            series=(
-                uplot.Series(label="time"),
-                *(
-                    uplot.Series(label=name, stroke=color, width=2)
-                    for name, color in zip(("kinetic", "elastic", "gravity"), colors, strict=True)
-                ),
-            ),
-            scales={"x": uplot.Scale(time=False)},
-            title="energy [J]",
-            height=170,
-        )
+        colors = {"kinetic": "#1f77b4", "elastic": "#d62728", "gravity": "#2ca02c"}
+        curves = (uplot.Series(label=name, stroke=color, width=2) for name, color in colors.items())
+        series, scales = (uplot.Series(label="time"), *curves), {"x": uplot.Scale(time=False)}
+        empty = tuple(np.zeros(2) for _ in series)
+        self._plot = gui.add_uplot(empty, series=series, scales=scales, title="energy [J]", height=170)
 
     def tell(self, message: str) -> None:
         """Show a line of text above the readouts."""
@@ -304,8 +256,3 @@ class Panel:
             self._plot_data.append((status.time, energies.kinetic, energies.elastic, energies.gravitational))
             if len(self._plot_data) > 1:
                 self._plot.data = tuple(np.array(column) for column in zip(*self._plot_data, strict=True))
-
-
-def _handle_choices(now: int) -> tuple[str, ...]:
-    """Return the counts on offer, the present one among them."""
-    return tuple(str(count) for count in sorted({2, 4, 8, 12, 16, 24, now}))

@@ -63,12 +63,8 @@ class LivePicture:
     def read(self) -> SplatPicture:
         """Return the splats on the host."""
         means, six = self.bound.arrays.means.numpy()[0], self.bound.arrays.covariances.numpy()[0]
-        return SplatPicture(
-            means=means.copy(),
-            covariances=six[:, _SIX].reshape(-1, 3, 3),
-            colors=self.colors,
-            opacities=self.opacities,
-        )
+        covariances = six[:, _SIX].reshape(-1, 3, 3)
+        return SplatPicture(means=means.copy(), covariances=covariances, colors=self.colors, opacities=self.opacities)
 
     def pick(self, origin: Array, direction: Array, state: newton.State) -> Hit | None:
         """Return where a ray with a unit direction meets the objects; see `LiveSession.pick`."""
@@ -106,13 +102,8 @@ class LivePicture:
             distance = float(along[chosen])
         index = next(o for o, of in enumerate(columns) if chosen < of.stop)
         point = origin + distance * direction
-        return Hit(
-            point=point,
-            rest_point=self._rest_point(index, chosen - columns[index].start, point, state),
-            distance=distance,
-            object_index=index,
-            splat=chosen,
-        )
+        rest = self._rest_point(index, chosen - columns[index].start, point, state)
+        return Hit(point=point, rest_point=rest, distance=distance, object_index=index, splat=chosen)
 
     def _rest_point(self, index: int, splat: int, point: Array, state: newton.State) -> Array:
         """Return the rest point [m] that a splat carries to a point, to first order about the splat's centre."""

@@ -28,96 +28,78 @@ RECORD_HZ = 30
 """Frames per simulated second."""
 
 
-class CoordinateRecorder:
-    """Keeps coordinates and poses in memory and writes them at the end."""
+class Recorder:
+    """Takes frames until it is finished, which puts the file in place, or discarded, which leaves nothing.
 
-    def __init__(self, path: Path, objects: Sequence[SoftObject]) -> None:
-        """Claim the file."""
-        self._pending = PendingFile(path, "recording")
+    Args:
+        path: The file.
+        take: Takes a time [s] and a state.
+        finish: Puts the file in place.
+        discard: Removes what was not finished.
+    """
+
+    def __init__(
+        self, path: Path, take: Callable[[float, newton.State], None], finish: Callable, discard: Callable
+    ) -> None:
+        """Begin without a frame."""
         self.path, self.count = path, 0
-        self._prints = tuple(thing.body.fingerprint for thing in objects)
-        self._frames: list[tuple[float, NDArray[np.float64], NDArray[np.float32]]] = []
+        self._take, self.finish, self.discard = take, finish, discard
 
     def add(self, time: float, state: newton.State) -> None:
         """Take a frame."""
+        self._take(time, state)
+        self.count += 1
+
+
+def _coordinates(path: Path, objects: Sequence[SoftObject]) -> Recorder:
+    """Return what keeps coordinates and poses in memory and writes them at the end."""
+    pending = PendingFile(path, "recording")
+    frames: list[tuple[float, NDArray[np.float64], NDArray[np.float32]]] = []
+
+    def take(time: float, state: newton.State) -> None:
         poses = host(state.body_q).astype(np.float32).reshape(-1, 7)
-        self._frames.append((time, np.array(soft(state).q.numpy(), dtype=np.float64), poses))
-        self.count += 1
+        frames.append((time, np.array(soft(state).q.numpy(), dtype=np.float64), poses))
 
-    def finish(self) -> None:
-        """Write the file."""
-        times, q, poses = (np.array(column) for column in zip(*self._frames, strict=True))
-        recording = LiveRecording(
-            times=times.astype(np.float64),
-            q=q.astype(np.float64),
-            body_q=poses.astype(np.float32).reshape(len(times), -1, 7),
-            fingerprints=self._prints,
-        )
-        recording.save(self._pending.temporary)
-        self._pending.publish()
+    def finish() -> None:
+        times, q, poses = (np.array(column) for column in zip(*frames, strict=True))
+        prints = tuple(thing.body.fingerprint for thing in objects)
+        body_q = poses.astype(np.float32).reshape(len(times), -1, 7)
+        recording = LiveRecording(times=times.astype(np.float64), q=q, body_q=body_q, fingerprints=prints)
+        recording.save(pending.temporary)
+        pending.publish()
 
-    def discard(self) -> None:
-        """Forget the frames and remove what was not published."""
-        self._frames.clear()
-        self._pending.discard()
+    return Recorder(path, take, finish, pending.discard)
 
 
-class FilmRecorder:
-    """Draws every frame with a camera and encodes it."""
+def _film(path: Path, model: newton.Model, picture: LivePicture, seen: PinholeCamera) -> Recorder:
+    """Return what draws every frame with a camera and encodes it."""
+    film = Film(path)
+    try:
+        camera = SplatCamera(model, picture.bound.arrays, [seen], options=CameraOptions(mesh_samples=4))
+    except BaseException:
+        film.discard()
+        raise
 
-    def __init__(self, path: Path, model: newton.Model, picture: LivePicture, camera: PinholeCamera) -> None:
-        """Claim the file and make the camera."""
-        self._film = Film(path)
-        self.path, self.count = path, 0
-        try:
-            self._camera = SplatCamera(model, picture.bound.arrays, [camera], options=CameraOptions(mesh_samples=4))
-        except BaseException:
-            self._film.discard()
-            raise
+    def take(time: float, state: newton.State) -> None:
+        camera.render(state)
+        film.add(camera.images(seen.name).numpy()[0].copy(), RECORD_HZ)
 
-    def add(self, time: float, state: newton.State) -> None:
-        """Draw a frame."""
-        self._camera.render(state)
-        self._film.add(self._camera.images(self._camera.cameras[0].name).numpy()[0].copy(), RECORD_HZ)
-        self.count += 1
-
-    def finish(self) -> None:
-        """Publish video and contact sheet."""
-        self._film.publish()
-
-    def discard(self) -> None:
-        """Remove what was written."""
-        self._film.discard()
+    return Recorder(path, take, film.publish, film.discard)
 
 
-class UsdRecorder:
-    """Keeps coordinates and writes a stage with handle matrices at the end."""
+def _stage(path: Path, model: newton.Model, objects: Sequence[SoftObject]) -> Recorder:
+    """Return what keeps coordinates and writes a stage with handle matrices at the end."""
+    from softmode.objects.placed import Placed
+    from softmode.usd.animation import UsdAnimation, UsdAnimationOptions
 
-    def __init__(self, path: Path, model: newton.Model, objects: Sequence[SoftObject]) -> None:
-        """Find the objects in the model."""
-        from softmode.objects.placed import Placed
-        from softmode.usd.animation import UsdAnimation, UsdAnimationOptions
+    bodies = [Placed(object=thing) for thing in objects]
+    animation = UsdAnimation(path, model, bodies, options=UsdAnimationOptions(fps=RECORD_HZ))
 
-        bodies = [Placed(object=thing) for thing in objects]
-        self._animation = UsdAnimation(path, model, bodies, options=UsdAnimationOptions(fps=RECORD_HZ))
-        self.path, self.count = path, 0
+    def take(time: float, state: newton.State) -> None:
+        with contextlib.suppress(SolverDiverged):  # a frame that is not finite is left out
+            animation.record(state, time)
 
-    def add(self, time: float, state: newton.State) -> None:
-        """Take a frame; one that is not finite is left out."""
-        with contextlib.suppress(SolverDiverged):
-            self._animation.record(state, time)
-        self.count += 1
-
-    def finish(self) -> None:
-        """Write the stage."""
-        self._animation.publish()
-
-    def discard(self) -> None:
-        """Nothing was written that is not whole."""
-
-
-Recorder = CoordinateRecorder | FilmRecorder | UsdRecorder
-"""What takes frames until it is finished, which puts the file in place, or discarded, which leaves nothing."""
+    return Recorder(path, take, animation.publish, lambda: None)  # nothing was written that is not whole
 
 
 def make_recorder(path: Path, scene: Scene, picture: LivePicture, camera: Callable[[], PinholeCamera]) -> Recorder:
@@ -135,11 +117,11 @@ def make_recorder(path: Path, scene: Scene, picture: LivePicture, camera: Callab
     """
     suffix = path.suffix.lower()
     if suffix == ".npz":
-        return CoordinateRecorder(path, scene.objects)
+        return _coordinates(path, scene.objects)
     if suffix == ".mp4":
-        return FilmRecorder(path, scene.model, picture, camera())
+        return _film(path, scene.model, picture, camera())
     if suffix in (".usdc", ".usd", ".usda"):
-        return UsdRecorder(path, scene.model, scene.objects)
+        return _stage(path, scene.model, scene.objects)
     raise ConfigError(f"recording {path} is no .mp4, .npz or .usdc file", hint="name it like out/poke.mp4")
 
 

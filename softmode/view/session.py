@@ -5,6 +5,7 @@ All calls must come from one thread.
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -24,6 +25,7 @@ from softmode.objects.config import ObjectConfig
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.host import host
 from softmode.scenes.meshes import SceneMesh, scene_meshes
+from softmode.splats.pinhole import PinholeCamera
 from softmode.view import live_parameters
 from softmode.view.coordinates import carry_over, coordinates
 from softmode.view.hands import Hands
@@ -55,13 +57,11 @@ class LiveSession:
     `poses` are what to show, the rest is what a person does. All calls must come from one thread.
     """
 
-    def __init__(
-        self, make: Callable[[ObjectConfig | None], LiveScene], source: ObjectConfig | None, options: LiveOptions
-    ) -> None:
+    def __init__(self, make: Callable[[ObjectConfig | None], LiveScene], options: LiveOptions) -> None:
         """Make the scene; use `from_object` or `from_env`."""
-        self.options = options
-        self._make, self._source = make, source
-        self._live = make(source)
+        self.options, self._make = options, make
+        self._source: ObjectConfig | None = None
+        self._live = make(None)
         self._given: dict[str, Any] = {}
         self._playing = True
         self._recorder: Recorder | None = None
@@ -123,7 +123,7 @@ class LiveSession:
             made = material or found.object.material or Material(youngs_modulus=1.0e5, density=250.0)
             return ObjectScene(found, scene, hold, made, chosen, device)
 
-        return cls(make, None, chosen)
+        return cls(make, chosen)
 
     @classmethod
     def from_env(
@@ -154,11 +154,7 @@ class LiveSession:
             ConfigError: If the environment or the policy is unknown, or an option out of range.
         """
         chosen = options or LiveOptions()
-
-        def make(origin: ObjectConfig | None) -> LiveScene:
-            return EnvScene(name, policy, config, seed, chosen, device, progress, origin)
-
-        return cls(make, None, chosen)
+        return cls(functools.partial(EnvScene, name, policy, config, seed, chosen, device, progress), chosen)
 
     # -- time ---------------------------------------------------------------------------------------------------------
 
@@ -387,17 +383,9 @@ class LiveSession:
         Raises:
             ConfigError: If a value lies outside its range; nothing is changed then.
         """
-        self._given |= live_parameters.checked(
-            gravity,
-            {
-                "youngs_modulus": youngs_modulus,
-                "poissons_ratio": poissons_ratio,
-                "density": density,
-                "viscosity": viscosity,
-                "mass_damping": mass_damping,
-                "friction": friction,
-            },
-        )
+        values = {"youngs_modulus": youngs_modulus, "poissons_ratio": poissons_ratio, "density": density}
+        values |= {"viscosity": viscosity, "mass_damping": mass_damping, "friction": friction}
+        self._given |= live_parameters.checked(gravity, values)
         live_parameters.apply(self._scene, self._given)
 
     def set_handles(self, count: int) -> None:
@@ -449,12 +437,11 @@ class LiveSession:
         """
         if self._recorder is not None:
             raise ConfigError(f"{self._recorder.path} is being recorded", hint="stop that recording first")
-        self._recorder = make_recorder(
-            Path(path),
-            self._scene,
-            self._picture,
-            lambda: live_camera(self._live.viewpoints, self.bounds(), position, target, edge),
-        )
+
+        def camera() -> PinholeCamera:
+            return live_camera(self._live.viewpoints, self.bounds(), position, target, edge)
+
+        self._recorder = make_recorder(Path(path), self._scene, self._picture, camera)
         self._record_from = self._clock
         self._record()
 

@@ -6,11 +6,10 @@ from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from softmode.view.gaussians import GaussianBuffer
-from softmode.view.live_types import DragView, SplatPicture
+from softmode.view.live_types import DragView, SplatPicture, Vector
 
 if TYPE_CHECKING:
     import viser
@@ -41,7 +40,7 @@ class Stage:
         *,
         on_drag: Handler,
         on_click: Handler,
-        on_pin: Callable[[int, NDArray[np.float64], NDArray[np.float64]], None],
+        on_pin: Callable[[int, Vector, Vector], None],
     ) -> None:
         """Build the scene."""
         self._server, self._session, self._on_pin = server, session, on_pin
@@ -60,13 +59,9 @@ class Stage:
             scale=unit,
         )
         self._add_grips(picture, on_drag, on_click)
+        nowhere = np.zeros((1, 2, 3), np.float32)
         self._line = server.scene.add_line_segments(
-            "/drag",
-            np.zeros((1, 2, 3), np.float32),
-            colors=DRAG_COLOR,
-            thickness=4.0,
-            thickness_units="screen",
-            visible=False,
+            "/drag", nowhere, colors=DRAG_COLOR, thickness=4.0, thickness_units="screen", visible=False
         )
         self._grip = server.scene.add_icosphere(
             "/grip", radius=0.02 * self.size, color=DRAG_COLOR, visible=False, cast_shadow=False
@@ -115,24 +110,15 @@ class Stage:
         }
         for number, mesh in enumerate(meshes):
             parent = f"/bodies/{mesh.body}" if mesh.body >= 0 else "/world"
+            name, color = f"{parent}/{number}", np.rint(255.0 * np.array(mesh.color)).astype(np.uint8)
+            opacity = None if mesh.opacity >= 1.0 else mesh.opacity
             scene.add_mesh_simple(
-                f"{parent}/{number}",
-                mesh.vertices,
-                mesh.faces,
-                color=np.rint(255.0 * np.array(mesh.color)).astype(np.uint8),
-                opacity=None if mesh.opacity >= 1.0 else mesh.opacity,
-                side="double",
-                flat_shading=False,
+                name, mesh.vertices, mesh.faces, color=color, opacity=opacity, side="double", flat_shading=False
             )
         if not meshes:  # nothing else tells up from down
-            edge = 4.0 * self._reach
+            edge, at = 4.0 * self._reach, (float(self._centre[0]), float(self._centre[1]), self._floor)
             scene.add_grid(
-                "/grid",
-                width=edge,
-                height=edge,
-                cell_size=0.1 * self._reach,
-                section_size=self._reach,
-                position=(float(self._centre[0]), float(self._centre[1]), self._floor),
+                "/grid", width=edge, height=edge, cell_size=0.1 * self._reach, section_size=self._reach, position=at
             )
 
     def _add_grips(self, picture: SplatPicture, on_drag: Handler, on_click: Handler) -> None:
@@ -148,14 +134,10 @@ class Stage:
         distance = KDTree(samples).query(picture.means)[0]
         near = distance[distance < 0.25 * self.size]  # an environment has other splats too
         radius = 1.3 * float(np.quantile(near, 0.95)) if len(near) else 0.1 * self.size
+        turns = np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (len(samples), 1))
+        places: dict[str, Any] = {"batched_wxyzs": turns, "batched_positions": samples.astype(np.float32)}
         self._grips = self._server.scene.add_batched_glb(
-            "/grips",
-            _invisible_sphere(radius),
-            batched_wxyzs=np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (len(samples), 1)),
-            batched_positions=samples.astype(np.float32),
-            lod="off",
-            cast_shadow=False,
-            receive_shadow=False,
+            "/grips", _invisible_sphere(radius), **places, lod="off", cast_shadow=False, receive_shadow=False
         )
         self._grips.on_drag("left")(on_drag)
         self._on_click = on_click
@@ -183,20 +165,16 @@ class Stage:
             if number not in self._gizmos:
                 self._gizmos[number] = self._add_gizmo(number, pin.position, pin.wxyz)
 
-    def move_gizmo(self, number: int, position: NDArray[np.float64]) -> None:
+    def move_gizmo(self, number: int, position: Vector) -> None:
         """Put the gizmo of a pin that is moved otherwise where the pin is."""
         if number in self._gizmos:
             self._gizmos[number].position = tuple(position)
 
-    def _add_gizmo(self, number: int, position: NDArray[np.float64], wxyz: NDArray[np.float64]) -> Any:
+    def _add_gizmo(self, number: int, position: Vector, wxyz: Vector) -> Any:
         """Add the gizmo that moves a pin."""
+        pose: dict[str, Any] = {"position": tuple(position), "wxyz": tuple(wxyz)}
         gizmo = self._server.scene.add_transform_controls(
-            f"/pins/{number}",
-            scale=0.4 * self.size,
-            position=tuple(position),
-            wxyz=tuple(wxyz),
-            depth_test=False,
-            opacity=0.7,
+            f"/pins/{number}", scale=0.4 * self.size, **pose, depth_test=False, opacity=0.7
         )
 
         async def moved(event: Any) -> None:

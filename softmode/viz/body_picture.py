@@ -16,7 +16,7 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.build.cubature import POISSON_RATIO
 from softmode.deformables.build.reduced_stiffness import elastic_modes, reduced_stiffness
 from softmode.deformables.build.report import BodyReport
-from softmode.errors import ConfigError, MissingExtraError
+from softmode.errors import ConfigError, needs_extra
 from softmode.files import whole_file
 from softmode.splats.splats import SH_DC, Splats
 
@@ -93,13 +93,9 @@ def write_body_picture(
         ConfigError: If the name is not that of a .png.
         StorageError: If it cannot be written.
     """
-    try:
+    with needs_extra("viz", "the picture of a body needs matplotlib"):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtraError(
-            "the picture of a body needs matplotlib", hint="install it with: pip install 'softmode[viz]'"
-        ) from error
     from PIL import Image
 
     target = Path(path)
@@ -115,27 +111,16 @@ def write_body_picture(
     height = 2.0 * strip + 4.8
     figure = Figure(figsize=(14.0, height), dpi=100, facecolor="white")
     canvas = FigureCanvasAgg(figure)
-    rows = figure.add_gridspec(
-        3,
-        1,
-        height_ratios=(strip, strip, 3.0),
-        left=0.02,
-        right=0.985,
-        top=1.0 - 0.8 / height,
-        bottom=0.5 / height,
-        hspace=0.5 / ((2.0 * strip + 3.0) / 3.0),
-    )
+    edges = {"left": 0.02, "right": 0.985, "top": 1.0 - 0.8 / height, "bottom": 0.5 / height}
+    gap = 0.5 / ((2.0 * strip + 3.0) / 3.0)
+    rows = figure.add_gridspec(3, 1, height_ratios=(strip, strip, 3.0), hspace=gap, **edges)
     x, y, z = 1e2 * np.ptp(body.bounds, axis=0)
-    figure.text(0.02, 1.0 - 0.35 / height, body.name, fontsize=15, weight="bold")
-    figure.text(
-        0.985,
-        1.0 - 0.35 / height,
+    facts = (
         f"{x:.3g} x {y:.3g} x {z:.3g} cm, {1e6 * body.volume:.4g} cm$^3$ · {body.function_count} functions · "
-        f"{body.mode_count} eigenmodes · {body.point_count} cubature points · {len(body.centres)} kernels",
-        fontsize=10,
-        ha="right",
-        color="0.3",
+        f"{body.mode_count} eigenmodes · {body.point_count} cubature points · {len(body.centres)} kernels"
     )
+    figure.text(0.02, 1.0 - 0.35 / height, body.name, fontsize=15, weight="bold")
+    figure.text(0.985, 1.0 - 0.35 / height, facts, fontsize=10, ha="right", color="0.3")
     titles = ["at rest", *(f"soft mode {k + 1}: {frequency[k]:.3g} Hz" for k in range(len(modes)))]
     _strip(figure, rows[0], titles, pictures[: len(titles)])
     _strip(figure, rows[1], names, pictures[len(titles) :])
@@ -181,7 +166,8 @@ def _weights(body: ReducedBody, splats: Splats) -> tuple[list[str], list[Array]]
 
     x = splats.means.astype(np.float64)
     weight = body.skinning_weights(x)[0]
-    names, colors = [_first_title(body)], [_first_colors(body, x)]
+    title, color = _first(body, x)
+    names, colors = [title], [color]
     ranks = _weight_names(body)
     for j in range(1, min(len(body.handle_degrees), COLUMNS)):
         one = weight[:, j] / max(float(np.abs(weight[:, j]).max()), 1e-300)
@@ -200,24 +186,18 @@ def _weight_names(body: ReducedBody) -> list[str]:
     return ["constant", *(f"region {name}" for name in order[:regions]), *modes, *["static response"] * responses]
 
 
-def _first_title(body: ReducedBody) -> str:
-    if body.stiffness_scale.max() > 1.0001 * body.stiffness_scale.min():
-        return f"stiffness x {body.stiffness_scale.min():.2g} to {body.stiffness_scale.max():.2g}"
-    return "regions: " + ", ".join(body.region_names) if body.region_names else "surface"
-
-
-def _first_colors(body: ReducedBody, x: Array) -> Array:
-    """Return colours (N, 3) that show where a body is stiffer, or its regions."""
+def _first(body: ReducedBody, x: Array) -> tuple[str, Array]:
+    """Return title and colours (N, 3) that show where a body is stiffer, or its regions."""
     from matplotlib import colormaps
 
-    scale = body.stiffness_scale
-    if scale.max() > 1.0001 * scale.min():
-        level = np.log(scale[KDTree(body.points).query(x)[1]] / scale.min()) / np.log(scale.max() / scale.min())
-        return np.asarray(colormaps["viridis"](level))[:, :3]
+    low, high = body.stiffness_scale.min(), body.stiffness_scale.max()
+    if high > 1.0001 * low:
+        level = np.log(body.stiffness_scale[KDTree(body.points).query(x)[1]] / low) / np.log(high / low)
+        return f"stiffness x {low:.2g} to {high:.2g}", np.asarray(colormaps["viridis"](level))[:, :3]
     found = np.full((len(x), 3), 0.86)
     for region in body.regions:
         found[region.distance(x)[0] <= 0.0] = _REGION
-    return found
+    return "regions: " + ", ".join(body.region_names) if body.region_names else "surface", found
 
 
 def _painted(body: ReducedBody, splats: Splats, colors: Array) -> Splats:
@@ -243,14 +223,9 @@ def _render(body: ReducedBody, shown: list[Splats]) -> list[NDArray[np.uint8]]:
     centre = middle[0] * right + middle[1] * up + (body.bounds.mean(axis=0) @ toward) * toward
     position = centre + distance * toward
     rows = round(PIXELS * min(max(tall / width, 0.35), 1.3))
-    camera = PinholeCamera.look_at(
-        "body",
-        position=(float(position[0]), float(position[1]), float(position[2])),
-        target=(float(centre[0]), float(centre[1]), float(centre[2])),
-        width=PIXELS,
-        height=rows,
-        fov_y=2.0 * float(np.arctan(0.5 * max(tall, width * rows / PIXELS) / distance)),
-    )
+    fov = 2.0 * float(np.arctan(0.5 * max(tall, width * rows / PIXELS) / distance))
+    (x, y, z), (u, v, w) = position.tolist(), centre.tolist()
+    camera = PinholeCamera.look_at("body", position=(x, y, z), target=(u, v, w), width=PIXELS, height=rows, fov_y=fov)
     views = ViewArrays.from_cameras([camera], background=(1.0, 1.0, 1.0))
     pictures = []
     for splats in shown:
@@ -297,18 +272,9 @@ def _draw_points(axes: Any, body: ReducedBody) -> None:
     order = np.argsort(body.points @ TOWARDS)
     depth = body.points[order] @ TOWARDS
     shade = (depth - depth[0]) / max(float(np.ptp(depth)), 1e-300)
-    size = 5000.0 * body.weights[order] / body.volume
-    axes.scatter(
-        body.points[order] @ right,
-        body.points[order] @ up,
-        s=size,
-        c=0.25 + 0.65 * shade,
-        cmap="Blues",
-        vmin=0.0,
-        vmax=1.0,
-        linewidths=0.3,
-        edgecolors="white",
-    )
+    look = {"s": 5000.0 * body.weights[order] / body.volume, "linewidths": 0.3, "edgecolors": "white"}
+    x, y = body.points[order] @ right, body.points[order] @ up
+    axes.scatter(x, y, c=0.25 + 0.65 * shade, cmap="Blues", vmin=0.0, vmax=1.0, **look)
 
 
 def _draw_kernels(axes: Any, body: ReducedBody) -> None:
@@ -318,11 +284,8 @@ def _draw_kernels(axes: Any, body: ReducedBody) -> None:
     right, up = _plane(axes, body, "kernel centres, radii of every tenth")
     x, y = body.centres @ right, body.centres @ up
     axes.scatter(x, y, s=5, color="#7a3e9d", linewidths=0)
-    for k in range(0, len(x), 10):
-        circle = Circle(
-            (float(x[k]), float(y[k])), float(body.radii[k]), fill=False, color="#7a3e9d", alpha=0.35, lw=0.7
-        )
-        axes.add_patch(circle)
+    for place in np.column_stack([x, y, body.radii])[::10].tolist():
+        axes.add_patch(Circle(place[:2], place[2], fill=False, color="#7a3e9d", alpha=0.35, lw=0.7))
     axes.autoscale_view()
 
 

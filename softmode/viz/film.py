@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from softmode.errors import ConfigError, MissingExtraError
+from softmode.errors import ConfigError, needs_extra
 from softmode.files import PendingFile
 
 if TYPE_CHECKING:
@@ -31,14 +31,9 @@ class Film:
 
     def __init__(self, path: Path) -> None:
         """Claim a temporary file beside ``path``."""
-        try:
+        with needs_extra("demo", "writing a video needs imageio and imageio-ffmpeg"):
             import imageio.v2  # noqa: F401
             import imageio_ffmpeg  # noqa: F401
-        except ImportError as error:
-            raise MissingExtraError(
-                "writing a video needs imageio and imageio-ffmpeg",
-                hint="install them with: pip install 'softmode[demo]'",
-            ) from error
         if path.suffix.lower() != ".mp4":
             raise ConfigError(f"video {path} is no .mp4 file", hint="name it like out/lift.mp4")
         self.path = path
@@ -64,14 +59,8 @@ class Film:
         if self._writer is None:
             import imageio.v2 as imageio
 
-            self._writer = imageio.get_writer(
-                self._file.temporary,
-                format="FFMPEG",
-                fps=fps,
-                codec="libx264",
-                quality=8,
-                macro_block_size=8,  # type: ignore[arg-type]
-            )
+            how: dict[str, Any] = {"format": "FFMPEG", "codec": "libx264", "quality": 8, "macro_block_size": 8}
+            self._writer = imageio.get_writer(self._file.temporary, fps=fps, **how)
         self._writer.append_data(frame)
         if self._count % self._stride == 0:
             self._frames.append(frame)

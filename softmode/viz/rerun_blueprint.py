@@ -26,24 +26,15 @@ def make_blueprint(worlds: Sequence[str], objects: Sequence[str], cameras: Seque
         return rrb.TimeSeriesView(name=name, origin="/", contents=contents, plot_legend=legend)
 
     position, target = eye
-    scene = rrb.Spatial3DView(
-        name="scene",
-        origin="/",
-        # Depth would be drawn as points in space.
-        contents=[f"+ /{w}scene/**" for w in worlds]
-        + [f"- /{w}scene/camera/{name}/depth" for w in worlds for name in cameras]
-        + [f"- /{w}scene/soft/{name}/surface" for w in worlds for name in objects],
-        background=(28, 30, 34),
-        line_grid=False,
-        eye_controls=rrb.EyeControls3D(position=position, look_target=target, eye_up=(0.0, 0.0, 1.0)),
-    )
-    pictures = [
-        rrb.Spatial2DView(
-            name=f"{w}{name}", origin=f"/{w}scene/camera/{name}", contents=[f"+ /{w}scene/camera/{name}/rgb"]
-        )
-        for w in worlds
-        for name in cameras
-    ]
+    contents = [f"+ /{w}scene/**" for w in worlds]
+    # Depth would be drawn as points in space.
+    contents += [f"- /{w}scene/camera/{name}/depth" for w in worlds for name in cameras]
+    contents += [f"- /{w}scene/soft/{name}/surface" for w in worlds for name in objects]
+    controls = rrb.EyeControls3D(position=position, look_target=target, eye_up=(0.0, 0.0, 1.0))
+    look: dict[str, Any] = {"background": (28, 30, 34), "line_grid": False}
+    scene = rrb.Spatial3DView(name="scene", origin="/", contents=contents, eye_controls=controls, **look)
+    shown = [(f"{w}{name}", f"/{w}scene/camera/{name}") for w in worlds for name in cameras]
+    pictures = [rrb.Spatial2DView(name=name, origin=path, contents=[f"+ {path}/rgb"]) for name, path in shown]
     views = [curves("energies [J]", "energy/**")]
     if task:
         views = [curves("reward", "reward/**"), *views, curves("success and metrics", "success", "metrics/**")]

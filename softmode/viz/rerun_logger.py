@@ -5,7 +5,6 @@ from __future__ import annotations
 import operator
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import newton
@@ -87,9 +86,7 @@ class RerunLogger:
         """Return the logger."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Publish the file, or discard it after an error."""
         if kind is None:
             self.publish()
@@ -152,17 +149,11 @@ class RerunLogger:
         self._paths[w] = {b: path for b, path in folder.items() if b >= 0}
         for mesh in self._meshes[w]:
             carrier = "world" if mesh.body < 0 else str(model.body_label[mesh.body])
+            path = f"{folder[mesh.body]}/{_part(mesh.label.removeprefix(f'{carrier}/'))}"
             color = [round(255 * c) for c in (*mesh.color, mesh.opacity)]
-            self._stream.log(
-                f"{folder[mesh.body]}/{_part(mesh.label.removeprefix(f'{carrier}/'))}",
-                rr.Mesh3D(
-                    vertex_positions=mesh.vertices,
-                    triangle_indices=mesh.faces,
-                    vertex_normals=mesh.normals,
-                    albedo_factor=color,
-                ),
-                static=True,
-            )
+            look: dict[str, Any] = {"vertex_normals": mesh.normals, "albedo_factor": color}
+            shape = rr.Mesh3D(vertex_positions=mesh.vertices, triangle_indices=mesh.faces, **look)
+            self._stream.log(path, shape, static=True)
 
     # -- a frame ------------------------------------------------------------------------------------------------------
 
@@ -242,9 +233,8 @@ class RerunLogger:
             self._stream.log(path, rr.GaussianSplats3D.from_fields(**fields))
         if not self.options.surface:
             return
-        points = host(
-            moment.state.particle_q
-        ).copy()  # rerun keeps what it is given, and on CPU this is the state's own memory
+        # rerun keeps what it is given, and on CPU this is the state's own memory
+        points = host(moment.state.particle_q).copy()
         for (w, o), (first, count) in self._samples.items():
             path = f"{self._prefix[w]}scene/soft/{self._soft[o]}/surface"
             fields: dict[str, Any] = {"positions": points[first : first + count]}
@@ -283,14 +273,9 @@ class RerunLogger:
         for w in self.worlds:
             pressed = np.linalg.norm(force[w], axis=-1) > 1e-3
             vectors, origins = force[w][pressed], place[w][pressed]
-            arrows = self._rr.Arrows3D(
-                vectors=scale * vectors,
-                origins=origins,
-                colors=[(230, 60, 60)],
-                radii=[0.0025],
-                labels=[f"{np.linalg.norm(v):.2f} N" for v in vectors],
-                show_labels=False,
-            )
+            labels = [f"{np.linalg.norm(v):.2f} N" for v in vectors]
+            look: dict[str, Any] = {"colors": [(230, 60, 60)], "radii": [0.0025], "show_labels": False}
+            arrows = self._rr.Arrows3D(vectors=scale * vectors, origins=origins, labels=labels, **look)
             self._stream.log(f"{self._prefix[w]}scene/contacts", arrows)
 
     def _log_images(self, camera: SplatCamera, w: int) -> None:
@@ -305,14 +290,9 @@ class RerunLogger:
                 fx, fy, cx, cy = lens[16:].tolist()
                 turn = matrix[:3, :3].T
                 self._stream.log(path, rr.Transform3D(translation=-turn @ matrix[:3, 3], mat3x3=turn))
-                self._stream.log(
-                    path,
-                    rr.Pinhole(
-                        image_from_camera=[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]],
-                        resolution=(camera.width, camera.height),
-                        image_plane_distance=0.07,
-                    ),
-                )
+                view_of, size = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], (camera.width, camera.height)
+                pinhole = rr.Pinhole(image_from_camera=view_of, resolution=size, image_plane_distance=0.07)
+                self._stream.log(path, pinhole)
             pixels = camera.images(view.name).numpy()[w].copy()
             self._stream.log(f"{path}/rgb", encoded(pixels, self.options.jpeg_quality))
             self._stream.log(f"{path}/depth", encoded_depth(camera.images(view.name, "depth").numpy()[w]))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from softmode.errors import ConfigError, MissingExtraError, StorageError
+from softmode.errors import ConfigError, StorageError, needs_extra
 from softmode.files import PendingFile
 
 if TYPE_CHECKING:
@@ -156,12 +156,8 @@ def check_target(target: str | Path) -> bool:
         ConfigError: If it is neither a .rrd file, nor the address of a viewer, nor "spawn".
         MissingExtraError: If rerun is not installed.
     """
-    try:
+    with needs_extra("viz", "recording for rerun needs rerun-sdk"):
         import rerun  # noqa: F401
-    except ImportError as error:
-        raise MissingExtraError(
-            "recording for rerun needs rerun-sdk", hint="install it with: pip install 'softmode[viz]'"
-        ) from error
     live = str(target) == "spawn" or str(target).startswith(LIVE)
     if not live and Path(target).suffix.lower() != ".rrd":
         raise ConfigError(f"recording {target} is no .rrd file", hint="name it like out/lift.rrd")
