@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, sparse
-from scipy.sparse import csgraph
 from scipy.sparse import linalg as sparse_linalg
 from scipy.spatial import KDTree
 
@@ -159,7 +158,9 @@ class Mesh:
         used, elements = np.unique(grid, return_inverse=True)
         elements = elements.reshape(-1, 27)
         index = np.stack(np.unravel_index(used, shape), axis=1)
-        order = self._short_band(index, elements)
+        # Along the axes, longest slowest, makes a short band; reverse Cuthill-McKee is a third shorter on an L, but its
+        # order depends on the processor, and stored frames do not.
+        order = np.lexsort(tuple(index[:, d] for d in np.argsort(np.ptp(index, axis=0), kind="stable")))
         rank = np.empty(len(order), int)
         rank[order] = np.arange(len(order))
         self.elements = rank[elements]
@@ -190,22 +191,6 @@ class Mesh:
         breaks = tuple(c.region for c in scene.clamps) + tuple(i.region for i in scene.inclusions)
         lines, solid = scene.shape.cells(cell or scene.cell, breaks, scene.grading)
         return cls(lines, solid, scene.shape.to_rest, scene.shape.to_reference)
-
-    @staticmethod
-    def _short_band(index: NDArray[np.int64], elements: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the better of two orders: along the axes, longest slowest, or reverse Cuthill-McKee."""
-        along = np.lexsort(tuple(index[:, d] for d in np.argsort(np.ptp(index, axis=0))))
-        count = len(index)
-        pairs = (np.repeat(elements, 27, axis=1).ravel(), np.tile(elements, (1, 27)).ravel())
-        graph = sparse.csr_matrix((np.ones(len(pairs[0]), np.int8), pairs), shape=(count, count))
-        cuthill = csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int64)
-
-        def width(order: NDArray[np.int64]) -> int:
-            rank = np.empty(count, int)
-            rank[order] = np.arange(count)
-            return int(np.ptp(rank[elements], axis=1).max())
-
-        return min((along, cuthill), key=width)
 
     def interpolation(self, points: ArrayLike) -> sparse.csr_matrix:
         """Return the matrix (P, N) that takes nodal values to rest points (P, 3) [m].
