@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -53,7 +54,17 @@ class Policy:
         self._center, self._half = action_range(self.interface, device)
 
     def make(self, **options: Any) -> gym.Env:
-        """Return the environment of the policy, with the options it was trained with and further ones."""
+        """Return the environment of the policy, with the options it was trained with and further ones.
+
+        Raises:
+            CheckpointError: If the environment is of a module that has not been imported: a checkpoint may come from
+                anywhere, and to import a module runs it.
+        """
+        module = self.env.rpartition(":")[0]
+        if module and module not in sys.modules:
+            raise CheckpointError(
+                f"the policy's environment {self.env} is of the module {module}", hint=f"import {module} first"
+            )
         return gym.make(self.env, **with_config(self.env, {**self.env_options, **options}))
 
     def check(self, env: gym.Env | gym.vector.VectorEnv) -> None:

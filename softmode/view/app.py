@@ -11,6 +11,7 @@ import socket
 import sys
 import threading
 import time
+import traceback
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -179,24 +180,30 @@ class ViewApp:
                 except SoftmodeError as error:
                     self._panel.tell(f"**{error}**")
                     print(f"softmode: {error}", file=sys.stderr)
+                except Exception as error:  # one page's message must not end the session of all
+                    self._panel.tell(f"**{type(error).__name__}: {error}** (the session goes on)")
+                    traceback.print_exc()
         return asked
 
     # -- what browsers ask for, in viser's thread ---------------------------------------------------------------------
 
     async def _on_drag(self, event: Any) -> None:
         """Queue one step of a drag of the mouse; async, so that steps stay in order."""
-        camera = event.client.camera
-        eye, forward = np.array(camera.position), _forward(np.array(camera.wxyz))
-        start, end = np.array(event.start_position), np.array(event.end_position)
-        client, phase = event.client_id, event.phase
-        self.submit(lambda session: self._do_drag(session, client, phase, eye, forward, start, end))
+        position, wxyz = event.client.camera.position, event.client.camera.wxyz
+        begun, now, client, phase = event.start_position, event.end_position, event.client_id, event.phase
+
+        def drag(session: LiveSession) -> None:
+            eye, start, end = (_vector(value, 3) for value in (position, begun, now))
+            self._do_drag(session, client, phase, eye, _forward(_vector(wxyz, 4)), start, end)
+
+        self.submit(drag)
 
     async def _on_click(self, event: Any) -> None:
         """Queue a click on the object."""
-        eye, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+        origin, along = event.ray_origin, event.ray_direction
 
         def pin(session: LiveSession) -> None:
-            hit = session.pick(eye, direction)
+            hit = session.pick(_vector(origin, 3), _vector(along, 3))
             if hit is not None and self._panel.mouse_mode == "pin":
                 session.pin(hit)
 
@@ -207,7 +214,7 @@ class ViewApp:
 
         def move(session: LiveSession) -> None:
             if number in session.pins():
-                session.move_pin(number, position, wxyz)
+                session.move_pin(number, _vector(position, 3), _vector(wxyz, 4))
 
         self.submit(move)
 
@@ -269,6 +276,21 @@ class _Drag:
     """The pin that is moved, None for a pull."""
     offset: Vector
     """From the gripped point to the centre of the pin [m]."""
+
+
+def _vector(value: object, count: int) -> Vector:
+    """Return a vector that a page has sent.
+
+    Raises:
+        ConfigError: If it is not so many finite numbers.
+    """
+    try:
+        found = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        found = np.zeros(0)
+    if found.shape != (count,) or not np.isfinite(found).all():
+        raise ConfigError(f"a page sent {value!r} in place of {count} numbers", hint="reload the page")
+    return found
 
 
 def _forward(wxyz: Vector) -> Vector:

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 import warp as wp
 
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.attachments import attach
@@ -205,3 +207,14 @@ def test_errors():
         attach(builder, instance, body)
     with pytest.raises(ConfigError, match="stiffness"):
         attach(builder, instance, body, box=TOP, stiffness=-1.0)
+
+
+def test_own_surface_can_be_attached():
+    """The surface samples of a body count as inside, also those in a corner that no kernel reaches; beyond them not."""
+    body = build_body(quadrature_from_box((1.0, 1.0, 1.0)), progress=False)
+    builder = newton.ModelBuilder()
+    soft = add_reduced_body(builder, body)
+    found = attach(builder, soft, body, points=body.surface_points)
+    assert found.count == len(body.surface_points)
+    with pytest.raises(ConfigError, match="1 of 1 points lie outside"):
+        attach(builder, soft, body, points=[[0.0, 0.0, 0.8]])

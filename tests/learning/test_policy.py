@@ -14,7 +14,7 @@ pytest.importorskip("torch")
 import torch
 from gymnasium.vector import AutoresetMode
 
-from softmode.errors import ConfigError
+from softmode.errors import CheckpointError, ConfigError
 from softmode.learning.checkpoints import write_checkpoint
 from softmode.learning.policy import Evaluation, evaluate, load_policy
 from softmode.learning.spaces import Interface
@@ -34,6 +34,17 @@ def test_one_or_many_observations_arrays_or_tensors(tmp_path: Path):
         np.testing.assert_allclose(policy(batch[k]), actions[k], atol=1e-6)
     tensors = policy(torch.tensor(batch))
     assert isinstance(tensors, torch.Tensor) and np.allclose(tensors.numpy(), actions)
+
+
+def test_a_checkpoint_imports_no_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """An environment of a module that nobody has imported is refused, and the module is not run."""
+    (tmp_path / "stranger.py").write_text("raise SystemExit('this has run')")
+    monkeypatch.syspath_prepend(tmp_path)
+    write_checkpoint(checkpoint(env="stranger:Pendulum-v1"), tmp_path / "p.npz")
+    with pytest.raises(CheckpointError, match="of the module stranger"):
+        load_policy(tmp_path / "p.npz").make()
+    write_checkpoint(checkpoint(), tmp_path / "p.npz")
+    load_policy(tmp_path / "p.npz").make().close()
 
 
 @pytest.mark.parametrize("encoder", ["nature", "impala"])

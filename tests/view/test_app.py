@@ -240,6 +240,20 @@ def test_what_cannot_be_done_is_told_and_survived(view: Served, capfd: pytest.Ca
     assert "poissons_ratio" in capfd.readouterr().err.replace("'s ", "s_").replace("poissons ratio", "poissons_ratio")
 
 
+def test_a_damaged_drag_ends_nothing(view: Served, capfd: pytest.CaptureFixture[str]) -> None:
+    """A message with a vector too short, or not finite, is told; whatever a command raises, the session goes on."""
+    size = view.ask(lambda session: session.size)
+    with PageClient(view.app.url) as client:
+        client.send(camera_message(np.array([0.0, -6.0 * size, 0.1])))
+        client.send(drag_message("start", np.array([0.0, 0.1]), np.zeros(3)))
+        client.send(drag_message("start", np.zeros(3), np.array([0.0, np.nan, 0.0])))
+        view.app.submit(lambda session: 1 / 0)
+        assert view.wait(lambda session: "ZeroDivisionError" in view.app._panel._message.content)
+        assert view.ask(lambda session: session.drag()) is None
+    told = capfd.readouterr().err
+    assert told.count("in place of 3 numbers") == 2 and "ZeroDivisionError" in told
+
+
 def test_pages_of_others_are_refused(view: Served) -> None:
     """A web page of another origin, open in the same browser, gets no connection; the tool's own page does."""
     from websockets.exceptions import InvalidStatus

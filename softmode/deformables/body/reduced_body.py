@@ -255,6 +255,15 @@ class ReducedBody:
         distance, nearest = tree.query(np.asarray(points, dtype=np.float64))
         return distance <= REACH * basis.support[nearest]
 
+    def holds(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Return which points (N, 3) belong to the body: within the kernels' reach, or on the sampled surface.
+
+        Kernels sit inside the body, so that corners of its own surface may lie a little beyond their reach.
+        """
+        x = np.asarray(points, dtype=np.float64)
+        apart = KDTree(self.surface_points).query(x)[0]
+        return self.covers(x) | (apart <= np.sqrt(self.surface_areas.mean()))
+
     def affine(self, matrix: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
         """Return the coordinates q (n, 3) of x = A X + t, with A (3, 3) and t (3,) [m] in the body frame."""
         a, t = np.asarray(matrix, dtype=np.float64), np.asarray(translation, dtype=np.float64)

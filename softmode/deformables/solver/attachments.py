@@ -93,7 +93,7 @@ def attach(
     elif points is not None:
         X = np.asarray(points, float).reshape(-1, 3) / s
         pins = np.full(len(X), s * s * per_area * body.surface_areas.sum() / max(len(X), 1))
-        outside = X[~np.isfinite(X).all(axis=1)] if not np.isfinite(X).all() else X[~body.covers(X)]
+        outside = X[~np.isfinite(X).all(axis=1)] if not np.isfinite(X).all() else X[~body.holds(X)]
         if len(outside):
             raise ConfigError(
                 f"{len(outside)} of {len(X)} points lie outside body {body.name!r}, the first at {s * outside[0]} [m]",
