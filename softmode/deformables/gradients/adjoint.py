@@ -58,6 +58,9 @@ class AdjointOptions:
     """|r| / |f| of a step above which a warning is given: away from the root the theorem does not hold."""
     residual_max: float = 1.0e-2
     """|r| / |f| of a step above which it is refused."""
+    constant_contact_stiffness: bool = False
+    """Whether a contact stiffness that follows E, nu and mass is taken for a constant. The gradients by these three are
+    then wrong by more than their size; all others are right."""
 
     def __post_init__(self) -> None:
         """Check every range."""
@@ -116,8 +119,9 @@ class AdjointReduced:
     (exactly); contact at the normals of the start of each step, the normal force of friction included. Not
     differentiated: the turning of contact normals with the point of contact, contacts appearing or vanishing at the end
     of their detection range (where they carry no force), the motion of rigid shapes, what BDF2 remembers from before
-    the record, and how the automatic contact stiffness follows E, nu and density: give ``contact_stiffness_per_area``
-    where that matters. Friction must be without memory. Parameters must not change between recording and ``backward``.
+    the record, and how the automatic contact stiffness follows E, nu and density: a record with contacts of such
+    stiffness is refused, unless ``contact_stiffness_per_area`` or an option says otherwise. Friction must be without
+    memory. Parameters must not change between recording and ``backward``.
 
     Args:
         solver: The solver; rigid dofs must not take part in its solve.
@@ -282,7 +286,8 @@ class AdjointReduced:
             The gradients; arrays are new with each call.
 
         Raises:
-            ConfigError: If nothing is recorded or a shape does not fit.
+            ConfigError: If nothing is recorded, a shape does not fit, or a contact whose stiffness follows the body is
+                part of the record.
             SolverDiverged: If a step is further from its root than ``residual_max``, or its linear system is singular.
 
         Warns:
@@ -291,6 +296,7 @@ class AdjointReduced:
         steps, t = self.step_count, self.tables
         if steps == 0:
             raise ConfigError("no step is recorded", hint="call start and step first")
+        self._check_contacts()
         q_bar, qd_bar = self._cotangent("loss_q", loss_q), self._cotangent("loss_qd", loss_qd)
         axes = {
             "": "instance unknown",
@@ -333,6 +339,22 @@ class AdjointReduced:
             grad_residual=residual,
             **{name: getattr(totals, name) for name in _TOTALS},
         )
+
+    def _check_contacts(self) -> None:
+        """Refuse contacts whose stiffness follows parameters by which the loss is differentiated."""
+        if self.options.constant_contact_stiffness or not self.entry_max:
+            return
+        data = soft(self.solver.model)
+        pins = np.bincount(data.pin_instance.numpy(), minlength=self.instances) if self.pin_total else 0
+        most = self._entry_count[: self.step_count].numpy().max(axis=0)
+        follows = np.flatnonzero((most > pins) & (data.contact_stiffness.numpy() == 0.0))
+        if len(follows):
+            raise ConfigError(
+                f"instance {follows[0]} has contacts whose stiffness follows its E, nu and density, which the gradients"
+                " by these do not know",
+                hint="give contact_stiffness_per_area to add_reduced_body or, for other gradients alone,"
+                " AdjointOptions(constant_contact_stiffness=True)",
+            )
 
     def _cotangent(self, name: str, values: wp.array | ArrayLike | None) -> Any:
         """Return dL/dq or dL/dv in blocks, with a row of zeros for the state before the record."""
