@@ -284,10 +284,7 @@ def _vector(value: object, count: int) -> Vector:
     Raises:
         ConfigError: If it is not so many finite numbers.
     """
-    try:
-        found = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        found = np.zeros(0)
+    found = np.asarray(value, dtype=np.float64)
     if found.shape != (count,) or not np.isfinite(found).all():
         raise ConfigError(f"a page sent {value!r} in place of {count} numbers", hint="reload the page")
     return found

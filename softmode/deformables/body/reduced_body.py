@@ -260,9 +260,8 @@ class ReducedBody:
 
         Kernels sit inside the body, so that corners of its own surface may lie a little beyond their reach.
         """
-        x = np.asarray(points, dtype=np.float64)
-        apart = KDTree(self.surface_points).query(x)[0]
-        return self.covers(x) | (apart <= np.sqrt(self.surface_areas.mean()))
+        apart = KDTree(self.surface_points).query(points)[0]
+        return self.covers(points) | (apart <= np.sqrt(self.surface_areas.mean()))
 
     def affine(self, matrix: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
         """Return the coordinates q (n, 3) of x = A X + t, with A (3, 3) and t (3,) [m] in the body frame."""

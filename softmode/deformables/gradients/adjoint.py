@@ -347,11 +347,10 @@ class AdjointReduced:
         data = soft(self.solver.model)
         pins = np.bincount(data.pin_instance.numpy(), minlength=self.instances) if self.pin_total else 0
         most = self._entry_count[: self.step_count].numpy().max(axis=0)
-        follows = np.flatnonzero((most > pins) & (data.contact_stiffness.numpy() == 0.0))
-        if len(follows):
+        follows = (most > pins) & (data.contact_stiffness.numpy() == 0.0)
+        if follows.any():
             raise ConfigError(
-                f"instance {follows[0]} has contacts whose stiffness follows its E, nu and density, which the gradients"
-                " by these do not know",
+                f"instance {follows.argmax()} has contacts whose stiffness follows its E, nu and density",
                 hint="give contact_stiffness_per_area to add_reduced_body or, for other gradients alone,"
                 " AdjointOptions(constant_contact_stiffness=True)",
             )
