@@ -22,7 +22,7 @@ import numpy as np
 
 from softmode.checks import require_number
 from softmode.errors import ConfigError, SoftmodeError, needs_extra
-from softmode.view.live_types import Vector
+from softmode.view.live_types import Vector, finite_vector
 from softmode.view.panel import Command, MouseMode, Panel
 from softmode.view.stage import Stage
 
@@ -193,8 +193,10 @@ class ViewApp:
         begun, now, client, phase = event.start_position, event.end_position, event.client_id, event.phase
 
         def drag(session: LiveSession) -> None:
-            eye, start, end = (_vector(value, 3) for value in (position, begun, now))
-            self._do_drag(session, client, phase, eye, _forward(_vector(wxyz, 4)), start, end)
+            given = {"camera": position, "start of the drag": begun, "end of the drag": now}
+            eye, start, end = (finite_vector(name, value) for name, value in given.items())
+            forward = _forward(finite_vector("wxyz", wxyz, 4))
+            self._do_drag(session, client, phase, eye, forward, start, end)
 
         self.submit(drag)
 
@@ -203,7 +205,7 @@ class ViewApp:
         origin, along = event.ray_origin, event.ray_direction
 
         def pin(session: LiveSession) -> None:
-            hit = session.pick(_vector(origin, 3), _vector(along, 3))
+            hit = session.pick(finite_vector("ray", origin), finite_vector("ray", along))
             if hit is not None and self._panel.mouse_mode == "pin":
                 session.pin(hit)
 
@@ -214,7 +216,7 @@ class ViewApp:
 
         def move(session: LiveSession) -> None:
             if number in session.pins():
-                session.move_pin(number, _vector(position, 3), _vector(wxyz, 4))
+                session.move_pin(number, position, wxyz)
 
         self.submit(move)
 
@@ -276,18 +278,6 @@ class _Drag:
     """The pin that is moved, None for a pull."""
     offset: Vector
     """From the gripped point to the centre of the pin [m]."""
-
-
-def _vector(value: object, count: int) -> Vector:
-    """Return a vector that a page has sent.
-
-    Raises:
-        ConfigError: If it is not so many finite numbers.
-    """
-    found = np.asarray(value, dtype=np.float64)
-    if found.shape != (count,) or not np.isfinite(found).all():
-        raise ConfigError(f"a page sent {value!r} in place of {count} numbers", hint="reload the page")
-    return found
 
 
 def _forward(wxyz: Vector) -> Vector:

@@ -251,7 +251,7 @@ def test_a_damaged_drag_ends_nothing(view: Served, capfd: pytest.CaptureFixture[
         assert view.wait(lambda session: "ZeroDivisionError" in view.app._panel._message.content)
         assert view.ask(lambda session: session.drag()) is None
     told = capfd.readouterr().err
-    assert told.count("in place of 3 numbers") == 2 and "ZeroDivisionError" in told
+    assert told.count("must be three finite numbers") == 2 and "ZeroDivisionError" in told
 
 
 def test_pages_of_others_are_refused(view: Served) -> None:

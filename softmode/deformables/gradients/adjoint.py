@@ -344,10 +344,9 @@ class AdjointReduced:
         """Refuse contacts whose stiffness follows parameters by which the loss is differentiated."""
         if self.options.constant_contact_stiffness or not self.entry_max:
             return
-        data = soft(self.solver.model)
-        pins = np.bincount(data.pin_instance.numpy(), minlength=self.instances) if self.pin_total else 0
         most = self._entry_count[: self.step_count].numpy().max(axis=0)
-        follows = (most > pins) & (data.contact_stiffness.numpy() == 0.0)
+        automatic = self.solver.parameters.contact_stiffness.numpy() == 0.0
+        follows = (most > self.tables.layout.pin_count) & automatic
         if follows.any():
             raise ConfigError(
                 f"instance {follows.argmax()} has contacts whose stiffness follows its E, nu and density",
