@@ -144,13 +144,7 @@ class StepTables:
 
     def newton_step(self, dt: float) -> NewtonStep:
         """Return what Newton's iteration reads and writes in a step of ``dt`` [s]."""
-        options, given = self.options, NewtonOptions()
-        for name in ("iteration_max", "force_tolerance", "step_length_min"):
-            setattr(given, name, getattr(options, name))
-        given.refresh_interval, given.refresh_distance = options.stiffness_renewal, options.renewal_distance
-        given.stick_range, given.dt = options.stick_velocity * dt, dt
-        given.rigid_max, given.factor_width, given.shared = self.rigid.count_max, self.system.width, int(self.shared)
-        self.step.options = given
+        self.step.options.dt, self.step.options.stick_range = dt, self.options.stick_velocity * dt
         return self.step
 
     def launch(self, kernel: Kernel, dim: int | Sequence[int], *arguments: object, block_dim: int = 256) -> None:
@@ -236,7 +230,11 @@ def allocate_tables(
         "arrays": allocate(NewtonArrays, _ARRAYS, sizes, device, given=of_system),
     }
     state = allocate(NewtonState, _NEWTON, sizes, device, given=given)
-    step = allocate(NewtonStep, "", {}, device, given={**structs, "rigid": rigid.table, "state": state})
+    shared = small and system.scalars.shape[2] <= SHARED_WIDTH
+    constant = _newton_options(options, rigid, system, shared)
+    step = allocate(
+        NewtonStep, "", {}, device, given={**structs, "rigid": rigid.table, "state": state, "options": constant}
+    )
     return StepTables(
         model=model,
         options=options,
@@ -260,5 +258,17 @@ def allocate_tables(
         team=sizes["team"],
         one_launch=one_launch,
         fused_kernel=wp.overload(fused.minimise_worlds, {"unit": system.unit}),
-        shared=small and system.scalars.shape[2] <= SHARED_WIDTH,
+        shared=shared,
     )
+
+
+def _newton_options(
+    options: SolverReducedOptions, rigid: RigidDofs, system: BlockCholesky, shared: bool
+) -> NewtonOptions:
+    """Return the options of Newton's iteration that do not depend on the length of a step."""
+    given = NewtonOptions()
+    for name in ("iteration_max", "force_tolerance", "step_length_min"):
+        setattr(given, name, getattr(options, name))
+    given.refresh_interval, given.refresh_distance = options.stiffness_renewal, options.renewal_distance
+    given.rigid_max, given.factor_width, given.shared = rigid.count_max, system.width, int(shared)
+    return given
