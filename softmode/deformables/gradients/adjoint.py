@@ -39,7 +39,7 @@ from softmode.errors import ConfigError, SolverDiverged
 
 Array = NDArray[np.float64]
 
-_ENTRY = ("row", "normal", "offset", "stiffness", "friction")
+_CONSTRAINT = ("row", "normal", "offset", "stiffness", "friction")
 """What a step's point constraints are made of, besides their count: members of the solver's ``PointConstraints``."""
 _TOTALS = ("youngs_modulus", "poissons_ratio", "viscosity", "friction", "density", "mass_damping", "gravity")
 
@@ -158,31 +158,31 @@ class AdjointReduced:
         self.device, layout = solver.model.device, t.layout
         self.instances, self.total = layout.instance_count, int(solver.parameters.q.shape[0])
         self.pin_total = int(solver.parameters.pin_target.shape[0]) if layout.pin_max else 0
-        self.entry_max = solver.view.constraint_max if solver.model.shape_count else layout.pin_max
+        self.constraint_max = solver.view.constraint_max if solver.model.shape_count else layout.pin_max
         self.generation = 0
         """Number of records begun."""
         self.dt: list[float] = []
 
         # row 0 of the states is the one before the record, which BDF2 remembers; row t + 1 is time t
-        states, entries = (step_max + 2, self.total), (self.instances, max(self.entry_max, 1))
+        states, constraints = (step_max + 2, self.total), (self.instances, max(self.constraint_max, 1))
         self._q, self._qd = self._zeros(states, wp.vec3d), self._zeros(states, wp.vec3d)
         self._dt_before = self._zeros((step_max + 1, self.instances), wp.float64)
         self._force, self._costate = (self._zeros((step_max, *t.unknowns), vec8d) for _ in range(2))
-        self._entry_count = self._zeros((step_max, self.instances), int)
-        kinds = {name: getattr(t.constraints, name).dtype for name in _ENTRY}
-        self._entry = {name: self._zeros((step_max, *entries), kind) for name, kind in kinds.items()}
+        self._constraint_count = self._zeros((step_max, self.instances), int)
+        kinds = {name: getattr(t.constraints, name).dtype for name in _CONSTRAINT}
+        self._constraint = {name: self._zeros((step_max, *constraints), kind) for name, kind in kinds.items()}
 
         self._sizes = {
             "instance": self.instances,
             "point": layout.point_max,
-            "entry": self.entry_max,
+            "constraint": self.constraint_max,
             "pin": self.pin_total,
             "unknown": 3 * layout.block_count,
         }
-        axes = {"": "instance point", "entry_slip entry_hessian entry": "instance entry"}
+        axes = {"": "instance point", "constraint_slip constraint_hessian constraint": "instance constraint"}
         self._step = allocate(kernels.Linearised, axes, self._sizes, self.device)
         points, constraints = Points(), PointConstraints()
-        points.stress, constraints.force = self._step.point, self._step.entry
+        points.stress, constraints.force = self._step.point, self._step.constraint
         constraints.count, constraints.row = t.constraints.count, t.constraints.row
         given = {"instances": t.instances, "basis": t.basis, "arrays": t.arrays}
         given |= {"points": points, "constraints": constraints}
@@ -251,7 +251,7 @@ class AdjointReduced:
             raise ConfigError(f"{t} steps are recorded, the most there is room for", hint="raise step_max")
         self._copy_state(state, t + 1)
         wp.copy(self._force[t], self.tables.motion.force)
-        for stored, values in self._entries(t):
+        for stored, values in self._constraints(t):
             wp.copy(stored, values)
         self.dt.append(float(dt))
 
@@ -262,12 +262,12 @@ class AdjointReduced:
         wp.copy(self._qd[t + 1], data.qd)
         wp.copy(self._dt_before[t], data.dt_before)
 
-    def _entries(self, t: int) -> list[tuple[Any, Any]]:
+    def _constraints(self, t: int) -> list[tuple[Any, Any]]:
         """Return pairs of what is stored of the point constraints of step t and where the solver has it."""
-        entries, width = self.tables.constraints, self.entry_max
-        pairs = [(self._entry_count[t], entries.count)]
+        constraints, width = self.tables.constraints, self.constraint_max
+        pairs = [(self._constraint_count[t], constraints.count)]
         if width:
-            pairs += [(stored[t], getattr(entries, name)[:, :width]) for name, stored in self._entry.items()]
+            pairs += [(stored[t], getattr(constraints, name)[:, :width]) for name, stored in self._constraint.items()]
         return pairs
 
     # -- backward -----------------------------------------------------------------------------------------------------
@@ -301,14 +301,14 @@ class AdjointReduced:
         axes = {
             "": "instance unknown",
             "log_modulus poissons_ratio viscosity": "instance point",
-            "friction": "instance entry",
+            "friction": "instance constraint",
             "pin_stiffness": "pin",
         }
         sums = allocate(kernels.Sums, axes, self._sizes, self.device)
         totals = allocate(kernels.Totals, "instance", self._sizes, self.device)
         pin_target = self._zeros((steps, max(self.pin_total, 1)), wp.vec3d)
         residual, error = (self._zeros((steps, self.instances), wp.float64) for _ in range(2))
-        bodies, (points, entries) = (t.instances, t.basis), self._dims
+        bodies, (points, constraints) = (t.instances, t.basis), self._dims
 
         for k in reversed(range(steps)):
             costate, dt = self._costate[k], wp.float64(self.dt[k])
@@ -318,9 +318,9 @@ class AdjointReduced:
             self._solve(k, q_bar[k + 2], costate)
             wp.copy(error[k], self._gmres.error)
             t.launch(kernels.accumulate_points, points, *bodies, costate, dt, sums, self._step)
-            if self.entry_max:
+            if self.constraint_max:
                 found = (costate, sums, pin_target[k], self._step)
-                t.launch(kernels.accumulate_entries, entries, *bodies, t.constraints, *found)
+                t.launch(kernels.accumulate_constraints, constraints, *bodies, t.constraints, *found)
             self._sum_points(t.newton.active)
             given = (t.motion, t.arrays, t.model.gravity, costate, self._driven, dt, k)
             t.launch(kernels.propagate, t.unknowns, *bodies, *given, q_bar, qd_bar, sums)
@@ -342,9 +342,9 @@ class AdjointReduced:
 
     def _check_contacts(self) -> None:
         """Refuse contacts whose stiffness follows parameters by which the loss is differentiated."""
-        if self.options.constant_contact_stiffness or not self.entry_max:
+        if self.options.constant_contact_stiffness or not self.constraint_max:
             return
-        most = self._entry_count[: self.step_count].numpy().max(axis=0)
+        most = self._constraint_count[: self.step_count].numpy().max(axis=0)
         automatic = self.solver.parameters.contact_stiffness.numpy() == 0.0
         follows = (most > self.tables.layout.pin_count) & automatic
         if follows.any():
@@ -389,7 +389,7 @@ class AdjointReduced:
         wp.copy(t.motion.force, self._force[k])
         end = t.arrays.q.reshape((1, *t.unknowns))
         t.launch(kernels.pack, (1, *self._blocks), t.instances, self._q[k + 2 : k + 3], end)
-        for stored, values in self._entries(k):
+        for stored, values in self._constraints(k):
             wp.copy(values, stored)
         adapt(t, dt)
         progress = t.newton
@@ -404,14 +404,16 @@ class AdjointReduced:
 
     def _measure(self, k: int, residual: wp.array) -> None:
         """Measure the residual of the restored step and linearise it."""
-        t, dt, (points, entries) = self.tables, self.dt[k], self._dims
+        t, dt, (points, constraints) = self.tables, self.dt[k], self._dims
         step = (t.motion, t.constraints, self._resolution, t.arrays, wp.float64(dt))
         t.launch(kernels.measure_residual, self.instances, t.instances, *step, residual)
         bodies = (t.instances, t.basis, t.motion)
         t.launch(kernels.place_points, points, *bodies, t.arrays.q, self._step)
-        if self.entry_max:
+        if self.constraint_max:
             stick_range = wp.float64(self.solver.options.stick_velocity * dt)
-            t.launch(kernels.place_entries, entries, *bodies, t.constraints, stick_range, t.arrays.q, self._step)
+            t.launch(
+                kernels.place_constraints, constraints, *bodies, t.constraints, stick_range, t.arrays.q, self._step
+            )
 
     def _solve(self, k: int, right: wp.array, solution: wp.array) -> None:
         """Solve H_t^T solution = right at the free functions; leave H_t^T solution at the driven ones."""
@@ -423,17 +425,17 @@ class AdjointReduced:
 
     def _apply(self, k: int, active: wp.array, direction: wp.array, product: wp.array) -> None:
         """Write H_t^T direction in active worlds to ``product`` and, for the driven functions, to ``_driven``."""
-        t, dt, (points, entries) = self.tables, wp.float64(self.dt[k]), self._dims
+        t, dt, (points, constraints) = self.tables, wp.float64(self.dt[k]), self._dims
         bodies = (t.instances, t.basis)
         t.launch(kernels.apply_points, points, *bodies, active, direction, dt, self._step)
-        if self.entry_max:
-            t.launch(kernels.apply_entries, entries, *bodies, t.constraints, active, direction, self._step)
+        if self.constraint_max:
+            t.launch(kernels.apply_constraints, constraints, *bodies, t.constraints, active, direction, self._step)
         self._sum_points(active)
         given = (t.motion, active, t.arrays, direction, dt)
         t.launch(kernels.sum_product, t.unknowns, *bodies, *given, product, self._driven)
 
     def _sum_points(self, active: wp.array) -> None:
-        """Sum what stands at the points, less what stands at the entries, into the solver's chunks."""
+        """Sum what stands at the points, less what stands at the constraints, into the solver's chunks."""
         t = self.tables
         dim = (self.instances, t.arrays.gradient_chunk.shape[1], t.layout.block_count)
         t.launch(sum_forces, dim, self._sums, active)
@@ -464,7 +466,7 @@ class AdjointReduced:
     @property
     def _dims(self) -> tuple[tuple[int, int], tuple[int, int]]:
         """Threads over the cubature points, and over the point constraints."""
-        return (self.instances, self.tables.layout.point_max), (self.instances, self.entry_max)
+        return (self.instances, self.tables.layout.point_max), (self.instances, self.constraint_max)
 
     def _zeros(self, shape: Sequence[int], dtype: type) -> Any:
         return wp.zeros(tuple(shape), dtype=dtype, device=self.device)

@@ -33,9 +33,11 @@ class Linearised:
     place: wp.array2d[wp.mat33d]  # (instance_count, point_max), G = F / s - I, s the scale of the body
     place_start: wp.array2d[wp.mat33d]  # the same at the start of the step
     point: wp.array2d[wp.mat33d]  # V times what is summed over the points next [N m]
-    entry_slip: wp.array2d[wp.vec3d]  # pins: x - target [m]; contacts: friction force per coefficient, times -1 [N]
-    entry_hessian: wp.array2d[wp.mat33d]  # -d force / d displacement [N/m]; not symmetric where a contact slips
-    entry: wp.array2d[wp.vec3d]  # what is summed over the entries next [N]
+    constraint_slip: wp.array2d[
+        wp.vec3d
+    ]  # pins: x - target [m]; contacts: friction force per coefficient, times -1 [N]
+    constraint_hessian: wp.array2d[wp.mat33d]  # -d force / d displacement [N/m]; not symmetric where a contact slips
+    constraint: wp.array2d[wp.vec3d]  # what is summed over the constraints next [N]
 
 
 @struct
@@ -45,7 +47,7 @@ class Sums:
     log_modulus: wp.array2d[wp.float64]  # (instance_count, point_max), as the next two
     poissons_ratio: wp.array2d[wp.float64]
     viscosity: wp.array2d[wp.float64]
-    friction: wp.array2d[wp.float64]  # (instance_count, entry_max)
+    friction: wp.array2d[wp.float64]  # (instance_count, constraint_max)
     pin_stiffness: wp.array[wp.float64]  # (pin_count,)
     mass: wp.array2d[vec8d]  # (instance_count, 3 block_count), as what follows
     mass_damping: wp.array2d[vec8d]
@@ -149,11 +151,11 @@ def place_points(
 
 
 @wp.kernel
-def place_entries(
+def place_constraints(
     instances: Instances,
     basis: Basis,
     motion: Motion,
-    entries: PointConstraints,
+    constraints: PointConstraints,
     stick_range: wp.float64,
     q: wp.array2d[vec8d],
     # Out:
@@ -161,37 +163,39 @@ def place_entries(
 ):
     """Linearise pins and contacts, the normal force of friction included, at fixed normals."""
     i, e = wp.tid()
-    if e >= entries.count[i]:
+    if e >= constraints.count[i]:
         return
-    d = interpolate_change(basis.row, entries.row[i, e], q, motion.q_start, i, instances.function_count[i])
-    x = entries.offset[i, e] + d
-    k = entries.stiffness[i, e]
+    d = interpolate_change(basis.row, constraints.row[i, e], q, motion.q_start, i, instances.function_count[i])
+    x = constraints.offset[i, e] + d
+    k = constraints.stiffness[i, e]
     identity = wp.identity(n=3, dtype=wp.float64)
     if e < instances.pin_count[i]:
-        step.entry_slip[i, e] = x
-        step.entry_hessian[i, e] = k * identity
+        step.constraint_slip[i, e] = x
+        step.constraint_hessian[i, e] = k * identity
         return
-    n = entries.normal[i, e]
+    n = constraints.normal[i, e]
     _psi, slope, curvature = normal_potential(-wp.dot(n, x), wp.float64(instances.smoothing[i]))
     t = x - wp.dot(n, x) * n
     y = wp.length(t)
     _f0, f1_over_y, f1_slope = friction_potential(y, stick_range)
-    c = entries.friction[i, e]
+    c = constraints.friction[i, e]
     N = wp.outer(n, n)
     slip = f1_over_y * (identity - N)
     if y > wp.float64(1.0e-9) * stick_range:
         slip += (f1_slope - f1_over_y) / (y * y) * wp.outer(t, t)
-    step.entry_slip[i, e] = k * slope * f1_over_y * t
-    step.entry_hessian[i, e] = k * curvature * N + c * k * slope * slip - c * k * curvature * f1_over_y * wp.outer(t, n)
+    step.constraint_slip[i, e] = k * slope * f1_over_y * t
+    step.constraint_hessian[i, e] = (
+        k * curvature * N + c * k * slope * slip - c * k * curvature * f1_over_y * wp.outer(t, n)
+    )
 
 
 @wp.kernel
 def measure_residual(
     instances: Instances,
     motion: Motion,
-    entries: PointConstraints,
+    constraints: PointConstraints,
     resolution: wp.array[wp.float64],  # (instance_count,), motion [m] whose inertia is no force worth naming
-    arrays: NewtonArrays,  # chunks of the gradient: forces of points less entries
+    arrays: NewtonArrays,  # chunks of the gradient: forces of points less constraints
     dt: wp.float64,
     # Out:
     ratio_out: wp.array[wp.float64],  # (instance_count,)
@@ -217,8 +221,8 @@ def measure_residual(
             stress = stress + internal[i, chunk, e]
         elastic += wp.dot(stress, stress)
     scale = wp.sqrt(wp.max(inertial, wp.max(elastic, external)))
-    for e in range(entries.count[i]):
-        scale += wp.length(entries.force[i, e])
+    for e in range(constraints.count[i]):
+        scale += wp.length(constraints.force[i, e])
     ratio_out[i] = wp.sqrt(total) / (scale + weight * resolution[i])
 
 
@@ -251,10 +255,10 @@ def apply_points(
 
 
 @wp.kernel
-def apply_entries(
+def apply_constraints(
     instances: Instances,
     basis: Basis,
-    entries: PointConstraints,
+    constraints: PointConstraints,
     active: wp.array[int],
     direction: wp.array2d[vec8d],
     # Out:
@@ -262,10 +266,10 @@ def apply_entries(
 ):
     """Evaluate the force of pins and contacts: less their transposed Hessian times the direction."""
     i, e = wp.tid()
-    if active[instances.world[i]] == 0 or e >= entries.count[i]:
+    if active[instances.world[i]] == 0 or e >= constraints.count[i]:
         return
-    d = interpolate(basis.row, entries.row[i, e], direction, i, instances.function_count[i])
-    step.entry[i, e] = -(wp.transpose(step.entry_hessian[i, e]) * d)
+    d = interpolate(basis.row, constraints.row[i, e], direction, i, instances.function_count[i])
+    step.constraint[i, e] = -(wp.transpose(step.constraint_hessian[i, e]) * d)
 
 
 @wp.kernel
@@ -274,7 +278,7 @@ def sum_product(
     basis: Basis,
     motion: Motion,
     active: wp.array[int],
-    arrays: NewtonArrays,  # chunks: sums of V dP grad b over the points less b f over the entries
+    arrays: NewtonArrays,  # chunks: sums of V dP grad b over the points less b f over the constraints
     direction: wp.array2d[vec8d],
     dt: wp.float64,
     # Out:
@@ -366,35 +370,35 @@ def accumulate_points(
 
 
 @wp.kernel
-def accumulate_entries(
+def accumulate_constraints(
     instances: Instances,
     basis: Basis,
-    entries: PointConstraints,
+    constraints: PointConstraints,
     costate: wp.array2d[vec8d],
     # In and out:
     sums: Sums,
     # Out:
     pin_target_out: wp.array[wp.vec3d],  # (pin_count,), of this step
-    step: Linearised,  # entry: what the start of the step feels through slip
+    step: Linearised,  # constraint: what the start of the step feels through slip
 ):
     """Add the gradients of pins, friction and of where a slipping contact started."""
     i, e = wp.tid()
-    if e >= entries.count[i]:
+    if e >= constraints.count[i]:
         return
-    L = interpolate(basis.row, entries.row[i, e], costate, i, instances.function_count[i])
-    step.entry[i, e] = wp.vec3d()
+    L = interpolate(basis.row, constraints.row[i, e], costate, i, instances.function_count[i])
+    step.constraint[i, e] = wp.vec3d()
     if e < instances.pin_count[i]:
         pin = instances.pin_start[i] + e
-        pin_target_out[pin] = entries.stiffness[i, e] * L
-        sums.pin_stiffness[pin] = sums.pin_stiffness[pin] - wp.dot(L, step.entry_slip[i, e])
+        pin_target_out[pin] = constraints.stiffness[i, e] * L
+        sums.pin_stiffness[pin] = sums.pin_stiffness[pin] - wp.dot(L, step.constraint_slip[i, e])
         return
-    n = entries.normal[i, e]
-    back = wp.transpose(step.entry_hessian[i, e]) * L
-    step.entry[i, e] = back - wp.dot(n, back) * n
+    n = constraints.normal[i, e]
+    back = wp.transpose(step.constraint_hessian[i, e]) * L
+    step.constraint[i, e] = back - wp.dot(n, back) * n
     # c = sqrt(friction of body * friction of shape)
     if instances.friction[i] > 0.0:
-        share = wp.float64(0.5) * entries.friction[i, e] / wp.float64(instances.friction[i])
-        sums.friction[i, e] = sums.friction[i, e] - share * wp.dot(L, step.entry_slip[i, e])
+        share = wp.float64(0.5) * constraints.friction[i, e] / wp.float64(instances.friction[i])
+        sums.friction[i, e] = sums.friction[i, e] - share * wp.dot(L, step.constraint_slip[i, e])
 
 
 @wp.kernel
@@ -402,7 +406,7 @@ def propagate(
     instances: Instances,
     basis: Basis,
     motion: Motion,
-    arrays: NewtonArrays,  # chunks: sums over points and entries of what the start of the step feels
+    arrays: NewtonArrays,  # chunks: sums over points and constraints of what the start of the step feels
     gravity: wp.array[wp.vec3],
     costate: wp.array2d[vec8d],
     driven: wp.array2d[vec8d],  # H^T lambda at the driven functions
@@ -457,7 +461,7 @@ def sum_gradients(
     # Out:
     totals: Totals,
 ):
-    """Sum over points, entries and functions, in order."""
+    """Sum over points, constraints and functions, in order."""
     i = wp.tid()
     modulus = wp.float64(0.0)
     nu = wp.float64(0.0)
