@@ -32,7 +32,7 @@ PAD = ObjectConfig(
     shape="cylinder",
     extents=(0.10, 0.10, 0.03),
     surface_count=200,
-    build=BuildOptions(function_count=29, poissons_ratio=0.4, cubature_count=256),
+    build=BuildOptions(function_count=32, poissons_ratio=0.4, cubature_count=256),
 )
 """A flat disc to press on."""
 PAD_MATERIAL = Material(youngs_modulus=5.0e4, poissons_ratio=0.4, density=500.0)
