@@ -313,8 +313,8 @@ def _nonnegative_path(
         while True:
             k = len(chosen)
             trial = inverse[:k, :k] @ right[:k]
-            for _ in range(2):  # Refinement repairs what the updates of the inverse lose.
-                trial += inverse[:k, :k] @ (right[:k] - normal[:k, :k] @ trial)
+            # Refinement repairs what the updates of the inverse lose.
+            trial += inverse[:k, :k] @ (right[:k] - normal[:k, :k] @ trial)
             if (trial > 0.0).all():
                 value = trial
                 break
