@@ -49,7 +49,7 @@ def load_source(
         _refuse_size(size, f"the body {config.body}" if config.body else f"a {config.shape} of {config.extents} m")
     elif size is not None:
         config = replace(config, size=size)
-    return Placed(object=load(config, progress=progress))
+    return Placed(object=load(config.for_varied_ratio(), progress=progress))  # Its nu has a slider.
 
 
 def _refuse_size(size: float | None, what: str) -> None:
@@ -68,4 +68,5 @@ def with_functions(config: ObjectConfig | None, count: int) -> ObjectConfig:
         raise ConfigError(f"functions must be a whole number in {FUNCTION_LEAST}..{FUNCTION_LIMIT}, got {count!r}")
     if config is None or config.body is not None:
         raise ConfigError("a body that is built cannot be given other functions", hint="open what it was built from")
-    return replace(config, build=config.build.with_functions(int(count)))
+    varied = config.build.with_functions(int(count)).for_varied_ratio()
+    return replace(config, build=varied.with_functions(int(count)))

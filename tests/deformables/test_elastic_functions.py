@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import warnings
 
+import newton
 import numpy as np
 import pytest
 
@@ -12,6 +14,8 @@ from softmode.deformables.body.regions import Region
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import FUNCTION_COUNT, BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_mesh, quadrature_from_sphere
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
 from softmode.errors import ConfigError
 from tests.oracle.solids import eigenvalues
 from tests.shapes import box, together
@@ -136,3 +140,32 @@ def test_regions_take_no_count() -> None:
     held = Region(name="held", box=((-1.0, -1.0, -1.0), (-0.04, 1.0, 1.0)))
     with pytest.raises(ConfigError, match="mode_count"):
         build_body(quadrature_from_box(SIZE), BuildOptions(function_count=40), regions=(held,), progress=False)
+
+
+def test_a_ratio_that_varies() -> None:
+    """Options for it name three ratios and take a quarter more functions, unless a ratio or eigenmodes are named."""
+    varied = BuildOptions(function_count=24).for_varied_ratio()
+    assert varied.poissons_ratios == (0.3, 0.45, 0.49) and varied.function_count == 30
+    assert BuildOptions().for_varied_ratio().function_count == 60
+    assert BuildOptions(accuracy=0.02).for_varied_ratio().function_count is None
+    for named in (BuildOptions(poissons_ratio=0.3), BuildOptions(mode_count=4)):
+        assert named.for_varied_ratio() is named
+
+
+def test_a_ratio_far_from_the_build_is_named() -> None:
+    """A body made for 0.4 warns when it is added with 0.49; one made for both does not."""
+    material = Material(poissons_ratio=0.49)
+    with pytest.warns(RuntimeWarning, match=r"poissons_ratio=0.49"):
+        add_reduced_body(newton.ModelBuilder(), built(function_count=24), material=material)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for ratio in (0.49, (0.3, 0.49)):
+            body = built(function_count=24, poissons_ratio=ratio)
+            add_reduced_body(newton.ModelBuilder(), body, material=material)
+
+
+@pytest.mark.parametrize("ratio", [0.5, -0.1, np.nan, (0.3, 0.5)])
+def test_ratios_without_a_material_are_refused(ratio: float | tuple[float, ...]) -> None:
+    """The error names the argument."""
+    with pytest.raises(ConfigError, match="poissons_ratio"):
+        BuildOptions(poissons_ratio=ratio)

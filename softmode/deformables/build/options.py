@@ -22,6 +22,8 @@ EIGENMODE_COUNT = 8
 """Skinning eigenmodes where FreeForm's functions are asked for, or regions are given, without a number."""
 FUNCTION_COUNT = 48
 """Functions where neither a number nor an accuracy is given."""
+VARIED_RATIOS = (0.3, 0.45, 0.49)
+"""Ratios that functions are made for where Poisson's ratio varies."""
 FUNCTION_LEAST = 10
 """The fewest functions: with all quadratic fields the first bending is free."""
 FUNCTION_LIMIT = 120
@@ -103,6 +105,16 @@ class BuildOptions:
     def with_functions(self, count: int) -> BuildOptions:
         """Return these options with another number of functions, chosen by elastic energy."""
         return replace(self, function_count=count, accuracy=None, mode_count=None, handles=None)
+
+    def for_varied_ratio(self) -> BuildOptions:
+        """Return these options for a Poisson's ratio that varies: several ratios, and a quarter more functions.
+
+        Options that name a ratio, or ask for FreeForm's functions, stay as they are.
+        """
+        if self.poissons_ratio is not None or self.eigenmode_handles:
+            return self
+        count = None if self.accuracy is not None else (self.function_count or FUNCTION_COUNT) * 5 // 4
+        return replace(self, poissons_ratio=VARIED_RATIOS, function_count=count)
 
     @property
     def eigenmode_handles(self) -> bool:
