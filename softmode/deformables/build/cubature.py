@@ -14,6 +14,7 @@ energy: the bending of a thin body, soft beside its stretching, would otherwise 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,8 @@ from softmode.deformables.build.static_response import lame_parameters
 from softmode.errors import BasisError
 
 Array = NDArray[np.float64]
+Real = NDArray[Any]
+"""Of single or double precision."""
 
 POISSON_RATIO = 0.4
 """Poisson's ratio of the training material; the points serve any other."""
@@ -227,7 +230,7 @@ def _batches(poses: list[tuple[Array, Array]]) -> list[list[tuple[Array, Array]]
 class _Sampler:
     """Stresses and forces of a set of weighted points, for several poses at a time."""
 
-    def __init__(self, gradient: Array, weights: Array) -> None:
+    def __init__(self, gradient: Real, weights: Real) -> None:
         self.gradient = np.ascontiguousarray(gradient).reshape(len(gradient), -1)  # (n, 3 P)
         self.weights = weights
 
@@ -267,12 +270,12 @@ def _stress(f: Array) -> Array:
 
 
 def _nonnegative_path(
-    columns: Array, target: Array, sizes: set[int], rng: np.random.Generator
+    columns: Real, target: Array, sizes: set[int], rng: np.random.Generator
 ) -> dict[int, tuple[NDArray[np.intp], Array]]:
     """Grow a non-negative least-squares solution of  x @ columns = target,  sum x = 1.
 
     Candidates are searched in eight interleaved random groups, one per step: a fresh group costs an eighth of the
-    search and loses nothing visible; the search, which memory bounds, reads float32. The inverse of the normal matrix
+    search and loses nothing visible. The inverse of the normal matrix
     is bordered and reduced as points come and go.
 
     Returns:
