@@ -87,9 +87,9 @@ def main(arguments: list[str] | None = None) -> None:
         f"{drop.thing.visible_splats.count} splats, {1e3 * drop.weight / GRAVITY:.1f} g, falls {100 * drop.fall:.0f} cm"
     )
     with Film(given.video) as film:
-        rows = drop.run(film, 60)
+        rows = drop.run(film, 105)
         film.publish()
-    for t, lowest, centre, kinetic in rows[::6]:
+    for t, lowest, centre, kinetic in rows[::7]:
         print(
             f"{t:6.2f} s: lowest {1e3 * lowest:7.2f} mm, centre {1e3 * centre:6.1f} mm, moving {1e3 * kinetic:8.4f} mJ"
         )

@@ -36,12 +36,17 @@ class _Asset:
     """Which of the separate parts of a splat file is the object."""
     pose: Literal["stable", "captured"] = "stable"
     """Lay an object that cannot stand on its stable side, or leave it as it is in the file."""
-    modes: int = 8
-    """Skinning eigenmodes beside the constant handle."""
-    handles: Literal["affine", "quadratic"] = "affine"
+    functions: int | None = None
+    """Scalar functions, chosen by elastic energy; 48 if omitted."""
+    accuracy: float | None = None
+    """Or as many as the first six free frequencies take to be this near to those of the whole space, such as 0.02."""
+    modes: int | None = None
+    """FreeForm's functions instead: so many skinning eigenmodes beside the constant handle; a body with regions has
+    those in any case, 8 if omitted."""
+    handles: Literal["affine", "quadratic"] | None = None
     """What each eigenmode carries: (X, Y, Z, 1), or all ten monomials up to degree two, for slender and flat bodies."""
-    kernels: int = 400
-    """Reproducing kernels."""
+    kernels: int | None = None
+    """Reproducing kernels; 1000 if omitted, 400 with eigenmodes."""
     points: int = 384
     """Cubature points, at which a step evaluates stress."""
     surface: int = 400
@@ -50,8 +55,8 @@ class _Asset:
     """Splats on a mesh; a splat file keeps its own."""
     rank_tolerance: float | None = None
     """Functions smaller than this are dropped as noise; 1e-5 if omitted, 1e-9 for slender and flat bodies."""
-    poissons_ratio: float = 0.4
-    """Poisson's ratio that the static responses of regions are made for; any other can be simulated."""
+    poissons_ratio: tuple[float, ...] = (0.4,)
+    """Poisson's ratio that the functions are made for; any other can be simulated, several serve one that varies."""
     region: tuple[str, ...] = ()
     """NAME=x0,y0,z0,x1,y1,z1: a part that scenes hold, move or grasp [m]; a seventh number makes it soft, stiffness / E
     [1/m^2]. Coordinates: z up, bounding box centred over the origin, standing on z = 0; inf is allowed."""
@@ -167,6 +172,7 @@ def _examined(options: _Asset) -> tuple[ReducedBody, Splats, BodyReport]:
         raise ConfigError(f"{options.file} is a mesh; crop and part are for splats", hint="leave them out")
     given = same_fields(options, BuildOptions)
     given |= {"mode_count": options.modes, "kernel_count": options.kernels, "cubature_count": options.points}
+    given["function_count"] = options.functions
     if options.rank_tolerance is None:
         given["rank_tolerance"] = RANK_TOLERANCE
     found, quadrature = build_object(

@@ -14,8 +14,8 @@ RL_SOLVER = SolverReducedOptions(
 )
 """Steps end when the residual force is below a thousandth of the forces on a body and it moves by less than 1e-4 of its
 size; a body at rest keeps its stiffness from step to step."""
-RL_BUILD = BuildOptions(mode_count=5, cubature_count=96)
-"""At most 24 functions, a system of 72 unknowns, which on CUDA fits in shared memory."""
+RL_BUILD = BuildOptions(function_count=24, cubature_count=96)
+"""24 functions, a system of 72 unknowns, which on CUDA fits in shared memory."""
 
 
 def rl_scene(config: TableSceneConfig | None = None, *, dt: float = 1.0 / 120.0) -> TableSceneConfig:

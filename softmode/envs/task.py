@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar, cast
 
 import gymnasium as gym
@@ -214,8 +215,14 @@ class Task:
     # -- what a task adds ---------------------------------------------------------------------------------------------
 
     def scene_config(self) -> TableSceneConfig:
-        """Return what the scene is built from: the configured one, and what a task adds to it."""
-        return self.config.scene
+        """Return what the scene is built from: the configured one, and what a task adds to it.
+
+        Where Poisson's ratio is drawn, the object's functions are made for several.
+        """
+        scene = self.config.scene
+        if self.config.poissons_ratio_range is None:
+            return scene
+        return replace(scene, object=scene.object.for_varied_ratio())
 
     def build(self) -> None:
         """Allocate what the subclass needs; called once, when the scene stands."""

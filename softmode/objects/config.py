@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -96,6 +96,12 @@ class ObjectConfig:
                 raise ConfigError("colors are for shapes and meshes", hint="leave them out; splats have their own")
             if np.shape(self.colors) != (2, 3) or not all(0.0 <= x <= 1.0 for color in self.colors for x in color):
                 raise ConfigError(f"colors {self.colors} are not two colours", hint="give two of (r, g, b) in 0..1")
+
+    def for_varied_ratio(self) -> ObjectConfig:
+        """Return this with a body for a Poisson's ratio that varies; a clamped or a built one stays as it is."""
+        if self.body is not None or self.clamped_height > 0.0:
+            return self
+        return replace(self, build=self.build.for_varied_ratio())
 
     def _check_extents(self) -> None:
         """Check that a shape has extents that fit it, and nothing else has any."""

@@ -68,4 +68,4 @@ def present(scene: Scene) -> LiveParameters:
     data = soft(scene.model)
     values = {name: float(getattr(data, name).numpy()[0]) for name in LIMITS | DAMPING_LIMITS}
     x, y, z = (host(scene.model.gravity)[0] + 0.0).tolist()
-    return LiveParameters(**values, gravity=(x, y, z), handles=scene.objects[0].body.mode_count)
+    return LiveParameters(**values, gravity=(x, y, z), functions=scene.objects[0].body.function_count)

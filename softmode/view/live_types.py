@@ -61,8 +61,8 @@ class LiveParameters:
     """Coulomb coefficient of the object."""
     gravity: tuple[float, float, float]
     """Gravity [m/s^2]."""
-    handles: int
-    """Skinning eigenmodes beside the constant handle."""
+    functions: int
+    """Scalar functions of the body; it has three unknowns for each."""
 
 
 @dataclass(frozen=True, kw_only=True)

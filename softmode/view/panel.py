@@ -25,8 +25,8 @@ FOLLOW_PAUSE = 1.0
 """How long a slider that was moved by hand is left alone [s]."""
 MODULUS_MARKS = ((3.0, "1 k"), (4.0, "10 k"), (5.0, "100 k"), (6.0, "1 M"), (7.0, "10 M"))
 PLOT_POINTS = 150
-HANDLE_COUNTS = (2, 4, 8, 12, 16, 24)
-"""Numbers of handles on offer, beside the present one."""
+FUNCTION_COUNTS = (16, 24, 36, 48, 60, 80)
+"""Numbers of functions on offer, beside the present one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,24 +168,24 @@ class Panel:
             for slider in SLIDERS:
                 says = {"hint": slider.hint, "marks": slider.marks}
                 self._connect(slider, gui.add_slider(slider.label, *slider.limits, slider.shown(now), **says))
-        choices = tuple(str(count) for count in sorted({*HANDLE_COUNTS, now.handles}))
-        hint = "skinning eigenmodes; another number builds the object anew"
-        handles = gui.add_dropdown("handles", choices, initial_value=str(now.handles), hint=hint)
+        choices = tuple(str(count) for count in sorted({*FUNCTION_COUNTS, now.functions}))
+        hint = "functions of the body, chosen by elastic energy; another number builds the object anew"
+        functions = gui.add_dropdown("functions", choices, initial_value=str(now.functions), hint=hint)
 
-        @handles.on_update
+        @functions.on_update
         async def _(event: Any) -> None:
             if event.client is None:
                 return
-            count = int(handles.value)
-            self._submit(lambda session: self._set_handles(session, count))
+            count = int(functions.value)
+            self._submit(lambda session: self._set_functions(session, count))
 
-        self._handles = handles
+        self._functions = functions
 
-    def _set_handles(self, session: LiveSession, count: int) -> None:
-        """Build the object with other handles; the picture stands still for as long as that takes."""
-        self.tell(f"building with {count} handles ...")
-        session.set_handles(count)
-        self.tell(f"built with {count} handles")
+    def _set_functions(self, session: LiveSession, count: int) -> None:
+        """Build the object with other functions; the picture stands still for as long as that takes."""
+        self.tell(f"building with {count} functions ...")
+        session.set_functions(count)
+        self.tell(f"built with {count} functions")
 
     def _connect(self, slider: Slider, handle: Any) -> None:
         """Let a slider change the session."""
@@ -207,8 +207,8 @@ class Panel:
             value, idle = slider.shown(now), time.monotonic() - self._touched[slider]
             if abs(handle.value - value) > 0.5 * slider.limits[2] and idle > FOLLOW_PAUSE:
                 handle.value = value
-        if self._handles.value != str(now.handles) and str(now.handles) in self._handles.options:
-            self._handles.value = str(now.handles)
+        if self._functions.value != str(now.functions) and str(now.functions) in self._functions.options:
+            self._functions.value = str(now.functions)
 
     def _add_readouts(self) -> None:
         """Text and a plot of energies."""

@@ -47,7 +47,7 @@ from softmode.view.live_types import (
 from softmode.view.pace import Pace
 from softmode.view.picture import LivePicture
 from softmode.view.recorders import RECORD_HZ, Recorder, live_camera, make_recorder
-from softmode.view.sources import load_source, with_handles
+from softmode.view.sources import load_source, with_functions
 
 
 class LiveSession:
@@ -388,20 +388,20 @@ class LiveSession:
         self._given |= live_parameters.checked(gravity, values)
         live_parameters.apply(self._scene, self._given)
 
-    def set_handles(self, count: int) -> None:
-        """Give the object another number of skinning eigenmodes: builds it anew, or takes it from the cache.
+    def set_functions(self, count: int) -> None:
+        """Give the object another number of functions: builds it anew, or takes it from the cache.
 
         Position, deformation and velocity are carried over by least squares, pins keep their numbers, a drag ends. With
         an environment a new episode begins.
 
         Raises:
-            ConfigError: If the count lies outside 1..64, or the object came as a saved body, which cannot be rebuilt.
+            ConfigError: If the count lies outside 10..120, or the object came as a saved body, which cannot be rebuilt.
         """
         if self._recorder is not None:
-            raise ConfigError("a recording is being made", hint="stop it before the handles change")
+            raise ConfigError("a recording is being made", hint="stop it before the functions change")
         old = self._object(0).body
-        source = with_handles(self._source or self._live.source, count)
-        if count == old.mode_count:
+        source = with_functions(self._source or self._live.source, count)
+        if count == old.function_count:
             return
         self.end_drag()
         motion = [coordinates(self._scene, name) for name in ("q", "qd")]

@@ -1,4 +1,4 @@
-"""From what a person names to a soft object: a configuration or a file, with other handles if asked."""
+"""From what a person names to a soft object: a configuration or a file, with another number of functions if asked."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from softmode.deformables.build.options import FUNCTION_LEAST, FUNCTION_LIMIT
 from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
 from softmode.objects.loader import Progress, load, object_config
@@ -16,9 +17,6 @@ from softmode.objects.soft_object import SoftObject
 from softmode.objects.stage_body import place_deformable
 from softmode.objects.stage_scene import read_usd_scene
 from softmode.stages import tokens
-
-HANDLES_MAX = 64
-"""Most eigenmodes that `LiveSession.set_handles` builds."""
 
 
 def load_source(
@@ -51,7 +49,7 @@ def load_source(
         _refuse_size(size, f"the body {config.body}" if config.body else f"a {config.shape} of {config.extents} m")
     elif size is not None:
         config = replace(config, size=size)
-    return Placed(object=load(config, progress=progress))
+    return Placed(object=load(config.for_varied_ratio(), progress=progress))  # Its nu has a slider.
 
 
 def _refuse_size(size: float | None, what: str) -> None:
@@ -60,14 +58,15 @@ def _refuse_size(size: float | None, what: str) -> None:
         raise ConfigError(f"size given for {what}", hint="leave it out, or build it anew")
 
 
-def with_handles(config: ObjectConfig | None, count: int) -> ObjectConfig:
-    """Return a configuration with another number of eigenmodes.
+def with_functions(config: ObjectConfig | None, count: int) -> ObjectConfig:
+    """Return a configuration with another number of functions, chosen by elastic energy.
 
     Raises:
         ConfigError: If it is of a body that is built, or the count is out of range.
     """
-    if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 1 <= count <= HANDLES_MAX:
-        raise ConfigError(f"handles must be a whole number in 1..{HANDLES_MAX}, got {count!r}")
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count > FUNCTION_LIMIT:
+        raise ConfigError(f"functions must be a whole number in {FUNCTION_LEAST}..{FUNCTION_LIMIT}, got {count!r}")
     if config is None or config.body is not None:
-        raise ConfigError("a body that is built cannot be given other handles", hint="open what it was built from")
-    return replace(config, build=replace(config.build, mode_count=int(count)))
+        raise ConfigError("a body that is built cannot be given other functions", hint="open what it was built from")
+    varied = config.build.with_functions(int(count)).for_varied_ratio()
+    return replace(config, build=varied.with_functions(int(count)))

@@ -23,7 +23,7 @@ LENGTH = 0.05
 def full() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points, weights and basis gradients of a box on the full quadrature."""
     quadrature = quadrature_from_box((0.06, 0.05, 0.04))
-    body = build_body(quadrature, BuildOptions(cubature_count=None))
+    body = build_body(quadrature, BuildOptions(mode_count=8, cubature_count=None))
     return quadrature.points, quadrature.weights, body.grad_basis.astype(np.float64)
 
 

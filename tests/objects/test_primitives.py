@@ -139,14 +139,20 @@ def hang(thing: SoftObject, material: Material, half: float) -> np.ndarray:
     return np.array([x[2, 2] - x[:2, 2].mean(), 0.5 * (x[0, 0] - x[1, 0])])
 
 
-def heavy_elastica(load: float) -> np.ndarray:
+def heavy_elastica(load: float, cap: float = 0.0) -> np.ndarray:
     """Return drop and reach of the tip over the length of a clamped inextensible rod under w L^3 / (E I) = load.
 
-    EI theta'' = -w (L - s) cos theta with theta(0) = theta'(L) = 0, theta below the horizontal.
+    EI theta'' = -W(s) cos theta with theta(0) = theta'(L) = 0, theta below the horizontal, W the weight beyond s: that
+    of a cylinder whose last `cap` of the length is a half ball, which lacks a third of it and drops 3.6 % less.
     """
+
+    def beyond(s: np.ndarray) -> np.ndarray:
+        into = np.clip(s - (1.0 - cap), 0.0, None) / max(cap, 1e-12)
+        return np.where(into > 0.0, cap * (2.0 / 3.0 - into + into**3 / 3.0), 1.0 - s - cap / 3.0)
+
     s = np.linspace(0.0, 1.0, 101)
     found = solve_bvp(
-        lambda s, y: np.stack([y[1], -load * (1.0 - s) * np.cos(y[0])]),
+        lambda s, y: np.stack([y[1], -load * beyond(s) * np.cos(y[0])]),
         lambda a, b: np.array([a[0], b[1]]),
         s,
         np.stack([np.tanh(5.0 * s), np.zeros_like(s)]),
@@ -163,7 +169,9 @@ def test_rope_bends_like_a_heavy_elastica(modulus: float) -> None:
     half, radius = 0.5 * presets.ROPE.extents[0], 0.5 * presets.ROPE.extents[1]  # type: ignore[index]
     material = replace(presets.ROPE_MATERIAL, youngs_modulus=modulus, density=1000.0)
     pull = 1000.0 * GRAVITY * 4.0 * half**3 / (modulus * radius**2)
-    np.testing.assert_allclose(hang(load(presets.ROPE), material, half) / half, heavy_elastica(pull), rtol=0.02)
+    np.testing.assert_allclose(
+        hang(load(presets.ROPE), material, half) / half, heavy_elastica(pull, radius / half), rtol=0.02
+    )
 
 
 def test_beam_sags_like_a_timoshenko_beam() -> None:

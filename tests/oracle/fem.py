@@ -534,3 +534,31 @@ def node_mask(mesh: Mesh, region: object) -> NDArray[np.bool_]:
 
 
 __all__ = ["TOLERANCE", "ConvergenceError", "Energy", "Mesh", "Minimiser", "Solid", "node_mask", "simulate", "static"]
+
+
+def free_eigenvalues(mesh: Mesh, poissons_ratio: float, count: int = 6) -> Array:
+    """Return the first elastic eigenvalues of a free homogeneous solid, per E / rho [1/m^2], ascending.
+
+    A frequency is sqrt(value E / rho) / (2 pi). Linear elasticity, consistent mass; the six rigid motions are left out.
+    """
+    mu, lam = 1.0 / (2.0 * (1.0 + poissons_ratio)), poissons_ratio / ((1 + poissons_ratio) * (1 - 2 * poissons_ratio))
+    G, w = mesh.gradients, mesh.weights
+    product = np.einsum("eq,eqai,eqbj->eaibj", w, G, G, optimize=True)
+    block = lam * product + mu * product.transpose(0, 1, 4, 3, 2)
+    trace = mu * np.einsum("eaibi->eab", product)
+    for i in range(3):
+        block[:, :, i, :, i] += trace
+    dof = (3 * mesh.elements[:, :, None] + np.arange(3)).reshape(len(mesh.elements), 81)
+    row, column = np.repeat(dof, 81, axis=1).ravel(), np.tile(dof, (1, 81)).ravel()
+    size = 3 * len(mesh.nodes)
+    K = sparse.csc_matrix((block.ravel(), (row, column)), shape=(size, size))
+    gram = np.einsum("eq,qa,qb->eab", w, mesh.values, mesh.values, optimize=True)
+    row, column = np.repeat(mesh.elements, 27, axis=1).ravel(), np.tile(mesh.elements, (1, 27)).ravel()
+    mass = sparse.csr_matrix((gram.ravel(), (row, column)), shape=(len(mesh.nodes),) * 2)
+    M = sparse.kron(mass, sparse.identity(3)).tocsc()
+    shift = 1e-3 / np.ptp(mesh.nodes, axis=0).max() ** 2
+    shifted = sparse_linalg.splu((K + shift * M).tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    inverse = sparse_linalg.LinearOperator(K.shape, matvec=shifted.solve, dtype=np.float64)
+    start = np.random.default_rng(0).normal(size=size)
+    value = sparse_linalg.eigsh(K, k=count + 6, M=M, sigma=-shift, OPinv=inverse, v0=start, return_eigenvectors=False)
+    return np.sort(value)[6:]

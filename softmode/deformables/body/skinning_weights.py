@@ -86,7 +86,10 @@ class SkinningWeights:
             slope[:, 4 + k, a] += z[:, b] / length
             slope[:, 4 + k, b] += z[:, a] / length
         owner, monomial = self.owner, self.monomial
-        product = value[:, owner] * z[:, monomial]
-        found = gradient[:, owner] * z[:, monomial, None]
-        found += value[:, owner, None] * slope[:, monomial]
-        return product, found
+        weight, factor = value[:, owner], z[:, monomial]
+        found = np.empty((3, count, len(owner)))  # Axis by axis: these are the largest arrays of a build.
+        for d in range(3):
+            np.multiply(gradient[:, owner, d], factor, out=found[d])
+            sloping = np.flatnonzero(slope[:, :, d].any(axis=0)[monomial])
+            found[d][:, sloping] += weight[:, sloping] * slope[:, monomial[sloping], d]
+        return weight * factor, found.transpose(1, 2, 0)

@@ -12,11 +12,13 @@ from softmode.deformables.body.regions import Envelope, Region
 from softmode.deformables.body.rkpm import BasisRKPM, ShapeFunctions, make_basis
 from softmode.deformables.body.skinning_weights import SkinningWeights, enveloped
 from softmode.deformables.build.eigenmodes import solve_eigenmodes
-from softmode.deformables.build.functions import Functions, orthonormalise
+from softmode.deformables.build.elastic_functions import SPACE_MODE_COUNT, choose_functions
+from softmode.deformables.build.functions import Functions, affine_first, orthonormalise
 from softmode.deformables.build.galerkin import mass_matrix
-from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.options import EIGENMODE_COUNT, EIGENMODE_KERNEL_COUNT, KERNEL_COUNT, BuildOptions
 from softmode.deformables.build.region_samples import RegionSamples, drive_matrices
 from softmode.deformables.build.static_response import lame_parameters, solve_harmonic_weights, solve_static_responses
+from softmode.errors import ConfigError
 
 Array = NDArray[np.float64]
 
@@ -69,6 +71,8 @@ class BodyBasis:
     """Driven coordinates from displacements of the region samples, shape (r, N)."""
     drive_affine: Array
     """Driven coordinates from affine motions of the regions, shape (R, r, 4)."""
+    report: dict[str, float]
+    """What the choice of the functions says of itself."""
 
 
 def make_body_basis(domain: Domain, options: BuildOptions, stage: Callable[[str], None]) -> BodyBasis:
@@ -83,19 +87,76 @@ def make_body_basis(domain: Domain, options: BuildOptions, stage: Callable[[str]
         BasisError: If the basis cannot be built.
         ConfigError: If options do not fit the object.
     """
-    envelope, points, volumes, samples = domain.envelope, domain.points, domain.volumes, domain.samples
-    kernels = make_basis(
-        domain.seeds, options.kernel_count, kernel=options.kernel, spacing=domain.spacing, seed=options.seed
+    by_energy = not domain.regions and not options.eigenmode_handles
+    if domain.regions and (options.function_count is not None or options.accuracy is not None):
+        raise ConfigError(
+            "function_count, accuracy: a body with regions has eigenmodes and static responses",
+            hint="give mode_count, or leave the regions away",
+        )
+    count = options.kernel_count or (KERNEL_COUNT if by_energy else EIGENMODE_KERNEL_COUNT)
+    kernels = make_basis(domain.seeds, count, kernel=options.kernel, spacing=domain.spacing, seed=options.seed)
+    return (_elastic_basis if by_energy else _eigenmode_basis)(kernels, domain, options, stage)
+
+
+def _elastic_basis(
+    kernels: BasisRKPM, domain: Domain, options: BuildOptions, stage: Callable[[str], None]
+) -> BodyBasis:
+    """Choose functions by elastic energy out of quadratic handles; for a body without regions."""
+    points, volumes, total = domain.points, domain.volumes, domain.volumes.sum()
+    shape = kernels.evaluate(points)
+    stage("kernels")
+    count = min(SPACE_MODE_COUNT, shape.centre_count - 1)
+    modes = solve_eigenmodes(shape, volumes, count, stiffness_scale=domain.stiffness)
+    skin = SkinningWeights(
+        coefficients=modes.coefficients,
+        degrees=np.full(count + 1, 2, dtype=np.int64),
+        blends=np.full(count + 1, -1, dtype=np.int64),
     )
+    stage("eigenmodes")
+    none = np.zeros((len(points), 0))
+    raw, raw_gradient = skin.products(*skin.evaluate(shape, none, none[:, :, None]), points, domain.length)
+    stage("responses")
+    mass, stiff = volumes * domain.density / total, volumes * domain.stiffness / total
+    chosen = choose_functions(
+        raw,
+        raw_gradient,
+        mass,
+        stiff,
+        quadratic=np.arange(10),
+        count=options.function_count,
+        accuracy=options.accuracy,
+        poissons_ratios=options.poissons_ratios,
+    )
+    functions = affine_first(chosen.transform, skin.leading, domain.length)
+    gradient = np.stack([raw_gradient[:, :, d] @ functions.transform for d in range(3)], axis=2)
+    stage("functions")
+    drive, drive_affine = drive_matrices(domain.samples, np.zeros((0, 0)), 0)
+    return BodyBasis(
+        kernels=kernels,
+        weights=skin,
+        eigenvalues=modes.eigenvalues,
+        functions=functions,
+        gradient=gradient,
+        drive=drive,
+        drive_affine=drive_affine,
+        report=chosen.report(),
+    )
+
+
+def _eigenmode_basis(
+    kernels: BasisRKPM, domain: Domain, options: BuildOptions, stage: Callable[[str], None]
+) -> BodyBasis:
+    """Take skinning eigenmodes times affine or quadratic motion, regions and their static responses."""
+    envelope, points, volumes, samples = domain.envelope, domain.points, domain.volumes, domain.samples
     shape, blend, blend_slope = enveloped(kernels.evaluate(points), envelope)
     stage("kernels")
     springs, pull = _springs(kernels, domain)
-    mu, lame = lame_parameters(options.poissons_ratio)
+    mu, lame = lame_parameters(_mean_ratio(options))
     scalar = 1.0 / (lame + 4.0 * mu)  # Of the weight-space Hessian, FreeForm eq. (35).
     modes = solve_eigenmodes(
         shape,
         volumes,
-        options.mode_count,
+        options.mode_count or EIGENMODE_COUNT,
         stiffness_scale=domain.stiffness,
         springs=None if springs is None else scalar * springs,
         vanishing=envelope is not None,
@@ -136,7 +197,13 @@ def make_body_basis(domain: Domain, options: BuildOptions, stage: Callable[[str]
         gradient=gradient,
         drive=drive,
         drive_affine=drive_affine,
+        report={},
     )
+
+
+def _mean_ratio(options: BuildOptions) -> float:
+    """Return the Poisson's ratio of the static responses."""
+    return sum(options.poissons_ratios) / len(options.poissons_ratios)
 
 
 def _springs(kernels: BasisRKPM, domain: Domain) -> tuple[Array | None, Array | None]:
@@ -189,7 +256,7 @@ def _weights(
     springs: Array | None,
 ) -> SkinningWeights:
     """Gather the weights: constant handle, regions, eigenmodes, static responses."""
-    degree = 1 if options.handles == "affine" else 2
+    degree = 2 if options.handles == "quadratic" else 1
     region_count = region_weights.shape[1]
     # Squares and products of coordinates do not vanish on a region: there the constant handle stays affine.
     parts, degrees = [modes[:, :1], region_weights], [degree if exact_count == 0 else 1, *[1] * region_count]
@@ -200,7 +267,7 @@ def _weights(
             shape,
             domain.volumes,
             density=domain.density,
-            poissons_ratio=options.poissons_ratio,
+            poissons_ratio=_mean_ratio(options),
             stiffness_scale=domain.stiffness,
             springs=springs,
             derivative_count=options.response_derivatives,

@@ -19,7 +19,7 @@ from softmode.deformables.build.cache import cache_directory, cached_body, finge
 from softmode.deformables.build.cubature import select_cubature
 from softmode.deformables.build.options import BuildOptions, HandleName
 from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.region_samples import refine_at_faces, sample_regions
+from softmode.deformables.build.region_samples import octants_near, refine_at_faces, sample_regions
 from softmode.errors import MaterialError
 
 __all__ = [
@@ -95,14 +95,16 @@ def _build(
     stiffness = _positive_field("stiffness_scale", stiffness_scale, len(quadrature.points))
     density = _positive_field("density_scale", density_scale, len(quadrature.points))
     fingerprint = fingerprint_of(FORMAT_VERSION, quadrature, options, name, list(regions), stiffness, density)
-    density = density * (quadrature.volume / (quadrature.weights @ density))
-    mass = quadrature.weights * density / quadrature.volume
-    offset = mass @ quadrature.points
-    seeds, bounds = quadrature.points - offset, quadrature.bounds - offset
+    places, weights, parent = octants_near(quadrature, regions)
+    stiffness, density = stiffness[parent], density[parent]
+    density = density * (quadrature.volume / (weights @ density))
+    mass = weights * density / quadrature.volume
+    offset = mass @ places
+    seeds, bounds = places - offset, quadrature.bounds - offset
     length = float(np.sqrt(mass @ (seeds**2).sum(axis=1)))
     regions = tuple(region.moved(offset, bounds) for region in regions)
-    samples = sample_regions(regions, seeds, quadrature.weights, quadrature.spacing)
-    points, volumes, parent = refine_at_faces(regions, seeds, quadrature.weights, quadrature.spacing)
+    samples = sample_regions(regions, seeds, weights, quadrature.spacing)
+    points, volumes, parent = refine_at_faces(regions, seeds, weights, quadrature.spacing)
     stiffness = stiffness[parent]
     seconds: dict[str, float] = {}
     with _reporter(progress, name) as report:
@@ -181,11 +183,12 @@ def _build(
         stage("surface")
     provenance: dict[str, Scalar] = {
         **{f"quadrature_{key}": v for key, v in quadrature.report.items() if isinstance(v, str | int | float | bool)},
-        **{f"option_{key}": v for key, v in dataclasses.asdict(options).items()},
+        **{f"option_{key}": _scalar(v) for key, v in dataclasses.asdict(options).items()},
         **{f"seconds_{key}": v for key, v in seconds.items()},
         "quadrature_count": len(points),
         "function_count": function_count,
-        "dropped_functions": len(basis.weights.owner) - function_count,
+        "dropped_functions": len(basis.weights.owner) - function_count if options.eigenmode_handles else 0,
+        **basis.report,
         "heterogeneous": stiffness_scale is not None or density_scale is not None,
         "cubature_count": len(chosen.index),
         "cubature_force_error": chosen.force_error,
@@ -199,6 +202,11 @@ def _build(
         provenance=provenance,
         build_seconds=time.perf_counter() - start,
     )
+
+
+def _scalar(value: Scalar | tuple[float, ...]) -> Scalar:
+    """Return an option as the header of a file holds it."""
+    return " ".join(f"{v:g}" for v in value) if isinstance(value, tuple) else value
 
 
 def _positive_field(name: str, value: ArrayLike | None, count: int) -> Array:

@@ -14,6 +14,7 @@ energy: the bending of a thin body, soft beside its stretching, would otherwise 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,8 @@ from softmode.deformables.build.static_response import lame_parameters
 from softmode.errors import BasisError
 
 Array = NDArray[np.float64]
+Real = NDArray[Any]
+"""Of single or double precision."""
 
 POISSON_RATIO = 0.4
 """Poisson's ratio of the training material; the points serve any other."""
@@ -116,24 +119,27 @@ def select_cubature(
     slope = slope[live]
     gradient = np.ascontiguousarray(gradient[live] / slope[:, None, None])  # (n, 3, P)
     full = _Sampler(gradient, fraction * modulus)
+    # What is fitted may be rounded, it is the same on both sides: half the time in half the digits.
+    modulus32 = modulus.astype(np.float32)
+    short = _Sampler(gradient.astype(np.float32), (fraction * modulus).astype(np.float32))
 
     # Rows: the virtual work of each pose's stress on a few random test displacements, per unit of the pose's force.
     tests = rng.normal(size=(3 * _TEST_COUNT, len(slope))) @ gradient.reshape(len(slope), -1) / np.sqrt(_ROWS_PER_POSE)
-    tests = tests.reshape(_TEST_COUNT, 9, point_count)
+    tests = tests.reshape(_TEST_COUNT, 9, point_count).astype(np.float32)
     moments = tests[:_MOMENT_COUNT].reshape(-1, point_count)
     rows = [
         _MOMENT_WEIGHT * np.ones((1, point_count)),
         _MOMENT_WEIGHT * moments / np.sqrt((moments**2 @ fraction).mean()),
     ]
     for poses in _batches(_poses(_POSE_COUNT, slope, rng)):
-        stress = full.stress(poses)
-        scale = 1.0 / np.linalg.norm(full.force(stress), axis=(1, 2))
+        stress = short.stress(poses)
+        scale = 1.0 / np.linalg.norm(short.force(stress), axis=(1, 2))
         for one, factor in zip(stress, scale, strict=True):
             picked = tests[rng.choice(_TEST_COUNT, _ROWS_PER_POSE, replace=False)]
-            rows.append(np.einsum("rcp,cp->rp", picked, one.reshape(9, -1)) * (factor * modulus))
+            rows.append(np.einsum("rcp,cp->rp", picked, one.reshape(9, -1)) * (factor * modulus32))
     eigenvalue, mode = elastic_modes(_free_stiffness(full, slope, driven))
     rows.append(_soft_rows(full, eigenvalue, _per_slope(mode, slope, driven), rng) * modulus)
-    columns = np.ascontiguousarray(np.concatenate(rows).T)
+    columns = np.ascontiguousarray(np.concatenate(rows, dtype=np.float32).T)
     sizes = {k for k in (32, 64, 96, 128, 192, 256, 384) if k < count} | {count}
     # Thousands of small products: threads of a BLAS would wait for each other on a busy machine.
     with threadpool_limits(limits=1, user_api="blas"):
@@ -224,7 +230,7 @@ def _batches(poses: list[tuple[Array, Array]]) -> list[list[tuple[Array, Array]]
 class _Sampler:
     """Stresses and forces of a set of weighted points, for several poses at a time."""
 
-    def __init__(self, gradient: Array, weights: Array) -> None:
+    def __init__(self, gradient: Real, weights: Real) -> None:
         self.gradient = np.ascontiguousarray(gradient).reshape(len(gradient), -1)  # (n, 3 P)
         self.weights = weights
 
@@ -234,9 +240,10 @@ class _Sampler:
 
     def stress(self, poses: list[tuple[Array, Array]]) -> Array:
         """Return P(F) for E = 1, shape (poses, 3, 3, P)."""
-        inner = self.slopes(np.stack([strain.T for _, strain in poses]))
+        inner = self.slopes(np.stack([strain.T for _, strain in poses]).astype(self.gradient.dtype))
         inner[:, range(3), range(3)] += 1.0
-        turned = [np.einsum("ab,bjp->ajp", pose[0], f) for pose, f in zip(poses, inner, strict=True)]
+        turn = np.stack([pose[0] for pose in poses]).astype(inner.dtype)
+        turned = (turn @ inner.reshape(len(poses), 3, -1)).reshape(inner.shape)
         return np.stack([_stress(f) for f in turned])
 
     def force(self, stress: Array) -> Array:
@@ -263,20 +270,20 @@ def _stress(f: Array) -> Array:
 
 
 def _nonnegative_path(
-    columns: Array, target: Array, sizes: set[int], rng: np.random.Generator
+    columns: Real, target: Array, sizes: set[int], rng: np.random.Generator
 ) -> dict[int, tuple[NDArray[np.intp], Array]]:
     """Grow a non-negative least-squares solution of  x @ columns = target,  sum x = 1.
 
     Candidates are searched in eight interleaved random groups, one per step: a fresh group costs an eighth of the
-    search and loses nothing visible; the search, which memory bounds, reads float32. The inverse of the normal matrix
+    search and loses nothing visible. The inverse of the normal matrix
     is bordered and reduced as points come and go.
 
     Returns:
         For each size reached: indices and weights.
     """
     group = [np.sort(g) for g in np.array_split(rng.permutation(len(columns)), 8)]
-    stored = [columns[g].astype(np.float32) for g in group]
-    inverse_length = 1.0 / np.maximum(np.linalg.norm(columns, axis=1), 1e-300)
+    stored = [columns[g] for g in group]
+    inverse_length = 1.0 / np.maximum(np.linalg.norm(columns, axis=1), 1e-30)
     top = max(sizes)
     chosen = np.zeros(0, dtype=np.intp)
     value = np.zeros(0)
@@ -292,8 +299,9 @@ def _nonnegative_path(
         gain = np.where(active[candidates], -np.inf, (stack @ residual.astype(np.float32)) * inverse_length[candidates])
         best = candidates[gain.argmax()]
         k = len(chosen)
-        coupling = support[:k] @ columns[best]
-        length_sq = float(columns[best] @ columns[best]) * (1.0 + _RIDGE)
+        column = columns[best].astype(np.float64)
+        coupling = support[:k] @ column
+        length_sq = float(column @ column) * (1.0 + _RIDGE)
         shadow = inverse[:k, :k] @ coupling
         rest = length_sq - float(coupling @ shadow)
         if not (gain.max() > 1e-12 and rest > _RIDGE * length_sq):
@@ -301,15 +309,15 @@ def _nonnegative_path(
             continue
         idle = 0
         chosen, value, active[best] = np.append(chosen, best), np.append(value, 0.0), True
-        support[k], right[k] = columns[best], float(columns[best] @ target)
+        support[k], right[k] = column, float(column @ target)
         normal[k, :k], normal[:k, k], normal[k, k] = coupling, coupling, length_sq
         inverse[:k, :k] += shadow[:, None] * (shadow / rest)
         inverse[k, :k], inverse[:k, k], inverse[k, k] = -shadow / rest, -shadow / rest, 1.0 / rest
         while True:
             k = len(chosen)
             trial = inverse[:k, :k] @ right[:k]
-            for _ in range(2):  # Refinement repairs what the updates of the inverse lose.
-                trial += inverse[:k, :k] @ (right[:k] - normal[:k, :k] @ trial)
+            # Refinement repairs what the updates of the inverse lose.
+            trial += inverse[:k, :k] @ (right[:k] - normal[:k, :k] @ trial)
             if (trial > 0.0).all():
                 value = trial
                 break

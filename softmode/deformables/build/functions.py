@@ -123,6 +123,21 @@ def orthonormalise(
     return Functions(transform=both @ rotation, mean=rotation.T @ mean, linear=rotation.T @ linear, driven_count=driven)
 
 
+def affine_first(transform: Array, leading: NDArray[np.intp], length: float) -> Functions:
+    """Return functions of which the first four span (1, x, y, z), 1 first, as they are.
+
+    Args:
+        transform: b = raw @ transform, orthonormal in mass, shape (R, n).
+        leading: The raw functions x, y, z and 1.
+        length: Unit of length of the raw functions [m].
+    """
+    unit = np.zeros((4, 4))
+    unit[range(4), range(4)] = [length, length, length, 1.0]
+    linear = np.zeros((transform.shape[1], 4))
+    linear[:4] = np.linalg.solve(transform[leading[:4], :4], unit)
+    return Functions(transform=transform, mean=np.eye(1, transform.shape[1])[0], linear=linear, driven_count=0)
+
+
 def _extend(basis: Array, gram: Array, index: NDArray[np.intp], tolerance: float) -> Array:
     """Add what raw functions hold beyond an orthonormal basis (R, n), down to a tolerance of the Gram matrix."""
     if not len(index):

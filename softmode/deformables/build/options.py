@@ -2,58 +2,127 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
-from softmode.checks import require_number
+from softmode.checks import require_choice, require_number
 from softmode.deformables.body.rkpm import KernelName
 from softmode.deformables.build.functions import RANK_TOLERANCE
 from softmode.errors import ConfigError
 
 HandleName = Literal["affine", "quadratic"]
 
+DEFAULT_POISSONS_RATIO = 0.4
+"""Poisson's ratio that a body is built for when none is given: that of `Material`."""
+KERNEL_COUNT = 1000
+"""Kernels of functions that are chosen by elastic energy."""
+EIGENMODE_KERNEL_COUNT = 400
+"""Kernels of FreeForm's functions."""
+EIGENMODE_COUNT = 8
+"""Skinning eigenmodes where FreeForm's functions are asked for, or regions are given, without a number."""
+FUNCTION_COUNT = 48
+"""Functions where neither a number nor an accuracy is given."""
+VARIED_RATIOS = (0.3, 0.45, 0.49)
+"""Ratios that functions are made for where Poisson's ratio varies."""
+FUNCTION_LEAST = 10
+"""The fewest functions: with all quadratic fields the first bending is free."""
+FUNCTION_LIMIT = 120
+"""The most functions that `BuildOptions.accuracy` may lead to."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class BuildOptions:
-    """How a body is reduced."""
+    """How a body is reduced.
 
-    mode_count: int = 8
-    """Skinning eigenmodes beside the constant handle; up to 4 (mode_count + 1) functions."""
-    kernel_count: int = 400
-    """Reproducing kernels; 400 give the first 16 eigenvalues of a box to 0.3 % in about 0.1 s."""
+    By default a body without regions has 48 functions that are chosen by elastic energy. `function_count` or `accuracy`
+    change how many. Either of `mode_count` and `handles` asks for FreeForm's functions instead: eigenmodes times affine
+    or quadratic motion. A body with regions has those in any case, and static responses.
+    """
+
+    function_count: int | None = None
+    """Scalar functions n, chosen by elastic energy; the body has 3 n unknowns. None takes 48, or follows `accuracy`."""
+    accuracy: float | None = None
+    """Largest relative error of the first six free frequencies against the whole space that the functions are chosen
+    from, for instance 0.02. The fewest functions that reach it are taken, up to 120."""
+    poissons_ratio: float | tuple[float, ...] | None = None
+    """Poisson's ratio that the functions are made for; None means 0.4. Any other can be simulated, but functions made
+    for 0.4 are 28 % too stiff in a plate of 0.49. Several, such as (0.3, 0.45, 0.49), serve a ratio that varies, and
+    want 60 functions. Static responses use the mean."""
+    mode_count: int | None = None
+    """Skinning eigenmodes beside the constant handle, of FreeForm's functions; up to 4 (mode_count + 1) functions."""
+    handles: HandleName | None = None
+    """What such an eigenmode carries: (X, Y, Z, 1), or all ten monomials up to degree two; None means "affine"."""
+    kernel_count: int | None = None
+    """Reproducing kernels. None takes 1000 where functions are chosen by elastic energy: corners and crossings need
+    them (a cross is 7 % too stiff with 400, 4 % with 1000). FreeForm's functions take 400, which give the first 16
+    eigenvalues of a box to 0.3 %."""
     kernel: KernelName = "cubic"
     """Bell of the reproducing kernels."""
-    handles: HandleName = "affine"
-    """What an eigenmode carries: (X, Y, Z, 1), or all ten monomials up to degree two."""
     static_responses: bool = True
     """On a body with regions: nine more weights, one function each, from its response to unit body forces."""
     response_derivatives: int = 12
     """Likewise, up to 18 from the second order of that response; a beam that bends far needs them, and then needs few
     eigenmodes: with 2 modes and 87 unknowns it is as accurate as with 16 and 189."""
-    poissons_ratio: float = 0.4
-    """Poisson's ratio of the responses; any other can be simulated, but the nearer it is the better."""
     rank_tolerance: float = RANK_TOLERANCE
-    """Raw functions that add less than this fraction of mass (of the scaled Gram matrix) to the others are dropped,
-    0 < tolerance <= 1e-2; on a body with regions it is at most 1e-7. Less keeps more, also noise: on an object with
-    symmetries the cubature's force error grows. Clamps that the build does not know gain by 1e-8."""
+    """Of FreeForm's functions those that add less than this fraction of mass (of the scaled Gram matrix) to the others
+    are dropped, 0 < tolerance <= 1e-2; on a body with regions it is at most 1e-7."""
     cubature_count: int | None = 384
-    """Points at which a step evaluates stress; None keeps all. Measured force errors at 256 points: 0.4-0.6 % (box,
-    sphere, beam), 1.5 % (bear, robot); at 384: 0.2-0.3 % and 0.8 %. A held body has more functions: 1-7 % at 384,
-    while its lowest elastic eigenvalues err by 1 % or less. Beyond 100 functions allow six points for each: 384 make a
-    held plate 40:1 of 132 functions 6 % too soft, 768 3 %. `provenance` has the body's own errors, of the forces also
+    """Points at which a step evaluates stress; None keeps all. Beyond 100 functions allow six points for each: 384 make
+    a held plate 40:1 of 132 functions 6 % too soft, 768 3 %. `provenance` has the body's own errors, of the forces also
     at smaller counts."""
     seed: int = 0
     """Seed of every random choice of the build."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
-        require_number("mode_count", self.mode_count, at_least=1)
-        if self.kernel_count <= self.mode_count + 4:
+        if self.mode_count is not None:
+            require_number("mode_count", self.mode_count, at_least=1)
+        if self.handles is not None:
+            require_choice("handles", self.handles, get_args(HandleName))
+        if self.function_count is not None:
+            require_number("function_count", self.function_count, at_least=FUNCTION_LEAST)
+        if self.accuracy is not None:
+            require_number("accuracy", self.accuracy, above=0.0, below=1.0)
+        asked = [name for name in ("function_count", "accuracy") if getattr(self, name) is not None]
+        if asked and (self.eigenmode_handles or len(asked) == 2):
+            others = [name for name in ("mode_count", "handles") if getattr(self, name) is not None]
+            raise ConfigError(
+                f"{' and '.join([*asked, *others])}: give one kind",
+                hint="function_count or accuracy choose functions by elastic energy; mode_count and handles ask for "
+                "FreeForm's eigenmodes",
+            )
+        if self.kernel_count is not None and self.kernel_count <= (self.mode_count or 0) + 4:
             raise ConfigError(f"kernel_count: expected more than mode_count + 4, got {self.kernel_count}")
         if self.cubature_count is not None:
             require_number("cubature_count", self.cubature_count, at_least=8)
         require_number("rank_tolerance", self.rank_tolerance, above=0.0, at_most=1.0e-2)
-        if self.handles not in get_args(HandleName):
-            raise ConfigError(f"handles: expected one of {get_args(HandleName)}, got {self.handles!r}")
         require_number("response_derivatives", self.response_derivatives, at_least=0, at_most=18)
-        require_number("poissons_ratio", self.poissons_ratio, at_least=0.0, below=0.5)
+        if self.poissons_ratio == ():
+            raise ConfigError("poissons_ratio: no values", hint="give one ratio or more, or None")
+        for ratio in self.poissons_ratios:
+            require_number("poissons_ratio", ratio, at_least=0.0, below=0.5)
+
+    def with_functions(self, count: int) -> BuildOptions:
+        """Return these options with another number of functions, chosen by elastic energy."""
+        return replace(self, function_count=count, accuracy=None, mode_count=None, handles=None)
+
+    def for_varied_ratio(self) -> BuildOptions:
+        """Return these options for a Poisson's ratio that varies: several ratios, and a quarter more functions.
+
+        Options that name a ratio, or ask for FreeForm's functions, stay as they are.
+        """
+        if self.poissons_ratio is not None or self.eigenmode_handles:
+            return self
+        count = None if self.accuracy is not None else (self.function_count or FUNCTION_COUNT) * 5 // 4
+        return replace(self, poissons_ratio=VARIED_RATIOS, function_count=count)
+
+    @property
+    def eigenmode_handles(self) -> bool:
+        """Whether FreeForm's functions are asked for."""
+        return self.mode_count is not None or self.handles is not None
+
+    @property
+    def poissons_ratios(self) -> tuple[float, ...]:
+        """The ratios that the functions are made for."""
+        given = DEFAULT_POISSONS_RATIO if self.poissons_ratio is None else self.poissons_ratio
+        return given if isinstance(given, tuple) else (given,)

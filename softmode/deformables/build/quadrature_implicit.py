@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from softmode.deformables.build.quadrature_grid import (
     SUBDIVISION,
     Quadrature,
-    assemble_cells,
+    cell_points,
     check_counts,
     finish_quadrature,
     grid_shape,
-    sum_by,
+    sum_pieces,
 )
 from softmode.deformables.build.surface_samples import CANDIDATES_PER_SAMPLE, select_surface
 from softmode.errors import AssetError
@@ -80,21 +80,26 @@ def quadrature_from_implicit(
     shape = grid_shape(box[1] - box[0], volume or rough_volume, area or rough_area, point_count)
 
     distance, value, nodes, width = _sample_grid(level, box, shape * SUBDIVISION)
-    filled = _filled(distance, width) * width.prod()
-    parent = np.arange(len(filled)).reshape(tuple(shape * SUBDIVISION))
-    parent = np.stack(np.unravel_index(parent, parent.shape), axis=-1).reshape(-1, 3) // SUBDIVISION
-    index = np.ravel_multi_index(tuple(parent.T), tuple(shape))
+    filled = _filled(distance, width)
+    axes = [np.arange(n * SUBDIVISION) // (SUBDIVISION // 2) for n in shape]
+    octant = np.ravel_multi_index(np.meshgrid(*axes, indexing="ij"), tuple(2 * shape)).ravel()
     keep = filled > 0.0
-    cell, first = sum_by(index[keep], filled[keep], nodes[keep], int(shape.prod()))
-    points, weights, counted = assemble_cells(cell, first, box[0], box[1], shape)
+    middle = box.mean(axis=0)
+    moments = sum_pieces(
+        octant[keep],
+        filled[keep] * width.prod(),
+        nodes[keep] - middle,
+        np.tile(width**2 / 12.0, (int(keep.sum()), 1)),
+        int((2 * shape).prod()),
+    )
+    lines = [np.linspace(box[0, d], box[1, d], shape[d] + 1) - middle[d] for d in range(3)]
+    found = cell_points(moments, lines)
     exact_area = area if area is not None else _surface_area(level, distance, value, nodes, width)
     candidates, normals = _project_surface(level, nodes, distance, width, surface_count, seed)
     surface = select_surface(candidates, normals, exact_area, surface_count, seed)
     extent = np.stack([candidates.min(axis=0), candidates.max(axis=0)])
     edges = (box[1] - box[0]) / shape
-    return finish_quadrature(
-        points, weights, counted, volume or counted, edges, surface, extent, {"source": "implicit"}
-    )
+    return finish_quadrature(found, middle, volume or found.counted, edges, surface, extent, {"source": "implicit"})
 
 
 def _sample_grid(

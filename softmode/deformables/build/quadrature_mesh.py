@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.build.quadrature_grid import (
     SUBDIVISION,
     Quadrature,
-    assemble_cells,
+    cell_points,
     check_counts,
     finish_quadrature,
     grid_shape,
-    sum_by,
+    match_moments,
+    sum_pieces,
 )
 from softmode.deformables.build.surface_samples import CANDIDATES_PER_SAMPLE, select_surface
 from softmode.errors import AssetError
 
 Array = NDArray[np.float64]
+
+COLUMNS = 32
+"""Columns across an axis, at least."""
+LARGE_FACE = 0.05
+"""A face of more than this share of all area across an axis gets a grid plane."""
 
 
 def quadrature_from_mesh(
@@ -57,10 +66,17 @@ def quadrature_from_mesh(
             f"mesh: the enclosed volume is {volume:.3g} m^3, it must be positive",
             hint="Flip the faces (inside out) or close and thicken the mesh.",
         )
-    shape = grid_shape(upper - lower, volume, area, point_count)
-    cell, first, signed = _integrate_columns(corner, normal[:, 2], lower, upper, shape)
-    points, weights, counted = assemble_cells(cell, first, lower, upper, shape)
-    volume *= counted / signed
+    aligned = (np.abs(normal).max(axis=1) > (1.0 - 1e-9) * twice_area) | (twice_area == 0.0)
+    shape = grid_shape(upper - lower, volume, 0.5 * float(twice_area[~aligned].sum()), point_count)
+    edges = (upper - lower) / shape
+    lines = [_grid_lines(local, normal, axis, float(edges[axis])) for axis in range(3)]
+    moments, signed = _integrate_columns(local, normal[:, 2], lines)
+    found = cell_points(moments, lines)
+    overlapping = signed > 1.001 * found.counted
+    if overlapping:
+        volume *= found.counted / signed
+    else:
+        found = replace(found, points=match_moments(found.points, found.weights, *_mesh_moments(local, volume)))
     rng = np.random.default_rng(seed)
     candidate_count = CANDIDATES_PER_SAMPLE * surface_count
     pick = np.searchsorted(
@@ -72,9 +88,9 @@ def quadrature_from_mesh(
     surface = select_surface(
         np.einsum("nk,nki->ni", bary, corner[pick]), normal[pick] / twice_area[pick, None], area, surface_count, seed
     )
-    report = {"source": "mesh", "triangles": len(face), "overlapping": signed > 1.001 * counted}
+    report = {"source": "mesh", "triangles": len(face), "overlapping": overlapping}
     extent = np.stack([lower, upper])
-    return finish_quadrature(points, weights, counted, volume, (upper - lower) / shape, surface, extent, report)
+    return finish_quadrature(found, centre, volume, edges, surface, extent, report)
 
 
 def _load_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
@@ -105,55 +121,95 @@ def _load_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, NDArray[np
     return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
 
 
-def _integrate_columns(
-    corner: Array, normal_z: Array, lower: Array, upper: Array, shape: NDArray[np.int64]
-) -> tuple[Array, Array, float]:
-    """Return volume (cells,) and first moment (cells, 3) per grid cell of a mesh, and the chords' signed volume."""
-    fine = shape[:2] * SUBDIVISION
-    width = (upper - lower)[:2] / fine
+def _mesh_moments(corner: Array, volume: float) -> tuple[Array, Array]:
+    """Return centroid and central second moments over volume of a closed mesh, by the divergence theorem."""
+    share = np.einsum("ti,ti->t", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6.0 / volume
+    total = corner.sum(axis=1)
+    centre = 0.25 * share @ total
+    second = np.einsum("t,tki,tkj->ij", share, corner, corner) + np.einsum("t,ti,tj->ij", share, total, total)
+    return centre, second / 20.0 - np.outer(centre, centre)
+
+
+def _grid_lines(corner: Array, normal: Array, axis: int, edge: float) -> Array:
+    """Return borders of cells along an axis, about `edge` [m] apart, with one on each large face across the axis.
+
+    Such a face at a quarter of a cell would be seen only as well as sub-columns are narrow.
+    """
+    low, high = float(corner[:, :, axis].min()), float(corner[:, :, axis].max())
+    flat = np.abs(normal[:, axis]) > (1.0 - 1e-9) * np.linalg.norm(normal, axis=1)
+    place = np.round((corner[flat, 0, axis] - low) / (high - low), 7)
+    where, group = np.unique(place, return_inverse=True)
+    size = np.bincount(group, np.abs(normal[flat, axis]), minlength=len(where))
+    borders = [0.0, 1.0]
+    for k in np.argsort(-size, kind="stable"):
+        if size[k] > LARGE_FACE * size.sum() and np.abs(np.array(borders) - where[k]).min() > 0.25 * edge / (
+            high - low
+        ):
+            borders.append(float(where[k]))
+    border = low + (high - low) * np.sort(borders)
+    counts = np.maximum(np.round(np.diff(border) / edge), 1).astype(int)
+    parts = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(border[:-1], border[1:], counts, strict=True)]
+    return np.append(np.concatenate(parts), high)
+
+
+def _integrate_columns(corner: Array, normal_z: Array, lines: list[Array]) -> tuple[Array, float]:
+    """Return the moments per octant of a mesh (8 cells, 10), see `sum_pieces`, and the chords' signed volume."""
+    # Even, for octants; more where few cells lie across.
+    parts = [max(SUBDIVISION, 2 * math.ceil(COLUMNS / 2 / (len(line) - 1))) for line in lines[:2]]
+    fine = [_split(line, n) for line, n in zip(lines[:2], parts, strict=True)]
+    x, y = (0.5 * (line[1:] + line[:-1]) for line in fine)
+    wide, deep = (np.diff(line) for line in fine)
     # Columns stand at sub-cell centres. Triangle-column pairs from each triangle's bounding box, then three edge tests.
-    flat = (corner[:, :, :2] - lower[:2]) / width - 0.5
-    begin = np.clip(np.ceil(flat.min(axis=1)), 0, fine).astype(np.int64)
-    end = np.clip(np.floor(flat.max(axis=1)) + 1, 0, fine).astype(np.int64)
+    plan = corner[:, :, :2]
+    begin = np.stack([np.searchsorted(axis, plan[:, :, d].min(axis=1)) for d, axis in enumerate((x, y))], axis=1)
+    end = np.stack([np.searchsorted(axis, plan[:, :, d].max(axis=1), "right") for d, axis in enumerate((x, y))], axis=1)
     span = np.maximum(end - begin, 0)
     count = span[:, 0] * span[:, 1]
     triangle = np.repeat(np.arange(len(corner)), count)
     within = np.arange(len(triangle)) - np.repeat(np.cumsum(count) - count, count)
     column = begin[triangle] + np.stack([within // span[triangle, 1], within % span[triangle, 1]], axis=1)
+    at = np.column_stack([x[column[:, 0]], y[column[:, 1]]])
     inside = np.ones(len(triangle), dtype=bool)
     bary = np.empty((len(triangle), 3))
     for k in range(3):
-        a, b = flat[triangle, (k + 1) % 3], flat[triangle, (k + 2) % 3]
+        a, b = plan[triangle, (k + 1) % 3], plan[triangle, (k + 2) % 3]
         swap = (a[:, 0] > b[:, 0]) | ((a[:, 0] == b[:, 0]) & (a[:, 1] > b[:, 1]))
         a, b = np.where(swap[:, None], b, a), np.where(swap[:, None], a, b)
-        side = (b[:, 0] - a[:, 0]) * (column[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (column[:, 0] - a[:, 0])
+        side = (b[:, 0] - a[:, 0]) * (at[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (at[:, 0] - a[:, 0])
         # A column exactly on an edge belongs to its left side, whichever triangle asks.
         left = np.where(side >= 0.0, 1.0, -1.0) * np.where(swap, -1.0, 1.0)
         inside &= left * normal_z[triangle] > 0.0
         bary[:, k] = np.where(swap, -side, side)
     triangle, column, bary = triangle[inside], column[inside], bary[inside]
     height = np.einsum("pk,pk->p", bary / bary.sum(axis=1, keepdims=True), corner[triangle, :, 2])
-    key = column[:, 0] * fine[1] + column[:, 1]
+    key = column[:, 0] * len(y) + column[:, 1]
     order = np.lexsort((height, key))
     key, height, column = key[order], height[order], column[order]
     # Going up, a downward facing triangle enters the object. Columns balance, so one running sum serves all.
     winding = np.cumsum(np.where(normal_z[triangle[order]] < 0.0, 1, -1))
     same = key[:-1] == key[1:]
-    signed = float((winding[:-1] * np.diff(height))[same].sum() * width.prod())
+    section = wide[column[:, 0]] * deep[column[:, 1]]
+    signed = float((winding[:-1] * np.diff(height) * section[:-1])[same].sum())
     open_ = np.flatnonzero((winding[:-1] > 0) & same)
-    bottom, top, column = height[open_], height[open_ + 1], column[open_]
+    bottom, top, column, section = height[open_], height[open_ + 1], column[open_], section[open_]
 
-    # Cut each chord at the cell borders.
-    step = (upper[2] - lower[2]) / shape[2]
-    k0 = np.clip(np.floor((bottom - lower[2]) / step), 0, shape[2] - 1).astype(np.int64)
-    k1 = np.clip(np.floor((top - lower[2]) / step), 0, shape[2] - 1).astype(np.int64)
+    # Cut each chord at the octants' borders.
+    levels = _split(lines[2], 2)
+    k0 = np.clip(np.searchsorted(levels, bottom, "right") - 1, 0, len(levels) - 2)
+    k1 = np.clip(np.searchsorted(levels, top, "right") - 1, 0, len(levels) - 2)
     count = k1 - k0 + 1
     chord = np.repeat(np.arange(len(bottom)), count)
     k = np.arange(len(chord)) - np.repeat(np.cumsum(count) - count, count) + k0[chord]
-    low = np.maximum(bottom[chord], lower[2] + k * step)
-    high = np.minimum(top[chord], lower[2] + (k + 1) * step)
-    volume = np.maximum(high - low, 0.0) * width.prod()
-    fine_xy = column[chord]
-    index = np.ravel_multi_index((fine_xy[:, 0] // SUBDIVISION, fine_xy[:, 1] // SUBDIVISION, k), tuple(shape))
-    position = np.column_stack([lower[:2] + (fine_xy + 0.5) * width, 0.5 * (low + high)])
-    return *sum_by(index, volume, position, int(shape.prod())), signed
+    low, high = np.maximum(bottom[chord], levels[k]), np.minimum(top[chord], levels[k + 1])
+    long = np.maximum(high - low, 0.0)
+    i, j = column[chord].T
+    grid = tuple(2 * (len(line) - 1) for line in lines)
+    octant = np.ravel_multi_index((i // (parts[0] // 2), j // (parts[1] // 2), k), grid)
+    centre = np.column_stack([x[i], y[j], 0.5 * (low + high)])
+    spread = np.column_stack([wide[i], deep[j], long]) ** 2 / 12.0
+    return sum_pieces(octant, long * section[chord], centre, spread, int(np.prod(grid))), signed
+
+
+def _split(line: Array, parts: int) -> Array:
+    """Return borders with every interval cut into equal parts."""
+    return np.interp(np.arange((len(line) - 1) * parts + 1) / parts, np.arange(len(line)), line)

@@ -30,14 +30,18 @@ def reduced_stiffness(gradient: Array, weights: Array, poissons_ratio: float) ->
         Linear elastic stiffness for E = 1 [m], shape (3 n, 3 n); all x components first, then y, then z.
     """
     count = len(gradient)
-    mu, lame = lame_parameters(poissons_ratio)
     flat = gradient.transpose(1, 0, 2).reshape(3 * count, -1)
-    product = ((flat * weights) @ flat.T).reshape(3, count, 3, count)
-    found = lame * product + mu * product.transpose(2, 1, 0, 3)
-    trace = mu * np.einsum("kakb->ab", product)
+    return elastic_stiffness(((flat * weights) @ flat.T).reshape(3, count, 3, count), poissons_ratio)
+
+
+def elastic_stiffness(products: Array, poissons_ratio: float) -> Array:
+    """Return the stiffness for E = 1, (3 n, 3 n), from sum_p w_p d_i b_k d_j b_l, (3, n, 3, n); x components first."""
+    mu, lame = lame_parameters(poissons_ratio)
+    found = lame * products + mu * products.transpose(2, 1, 0, 3)
+    trace = mu * np.einsum("kakb->ab", products)
     for i in range(3):
         found[i, :, i] += trace
-    return found.reshape(3 * count, 3 * count)
+    return found.reshape(3 * products.shape[1], -1)
 
 
 def elastic_modes(stiffness: Array) -> tuple[Array, Array]:

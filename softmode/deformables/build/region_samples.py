@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from softmode.deformables.body.regions import Region
+from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.errors import BasisError, ConfigError
 
 Array = NDArray[np.float64]
@@ -29,6 +31,33 @@ class RegionSamples:
     """Volumes [m^3], shape (N,); corners of exact regions have none."""
     exact: NDArray[np.bool_]
     """Whether the region of each is exact, shape (N,)."""
+
+
+def octants_near(quadrature: Quadrature, regions: Sequence[Region]) -> tuple[Array, Array, NDArray[np.intp]]:
+    """Take the octants of cells that regions hold or come near to, in place of their points.
+
+    Octants tile the object, so that the part of them inside a face is known; Gauss points do not.
+
+    Args:
+        quadrature: The object.
+        regions: The regions, in its frame.
+
+    Returns:
+        Points [m] (P', 3), volumes [m^3] (P',), and the quadrature point that each came from or is nearest to (P',).
+    """
+    points, weights, cells = quadrature.points, quadrature.weights, quadrature.cells
+    if cells is None or not regions:
+        return points, weights, np.arange(len(points))
+    reach = np.min([region.distance(cells.octants)[0] for region in regions], axis=0)
+    near = np.zeros(1 + max(cells.of_point.max(), cells.of_octant.max()), dtype=bool)
+    near[cells.of_octant[reach < 2.0 * quadrature.spacing]] = True
+    kept, split = np.flatnonzero(~near[cells.of_point]), near[cells.of_octant]
+    nearest = KDTree(points).query(cells.octants[split])[1]
+    return (
+        np.concatenate([points[kept], cells.octants[split]]),
+        np.concatenate([weights[kept], cells.weights[split]]),
+        np.concatenate([kept, nearest]),
+    )
 
 
 def sample_regions(regions: Sequence[Region], points: Array, weights: Array, spacing: float) -> RegionSamples:

@@ -33,6 +33,8 @@ STRAIN = 0.1
 """Strain (root mean square over the body) at which the Jacobian of a mode is measured."""
 CONDITION_WARNING = 1e6
 """Condition number of a moment matrix from which on gradients lose more digits than float32 has to spare."""
+FREQUENCY_WARNING = 0.05
+"""Error of the first frequencies, against the space that functions are chosen from, above which a body is too stiff."""
 SLENDER = 0.3
 """Ratio of the least to the largest extent under which affine handles lock a body in bending."""
 BARE = 3.0
@@ -193,17 +195,28 @@ def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
             " thin to be integrated and touched as a solid",
             "thicken the asset to a hundredth of its size",
         )
+    error = body.provenance.get("frequency_error")
+    if error is not None and float(notes.measure("error of the first frequencies", float(error))) > FREQUENCY_WARNING:
+        notes.find(
+            "warning",
+            "functions",
+            f"its first six frequencies are up to {100.0 * float(error):.0f} % too high with {body.function_count}"
+            " functions",
+            "build it with --accuracy 0.03, or more --functions",
+        )
+    if error is not None or body.region_names:
+        return
     degrees = body.handle_degrees
     tolerance = body.provenance.get("option_rank_tolerance")
-    if slender < SLENDER and not (degrees == 2).any() and not body.region_names:
+    if slender < SLENDER and not (degrees == 2).any():
         notes.find(
             "warning",
             "slender",
             f"the body is slender or flat ({slender:.2f} of its length) and has affine handles, which make it a third"
             " too stiff in bending",
-            "build it with --handles quadratic --modes 4 --rank-tolerance 1e-9",
+            "leave --modes and --handles away: then its functions are chosen by elastic energy",
         )
-    elif slender < SLENDER and not body.region_names and tolerance is not None and float(tolerance) >= RANK_TOLERANCE:
+    elif slender < SLENDER and tolerance is not None and float(tolerance) >= RANK_TOLERANCE:
         notes.find(
             "warning",
             "slender",

@@ -1,6 +1,7 @@
 """What a model knows of reduced bodies: Newton custom attributes, and how bodies and pins get into a builder."""
 
 import hashlib
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -155,6 +156,13 @@ def add_reduced_body(
     s = float(np.float32(scale))  # as the model stores it
     omega = np.asarray(angular_velocity, float)
     spin = np.array([[0, -omega[2], omega[1]], [omega[2], 0, -omega[0]], [-omega[1], omega[0], 0]])
+    if not body.serves_ratio(material.poissons_ratio):
+        warnings.warn(
+            f"body {body.name!r} has functions for another Poisson's ratio than {material.poissons_ratio:g}: it comes"
+            f" out too stiff; build it with BuildOptions(poissons_ratio={material.poissons_ratio:g})",
+            RuntimeWarning,
+            stacklevel=2,
+        )
     q = body.affine(s * R, p)
     # the velocity field v + omega x (R s X) as coordinates: affine() of I + A subtracts the identity again
     qd = body.affine(np.eye(3) + spin @ (s * R), np.asarray(velocity, float))

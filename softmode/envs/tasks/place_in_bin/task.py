@@ -168,7 +168,7 @@ class PlaceInBin(Task):
 
     def scene_config(self) -> TableSceneConfig:
         """Add the bin."""
-        scene = self.config.scene
+        scene = super().scene_config()
         return replace(scene, fixtures=(*scene.fixtures, *self.config.bin.fixtures()))
 
     def build(self) -> None:

@@ -1,0 +1,45 @@
+"""Frequencies of free bodies beside finite elements, for every solid, Poisson's ratio and number of functions.
+
+Run from the repository root: ``python -m benchmarks.modes [--only NAME ...] [--functions N ...] [--all-points]``.
+
+A row: the smallest and largest relative error of the first six frequencies, in percent, of a body as a user builds it
+from the closed surface (cubature included), for each number of functions; "FreeForm" are 8 eigenmodes times affine
+motion, 36 functions.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from softmode.deformables import BuildOptions, build_body, quadrature_from_mesh
+from tests.oracle.solids import SOLIDS, frequency_errors
+
+RATIOS = (0.3, 0.45, 0.49)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="+", default=list(SOLIDS), choices=list(SOLIDS), metavar="NAME")
+    parser.add_argument("--functions", nargs="+", type=int, default=[24, 36, 48, 80])
+    parser.add_argument("--points", type=int, default=4000, help="quadrature points")
+    parser.add_argument("--all-points", action="store_true", help="no cubature")
+    options = parser.parse_args()
+    count = None if options.all_points else BuildOptions().cubature_count
+    print(f"{'solid':<26}{'nu':>6}{'FreeForm':>16}" + "".join(f"{f'{n} functions':>18}" for n in options.functions))
+    for name in options.only:
+        solid = SOLIDS[name]()
+        quadrature = quadrature_from_mesh(*solid.surface(), point_count=options.points)
+        freeform = build_body(quadrature, BuildOptions(mode_count=8, cubature_count=count), progress=False)
+        for ratio in RATIOS:
+            reference = solid.eigenvalues(ratio)
+            cells = [frequency_errors(freeform, reference, ratio)]
+            for n in options.functions:
+                chosen = BuildOptions(function_count=n, poissons_ratio=ratio, cubature_count=count)
+                cells.append(frequency_errors(build_body(quadrature, chosen, progress=False), reference, ratio))
+            text = [f"{100 * low:+.1f}..{100 * high:+.1f} %" for low, high in cells]
+            print(f"{name:<26}{ratio:6.2f}{text[0]:>16}" + "".join(f"{cell:>18}" for cell in text[1:]), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,171 @@
+"""Functions chosen by elastic energy: nested, exact for affine motion, as accurate as they say, the same every time."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+
+import newton
+import numpy as np
+import pytest
+
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.body.regions import Region
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import FUNCTION_COUNT, BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_mesh, quadrature_from_sphere
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.errors import ConfigError
+from tests.oracle.solids import eigenvalues
+from tests.shapes import box, together
+
+ALL = {"cubature_count": None, "kernel_count": 200}
+SIZE = (0.12, 0.05, 0.03)
+
+
+def built(**options: object) -> ReducedBody:
+    """Return a box with all of its points and few kernels."""
+    return build_body(quadrature_from_box(SIZE, point_count=1500), BuildOptions(**{**ALL, **options}), progress=False)
+
+
+@pytest.fixture(scope="module")
+def bodies() -> dict[int, ReducedBody]:
+    """Bodies of one box by number of functions."""
+    return {n: built(function_count=n) for n in (10, 24, 36, 48, 80)}
+
+
+def test_functions_are_nested(bodies: dict[int, ReducedBody]) -> None:
+    """The functions of a smaller count are the first of a larger one."""
+    points = bodies[80].points[::7]
+    most = bodies[80].evaluate(points)[0]
+    for count, body in bodies.items():
+        np.testing.assert_allclose(body.evaluate(points)[0], most[:, :count], atol=1e-8 * np.abs(most).max())
+
+
+@pytest.mark.parametrize("poissons_ratio", [0.0, 0.3, 0.49])
+def test_more_functions_never_stiffen(bodies: dict[int, ReducedBody], poissons_ratio: float) -> None:
+    """With all points no frequency rises with the number of functions, at any Poisson's ratio."""
+    values = [eigenvalues(body, poissons_ratio) for body in bodies.values()]
+    for fewer, more in itertools.pairwise(values):
+        assert (more <= fewer * (1.0 + 1e-6)).all()  # gradients are stored in float32
+
+
+def test_affine_motion_is_exact(bodies: dict[int, ReducedBody]) -> None:
+    """Linear coordinates give (X, Y, Z, 1) at any point, and a stretch moves it there."""
+    body = bodies[36]
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 3)) * SIZE
+    value, gradient = body.evaluate(points)
+    np.testing.assert_allclose(value @ body.linear_coordinates, np.column_stack([points, np.ones(20)]), atol=1e-12)
+    A = np.array([[1.1, 0.2, 0.0], [0.0, 0.9, 0.1], [0.3, 0.0, 1.2]])
+    np.testing.assert_allclose(points + value @ body.affine(A), points @ A.T, atol=1e-12)
+    np.testing.assert_allclose(np.einsum("nkj,kc->ncj", gradient, body.affine(A))[3], (A - np.eye(3)), atol=1e-9)
+
+
+def test_functions_are_orthonormal_in_mass() -> None:
+    """Also with a density that varies, and only the first has a mean."""
+    quadrature = quadrature_from_box(SIZE, point_count=1500)
+    density = np.where(quadrature.points[:, 0] > 0.0, 3.0, 1.0)
+    body = build_body(quadrature, BuildOptions(function_count=40, **ALL), density_scale=density, progress=False)
+    value = body.evaluate(quadrature.points - body.offset)[0]
+    mass = quadrature.weights * density / (quadrature.weights @ density)
+    np.testing.assert_allclose((value * mass[:, None]).T @ value, np.eye(40), atol=1e-9)
+    np.testing.assert_allclose(body.mean_basis, np.eye(40)[0], atol=1e-12)
+
+
+def test_accuracy_chooses_the_count(bodies: dict[int, ReducedBody]) -> None:
+    """The fewest functions are taken that reach the accuracy, and the report says what they reach."""
+    counts = []
+    for accuracy in (0.2, 0.05, 0.01):
+        body = built(accuracy=accuracy)
+        reached = body.provenance["frequency_error"]
+        assert isinstance(reached, float) and 0.0 <= reached <= accuracy
+        fewer = built(function_count=body.function_count - 1).provenance["frequency_error"]
+        assert isinstance(fewer, float) and fewer > accuracy
+        counts.append(body.function_count)
+    assert counts == sorted(counts) and counts[0] < counts[-1]
+    assert bodies[80].provenance["frequency_error"] <= bodies[48].provenance["frequency_error"]  # type: ignore[operator]
+
+
+def test_accuracy_out_of_reach_is_refused() -> None:
+    """The message says what the most functions reach."""
+    with pytest.raises(ConfigError, match="120 functions reach"):
+        build_body(quadrature_from_sphere(0.05, point_count=3000), BuildOptions(accuracy=1e-7), progress=False)
+
+
+def test_functions_for_several_ratios(bodies: dict[int, ReducedBody]) -> None:
+    """Functions made for 0.3 and 0.49 serve both better than those of one serve the other."""
+    both = built(function_count=48, poissons_ratio=(0.3, 0.49))
+    soft = built(function_count=48, poissons_ratio=0.3)
+    full = eigenvalues(built(function_count=120, poissons_ratio=0.49), 0.49)
+    error = [np.sqrt(eigenvalues(body, 0.49) / full).max() - 1.0 for body in (both, soft)]
+    assert error[0] < 0.5 * error[1]
+
+
+def test_ratio_is_part_of_the_fingerprint() -> None:
+    """Bodies for other materials are other bodies."""
+    prints = {built(poissons_ratio=nu).fingerprint for nu in (0.3, 0.49, (0.3, 0.49))}
+    assert len(prints) == 3
+
+
+def test_defaults_and_determinism() -> None:
+    """48 functions, the same bits every time."""
+    first, again = built(), built()
+    assert first.function_count == FUNCTION_COUNT
+    np.testing.assert_array_equal(first.transform, again.transform)
+    np.testing.assert_array_equal(first.grad_basis, again.grad_basis)
+
+
+def test_cubature_keeps_the_soft_modes() -> None:
+    """With the default number of points the lowest eigenvalues are those of all points to 0.5 %."""
+    body = build_body(quadrature_from_box((0.3, 0.03, 0.03)), progress=False)
+    error = body.provenance["soft_mode_error"]
+    assert isinstance(error, float) and 0.0 < error < 5e-3
+
+
+def test_detached_parts_move_against_each_other() -> None:
+    """Two boxes without contact: more than six motions cost nothing, and each part moves alone."""
+    low, faces = box((0.02, 0.02, 0.02))
+    high = low + np.array([0.1, 0.0, 0.0])
+    quadrature = quadrature_from_mesh(*together((low, faces), (high, faces)), point_count=1200)
+    body = build_body(
+        quadrature, BuildOptions(function_count=40, kernel_count=100, cubature_count=None), progress=False
+    )
+    value = eigenvalues(body, 0.4, 12)
+    assert (value[:6] < 1e-4 * value[-1]).all()
+
+
+def test_regions_take_no_count() -> None:
+    """A body with regions has eigenmodes and responses; the message says what to give."""
+    held = Region(name="held", box=((-1.0, -1.0, -1.0), (-0.04, 1.0, 1.0)))
+    with pytest.raises(ConfigError, match="mode_count"):
+        build_body(quadrature_from_box(SIZE), BuildOptions(function_count=40), regions=(held,), progress=False)
+
+
+def test_a_ratio_that_varies() -> None:
+    """Options for it name three ratios and take a quarter more functions, unless a ratio or eigenmodes are named."""
+    varied = BuildOptions(function_count=24).for_varied_ratio()
+    assert varied.poissons_ratios == (0.3, 0.45, 0.49) and varied.function_count == 30
+    assert BuildOptions().for_varied_ratio().function_count == 60
+    assert BuildOptions(accuracy=0.02).for_varied_ratio().function_count is None
+    for named in (BuildOptions(poissons_ratio=0.3), BuildOptions(mode_count=4)):
+        assert named.for_varied_ratio() is named
+
+
+def test_a_ratio_far_from_the_build_is_named() -> None:
+    """A body made for 0.4 warns when it is added with 0.49; one made for both does not."""
+    material = Material(poissons_ratio=0.49)
+    with pytest.warns(RuntimeWarning, match=r"poissons_ratio=0.49"):
+        add_reduced_body(newton.ModelBuilder(), built(function_count=24), material=material)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for ratio in (0.49, (0.3, 0.49)):
+            body = built(function_count=24, poissons_ratio=ratio)
+            add_reduced_body(newton.ModelBuilder(), body, material=material)
+
+
+@pytest.mark.parametrize("ratio", [0.5, -0.1, np.nan, (0.3, 0.5)])
+def test_ratios_without_a_material_are_refused(ratio: float | tuple[float, ...]) -> None:
+    """The error names the argument."""
+    with pytest.raises(ConfigError, match="poissons_ratio"):
+        BuildOptions(poissons_ratio=ratio)
