@@ -17,7 +17,6 @@ from softmode.cli.main import main
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.cubature import POISSON_RATIO
-from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.errors import AssetError, ConfigError
 from softmode.objects import ObjectConfig, load, surface_cover, write_object

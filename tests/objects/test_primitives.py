@@ -169,7 +169,9 @@ def test_rope_bends_like_a_heavy_elastica(modulus: float) -> None:
     half, radius = 0.5 * presets.ROPE.extents[0], 0.5 * presets.ROPE.extents[1]  # type: ignore[index]
     material = replace(presets.ROPE_MATERIAL, youngs_modulus=modulus, density=1000.0)
     pull = 1000.0 * GRAVITY * 4.0 * half**3 / (modulus * radius**2)
-    np.testing.assert_allclose(hang(load(presets.ROPE), material, half) / half, heavy_elastica(pull, radius / half), rtol=0.02)
+    np.testing.assert_allclose(
+        hang(load(presets.ROPE), material, half) / half, heavy_elastica(pull, radius / half), rtol=0.02
+    )
 
 
 def test_beam_sags_like_a_timoshenko_beam() -> None:
