@@ -177,12 +177,18 @@ def warn_untold_pins(model: newton.Model, layout: Layout) -> None:
             )
 
 
-def untold_share(body: ReducedBody, points: np.ndarray) -> float:
-    """Return the fraction of a body's surface that lies at points (N, 3) [m], except in regions that its build knew."""
+def untold_share(body: ReducedBody, points: np.ndarray, reach: float = 0.0) -> float:
+    """Return the fraction of a body's surface that points hold, except in regions that its build knew.
+
+    Args:
+        body: The body.
+        points: Held points of its rest frame [m], shape (N, 3).
+        reach: How far a point holds what is around it [m], at least the distance between samples of the surface.
+    """
     spacing = float(np.sqrt(body.surface_areas.mean()))
     for region in body.regions:
         points = points[region.distance(points)[0] > spacing]
     if not len(points):
         return 0.0
     apart = KDTree(points).query(body.surface_points)[0]
-    return float(body.surface_areas[apart <= spacing].sum() / body.surface_areas.sum())
+    return float(body.surface_areas[apart <= max(spacing, reach)].sum() / body.surface_areas.sum())
