@@ -20,7 +20,6 @@ from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.attachments import Attachment, attach
 from softmode.robots.arm import ArmIndices
 
-
 GLUE_STIFFNESS = 680.0
 """Stiffness kappa / E of the glued half over the square of the radius, as its build knows it: about that of the
 attachment. The dome of a fingertip of 6 modes then yields 0.47 mm to a newton on 3 mm, of 12 modes without it 0.34 mm,
