@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from softmode.deformables.build.build_body import build_body
     from softmode.deformables.build.cache import cached_body
     from softmode.deformables.build.eigenmodes import Eigenmodes, solve_eigenmodes
+    from softmode.deformables.build.hold import carry_over, hold
     from softmode.deformables.build.occupancy import Occupancy, fill_splats
     from softmode.deformables.build.options import BuildOptions
     from softmode.deformables.build.quadrature import (
@@ -81,8 +82,10 @@ __all__ = [
     "average_basis",
     "build_body",
     "cached_body",
+    "carry_over",
     "elastic_modes",
     "fill_splats",
+    "hold",
     "quadrature_from_box",
     "quadrature_from_capsule",
     "quadrature_from_implicit",

@@ -1,4 +1,4 @@
-"""Reduced coordinates of the objects of a scene on the host, and carrying them over to another basis."""
+"""Reduced coordinates of the objects of a scene on the host, and giving them those of another body."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.build.hold import carry_over
 from softmode.deformables.model.namespaces import soft
 from softmode.scenes.scene import Scene
 
@@ -27,8 +28,8 @@ def coordinates(scene: Scene, name: Literal["q", "qd"], object_index: int = 0) -
     return values[start : start + scene.objects[object_index].body.function_count].astype(np.float64)
 
 
-def carry_over(scene: Scene, old: ReducedBody, q: Array, qd: Array) -> None:
-    """Give the only object of a scene the positions and velocities that it had with another basis, by least squares.
+def set_motion(scene: Scene, old: ReducedBody, q: Array, qd: Array) -> None:
+    """Give the only object of a scene the motion that it had with another body; see `carry_over`.
 
     Args:
         scene: The scene, with the new body.
@@ -36,12 +37,9 @@ def carry_over(scene: Scene, old: ReducedBody, q: Array, qd: Array) -> None:
         q: Its coordinates [m], shape (n, 3).
         qd: Their velocities [m/s], shape (n, 3).
     """
-    body, state = scene.objects[0].body, soft(scene.state)
-    X = np.concatenate([old.surface_points, old.points])
-    before, shift = old.evaluate(X)[0], old.offset - body.offset
-    rows = body.evaluate(X + shift)[0]
-    found = np.linalg.lstsq(rows, np.hstack([before @ q - shift, before @ qd]), rcond=1e-10)[0]
-    state.q.assign(found[:, :3])
-    state.qd.assign(found[:, 3:])
+    state = soft(scene.state)
+    place, rate = carry_over(old, scene.objects[0].body, q, qd)
+    state.q.assign(place)
+    state.qd.assign(rate)
     state.dt_before.zero_()
     scene.solver.update_particles(scene.state)

@@ -48,6 +48,11 @@ class Hands:
         """Whether anything is held."""
         return self._drag is not None or bool(self._pins)
 
+    @property
+    def dragging(self) -> bool:
+        """Whether something is dragged."""
+        return self._drag is not None
+
     def let_go(self) -> None:
         """Let go of everything."""
         for grips in self._scene.grips:

@@ -37,9 +37,13 @@ HELD_PART = 0.12
 
 def grips_of(options: LiveOptions) -> dict[str, Any]:
     """Return how many points of an object pins and the drag may need at a time, and how stiff the grips are."""
-    strength = GripOptions(pull_stiffness=options.drag_stiffness, pull_rate=options.drag_rate)
     slots = (options.pin_max + 1) * options.pin_points + 1  # what it hangs by is a pin more
-    return {"grip_slots": slots, "grip_options": strength}
+    return {"grip_slots": slots, "grip_options": grips_strength(options)}
+
+
+def grips_strength(options: LiveOptions) -> GripOptions:
+    """Return how stiff the grips of a session are."""
+    return GripOptions(pull_stiffness=options.drag_stiffness, pull_rate=options.drag_rate)
 
 
 class ObjectScene:

@@ -156,6 +156,8 @@ class LiveStatus:
     """Names of the solver's flags in the last frame, empty if all is well; see `softmode.deformables.model.status`."""
     recording: bool
     """Whether a recording is being made."""
+    notice: str
+    """What a person should know: pins that the body was not built for, a build that is under way. Empty if nothing."""
     reward_terms: dict[str, float]
     """The reward's terms in the last control step, empty without an environment."""
     success: bool

@@ -150,6 +150,12 @@ class Panel:
             only_last = unpin.value == "last"
             self._submit(lambda session: self._unpin(session, only_last))
 
+        build = gui.add_button("build for pins", hint="builds the object anew for the regions that are pinned")
+
+        @build.on_click
+        async def _(_: Any) -> None:
+            self._submit(lambda session: session.build_for_pins())
+
     def _set_mode(self, mode: MouseMode) -> None:
         """Change what the mouse does."""
         self.mouse_mode = mode
@@ -239,6 +245,8 @@ class Panel:
             ("solver", ", ".join(status.solver) or "converged"),
             ("energy", f"{energies.kinetic:.2e} kinetic, {energies.elastic:.2e} elastic J"),
         ]
+        if status.notice:
+            rows += [("pins", status.notice)]
         if status.reward_terms:
             rows += [("reward", ", ".join(f"{name} {value:.2f}" for name, value in status.reward_terms.items()))]
             rows += [("episode", f"{status.episode}{', solved' if status.success else ''}")]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +21,18 @@ from softmode.deformables.materials.material import Material
 from softmode.deformables.model.namespaces import soft
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.energies import SoftEnergies
-from softmode.errors import ConfigError
+from softmode.deformables.tools.grips import Grip
+from softmode.errors import ConfigError, SoftmodeError
 from softmode.objects.config import ObjectConfig
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.host import host
 from softmode.scenes.meshes import SceneMesh, scene_meshes
 from softmode.splats.pinhole import PinholeCamera
 from softmode.view import live_parameters
-from softmode.view.coordinates import carry_over, coordinates
+from softmode.view.coordinates import coordinates, set_motion
 from softmode.view.hands import Hands
 from softmode.view.live_recording import LiveRecording
-from softmode.view.live_scenes import EnvScene, LiveScene, ObjectScene
+from softmode.view.live_scenes import EnvScene, LiveScene, ObjectScene, grips_strength
 from softmode.view.live_types import (
     DragView,
     Energies,
@@ -46,6 +48,7 @@ from softmode.view.live_types import (
 )
 from softmode.view.pace import Pace
 from softmode.view.picture import LivePicture
+from softmode.view.pin_builds import PinBuilds, held_untold, pin_regions
 from softmode.view.recorders import RECORD_HZ, Recorder, live_camera, make_recorder
 from softmode.view.sources import load_source, with_functions
 
@@ -57,7 +60,7 @@ class LiveSession:
     `poses` are what to show, the rest is what a person does. All calls must come from one thread.
     """
 
-    def __init__(self, make: Callable[[ObjectConfig | None], LiveScene], options: LiveOptions) -> None:
+    def __init__(self, make: Callable[[ObjectConfig | SoftObject | None], LiveScene], options: LiveOptions) -> None:
         """Make the scene; use `from_object` or `from_env`."""
         self.options, self._make = options, make
         self._source: ObjectConfig | None = None
@@ -65,7 +68,8 @@ class LiveSession:
         self._given: dict[str, Any] = {}
         self._playing = True
         self._recorder: Recorder | None = None
-        self._hands = Hands(options)
+        self._hands, self._builds, self._build_error = Hands(options), PinBuilds(), ""
+        self._share: tuple[tuple[int, tuple[int, ...]], float] = ((0, ()), 0.0)
         self._clock, self._record_from = 0.0, 0.0
         self._bind()
 
@@ -73,7 +77,7 @@ class LiveSession:
         """Take up a scene that has just been made."""
         self._scene = scene = self._live.scene
         self._picture = LivePicture(scene.objects, scene.model, self._live.marker)
-        self._energies = SoftEnergies(scene.solver)
+        self._energies, self._first_body = SoftEnergies(scene.solver), scene.objects[0].body
         self._solver = scene.solver
         self._meshes: tuple[SceneMesh, ...] | None = None
         self._pace = Pace(self._live.block_dt, self.options.budget)
@@ -118,8 +122,14 @@ class LiveSession:
         """
         chosen = options or LiveOptions()
 
-        def make(origin: ObjectConfig | None) -> LiveScene:
-            found = load_source(origin or source, None if origin else size, progress)
+        first = load_source(source, size, progress)
+
+        def make(origin: ObjectConfig | SoftObject | None) -> LiveScene:
+            found = first
+            if isinstance(origin, ObjectConfig):
+                found = load_source(origin, None, progress)
+            elif origin is not None:
+                found = replace(first, object=origin)
             made = material or found.object.material or Material(youngs_modulus=1.0e5, density=250.0)
             return ObjectScene(found, scene, hold, made, chosen, device)
 
@@ -171,6 +181,7 @@ class LiveSession:
             ConfigError: If `frame_dt` is not a finite number >= 0.
         """
         require_number("frame_dt", frame_dt, at_least=0.0, unit="s")
+        self._take_build()
         now = time.perf_counter()
         if not self._playing:
             return 0.0
@@ -207,6 +218,7 @@ class LiveSession:
         if self._recorder is not None:
             self._recorder.discard()
             self._recorder = None
+        self._builds.close()
         self._live.close()
 
     # -- what to show -------------------------------------------------------------------------------------------------
@@ -258,6 +270,7 @@ class LiveSession:
             step_milliseconds=1e3 * self._pace.block_seconds / live.block_steps,
             solver=status_reasons(self._bits),
             recording=self._recorder is not None,
+            notice=self._notice(),
             reward_terms=dict(live.terms),
             success=live.success,
             episode=live.episode,
@@ -399,20 +412,77 @@ class LiveSession:
         """
         if self._recorder is not None:
             raise ConfigError("a recording is being made", hint="stop it before the functions change")
-        old = self._object(0).body
         source = with_functions(self._source or self._live.source, count)
-        if count == old.function_count:
+        if count != self._object(0).body.function_count:
+            self._exchange(source)
+            self._source = source
+
+    def build_for_pins(self) -> None:
+        """Build the object anew for the regions that are pinned now, in the background; time runs on.
+
+        A body that was not built to be held in a place is too stiff around it, see :func:`softmode.deformables.hold`.
+        The first `advance` after the build exchanges the body, when nothing is dragged or recorded; motion is carried
+        over and pins keep their numbers. `status` says in `notice` how it stands.
+
+        Raises:
+            ConfigError: With an environment, if nothing is pinned, if such a build is under way, or if the object came
+                as a body that does not keep what it was built from.
+        """
+        body, grips = self._object(0).body, self._pinned()
+        if isinstance(self._live, EnvScene):
+            raise ConfigError("an environment brings its object", hint="build its body with regions")
+        if not grips:
+            raise ConfigError("nothing is pinned", hint="pin a region first")
+        if self._builds.running:
+            raise ConfigError("a build for pins is under way", hint="wait until it is done")
+        if not self._first_body.sources:
+            raise ConfigError(f"body {body.name!r} does not keep what it was built from", hint="build it anew")
+        self._build_error = ""
+        self._builds.begin(self._first_body, pin_regions(body, grips, grips_strength(self.options)))
+
+    def _pinned(self) -> list[Grip]:
+        """Return what holds the first object."""
+        return [grip for grip in self._scene.grips[0].held.values() if not grip.pulls]
+
+    def _take_build(self) -> None:
+        """Exchange the body for the one that was built for pins, if there is one and nobody is busy with the object."""
+        if self._recorder is not None or self._hands.dragging:
             return
+        try:
+            body = self._builds.take()
+        except SoftmodeError as error:
+            self._build_error = f"the build for pins failed: {error}"
+            return
+        if body is not None:
+            first = self._first_body
+            self._exchange(replace(self._object(0), body=body))
+            self._first_body = first
+
+    def _notice(self) -> str:
+        """Return what a person should know of the pins."""
+        if self._builds.running:
+            return "building for the pins ..."
+        body, held = self._object(0).body, tuple(self._scene.grips[0].held)
+        if self._share[0] != (id(body), held):
+            self._share = ((id(body), held), held_untold(body, self._pinned()))
+        share = self._share[1]
+        hint = "build_for_pins() mends that" if body.sources and not isinstance(self._live, EnvScene) else ""
+        stiff = f"pins hold {share:.0%} of {body.name!r}, which was not built for it and is too stiff; {hint}"
+        return self._build_error or (stiff.rstrip("; ") if share else "")
+
+    def _exchange(self, source: ObjectConfig | SoftObject) -> None:
+        """Make the scene anew with another build of its object, and go on from where it is."""
+        old = self._object(0).body
         self.end_drag()
         motion = [coordinates(self._scene, name) for name in ("q", "qd")]
         pins, elapsed = self._hands.kept(), self._time
         made = self._make(source)  # a build that fails leaves all as it was
         self._live.close()
-        self._live, self._source = made, source
+        self._live = made
         self._bind()
         if not isinstance(made, EnvScene):
             self._hands.hold_again(pins)
-            carry_over(self._scene, old, *motion)
+            set_motion(self._scene, old, *motion)
             self._time = elapsed
         live_parameters.apply(self._scene, self._given)
 

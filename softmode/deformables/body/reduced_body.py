@@ -38,6 +38,8 @@ FORMAT, FORMAT_VERSION = "softmode.ReducedBody", 2
 _HINT = "build the body again"
 RATIO_HARMLESS = 0.45
 """Poisson's ratio up to which functions made for any other serve."""
+_SOURCES = "sources."
+"""What the names of the sources begin with in a file."""
 REACH = 0.35
 """How far from its nearest kernel centre a point may lie, as a fraction of the kernel's support. Inside an object the
 ratio stays under 0.3; beyond, the functions grow as extrapolated polynomials do (tenfold at 0.5), so they are held
@@ -123,6 +125,8 @@ class ReducedBody:
     """What went in, what was measured, what was lost."""
     build_seconds: float
     """Wall time of the build [s]."""
+    sources: Mapping[str, NDArray[Any]] | None = dataclasses.field(default=None, repr=False, compare=False)
+    """What it was built from, for :func:`softmode.deformables.hold`, or None; see ``build.sources``."""
 
     @property
     def function_count(self) -> int:
@@ -315,7 +319,7 @@ class ReducedBody:
 
     def fields(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Return what is no array, with the format and its version, ready for JSON, and the arrays by name."""
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        values = {f.name: getattr(self, f.name) for f in _own_fields()}
         arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
         told = {name: value for name, value in values.items() if name not in arrays}
         return {"format": FORMAT, "version": FORMAT_VERSION, **told}, arrays
@@ -335,7 +339,7 @@ class ReducedBody:
         Raises:
             AssetError: If they are not those of a body.
         """
-        names = {f.name for f in dataclasses.fields(cls)}
+        names = {f.name for f in _own_fields()}
         if set(header) | set(arrays) != names or set(header) & set(arrays):
             wrong = sorted(names ^ (set(header) | set(arrays)))
             raise AssetError(f"{source}: fields {wrong} do not match", hint=hint)
@@ -349,18 +353,22 @@ class ReducedBody:
             raise AssetError(f"{source}: a field has another type or shape ({error})", hint=hint) from error
         return body
 
-    def save(self, path: str | os.PathLike[str], *, beside: Mapping[str, NDArray[Any]] | None = None) -> None:
+    def save(
+        self, path: str | os.PathLike[str], *, beside: Mapping[str, NDArray[Any]] | None = None, sources: bool = True
+    ) -> None:
         """Write an .npz without pickle; the file appears complete or not at all.
 
         Args:
             path: The file; its folder is made if it is missing.
             beside: Arrays to store beside the body, by names with a dot; `load` skips them.
+            sources: Whether to keep what the body was built from, if it has that: `hold` needs it.
 
         Raises:
             StorageError: If it cannot be written.
         """
         header, arrays = self.fields()
-        write_archive(path, header, {**arrays, **(beside or {})}, "body file")
+        kept = {_SOURCES + name: array for name, array in (self.sources or {}).items()} if sources else {}
+        write_archive(path, header, {**arrays, **kept, **(beside or {})}, "body file")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> ReducedBody:
@@ -380,7 +388,10 @@ class ReducedBody:
         """
         header, arrays = read_archive(path, FORMAT, FORMAT_VERSION, what="body file", hint=_HINT)
         own = {name: array for name, array in arrays.items() if "." not in name}
-        return cls.from_fields(header, own, f"body file {path}"), {n: a for n, a in arrays.items() if n not in own}
+        body = cls.from_fields(header, own, f"body file {path}")
+        sources = {n.removeprefix(_SOURCES): a for n, a in arrays.items() if n.startswith(_SOURCES)}
+        beside = {n: a for n, a in arrays.items() if n not in own and not n.startswith(_SOURCES)}
+        return dataclasses.replace(body, sources=sources or None), beside
 
     def check(self) -> None:
         """Verify shapes, dtypes, finiteness and the weights' sum.
@@ -388,4 +399,9 @@ class ReducedBody:
         Raises:
             BasisError: If any is wrong.
         """
-        check_fields({f.name: getattr(self, f.name) for f in dataclasses.fields(self)})
+        check_fields({f.name: getattr(self, f.name) for f in _own_fields()})
+
+
+def _own_fields() -> list[dataclasses.Field[Any]]:
+    """Return the fields that make up a body, without its sources."""
+    return [f for f in dataclasses.fields(ReducedBody) if f.name != "sources"]

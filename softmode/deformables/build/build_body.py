@@ -20,6 +20,7 @@ from softmode.deformables.build.cubature import select_cubature
 from softmode.deformables.build.options import BuildOptions, HandleName
 from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.region_samples import octants_near, refine_at_faces, sample_regions
+from softmode.deformables.build.sources import Sources, pack_sources
 from softmode.errors import MaterialError
 
 __all__ = [
@@ -95,6 +96,13 @@ def _build(
     stiffness = _positive_field("stiffness_scale", stiffness_scale, len(quadrature.points))
     density = _positive_field("density_scale", density_scale, len(quadrature.points))
     fingerprint = fingerprint_of(FORMAT_VERSION, quadrature, options, name, list(regions), stiffness, density)
+    sources = Sources(
+        quadrature=quadrature,
+        options=options,
+        regions=regions,
+        stiffness_scale=None if stiffness_scale is None else stiffness,
+        density_scale=None if density_scale is None else density,
+    )
     places, weights, parent = octants_near(quadrature, regions)
     stiffness, density = stiffness[parent], density[parent]
     density = density * (quadrature.volume / (weights @ density))
@@ -178,6 +186,7 @@ def _build(
             fingerprint=fingerprint,
             provenance={},
             build_seconds=0.0,
+            sources=pack_sources(sources),
         )
         surface = body.evaluate(body.surface_points)[0]
         stage("surface")

@@ -5,6 +5,7 @@ targets that move with the rigid body. The springs are pins (see ``authoring``),
 as everything else, and what they pull at one end they pull at the other.
 """
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,11 +13,17 @@ from typing import Any
 import newton
 import numpy as np
 import warp as wp
+from scipy.spatial import KDTree
 
 from softmode.checks import require_number
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.model.authoring import NAMESPACE, add_pins, attribute_values, body_key, bulk_stiffness
+from softmode.deformables.model.layout import Layout
+from softmode.deformables.model.namespaces import soft
 from softmode.errors import ConfigError
+
+UNTOLD_SHARE = 0.02
+"""Fraction of a body's surface up to which pins may hold it where the build was not told of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,3 +148,47 @@ def _coordinates(builder: newton.ModelBuilder, instance: int, body: ReducedBody)
     return np.array(
         [[float(x) for x in q] for q in attribute_values(builder, "q")[start : start + body.function_count]]
     )
+
+
+def warn_untold_pins(model: newton.Model, layout: Layout) -> None:
+    """Warn of every body of which pins hold more than 2 % of the surface outside the regions that its build knew.
+
+    Smooth functions cannot stand still in one part and move beside it: such a body is too stiff, and stiffer springs
+    make it stiffer still.
+    """
+    data = soft(model)
+    if not layout.pin_max:
+        return
+    owner, point, stiffness = (getattr(data, f"pin_{name}").numpy() for name in ("instance", "point", "stiffness"))
+    told: set[tuple[int, bytes]] = set()
+    for instance in np.unique(owner[stiffness > 0.0]):
+        asset, X = int(layout.asset[instance]), point[(owner == instance) & (stiffness > 0.0)]
+        if (key := (asset, X.tobytes())) in told:
+            continue
+        told.add(key)
+        share = untold_share(layout.bodies[asset], X)
+        if share > UNTOLD_SHARE:
+            warnings.warn(
+                f"pins hold {share:.0%} of the surface of body {layout.bodies[asset].name!r} (instance {instance}), "
+                "which was not built to be held there, and is too stiff; build it with regions=[Region(...)], or use "
+                "softmode.deformables.hold(body, Region(...))",
+                UserWarning,
+                stacklevel=4,
+            )
+
+
+def untold_share(body: ReducedBody, points: np.ndarray, reach: float = 0.0) -> float:
+    """Return the fraction of a body's surface that points hold, except in regions that its build knew.
+
+    Args:
+        body: The body.
+        points: Held points of its rest frame [m], shape (N, 3).
+        reach: How far a point holds what is around it [m], at least the distance between samples of the surface.
+    """
+    spacing = float(np.sqrt(body.surface_areas.mean()))
+    for region in body.regions:
+        points = points[region.distance(points)[0] > spacing]
+    if not len(points):
+        return 0.0
+    apart = KDTree(points).query(body.surface_points)[0]
+    return float(body.surface_areas[apart <= max(spacing, reach)].sum() / body.surface_areas.sum())

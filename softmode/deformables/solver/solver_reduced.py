@@ -18,6 +18,7 @@ from softmode.deformables.model.namespaces import SoftControl, soft
 from softmode.deformables.model.rigid_dofs import RigidDofs
 from softmode.deformables.model.tables import present
 from softmode.deformables.solver import finish as last_phase
+from softmode.deformables.solver.attachments import warn_untold_pins
 from softmode.deformables.solver.detect import detect
 from softmode.deformables.solver.minimise import minimise
 from softmode.deformables.solver.observables import ReducedObservableKind, ReducedObservables
@@ -73,6 +74,7 @@ class SolverReduced(ReducedSolver):
         super().__init__(model, allocate_tables(model, bodies, options or SolverReducedOptions(), rigid))
         self._prescribed = True
         self._check_materials()
+        warn_untold_pins(model, self.tables.layout)
         self.refresh()
 
     def _check_materials(self) -> None:
