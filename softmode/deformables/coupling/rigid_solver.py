@@ -1,4 +1,4 @@
-"""MuJoCo's step in two halves: what the joint solve needs of ``SolverMuJoCo`` that has no public name yet."""
+"""What the joint solve needs of ``SolverMuJoCo`` besides its public names: a step in two halves, what it dropped."""
 
 import warnings
 from collections.abc import Callable, Generator
@@ -48,3 +48,10 @@ def second_half(rigid: SolverMuJoCo) -> Callable[[], AbstractContextManager[None
                 del vars(rigid)["_mujoco_warp_step"]
 
     return from_forces_on
+
+
+def dropping_overflows() -> int:
+    """Return the bits of MuJoCo Warp's ``Data.overflow`` with which contacts or constraint rows are dropped."""
+    from mujoco_warp import OverflowType as Kind
+
+    return int(Kind.NEFC | Kind.NJMAX_NNZ | Kind.BROADPHASE | Kind.NARROWPHASE | Kind.CCD)

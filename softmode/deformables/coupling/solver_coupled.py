@@ -32,7 +32,7 @@ from newton.solvers import SolverBase, SolverMuJoCo
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.coupling import coupling_kernels as kernels
-from softmode.deformables.coupling.rigid_solver import second_half
+from softmode.deformables.coupling.rigid_solver import dropping_overflows, second_half
 from softmode.deformables.model.declare import WRENCH
 from softmode.deformables.model.rigid_dofs import RigidDofs
 from softmode.deformables.model.tables import allocate, host, present
@@ -58,7 +58,7 @@ class SolverCoupledReduced(ReducedSolver):
         bodies: The reduced bodies used in the model.
         options: How the soft step is solved.
         rigid: The MuJoCo solver; default ``SolverMuJoCo(model)``, whose room for contacts is MuJoCo's guess from the
-            initial state: if it prints "nefc overflow", pass ``SolverMuJoCo(model, njmax=..., nconmax=...)``.
+            initial state: where the status is "rigid_overflow", pass ``SolverMuJoCo(model, njmax=..., nconmax=...)``.
 
     Attributes:
         reduced: The :class:`SolverReduced` inside.
@@ -90,7 +90,7 @@ class SolverCoupledReduced(ReducedSolver):
         super().__init__(model, self.reduced.tables)
         device, count = model.device, model.joint_dof_count
         self.predicted_state = model.state()
-        self._from_forces_on = second_half(self.rigid)
+        self._from_forces_on, self._dropping = second_half(self.rigid), dropping_overflows()
         self._joint_S = wp.zeros(count, dtype=WRENCH, device=device)
         self._body_f = wp.zeros(model.body_count, dtype=WRENCH, device=device)
         self._damping = wp.zeros(count, dtype=float, device=device)
@@ -226,7 +226,7 @@ class SolverCoupledReduced(ReducedSolver):
         """Let the joint dofs take part where a soft body is near a rigid one, and evaluate their inertia there."""
         t, dofs = self.tables, self.tables.rigid
         self._any_coupled.zero_()
-        near = (t.instances, t.newton, t.constraints, dofs.dof_count)
+        near = (t.instances, t.newton, t.constraints, dofs.dof_count, self.rigid.mjw_data.overflow, self._dropping)
         t.launch(kernels.find_coupled, self.world_count, *near, dofs.table, self._any_coupled)
         self._branch(self._any_coupled, self._linearise, state=state, dt=dt)
 
@@ -285,7 +285,9 @@ class SolverCoupledReduced(ReducedSolver):
                 continue
             rows, width = len(world), source.size * wp.types.type_size_in_bytes(source.dtype) // 4 // len(world)
             flat = [wp.array(ptr=x.ptr, shape=rows * width, dtype=float, device=x.device) for x in (source, target)]
-            self.tables.launch(kernels.keep_prediction, (rows, width), self._pushed, world, width, *flat)
+            self.tables.launch(
+                kernels.keep_prediction, (rows, width), self._pushed, world, width, *flat, self.reduced.status
+            )
 
     def notify_model_changed(self, flags: int) -> None:
         """Pass the change on to both solvers."""
