@@ -285,9 +285,8 @@ class SolverCoupledReduced(ReducedSolver):
                 continue
             rows, width = len(world), source.size * wp.types.type_size_in_bytes(source.dtype) // 4 // len(world)
             flat = [wp.array(ptr=x.ptr, shape=rows * width, dtype=float, device=x.device) for x in (source, target)]
-            self.tables.launch(
-                kernels.keep_prediction, (rows, width), self._pushed, world, width, *flat, self.reduced.status
-            )
+            kept = (self._pushed, world, width, *flat, self.reduced.status)
+            self.tables.launch(kernels.keep_prediction, (rows, width), *kept)
 
     def notify_model_changed(self, flags: int) -> None:
         """Pass the change on to both solvers."""

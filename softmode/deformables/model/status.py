@@ -16,6 +16,9 @@ WORLD_RIGID_NOT_FINITE = 32
 """Status bit: a coordinate, pose or velocity of a rigid body is not finite; only a reset mends it."""
 WORLD_RIGID_OVERFLOW = 64
 """Status bit: MuJoCo dropped contacts or constraint rows between rigid bodies, for which it had no room."""
+WORLD_PARAMETER_RANGE = 128
+"""Status bit: a parameter of a soft body is no number, infinite or outside the range of ``Material``, as one written
+into ``model.softmode`` may be."""
 
 REASONS = {
     WORLD_ITERATION_LIMIT: "iteration_limit",
@@ -25,6 +28,7 @@ REASONS = {
     WORLD_COLLAPSED: "collapsed",
     WORLD_RIGID_NOT_FINITE: "rigid_not_finite",
     WORLD_RIGID_OVERFLOW: "rigid_overflow",
+    WORLD_PARAMETER_RANGE: "parameter_range",
 }
 """Name of every status bit, as ``info`` of the environments gives it."""
 
@@ -36,6 +40,7 @@ REMEDIES = {
     WORLD_COLLAPSED: "reduce the load, raise E or nu",
     WORLD_RIGID_NOT_FINITE: "look for NaN in drives, forces and teleported bodies; reset the world",
     WORLD_RIGID_OVERFLOW: "pass rigid=SolverMuJoCo(model, njmax=..., nconmax=...)",
+    WORLD_PARAMETER_RANGE: "write parameters by set_parameters, which clamps them",
 }
 """What to do about every status bit."""
 
