@@ -62,9 +62,7 @@ def given(count, where=None):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1.5])
-@pytest.mark.parametrize(
-    "name", ["youngs_modulus", "poissons_ratio", "viscosity", "mass_damping", "friction", "density"]
-)
+@pytest.mark.parametrize("name", MATERIAL_FIELDS)
 def test_a_bad_parameter_written_into_the_model_is_flagged(name, bad):
     """Of three worlds in a replayed graph the one whose parameter left its range, and no other, says so."""
     scene = falling(world_count=3)

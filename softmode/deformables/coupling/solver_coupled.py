@@ -32,7 +32,7 @@ from newton.solvers import SolverBase, SolverMuJoCo
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.coupling import coupling_kernels as kernels
-from softmode.deformables.coupling.rigid_solver import dropping_overflows, second_half
+from softmode.deformables.coupling.rigid_solver import dropping_overflows, mujoco_warnings, second_half
 from softmode.deformables.model.declare import WRENCH
 from softmode.deformables.model.rigid_dofs import RigidDofs
 from softmode.deformables.model.tables import allocate, host, present
@@ -79,7 +79,8 @@ class SolverCoupledReduced(ReducedSolver):
         """Build both solvers and tie the joint dofs into the reduced one."""
         if model.joint_dof_count == 0:
             raise ConfigError("model has no joint dofs to couple with", hint="use SolverReduced")
-        self.rigid = rigid or SolverMuJoCo(model)
+        with mujoco_warnings():
+            self.rigid = rigid or SolverMuJoCo(model)
         if self.rigid.use_mujoco_cpu:
             raise ConfigError(
                 "the rigid solver runs MuJoCo in C, which shows its constraints to no kernel",
@@ -291,7 +292,8 @@ class SolverCoupledReduced(ReducedSolver):
     def notify_model_changed(self, flags: int) -> None:
         """Pass the change on to both solvers."""
         self.reduced.notify_model_changed(flags)
-        self.rigid.notify_model_changed(flags)
+        with mujoco_warnings():
+            self.rigid.notify_model_changed(flags)
         self._bind()
 
     def reset(
