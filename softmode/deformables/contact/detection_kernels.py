@@ -500,7 +500,9 @@ def gather_contacts(
             partner_mass = float(0.0)
             if body >= 0 and prescribed == 0:
                 partner_mass = shapes.body_mass[body]
-            kappa = stiffness_per_area(instances, i, partner_mass, shape_area(shapes, shape), dt)
+            kappa = stiffness_per_area(
+                instances, i, basis.row_stiffness[row], partner_mass, shape_area(shapes, shape), dt
+            )
             stiffness = wp.float64(kappa * sample_area(instances.scale[i], basis.row_area[row]))
             slip, anchor = remembered_slip(
                 shapes,

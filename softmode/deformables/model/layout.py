@@ -8,6 +8,7 @@ from typing import Any
 import newton
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.model.authoring import CONTACT_FIELDS, MATERIAL_FIELDS, body_key
@@ -195,6 +196,7 @@ def lay_out_bases(model: newton.Model, layout: Layout) -> Basis:
         "row": blocks(np.concatenate([padded([body.surface_basis for body in bodies]), pin_rows, dynamic])),
         "row_point": np.concatenate([joined("surface_points"), pin_points]),
         "row_area": np.append(joined("surface_areas"), np.zeros(len(pin_points))),
+        "row_stiffness": np.concatenate([_surface_stiffness(body) for body in bodies]),
         "inner_row": blocks(padded(inner_rows)),
         "inner_point": np.concatenate(inner),
     }
@@ -211,6 +213,11 @@ def lay_out_bases(model: newton.Model, layout: Layout) -> Basis:
 def _size(body: ReducedBody) -> float:
     """Return the diagonal of a body's bounds [m]."""
     return float(np.linalg.norm(np.ptp(body.bounds, axis=0)))
+
+
+def _surface_stiffness(body: ReducedBody) -> np.ndarray:
+    """Return Young's modulus at the surface samples relative to the body's: that of the nearest cubature point."""
+    return body.stiffness_scale[KDTree(body.points).query(body.surface_points)[1]]
 
 
 def _padded(values: np.ndarray, stride: int) -> np.ndarray:
