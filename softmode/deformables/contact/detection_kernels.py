@@ -432,6 +432,7 @@ def gather_contacts(
     basis: Basis,
     shapes: Shapes,
     samples: Samples,
+    relative_stiffness: wp.array[float],  # (sample_total,), Young's modulus relative to the body's
     constraint_max: int,
     prescribed: int,
     stick_ratio: wp.float64,
@@ -501,7 +502,7 @@ def gather_contacts(
             if body >= 0 and prescribed == 0:
                 partner_mass = shapes.body_mass[body]
             kappa = stiffness_per_area(
-                instances, i, basis.row_stiffness[row], partner_mass, shape_area(shapes, shape), dt
+                instances, i, relative_stiffness[row], partner_mass, shape_area(shapes, shape), dt
             )
             stiffness = wp.float64(kappa * sample_area(instances.scale[i], basis.row_area[row]))
             slip, anchor = remembered_slip(

@@ -196,7 +196,6 @@ def lay_out_bases(model: newton.Model, layout: Layout) -> Basis:
         "row": blocks(np.concatenate([padded([body.surface_basis for body in bodies]), pin_rows, dynamic])),
         "row_point": np.concatenate([joined("surface_points"), pin_points]),
         "row_area": np.append(joined("surface_areas"), np.zeros(len(pin_points))),
-        "row_stiffness": np.concatenate([_surface_stiffness(body) for body in bodies]),
         "inner_row": blocks(padded(inner_rows)),
         "inner_point": np.concatenate(inner),
     }
@@ -210,14 +209,19 @@ def lay_out_bases(model: newton.Model, layout: Layout) -> Basis:
     return basis
 
 
+def surface_stiffness(bodies: Sequence[ReducedBody]) -> np.ndarray:
+    """Return Young's modulus at the surface samples of all bodies relative to the body's, shape (sample_total,).
+
+    That of the nearest cubature point. Contact alone reads it, so that it is no part of ``Basis``: a CPU kernel copies
+    its structs in every thread.
+    """
+    nearest = [KDTree(body.points).query(body.surface_points)[1] for body in bodies]
+    return np.concatenate([body.stiffness_scale[index] for body, index in zip(bodies, nearest, strict=True)])
+
+
 def _size(body: ReducedBody) -> float:
     """Return the diagonal of a body's bounds [m]."""
     return float(np.linalg.norm(np.ptp(body.bounds, axis=0)))
-
-
-def _surface_stiffness(body: ReducedBody) -> np.ndarray:
-    """Return Young's modulus at the surface samples relative to the body's: that of the nearest cubature point."""
-    return body.stiffness_scale[KDTree(body.points).query(body.surface_points)[1]]
 
 
 def _padded(values: np.ndarray, stride: int) -> np.ndarray:

@@ -34,7 +34,6 @@ class Basis:
     row: wp.array2d[vec8]  # (row_total, block_count): surface samples of all bodies, then pins, then dynamic rows
     row_point: wp.array[wp.vec3d]  # (row_total,) [m]
     row_area: wp.array[float]  # (row_total,) [m^2]
-    row_stiffness: wp.array[float]  # (sample_total,), Young's modulus at a surface sample relative to the body's
     row_normal: wp.array[wp.vec3]  # (sample_total,), outward at rest; only where soft bodies may touch each other
     row_gradient: wp.array3d[vec8]  # (block_count, sample_total, 3) [1/m], likewise
     inner_row: wp.array2d[vec8]  # (sample_total, block_count), difference to a point inside the body
