@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from softmode.deformables.materials.material import Material
     from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
     from softmode.deformables.model.status import status_reasons
+    from softmode.deformables.model.velocities import set_velocity
     from softmode.deformables.skinning.skin_splats import SkinSplats, average_basis
     from softmode.deformables.skinning.skinning_adjoint import AdjointSkinning
     from softmode.deformables.solver.attachments import Attachment, attach
@@ -97,6 +98,7 @@ __all__ = [
     "report_body",
     "rollout",
     "set_parameters",
+    "set_velocity",
     "solve_eigenmodes",
     "status_reasons",
 ]

@@ -451,7 +451,8 @@ class Task:
         self.any_done.zero_()
         self.evaluate()
         status, lowest = scene.solver.status, scene.soft.height - FALL
-        inputs = [fresh, self.limit, bits.WORLD_NOT_FINITE, status, self.finite, self.state, lowest]
+        not_finite = bits.WORLD_NOT_FINITE | bits.WORLD_RIGID_NOT_FINITE
+        inputs = [fresh, self.limit, not_finite, status, self.finite, self.state, lowest]
         self.launch(kernels.finish_step, inputs, [self.result, self._episode])
 
     def _keep_pictures(self) -> None:

@@ -230,7 +230,7 @@ def forget(
 def finish_step(
     fresh: wp.array[wp.bool],  # worlds whose step was a reset
     limit: int,  # steps per episode, 0 for none
-    not_finite: int,  # status bit
+    not_finite: int,  # status bits
     status: wp.array[int],
     finite: wp.array[wp.bool],
     state: WorldState,

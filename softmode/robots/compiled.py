@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from softmode.deformables.coupling.rigid_solver import mujoco_warnings
 from softmode.errors import AssetError, ConfigError
 from softmode.robots.assets import RobotAsset
 from softmode.robots.description import JointDrive, RobotGripper, ToolPose
@@ -93,7 +94,8 @@ class CompiledRobot:
         """Return the kinematics at a pose."""
         data = self.mujoco.MjData(self.model)
         data.qpos[:] = joint_q + self.reference
-        self.mujoco.mj_forward(self.model, data)
+        with mujoco_warnings():
+            self.mujoco.mj_forward(self.model, data)
         return data
 
     def tool(self, name: str | None, offset: np.ndarray) -> tuple[int, ToolPose]:

@@ -10,6 +10,7 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from softmode.checks import require_number
+from softmode.deformables.coupling.rigid_solver import mujoco_warnings
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import register_custom_attributes
@@ -171,7 +172,8 @@ class TableScene:
     def _build_solver(self) -> None:
         """Make the coupled solver, the controller and the buffers of a control step."""
         config, model, worlds = self.config, self.model, self.world_count
-        rigid = SolverMuJoCo(model, njmax=config.constraint_max, nconmax=config.rigid_contact_max)
+        with mujoco_warnings():
+            rigid = SolverMuJoCo(model, njmax=config.constraint_max, nconmax=config.rigid_contact_max)
         distinct = list({id(thing.body): thing.body for thing in self.objects}.values())
         self.solver = SolverCoupledReduced(model, distinct, options=config.solver, rigid=rigid)
         self.state: Any = model.state()

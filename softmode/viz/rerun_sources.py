@@ -215,7 +215,7 @@ def solver_scalars(solver: ReducedSolver, world: int) -> Numbers:
 
 def solver_remarks(solver: ReducedSolver, world: int) -> list[tuple[str, str]]:
     """Return the names of the status bits that are set."""
-    reasons = status_reasons(int(solver.status.numpy()[world]))
+    reasons = status_reasons(int(solver.status.numpy()[world]), remedies=True)
     return [("WARN", f"solver: {', '.join(reasons)}")] if reasons else []
 
 

@@ -111,6 +111,43 @@ def test_release_of_one_world_in_a_recorded_graph():
     assert batch.centre(1)[2] < -0.01
 
 
+def test_an_attachment_is_moved_in_a_recorded_graph():
+    """Poses written between replays carry the glued top along, each world its own; one that is not moved keeps bits."""
+    body, kept = cube(), []
+
+    def populate(world):
+        instance = add_reduced_body(world, body, position=(0.2, 0.0, 1.0), material=Material(mass_damping=20.0))
+        kept.append(attach(world, instance, body, box=TOP))
+
+    scene, still = (Scene(populate, [body], gravity=DOWN, world_count=2) for _ in range(2))
+    poses = wp.array([wp.transform_identity()] * 2, dtype=wp.transform, device="cpu")
+    with wp.ScopedCapture(device="cpu") as capture:
+        scene.solver.move(kept[0], scene.control, poses)
+        for _ in range(2):
+            scene.step()
+    scene.solver.reset(scene.state)
+    shift = np.array([0.05, 0.02, -0.1])
+    for k in range(1, 101):
+        turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), 0.01 * min(k, 80))
+        move = wp.transform(wp.vec3(shift * min(k, 80) / 80), turn)
+        poses.assign([wp.transform_identity(), move])
+        wp.capture_launch(capture.graph)
+        still.step(2)
+    for name in ("q", "qd"):
+        np.testing.assert_array_equal(getattr(scene, name)(0), getattr(still, name)(0))
+    top = body.surface_points[:, 2] >= TOP[0][2]
+    hung, moved = scene.state.particle_q.numpy().reshape(2, -1, 3)[:, top].astype(float)
+    np.testing.assert_allclose(moved, hung @ rotation((0, 0, 1), 0.8).T + shift, atol=1e-3 * EDGE)
+    poses.fill_(wp.transform_identity())
+    scene.solver.move(kept[0], scene.control, poses)
+    np.testing.assert_array_equal(scene.control.softmode.pin_target.numpy(), scene.model.softmode.pin_target.numpy())
+    for wrong in ([wp.transform_identity()] * 2, wp.zeros(2, dtype=wp.vec3, device="cpu"), poses[:1]):
+        with pytest.raises(ConfigError, match=r"pose must be a wp.array of wp.transform, shape \(2,\)"):
+            scene.solver.move(kept[0], scene.control, wrong)
+    with pytest.raises(ConfigError, match="shares its arrays"):
+        scene.solver.move(kept[0], scene.model.control(clone_variables=False), poses)
+
+
 @pytest.mark.parametrize("coupled", [True, False])
 def test_weight_on_a_moving_link(coupled):
     """Hung on a rigid body: at rest its wrench is the weight of the cube, the lever about its centre of mass included.

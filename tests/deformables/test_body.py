@@ -432,3 +432,50 @@ def test_progress_is_reported(quadrature: Quadrature, capsys) -> None:
     assert capsys.readouterr().err == ""
     build_body(quadrature, SMALL, name="bar", progress=True)
     assert "build bar" in capsys.readouterr().err
+
+
+# -- fields ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_field_of_the_span_is_projected_onto_itself(body: ReducedBody) -> None:
+    """An affine field and a sum of functions come back as they are, from values at the cubature points alone."""
+    rng = np.random.default_rng(0)
+    A, t, q = rng.normal(size=(3, 3)), rng.normal(size=3), rng.normal(size=(body.function_count, 3))
+    expected = body.affine(np.eye(3) + A, t)
+    np.testing.assert_allclose(body.project(lambda X: X @ A.T + t), expected, atol=1e-11 * np.abs(expected).max())
+    np.testing.assert_allclose(body.project(lambda X: body.evaluate(X)[0] @ q), q, atol=1e-11 * np.abs(q).max())
+
+
+def test_the_error_of_a_projected_field_falls_with_the_functions() -> None:
+    """With 4, 8 and 16 modes the error of a smooth field falls, at most a tenth above the best there is."""
+    quadrature = quadrature_from_box((0.4, 0.1, 0.1), point_count=2000, surface_count=60)
+    mass, errors = quadrature.weights / quadrature.volume, []
+
+    def field(X: np.ndarray) -> np.ndarray:
+        x, y, z = 10.0 * X.T
+        return np.stack([np.sin(2.0 * x) * y, np.cos(1.5 * x), 0.2 * x * x + y * z], axis=1)
+
+    for mode_count in (4, 8, 16):
+        options = BuildOptions(mode_count=mode_count, kernel_count=200, cubature_count=200)
+        body = build_body(quadrature, options)
+        X = quadrature.points - body.offset
+        B, v = body.evaluate(X)[0], field(X)
+        found, best = (
+            np.sqrt(mass @ ((B @ q - v) ** 2).sum(axis=1) / (mass @ (v**2).sum(axis=1)))
+            for q in (body.project(field), B.T @ (mass[:, None] * v))
+        )
+        assert best <= found < 1.1 * best
+        errors.append(found)
+        momentum = body.mean_basis @ body.project(field)
+        np.testing.assert_allclose(momentum, mass @ v, atol=2e-3 * np.abs(mass @ v).max())
+    assert errors[1] < 0.75 * errors[0] and errors[2] < 0.5 * errors[1]
+
+
+@pytest.mark.parametrize("field", [lambda X: X[:, :2], lambda X: np.full_like(X, np.nan)], ids=["shape", "nan"])
+def test_fields_that_are_none_are_refused(body: ReducedBody, field) -> None:
+    """By name, before anything is solved; too few cubature points are refused too."""
+    with pytest.raises(ConfigError, match="field: expected finite vectors"):
+        body.project(field)
+    few = dataclasses.replace(body, points=body.points[:5], weights=body.weights[:5], grad_basis=body.grad_basis[:5])
+    with pytest.raises(BasisError, match="5 cubature points tell 5 of"):
+        few.project(lambda X: X)

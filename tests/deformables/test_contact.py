@@ -1,5 +1,7 @@
 """Contact with shapes that move as prescribed: weight, friction, detection."""
 
+import dataclasses
+
 import newton
 import numpy as np
 import pytest
@@ -182,6 +184,34 @@ def test_automatic_stiffness_follows_the_parameters(dt):
     replay()
     assert stiffness_per_area(scene, 0) == pytest.approx(2.0e6, rel=1e-5)
     assert stiffness_per_area(scene, 1) == pytest.approx(reference.contact_stiffness(body, second, dt), rel=1e-5)
+
+
+@pytest.mark.parametrize("count", [1, 2], ids=["ground", "pair"])
+def test_automatic_stiffness_is_that_of_the_touching_part(count):
+    """A cube whose half is ten times as stiff touches with kappa(E) there and kappa(10 E) here; in pairs in series."""
+    jump = np.where(cube().points[:, 0] < 0.0, 1.0, 10.0)
+    body = dataclasses.replace(cube(), stiffness_scale=jump, fingerprint="a cube of two halves")
+    material, dt = Material(youngs_modulus=1.0e6), 0.02
+
+    def populate(world):
+        for k in range(count):
+            add_reduced_body(world, body, material=material, position=(0.0, 0.0, (0.5 + k) * EDGE - 1e-4))
+
+    scene = Scene(populate, [body], ground=0.5 if count == 1 else None, dt=dt)
+    scene.step()
+    entries, basis = scene.reduced.view.constraints, scene.reduced.view.basis
+    touching = slice(0, int(entries.count.numpy()[0]))
+    row = entries.row.numpy()[0, touching]
+    own = row < body.surface_count  # of a pair, the samples of the body and not those of the other
+    ratio = entries.stiffness.numpy()[0, touching][own] / basis.row_area.numpy()[row[own]]
+    x, clear = body.surface_points[row[own], 0], np.abs(body.surface_points[row[own], 0]) > 0.2 * EDGE
+    assert (x[clear] < 0.0).any() and (x[clear] > 0.0).any()
+    for side, factor in ((x < 0.0, 1.0), (x > 0.0, 10.0)):
+        part = dataclasses.replace(material, youngs_modulus=factor * material.youngs_modulus)
+        partner = material.density * body.volume if count == 2 else np.inf
+        kappa = reference.contact_stiffness(body, part, dt, partner)
+        assert kappa > 1.0e8
+        np.testing.assert_allclose(ratio[clear & side], kappa if count == 1 else 0.25 * kappa, rtol=1e-5)
 
 
 @pytest.mark.parametrize("ratio", [0.1, 10.0])

@@ -430,6 +430,57 @@ def test_not_a_number_stays_out_of_robots_and_other_worlds():
     assert np.isfinite(dirty.state.body_q.numpy()).all()
 
 
+@pytest.mark.parametrize("pushed", [False, True])
+@pytest.mark.parametrize("array", ["joint_q", "joint_qd", "body_q", "body_qd"])
+def test_a_rigid_state_that_is_not_finite_is_flagged_in_its_world(array, pushed):
+    """NaN in what MuJoCo steps is flagged in a replayed graph, pushed by a soft body or not; a reset mends the world.
+
+    MuJoCo reads joint coordinates and writes poses: a NaN in a pose or a twist is gone after the step, yet flagged.
+    """
+    scene, _ = impact(1.0, world_count=3)
+    replay = scene.capture()
+    for _ in range(2 if pushed else 0):
+        replay()
+    assert (np.abs(scene.reduced.body_wrench.numpy()[1]).max() > 0.0) == pushed
+    assert not scene.reduced.status.numpy().any()
+    values = getattr(scene.state, array)
+    spoilt = values.numpy()
+    spoilt.reshape(3, -1)[1, 2] = np.nan
+    values.assign(spoilt)
+    replay()
+    status = scene.reduced.status.numpy()
+    assert status[1] & bits.WORLD_RIGID_NOT_FINITE and not status[[0, 2]].any()
+    scene.solver.reset(scene.state)
+    replay()
+    assert not scene.reduced.status.numpy().any()
+    assert all(np.isfinite(getattr(scene.state, name).numpy()).all() for name in ("joint_q", "joint_qd", "body_q"))
+
+
+@pytest.mark.parametrize("limits", [{"njmax": 12}, {"nconmax": 2, "njmax": 64}], ids=["rows", "contacts"])
+def test_what_mujoco_drops_is_flagged(limits):
+    """Four contacts of a box on the ground in too little room are flagged in a graph; with room nothing is.
+
+    Rows are counted per world; room for contacts is shared, so that a world in flight is flagged with the others.
+    """
+
+    def populate(world):
+        add_free_box(world, (0.05,) * 3, 1.0, (0.3, 0.0, 0.5))
+        add_reduced_body(world, cube(), position=(0.0, 0.0, EDGE))
+
+    def flags(**mujoco):
+        scene = Scene(populate, [cube()], coupled=True, world_count=2, gravity=DOWN, ground=0.5, mujoco=mujoco)
+        replay, joint_q = scene.capture(), scene.state.joint_q.numpy()
+        joint_q[2] = 0.05  # the first world's box stands on the ground
+        scene.state.joint_q.assign(joint_q)
+        replay()
+        return scene.reduced.status.numpy()
+
+    flagged = flags(**limits) & bits.WORLD_RIGID_OVERFLOW
+    assert flagged[0] and bool(flagged[1]) == ("nconmax" in limits)
+    assert not flags(njmax=64, nconmax=32).any()
+    assert "SolverMuJoCo(model, njmax=..., nconmax=...)" in bits.status_reasons(int(flagged[0]), remedies=True)[0]
+
+
 def test_reset_restores_both():
     """A reset puts soft and rigid bodies back to their initial state; the run that follows repeats the first."""
     scene, _ = impact(1.0)

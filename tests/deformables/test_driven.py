@@ -5,6 +5,7 @@ import functools
 import newton
 import numpy as np
 import pytest
+import warp as wp
 
 from softmode.deformables.body.regions import Region
 from softmode.deformables.build.build_body import build_body
@@ -81,6 +82,22 @@ def test_driven_regions_follow_their_poses():
     assert not scene.reduced.status.numpy().any()
     middle = body.evaluate(np.array([[0.0, 0.0, 0.5 * EDGE]]))[0] @ scene.q()
     assert 0.2 < -middle[0, 1] / (0.5 * EDGE) < 0.8  # about half of the radian
+
+
+def test_driven_regions_are_moved_between_replays_of_a_graph():
+    """What ``q_driven`` holds when a graph is replayed counts: written by drive_regions, or copied on the device."""
+    body = held_bar()
+    scene = scene_of(body, dt=0.01)
+    replay = scene.capture()
+    for k in range(1, 6):
+        drive_regions(scene.model, scene.control, 0, body, np.eye(3)[None], np.array([[0.002 * k, 0.0, 0.0]]))
+        replay()
+        x, X = region_positions(scene, "left")
+        np.testing.assert_allclose(x, X + np.array([0.002 * k, 0.0, 0.0]), atol=8 * FLOAT32 * LENGTH)
+    wp.copy(scene.control.softmode.q_driven, scene.model.softmode.q)
+    replay()
+    x, X = region_positions(scene, "left")
+    np.testing.assert_allclose(x, X, atol=8 * FLOAT32 * LENGTH)
 
 
 def test_soft_region_is_held_by_its_pins():

@@ -6,7 +6,8 @@ import pytest
 import warp as wp
 
 from softmode.deformables.materials.material import Material
-from softmode.deformables.model.authoring import add_pins, add_reduced_body
+from softmode.deformables.model import status as bits
+from softmode.deformables.model.authoring import MATERIAL_FIELDS, add_pins, add_reduced_body
 from softmode.deformables.solver.parameters import PARAMETER_FLAGS, PARAMETER_LIMITS, ShapeFriction, set_parameters
 from softmode.errors import ConfigError
 from tests.deformables.test_many_bodies import clamped
@@ -58,6 +59,30 @@ def given(count, where=None):
         values[where if where is not None else slice(None)] = value
         out[name] = device(values)
     return out
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -1.5])
+@pytest.mark.parametrize("name", MATERIAL_FIELDS)
+def test_a_bad_parameter_written_into_the_model_is_flagged(name, bad):
+    """Of three worlds in a replayed graph the one whose parameter left its range, and no other, says so."""
+    scene = falling(world_count=3)
+    replay = scene.capture()
+    replay()
+    assert not scene.reduced.status.numpy().any()
+    array = getattr(scene.model.softmode, name)
+    values = array.numpy()
+    values[1] = bad
+    array.assign(values)
+    scene.solver.notify_model_changed(0)  # density counts from here on
+    replay()
+    status = scene.reduced.status.numpy() & bits.WORLD_PARAMETER_RANGE
+    assert status[1] and not status[[0, 2]].any()
+    values[1] = GIVEN.get(name, 0.0)
+    array.assign(values)
+    scene.solver.notify_model_changed(0)
+    scene.solver.reset(scene.state)
+    replay()
+    assert not scene.reduced.status.numpy().any()
 
 
 def test_masked_update_in_a_captured_run():

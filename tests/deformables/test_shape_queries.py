@@ -344,6 +344,8 @@ def test_status_reasons():
     """Every status bit has a name; several come lowest first; an unknown bit is refused."""
     every = [value for name, value in vars(bits).items() if name.startswith("WORLD_")]
     assert sorted(bits.REASONS) == sorted(every) and len(set(bits.REASONS.values())) == len(every)
+    assert sorted(bits.REMEDIES) == sorted(bits.REASONS)
+    assert bits.status_reasons(bits.WORLD_CONTACT_OVERFLOW, remedies=True) == ("contact_overflow (raise contact_max)",)
     assert bits.status_reasons(0) == ()
     assert bits.status_reasons(bits.WORLD_NOT_FINITE | bits.WORLD_CONTACT_OVERFLOW) == (
         "contact_overflow",

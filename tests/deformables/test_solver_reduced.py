@@ -10,6 +10,7 @@ from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model import status as bits
 from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
 from softmode.deformables.model.lane_kernels import from_blocks, to_blocks
+from softmode.deformables.model.velocities import set_velocity
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.errors import ConfigError
@@ -528,6 +529,83 @@ def test_not_a_number_stays_in_its_world(array):
             np.testing.assert_array_equal(dirty.qd(i), clean.qd(i))
     if array == "qd":  # the pose was sound: the world stands still at it
         assert np.isfinite(dirty.q(1)).all()
+
+
+# -- velocities --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.3])
+def test_a_velocity_field_that_is_affine_is_one_exactly(scale):
+    """A rigid motion as a field over rest points is the same velocity; momentum and energy are the closed form.
+
+    Of a field A X + v: momentum m v, energy m/2 (v^2 + tr(A J A^T) / m) with J the second moments of the mass.
+    """
+    body, R, material = cube(), rotation((1, 2, 3), 0.7), Material()
+    v, omega = np.array([0.3, -0.2, 0.5]), np.array([1.0, -2.0, 0.5])
+    A = np.random.default_rng(0).normal(size=(3, 3))
+
+    def scene(**given):
+        def populate(world):
+            add_reduced_body(world, body, rotation=R, position=(0.1, 0.2, 0.3), scale=scale, **given)
+
+        return Scene(populate, [body])
+
+    rigid = scene(velocity=v, angular_velocity=omega)
+    field = scene(velocity_field=lambda X: v + np.cross(omega, X @ R.T))
+    np.testing.assert_allclose(field.qd(), rigid.qd(), atol=1e-12)
+    particles = [s.state.particle_qd.numpy() for s in (field, rigid)]
+    np.testing.assert_allclose(*particles, atol=4 * FLOAT32 * np.abs(particles[1]).max())
+    sheared = scene(velocity=v, velocity_field=lambda X: X @ A.T)
+    mass, linear = material.density * scale**3 * body.volume, body.linear_coordinates
+    J = mass * scale**2 * linear[:, :3].T @ linear[:, :3]  # the functions are orthonormal in mass
+    np.testing.assert_allclose(sheared.momentum()[0], mass * v, rtol=1e-6)
+    np.testing.assert_allclose(sheared.kinetic_energy(), 0.5 * (mass * v @ v + np.trace(A @ J @ A.T)), rtol=1e-6)
+
+
+def test_set_velocity_turns_a_deformed_body_about_its_centre():
+    """Momentum m v, spin I omega of the deformed body, exactly; in free flight it goes on from there."""
+    scene = single(world_count=2)
+    scatter(scene)
+    other = scene.qd(1)
+    v, omega = np.array([0.3, -0.2, 0.5]), np.array([1.0, -2.0, 0.5])
+    set_velocity(scene.model, scene.state, 0, cube(), velocity=v, angular_velocity=omega)
+    y, centre = scene.q(0) + cube().linear_coordinates[:, :3], scene.centre(0)
+    moments = scene.mass() * (y.T @ y - np.outer(centre, centre))  # int rho (x - c)(x - c)^T
+    p, L = scene.momentum()
+    np.testing.assert_allclose(p, scene.mass() * v, rtol=1e-12)
+    spin = (np.trace(moments) * np.eye(3) - moments) @ omega
+    np.testing.assert_allclose(L - np.cross(centre, p), spin, atol=1e-12 * np.abs(spin).max())
+    energy = 0.5 * (scene.mass() * v @ v + omega @ spin)
+    np.testing.assert_allclose(scene.kinetic_energy(), energy, rtol=1e-12)
+    np.testing.assert_array_equal(scene.qd(1), other)
+    moved = cube().surface_basis @ scene.qd(0)
+    found = scene.state.particle_qd.numpy()[: cube().surface_count]
+    np.testing.assert_allclose(found, moved, atol=4 * FLOAT32 * np.abs(moved).max())
+    squeezed = lambda X: -0.1 * X  # noqa: E731
+    set_velocity(scene.model, scene.state, 0, cube(), velocity=v, velocity_field=squeezed)
+    np.testing.assert_allclose(scene.qd(0), cube().affine(0.9 * np.eye(3), v), atol=1e-12)
+    scene.step(3)
+    np.testing.assert_allclose(scene.momentum()[0], scene.mass() * v, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"instance": 1}, "1 soft bodies, got 1"),
+        ({"body": bar}, "instance 0 is not of body 'bar'"),
+        ({"velocity": (0.0, np.nan, 0.0)}, "velocity must be three finite"),
+        ({"angular_velocity": (0.0, 0.0)}, "angular_velocity must be three finite"),
+        ({"velocity_field": lambda X: X[0]}, "field: expected finite vectors"),
+    ],
+    ids=str,
+)
+def test_bad_velocities(changes, match):
+    """What set_velocity cannot take is refused by name."""
+    scene = single()
+    arguments = {"model": scene.model, "state": scene.state, "instance": 0, "body": cube} | changes
+    arguments["body"] = arguments["body"]()
+    with pytest.raises(ConfigError, match=match):
+        set_velocity(**arguments)
 
 
 # -- errors ------------------------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
+from softmode.deformables.model import status as bits
 from softmode.envs.end_reason import EndReason
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
@@ -30,17 +31,19 @@ def actions(count: int, num_envs: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-1.0, 1.0, (count, num_envs, 5)).astype(np.float32)
 
 
-def poison(env: SoftVectorEnv, world: int) -> None:
-    """Make one world's object not a number."""
-    q = env.task.scene.state.softmode.q
-    count = env.task.scene.soft.body.function_count
-    values = q.numpy().copy()
+def poison(env: SoftVectorEnv, world: int, part: str) -> None:
+    """Make one world's object, or the velocity of its arm, not a number."""
+    state = env.task.scene.state
+    array = state.softmode.q if part == "object" else state.joint_qd
+    values = array.numpy().copy()
+    count = len(values) // env.num_envs
     values[world * count : (world + 1) * count] = np.nan
-    q.assign(values)
+    array.assign(values)
 
 
+@pytest.mark.parametrize("part", ["object", "arm"])
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_a_world_that_is_not_finite_is_reset_alone(mode: AutoresetMode) -> None:
+def test_a_world_that_is_not_finite_is_reset_alone(mode: AutoresetMode, part: str) -> None:
     """NaN ends that world's episode as DIVERGED, the next one is sound, the others keep every bit."""
     env, broken, steps = make(3, autoreset_mode=mode, max_episode_steps=50), 1, 8
     runs: list[list[Any]] = []
@@ -49,7 +52,7 @@ def test_a_world_that_is_not_finite_is_reset_alone(mode: AutoresetMode) -> None:
         run = []
         for step, action in enumerate(actions(steps, 3)):
             if poisoned and step == 3:
-                poison(env, broken)
+                poison(env, broken, part)
             run.append(env.step(action))
         runs.append(run)
     env.close()
@@ -63,6 +66,9 @@ def test_a_world_that_is_not_finite_is_reset_alone(mode: AutoresetMode) -> None:
     info = runs[1][3][4]
     reasons = info["final_info"]["end_reason"] if mode == AutoresetMode.SAME_STEP else info["end_reason"]
     assert reasons[broken] == EndReason.DIVERGED
+    if mode == AutoresetMode.SAME_STEP:
+        flag = bits.WORLD_NOT_FINITE if part == "object" else bits.WORLD_RIGID_NOT_FINITE
+        assert info["final_info"]["solver_status"][broken] & flag
     assert (runs[1][-1][0][broken] != 0.0).any() and runs[1][-1][4]["solver_status"][broken] == 0
 
 

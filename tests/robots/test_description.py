@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -332,3 +333,32 @@ def test_urdf_mesh_that_is_missing(tmp_path):
     path = write_urdf(tmp_path, URDF.replace("wedge.stl", "spoon.stl"))
     with pytest.raises(AssetError, match=r"spoon\.stl.*does not exist"):
         robots.load(path, asset_root=tmp_path)
+
+
+SINGULAR = """<mujoco><worldbody>
+  <body name="light"><joint name="first"/><inertial mass="1e-14" pos="0 0 0" diaginertia="2e-15 2e-15 2e-15"/>
+    <body name="heavy"><joint name="second"/><inertial mass="100" pos="0 0 0" diaginertia="100 100 100"/></body>
+  </body>
+</worldbody></mujoco>"""
+"""Two links on one axis, the first of which weighs next to nothing: MuJoCo warns of a singular inertia matrix."""
+
+
+@pytest.mark.filterwarnings("ignore:Inertia matrix:UserWarning")  # of MuJoCo's compiler, which warns in Python
+def test_warnings_of_mujoco_are_pythons(tmp_path, monkeypatch):
+    """They write no MUJOCO_LOG.TXT, are errors where warnings are, and leave a handler of the user's in its place."""
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "singular.xml"
+    file.write_text(SINGULAR)
+    with pytest.warns(RuntimeWarning, match="MuJoCo: Inertia matrix is too close to singular"):
+        robots.load(file, end_effector="heavy")
+    with warnings.catch_warnings(), pytest.raises(RuntimeWarning, match="singular"):
+        warnings.simplefilter("error", RuntimeWarning)
+        robots.load(file, end_effector="heavy")
+    assert mujoco.get_mju_user_warning() is None
+    own: list[str] = []
+    mujoco.set_mju_user_warning(own.append)
+    try:
+        robots.load(file, end_effector="heavy")
+    finally:
+        mujoco.set_mju_user_warning(None)
+    assert own and not (tmp_path / "MUJOCO_LOG.TXT").exists()

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -285,6 +285,32 @@ class ReducedBody:
         if a.shape != (3, 3) or t.shape != (3,):
             raise ConfigError(f"matrix (3, 3) and translation (3,): got shapes {a.shape} and {t.shape}")
         return self.linear_coordinates @ np.vstack([(a - np.eye(3)).T, t])
+
+    def project(self, field: Callable[[Array], ArrayLike]) -> Array:
+        """Return the coordinates (n, 3) of the vector field, of the functions' span, that is nearest to a given one.
+
+        Nearest in the mean square over the volume, summed over the cubature points. A field of the span comes back as
+        it is, affine ones among them.
+
+        Args:
+            field: Vectors (N, 3) at rest points of the body frame [m], shape (N, 3).
+
+        Raises:
+            ConfigError: If the vectors are not finite or of another shape.
+            BasisError: If the cubature points are too few to tell the functions apart.
+        """
+        vectors = np.asarray(field(self.points), dtype=np.float64)
+        if vectors.shape != self.points.shape or not np.isfinite(vectors).all():
+            raise ConfigError(f"field: expected finite vectors {self.points.shape}, got shape {vectors.shape}")
+        root = np.sqrt(self.weights)[:, None]
+        solved: Any = np.linalg.lstsq(root * self.evaluate(self.points)[0], root * vectors, rcond=None)
+        found, _, rank, _ = solved
+        if rank < self.function_count:
+            raise BasisError(
+                f"{self.point_count} cubature points tell {rank} of {self.function_count} functions apart",
+                hint="build the body with a larger cubature_count",
+            )
+        return found
 
     def region_rows(self, name: str) -> NDArray[np.intp]:
         """Return which rows of `region_points` sample a region.

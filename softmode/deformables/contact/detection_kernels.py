@@ -21,7 +21,7 @@ from softmode.deformables.contact.shape_query_kernels import (
 )
 from softmode.deformables.model.declare import struct
 from softmode.deformables.model.lane_kernels import barrier
-from softmode.deformables.model.status import WORLD_CONTACT_OVERFLOW
+from softmode.deformables.model.status import WORLD_CONTACT_OVERFLOW, WORLD_RIGID_NOT_FINITE
 from softmode.deformables.model.struct_kernels import (
     OVERLAP,
     SLOTS,
@@ -143,8 +143,9 @@ def cull_shapes(
     dt: float,
     # Out:
     near_out: wp.array2d[int],  # (instance_count, candidate_max)
+    status: wp.array[int],  # (world_count,)
 ):
-    """Mark the candidate shapes whose bounding sphere reaches the bounds of the instance.
+    """Mark the candidate shapes whose bounding sphere reaches the bounds of the instance; flag one that is nowhere.
 
     A body does not touch the shapes of a rigid body that it is fixed to, until it is released.
     """
@@ -153,6 +154,12 @@ def cull_shapes(
     near_out[i, c] = 0
     if shape < 0:
         return
+    body = shapes.body[shape]
+    if body >= 0:
+        place = shapes.body_q[body]
+        finite = wp.isfinite(wp.transform_get_translation(place)) and wp.isfinite(wp.transform_get_rotation(place))
+        if not (finite and wp.isfinite(shapes.body_qd[body])):
+            wp.atomic_or(status, instances.world[i], WORLD_RIGID_NOT_FINITE)
     if shapes.kind[shape] == PLANE or shapes.kind[shape] == HEIGHTFIELD:  # solid below without end
         near_out[i, c] = 1
         return
@@ -160,7 +167,6 @@ def cull_shapes(
     lower = shapes.lower[shape]
     upper = shapes.upper[shape]
     radius = 0.5 * wp.length(upper - lower)
-    body = shapes.body[shape]
     if body >= 0:
         pose = shapes.body_q[body] * pose
         if instances.link_pin_count[i] > 0:
@@ -426,6 +432,7 @@ def gather_contacts(
     basis: Basis,
     shapes: Shapes,
     samples: Samples,
+    relative_stiffness: wp.array[float],  # (sample_total,), Young's modulus relative to the body's
     constraint_max: int,
     prescribed: int,
     stick_ratio: wp.float64,
@@ -494,7 +501,9 @@ def gather_contacts(
             partner_mass = float(0.0)
             if body >= 0 and prescribed == 0:
                 partner_mass = shapes.body_mass[body]
-            kappa = stiffness_per_area(instances, i, partner_mass, shape_area(shapes, shape), dt)
+            kappa = stiffness_per_area(
+                instances, i, relative_stiffness[row], partner_mass, shape_area(shapes, shape), dt
+            )
             stiffness = wp.float64(kappa * sample_area(instances.scale[i], basis.row_area[row]))
             slip, anchor = remembered_slip(
                 shapes,

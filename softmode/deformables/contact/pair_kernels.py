@@ -448,6 +448,7 @@ def write_pairs(
     motion: Motion,
     samples: Samples,
     state: NewtonState,
+    relative_stiffness: wp.array[float],  # (sample_total,), Young's modulus relative to the body's
     stick_ratio: wp.float64,
     stick_partner: wp.array[wp.vec2i],  # (particle_count,), see ``stick_kernels``
     stick_slip: wp.array[mat23d],  # (particle_count,) [m]
@@ -500,8 +501,8 @@ def write_pairs(
             value = basis.row[own, b] - value
         basis.row[row, b] = value
 
-    ki = stiffness_per_area(instances, i, float(instances.mass[j]), instances.area[j], dt)
-    kj = stiffness_per_area(instances, j, float(instances.mass[i]), instances.area[i], dt)
+    ki = stiffness_per_area(instances, i, relative_stiffness[own], float(instances.mass[j]), instances.area[j], dt)
+    kj = stiffness_per_area(instances, j, relative_stiffness[at], float(instances.mass[i]), instances.area[i], dt)
     # two layers in series; each of the two surfaces brings its samples, so that each counts one half
     stiffness = wp.float64(0.5 * ki * kj / (ki + kj) * sample_area(instances.scale[i], basis.row_area[own]))
     friction = wp.float64(wp.sqrt(instances.friction[i] * instances.friction[j]))

@@ -105,22 +105,25 @@ def slip_potential(y: wp.float64, limit: wp.float64, stick: wp.float64, stick_ra
 
 
 @wp.func
-def stiffness_per_area(instances: Instances, i: int, partner_mass: float, partner_area: float, dt: float):
+def stiffness_per_area(
+    instances: Instances, i: int, relative: float, partner_mass: float, partner_area: float, dt: float
+):
     """Return the contact stiffness per area [Pa/m] of a body against a partner, from the parameters as they are now.
 
-    What ``contact_stiffness`` gives, or, where that is 0, the largest of BULK_FACTOR times the wave modulus over the
-    size, INERTIA_FACTOR times the effective mass per area over dt^2, and STIFFNESS_FLOOR.
+    What ``contact_stiffness`` gives, or, where that is 0, the largest of BULK_FACTOR times the wave modulus there over
+    the size, INERTIA_FACTOR times the effective mass per area over dt^2, and STIFFNESS_FLOOR.
 
     Args:
         instances: The bodies.
         i: The body.
+        relative: Young's modulus where they touch relative to the body's.
         partner_mass: Mass of what it touches [kg]; 0 where that does not yield.
         partner_area: Its surface area [m^2].
         dt: Step [s].
     """
     if instances.contact_stiffness[i] > 0.0:
         return instances.contact_stiffness[i]
-    wave = p_wave_modulus(instances.youngs_modulus[i], instances.poissons_ratio[i])
+    wave = p_wave_modulus(relative * instances.youngs_modulus[i], instances.poissons_ratio[i])
     mass = float(instances.mass[i])
     if partner_mass > 0.0:
         mass *= partner_mass / (mass + partner_mass)

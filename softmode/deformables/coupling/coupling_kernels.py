@@ -4,6 +4,7 @@ import newton
 import warp as wp
 
 from softmode.deformables.model.declare import struct
+from softmode.deformables.model.status import WORLD_RIGID_NOT_FINITE, WORLD_RIGID_OVERFLOW
 from softmode.deformables.model.struct_kernels import Instances, NewtonState, PointConstraints, Rigid, first_coupled
 
 wp.set_module_options({"enable_backward": False})
@@ -28,12 +29,16 @@ def find_coupled(
     state: NewtonState,
     constraints: PointConstraints,
     dof_count: wp.array[int],
+    overflow: wp.array[int],  # (world_count,), bits of mujoco_warp.OverflowType of the prediction
+    dropping: int,  # those with which contacts or constraint rows are dropped
     # Out:
     rigid: Rigid,
     any_out: wp.array[int],  # (1,)
 ):
-    """Let the joint dofs take part in the worlds in which a soft body is near a rigid one that moves."""
+    """Let the joint dofs take part where a soft body is near a rigid one that moves; flag what MuJoCo dropped."""
     w = wp.tid()
+    if (overflow[w] & dropping) != 0:
+        state.status[w] = state.status[w] | WORLD_RIGID_OVERFLOW
     coupled = int(0)
     for i in range(state.instance_start[w], state.instance_start[w + 1]):
         for e in range(first_coupled(instances, i), constraints.count[i]):
@@ -74,11 +79,15 @@ def keep_prediction(
     predicted: wp.array[float],
     # In and out:
     corrected: wp.array[float],
+    status: wp.array[int],  # (world_count,)
 ):
-    """Put the prediction back in the worlds that no soft body pushes, ``width`` numbers per element."""
+    """Put the prediction back in the worlds that no soft body pushes, ``width`` numbers per element; flag a NaN."""
     e, c = wp.tid()
-    if pushed[wp.max(world[e], 0)] == 0:
+    w = wp.max(world[e], 0)
+    if pushed[w] == 0:
         corrected[width * e + c] = predicted[width * e + c]
+    if not wp.isfinite(corrected[width * e + c]):
+        wp.atomic_or(status, w, WORLD_RIGID_NOT_FINITE)
 
 
 @struct

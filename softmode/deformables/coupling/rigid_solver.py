@@ -1,10 +1,36 @@
-"""MuJoCo's step in two halves: what the joint solve needs of ``SolverMuJoCo`` that has no public name yet."""
+"""What the joint solve needs of MuJoCo besides ``SolverMuJoCo``: a step in two halves, what it dropped, warnings."""
 
+import importlib
 import warnings
 from collections.abc import Callable, Generator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Any
 
 from newton.solvers import SolverMuJoCo
+
+
+@contextmanager
+def mujoco_warnings() -> Generator[None]:
+    """Make Python's of the warnings of MuJoCo in C, which would write them to MUJOCO_LOG.TXT in the working folder.
+
+    They are warned of at the end: an exception within MuJoCo's handler, as ``-W error`` raises, ends the process. A
+    handler that someone else has set stays.
+
+    Warns:
+        RuntimeWarning: For each of them.
+    """
+    mujoco: Any = importlib.import_module("mujoco")
+    if mujoco.get_mju_user_warning() is not None:
+        yield
+        return
+    messages: list[str] = []
+    mujoco.set_mju_user_warning(messages.append)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(None)
+        for message in messages:
+            warnings.warn(f"MuJoCo: {message}", RuntimeWarning, stacklevel=4)
 
 
 def second_half(rigid: SolverMuJoCo) -> Callable[[], AbstractContextManager[None]]:
@@ -48,3 +74,10 @@ def second_half(rigid: SolverMuJoCo) -> Callable[[], AbstractContextManager[None
                 del vars(rigid)["_mujoco_warp_step"]
 
     return from_forces_on
+
+
+def dropping_overflows() -> int:
+    """Return the bits of MuJoCo Warp's ``Data.overflow`` with which contacts or constraint rows are dropped."""
+    from mujoco_warp import OverflowType as Kind
+
+    return int(Kind.NEFC | Kind.NJMAX_NNZ | Kind.BROADPHASE | Kind.NARROWPHASE | Kind.CCD)

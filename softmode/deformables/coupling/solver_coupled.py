@@ -32,7 +32,7 @@ from newton.solvers import SolverBase, SolverMuJoCo
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.coupling import coupling_kernels as kernels
-from softmode.deformables.coupling.rigid_solver import second_half
+from softmode.deformables.coupling.rigid_solver import dropping_overflows, mujoco_warnings, second_half
 from softmode.deformables.model.declare import WRENCH
 from softmode.deformables.model.rigid_dofs import RigidDofs
 from softmode.deformables.model.tables import allocate, host, present
@@ -58,7 +58,7 @@ class SolverCoupledReduced(ReducedSolver):
         bodies: The reduced bodies used in the model.
         options: How the soft step is solved.
         rigid: The MuJoCo solver; default ``SolverMuJoCo(model)``, whose room for contacts is MuJoCo's guess from the
-            initial state: if it prints "nefc overflow", pass ``SolverMuJoCo(model, njmax=..., nconmax=...)``.
+            initial state: where the status is "rigid_overflow", pass ``SolverMuJoCo(model, njmax=..., nconmax=...)``.
 
     Attributes:
         reduced: The :class:`SolverReduced` inside.
@@ -79,7 +79,8 @@ class SolverCoupledReduced(ReducedSolver):
         """Build both solvers and tie the joint dofs into the reduced one."""
         if model.joint_dof_count == 0:
             raise ConfigError("model has no joint dofs to couple with", hint="use SolverReduced")
-        self.rigid = rigid or SolverMuJoCo(model)
+        with mujoco_warnings():
+            self.rigid = rigid or SolverMuJoCo(model)
         if self.rigid.use_mujoco_cpu:
             raise ConfigError(
                 "the rigid solver runs MuJoCo in C, which shows its constraints to no kernel",
@@ -90,7 +91,7 @@ class SolverCoupledReduced(ReducedSolver):
         super().__init__(model, self.reduced.tables)
         device, count = model.device, model.joint_dof_count
         self.predicted_state = model.state()
-        self._from_forces_on = second_half(self.rigid)
+        self._from_forces_on, self._dropping = second_half(self.rigid), dropping_overflows()
         self._joint_S = wp.zeros(count, dtype=WRENCH, device=device)
         self._body_f = wp.zeros(model.body_count, dtype=WRENCH, device=device)
         self._damping = wp.zeros(count, dtype=float, device=device)
@@ -226,7 +227,7 @@ class SolverCoupledReduced(ReducedSolver):
         """Let the joint dofs take part where a soft body is near a rigid one, and evaluate their inertia there."""
         t, dofs = self.tables, self.tables.rigid
         self._any_coupled.zero_()
-        near = (t.instances, t.newton, t.constraints, dofs.dof_count)
+        near = (t.instances, t.newton, t.constraints, dofs.dof_count, self.rigid.mjw_data.overflow, self._dropping)
         t.launch(kernels.find_coupled, self.world_count, *near, dofs.table, self._any_coupled)
         self._branch(self._any_coupled, self._linearise, state=state, dt=dt)
 
@@ -285,12 +286,14 @@ class SolverCoupledReduced(ReducedSolver):
                 continue
             rows, width = len(world), source.size * wp.types.type_size_in_bytes(source.dtype) // 4 // len(world)
             flat = [wp.array(ptr=x.ptr, shape=rows * width, dtype=float, device=x.device) for x in (source, target)]
-            self.tables.launch(kernels.keep_prediction, (rows, width), self._pushed, world, width, *flat)
+            kept = (self._pushed, world, width, *flat, self.reduced.status)
+            self.tables.launch(kernels.keep_prediction, (rows, width), *kept)
 
     def notify_model_changed(self, flags: int) -> None:
         """Pass the change on to both solvers."""
         self.reduced.notify_model_changed(flags)
-        self.rigid.notify_model_changed(flags)
+        with mujoco_warnings():
+            self.rigid.notify_model_changed(flags)
         self._bind()
 
     def reset(

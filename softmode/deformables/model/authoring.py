@@ -2,7 +2,7 @@
 
 import hashlib
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import newton
@@ -31,9 +31,25 @@ CONTACT_FIELDS = ("contact_stiffness", "contact_radius", "self_contact")
 """What a model stores per instance of its surface."""
 
 
+VelocityField = Callable[[NDArray[np.float64]], ArrayLike]
+"""Velocities in the world's axes [m/s], shape (N, 3), of rest points of a body, at its scale, in its frame [m]."""
+
+
 def body_key(body: ReducedBody) -> int:
     """Return the number that ties an instance in a model to its body: 62 bits of the body's fingerprint."""
     return int.from_bytes(hashlib.sha256(body.fingerprint.encode()).digest()[:8], "little") >> 2
+
+
+def finite_vector(name: str, value: ArrayLike) -> NDArray[np.float64]:
+    """Return three finite numbers.
+
+    Raises:
+        ConfigError: If they are not.
+    """
+    found = np.asarray(value, dtype=float)
+    if found.shape != (3,) or not np.isfinite(found).all():
+        raise ConfigError(f"{name} must be three finite numbers, got {value!r}")
+    return found
 
 
 def register_custom_attributes(builder: newton.ModelBuilder) -> None:
@@ -110,6 +126,7 @@ def add_reduced_body(
     rotation: np.ndarray | None = None,
     velocity: Sequence[float] = (0.0, 0.0, 0.0),
     angular_velocity: Sequence[float] = (0.0, 0.0, 0.0),
+    velocity_field: VelocityField | None = None,
     contact_stiffness_per_area: float | None = None,
     contact_radius: float = 0.0,
     self_contact: bool = False,
@@ -126,6 +143,9 @@ def add_reduced_body(
         rotation: Rotation matrix of the rest pose, shape (3, 3); default identity.
         velocity: Initial velocity of the centre of mass [m/s].
         angular_velocity: Initial angular velocity [rad/s].
+        velocity_field: What is added to them: velocities in the world's axes [m/s], shape (N, 3), of rest points of the
+            body, at its scale, in its frame [m], shape (N, 3). The body takes the nearest that its functions can; see
+            :meth:`softmode.deformables.body.reduced_body.ReducedBody.project`.
         contact_stiffness_per_area: Penalty stiffness of contact [Pa/m]; None or 0 lets it follow the material and the
             step, see :func:`softmode.deformables.contact.penalty_kernels.stiffness_per_area`.
         contact_radius: How far the surface that touches stands out from the body's [m].
@@ -138,23 +158,20 @@ def add_reduced_body(
         Index of the instance in this builder.
 
     Raises:
-        ConfigError: If the pose, a stiffness or a radius is not finite, the rotation is no rotation, or the scale lies
-            outside its range.
+        ConfigError: If the pose, a velocity, a stiffness or a radius is not finite, the rotation is no rotation, or the
+            scale lies outside its range.
     """
     register_custom_attributes(builder)
     material = material or Material()
     R = np.eye(3) if rotation is None else rotation_matrix(rotation)
-    p = np.asarray(position, float)
-    for name, value in (("position", position), ("velocity", velocity), ("angular_velocity", angular_velocity)):
-        if np.shape(value) != (3,) or not np.isfinite(value).all():
-            raise ConfigError(f"{name} must be three finite numbers, got {value!r}")
+    p, v0 = finite_vector("position", position), finite_vector("velocity", velocity)
+    omega = finite_vector("angular_velocity", angular_velocity)
     stiffness = contact_stiffness_per_area or 0.0
     require_number("contact_stiffness_per_area", stiffness, at_least=0.0, unit="[Pa/m]")
     require_number("contact_radius", contact_radius, at_least=0.0, unit="[m]")
     hint = "build the body at that size instead"
     require_number("scale", scale, at_least=SCALE_MIN, at_most=SCALE_MAX, hint=hint)
     s = float(np.float32(scale))  # as the model stores it
-    omega = np.asarray(angular_velocity, float)
     spin = np.array([[0, -omega[2], omega[1]], [omega[2], 0, -omega[0]], [-omega[1], omega[0], 0]])
     if not body.serves_ratio(material.poissons_ratio):
         warnings.warn(
@@ -165,9 +182,12 @@ def add_reduced_body(
         )
     q = body.affine(s * R, p)
     # the velocity field v + omega x (R s X) as coordinates: affine() of I + A subtracts the identity again
-    qd = body.affine(np.eye(3) + spin @ (s * R), np.asarray(velocity, float))
+    qd = body.affine(np.eye(3) + spin @ (s * R), v0)
     x = s * body.surface_points @ R.T + p
-    v = np.asarray(velocity, float) + x @ spin.T - p @ spin.T
+    v = v0 + x @ spin.T - p @ spin.T
+    if velocity_field is not None:
+        more = body.project(lambda X: velocity_field(s * X))
+        qd, v = qd + more, v + body.surface_basis @ more
     radius = 0.5 * s * float(np.sqrt(body.surface_areas.mean())) if particle_radius is None else particle_radius
     mass = material.density * s**3 * body.volume / body.surface_count
 

@@ -8,6 +8,7 @@ from typing import Any
 import newton
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.model.authoring import CONTACT_FIELDS, MATERIAL_FIELDS, body_key
@@ -206,6 +207,16 @@ def lay_out_bases(model: newton.Model, layout: Layout) -> Basis:
     basis = allocate(Basis, {"": "1", "row_gradient gradient_across": "1 1 1"}, {}, device, given=given)
     basis.gradient_across = basis.gradient_across.transpose((2, 0, 1)) if device.is_cuda else basis.gradient
     return basis
+
+
+def surface_stiffness(bodies: Sequence[ReducedBody]) -> np.ndarray:
+    """Return Young's modulus at the surface samples of all bodies relative to the body's, shape (sample_total,).
+
+    That of the nearest cubature point. Contact alone reads it, so that it is no part of ``Basis``: a CPU kernel copies
+    its structs in every thread.
+    """
+    nearest = [KDTree(body.points).query(body.surface_points)[1] for body in bodies]
+    return np.concatenate([body.stiffness_scale[index] for body, index in zip(bodies, nearest, strict=True)])
 
 
 def _size(body: ReducedBody) -> float:

@@ -12,6 +12,13 @@ WORLD_NOT_FINITE = 8
 """Status bit: the step produced a value that is not finite; the world kept its state at rest."""
 WORLD_COLLAPSED = 16
 """Status bit: more than a tenth of a body is squeezed to less than a hundredth of its volume."""
+WORLD_RIGID_NOT_FINITE = 32
+"""Status bit: a coordinate, pose or velocity of a rigid body is not finite; only a reset mends it."""
+WORLD_RIGID_OVERFLOW = 64
+"""Status bit: MuJoCo dropped contacts or constraint rows between rigid bodies, for which it had no room."""
+WORLD_PARAMETER_RANGE = 128
+"""Status bit: a parameter of a soft body is no number, infinite or outside the range of ``Material``, as one written
+into ``model.softmode`` may be."""
 
 REASONS = {
     WORLD_ITERATION_LIMIT: "iteration_limit",
@@ -19,12 +26,31 @@ REASONS = {
     WORLD_CONTACT_OVERFLOW: "contact_overflow",
     WORLD_NOT_FINITE: "not_finite",
     WORLD_COLLAPSED: "collapsed",
+    WORLD_RIGID_NOT_FINITE: "rigid_not_finite",
+    WORLD_RIGID_OVERFLOW: "rigid_overflow",
+    WORLD_PARAMETER_RANGE: "parameter_range",
 }
 """Name of every status bit, as ``info`` of the environments gives it."""
 
+REMEDIES = {
+    WORLD_ITERATION_LIMIT: "shorten the step, or soften the pins and the contact",
+    WORLD_NO_DESCENT: "shorten the step if it persists",
+    WORLD_CONTACT_OVERFLOW: "raise contact_max",
+    WORLD_NOT_FINITE: "look for huge loads, tiny masses",
+    WORLD_COLLAPSED: "reduce the load, raise E or nu",
+    WORLD_RIGID_NOT_FINITE: "look for NaN in drives, forces and teleported bodies; reset the world",
+    WORLD_RIGID_OVERFLOW: "pass rigid=SolverMuJoCo(model, njmax=..., nconmax=...)",
+    WORLD_PARAMETER_RANGE: "write parameters by set_parameters, which clamps them",
+}
+"""What to do about every status bit."""
 
-def status_reasons(bits: int) -> tuple[str, ...]:
+
+def status_reasons(bits: int, *, remedies: bool = False) -> tuple[str, ...]:
     """Return the names of the status bits that are set, lowest bit first; empty where nothing went wrong.
+
+    Args:
+        bits: Status of one world.
+        remedies: Whether to add what to do, as in "contact_overflow (raise contact_max)".
 
     Raises:
         ConfigError: If a bit is set that is no status bit.
@@ -33,4 +59,5 @@ def status_reasons(bits: int) -> tuple[str, ...]:
         raise ConfigError(
             f"bits must be a combination of {sorted(REASONS)}, got {bits}", hint="pass one world's status"
         )
-    return tuple(name for bit, name in REASONS.items() if bits & bit)
+    found = [bit for bit in REASONS if bits & bit]
+    return tuple(f"{REASONS[bit]} ({REMEDIES[bit]})" if remedies else REASONS[bit] for bit in found)

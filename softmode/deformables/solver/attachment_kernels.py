@@ -1,4 +1,4 @@
-"""Device side of attachments: pins are held or released per world."""
+"""Device side of attachments: pins are held, released or moved per world."""
 
 import warp as wp
 
@@ -27,6 +27,27 @@ def hold_pins(
     if in_mask(instance_world[i], world_mask):
         pin = instances.pin_start[i] + first + p
         pin_stiffness[pin] = sign * wp.abs(pin_stiffness[pin])
+
+
+@wp.kernel
+def move_pins(
+    instances: Instances,
+    instance_start: wp.array[int],  # (world_count + 1,)
+    local: int,
+    first: int,
+    pose: wp.array[wp.transform],  # (world_count,)
+    target: wp.array[wp.vec3d],  # (pin_total,), as the model has it [m]
+    # Out:
+    target_out: wp.array[wp.vec3d],
+):
+    """Move the targets of an attachment from where the model has them."""
+    w, p = wp.tid()
+    i = instance_start[w] + local
+    if i >= instance_start[w + 1]:
+        return
+    pin = instances.pin_start[i] + first + p
+    x = wp.vec3(target[pin])
+    target_out[pin] = target[pin] + wp.vec3d(wp.transform_point(pose[w], x) - x)
 
 
 @wp.kernel

@@ -69,7 +69,7 @@ def _gather_pins(t: StepTables, control: SoftControl, dt: float, prescribed: boo
 def _find_contacts(t: StepTables, state: newton.State, dt: float, prescribed: bool) -> None:
     """Find the contacts of the surface samples with the rigid shapes."""
     memory, candidate = soft(state), t.candidate
-    culled = (t.instances, candidate, t.shapes, t.samples, *t.pin_arrays, float(dt), t.near)
+    culled = (t.instances, candidate, t.shapes, t.samples, *t.pin_arrays, float(dt), t.near, t.newton.status)
     t.launch(kernels.cull_shapes, candidate.shape, *culled)
     found = (t.instances, t.basis, t.motion, candidate, t.near, t.shapes, float(dt), t.samples)
     t.launch(kernels.find_contacts, t.samples.position.shape, *found)
@@ -77,6 +77,6 @@ def _find_contacts(t: StepTables, state: newton.State, dt: float, prescribed: bo
     t.launch_teams(
         kernels.gather_contacts,
         t.layout.instance_count,
-        *(t.instances, t.basis, t.shapes, t.samples, t.constraints.row.shape[1], *stick),
+        *(t.instances, t.basis, t.shapes, t.samples, t.surface_stiffness, t.constraints.row.shape[1], *stick),
         *(memory.stick_shape, memory.stick_point, t.constraints, t.newton.status),
     )

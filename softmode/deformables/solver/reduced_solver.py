@@ -9,7 +9,7 @@ from newton.solvers import SolverBase
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.model.authoring import register_custom_attributes
-from softmode.deformables.model.namespaces import SoftModel
+from softmode.deformables.model.namespaces import SoftModel, soft
 from softmode.deformables.solver import attachment_kernels
 from softmode.deformables.solver import finish as last_phase
 from softmode.deformables.solver.attachments import Attachment
@@ -165,6 +165,32 @@ class ReducedSolver(SolverBase):
         worlds = (t.newton.instance_start, t.parameters.instance_world, mask)
         where = (attachment.instance, attachment.first, sign, t.parameters.pin_stiffness)
         t.launch(attachment_kernels.hold_pins, (self.world_count, attachment.count), t.instances, *worlds, *where)
+
+    def move(self, attachment: Attachment, control: newton.Control, pose: wp.array) -> None:
+        """Move what holds an attachment: its targets are those of the model, moved rigidly in each world.
+
+        Reads nothing back; in a captured graph the poses are those that the array holds when it is replayed. A reset
+        leaves the targets where they are: move them back too.
+
+        Args:
+            attachment: What :func:`softmode.deformables.solver.attachments.attach` returned.
+            control: Control of the steps, whose ``softmode.pin_target`` is written.
+            pose: Motion from where the targets were when the body was attached, in the frame of the link or the world,
+                ``wp.transform`` of shape (world_count,), on the solver's device: x = R x_0 + t.
+
+        Raises:
+            ConfigError: If the poses have another shape or type or lie on another device, or the control shares its
+                targets with the model.
+        """
+        t, given, start = self.tables, pose, self.parameters.pin_target
+        form = (wp.transform, (self.world_count,), self.model.device)
+        if not isinstance(given, wp.array) or (given.dtype, given.shape, given.device) != form:
+            raise ConfigError(f"pose must be a wp.array of wp.transform, shape {form[1]}, on {form[2]}")
+        target = soft(control).pin_target
+        if target.ptr == start.ptr:
+            raise ConfigError("control shares its arrays with the model", hint="make it with model.control()")
+        where = (t.newton.instance_start, attachment.instance, attachment.first, given, start, target)
+        t.launch(attachment_kernels.move_pins, (self.world_count, attachment.count), t.instances, *where)
 
     def checked_mask(self, world_mask: wp.array | None) -> wp.array:
         """Return the mask, all worlds if there is none; refuse what a kernel would misread.

@@ -31,7 +31,7 @@ from softmode.deformables.materials.material_kernels import (
 from softmode.deformables.model.declare import kernel_over
 from softmode.deformables.model.deformation_kernels import elastic_gradient
 from softmode.deformables.model.lane_kernels import LANES, team_sum, vec8d
-from softmode.deformables.model.status import WORLD_COLLAPSED, WORLD_NOT_FINITE
+from softmode.deformables.model.status import WORLD_COLLAPSED, WORLD_NOT_FINITE, WORLD_PARAMETER_RANGE
 from softmode.deformables.model.struct_kernels import (
     Basis,
     Instances,
@@ -73,6 +73,18 @@ def sum_external(
         step.arrays.gradient_chunk[i, chunk, axis * stride + b] = total[axis]
 
 
+@wp.func
+def has_sound_parameters(instances: Instances, i: int):
+    """Return whether the parameters of an instance are finite and in the ranges of ``Material``."""
+    positive = wp.vec3(instances.youngs_modulus[i], instances.scale[i], float(instances.mass[i]))
+    damping = wp.vec2(instances.viscosity[i], instances.mass_damping[i])
+    contact = wp.vec3(instances.friction[i], instances.contact_stiffness[i], instances.contact_radius[i])
+    finite = wp.isfinite(positive) and wp.isfinite(damping) and wp.isfinite(contact)
+    nu = instances.poissons_ratio[i]
+    inside = wp.min(positive) > 0.0 and wp.min(damping) >= 0.0 and wp.min(contact) >= 0.0 and nu > -1.0 and nu < 0.5
+    return finite and inside
+
+
 @wp.kernel
 def begin_step(
     step: NewtonStep,
@@ -86,9 +98,11 @@ def begin_step(
     q_driven: wp.array[wp.vec3d],  # (function_total,), where the driven functions are to be at the end of the step
     bdf2: int,
 ):
-    """Read the state, predict where the body goes, and add gravity to the external forces."""
+    """Read the state, predict where the body goes, and add gravity to the external forces; flag bad parameters."""
     dt = step.options.dt
     i, b = wp.tid()
+    if b == 0 and not has_sound_parameters(step.instances, i):
+        wp.atomic_or(step.state.status, step.instances.world[i], WORLD_PARAMETER_RANGE)
     n = step.instances.function_count[i]
     if LANES * b >= n:
         return

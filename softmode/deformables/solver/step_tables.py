@@ -16,7 +16,7 @@ from softmode.deformables.contact.pairs import SoftPairs
 from softmode.deformables.contact.shape_tables import candidate_shapes, shape_table
 from softmode.deformables.model.declare import WRENCH, Kernel, launch, launch_teams
 from softmode.deformables.model.lane_kernels import team_size
-from softmode.deformables.model.layout import Layout, lay_out, lay_out_bases, lay_out_instances
+from softmode.deformables.model.layout import Layout, lay_out, lay_out_bases, lay_out_instances, surface_stiffness
 from softmode.deformables.model.namespaces import SoftModel, soft
 from softmode.deformables.model.rigid_dofs import RigidDofs
 from softmode.deformables.model.scaled_quantities import ScaledQuantities
@@ -98,6 +98,8 @@ class StepTables:
     """All of these, for Newton's kernels."""
     rigid: RigidDofs
     """Joint dofs that take part in the solve."""
+    surface_stiffness: wp.array
+    """Young's modulus at the surface samples of all bodies relative to the body's, float (sample_total,)."""
     shapes: Shapes
     """The rigid shapes."""
     meshes: list[Any]
@@ -183,9 +185,10 @@ def allocate_tables(
     )
     candidate = wp.array(candidate_shapes(model, layout), dtype=int, device=device)
     shapes, meshes = shape_table(model)
+    stiffness = wp.array(surface_stiffness(layout.bodies), dtype=float, device=device)
     pairs = None
     if layout.pair_max:
-        pairs = SoftPairs(layout, instances, basis, options.stick_ratio, scaled.spacing, device)
+        pairs = SoftPairs(layout, instances, basis, options.stick_ratio, scaled.spacing, stiffness, device)
     system_start, system = join_systems(layout, instances, rigid.count_max + 1, device)
 
     blocks, count, square = layout.block_count, layout.instance_count, 3 * layout.block_count**2
@@ -245,6 +248,7 @@ def allocate_tables(
         newton=state,
         step=step,
         rigid=rigid,
+        surface_stiffness=stiffness,
         shapes=shapes,
         meshes=meshes,
         candidate=candidate,
