@@ -264,7 +264,7 @@ def run_all(row: Row, references: list[str]) -> list[Result]:
             Result(
                 label=row.label,
                 scene=name,
-                mode_count=row.options.mode_count,
+                mode_count=row.options.mode_count or 0,
                 unknowns=3 * body.function_count,
                 cubature_count=body.point_count,
                 stiffness=row.stiffness,

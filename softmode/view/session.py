@@ -5,7 +5,6 @@ All calls must come from one thread.
 
 from __future__ import annotations
 
-import functools
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -164,7 +163,12 @@ class LiveSession:
             ConfigError: If the environment or the policy is unknown, or an option out of range.
         """
         chosen = options or LiveOptions()
-        return cls(functools.partial(EnvScene, name, policy, config, seed, chosen, device, progress), chosen)
+
+        def make(origin: ObjectConfig | SoftObject | None) -> LiveScene:
+            source = origin if isinstance(origin, ObjectConfig) else None
+            return EnvScene(name, policy, config, seed, chosen, device, progress, source)
+
+        return cls(make, chosen)
 
     # -- time ---------------------------------------------------------------------------------------------------------
 

@@ -90,6 +90,6 @@ class SkinningWeights:
         found = np.empty((3, count, len(owner)))  # Axis by axis: these are the largest arrays of a build.
         for d in range(3):
             np.multiply(gradient[:, owner, d], factor, out=found[d])
-            sloping = np.flatnonzero(slope[:, :, d].any(axis=0)[monomial])
+            sloping = np.flatnonzero(np.any(slope[:, :, d], axis=0)[monomial])
             found[d][:, sloping] += weight[:, sloping] * slope[:, monomial[sloping], d]
         return weight * factor, found.transpose(1, 2, 0)

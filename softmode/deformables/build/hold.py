@@ -85,8 +85,9 @@ def carry_over(old: ReducedBody, new: ReducedBody, q: ArrayLike, qd: ArrayLike) 
         raise ConfigError(f"q and qd: expected shape ({old.function_count}, 3), got {place.shape} and {rate.shape}")
     X, mass = mass_points(new)
     shift = new.offset - old.offset  # X of the new body is X + shift of the old one
-    root = np.sqrt(mass / mass.sum())[:, None]
     before = old.evaluate(X + shift)[0]
-    wanted = np.hstack([before @ place + shift, before @ rate])
-    found = np.linalg.lstsq(root * new.evaluate(X)[0], root * wanted, rcond=1e-10)[0]
-    return found[:, :3], found[:, 3:]
+
+    def in_new(field: Array) -> Array:
+        return new.project(lambda points: field, points=X, weights=mass)
+
+    return in_new(before @ place + shift), in_new(before @ rate)
