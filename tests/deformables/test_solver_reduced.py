@@ -597,7 +597,7 @@ def test_set_velocity_turns_a_deformed_body_about_its_centre():
         ({"angular_velocity": (0.0, 0.0)}, "angular_velocity must be three finite"),
         ({"velocity_field": lambda X: X[0]}, "field: expected finite vectors"),
     ],
-    ids=str,
+    ids=["instance", "body", "velocity", "angular_velocity", "velocity_field"],
 )
 def test_bad_velocities(changes, match):
     """What set_velocity cannot take is refused by name."""
