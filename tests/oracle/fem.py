@@ -536,14 +536,21 @@ def node_mask(mesh: Mesh, region: object) -> NDArray[np.bool_]:
 __all__ = ["TOLERANCE", "ConvergenceError", "Energy", "Mesh", "Minimiser", "Solid", "node_mask", "simulate", "static"]
 
 
-def free_eigenvalues(mesh: Mesh, poissons_ratio: float, count: int = 6) -> Array:
-    """Return the first elastic eigenvalues of a free homogeneous solid, per E / rho [1/m^2], ascending.
+def free_eigenvalues(mesh: Mesh, poissons_ratio: float, count: int = 6, *, stiffness: ArrayLike | None = None) -> Array:
+    """Return the first elastic eigenvalues of a free solid, per E / rho [1/m^2], ascending.
 
     A frequency is sqrt(value E / rho) / (2 pi). Linear elasticity, consistent mass; the six rigid motions are left out.
+
+    Args:
+        mesh: Elements of the solid.
+        poissons_ratio: nu.
+        count: How many.
+        stiffness: Relative Young's modulus of every element, shape (element_count,); ones when None.
     """
     mu, lam = 1.0 / (2.0 * (1.0 + poissons_ratio)), poissons_ratio / ((1 + poissons_ratio) * (1 - 2 * poissons_ratio))
     G, w = mesh.gradients, mesh.weights
-    product = np.einsum("eq,eqai,eqbj->eaibj", w, G, G, optimize=True)
+    scale = np.ones(len(mesh.elements)) if stiffness is None else np.asarray(stiffness, dtype=np.float64)
+    product = np.einsum("e,eq,eqai,eqbj->eaibj", scale, w, G, G, optimize=True)
     block = lam * product + mu * product.transpose(0, 1, 4, 3, 2)
     trace = mu * np.einsum("eaibi->eab", product)
     for i in range(3):

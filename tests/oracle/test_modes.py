@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.moduli import CASES, two_moduli, two_moduli_mesh
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_mesh
+from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_mesh
 from tests.oracle.fem import Mesh, free_eigenvalues
 from tests.oracle.solids import SOLIDS, frequency_errors
 
@@ -57,3 +58,23 @@ def test_eighty_functions(name: str, poissons_ratio: float) -> None:
     """With 80 functions bars and plates are within 2 %."""
     low, high = errors(name, poissons_ratio, function_count=80)
     assert -0.01 < low and high < 0.02
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_two_moduli(name: str) -> None:
+    """A jump of ten times, in no relation to the grid, costs 6 % at most in the first six frequencies."""
+    size, axis, jump = CASES[name]
+    mesh, moduli = two_moduli_mesh(size, axis, jump)
+    quadrature = quadrature_from_box(size)
+    options = BuildOptions(poissons_ratio=0.3)
+    body = build_body(quadrature, options, stiffness_scale=two_moduli(axis, jump), progress=False)
+    low, high = frequency_errors(body, free_eigenvalues(mesh, 0.3, stiffness=moduli), 0.3)
+    assert -0.06 < low and high < 0.06
+
+
+def test_few_points_are_not_soft() -> None:
+    """A bar of 1,500 points is within 2 %: kernels do not move between the points."""
+    solid = SOLIDS["bar 10:1"]()
+    body = build_body(quadrature_from_mesh(*solid.surface(), point_count=1500), progress=False)
+    low, high = frequency_errors(body, solid.eigenvalues(0.4), 0.4)
+    assert -0.02 < low and high < 0.03

@@ -15,7 +15,7 @@ from softmode.deformables.build.eigenmodes import solve_eigenmodes
 from softmode.deformables.build.elastic_functions import SPACE_MODE_COUNT, choose_functions
 from softmode.deformables.build.functions import Functions, affine_first, orthonormalise
 from softmode.deformables.build.galerkin import mass_matrix
-from softmode.deformables.build.options import EIGENMODE_COUNT, EIGENMODE_KERNEL_COUNT, KERNEL_COUNT, BuildOptions
+from softmode.deformables.build.options import EIGENMODE_COUNT, BuildOptions
 from softmode.deformables.build.region_samples import RegionSamples, drive_matrices
 from softmode.deformables.build.static_response import lame_parameters, solve_harmonic_weights, solve_static_responses
 from softmode.errors import ConfigError
@@ -93,7 +93,7 @@ def make_body_basis(domain: Domain, options: BuildOptions, stage: Callable[[str]
             "function_count, accuracy: a body with regions has eigenmodes and static responses",
             hint="give mode_count, or leave the regions away",
         )
-    count = options.kernel_count or (KERNEL_COUNT if by_energy else EIGENMODE_KERNEL_COUNT)
+    count = options.kernels(len(domain.seeds), by_energy=by_energy)
     kernels = make_basis(domain.seeds, count, kernel=options.kernel, spacing=domain.spacing, seed=options.seed)
     return (_elastic_basis if by_energy else _eigenmode_basis)(kernels, domain, options, stage)
 

@@ -36,6 +36,8 @@ __all__ = [
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
+Field = ArrayLike | Callable[[Array], ArrayLike]
+"""One value per quadrature point, or a function of points (N, 3) [m] in asset coordinates."""
 
 _PROGRESS = {"kernels": 0.1, "eigenmodes": 0.2, "responses": 0.35, "functions": 0.45, "cubature": 0.95, "surface": 1.0}
 """Fraction of a build that is done after each stage."""
@@ -47,8 +49,8 @@ def build_body(
     *,
     name: str = "body",
     regions: Sequence[Region] = (),
-    stiffness_scale: ArrayLike | None = None,
-    density_scale: ArrayLike | None = None,
+    stiffness_scale: Field | None = None,
+    density_scale: Field | None = None,
     progress: bool | Progress | None = None,
 ) -> ReducedBody:
     """Reduce an object: kernels, weights, orthonormal functions, cubature.
@@ -60,9 +62,10 @@ def build_body(
         regions: Parts that a scene holds, moves or grasps. Exact ones get weights of their own (one on the region,
             zero on the others) and all other weights vanish there, so that holding them costs no accuracy; soft ones
             enter the weights as springs. The more of a scene's supports are known here, the better the body bends.
-        stiffness_scale: Young's modulus per quadrature point relative to the body's, shape (P,); ones when None.
-        density_scale: Density per quadrature point relative to any common reference, shape (P,); normalised to volume
-            mean 1.
+        stiffness_scale: Young's modulus relative to the body's: one value per quadrature point, shape (P,), or a
+            function that returns them (N,) for points (N, 3) of asset coordinates [m]; ones when None. A cell that a
+            jump cuts has the values of its points: means over the cell were worse (``docs/accuracy.md``).
+        density_scale: Density relative to any common reference, likewise; normalised to volume mean 1.
         progress: True or False shows a bar or not; None shows one on a terminal when the build exceeds two seconds; a
             callable receives (stage, fraction done).
 
@@ -87,14 +90,14 @@ def _build(
     options: BuildOptions,
     name: str,
     regions: tuple[Region, ...],
-    stiffness_scale: ArrayLike | None,
-    density_scale: ArrayLike | None,
+    stiffness_scale: Field | None,
+    density_scale: Field | None,
     progress: bool | Progress | None,
 ) -> ReducedBody:
     """Do what :func:`build_body` says."""
     start = time.perf_counter()
-    stiffness = _positive_field("stiffness_scale", stiffness_scale, len(quadrature.points))
-    density = _positive_field("density_scale", density_scale, len(quadrature.points))
+    stiffness = _positive_field("stiffness_scale", stiffness_scale, quadrature.points)
+    density = _positive_field("density_scale", density_scale, quadrature.points)
     fingerprint = fingerprint_of(FORMAT_VERSION, quadrature, options, name, list(regions), stiffness, density)
     sources = Sources(
         quadrature=quadrature,
@@ -218,12 +221,15 @@ def _scalar(value: Scalar | tuple[float, ...]) -> Scalar:
     return " ".join(f"{v:g}" for v in value) if isinstance(value, tuple) else value
 
 
-def _positive_field(name: str, value: ArrayLike | None, count: int) -> Array:
+def _positive_field(name: str, value: Field | None, points: Array) -> Array:
+    """Return a field's values at points (P, 3), shape (P,)."""
     if value is None:
-        return np.ones(count)
-    found = np.array(value, dtype=np.float64)
-    if found.shape != (count,):
-        raise MaterialError(f"{name}: expected one value per quadrature point, shape ({count},), got {found.shape}")
+        return np.ones(len(points))
+    found = np.array(value(points) if callable(value) else value, dtype=np.float64)
+    if found.shape != (len(points),):
+        raise MaterialError(
+            f"{name}: expected one value per quadrature point, shape ({len(points)},), got {found.shape}"
+        )
     if not (np.isfinite(found).all() and (found > 0.0).all()):
         bad = int(np.flatnonzero(~(np.isfinite(found) & (found > 0.0)))[0])
         raise MaterialError(f"{name}: expected finite values > 0, got {found[bad]} at row {bad}")

@@ -27,7 +27,8 @@ def hold(
 ) -> ReducedBody:
     """Return the body that a build told of further regions would have given.
 
-    It takes as long as the build. Motion goes over by :func:`carry_over`.
+    It takes as long as the build. Motion goes over by :func:`carry_over`. A number of functions that was asked for is
+    not kept: a body with regions has eigenmodes and static responses.
 
     Args:
         body: A body that keeps its sources: one that was built, or read from a file that was saved with them.
@@ -50,7 +51,7 @@ def hold(
     given = unpack_sources(body)
     held = build_body(
         given.quadrature,
-        given.options,
+        given.options.for_regions(),
         name=body.name,
         regions=(*given.regions, *regions),
         stiffness_scale=given.stiffness_scale,

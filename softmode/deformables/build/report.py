@@ -33,6 +33,9 @@ STRAIN = 0.1
 """Strain (root mean square over the body) at which the Jacobian of a mode is measured."""
 CONDITION_WARNING = 1e6
 """Condition number of a moment matrix from which on gradients lose more digits than float32 has to spare."""
+KERNEL_POINTS, REGION_POINTS = 3, 6
+"""Quadrature points for every kernel below which a body may be too soft. On a body with regions static responses use
+all kernels: a clamped beam of 5,000 points bends with an error of 1e-6 (nMSE) with 600 kernels, of 2.5e-3 with 1,000."""
 FREQUENCY_WARNING = 0.05
 """Error of the first frequencies, against the space that functions are chosen from, above which a body is too stiff."""
 SLENDER = 0.3
@@ -194,6 +197,14 @@ def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
             f"the body is {1e3 * thickness * size:.2g} mm thick on average, 1/{1.0 / thickness:.0f} of its size: too"
             " thin to be integrated and touched as a solid",
             "thicken the asset to a hundredth of its size",
+        )
+    points, kernels = body.provenance.get("quadrature_count"), len(body.centres)
+    if isinstance(points, int) and kernels * (REGION_POINTS if body.region_names else KERNEL_POINTS) > points:
+        notes.find(
+            "warning",
+            "kernels",
+            f"its {kernels} kernels move between {points} quadrature points at no cost of energy: too soft",
+            "build it with more points, or without a number of kernels",
         )
     error = body.provenance.get("frequency_error")
     if error is not None and float(notes.measure("error of the first frequencies", float(error))) > FREQUENCY_WARNING:
