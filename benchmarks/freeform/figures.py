@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from benchmarks.accuracy import affine
 from benchmarks.accuracy_runner import Row, Simulation, body_of
 from benchmarks.baselines.mpm import Particles
 from softmode.deformables.body.rkpm import BasisRKPM, make_basis
+from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box
 from tests.oracle.scenes import BEAM, LEFT, RIGHT, Clamp, Motion, Scene
 
@@ -98,13 +98,13 @@ def figure7(path: Path, *, quick: bool = False) -> dict[str, Any]:
     scene = dataclasses.replace(STRETCH, steps=2) if quick else STRETCH
     rest, moved = {}, {}
     for voxel, per_cell in ((0.5, 2), (1.0 / 3.0, 2)):
-        beam = Particles(scene, voxel, per_cell=per_cell)
+        beam = Particles(scene, voxel, per_cell=per_cell, substeps=5)
         for _ in range(scene.steps):
             beam.step()
         label = f"MPM, cells of {voxel:.2g} m"
         rest[label], moved[label] = beam.rest, beam.rest + beam.displacement()
-    body = body_of(scene, affine(3, static_responses=True), 5000, "exact", None)[0]
-    row = Row(label="", scene=scene.name, options=affine(3), stiffness=None)
+    body = body_of(scene, BuildOptions(mode_count=3, poissons_ratio=scene.poissons_ratio), 5000, "exact", None)[0]
+    row = Row(label="", scene=scene.name, options=BuildOptions(), stiffness=None)
     q = Simulation(scene, body, row).run(scene.steps)[0]
     points = next(iter(rest.values()))
     rest["softmode"] = points
@@ -112,8 +112,7 @@ def figure7(path: Path, *, quick: bool = False) -> dict[str, Any]:
     gaps = {label: longest_gap(rest[label], moved[label]) for label in rest}
     figure, panels = _panels(len(rest), 1, (9.5, 4.2))
     for panel, label in zip(panels, rest, strict=True):
-        height = rest[label][:, 1]
-        panel.scatter(*moved[label][:, [0, 2]].T, 9, height, cmap="viridis")
+        panel.scatter(*moved[label][:, [0, 2]].T, 9, rest[label][:, 0], cmap="viridis")
         panel.set(title=f"{label}: neighbours up to {gaps[label]:.1f} times their distance at rest", aspect="equal")
         panel.set(xlim=(-2.7, 12.7), ylim=(-0.7, 0.7), yticks=[])
     _save(figure, path)

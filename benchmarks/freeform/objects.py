@@ -30,7 +30,7 @@ from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model.authoring import add_pins, add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.files import whole_file
-from tests.oracle.fem import Mesh, Minimiser, Solid
+from tests.oracle.fem import ConvergenceError, Mesh, Minimiser, Solid
 from tests.oracle.solids import SOLIDS
 from tests.scenes import Scene
 from tests.shape_trials import Voxels, voxelise
@@ -209,8 +209,12 @@ def _simulate_fem(thing: Thing, grip: Grip, mesh: Mesh, steps: int) -> Array:
     weight = solid.body_force(grip.gravity * thing.down)
     x, v, frames = mesh.nodes, np.zeros_like(mesh.nodes), []
     for n in range(1, steps + 1):
-        guess = x + DT * v
-        found, _ = minimise(guess, inertia @ guess + weight + pull @ grip.targets(n, steps), 1e-4)
+        ahead = x + DT * v
+        load = inertia @ ahead + weight + pull @ grip.targets(n, steps)
+        try:
+            found, _ = minimise(ahead, load, 1e-4)
+        except ConvergenceError:  # The inertial guess may turn elements inside out; the last positions do not.
+            found, _ = minimise(x, load, 1e-4)
         x, v = found, (found - x) / DT
         frames.append(x - mesh.nodes)
     return np.array(frames)
@@ -289,7 +293,12 @@ def run_thing(thing: Thing, bases: dict[str, BuildOptions], folder: Path | None,
     for condition in CONDITIONS:
         grip = thing.grip(condition)
         start = time.process_time()
-        expected = fem_motion(thing, grip, points, steps, folder)
+        try:
+            expected = fem_motion(thing, grip, points, steps, folder)
+        except ConvergenceError as error:
+            print(f"{thing.name:<18}{len(thing.factors):>5} {condition:<10} no reference: {error}", flush=True)
+            record["no_reference"] = [*record.get("no_reference", []), condition]
+            continue
         fem_seconds = time.process_time() - start
         line, moved = f"{thing.name:<18}{len(thing.factors):>5} {condition:<10}", 0.0
         start = time.process_time()
