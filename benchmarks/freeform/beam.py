@@ -35,7 +35,7 @@ MPM_VOXEL, MPM_TWIST_STEPS = 0.5, 50
 
 def freeform(mode_count: int, **changes: object) -> BuildOptions:
     """Return FreeForm's functions: all of them, none dropped for their small size."""
-    return affine(mode_count, rank_tolerance=FINE_RANK, **changes)
+    return dataclasses.replace(affine(mode_count, rank_tolerance=FINE_RANK), **changes)  # type: ignore[arg-type]
 
 
 def default(function_count: int, **changes: Any) -> BuildOptions:
