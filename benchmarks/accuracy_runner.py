@@ -93,7 +93,7 @@ class Result:
     last: float
     """Error of the last frame alone, by the largest edge."""
     milliseconds: float
-    """Median wall time of a captured step."""
+    """Median processor time of a captured step."""
     iterations: float
     """Mean Newton iterations per step."""
     status: int
@@ -190,14 +190,14 @@ class Simulation:
         self.moving = any(c.motion.rate or any(c.motion.velocity) for _, c in self.targets)
 
     def run(self, steps: int) -> tuple[Array, list[float], list[int]]:
-        """Take steps; return coordinates (steps + 1, n, 3) [m], wall times [ms] and Newton iterations."""
+        """Take steps; return coordinates (steps + 1, n, 3) [m], processor times [ms] and Newton iterations."""
         q, times, iterations = [self.q], [], []
         for n in range(1, steps + 1):
             if self.moving or n == 1:
                 self._move(n * self.scene.dt)
-            start = time.perf_counter()
+            start = time.process_time()
             wp.capture_launch(self.graphs[(n - 1) % 2])
-            times.append(1e3 * (time.perf_counter() - start))
+            times.append(1e3 * (time.process_time() - start))
             q.append(self.states[n % 2].softmode.q.numpy().copy())
             iterations.append(int(self.solver.iteration.numpy()[0]))
         return np.array(q), times, iterations

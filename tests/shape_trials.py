@@ -8,6 +8,7 @@ enough to be linear: gravity in an oblique direction, and forces on the surface 
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -187,7 +188,7 @@ def voxelise(shape: Shape, cells: int) -> Voxels:
     A cell is filled if the shape fills 0.3 of what it does in its fullest cells, so that thin walls stay closed; only
     the largest face-connected part is kept.
     """
-    quadrature = shape.quadrature(40_000)
+    quadrature = _fine_quadrature(shape)
     lower, upper = quadrature.bounds
     count = np.maximum(np.round((upper - lower) / (upper - lower).max() * cells).astype(int), 2)
     lines = tuple(np.linspace(lower[d], upper[d], count[d] + 1) for d in range(3))
@@ -206,6 +207,11 @@ def voxelise(shape: Shape, cells: int) -> Voxels:
     trim = tuple(slice(k[0], k[-1] + 1) for k in kept)
     trimmed = tuple(line[k[0] : k[-1] + 2] for line, k in zip(lines, kept, strict=True))
     return Voxels(lines=trimmed, filled=filled[trim], axis=shape.axis)  # type: ignore[arg-type]
+
+
+@functools.cache
+def _fine_quadrature(shape: Shape) -> Quadrature:
+    return shape.quadrature(40_000)
 
 
 def _components(filled: NDArray[np.bool_]) -> tuple[NDArray[np.int32], int]:

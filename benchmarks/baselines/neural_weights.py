@@ -141,13 +141,8 @@ def _train(
         x = unit[torch.randint(len(unit), (options.sample_count,))]
         weight, slope = _forward(torch, layers, x, torch.diag(1.0 / scale))
         transform = options.transform_deviation * torch.randn(options.transform_count, options.mode_count, 4, 3)
-        homogeneous = torch.nn.functional.pad(x * scale, (0, 1), value=1.0)
-        # d/dX_d of w_j Z_c, with Z = (X, 1): slope_jd Z_c + w_j delta_cd
-        gradient = torch.einsum("njd,nc->njcd", slope, homogeneous)
-        gradient = gradient + torch.einsum("nj,cd->njcd", weight, torch.eye(4)[:, :3])
-        F = torch.eye(3) + torch.einsum("njcd,bjci->nbid", gradient, transform)
         mix = iteration / options.iterations
-        energy = (1.0 - mix) * _linear_elastic(torch, F, mu, lam) + mix * _neo_hookean(torch, F, mu, lam)
+        energy = elastic_energy(torch, weight, slope, x * scale, transform, mu, lam, mix)
         elastic = options.elastic_weight * volume / len(x) * energy.sum()
         orthogonality = options.orthogonality_weight * ((weight.T @ weight - identity) ** 2).mean()
         optimizer.zero_grad()
@@ -168,6 +163,29 @@ def _forward(torch: Any, layers: list[Any], x: Any, seed: Any) -> tuple[Any, Any
         x = torch.nn.functional.elu(z)
         slope = torch.exp(torch.clamp(z, max=0.0))[:, None] * (slope @ layer.weight.T)
     return layers[-1](x), (slope @ layers[-1].weight.T).transpose(1, 2)
+
+
+def elastic_energy(
+    torch: Any, weight: Any, slope: Any, points: Any, transform: Any, mu: float, lam: float, mix: float
+) -> Any:
+    """Return the energy density (N, B) of random handle transforms, ramped from linear to Neo-Hookean by `mix`.
+
+    Args:
+        torch: The module.
+        weight: Weights (N, m).
+        slope: Their gradients (N, m, 3).
+        points: Rest positions (N, 3).
+        transform: What each handle does, (B, m, 4, 3).
+        mu: Shear modulus.
+        lam: Lame's first parameter.
+        mix: 0 to 1.
+    """
+    homogeneous = torch.nn.functional.pad(points, (0, 1), value=1.0)
+    # d/dX_d of w_j Z_c, with Z = (X, 1): slope_jd Z_c + w_j delta_cd
+    gradient = torch.einsum("njd,nc->njcd", slope, homogeneous)
+    gradient = gradient + torch.einsum("nj,cd->njcd", weight, torch.eye(4)[:, :3])
+    F = torch.eye(3) + torch.einsum("njcd,bjci->nbid", gradient, transform)
+    return (1.0 - mix) * _linear_elastic(torch, F, mu, lam) + mix * _neo_hookean(torch, F, mu, lam)
 
 
 def _linear_elastic(torch: Any, F: Any, mu: float, lam: float) -> Any:

@@ -93,7 +93,7 @@ def make_body_basis(domain: Domain, options: BuildOptions, stage: Callable[[str]
             "function_count, accuracy: a body with regions has eigenmodes and static responses",
             hint="give mode_count, or leave the regions away",
         )
-    count = options.kernels(len(domain.seeds), by_energy=by_energy)
+    count = options.kernels(len(domain.seeds), held=bool(domain.regions))
     kernels = make_basis(domain.seeds, count, kernel=options.kernel, spacing=domain.spacing, seed=options.seed)
     return (_elastic_basis if by_energy else _eigenmode_basis)(kernels, domain, options, stage)
 

@@ -18,7 +18,7 @@ KERNEL_COUNT = 1000
 """Kernels of functions that are chosen by elastic energy."""
 EIGENMODE_KERNEL_COUNT = 400
 """Kernels of FreeForm's functions."""
-MANY_POINTS = 3000
+MANY_POINTS = 3200
 """Quadrature points from which on there may be as many kernels as that."""
 KERNEL_LEAST = 60
 """The fewest kernels where none are asked for."""
@@ -59,9 +59,9 @@ class BuildOptions:
     kernel_count: int | None = None
     """Reproducing kernels. None takes 1000 where functions are chosen by elastic energy: corners and crossings need
     them (a cross is 7 % too stiff with 400, 4 % with 1000). FreeForm's functions take 400, which give the first 16
-    eigenvalues of a box to 0.3 %. Below 3,000 quadrature points None takes a fifth of them at most: kernels that are
-    narrower move between the points and cost no energy (a bar of 1,000 points and 1,000 kernels was 38 % too soft, with
-    200 kernels it is 2.5 %)."""
+    eigenvalues of a box to 0.3 %. Below 3,200 quadrature points None takes a fifth of them at most, with regions an
+    eighth: kernels that are narrower move between the points and cost no energy (a bar of 1,000 points and 1,000
+    kernels was 38 % too soft, with 200 kernels it is 2.5 %)."""
     kernel: KernelName = "cubic"
     """Bell of the reproducing kernels."""
     static_responses: bool = True
@@ -126,12 +126,13 @@ class BuildOptions:
         """Return these options for a body with regions, which has FreeForm's functions and static responses."""
         return replace(self, function_count=None, accuracy=None)
 
-    def kernels(self, point_count: int, *, by_energy: bool) -> int:
-        """Return how many kernels a body of so many quadrature points has."""
+    def kernels(self, point_count: int, *, held: bool) -> int:
+        """Return how many kernels a body of so many quadrature points has, `held` if it has regions."""
         if self.kernel_count is not None:
             return self.kernel_count
-        most = KERNEL_COUNT if by_energy else EIGENMODE_KERNEL_COUNT
-        return most if point_count >= MANY_POINTS else min(most, max(point_count // 5, KERNEL_LEAST))
+        most = EIGENMODE_KERNEL_COUNT if held or self.eigenmode_handles else KERNEL_COUNT
+        few = max(point_count // (8 if held else 5), KERNEL_LEAST)
+        return most if point_count >= MANY_POINTS else min(most, few)
 
     @property
     def eigenmode_handles(self) -> bool:
