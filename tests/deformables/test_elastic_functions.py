@@ -169,3 +169,11 @@ def test_ratios_without_a_material_are_refused(ratio: float | tuple[float, ...])
     """The error names the argument."""
     with pytest.raises(ConfigError, match="poissons_ratio"):
         BuildOptions(poissons_ratio=ratio)
+
+
+def test_more_functions_than_there_are() -> None:
+    """What the elastic modes cannot make is told."""
+    quadrature = quadrature_from_box((0.3, 0.03, 0.03), point_count=1500)
+    with pytest.warns(RuntimeWarning, match="200 asked for"):
+        body = build_body(quadrature, BuildOptions(function_count=200, kernel_count=200))
+    assert body.function_count < 200

@@ -17,6 +17,7 @@ doi:10.1145/2508363.2508392), weighted by energy.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,6 +85,9 @@ def choose_functions(
         accuracy: Largest relative error of the first six frequencies, or None.
         poissons_ratios: The body's own, or several.
 
+    Warns:
+        RuntimeWarning: If there are fewer functions than asked for, which begins at about 130.
+
     Raises:
         ConfigError: If the accuracy is not reached within 120 functions.
         BasisError: If the elastic stiffness is singular.
@@ -105,6 +109,12 @@ def choose_functions(
             middle = (low + chosen) // 2
             errors[middle] = space.frequency_error(order[:, :middle], modes)
             low, chosen = (low, middle) if errors[middle] <= accuracy else (middle, chosen)
+    if count is not None and order.shape[1] < count:
+        warnings.warn(
+            f"function_count: {count} asked for, the object's elastic modes make {order.shape[1]}",
+            RuntimeWarning,
+            stacklevel=2,
+        )
     transform = space.transform @ order[:, :chosen]
     # A second pass against the functions themselves repairs what the squared condition number cost.
     value = raw @ transform
