@@ -344,7 +344,8 @@ def test_several_articulations_in_a_world():
     wrench = scene.solver.body_wrench.numpy()
     tray = flap - 1
     assert wrench[tray, 2] == pytest.approx(-scene.mass() * GRAVITY, rel=0.02)
-    assert wrench[1, 1] == pytest.approx(-wrench[2, 1], rel=1e-2)
+    friction = 0.8 * scene.mass() * GRAVITY  # of the ground, on which the squeezed cube still stands
+    assert wrench[1, 1] == pytest.approx(-wrench[2, 1], abs=friction)
     assert wrench[1, 1] > 10.0
     assert scene.reduced.status.numpy()[0] == 0
 

@@ -409,8 +409,9 @@ def test_gradients():
         for name in ("youngs_modulus", "density", "poissons_ratio", "viscosity"):
             value = float(getattr(scene.model.softmode, name).numpy()[0])
             x, losses = [], []
+            step = 2e-4 if name == "poissons_ratio" else 1e-3  # its second derivative is large
             for factor in (-1.0, 1.0):
-                scene.set_parameter(name, value * (1.0 + factor * 1e-3))
+                scene.set_parameter(name, value * (1.0 + factor * step))
                 x.append(float(getattr(scene.model.softmode, name).numpy()[0]))
                 losses.append(loss(scene, adjoint))
             scene.set_parameter(name, value)
@@ -418,7 +419,9 @@ def test_gradients():
             assert gradients[name][0] == pytest.approx(slope, rel=1e-4), name
     for name in ("youngs_modulus", "density", "poissons_ratio", "viscosity", "q", "qd", "force", "pin_target"):
         mine, twin = (gradients[name] for gradients in found)
-        np.testing.assert_allclose(mine, twin, atol=1e-5 * np.abs(twin).max(), err_msg=name)
+        # nu, a float32, changes its own derivative by ten times as much as itself
+        bound = 1e-4 if name == "poissons_ratio" else 1e-5
+        np.testing.assert_allclose(mine, twin, atol=bound * np.abs(twin).max(), err_msg=name)
 
 
 # -- closed forms ------------------------------------------------------------------------------------------------------

@@ -56,8 +56,10 @@ def some_state(body: ReducedBody, seed: int = 7, scale: float = 1.0) -> np.ndarr
 
 
 def assert_same(one: ReducedBody, other: ReducedBody) -> None:
-    """Assert that two bodies are equal field by field, to the bit."""
+    """Assert that two bodies are equal field by field, to the bit, but for what they were built from."""
     for field in dataclasses.fields(ReducedBody):
+        if field.name == "sources":
+            continue
         a, b = getattr(one, field.name), getattr(other, field.name)
         if isinstance(a, np.ndarray):
             assert a.dtype == b.dtype and a.shape == b.shape, field.name

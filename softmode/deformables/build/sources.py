@@ -64,7 +64,8 @@ def unpack_sources(body: ReducedBody) -> Sources:
         document = json.loads(stored.pop("document").tobytes())
         stiffness, density = stored.pop("stiffness_scale", None), stored.pop("density_scale", None)
         cells = {name.removeprefix("cells."): stored.pop(name) for name in list(stored) if name.startswith("cells.")}
-        quadrature: dict[str, Any] = {**document["quadrature"], **stored}
+        members = {name: stored.pop(name).astype(bool) for name in ("members", "satellites") if name in stored}
+        quadrature: dict[str, Any] = {**document["quadrature"], **stored, **members}
         options = document["options"]
         if isinstance(options["poissons_ratio"], list):
             options["poissons_ratio"] = tuple(options["poissons_ratio"])
@@ -99,6 +100,7 @@ def _split(value: Quadrature | Cells) -> tuple[dict[str, NDArray[Any]], dict[str
     """Return the arrays of a record and what else it holds that JSON can."""
     fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
     arrays = {name: item for name, item in fields.items() if isinstance(item, np.ndarray)}
+    arrays = {name: item.astype(np.uint8) if item.dtype == bool else item for name, item in arrays.items()}
     told = {name: item for name, item in fields.items() if name not in arrays and name != "cells" and item is not None}
     if "report" in told:
         told["report"] = {key: item for key, item in told["report"].items() if _plain(item)}
