@@ -286,32 +286,41 @@ class ReducedBody:
             raise ConfigError(f"matrix (3, 3) and translation (3,): got shapes {a.shape} and {t.shape}")
         return self.linear_coordinates @ np.vstack([(a - np.eye(3)).T, t])
 
-    def project(
-        self, field: Callable[[Array], ArrayLike], *, points: Array | None = None, weights: Array | None = None
-    ) -> Array:
+    def project(self, field: Callable[[Array], ArrayLike]) -> Array:
         """Return the coordinates (n, 3) of the vector field, of the functions' span, that is nearest to a given one.
 
-        Nearest in the mean square over the volume. A field of the span comes back as it is, affine ones among them.
+        Nearest in the mean square over the volume, summed over the cubature points. A field of the span comes back as
+        it is, affine ones among them.
 
         Args:
             field: Vectors (N, 3) at rest points of the body frame [m], shape (N, 3).
-            points: Points to sum over [m], shape (N, 3); None for the cubature's.
-            weights: What each of them counts, shape (N,).
 
         Raises:
             ConfigError: If the vectors are not finite or of another shape.
             BasisError: If the cubature points are too few to tell the functions apart.
         """
-        X, w = (self.points, self.weights) if points is None or weights is None else (points, weights)
-        vectors = np.asarray(field(X), dtype=np.float64)
-        if vectors.shape != X.shape or not np.isfinite(vectors).all():
-            raise ConfigError(f"field: expected finite vectors {X.shape}, got shape {vectors.shape}")
-        root = np.sqrt(w / w.sum())[:, None]
-        solved: Any = np.linalg.lstsq(root * self.evaluate(X)[0], root * vectors, rcond=None)
+        vectors = np.asarray(field(self.points), dtype=np.float64)
+        if vectors.shape != self.points.shape or not np.isfinite(vectors).all():
+            raise ConfigError(f"field: expected finite vectors {self.points.shape}, got shape {vectors.shape}")
+        return self.fit(vectors, self.points, self.weights)
+
+    def fit(self, values: Array, points: Array, weights: Array) -> Array:
+        """Return the coordinates (n, C) of the functions of the span that are nearest to values in the mean square.
+
+        Args:
+            values: Values at the points, shape (N, C).
+            points: Rest points of the body frame [m], shape (N, 3).
+            weights: What each of them counts, shape (N,).
+
+        Raises:
+            BasisError: If the points are too few to tell the functions apart.
+        """
+        root = np.sqrt(weights / weights.sum())[:, None]
+        solved: Any = np.linalg.lstsq(root * self.evaluate(points)[0], root * values, rcond=None)
         found, _, rank, _ = solved
         if rank < self.function_count:
             raise BasisError(
-                f"{len(X)} cubature points tell {rank} of {self.function_count} functions apart",
+                f"{len(points)} cubature points tell {rank} of {self.function_count} functions apart",
                 hint="build the body with a larger cubature_count",
             )
         return found

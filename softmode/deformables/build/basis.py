@@ -128,19 +128,9 @@ def _elastic_basis(
         poissons_ratios=options.poissons_ratios,
     )
     functions = affine_first(chosen.transform, skin.leading, domain.length)
-    gradient = np.stack([raw_gradient[:, :, d] @ functions.transform for d in range(3)], axis=2)
+    found = _finished(kernels, skin, modes.eigenvalues, functions, raw_gradient, None, domain, chosen.report())
     stage("functions")
-    drive, drive_affine = drive_matrices(domain.samples, np.zeros((0, 0)), 0)
-    return BodyBasis(
-        kernels=kernels,
-        weights=skin,
-        eigenvalues=modes.eigenvalues,
-        functions=functions,
-        gradient=gradient,
-        drive=drive,
-        drive_affine=drive_affine,
-        report=chosen.report(),
-    )
+    return found
 
 
 def _eigenmode_basis(
@@ -185,19 +175,44 @@ def _eigenmode_basis(
         rank_tolerance=options.rank_tolerance,
         trace=trace,
     )
-    driven = np.zeros((0, 0)) if trace is None else trace @ found.transform[:, : found.driven_count]
-    drive, drive_affine = drive_matrices(samples, driven, len(domain.regions))
-    gradient = np.stack([raw_gradient[:, :, d] @ found.transform for d in range(3)], axis=2)
+    basis = _finished(kernels, skin, modes.eigenvalues, found, raw_gradient, trace, domain, {})
     stage("functions")
+    return basis
+
+
+def _finished(
+    kernels: BasisRKPM,
+    skin: SkinningWeights,
+    eigenvalues: Array,
+    functions: Functions,
+    raw_gradient: Array,
+    trace: Array | None,
+    domain: Domain,
+    report: dict[str, float],
+) -> BodyBasis:
+    """Return the basis with what follows from its functions: gradients, and how regions drive it.
+
+    Args:
+        kernels: Reproducing kernels.
+        skin: Skinning weights.
+        eigenvalues: Of the eigenmodes, shape (m + 1,).
+        functions: The functions.
+        raw_gradient: Gradients of the raw functions [1/m], (P, R, 3).
+        trace: Raw functions at points that fill the exact regions, (T, R); None without such regions.
+        domain: What the body is.
+        report: What the provenance keeps.
+    """
+    driven = np.zeros((0, 0)) if trace is None else trace @ functions.transform[:, : functions.driven_count]
+    drive, drive_affine = drive_matrices(domain.samples, driven, len(domain.regions))
     return BodyBasis(
         kernels=kernels,
         weights=skin,
-        eigenvalues=modes.eigenvalues,
-        functions=found,
-        gradient=gradient,
+        eigenvalues=eigenvalues,
+        functions=functions,
+        gradient=np.stack([raw_gradient[:, :, d] @ functions.transform for d in range(3)], axis=2),
         drive=drive,
         drive_affine=drive_affine,
-        report={},
+        report=report,
     )
 
 

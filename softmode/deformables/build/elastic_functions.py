@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from softmode.deformables.build.functions import orthonormal_in_mass
 from softmode.deformables.build.options import FUNCTION_COUNT, FUNCTION_LIMIT
 from softmode.deformables.build.reduced_stiffness import elastic_stiffness
 from softmode.deformables.build.static_response import lame_parameters
@@ -115,10 +116,7 @@ def choose_functions(
             RuntimeWarning,
             stacklevel=2,
         )
-    transform = space.transform @ order[:, :chosen]
-    # A second pass against the functions themselves repairs what the squared condition number cost.
-    value = raw @ transform
-    transform = transform @ np.linalg.inv(np.linalg.cholesky(value.T @ (mass[:, None] * value))).T
+    transform = orthonormal_in_mass(space.transform @ order[:, :chosen], raw, mass)
     return ElasticChoice(transform=transform, frequency_error=errors[chosen], space_count=space.count)
 
 

@@ -95,15 +95,10 @@ def orthonormalise(
     both = _extend(both, gram, np.flatnonzero(others & ~kept), bound)
     if both.shape[1] == len(lead):
         raise BasisError("the eigenmodes add nothing to affine motion", hint="Use more modes or kernels.")
-    # One pass against the actual functions repairs what the squared condition number of the Gram matrix cost.
-    values = raw @ both
-    both = both @ np.linalg.inv(np.linalg.cholesky(values.T @ (mass[:, None] * values))).T
+    both = orthonormal_in_mass(both, raw, mass)
     # Both triangular factors keep the leading functions within the leading raw ones, and the first four within
     # (1, x, y, z): there the linear functions are read off exactly.
-    unit = np.zeros((4, 4))
-    unit[[1, 2, 3, 0], range(4)] = [length, length, length, 1.0]
-    linear = np.zeros((both.shape[1], 4))
-    linear[:4] = np.linalg.solve(both[lead[:4], :4], unit)
+    linear = _linear_coordinates(both, leading, length)
     mean = np.eye(1, both.shape[1])[0]
     rotation, driven = np.eye(both.shape[1]), 0
     if trace is not None:
@@ -131,11 +126,29 @@ def affine_first(transform: Array, leading: NDArray[np.intp], length: float) -> 
         leading: The raw functions x, y, z and 1.
         length: Unit of length of the raw functions [m].
     """
-    unit = np.zeros((4, 4))
-    unit[range(4), range(4)] = [length, length, length, 1.0]
-    linear = np.zeros((transform.shape[1], 4))
-    linear[:4] = np.linalg.solve(transform[leading[:4], :4], unit)
+    linear = _linear_coordinates(transform, leading, length)
     return Functions(transform=transform, mean=np.eye(1, transform.shape[1])[0], linear=linear, driven_count=0)
+
+
+def orthonormal_in_mass(transform: Array, raw: Array, mass: Array) -> Array:
+    """Return a transform (R, n) whose functions are orthonormal, from one whose functions nearly are.
+
+    A pass against the functions themselves repairs what the squared condition number of a Gram matrix cost.
+
+    Args:
+        transform: b = raw @ transform, shape (R, n).
+        raw: Raw functions at the quadrature points, (P, R).
+        mass: V_p rho_p / V, shape (P,).
+    """
+    values = raw @ transform
+    return transform @ np.linalg.inv(np.linalg.cholesky(values.T @ (mass[:, None] * values))).T
+
+
+def _linear_coordinates(transform: Array, leading: NDArray[np.intp], length: float) -> Array:
+    """Return c (n, 4) with sum_k b_k c_kj = (X, Y, Z, 1)_j, where the first four functions span (x, y, z, 1)."""
+    linear = np.zeros((transform.shape[1], 4))
+    linear[:4] = np.linalg.solve(transform[leading[:4], :4], np.diag([length, length, length, 1.0]))
+    return linear
 
 
 def _extend(basis: Array, gram: Array, index: NDArray[np.intp], tolerance: float) -> Array:

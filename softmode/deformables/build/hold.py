@@ -87,8 +87,5 @@ def carry_over(old: ReducedBody, new: ReducedBody, q: ArrayLike, qd: ArrayLike) 
     X, mass = mass_points(new)
     shift = new.offset - old.offset  # X of the new body is X + shift of the old one
     before = old.evaluate(X + shift)[0]
-
-    def in_new(field: Array) -> Array:
-        return new.project(lambda points: field, points=X, weights=mass)
-
-    return in_new(before @ place + shift), in_new(before @ rate)
+    found = new.fit(np.hstack([before @ place + shift, before @ rate]), X, mass)
+    return found[:, :3], found[:, 3:]
