@@ -57,6 +57,8 @@ class ObjectConfig:
     """Which of the separate parts of a splat file is the object: the one with the largest least spread, so that neither
     the ground it was captured on, wide but thin, nor loose small parts win; the one with the greatest height; the one
     with most splats; or whatever there is."""
+    resolution: int | None = None
+    """Voxels along the longest edge of the grid in which a splat file is filled; 64 if None."""
     pose: Pose = "stable"
     """"stable" lays an object from a file that cannot stand as it is there (on a pointed foot, say) on the side that
     needs the least turn; "captured" lets it topple."""
@@ -75,6 +77,8 @@ class ObjectConfig:
         require_fields(self, ("contact_radius", "clamped_height"), at_least=0.0, unit="m")
         require_number("splat_count", self.splat_count, at_least=100)
         require_number("surface_count", self.surface_count, at_least=16)
+        if self.resolution is not None:
+            require_number("resolution", self.resolution, at_least=16, at_most=512)
         if self.crop is not None and not all(a < b for a, b in zip(self.crop[:3], self.crop[3:], strict=True)):
             raise ConfigError(f"crop {self.crop} is empty", hint="give x0 y0 z0 x1 y1 z1 with every 0 below its 1")
         for name, known in (("shape", Shape), ("up", UpAxis), ("part", Part), ("pose", Pose)):

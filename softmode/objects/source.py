@@ -67,8 +67,8 @@ def object_source(config: ObjectConfig) -> ObjectSource:
         return ObjectSource(splats, solid, shape, (shape, extents), splats.count)
     splats, given, name = _upright_splats(config)
     arrays = (splats.means, splats.scales, splats.quats, splats.opacities)
-    solid = partial(quadrature_from_splats, *arrays, surface_count=count)
-    return ObjectSource(splats, solid, name, ("splats", *arrays), given)
+    solid = partial(quadrature_from_splats, *arrays, surface_count=count, resolution=config.resolution)
+    return ObjectSource(splats, solid, name, ("splats", *arrays, config.resolution), given)
 
 
 def standing_quadrature(config: ObjectConfig, source: ObjectSource) -> tuple[Quadrature, NDArray[np.float64]]:

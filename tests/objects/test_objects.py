@@ -254,6 +254,7 @@ def test_empty_crop_says_where_the_splats_are(tmp_path: Path) -> None:
         {"pose": "flat"},
         {"contact_radius": -0.001},
         {"clamped_height": float("inf")},
+        {"resolution": 8},
     ],
 )
 def test_options_out_of_range_are_refused(given: dict) -> None:

@@ -87,7 +87,7 @@ def quadrature_from_splats(
     *,
     point_count: int = 4000,
     surface_count: int = 400,
-    resolution: int = 64,
+    resolution: int | None = None,
     seed: int = 0,
 ) -> Quadrature:
     """Fill a shell of Gaussian splats and integrate its interior; `occupancy.fill_splats` states the rule.
@@ -99,7 +99,7 @@ def quadrature_from_splats(
         opacities: Opacities 0..1, shape (N,).
         point_count: Target number of quadrature points.
         surface_count: Number of surface samples.
-        resolution: Voxels along the longest edge of the occupancy grid.
+        resolution: Voxels along the longest edge of the occupancy grid; 64 if None.
         seed: Seed of the surface samples.
 
     Returns:
@@ -108,7 +108,7 @@ def quadrature_from_splats(
     Raises:
         AssetError: If arrays do not match, hold NaN, or enclose no volume.
     """
-    solid = fill_splats(means, scales, quats, opacities, resolution=resolution)
+    solid = fill_splats(means, scales, quats, opacities, resolution=resolution or 64)
     found = quadrature_from_implicit(
         solid.level, solid.bounds, point_count=point_count, surface_count=surface_count, seed=seed
     )
@@ -122,7 +122,7 @@ def quadrature_from_points(
     radius: float = 0.0,
     point_count: int = 4000,
     surface_count: int = 400,
-    resolution: int = 64,
+    resolution: int | None = None,
     seed: int = 0,
 ) -> Quadrature:
     """Integrate the object whose surface a point cloud samples.
@@ -135,7 +135,7 @@ def quadrature_from_points(
         radius: How far the surface lies outside the points [m].
         point_count: Target number of quadrature points.
         surface_count: Number of surface samples.
-        resolution: Voxels along the longest edge of the occupancy grid.
+        resolution: Voxels along the longest edge of the occupancy grid; 64 if None.
         seed: Seed of the surface samples.
 
     Returns:
@@ -150,7 +150,7 @@ def quadrature_from_points(
     if not (np.isfinite(radius) and radius >= 0.0):
         raise AssetError(f"radius: expected a length of zero or more [m], got {radius!r}")
     quats = np.tile([0.0, 0.0, 0.0, 1.0], (len(x), 1))
-    solid = fill_splats(x, np.zeros_like(x), quats, np.ones(len(x)), resolution=resolution, outset=radius)
+    solid = fill_splats(x, np.zeros_like(x), quats, np.ones(len(x)), resolution=resolution or 64, outset=radius)
     found = quadrature_from_implicit(
         solid.level, solid.bounds, point_count=point_count, surface_count=surface_count, seed=seed
     )
