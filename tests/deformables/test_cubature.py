@@ -162,3 +162,16 @@ def test_all_points_and_bad_input(full) -> None:
         select_cubature(weights, gradient, 4)
     with pytest.raises(BasisError, match="grad_basis"):
         select_cubature(weights, np.full_like(gradient, np.nan), 16)
+
+
+def test_points_end_where_the_fit_ends_in_rounding() -> None:
+    """Few functions ask for few points: more than they need add none, and do not depend on how many were asked for."""
+    body = build_body(
+        quadrature_from_box((0.06, 0.05, 0.04), point_count=2000),
+        BuildOptions(function_count=12, kernel_count=100, cubature_count=None),
+    )
+    gradient = body.grad_basis.astype(np.float64)
+    found, again = (select_cubature(body.weights, gradient, count) for count in (600, 1200))
+    assert len(found.index) < 600 and found.force_error < 3e-4
+    np.testing.assert_array_equal(found.index, again.index)
+    np.testing.assert_array_equal(found.weights, again.weights)
