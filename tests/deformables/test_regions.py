@@ -291,3 +291,15 @@ def test_soft_regions_can_move_apart(quadrature: Quadrature) -> None:
     root = np.sqrt(body.region_weights)[:, None]
     q = np.linalg.lstsq(root * basis, root * target, rcond=1e-10)[0]
     assert np.linalg.norm(root * (basis @ q - target)) < 0.05 * np.linalg.norm(root * target)
+
+
+def test_springs_of_a_soft_region_are_relative_to_what_they_hold(quadrature: Quadrature) -> None:
+    """Kappa = stiffness E with the local E: four times E everywhere changes no function, in one part its springs."""
+    plain = build_body(quadrature, OPTIONS, regions=(SOFT,))
+    stiff = build_body(quadrature, OPTIONS, regions=(SOFT,), stiffness_scale=np.full(len(quadrature.points), 4.0))
+    at = plain.points[::5]
+    size = np.abs(plain.evaluate(at)[0]).max()
+    np.testing.assert_allclose(stiff.evaluate(at)[0], plain.evaluate(at)[0], atol=1e-8 * size)
+    part = build_body(quadrature, OPTIONS, regions=(SOFT,), stiffness_scale=lambda x: np.where(x[:, 0] > 0.0, 4.0, 1.0))
+    for body in (stiff, part):
+        np.testing.assert_allclose(body.region_weights, 4.0 * plain.region_weights, rtol=1e-12)

@@ -114,7 +114,7 @@ class ReducedBody:
     region_index: Indices
     """Region of each of these points, int64, shape (N,)."""
     region_weights: Array
-    """Their volumes [m^3]; corners of exact regions have none; shape (N,)."""
+    """Their volumes [m^3], of soft regions times relative Young's modulus; corners of exact ones have none; (N,)."""
     drive: Array
     """q[:r] = drive @ u for displacements u of the region points: least squares, shape (r, N)."""
     drive_affine: Array

@@ -33,7 +33,7 @@ class Region:
     """How far the region reaches beyond the box or the points [m]."""
     stiffness: float | None = None
     """None: the region is held or moved exactly. A number kappa / E [1/m^2]: by springs of kappa = stiffness * E per
-    volume [Pa/m^2], the energy kappa / 2 int |x - x_target|^2 dV."""
+    volume [Pa/m^2], the energy kappa / 2 int |x - x_target|^2 dV, with the Young's modulus E of each point."""
 
     def __post_init__(self) -> None:
         """Check shapes and ranges; store what was given as float64 arrays."""

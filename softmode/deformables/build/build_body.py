@@ -114,7 +114,7 @@ def _build(
     seeds, bounds = places - offset, quadrature.bounds - offset
     length = float(np.sqrt(mass @ (seeds**2).sum(axis=1)))
     regions = tuple(region.moved(offset, bounds) for region in regions)
-    samples = sample_regions(regions, seeds, weights, quadrature.spacing)
+    samples = sample_regions(regions, seeds, weights, stiffness, quadrature.spacing)
     points, volumes, parent = refine_at_faces(regions, seeds, weights, quadrature.spacing)
     stiffness = stiffness[parent]
     seconds: dict[str, float] = {}

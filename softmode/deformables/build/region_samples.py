@@ -28,7 +28,7 @@ class RegionSamples:
     index: NDArray[np.int64]
     """Region of each, shape (N,)."""
     weights: Array
-    """Volumes [m^3], shape (N,); corners of exact regions have none."""
+    """Volumes [m^3], of soft regions times relative Young's modulus, shape (N,); corners of exact regions have none."""
     exact: NDArray[np.bool_]
     """Whether the region of each is exact, shape (N,)."""
 
@@ -60,13 +60,16 @@ def octants_near(quadrature: Quadrature, regions: Sequence[Region]) -> tuple[Arr
     )
 
 
-def sample_regions(regions: Sequence[Region], points: Array, weights: Array, spacing: float) -> RegionSamples:
+def sample_regions(
+    regions: Sequence[Region], points: Array, weights: Array, stiffness: Array, spacing: float
+) -> RegionSamples:
     """Sample regions by the cells of a quadrature; exact ones also by corners, so that a layer of cells has thickness.
 
     Args:
         regions: The regions, in the frame of the points.
         points: Quadrature points [m], shape (P, 3).
         weights: Their volumes [m^3], shape (P,).
+        stiffness: Their relative Young's modulus, shape (P,): springs of a soft region are as stiff as what they hold.
         spacing: Edge of their cells [m].
 
     Raises:
@@ -88,6 +91,8 @@ def sample_regions(regions: Sequence[Region], points: Array, weights: Array, spa
             held[inside] = i
             corner = region.corners(place, spacing)
             place, volume = np.concatenate([place, corner]), np.concatenate([volume, np.zeros(len(corner))])
+        else:
+            volume = volume * stiffness[KDTree(points).query(place)[1]]
         places.append(place)
         volumes.append(volume)
         index.append(np.full(len(place), i, dtype=np.int64))
