@@ -217,12 +217,13 @@ class Task:
     def scene_config(self) -> TableSceneConfig:
         """Return what the scene is built from: the configured one, and what a task adds to it.
 
-        Where Poisson's ratio is drawn, the object's functions are made for several.
+        Where Poisson's ratio is drawn, the functions of every object are made for several.
         """
         scene = self.config.scene
         if self.config.poissons_ratio_range is None:
             return scene
-        return replace(scene, object=scene.object.for_varied_ratio())
+        first, *others = (thing.for_varied_ratio() for thing in (scene.object, *scene.others))
+        return replace(scene, object=first, others=tuple(others))
 
     def build(self) -> None:
         """Allocate what the subclass needs; called once, when the scene stands."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from softmode.checks import require_choice, require_fields, require_number
 from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.materials.material import Material
 from softmode.errors import ConfigError
 from softmode.objects.parts import Part
 from softmode.objects.primitives import Color, Extents, find_axis
@@ -100,6 +101,10 @@ class ObjectConfig:
                 raise ConfigError("colors are for shapes and meshes", hint="leave them out; splats have their own")
             if np.shape(self.colors) != (2, 3) or not all(0.0 <= x <= 1.0 for color in self.colors for x in color):
                 raise ConfigError(f"colors {self.colors} are not two colours", hint="give two of (r, g, b) in 0..1")
+
+    def for_material(self, material: Material | None) -> ObjectConfig:
+        """Return this with a body for a material's own Poisson's ratio, unless its options name one."""
+        return self if material is None else replace(self, build=self.build.for_ratio(material.poissons_ratio))
 
     def for_varied_ratio(self) -> ObjectConfig:
         """Return this with a body for a Poisson's ratio that varies; a clamped or a built one stays as it is."""

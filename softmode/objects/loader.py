@@ -46,7 +46,8 @@ def load(
     Args:
         source: A configuration; a file of splats, of a point cloud, of a mesh or of a body, or an OpenUSD stage with
             any of these; a body; splats or a mesh (also of trimesh) in memory; None for the built-in plush.
-        material: What it is made of; None for what its file says.
+        material: What it is made of; None for what its file says. The body is built for its Poisson's ratio, unless
+            `BuildOptions` name one.
         progress: Passed to :func:`softmode.deformables.build.build_body.build_body`.
         options: Fields of `ObjectConfig`, such as ``size=0.08``; they replace those of a configuration. A body takes
             only ``contact_radius``.
@@ -62,6 +63,7 @@ def load(
     if isinstance(source, ReducedBody):
         return SoftObject(body=source, splats=surface_cover(source), material=material, **options)
     config = object_config(source, **options)
+    made = config.for_material(material).build
     if config.body is not None:
         found = read_object(config.body)
         return replace(
@@ -80,11 +82,11 @@ def load(
             wide = float("inf")
             top = float(quadrature.bounds[0, 2]) + config.clamped_height
             regions = (Region(name="foot", box=((-wide,) * 3, (wide, wide, top))),)
-        body = build_body(quadrature, config.build, name=parts.name, regions=regions, progress=progress)
+        body = build_body(quadrature, made, name=parts.name, regions=regions, progress=progress)
         return replace(body, provenance={**body.provenance, "turn": json.dumps(turn.tolist())})
 
     clamp = (config.clamped_height,) if config.clamped_height > 0.0 else ()
-    body = cached_body((RECIPE, *parts.key, may_turn(config), config.surface_count, config.build, *clamp), build)
+    body = cached_body((RECIPE, *parts.key, may_turn(config), config.surface_count, made, *clamp), build)
     turn = np.array(json.loads(str(body.provenance["turn"])))
     splats = splats_of_body(parts.splats, body, turn)
     return SoftObject(body=body, splats=splats, material=material, contact_radius=config.contact_radius, config=config)

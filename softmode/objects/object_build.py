@@ -15,6 +15,7 @@ from softmode.checks import require_number
 from softmode.deformables.body.regions import Region
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.quadrature_grid import Quadrature
+from softmode.deformables.materials.material import Material
 from softmode.errors import ConfigError
 from softmode.objects.loader import Progress, object_config
 from softmode.objects.soft_object import SoftObject
@@ -49,6 +50,7 @@ def build_object(
     *,
     regions: Sequence[Region] = (),
     stiffness: Sequence[StifferBox] = (),
+    material: Material | None = None,
     progress: Progress = None,
     **options: Any,
 ) -> tuple[SoftObject, Quadrature]:
@@ -62,6 +64,7 @@ def build_object(
         source: Which object, as for `load`; not a body.
         regions: Parts that a scene holds, moves or grasps.
         stiffness: Parts of another stiffness; where they overlap, the last one counts.
+        material: What the object is made of, as for `load`.
         progress: Passed to :func:`softmode.deformables.build.build_body.build_body`.
         options: Fields of `ObjectConfig`, such as ``size=0.08``.
 
@@ -83,7 +86,7 @@ def build_object(
     scale = _stiffness(stiffness, quadrature.points - seat)
     body = build_body(
         quadrature,
-        config.build,
+        config.for_material(material).build,
         name=parts.name,
         regions=[region.moved(-seat, quadrature.bounds) for region in regions],
         stiffness_scale=scale,
@@ -96,7 +99,8 @@ def build_object(
     counts = {"asset_splats": parts.asset_splats, "asset_left_out": left_out}
     frame = {"turn": json.dumps(turn.tolist()), "seat": json.dumps(seat.tolist())}
     body = replace(body, provenance={**body.provenance, **origin, **counts, **frame})
-    return SoftObject(body=body, splats=splats, contact_radius=config.contact_radius, config=config), quadrature
+    found = SoftObject(body=body, splats=splats, material=material, contact_radius=config.contact_radius, config=config)
+    return found, quadrature
 
 
 def _stiffness(boxes: Sequence[StifferBox], points: NDArray[np.float64]) -> NDArray[np.float64] | None:

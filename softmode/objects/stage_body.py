@@ -48,7 +48,7 @@ def place_deformable(
 
     Args:
         deformable: From `read_usd_scene`.
-        options: How its body is reduced; defaults when None.
+        options: How its body is reduced; defaults when None, for the Poisson's ratio of its material.
         material: Properties that the stage does not give; ``Material()`` when None.
         surface_count: Number of surface samples.
         splat_count: Number of splats on a body that the stage shows by meshes.
@@ -69,7 +69,9 @@ def place_deformable(
         body = body_of(deformable.bundle, deformable.path)
         offset = np.zeros(3)  # the prim's frame is the body frame
     else:
-        body = build_deformable(deformable, options, surface_count=surface_count, progress=progress)
+        ratio = deformable.material(1.0, material).poissons_ratio
+        chosen = (options or BuildOptions()).for_ratio(ratio)
+        body = build_deformable(deformable, chosen, surface_count=surface_count, progress=progress)
         offset = body.offset
     splats = deformable.splats or _mesh_splats(deformable, splat_count)
     if splats is not None and offset.any():

@@ -81,6 +81,7 @@ def add_soft_fingertips(
     material = material or Material(youngs_modulus=3.0e5, poissons_ratio=0.45, density=1100.0, friction=1.0)
     quadrature = quadrature_from_capsule(radius, half_height, point_count=2000, surface_count=400)
     options = BuildOptions(mode_count=mode_count, kernel_count=300, cubature_count=256)
+    options = options.for_ratio(material.poissons_ratio)
     back = ((-np.inf, -np.inf, -np.inf), (np.inf, 0.0, np.inf))
     glued = Region(name="back", box=np.array(back), stiffness=GLUE_STIFFNESS / radius**2)
     body = build_body(quadrature, options, name="fingertip", regions=(glued,))

@@ -114,7 +114,7 @@ class TableScene:
         self.device = wp.get_device(device)
         self.dt = 1.0 / (config.control_hz * config.substeps)
         kinds = (config.object, *config.others)
-        loaded = {kind: load(kind, progress=progress) for kind in dict.fromkeys(kinds)}
+        loaded = {kind: load(kind, material=config.material, progress=progress) for kind in dict.fromkeys(kinds)}
         self.objects: tuple[SoftObject, ...] = tuple(loaded[kind] for kind in kinds)
         """The soft objects of a world; their instances follow each other, world by world."""
         self._build_model()

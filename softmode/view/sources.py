@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softmode.deformables.build.options import FUNCTION_LEAST, FUNCTION_LIMIT
+from softmode.deformables.build.options import FUNCTION_LEAST, FUNCTION_LIMIT, BuildOptions
 from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
 from softmode.objects.loader import Progress, load, object_config
@@ -40,7 +40,7 @@ def load_source(
     if isinstance(source, str | Path) and Path(source).suffix.lower() in tokens.SUFFIXES:
         deformables = read_usd_scene(source).deformables
         if deformables:
-            first = place_deformable(deformables[0], progress=progress)
+            first = place_deformable(deformables[0], BuildOptions().for_varied_ratio(), progress=progress)
             _refuse_size(size, f"the body {first.body.name!r} of {source}")
             splats = first.splats or surface_cover(first.body)
             return Placed(object=replace(first.object, splats=splats), scale=first.scale)

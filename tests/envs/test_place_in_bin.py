@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import softmode  # noqa: F401  (registers the environments)
+from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.model.status import WORLD_COLLAPSED, WORLD_ITERATION_LIMIT
 from softmode.envs.end_reason import EndReason
 from softmode.envs.scripted import scripted_policy
@@ -321,3 +322,14 @@ def test_an_empty_bin_will_do() -> None:
     assert "other_offsets" not in env.task.segments
     info, _ = play(env, 0)
     assert info["is_success"] and info["others_inside"] == 0.0
+
+
+def test_every_object_is_built_for_a_ratio_that_varies() -> None:
+    """Where Poisson's ratio is drawn, the toy's functions and the others' are made for several."""
+    build = BuildOptions(function_count=12, kernel_count=60, cubature_count=48)
+    scene = bin_scene()
+    first, *others = (replace(thing, build=build) for thing in (scene.object, *scene.others))
+    scene = replace(scene, object=first, others=tuple(others))
+    env = PlaceInBinEnv(config=PlaceInBinConfig(scene=scene, poissons_ratio_range=(0.2, 0.45)))
+    assert {thing.body.function_count for thing in env.scene.objects} == {15}
+    assert all(thing.body.serves_ratio(0.49) for thing in env.scene.objects)

@@ -12,7 +12,7 @@ import trimesh
 
 from softmode.deformables import BuildOptions, Material
 from softmode.errors import ConfigError
-from softmode.objects import ObjectConfig, Placed, SoftObject, load, surface_cover
+from softmode.objects import ObjectConfig, Placed, SoftObject, build_object, load, surface_cover
 from softmode.splats import make_plush, write_ply
 from softmode.splats.formats import read_splats
 
@@ -104,3 +104,39 @@ def test_bad_places_are_refused(given: dict, cup: Path) -> None:
     """A place is checked when it is made."""
     with pytest.raises(ConfigError, match=next(iter(given))):
         Placed(object=SoftObject(body=load(cup, **SMALL).body), **given)
+
+
+def test_a_body_is_built_for_the_ratio_of_its_material(cup: Path) -> None:
+    """The material's Poisson's ratio is that of the build, unless the options name one; 0.4 changes no bit."""
+    options = {"size": 0.06, "splat_count": 120, "surface_count": 60}
+    small = BuildOptions(function_count=12, kernel_count=60, cubature_count=48)
+    rubber = Material(poissons_ratio=0.49)
+    plain, default, found, named = (
+        load(cup, material=material, build=build, **options).body
+        for material, build in (
+            (None, small),
+            (Material(), small),
+            (rubber, small),
+            (rubber, replace(small, poissons_ratio=0.3)),
+        )
+    )
+    assert default.fingerprint == plain.fingerprint
+    np.testing.assert_array_equal(default.grad_basis, plain.grad_basis)
+    assert found.provenance["option_poissons_ratio"] == 0.49 and found.serves_ratio(0.49)
+    assert found.fingerprint != plain.fingerprint
+    assert named.provenance["option_poissons_ratio"] == 0.3
+    again = load(cup, material=rubber, build=small, **options)
+    assert again.config is not None and again.config.build == small, "the configuration stays as it was given"
+    anew, _ = build_object(cup, material=rubber, build=small, **options)
+    np.testing.assert_array_equal(anew.body.grad_basis, found.grad_basis)
+    assert anew.material == rubber
+
+
+def test_options_for_a_ratio() -> None:
+    """0.4 and options that name a ratio stay as they are; a negative ratio is served by functions for 0."""
+    given = BuildOptions()
+    assert given.for_ratio(0.4) is given
+    assert given.for_ratio(0.45).poissons_ratios == (0.45,)
+    assert given.for_ratio(-0.3).poissons_ratios == (0.0,)
+    varied = given.for_varied_ratio()
+    assert varied.for_ratio(0.2) is varied

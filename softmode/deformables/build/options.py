@@ -49,9 +49,9 @@ class BuildOptions:
     """Largest relative error of the first six free frequencies against the whole space that the functions are chosen
     from, for instance 0.02. The fewest functions that reach it are taken, up to 120."""
     poissons_ratio: float | tuple[float, ...] | None = None
-    """Poisson's ratio that the functions are made for; None means 0.4. Any other can be simulated, but functions made
-    for 0.4 are 28 % too stiff in a plate of 0.49. Several, such as (0.3, 0.45, 0.49), serve a ratio that varies, and
-    want 60 functions. Static responses use the mean."""
+    """Poisson's ratio that the functions are made for; None means that of the material that an object is loaded with,
+    else 0.4. Any other can be simulated, but functions made for 0.4 are 28 % too stiff in a plate of 0.49. Several,
+    such as (0.3, 0.45, 0.49), serve a ratio that varies, and want 60 functions. Static responses use the mean."""
     mode_count: int | None = None
     """Skinning eigenmodes beside the constant handle, of FreeForm's functions; up to 4 (mode_count + 1) functions."""
     handles: HandleName | None = None
@@ -73,9 +73,9 @@ class BuildOptions:
     """Of FreeForm's functions those that add less than this fraction of mass (of the scaled Gram matrix) to the others
     are dropped, 0 < tolerance <= 1e-2; on a body with regions it is at most 1e-7."""
     cubature_count: int | None = 384
-    """Points at which a step evaluates stress; None keeps all. Beyond 100 functions allow six points for each: 384 make
-    a held plate 40:1 of 132 functions 6 % too soft, 768 3 %. `provenance` has the body's own errors, of the forces also
-    at smaller counts."""
+    """Points at which a step evaluates stress, or fewer where these fit the forces to rounding; None keeps all. Beyond
+    100 functions allow six points for each: 384 make a held plate 40:1 of 132 functions 6 % too soft, 768 3 %.
+    `provenance` has the body's own errors, of the forces also at smaller counts."""
     seed: int = 0
     """Seed of every random choice of the build."""
 
@@ -111,6 +111,15 @@ class BuildOptions:
     def with_functions(self, count: int) -> BuildOptions:
         """Return these options with another number of functions, chosen by elastic energy."""
         return replace(self, function_count=count, accuracy=None, mode_count=None, handles=None)
+
+    def for_ratio(self, poissons_ratio: float) -> BuildOptions:
+        """Return these options for a material's Poisson's ratio, unless they name one.
+
+        Functions made for 0 serve a ratio below.
+        """
+        if self.poissons_ratio is not None or poissons_ratio == DEFAULT_POISSONS_RATIO:
+            return self
+        return replace(self, poissons_ratio=max(poissons_ratio, 0.0))
 
     def for_varied_ratio(self) -> BuildOptions:
         """Return these options for a Poisson's ratio that varies: several ratios, and a quarter more functions.

@@ -152,7 +152,7 @@ class PushSoft(Task):
 
     def marker(self) -> Splats:
         """Return the outline of the object, to be drawn on the table."""
-        soft = load(self.config.scene.object)
+        soft = load(self.scene_config().object, material=self.config.scene.material)
         points = soft.body.surface_points[:, :2]
         corners = points[ConvexHull(points).vertices]
         edges = np.roll(corners, -1, axis=0) - corners

@@ -87,7 +87,11 @@ class ShapeSoft(Task):
 
     def marker(self) -> Splats:
         """Return the surface of the post; `observe` bends it."""
-        return dots(load(self.config.scene.object).body.surface_points, 0.004, opacity=0.35)
+        return dots(
+            load(self.scene_config().object, material=self.config.scene.material).body.surface_points,
+            0.004,
+            opacity=0.35,
+        )
 
 
 class ShapeSoftEnv(GoalMethods, SoftEnv):
