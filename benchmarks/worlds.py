@@ -6,19 +6,24 @@ actions of its own instead. ``--preset rl`` takes the scene of ``softmode.envs.p
 
 Prints milliseconds per control step, world steps per second, the union of the solver's status bits and, on CUDA, the
 memory taken; with ``--pixels 64`` also the time of a picture of that edge in every world, meshes, shadows and splats,
-and what it takes without the splats.
+and what it takes without the splats. ``--grip`` prints instead, for bodies and solvers between a fine scene and the
+preset, what the fingers feel and how wide the object between them is, scripted lifts, and processor time of one world.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from softmode.envs.presets import rl_scene
+from softmode.deformables.build.options import BuildOptions
+from softmode.envs.presets import RL_BUILD, rl_scene
+from softmode.envs.tasks.lift_soft.scripted import ScriptedLift
+from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv
 from softmode.scenes.table_scene import TableScene, TableSceneConfig
 from softmode.splats.camera import SplatCamera
 from softmode.splats.pinhole import PinholeCamera
@@ -34,7 +39,11 @@ def main() -> None:
     parser.add_argument("--random", action="store_true", help="random actions instead of a grasp")
     parser.add_argument("--warm-up", type=int, default=26, help="control steps before the clock starts")
     parser.add_argument("--preset", choices=["fine", "rl"], default="fine")
+    parser.add_argument("--grip", action="store_true", help="print what bodies and solvers change in a grip")
     options = parser.parse_args()
+    if options.grip:
+        report_grips()
+        return
     config = rl_scene() if options.preset == "rl" else TableSceneConfig()
     wp.config.log_level = wp.LOG_WARNING
     for count in options.worlds:
@@ -100,6 +109,50 @@ def report_pictures(scene: TableScene, camera: PinholeCamera, repeats: int) -> N
         spent = float(np.median(times))
         print(
             f"  {camera.width} px, {name}: {spent:.2f} ms, {1e3 * scene.world_count / spent:.0f} pictures/s", flush=True
+        )
+
+
+def report_grips() -> None:
+    """Print force, width and extent of the object in one grip, scripted lifts, and time, by body and solver."""
+    fine = TableSceneConfig()
+
+    def body(config: TableSceneConfig, **options: Any) -> TableSceneConfig:
+        return replace(config, object=replace(config.object, build=BuildOptions(**options)))
+
+    scenes = {
+        "120 functions, 768 points": body(fine, function_count=120, cubature_count=768),
+        "default": fine,
+        "default, 4 steps of 1/120 s": replace(fine, substeps=4),
+        "32 functions": body(fine, function_count=32),
+        "24 functions": body(fine, function_count=RL_BUILD.function_count),
+        "preset": rl_scene(),
+        "preset, 48 functions": body(rl_scene(), cubature_count=RL_BUILD.cubature_count),
+        "preset, FreeForm's": body(rl_scene(), mode_count=5, cubature_count=RL_BUILD.cubature_count),
+    }
+    wp.config.log_level = wp.LOG_WARNING
+    print(f"{'':<30}{'force [N]':>16}{'width [mm]':>12}{'extent [mm]':>20}{'ms':>7}  scripted lifts")
+    for name, config in scenes.items():
+        scene = TableScene(config, device="cpu")
+        times = []
+        for step in range(70):
+            clock = time.process_time()
+            scene.step(grasp_action(scene, step))
+            times.append(1e3 * (time.process_time() - clock))
+        force = np.linalg.norm(scene.finger_force.numpy()[0], axis=1)
+        extent = 1e3 * np.ptp(scene.state.particle_q.numpy(), axis=0)
+        lifts = []
+        for seed in range(3):
+            env = LiftSoftEnv(config=LiftSoftConfig(scene=replace(config, constraint_max=96)))
+            observation, info = env.reset(seed=seed, options={"youngs_modulus": 1.0e5})
+            policy, over, count = ScriptedLift(env), False, 0
+            while not over:
+                observation, _, ended, cut, info = env.step(policy(observation))
+                over, count = ended or cut, count + 1
+            lifts.append(str(count) if info["is_success"] else "lost")
+        print(
+            f"{name:<30}{force[0]:>8.2f}{force[1]:>8.2f}{1e3 * scene.controller.opening.numpy()[0]:>12.2f}"
+            f"{extent[0]:>8.1f}{extent[1]:>6.1f}{extent[2]:>6.1f}{np.median(times[40:]):>7.2f}  {', '.join(lifts)}",
+            flush=True,
         )
 
 
