@@ -538,7 +538,14 @@ __all__ = ["TOLERANCE", "ConvergenceError", "Energy", "Mesh", "Minimiser", "Soli
 
 
 def free_eigenvalues(mesh: Mesh, poissons_ratio: float, count: int = 6, *, stiffness: ArrayLike | None = None) -> Array:
-    """Return the first elastic eigenvalues of a free solid, per E / rho [1/m^2], ascending.
+    """Return the first elastic eigenvalues of a free solid, see `free_modes`."""
+    return free_modes(mesh, poissons_ratio, count, stiffness=stiffness)[0]
+
+
+def free_modes(
+    mesh: Mesh, poissons_ratio: float, count: int = 6, *, stiffness: ArrayLike | None = None
+) -> tuple[Array, Array]:
+    """Return the first elastic eigenvalues of a free solid, per E / rho [1/m^2], ascending, and its modes (node, 3, .).
 
     A frequency is sqrt(value E / rho) / (2 pi). Linear elasticity, consistent mass; the six rigid motions are left out.
 
@@ -568,5 +575,6 @@ def free_eigenvalues(mesh: Mesh, poissons_ratio: float, count: int = 6, *, stiff
     shifted = sparse_linalg.splu((K + shift * M).tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
     inverse = sparse_linalg.LinearOperator(K.shape, matvec=shifted.solve, dtype=np.float64)
     start = np.random.default_rng(0).normal(size=size)
-    value = sparse_linalg.eigsh(K, k=count + 6, M=M, sigma=-shift, OPinv=inverse, v0=start, return_eigenvectors=False)
-    return np.sort(value)[6:]
+    value, mode = sparse_linalg.eigsh(K, k=count + 6, M=M, sigma=-shift, OPinv=inverse, v0=start)
+    order = np.argsort(value)[6:]
+    return value[order], mode[:, order].reshape(len(mesh.nodes), 3, -1)

@@ -33,11 +33,15 @@ class Bricks:
 
     def eigenvalues(self, poissons_ratio: float, count: int = 6) -> Array:
         """Return the first free eigenvalues by finite elements, per E / rho [1/m^2]."""
+        return free_eigenvalues(self.mesh(), poissons_ratio, count)
+
+    def mesh(self) -> Mesh:
+        """Return the finite elements."""
         fine = self.mask
         for axis in range(3):
             fine = fine.repeat(self.refine, axis=axis)
         lines = tuple(np.arange(n + 1) * (p / self.refine) for n, p in zip(fine.shape, self.pitch, strict=True))
-        return free_eigenvalues(Mesh(lines, fine), poissons_ratio, count)  # type: ignore[arg-type]
+        return Mesh(lines, fine)  # type: ignore[arg-type]
 
 
 def _full(*counts: int) -> Mask:
