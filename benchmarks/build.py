@@ -28,7 +28,9 @@ RIGHT = Region(name="right", box=((2.0, -np.inf, -np.inf), (np.inf,) * 3))
 PAPER = BuildOptions(mode_count=32, kernel_count=1000)
 CASES: dict[str, tuple[BuildOptions, tuple[Region, ...]]] = {
     "K = 1000, m = 32": (PAPER, ()),
-    "default, K = 400, m = 8": (BuildOptions(), ()),
+    "default: 48 functions, K = 1000": (BuildOptions(), ()),
+    "48 functions, K = 400": (BuildOptions(kernel_count=400), ()),
+    "K = 400, m = 8": (BuildOptions(mode_count=8), ()),
     "K = 400, m = 16": (BuildOptions(mode_count=16), ()),
     "K = 400, m = 8, quadratic handles": (BuildOptions(handles="quadratic"), ()),
     "K = 400, m = 2, one end held exactly": (BuildOptions(mode_count=2), (LEFT,)),

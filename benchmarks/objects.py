@@ -1,8 +1,8 @@
 """What the preset objects cost, and how far a rope bends with which handles.
 
 The first table has one line per preset of `softmode.objects.presets`: sizes, processor time of the build without a
-cache, time of a step at rest on the ground. The second one holds a rope in its middle and compares the drop of its
-ends with the heavy elastica's.
+cache, time of a step at rest on the ground. The second one presses on their tops and compares with many functions. The
+third one holds a rope in its middle and compares the drop of its ends with the heavy elastica's.
 
 Run: ``python -m benchmarks.objects [--load 2.5]``
 """
@@ -19,13 +19,17 @@ import numpy as np
 import warp as wp
 
 from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.reduced_stiffness import reduced_stiffness
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReduced
-from softmode.objects import load, presets
+from softmode.objects import ObjectConfig, load, presets
 from tests.objects.test_primitives import hang, heavy_elastica
 from tests.scenes import GRAVITY
 
 DT = 1.0 / 240.0
+PATCH = 0.024
+"""Diameter of what presses on an object [m]."""
+FINE = BuildOptions(mode_count=16, handles="quadratic", rank_tolerance=1e-9)
 ROPES = (
     BuildOptions(mode_count=6),
     BuildOptions(mode_count=16),
@@ -64,8 +68,21 @@ def step_time(name: str) -> str:
     return f"| {name} | {sizes} | {seconds:.2f} | {min(times):.2f} |"
 
 
+def compliance(config: ObjectConfig, ratio: float, build: BuildOptions) -> float:
+    """Return how far a free object gives, per unit of force, under a round patch in the middle of its top [1/m]."""
+    body = load(replace(config, build=replace(build, cubature_count=None)), progress=False).body
+    gradient = body.grad_basis.astype(np.float64).transpose(1, 2, 0)
+    value, mode = np.linalg.eigh(reduced_stiffness(gradient, body.weights, ratio))
+    across = PATCH * (np.mgrid[-10:11, -10:11].reshape(2, -1).T / 20.0)
+    across = across[np.linalg.norm(across, axis=1) <= 0.5 * PATCH]
+    top = body.bounds[:, :2].mean(axis=0), body.bounds[1, 2]
+    force = body.evaluate(np.column_stack([top[0] + across, np.full(len(across), top[1])]))[0].mean(axis=0)
+    load_on = mode[2 * body.function_count :].T @ force
+    return float((load_on[6:] ** 2 / value[6:]).sum())  # The object accelerates under the force.
+
+
 def main() -> None:
-    """Print both tables."""
+    """Print all tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--load", type=float, default=2.5, help="w (L/2)^3 / (E I) of the rope")
     pull = parser.parse_args().load
@@ -77,6 +94,10 @@ def main() -> None:
         for name in ("BEAM", "CUBE", "PAD", "ROPE"):
             os.environ["SOFTMODE_CACHE"] = os.path.join(folder, name)
             print(step_time(name), flush=True)
+        print(f"\npatch of {1e3 * PATCH:.0f} mm: compliance over that of quadratic handles of 16 modes")
+        for name in ("BEAM", "CUBE", "PAD"):
+            config, ratio = getattr(presets, name), getattr(presets, f"{name}_MATERIAL").poissons_ratio
+            print(name, round(compliance(config, ratio, config.build) / compliance(config, ratio, FINE), 2), flush=True)
         half, radius = 0.5 * presets.ROPE.extents[0], 0.5 * presets.ROPE.extents[1]  # type: ignore[index]
         modulus = 1000.0 * GRAVITY * 4.0 * half**3 / (pull * radius**2)
         material = replace(presets.ROPE_MATERIAL, youngs_modulus=modulus, density=1000.0)
