@@ -12,7 +12,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     "softmode errors",
-    "files checks lazy versions",
+    "files checks lazy quiet versions",
     "deformables stages",
     "splats robots",
     "objects",

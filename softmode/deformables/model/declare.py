@@ -5,6 +5,10 @@ from typing import Any
 
 import warp as wp
 
+from softmode.quiet import quieten_warp
+
+quieten_warp()
+
 Kernel = Callable[..., object]
 """A ``wp.kernel``, which a type checker takes for the function that it was made of."""
 

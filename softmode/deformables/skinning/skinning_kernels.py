@@ -4,6 +4,9 @@ import functools
 
 import warp as wp
 
+from softmode.quiet import quieten_warp
+
+quieten_warp()
 wp.set_module_options({"enable_backward": False})
 
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
