@@ -390,6 +390,24 @@ def test_cache_builds_once(body: ReducedBody, tmp_path: Path, monkeypatch) -> No
     assert len(list((tmp_path / "bodies").glob("*.npz"))) == 2
 
 
+def test_a_cache_that_cannot_be_made_is_temporary(body: ReducedBody, tmp_path: Path, monkeypatch) -> None:
+    """A warning names SOFTMODE_CACHE; the body is kept for this process and its children, and built once."""
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("SOFTMODE_CACHE", str(tmp_path / "file" / "cache"))
+    calls = []
+
+    def build() -> ReducedBody:
+        calls.append(1)
+        return body
+
+    with pytest.warns(UserWarning, match="SOFTMODE_CACHE"):
+        same(cached_body(("a", 1), build), body)
+    assert cache_directory() != tmp_path / "file" / "cache" and list(cache_directory().glob("bodies/*.npz"))
+    same(cached_body(("a", 1), build), body)
+    assert len(calls) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
 def test_damaged_cache_entry_is_rebuilt(body: ReducedBody, tmp_path: Path) -> None:
     """Rubbish under the right name is replaced."""
     cached_body(("k",), lambda: body, directory=tmp_path)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import dataclasses
 import hashlib
 import os
+import shutil
 import sys
+import tempfile
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -29,7 +33,8 @@ def cached_body(
     Args:
         key: Everything the result depends on; see `fingerprint_of` for what can be hashed.
         build: Called without arguments when the cache has no usable entry.
-        directory: Cache folder; default is `cache_directory()` / "bodies".
+        directory: Cache folder; default is `cache_directory()` / "bodies", or a temporary folder with a warning where
+            that cannot be made or written to.
 
     Returns:
         The body.
@@ -38,7 +43,9 @@ def cached_body(
     path = folder / f"{fingerprint_of(FORMAT_VERSION, *key)}.npz"
     with contextlib.suppress(AssetError):
         return ReducedBody.load(path)
-    folder.mkdir(parents=True, exist_ok=True)
+    if directory is None:
+        path = _writable_cache(folder) / path.name
+    path.parent.mkdir(parents=True, exist_ok=True)
     with _locked(path.with_suffix(".lock")):
         with contextlib.suppress(AssetError):
             return ReducedBody.load(path)
@@ -51,6 +58,29 @@ def cache_directory() -> Path:
     """Return the user's cache folder: the environment variable SOFTMODE_CACHE, or ~/.cache/softmode."""
     override = os.environ.get("SOFTMODE_CACHE")
     return Path(override) if override else Path.home() / ".cache" / "softmode"
+
+
+def _writable_cache(folder: Path) -> Path:
+    """Return a cache folder, or one in a temporary folder where it cannot be made or written to.
+
+    The temporary folder becomes SOFTMODE_CACHE of this process, so that its children share it, and ends with it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            return folder
+        reason = "not writable"
+    except OSError as error:
+        reason = error.strerror or str(error)
+    temporary = tempfile.mkdtemp(prefix="softmode-")
+    atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+    os.environ["SOFTMODE_CACHE"] = temporary
+    warnings.warn(
+        f"the cache folder {folder} cannot be used ({reason}): bodies are kept in {temporary} until this process ends."
+        " Set SOFTMODE_CACHE to a folder that can be written to",
+        stacklevel=4,
+    )
+    return Path(temporary, folder.name)
 
 
 def fingerprint_of(*values: object) -> str:
