@@ -206,7 +206,8 @@ def main() -> None:
                 f"success {100.0 * successes / episodes:5.1f} %  std {float(agent.log_std.detach().exp().mean()):.2f}"
             )
     worlds.env.close()
-    test_final(history)
+    if options.short:
+        test_final(history)
 
 
 if __name__ == "__main__":

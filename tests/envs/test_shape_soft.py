@@ -59,6 +59,15 @@ def play(env: ShapeSoftEnv, seed: int, **options: Any) -> dict[str, Any]:
 # -- goals ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("obs_type", ["pixels", "pixels_agent_pos"])
+def test_pictures_have_no_goals(obs_type: str) -> None:
+    """Stable-Baselines3's checker takes an environment of pictures for what it is: one without goals."""
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    env = gym.make(ENV_ID, obs_type=obs_type).unwrapped
+    checker.check_env(env, warn=True, skip_render_check=True)
+    assert not hasattr(env, "compute_reward")
+
+
 def test_goals_are_surface_points_seen_from_the_foot(shape: ShapeSoftEnv) -> None:
     """`achieved_goal` are the samples relative to the foot; a target of no displacement is the post at rest."""
     given = {"position": (0.455, -0.005), "yaw": 0.9, "goal": (0.0, 0.4)}

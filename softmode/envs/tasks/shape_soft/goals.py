@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from types import MethodType
 from typing import Any
 
 import numpy as np
@@ -27,14 +28,29 @@ def reward_rules(config: ShapeSoftConfig) -> Any:
     return filled(kernels.Rules, config, point_count=POINTS, sparse=int(config.reward == "sparse"))
 
 
+class _GoalMethod:
+    """A method that environments have only where their observations hold the goals, which is how learners tell them."""
+
+    def __init__(self, method: Callable[..., Any]) -> None:
+        self.method, self.__doc__ = method, method.__doc__
+
+    def __get__(self, env: Any, kind: type | None = None) -> Callable[..., Any]:
+        if env is None:
+            return self.method
+        if env.obs_type != "state":
+            raise AttributeError(f"{self.method.__name__} needs the goals that obs_type='state' observes")
+        return MethodType(self.method, env)
+
+
 class GoalMethods:
-    """Reward and ends of episodes as functions of the goals."""
+    """Reward and ends of episodes as functions of the goals; only with state observations, which hold them."""
 
     config: ShapeSoftConfig
 
     device: wp.Device
     """Device on which rewards of numpy arrays are computed: that of the task."""
 
+    @_GoalMethod
     def compute_reward(self, achieved_goal: Goals, desired_goal: Goals, info: Infos = None) -> Any:
         """Return the reward of a step that led to `achieved_goal`, bit for bit that of the step on the same device.
 
@@ -72,6 +88,7 @@ class GoalMethods:
         wp.launch(kernels.compute_reward, dim=reward.shape[0], inputs=inputs, outputs=[reward], device=device)
         return reward
 
+    @_GoalMethod
     def compute_terminated(self, achieved_goal: Goals, desired_goal: Goals, info: Infos = None) -> Any:
         """Return whether the episode ended by a failure, which `info` (one or a sequence) knows; goals end none."""
         if isinstance(info, Mapping):
@@ -80,6 +97,7 @@ class GoalMethods:
             return np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
         return np.array([_failed(one) for one in info])
 
+    @_GoalMethod
     def compute_truncated(self, achieved_goal: Goals, desired_goal: Goals, info: Infos = None) -> Any:
         """Return False: the time limit is not the task's."""
         return np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
