@@ -61,7 +61,7 @@ def test_info_describes_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 @pytest.mark.parametrize("kind", [".ply", ".spz"])
 def test_convert_keeps_the_splats(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What was read is what is written, to what the kind can hold; --up -y turns z up into y down."""
+    """What was read is what is written, to what the kind can hold; a convention turns it from the axis that is up."""
     source, target = tmp_path / "a.ply", tmp_path / f"b{kind}"
     plush = make_plush(count=500)
     write_ply(source, plush)
@@ -70,7 +70,10 @@ def test_convert_keeps_the_splats(kind: str, tmp_path: Path, capsys: pytest.Capt
     read = read_splats(target)
     np.testing.assert_allclose(read.means, plush.means, atol=1e-6 if kind == ".ply" else 2.0**-12)
     np.testing.assert_allclose(read.colors(), plush.colors(), atol=0.02)
-    assert main(["splat", "convert", str(source), str(target), "--up", "-y"]) == 0
+    turned = ["splat", "convert", str(source), str(target), "--up", "+z", "--convention"]
+    assert main([*turned, "spz"]) == 0
+    np.testing.assert_allclose(read_splats(target).oriented("+y").means, read.means, atol=2.0**-11)
+    assert main([*turned, "trained"]) == 0
     np.testing.assert_allclose(read_splats(target).oriented("-y").means, read.means, atol=2.0**-11)
     assert np.abs(read_splats(target).means[:, 1] + read.means[:, 2]).max() < 2.0**-11
 
@@ -87,6 +90,7 @@ FAILURES: dict[str, tuple[list[str], str]] = {
     "no folder": (["from-mesh", "{mesh}", "--out", "{folder}/deep/toy.ply"], "deep"),
     "other kind": (["from-mesh", "{mesh}", "--out", "{folder}/toy.jpg"], "toy.jpg"),
     "info missing": (["info", "{folder}/none.ply"], "none.ply"),
+    "up alone": (["convert", "{folder}/text.ply", "{folder}/b.ply", "--up", "-y"], "--convention"),
     "convert missing": (["convert", "{folder}/none.ply", "{folder}/b.ply"], "none.ply"),
     "convert to other kind": (["convert", "{folder}/none.ply", "{folder}/b.jpg"], "b.jpg"),
 }

@@ -8,13 +8,16 @@ from typing import Any, Literal
 
 from softmode.checks import require_number
 from softmode.cli.common import bar_interval, quiet_warp, warp_device
-from softmode.errors import AssetError
+from softmode.errors import AssetError, ConfigError
 from softmode.files import check_place
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SplatFromMesh:
-    """Make splats of a textured or vertex-coloured mesh: sample its surface, then fit the splats to pictures of it."""
+    """Make splats of a textured or vertex-coloured mesh: sample its surface, then fit the splats to pictures of it.
+
+    Example: softmode splat from-mesh toy.glb --count 20000
+    """
 
     mesh: Path
     """Mesh file of any kind that trimesh reads (.glb, .obj, .ply, .stl, ...), with its textures."""
@@ -80,7 +83,10 @@ class SplatFromMesh:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SplatInfo:
-    """Print what a splat file holds."""
+    """Print what a splat file holds.
+
+    Example: softmode splat info toy.ply
+    """
 
     file: Path
     """The splat file."""
@@ -111,22 +117,35 @@ class SplatInfo:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SplatConvert:
-    """Read a splat file and write it as another kind, named by the suffix."""
+    """Read a splat file and write it as another kind, named by the suffix.
+
+    Example: softmode splat convert toy.ply toy.spz --convention spz
+    """
 
     source: Path
     """File to read."""
     target: Path
     """File to write: .ply, .compressed.ply, .splat, .spz, .usd, .usda or .usdc."""
-    up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] = "+z"
-    """Axis of the written file onto which +z of the read one is turned; +z leaves it."""
+    convention: Literal["z-up", "spz", "trained"] | None = None
+    """Whom the written file is turned for: softmode (z-up); readers that keep to SPZ's specification, and three.js
+    (spz: y up); those that take a file as training leaves it (trained: y down). Without it the numbers stay."""
+    up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
+    """Axis of the file to read that points up, with --convention; -y for splats, +z for OpenUSD if omitted."""
 
     def run(self) -> int:
         """Read and write."""
-        from softmode.splats.formats import read_splats, write_splats
+        from softmode.splats.formats import CONVENTIONS, read_splats, write_splats
+        from softmode.stages import tokens
 
         _check_target(self.target)
+        if self.convention is None and self.up is not None:
+            raise ConfigError("--up says nothing without a convention", hint="give --convention too, like spz")
         splats = read_splats(self.source)
-        write_splats(self.target, splats, up=self.up)
+        if self.convention is None:
+            write_splats(self.target, splats)
+        else:
+            own = "+z" if self.source.suffix.lower() in tokens.SUFFIXES else "-y"
+            write_splats(self.target, splats.oriented(self.up or own), up=CONVENTIONS[self.convention])
         print(f"wrote {splats.count} splats of degree {splats.sh_degree} to {self.target}")
         return 0
 

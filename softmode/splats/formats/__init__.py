@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 from softmode.errors import ConfigError
 from softmode.splats.formats.common import typed_errors, unreadable
@@ -24,6 +25,7 @@ from softmode.splats.formats.usd import read_usd, write_usd
 from softmode.splats.splats import Splats, UpAxis, up_rotation
 
 __all__ = [
+    "CONVENTIONS",
     "READABLE",
     "WRITABLE",
     "read_splats",
@@ -52,6 +54,12 @@ _WRITERS: dict[str, Callable[[Path, Splats], None]] = {
     ".spz": write_spz,
     **dict.fromkeys(_USD, write_usd),
 }
+
+Convention = Literal["z-up", "spz", "trained"]
+CONVENTIONS: dict[Convention, UpAxis] = {"z-up": "+z", "spz": "+y", "trained": "-y"}
+"""Which axis is up in a written file, by the name of a convention: softmode's own; that of the SPZ specification, of
+glTF and of three.js; that of the cameras which splats are trained with, and of most .ply. docs/splat_files.md says who
+expects which."""
 
 READABLE = tuple(_READERS)
 """Suffixes that `read_splats` knows; `.ply` covers `.compressed.ply`, `.json` is the meta.json of a SOG v2 folder."""
@@ -99,9 +107,8 @@ def write_splats(path: str | os.PathLike[str], splats: Splats, *, up: UpAxis = "
         path: File to write: `.ply` (exact), `.compressed.ply`, `.spz`, `.splat`, or OpenUSD `.usd`, `.usda`, `.usdc`
             (exact). What each format loses stands in docs/splat_files.md. The folder must exist.
         splats: What to write.
-        up: Axis of the file onto which +Z of the splats is turned; viewers of trained `.ply`, `.splat` and SOG files
-            mostly take "-y" for up, those of SPZ "+y". "+z" writes the splats as they are. OpenUSD files say which axis
-            is up and take "+z" only.
+        up: Axis of the file onto which +Z of the splats is turned, such as `CONVENTIONS["spz"]`; see there. "+z" writes
+            the splats as they are. OpenUSD files say which axis is up and take "+z" only.
 
     Raises:
         AssetError: If the suffix names no writable format.
