@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("torch")
 
 from softmode.cli import main as cli
-from softmode.cli.train import parse_env_options, parse_overrides
+from softmode.cli.train import Train, parse_env_options, parse_overrides
 from softmode.errors import ConfigError
 from softmode.learning.config_values import config_of
 
@@ -125,3 +127,39 @@ def test_the_command_line_stays_light():
     code = "import sys, softmode.cli.main; print([name for name in ('torch', 'tensorboard') if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_worlds_in_processes_are_the_same_bits(tmp_path: Path, monkeypatch):
+    """A run whose worlds are shared by two processes ends with the networks of the one in a single process."""
+    from softmode.learning.checkpoints import read_checkpoint
+
+    found = []
+    for count in ("1", "2"):
+        folder = tmp_path / count
+        arguments = ["train", "softmode/PushSoft-v0", "--run-dir", str(folder), "--processes", count, "--num-envs", "2"]
+        arguments += ["--set", "rollout_steps=4", "hidden=[8]", "epochs=1", "--total-steps", "16"]
+        assert cli.main([*arguments, "--eval-episodes", "0"]) == 0
+        assert json.loads((folder / "config.json").read_text())["processes"] == int(count)
+        found.append(read_checkpoint(folder / "latest.npz"))
+    one, two = found
+    assert two.env_options == {} and set(one.arrays) == set(two.arrays)
+    assert all(np.array_equal(array, two.arrays[name]) for name, array in one.arrays.items())
+
+
+@pytest.mark.parametrize(
+    ("given", "environment", "count"),
+    [
+        ({}, {}, 3),
+        ({"num_envs": 2}, {}, 2),
+        ({}, {"LOCAL_WORLD_SIZE": "2"}, 1),
+        ({"processes": 5}, {}, 5),
+        ({"device": "cuda:0"}, {}, 1),
+        ({"env": "Pendulum-v1"}, {}, 1),
+    ],
+)
+def test_training_takes_the_cores_there_are(given, environment, count, monkeypatch):
+    """One process for each core of a rank, no more than worlds; on a GPU and for other environments one."""
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0, 1, 2}, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    assert Train(**{"env": "softmode/LiftSoft-v0", **given}).process_count() == count

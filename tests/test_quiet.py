@@ -6,7 +6,13 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import pytest
+import warp as wp
+
+from softmode.cli.common import quiet_warp
+from softmode.quiet import quieten_warp
 from tests.test_layers import imports
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -62,3 +68,59 @@ def test_every_module_that_launches_is_quiet() -> None:
     launching = [name for name, path in files.items() if path.is_file() and "wp.launch(" in path.read_text()]
     assert len(launching) > 3
     assert not [name for name in launching if "softmode.quiet" not in reached(name, {name})]
+
+
+class Kept:
+    """A logger that keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def info(self, message: str) -> None:
+        """Keep a line."""
+        self.lines.append(message)
+
+    debug = info
+
+    def warning(self, message: str, category: type[Warning] | None = None, stacklevel: int = 1) -> None:
+        """Keep a warning."""
+        self.lines.append(message)
+
+    error = info
+
+
+def test_a_logger_of_the_users_gets_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What softmode calls is left out, unless it names a module of the user's or Warp is to tell all; warnings stay."""
+    before = wp.get_logger()
+    kept = Kept()
+    wp.set_logger(kept)
+    try:
+        logger = quieten_warp()
+        assert quieten_warp() is logger is wp.get_logger()
+        within: dict[str, Any] = {"__name__": "softmode.anything", "logger": logger}
+        exec("def load(line): logger.info(line)", within)
+        load = within["load"]
+        load("Module softmode.anything 12ab load on device 'cpu' took 1.00 ms (cached)")
+        load("Module _inner_kernel_0f load on device 'cpu' took 1.00 ms (compiled)")
+        assert kept.lines == []
+        load(f"Module {__name__} 12ab load on device 'cpu' took 1.00 ms (cached)")
+        logger.info("Module _inner_kernel_0f load on device 'cpu' took 1.00 ms (cached)")
+        logger.warning("careful")
+        assert len(kept.lines) == 3
+        monkeypatch.setattr(wp.config, "log_level", wp.LOG_DEBUG)
+        load("Module softmode.anything 12ab load on device 'cpu' took 1.00 ms (cached)")
+        assert len(kept.lines) == 4
+    finally:
+        wp.set_logger(before)
+
+
+def test_commands_say_once_what_takes_so_long(capsys: pytest.CaptureFixture[str]) -> None:
+    """Modules from the cache are not worth a line; the first that is compiled is, where no terminal shows a bar."""
+    line = "Module softmode.anything 12ab load on device 'cpu' took 9.00 ms"
+    with quiet_warp():
+        wp.get_logger().info(f"{line} (cached)")
+        assert "compiling" not in capsys.readouterr().err
+        for _ in range(3):
+            wp.get_logger().info(f"{line} (compiled)")
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("compiling kernels (first run only, a minute or two)") == 1

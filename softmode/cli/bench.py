@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from softmode.cli.common import quiet_warp
+from softmode.cli.common import own_object, quiet_warp, warn_of_object
+from softmode.cli.object_options import ObjectOptions
 from softmode.errors import ConfigError
+from softmode.learning.config_values import split_config
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Bench:
-    """Time a vector environment with random actions; --stages says where the time goes."""
+    """Time a vector environment with random actions.
+
+    Example: softmode bench softmode/LiftSoft-v0 --num-envs 1 16 --stages
+    """
 
     env: str
     """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
@@ -37,11 +42,12 @@ class Bench:
     """What observations are; torch on CUDA and numpy on CPU if omitted."""
     stages: bool = False
     """Print the time of the parts of a step."""
+    toy: Annotated[ObjectOptions, own_object()] = dataclasses.field(default_factory=ObjectOptions)
+    """Your own object; what is left out is as the task, the policy's run or the file has it."""
 
     def run(self) -> int:
         """Measure; return the exit code."""
         from softmode.envs.arguments import checked_device
-        from softmode.envs.catalogue import config_class
         from softmode.envs.throughput import report_throughput
 
         if not self.num_envs:
@@ -50,13 +56,14 @@ class Bench:
             raise ConfigError("--stages looks into this process only", hint="leave --processes at 1")
         with quiet_warp():
             device = checked_device(self.device)
-            known = config_class(self.env)
-            config = known() if self.preset is None else known.preset(self.preset)
+            chosen = {} if self.preset is None else {"preset": self.preset}
+            config, _ = split_config(self.env, self.toy.env_options(self.env, chosen))
             if self.image_size is not None:
                 config = dataclasses.replace(config, image_size=self.image_size)
             given: dict[str, Any] = {"obs_type": self.obs_type, "config": config, "processes": self.processes}
             given |= {"device": str(device), "output": self.output or ("torch" if device.is_cuda else "numpy")}
             how = {"steps": self.steps, "warmup": self.warmup, "actions": self.actions, "stages": self.stages}
             for count in self.num_envs:
-                report_throughput(self.env, count, given, **how)
+                tell = warn_of_object if count == self.num_envs[0] else None
+                report_throughput(self.env, count, given, made=tell, **how)
         return 0

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from softmode.checks import require_fields
-from softmode.cli.common import quiet_warp, same_fields, short_name
+from softmode.cli.common import finding_line, optional_argument, own_object, quiet_warp, same_fields, short_name
+from softmode.cli.object_options import ObjectOptions, named_numbers
 from softmode.errors import ConfigError
 from softmode.files import check_place
 
@@ -15,27 +17,20 @@ if TYPE_CHECKING:
     from softmode.deformables.body.reduced_body import ReducedBody
     from softmode.deformables.body.regions import Region
     from softmode.deformables.build.report import BodyReport
-    from softmode.objects.object_build import StifferBox
     from softmode.splats.splats import Splats
+
+
+SHOWN = {"youngs_modulus": 1.0e5, "density": 300.0}
+"""Material of frequencies where nothing is said: Young's modulus [Pa] and density [kg/m^3]."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Asset:
     """A file, and how it becomes a body."""
 
-    file: Path
+    file: Annotated[Path | None, optional_argument()] = None
     """Splats (.ply, .splat, .spz, .sog, meta.json, .usd, ...), a mesh (.glb, .obj, .stl, .usd, ...) or a point cloud
-    (.npz with points, normals, colors; .ply)."""
-    size: float | None = None
-    """Longest edge of the object [m]; 0.08 if omitted."""
-    up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
-    """Axis of the file that points up; -y for splats, +y for glTF, +z for the rest if omitted."""
-    crop: tuple[float, float, float, float, float, float] | None = None
-    """Box x0 y0 z0 x1 y1 z1 of a splat file, once turned up, outside which splats are dropped."""
-    part: Literal["thickest", "tallest", "largest", "all"] = "thickest"
-    """Which of the separate parts of a splat file is the object."""
-    pose: Literal["stable", "captured"] = "stable"
-    """Lay an object that cannot stand on its stable side, or leave it as it is in the file."""
+    (.npz with points, normals, colors; .ply); --splat and --object name one too."""
     functions: int | None = None
     """Scalar functions, chosen by elastic energy; 48 if omitted."""
     accuracy: float | None = None
@@ -60,26 +55,43 @@ class _Asset:
     region: tuple[str, ...] = ()
     """NAME=x0,y0,z0,x1,y1,z1: a part that scenes hold, move or grasp [m]; a seventh number makes it soft, stiffness / E
     [1/m^2]. Coordinates: z up, bounding box centred over the origin, standing on z = 0; inf is allowed."""
-    stiffness: tuple[str, ...] = ()
-    """NAME=x0,y0,z0,x1,y1,z1,FACTOR: a part that is FACTOR times as stiff as the rest, in the same coordinates."""
     seed: int = 0
     """Seed of every random choice of the build."""
+    toy: Annotated[ObjectOptions, own_object()] = dataclasses.field(default_factory=ObjectOptions)
+    """Your own object; what is left out is as the task, the policy's run or the file has it."""
+
+    @property
+    def path(self) -> Path:
+        """The file that is given.
+
+        Raises:
+            ConfigError: If there is none, or two.
+        """
+        given = [file for file in (self.file, self.toy.splat, self.toy.object) if file is not None]
+        if len(given) != 1:
+            said = f"{len(given)} files are given" if given else "no file is given"
+            raise ConfigError(said, hint="name one, like: softmode body check toy.ply")
+        return given[0]
 
     def target(self, path: Path | None, suffix: str) -> Path:
         """Return what to write, beside the file if nothing is said; refuse it before any work if that cannot be."""
-        stem = self.file.parent.name if self.file.name == "meta.json" else self.file.stem
-        path = self.file.with_name(f"{stem}{suffix}") if path is None else path
+        file = self.path
+        stem = file.parent.name if file.name == "meta.json" else file.stem
+        path = file.with_name(f"{stem}{suffix}") if path is None else path
         if path.suffix.lower() != suffix:
             raise ConfigError(f"out {path} is no {suffix} file", hint=f"name it like toy{suffix}")
         check_place(path, "file", make_folders=False)
-        if path.exists() and self.file.exists() and path.samefile(self.file):
+        if path.exists() and file.exists() and path.samefile(file):
             raise ConfigError(f"{path} is the file that is read", hint="choose another name with --out")
         return path
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BodyBuild(_Asset):
-    """Build the body of a splat file, mesh or point cloud and save it with its splats."""
+    """Build the body of a splat file, mesh or point cloud and save it with its splats and what it is made of.
+
+    Example: softmode body build toy.ply --size 0.08 --youngs-modulus 2e5 -o toy.npz
+    """
 
     out: Annotated[Path | None, short_name("-o")] = None
     """Body file to write, FILE.npz beside the file if omitted; `softmode play --object`, `body show` and `body check`
@@ -102,23 +114,21 @@ class BodyBuild(_Asset):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BodyShow(_Asset):
-    """Draw a body: soft modes, skinning weights, cubature, kernels, spectra, report."""
+    """Draw a body: soft modes, skinning weights, cubature, kernels, spectra, report.
+
+    Example: softmode body show toy.npz -o toy.png
+    """
 
     out: Annotated[Path | None, short_name("-o")] = None
     """Picture to write, FILE.png beside the file if omitted."""
-    youngs_modulus: float = 1.0e5
-    """Young's modulus for the frequencies [Pa]."""
-    density: float = 300.0
-    """Density for the frequencies [kg/m^3]."""
 
     def run(self) -> int:
         """Draw, print, return 0."""
         out = self.target(self.out, ".png")
-        require_fields(self, ("youngs_modulus", "density"), above=0.0)
         from softmode.viz.body_picture import mode_frequencies, write_body_picture
 
         body, splats, report = _examined(self)
-        material = {"youngs_modulus": self.youngs_modulus, "density": self.density}
+        material = _material(body)
         with quiet_warp():
             write_body_picture(out, body, splats, report, **material)
         for key, value in body.provenance.items():
@@ -133,11 +143,19 @@ class BodyShow(_Asset):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BodyCheck(_Asset):
-    """Examine a body, or the body that a file would become; exit code 0: well, 1: with warnings, 2: broken."""
+    """Examine a body, or the body that a file would become; exit code 0: well, 1: with warnings, 2: broken.
+
+    Example: softmode body check toy.ply --size 0.08
+    """
 
     def run(self) -> int:
         """Measure, print findings with remedies, return the exit code."""
+        from softmode.viz.body_picture import mode_frequencies
+
         body, _, report = _examined(self)
+        material = _material(body)
+        print(f"{'made of, stored or given':44} {body.provenance.get('material', 'nothing said')}")
+        print(f"{'first frequency [Hz]':44} {mode_frequencies(body, **material)[0]:.4g}")
         _print_report(report, measures=True)
         print(f"{body.name}: {('all is well', 'usable, with warnings', 'broken')[report.severity]}")
         return report.severity
@@ -151,42 +169,43 @@ def _examined(options: _Asset) -> tuple[ReducedBody, Splats, BodyReport]:
     from softmode.objects.config import ObjectConfig
     from softmode.objects.loader import load
     from softmode.objects.object_build import build_object
-    from softmode.objects.object_file import file_kind
+    from softmode.objects.object_file import file_kind, stored_material
 
-    kind = file_kind(options.file)
-    if kind == "body":
-        given = [
-            field.name.replace("_", "-")
-            for field in dataclasses.fields(_Asset)
-            if field.name != "file" and getattr(options, field.name) != field.default
-        ]
+    options.toy.check()
+    path = options.path
+    toy = options.toy if options.file is None else dataclasses.replace(options.toy, object=path)
+    if toy.splat is None and file_kind(path) == "body":
+        given = [f.name for f in dataclasses.fields(_Asset) if getattr(options, f.name) != f.default]
+        given = [*(name.replace("_", "-") for name in given if name not in ("file", "toy")), *toy.shape]
         if given or isinstance(options, BodyBuild):
             raise ConfigError(
-                f"{options.file} is a body already{': --' + ', --'.join(given) if given else ''}",
+                f"{path} is a body already{': --' + ', --'.join(given) if given else ''}",
                 hint="give the file that it was built from",
             )
-        found = load(options.file)
-        splats = found.visible_splats
-        return found.body, splats, report_body(found.body, splats=splats.means)
-    if kind == "mesh" and (options.crop is not None or options.part != "thickest"):
-        raise ConfigError(f"{options.file} is a mesh; crop and part are for splats", hint="leave them out")
-    given = same_fields(options, BuildOptions)
-    given |= {"mode_count": options.modes, "kernel_count": options.kernels, "cubature_count": options.points}
-    given["function_count"] = options.functions
-    if options.rank_tolerance is None:
-        given["rank_tolerance"] = RANK_TOLERANCE
-    found, quadrature = build_object(
-        options.file,
-        regions=[_region(text) for text in options.region],
-        stiffness=[_stiffer(text) for text in options.stiffness],
-        size=ObjectConfig.size if options.size is None else options.size,
-        **{name: getattr(options, name) for name in ("up", "crop", "part", "pose")},
-        surface_count=options.surface,
-        splat_count=options.splats,
-        build=BuildOptions(**given),
-    )
-    splats = found.visible_splats
-    return found.body, splats, report_body(found.body, quadrature=quadrature, splats=splats.means)
+        found, quadrature = load(path), None
+    else:
+        given = same_fields(options, BuildOptions)
+        given |= {"mode_count": options.modes, "kernel_count": options.kernels, "cubature_count": options.points}
+        given["function_count"] = options.functions
+        if options.rank_tolerance is None:
+            given["rank_tolerance"] = RANK_TOLERANCE
+        counts = {"surface_count": options.surface, "splat_count": options.splats}
+        config = dataclasses.replace(toy.object_of(ObjectConfig()), **counts, build=BuildOptions(**given))
+        found, quadrature = build_object(config, regions=[_region(text) for text in options.region])
+    body, splats = found.body, found.visible_splats
+    made_of = {**stored_material(body), **toy.material}
+    if made_of:
+        body = dataclasses.replace(body, provenance={**body.provenance, "material": json.dumps(made_of)})
+    report = report_body(body, quadrature=quadrature, splats=splats.means, size=found.size_asked)
+    return body, splats, report
+
+
+def _material(body: ReducedBody) -> dict[str, float]:
+    """Return Young's modulus [Pa] and density [kg/m^3] for frequencies: of the body, or SHOWN."""
+    from softmode.objects.object_file import stored_material
+
+    stored = stored_material(body)
+    return {name: stored.get(name, value) for name, value in SHOWN.items()}
 
 
 def _print_report(report: BodyReport, *, measures: bool) -> None:
@@ -195,36 +214,12 @@ def _print_report(report: BodyReport, *, measures: bool) -> None:
         for measure in report.measures:
             print(f"{measure.name:44} {measure.value:.4g} {measure.unit}".rstrip())
     for finding in report.findings:
-        remedy = finding.remedy[:1].upper() + finding.remedy[1:]
-        print(f"{finding.severity}: {finding.name}: {finding.what}. {remedy}.")
-
-
-def _named_numbers(option: str, text: str, counts: tuple[int, ...]) -> tuple[str, list[float]]:
-    """Return the name and the numbers of NAME=number,number,..."""
-    name, _, values = text.partition("=")
-    try:
-        found = [float(word) for word in values.split(",")]
-    except ValueError:
-        found = []
-    if not name or len(found) not in counts:
-        raise ConfigError(
-            f"{option} {text!r}: expected NAME= and {' or '.join(map(str, counts))} numbers separated by commas",
-            hint=f"give it like --{option} root=-inf,-inf,-inf,inf,inf,0.01" + (",10" if 6 not in counts else ""),
-        )
-    return name, found
+        print(finding_line(finding, sys.stdout))
 
 
 def _region(text: str) -> Region:
     """Return the region NAME=x0,y0,z0,x1,y1,z1[,stiffness]."""
     from softmode.deformables.body.regions import Region
 
-    name, values = _named_numbers("region", text, (6, 7))
+    name, values = named_numbers("region", text, (6, 7))
     return Region(name=name, box=(values[:3], values[3:6]), stiffness=values[6] if len(values) == 7 else None)
-
-
-def _stiffer(text: str) -> StifferBox:
-    """Return the part NAME=x0,y0,z0,x1,y1,z1,factor."""
-    from softmode.objects.object_build import StifferBox
-
-    _, (x0, y0, z0, x1, y1, z1, factor) = _named_numbers("stiffness", text, (7,))
-    return StifferBox(box=(x0, y0, z0, x1, y1, z1), factor=factor)

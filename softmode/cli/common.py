@@ -1,14 +1,20 @@
-"""What the commands share: a quiet Warp, a device by name, the pace of progress bars."""
+"""What the commands share: a quiet Warp, a device by name, progress bars, what is said about objects."""
 
 from __future__ import annotations
 
 import contextlib
+import mmap
+import os
 import sys
 from collections.abc import Iterator
 from dataclasses import fields
-from typing import Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from softmode.errors import ConfigError
+
+if TYPE_CHECKING:
+    from softmode.deformables.build.report import Finding
+    from softmode.objects.soft_object import SoftObject
 
 
 def short_name(name: str) -> Any:
@@ -20,16 +26,92 @@ def short_name(name: str) -> Any:
 
 @contextlib.contextmanager
 def quiet_warp() -> Iterator[None]:
-    """Start Warp and silence what it tells about every module it loads; its warnings stay."""
+    """Start Warp; of what it tells about every module it loads only a count of those compiled is shown."""
     import warp as wp
 
-    before = wp.config.log_level
-    wp.config.log_level = max(before, wp.LOG_WARNING)
-    try:
+    from softmode.quiet import listening
+
+    with contextlib.closing(_KernelCount()) as count, listening(count):
         wp.init()
         yield
-    finally:
-        wp.config.log_level = before
+
+
+class _KernelCount:
+    """Counts the modules that Warp compiles: in a bar on a terminal, else one line says what takes so long."""
+
+    def __init__(self) -> None:
+        """Show nothing yet."""
+        self._bar: Any = None
+        self._taken = mmap.mmap(-1, 1)  # shared with child processes: one of them all shows its count
+
+    def __call__(self, line: str) -> None:
+        """Take a line of Warp's."""
+        if "(compiled)" not in line:
+            return
+        if self._bar is None:
+            if self._taken[0]:
+                return
+            self._taken[0] = 1
+            from tqdm import tqdm
+
+            what, terminal = "compiling kernels (first run only, a minute or two)", sys.stderr.isatty()
+            if not terminal:
+                print(what, file=sys.stderr, flush=True)
+            self._bar = tqdm(desc=what, unit=" modules", leave=False, disable=not terminal)
+        self._bar.update()
+
+    def close(self) -> None:
+        """Remove the bar."""
+        if self._bar is not None:
+            self._bar.close()
+
+
+def own_object() -> Any:
+    """Return what shows the options of an own object as a group of their own; evaluated when tyro reads it."""
+    import tyro
+
+    return tyro.conf.OmitArgPrefixes
+
+
+def optional_argument() -> Any:
+    """Return what makes a field an argument that may be left out; evaluated when tyro reads it."""
+    import tyro
+
+    return tyro.conf.Positional
+
+
+def finding_line(finding: Finding, stream: TextIO) -> str:
+    """Return a finding with its remedy in a line, its severity in colour where a terminal shows it."""
+    remedy = finding.remedy[:1].upper() + finding.remedy[1:]
+    severity = finding.severity
+    if stream.isatty() and not os.environ.get("NO_COLOR"):
+        severity = f"\x1b[{'31' if severity == 'broken' else '33'}m{severity}\x1b[0m"
+    return f"{severity}: {finding.name}: {finding.what}. {remedy}."
+
+
+def warn_of_object(env: Any) -> None:
+    """Print, on stderr, what the user should know about an environment's object that comes from a file.
+
+    Args:
+        env: A single or a vector environment; one that is not softmode's has no such object.
+    """
+    from softmode.objects.loader import load
+
+    base = env.unwrapped
+    if not hasattr(base, "task_class") or base.config.scene.object.file is None:
+        return
+    scene = base.config.scene
+    try:
+        thing = base.task.scene.soft
+    except ConfigError:  # The worlds live in other processes, which have put the body into the cache.
+        thing = load(scene.object, material=scene.material)
+    warn_of(thing, scene.arm.gripper.stroke if base.task_class.grasps else None)
+
+
+def warn_of(thing: SoftObject, opening: float | None = None) -> None:
+    """Print, on stderr, what the user should know about an object that a gripper of an opening [m], if any, takes."""
+    for finding in thing.findings(opening=opening):
+        print(f"softmode: {finding_line(finding, sys.stderr)}", file=sys.stderr, flush=True)
 
 
 def warp_device(name: str | None) -> Any:
@@ -61,6 +143,10 @@ class BuildBar:
     def __init__(self) -> None:
         """Show nothing yet."""
         self._bar: Any = None
+
+    def __deepcopy__(self, memo: object) -> BuildBar:
+        """Return itself: Gymnasium copies what an environment was made with, and a terminal cannot be copied."""
+        return self
 
     def __enter__(self) -> BuildBar:
         """Return the bar."""

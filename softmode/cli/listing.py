@@ -11,7 +11,10 @@ from softmode.errors import ConfigError
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ListEnvs:
-    """List the environments and their tasks."""
+    """List the environments and their tasks.
+
+    Example: softmode list-envs
+    """
 
     def run(self) -> int:
         """Print one line per environment."""
@@ -22,7 +25,10 @@ class ListEnvs:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Robots:
-    """List the robots that load by name, or fetch some into the cache so that they load without a network."""
+    """List the robots that load by name, or fetch some into the cache so that they load without a network.
+
+    Example: softmode robots fetch so101 ur5e
+    """
 
     action: Literal["list", "fetch"]
     """list prints the names, fetch downloads models."""

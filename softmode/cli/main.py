@@ -18,12 +18,26 @@ from softmode.cli.train import Evaluate, Export, Train
 from softmode.cli.view import View
 from softmode.errors import SoftmodeError, needs_extra
 
+FIRST_STEPS = """softmode simulates soft objects made of splats or meshes, and robots that grasp them. To begin with:
+
+  softmode play softmode/LiftSoft-v0 --video out/lift.mp4                    a robot lifts a toy; the film
+  softmode view                                                             pull a toy with the mouse, in a browser
+  softmode body check toy.ply                                               what your own splats or mesh would become
+  softmode play softmode/LiftSoft-v0 --splat toy.ply --video out/toy.mp4     the robot lifts your own
+  softmode train softmode/LiftSoft-v0 --splat toy.ply --time-limit 1800      and learns to
+
+softmode list-envs lists the tasks, softmode --help the commands, softmode play --help the options of one."""
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; errors that softmode expects print one line and return 2, an interruption returns 130."""
-    if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+    given = sys.argv[1:] if arguments is None else arguments
+    if given == ["--version"]:
         print(f"softmode {__version__}")
         return 0
+    if not given:
+        print(FIRST_STEPS, file=sys.stderr)
+        raise SystemExit(2)
     try:
         with needs_extra("demo", "the command line needs tyro"):
             import tyro
@@ -41,7 +55,8 @@ def main(arguments: list[str] | None = None) -> int:
         kinds |= Annotated[splat, subcommand("splat", description="Make, inspect and convert splat files.")]
         body = one_of({"build": BodyBuild, "show": BodyShow, "check": BodyCheck})
         kinds |= Annotated[body, subcommand("body", description="Build, draw and check the bodies of soft objects.")]
-        return tyro.cli(kinds, prog="softmode", args=arguments, config=(tyro.conf.PositionalRequiredArgs,)).run()
+        config = (tyro.conf.PositionalRequiredArgs, tyro.conf.DisallowNone)
+        return tyro.cli(kinds, prog="softmode", args=arguments, config=config).run()
     except SoftmodeError as error:
         print(f"softmode: error: {error}", file=sys.stderr)
         return 2

@@ -5,16 +5,16 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import shlex
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from softmode.checks import require_number
-from softmode.cli.common import BuildBar, bar_interval, quiet_warp, warp_device
-from softmode.envs.catalogue import config_class, registered_id
-from softmode.errors import ConfigError, MaterialError
+from softmode.cli.common import BuildBar, bar_interval, own_object, quiet_warp, warn_of_object, warp_device
+from softmode.cli.object_options import ObjectOptions
+from softmode.envs.catalogue import registered_id
+from softmode.learning.config_values import split_config
 from softmode.learning.players import check_policy, policy_factory, trained_policy
 from softmode.viz.film import Film
 
@@ -24,7 +24,10 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Play:
-    """Play episodes of an environment and film them."""
+    """Play episodes of an environment and film them.
+
+    Example: softmode play softmode/LiftSoft-v0 --splat toy.ply --video out/toy.mp4
+    """
 
     env: str
     """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
@@ -43,24 +46,10 @@ class Play:
     """OpenUSD stage to write (.usdc, .usd or .usda)."""
     usd_mode: Literal["handles", "baked"] = "handles"
     """What the stage samples: handle matrices only, or also every splat."""
-    splat: Path | None = None
-    """Splat file of the object (INRIA .ply, or a SOG v2 folder, meta.json or .sog); the built-in plush if omitted."""
-    object: Path | None = None
-    """Body file of the object, from `softmode body build`, or a stage with a body; instead of a splat file."""
-    size: float | None = None
-    """Longest edge of the object [m], as the task has it if omitted; the gripper opens 0.09 m."""
-    up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
-    """Axis of the splat file that points up, -y if omitted."""
-    crop: tuple[float, float, float, float, float, float] | None = None
-    """Box x0 y0 z0 x1 y1 z1 of the splat file, once turned up, outside which splats are dropped."""
-    part: Literal["thickest", "tallest", "largest", "all"] | None = None
-    """Which of the separate parts of the splat file is the object; the thickest if omitted."""
-    pose: Literal["stable", "captured"] | None = None
-    """Lay an object that cannot stand on its stable side (as if omitted), or let it topple."""
-    youngs_modulus: float | None = None
-    """Young's modulus of the object [Pa]; random if omitted."""
     device: str | None = None
     """Warp device, for example cpu or cuda:0."""
+    toy: Annotated[ObjectOptions, own_object()] = dataclasses.field(default_factory=ObjectOptions)
+    """Your own object; what is left out is as the task, the policy's run or the file has it."""
 
     def run(self) -> int:
         """Play; return the exit code."""
@@ -68,8 +57,7 @@ class Play:
         registered_id(self.env)
         require_number("episodes", self.episodes, at_least=1, hint="give a count like 3")
         require_number("seed", self.seed, at_least=0, hint="give a whole number like 0")
-        if (modulus := self.youngs_modulus) is not None:
-            require_number("youngs-modulus", modulus, above=0.0, hint="give it in Pa, like 2e5", error=MaterialError)
+        self.toy.check()
         if self.rerun is not None:
             from softmode.viz.rerun_stream import check_target
 
@@ -85,18 +73,17 @@ class Play:
 def _play(options: Play, film: Film | None) -> int:
     """Build the environment, play, publish the film."""
     import gymnasium as gym
-    import warp as wp
 
     started = time.perf_counter()
     trained = trained_policy(options.policy, options.env)
-    given = dict(trained.env_options) if trained else {}
+    given = options.toy.env_options(options.env, dict(trained.env_options) if trained else {})
+    config, given = split_config(options.env, given)
+    config = dataclasses.replace(config, mesh_samples=4 if options.video else config.mesh_samples)
     with quiet_warp():
-        if not any(Path(wp.config.kernel_cache_dir or "").glob("wp_softmode.deformables.solver.step_kernels_*")):
-            print("compiling kernels (first run only, a minute or two)", file=sys.stderr, flush=True)
         with BuildBar() as progress:
-            config = _task_config(options, given.pop("config", {}))
             given |= {"config": config, "device": warp_device(options.device), "progress": progress}
             env = gym.make(options.env, render_mode="rgb_array" if film or options.rerun else None, **given)
+        warn_of_object(env)
         try:
             if trained:
                 trained.check(env)
@@ -148,8 +135,7 @@ def _play_episode(
     import gymnasium as gym
     from tqdm import tqdm
 
-    given = {} if options.youngs_modulus is None else {"youngs_modulus": options.youngs_modulus}
-    observation, info = env.reset(seed=seed, options=given)
+    observation, info = env.reset(seed=seed)
     policy = factory(seed)
     for log in logs:
         log.record()
@@ -174,30 +160,3 @@ def _play_episode(
         f"return {total:.1f}, success: {info['is_success']}"
     )
     return bool(info["is_success"])
-
-
-def _task_config(options: Play, trained: dict[str, Any]) -> Any:
-    """Turn the options that concern the object into a configuration, else as that of a trained policy."""
-    from softmode.learning.config_values import config_of
-    from softmode.objects.config import ObjectConfig
-
-    base = config_of(config_class(options.env), trained)
-    scene = base.scene
-    names = ("splat", "size", "up", "crop", "part", "pose")
-    given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    if options.object is not None:
-        if given:
-            raise ConfigError(
-                f"{', '.join(given)} given for the body {options.object}", hint="give them to softmode body build"
-            )
-        scene = dataclasses.replace(scene, object=ObjectConfig(body=options.object))
-    elif given:
-        thing = scene.object
-        if options.splat is not None:
-            thing = ObjectConfig(surface_count=thing.surface_count, build=thing.build)
-        if thing.extents is not None or thing.body is not None:
-            what = f"a {thing.shape} of {thing.extents} m" if thing.body is None else f"the body {thing.body}"
-            raise ConfigError(f"{', '.join(given)} given for {what}", hint="give a --splat file too")
-        thing = dataclasses.replace(thing, **given)
-        scene = dataclasses.replace(scene, object=thing)
-    return dataclasses.replace(base, scene=scene, mesh_samples=4 if options.video else base.mesh_samples)

@@ -7,9 +7,19 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from softmode.cli.common import bar_interval, quiet_warp, short_name, warp_device
+from softmode.cli.common import (
+    BuildBar,
+    bar_interval,
+    own_object,
+    quiet_warp,
+    short_name,
+    warn_of_object,
+    warp_device,
+)
+from softmode.cli.object_options import ObjectOptions
 from softmode.envs.catalogue import purpose, registered_id
 from softmode.errors import ConfigError
+from softmode.learning.config_values import with_config
 from softmode.learning.players import check_policy, policy_factory, trained_policy
 
 if TYPE_CHECKING:
@@ -22,7 +32,10 @@ ROBOT = "softmode_arm"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Record:
-    """Record episodes of an environment as a LeRobot v3.0 dataset."""
+    """Record episodes of an environment as a LeRobot v3.0 dataset.
+
+    Example: softmode record softmode/LiftSoft-v0 --splat toy.ply -o out/toy --episodes 50
+    """
 
     env: str
     """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
@@ -48,6 +61,8 @@ class Record:
     """Add to the dataset in the folder, if there is one."""
     device: str | None = None
     """Warp device, for example cpu or cuda:0."""
+    toy: Annotated[ObjectOptions, own_object()] = dataclasses.field(default_factory=ObjectOptions)
+    """Your own object; what is left out is as the task, the policy's run or the file has it."""
 
     def run(self) -> int:
         """Record; return the exit code."""
@@ -65,21 +80,22 @@ class Record:
 
         check_recording(self.episodes, self.seed, self.noise)
         trained = trained_policy(self.policy, self.env)
-        given: dict[str, Any] = {"obs_type": "pixels_agent_pos"}
-        if trained is not None:
-            from softmode.learning.environments import with_config
-
-            given = dict(with_config(self.env, trained.env_options))
+        given: dict[str, Any] = {"obs_type": "pixels_agent_pos"} if trained is None else dict(trained.env_options)
         if self.obs_type is not None:
             given["obs_type"] = self.obs_type
+        given = self.toy.env_options(self.env, given)
         with quiet_warp():
-            env = gym.make(self.env, **given, device=warp_device(self.device))
+            with BuildBar() as progress:
+                made = {**with_config(self.env, given), "device": warp_device(self.device), "progress": progress}
+                env = gym.make(self.env, **made)
+            warn_of_object(env)
         try:
             policy = policy_factory(self.policy, env, trained)
             features = environment_features(env, pictures=self.pictures)
+            origin = {"env": self.env, "env_options": given}
             fps = int(env.metadata["render_fps"])
             with (
-                DatasetWriter(out, features, fps=fps, robot_type=ROBOT, append=self.append) as writer,
+                DatasetWriter(out, features, fps=fps, robot_type=ROBOT, append=self.append, origin=origin) as writer,
                 tqdm(total=self.episodes, desc="recording", unit="episode", mininterval=bar_interval()) as bar,
             ):
                 before = writer.episode_count

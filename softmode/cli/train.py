@@ -4,25 +4,35 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from softmode.checks import require_number
-from softmode.cli.common import quiet_warp, same_fields
+from softmode.cli.common import own_object, quiet_warp, same_fields, warn_of_object
+from softmode.cli.object_options import ObjectOptions
+from softmode.envs.catalogue import is_soft
 from softmode.errors import ConfigError
 from softmode.learning.players import require_torch
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Train:
-    """Train a policy; several GPUs: torchrun --nproc-per-node 2 -m softmode.cli train ID --device cuda."""
+    """Train a policy with PPO.
+
+    Example: softmode train softmode/LiftSoft-v0 --splat toy.ply --time-limit 1800 --name toy
+
+    Several GPUs: torchrun --nproc-per-node 2 -m softmode.cli train ID --device cuda
+    """
 
     env: str
     """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
     algo: Literal["ppo"] = "ppo"
     """Algorithm."""
     num_envs: int = 16
-    """Worlds of each process: 16 on a CPU, 4096 on a GPU."""
+    """Worlds of each rank: 16 on a CPU, 4096 on a GPU."""
+    processes: int | None = None
+    """Processes that share the worlds on a CPU; one for each core if omitted."""
     device: str = "cpu"
     """cpu, cuda:0, or cuda under torchrun."""
     seed: int = 0
@@ -53,28 +63,53 @@ class Train:
     """Episodes of the evaluation at the end; none with 0."""
     checkpoint_seconds: float = 30.0
     """Seconds between two checkpoints."""
+    toy: Annotated[ObjectOptions, own_object()] = dataclasses.field(default_factory=ObjectOptions)
+    """Your own object; what is left out is as the task, the policy's run or the file has it."""
 
     def run(self) -> int:
         """Train; return the exit code."""
         require_torch()
+        if self.resume and self.toy.is_given:
+            raise ConfigError("--resume goes on with the object of the run", hint="leave the object's options out")
+        from softmode.learning.environments import make_vector_env
         from softmode.learning.train_options import TrainOptions
         from softmode.learning.trainer import train
 
+        def make(*arguments: Any) -> Any:
+            """Return the worlds, and say what there is to say about their object."""
+            env = make_vector_env(*arguments)
+            if os.environ.get("RANK", "0") == "0":
+                warn_of_object(env)
+            return env
+
         given = same_fields(self, TrainOptions)
-        given["env_options"] = parse_env_options(self.env_options, self.obs_type)
+        given["env_options"] = self.toy.env_options(self.env, parse_env_options(self.env_options, self.obs_type))
         given["total_steps"] = None if self.total_steps is None else int(self.total_steps)
+        given["processes"] = self.process_count()
         options = TrainOptions(**given, overrides=parse_overrides(self.set))
         with quiet_warp():
             try:
-                train(options, report=lambda line: print(line, flush=True))
+                train(options, make=make, report=lambda line: print(line, flush=True))
             except KeyboardInterrupt:
                 return 130
         return 0
 
+    def process_count(self) -> int:
+        """Return the processes of this rank: as asked for, or this machine's cores shared among its ranks."""
+        if self.processes is not None:
+            return self.processes
+        if self.device != "cpu" or not is_soft(self.env):
+            return 1
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return max(1, min(cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")), self.num_envs))
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Evaluate:
-    """Play whole episodes with a trained policy and print how often it succeeds."""
+    """Play whole episodes with a trained policy and print how often it succeeds.
+
+    Example: softmode evaluate softmode/LiftSoft-v0 policies/lift_soft.npz --splat toy.ply --episodes 20
+    """
 
     env: str
     """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
@@ -92,6 +127,8 @@ class Evaluate:
     """What the policy sees; as in its run if omitted."""
     env_options: str = "{}"
     """Further keyword arguments of the environment as JSON."""
+    toy: Annotated[ObjectOptions, own_object()] = dataclasses.field(default_factory=ObjectOptions)
+    """Your own object; what is left out is as the task, the policy's run or the file has it."""
 
     def run(self) -> int:
         """Evaluate; return the exit code."""
@@ -103,9 +140,11 @@ class Evaluate:
         require_number("num_envs", self.num_envs, at_least=1, hint="give a count like 16")
         policy = load_policy(self.policy, self.device)
         options = {**policy.env_options, **parse_env_options(self.env_options, self.obs_type)}
+        options = self.toy.env_options(self.env, options)
         device = local_device(self.device)
         with quiet_warp():
             env = make_vector_env(self.env, self.num_envs, device, options)
+            warn_of_object(env)
             try:
                 policy.check(env)
                 print(evaluate(env, policy, self.episodes, seed=self.seed, device=device))
@@ -116,7 +155,10 @@ class Evaluate:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write the policy of a run's checkpoint to a file of its own, without optimizer and critic."""
+    """Write the policy of a run's checkpoint to a file of its own, without optimizer and critic.
+
+    Example: softmode export runs/LiftSoft-v0/20261121-101500/best.npz policies/mine.npz
+    """
 
     checkpoint: Path
     """Checkpoint of a run, for example best.npz."""

@@ -7,12 +7,15 @@ import os
 import sys
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from softmode import ENVIRONMENTS
 from softmode.checks import require_number
-from softmode.cli.common import BuildBar, quiet_warp, same_fields, warp_device
+from softmode.cli.common import BuildBar, own_object, quiet_warp, same_fields, warn_of, warp_device
+from softmode.cli.object_options import ObjectOptions
 from softmode.errors import AssetError, ConfigError
+from softmode.learning.config_values import split_config
+from softmode.learning.players import trained_policy
 
 if TYPE_CHECKING:
     from softmode.view.session import LiveSession
@@ -20,7 +23,10 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View:
-    """Show a soft object or an environment in the browser; pull and pin it with the mouse, tune it with sliders."""
+    """Show a soft object or an environment in the browser; pull and pin it with the mouse, tune it with sliders.
+
+    Example: softmode view toy.ply --size 0.12 --scene drop
+    """
 
     target: tuple[str, ...]
     """An environment's id, or the file of a splat, a mesh, a saved body (.npz) or an OpenUSD stage; the built-in plush
@@ -29,8 +35,6 @@ class View:
     """An object hangs, held by one end, or drops on a table."""
     hold: Literal["top", "base"] = "top"
     """Which end of a hanging object is held."""
-    size: float | None = None
-    """Longest edge of an object [m]."""
     policy: str = "scripted"
     """What moves the arm of an environment: scripted, random, zero, or the checkpoint of a run."""
     seed: int = 0
@@ -51,6 +55,8 @@ class View:
     """What the button records: a video, coordinates, or an OpenUSD stage (extra [usd])."""
     device: str | None = None
     """Warp device, for example cpu or cuda:0."""
+    toy: Annotated[ObjectOptions, own_object()] = dataclasses.field(default_factory=ObjectOptions)
+    """Your own object; what is left out is as the task, the policy's run or the file has it."""
 
     def run(self) -> int:
         """Serve; return the exit code."""
@@ -90,8 +96,11 @@ def _session(options: View) -> LiveSession:
     """Make the session that was asked for."""
     from gymnasium.envs.registration import registry
 
-    from softmode.envs.catalogue import registered_id
+    from softmode.envs.catalogue import env_class, registered_id
+    from softmode.objects.config import ObjectConfig
     from softmode.view.session import LiveSession
+
+    options.toy.check()
 
     if len(options.target) > 1:
         raise ConfigError(f"{len(options.target)} things to show: {', '.join(options.target)}", hint="name one")
@@ -100,19 +109,36 @@ def _session(options: View) -> LiveSession:
         missing = target is not None and not Path(target).exists()
         if target is not None and missing and (target.startswith("softmode/") or ":" in target or target in registry):
             registered_id(target)
-            _refuse(options, ("scene", "hold", "size"), "an environment")
-            return LiveSession.from_env(
-                target, policy=options.policy, seed=options.seed, device=device, progress=progress
+            _refuse(options, ("scene", "hold"), "an environment")
+            trained = trained_policy(options.policy, target)
+            given = options.toy.env_options(target, dict(trained.env_options) if trained else {})
+            config, _ = split_config(target, given)
+            session = LiveSession.from_env(
+                target, policy=options.policy, config=config, seed=options.seed, device=device, progress=progress
             )
+            if config.scene.object.file is not None:
+                grasps = env_class(target).task_class.grasps
+                warn_of(session.object, config.scene.arm.gripper.stroke if grasps else None)
+            return session
         if missing:
             raise AssetError(
                 f"{target} is neither a file nor an environment",
                 hint=f"give a splat, mesh or .npz file, or one of {', '.join(ENVIRONMENTS)}",
             )
         _refuse(options, ("policy", "seed"), "an object")
-        return LiveSession.from_object(
-            target, scene=options.scene, hold=options.hold, size=options.size, device=device, progress=progress
+        source = target
+        if options.toy.shape or options.toy.file is not None:
+            if target is not None and options.toy.file is not None:
+                raise ConfigError(f"{target} and {options.toy.file} are two objects", hint="name one")
+            file = options.toy.object if target is None else Path(target)
+            source = dataclasses.replace(options.toy, object=file).object_of(ObjectConfig())
+        session = LiveSession.from_object(
+            source, scene=options.scene, hold=options.hold, device=device, progress=progress
         )
+        session.set_parameters(**options.toy.material)
+        if source is not None:
+            warn_of(session.object)
+        return session
 
 
 def _refuse(options: View, names: tuple[str, ...], what: str) -> None:

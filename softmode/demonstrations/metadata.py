@@ -43,6 +43,8 @@ class Metadata:
     """The row of every episode."""
     statistics: list[dict[str, Statistics]]
     """Statistics of every episode by feature."""
+    origins: tuple[dict[str, Any], ...]
+    """Where the episodes come from, each from its ``first_episode`` on: environment and options; empty if not said."""
 
     def data_table(self, row: Mapping[str, Any]) -> Any:
         """Return the table that holds an episode's frames; raises AssetError if it does not."""
@@ -136,6 +138,7 @@ def read_metadata(folder: str | Path) -> Metadata:
         frame_count=frames,
         rows=rows,
         statistics=statistics,
+        origins=_read_origins(folder, episodes),
     )
 
 
@@ -146,6 +149,19 @@ def _ordered(features: dict[str, Feature]) -> dict[str, Feature]:
         for name, kind in features.items()
     }
     return {n: f for n, f in plain.items() if n not in INDEX_FEATURES} | INDEX_FEATURES
+
+
+def _read_origins(folder: Path, episodes: int) -> tuple[dict[str, Any], ...]:
+    """Return where the episodes come from; what a killed recording left behind the last one is left out."""
+    path = folder / schema.ORIGINS_PATH
+    if not path.exists():
+        return ()
+    origins = read_json(path).get("origins")
+    if not isinstance(origins, list) or not all(
+        isinstance(origin, dict) and type(origin.get("first_episode")) is int for origin in origins
+    ):
+        raise AssetError(f"{path} does not say where the episodes come from", hint=REMEDY)
+    return tuple(origin for origin in origins if origin["first_episode"] < episodes)
 
 
 def _read_tasks(folder: Path) -> tuple[str, ...]:

@@ -41,6 +41,8 @@ class Dataset:
     """Frame behind the last one of every episode, shape (episodes,)."""
     statistics: dict[str, Statistics]
     """Statistics of every feature over all frames."""
+    origins: tuple[dict[str, Any], ...] = ()
+    """Where the episodes come from, each from its ``first_episode`` on: environment and options; empty if not said."""
 
     @property
     def episode_count(self) -> int:
@@ -98,7 +100,7 @@ def read_dataset(
     for name in INDEX_FEATURES:
         columns[name] = columns[name][:, 0]
     return Dataset(
-        **{name: getattr(found, name) for name in ("fps", "robot_type", "features", "tasks")},
+        **{name: getattr(found, name) for name in ("fps", "robot_type", "features", "tasks", "origins")},
         columns={name: columns[name] for name in wanted},
         episode_start=starts,
         episode_stop=stops,

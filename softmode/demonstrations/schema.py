@@ -6,6 +6,7 @@ A dataset is a folder::
     meta/stats.json                                 statistics of every feature over all frames
     meta/tasks.parquet                              task sentences and their numbers
     meta/episodes/chunk-000/file-000.parquet        one row per episode: where its frames are, its statistics
+    meta/softmode.json                              where the episodes come from; not of the format
     data/chunk-000/file-000.parquet                 one row per frame
     videos/KEY/chunk-000/file-000.mp4               pictures, when they are stored as video
 
@@ -36,6 +37,7 @@ DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 INFO_PATH, STATISTICS_PATH, TASKS_PATH = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"
+ORIGINS_PATH = "meta/softmode.json"
 IMAGE_NAMES = ("height", "width", "channels")
 
 

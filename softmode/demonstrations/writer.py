@@ -47,6 +47,8 @@ class DatasetWriter:
         fps: Frames per second.
         robot_type: Name of the robot.
         append: Add to the dataset that is there, if there is one.
+        origin: Where the episodes come from, as JSON values: the environment, its options and objects. Kept in
+            ``meta/softmode.json`` with the number of the first episode.
         file_megabytes: Size at which the next table file is begun.
 
     Raises:
@@ -65,6 +67,7 @@ class DatasetWriter:
         fps: int,
         robot_type: str | None = None,
         append: bool = False,
+        origin: Mapping[str, Any] | None = None,
         file_megabytes: int = 20,
     ) -> None:
         """Make or open the folder."""
@@ -86,6 +89,8 @@ class DatasetWriter:
         self._tables: list[Any] = []  # and their frames
         self._file = 0
         self._tasks: dict[str, int] = {}
+        self._origins: list[dict[str, Any]] = []  # of the episodes before, by their first one
+        self._origin = origin
         self._statistics: dict[str, Statistics] = {}
         self.episode_count = 0
         """Episodes in the dataset."""
@@ -140,7 +145,7 @@ class DatasetWriter:
             )
         self._tasks = {task: number for number, task in enumerate(found.tasks)}
         self.episode_count, self.frame_count = found.episode_count, found.frame_count
-        self._robot_type = found.robot_type
+        self._robot_type, self._origins = found.robot_type, list(found.origins)
         if not found.rows:
             return
         self._statistics = found.combined()
@@ -252,6 +257,11 @@ class DatasetWriter:
             moves[schema.TASKS_PATH] = write_table(stage / "tasks.parquet", [schema.tasks_table(tasks)])
         moves[schema.EPISODES_PATH.format(**where)] = write_table(stage / "episodes.parquet", [schema.rows_table(rows)])
         moves[schema.STATISTICS_PATH] = write_json(stage / "stats.json", schema.listed(total))
+        origins, last = self._origins, dict(self._origins[-1]) if self._origins else {}
+        last.pop("first_episode", None)
+        if self._origin is not None and self._origin != last:
+            origins = [*origins, {**self._origin, "first_episode": number}]
+            moves[schema.ORIGINS_PATH] = write_json(stage / "softmode.json", {"origins": origins})
         moves[schema.INFO_PATH] = write_json(stage / "info.json", self._info(number + 1, start + count, tasks))
         for source in moves.values():
             sync(source)
@@ -263,7 +273,7 @@ class DatasetWriter:
             os.rename(self._root, self.folder)  # replaces an empty folder, and fails on any other
             self._root, self._is_new, self._made = self.folder, False, []
         self._rows, self._tables, self._file = rows, tables, file
-        self._tasks, self._statistics = tasks, total
+        self._tasks, self._statistics, self._origins = tasks, total, origins
         self.episode_count, self.frame_count = number + 1, start + count
         self._films_done = film_number
 

@@ -78,7 +78,7 @@ def _with_splat(thing: ObjectConfig, given: Shortcuts) -> ObjectConfig:
             f"size given for {what}", hint="set the extents of config.scene.object, or give a splat file too"
         )
     changes = {"splat": given.splat, "size": given.size}
-    return replace(thing, **{name: value for name, value in changes.items() if value is not None})  # type: ignore[arg-type]
+    return thing.changed(**{name: value for name, value in changes.items() if value is not None})
 
 
 def checked_device(device: wp.DeviceLike) -> wp.Device:

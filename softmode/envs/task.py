@@ -78,6 +78,8 @@ class Task:
     """Makes the policy that `--policy scripted` plays, from observation to action, for an environment."""
     point_count: ClassVar[int] = 16
     """Surface points of the object in the observation."""
+    grasps: ClassVar[bool] = False
+    """Whether the gripper is to take object 0."""
     kernels: ClassVar[Any] = None
     """Device side that `observe` and `evaluate` launch, a module with kernels of these names and a struct `Plan`: first
     columns of parameters (`drawn`) and segments (`columns`), and what has the name of an attribute of the task, its

@@ -104,6 +104,7 @@ def report_throughput(
     warmup: int = 100,
     actions: Actions = "random",
     stages: bool = False,
+    made: Callable[[gym.vector.VectorEnv], None] | None = None,
 ) -> Throughput:
     """Make the vector environment of an id, measure it, print a line, close it.
 
@@ -115,6 +116,7 @@ def report_throughput(
         warmup: Steps before them.
         actions: See :func:`measure_throughput`.
         stages: Whether to print the time of the parts of a step.
+        made: Called with the environment before it is measured.
     """
     check_steps(steps, warmup)
     device = checked_device(options.get("device"))
@@ -122,13 +124,15 @@ def report_throughput(
     clock = time.perf_counter()
     env = gym.make_vec(name, num_envs=num_envs, **options)
     assert isinstance(env, SoftVectorEnv)
-    made = time.perf_counter() - clock
+    seconds = time.perf_counter() - clock
+    if made is not None:
+        made(env)
     result = measure_throughput(env, steps=steps, warmup=warmup, actions=actions, free_before=free)
     memory = f", {result.megabytes:,.0f} MB" if device.is_cuda else ""
     print(
         f"{num_envs} worlds, {actions} actions: {result.rate:,.0f} env-steps/s, "
         f"{1e3 * result.seconds / result.steps:.2f} ms per step, a finger touches in {100 * result.touching:.0f} %, "
-        f"{result.failures} failures{memory}, made in {made:.1f} s",
+        f"{result.failures} failures{memory}, made in {seconds:.1f} s",
         flush=True,
     )
     if stages and options.get("processes", 1) == 1:

@@ -7,9 +7,9 @@ from typing import Any
 import gymnasium as gym
 import torch
 
-from softmode.envs.catalogue import config_class, is_soft
+from softmode.envs.catalogue import is_soft
 from softmode.errors import ConfigError
-from softmode.learning.config_values import config_of
+from softmode.learning.config_values import with_config
 
 
 def make_vector_env(env: str, num_envs: int, device: torch.device, options: dict[str, Any]) -> gym.vector.VectorEnv:
@@ -36,14 +36,3 @@ def make_vector_env(env: str, num_envs: int, device: torch.device, options: dict
         raise ConfigError(
             f"unknown option of {env}: {error}", hint="see the documentation of the environment"
         ) from error
-
-
-def with_config(env: str, options: dict[str, Any]) -> dict[str, Any]:
-    """Return keyword arguments of a softmode environment, a ``config`` that is a dict as the configuration it means.
-
-    Raises:
-        ConfigError: If a field is unknown or outside its range.
-    """
-    if not isinstance(options.get("config"), dict) or not is_soft(env):
-        return options
-    return {**options, "config": config_of(config_class(env), options["config"])}

@@ -7,6 +7,7 @@ import math
 import os
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -19,8 +20,8 @@ with needs_extra("rl", "trained policies need torch"):
     import torch
 
 from softmode.learning.checkpoints import Checkpoint, check_env, read_checkpoint
+from softmode.learning.config_values import located_options, with_config
 from softmode.learning.distributed import local_device
-from softmode.learning.environments import with_config
 from softmode.learning.networks import Actor
 from softmode.learning.spaces import Interface
 from softmode.learning.vector_tensors import TensorVectorEnv, action_range, tensors_of
@@ -102,6 +103,9 @@ class Policy:
 def load_policy(path: str | os.PathLike[str], device: str = "cpu") -> Policy:
     """Load a policy from a checkpoint of a run.
 
+    Files of its environment's objects are found again by their fingerprints: where they were, beside the checkpoint, or
+    in the working folder.
+
     Args:
         path: The file.
         device: Where the policy computes, for example cpu or cuda:0.
@@ -110,7 +114,9 @@ def load_policy(path: str | os.PathLike[str], device: str = "cpu") -> Policy:
         CheckpointError: If the file is missing, damaged, foreign, or of another version.
         ConfigError: If the device is not there.
     """
-    return Policy(read_checkpoint(path), local_device(device), path)
+    checkpoint = read_checkpoint(path)
+    options = located_options(checkpoint.env_options, Path(path).absolute().parent)
+    return Policy(dataclasses.replace(checkpoint, env_options=options), local_device(device), path)
 
 
 def actor_of(checkpoint: Checkpoint, device: torch.device, path: object = "") -> Actor:

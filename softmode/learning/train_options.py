@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from softmode.checks import SEED_MAX, require_number
+from softmode.envs.catalogue import is_soft
 from softmode.errors import ConfigError
 from softmode.learning.hyperparameters import Hyperparameters, preset
 
@@ -29,7 +30,9 @@ class TrainOptions:
     env: str
     """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
     num_envs: int = 16
-    """Worlds of each process."""
+    """Worlds of each rank."""
+    processes: int = 1
+    """Child processes that share the worlds of a rank, on a CPU; their steps are the same bits for any number."""
     device: str = "cpu"
     """cpu, cuda:0, or cuda under torchrun."""
     seed: int = 0
@@ -66,6 +69,7 @@ class TrainOptions:
     def __post_init__(self) -> None:
         """Check every range."""
         require_number("num_envs", self.num_envs, at_least=1, hint="give a count like 16")
+        require_number("processes", self.processes, at_least=1, hint="give the number of cores to use")
         require_number("seed", self.seed, at_least=0, at_most=SEED_MAX, hint="give a whole number like 0")
         if self.total_steps is not None:
             require_number("total_steps", self.total_steps, at_least=1, hint="give a count like 1e6")
@@ -85,6 +89,18 @@ class TrainOptions:
             raise ConfigError(
                 f"env_options hold what JSON cannot ({error})", hint="give config as a dict of the fields that differ"
             ) from error
+
+    def world_options(self) -> dict[str, Any]:
+        """Return keyword arguments of the worlds: those of the environment, and what shares them among processes.
+
+        Raises:
+            ConfigError: If several processes are asked for an environment that is not softmode's.
+        """
+        if self.processes == 1:
+            return self.env_options
+        if not is_soft(self.env):
+            raise ConfigError(f"processes is {self.processes} for {self.env}", hint="leave it at 1")
+        return {"processes": self.processes, "output": "numpy", **self.env_options}
 
     def resolved(self, worlds: int) -> Hyperparameters:
         """Return the hyperparameters of a run with this many worlds on all ranks together.

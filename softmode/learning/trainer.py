@@ -21,6 +21,7 @@ with needs_extra("rl", "training needs torch"):
     import torch
 
 from softmode.learning.checkpoints import Checkpoint, check_env, read_checkpoint, same_env, write_checkpoint
+from softmode.learning.config_values import located_options, pinned_options
 from softmode.learning.distributed import Ranks, local_device
 from softmode.learning.environments import make_vector_env
 from softmode.learning.nan_guard import NanGuard
@@ -60,7 +61,7 @@ def train(options: TrainOptions, *, make: MakeVectorEnv = make_vector_env, repor
         options, start = _starting_point(options)
         if ranks.rank == 0 and not options.resume and options.run_dir is not None and options.run_dir.exists():
             RunFolder(options.run_dir, resume=False)  # refuses, before the worlds are built
-        worlds = make(options.env, options.num_envs, device, options.env_options)
+        worlds = make(options.env, options.num_envs, device, options.world_options())
         try:
             run = _Run(options, TensorVectorEnv(worlds, device), ranks, start, report)
             run.loop()
@@ -76,6 +77,7 @@ def train(options: TrainOptions, *, make: MakeVectorEnv = make_vector_env, repor
 def _starting_point(options: TrainOptions) -> tuple[TrainOptions, Checkpoint | None]:
     """Return the options, those of the run that goes on where they are its own, and the checkpoint to start from."""
     if not options.resume:
+        options = dataclasses.replace(options, env_options=pinned_options(options.env, options.env_options))
         return options, None if options.init is None else read_checkpoint(options.init)
     assert options.run_dir is not None
     config = RunFolder(options.run_dir, resume=True).read_config()
@@ -92,7 +94,7 @@ def _starting_point(options: TrainOptions) -> tuple[TrainOptions, Checkpoint | N
             options,
             num_envs=int(config["num_envs"]),
             seed=int(config["seed"]),
-            env_options=start.env_options,
+            env_options=located_options(start.env_options, options.run_dir.absolute()),
             teacher=options.teacher or (Path(config["teacher"]) if config.get("teacher") else None),
             hyperparameters=start.hyperparameters,
         ), start
@@ -236,6 +238,7 @@ class _Run:
             "env": options.env,
             "env_options": options.env_options,
             "num_envs": options.num_envs,
+            "processes": options.processes,
             "ranks": self.ranks.count,
             "seed": options.seed,
             "device": str(self.device),

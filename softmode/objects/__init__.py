@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 from softmode.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from softmode.objects.config import ObjectConfig
+    from softmode.objects.config import ObjectConfig, StifferBox
     from softmode.objects.loader import load
     from softmode.objects.mesh_file import read_mesh
     from softmode.objects.mesh_fit import FitOptions, MeshFit, splats_from_mesh
-    from softmode.objects.object_build import StifferBox, build_object
+    from softmode.objects.object_build import build_object
     from softmode.objects.object_file import surface_cover, write_object
     from softmode.objects.placed import Placed
     from softmode.objects.presets import (

@@ -4,21 +4,42 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from softmode.checks import require_choice, require_fields, require_number
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
-from softmode.errors import ConfigError
+from softmode.errors import AssetError, ConfigError
+from softmode.objects.fingerprint import file_fingerprint, find_file
 from softmode.objects.parts import Part
 from softmode.objects.primitives import Color, Extents, find_axis
 from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.splats import Splats, UpAxis
 
+Box = tuple[float, float, float, float, float, float]
 Shape = Literal["plush", "box", "cylinder", "capsule", "sphere"]
 Pose = Literal["stable", "captured"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StifferBox:
+    """A part of an object of another stiffness: a core, a bone, a soft belly."""
+
+    box: Box
+    """Corners x0, y0, z0, x1, y1, z1 [m] where the object stands: z up, its bounding box centred over the origin and
+    standing on z = 0; may be infinite."""
+    factor: float
+    """Young's modulus inside over that of the body, > 0."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if not all(a < b for a, b in zip(self.box[:3], self.box[3:], strict=True)):
+            raise ConfigError(
+                f"stiffness: box {self.box} is empty", hint="give x0,y0,z0,x1,y1,z1 with every 0 below its 1"
+            )
+        require_number("stiffness: factor", self.factor, above=0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,14 +87,20 @@ class ObjectConfig:
     contact_radius: float = 0.0
     """How far the surface that touches stands out from the body's [m]. Samples are points: one or two millimetres keep
     an edge that presses between them from catching on them."""
+    stiffness: tuple[StifferBox, ...] = ()
+    """Parts of another stiffness; where they overlap, the last one counts."""
     clamped_height: float = 0.0
     """Height of the foot that is fixed to the table [m], 0 for an object that stands free. A clamped object keeps its
     scale."""
     build: BuildOptions = field(default_factory=BuildOptions)
     """How the body is reduced."""
+    fingerprint: str | None = None
+    """`file_fingerprint` of the file that is meant, see `pinned`; None takes whatever lies at the path. The file is
+    looked for at its path and by its name in the working folder; another content is refused when it is loaded."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
+        object.__setattr__(self, "stiffness", tuple(self.stiffness))
         require_number("size", self.size, at_least=0.005, at_most=1.0, unit="m", hint="give the longest edge in metres")
         require_fields(self, ("contact_radius", "clamped_height"), at_least=0.0, unit="m")
         require_number("splat_count", self.splat_count, at_least=100)
@@ -95,6 +122,8 @@ class ObjectConfig:
         if self.body is not None and self.clamped_height > 0.0:
             hint = "build it with a region for its foot: softmode body build FILE --region foot=..."
             raise ConfigError(f"clamped_height is {self.clamped_height} m for a body that is built", hint=hint)
+        if self.body is not None and self.stiffness:
+            raise ConfigError(f"stiffness given for the body {self.body}", hint="give it when the body is built")
         self._check_extents()
         if self.colors is not None:
             if self.shape == "plush" and self.mesh is None:
@@ -105,6 +134,49 @@ class ObjectConfig:
     def for_material(self, material: Material | None) -> ObjectConfig:
         """Return this with a body for a material's own Poisson's ratio, unless its options name one."""
         return self if material is None else replace(self, build=self.build.for_ratio(material.poissons_ratio))
+
+    @property
+    def file(self) -> tuple[str, Path] | None:
+        """Which of `splat`, `mesh` and `body` names a file, and the file; None where there is none."""
+        for kind in ("splat", "mesh", "body"):
+            if isinstance(given := getattr(self, kind), str | Path):
+                return kind, Path(given)
+        return None
+
+    def changed(self, **options: Any) -> ObjectConfig:
+        """Return this with other options; another file comes without the fingerprint of the one before."""
+        if any(options.get(kind) is not None for kind in ("splat", "mesh", "body")):
+            options = {"fingerprint": None, **options}
+        return replace(self, **options)
+
+    def pinned(self) -> ObjectConfig:
+        """Return this with the whole path and the fingerprint of its file, so that it is found again from elsewhere.
+
+        Raises:
+            AssetError: If the file cannot be read.
+        """
+        if self.file is None or self.fingerprint is not None:
+            return self
+        kind, path = self.file
+        return replace(self, **{kind: str(path.resolve())}, fingerprint=file_fingerprint(path))  # type: ignore[arg-type]
+
+    def located(self) -> ObjectConfig:
+        """Return this with its file where it was found.
+
+        Raises:
+            AssetError: If it has a fingerprint, and no file of that content is there.
+        """
+        if self.file is None or self.fingerprint is None:
+            return self
+        kind, path = self.file
+        found = find_file(path, self.fingerprint, Path.cwd())
+        if found is None:
+            what = "the content has changed since it was recorded" if path.exists() else "no such file any more"
+            raise AssetError(
+                f"object file {path}: {what}, and none of that name and content in the working folder",
+                hint="put it back, or name another object (--splat or --object)",
+            )
+        return replace(self, **{kind: str(found)})  # type: ignore[arg-type]
 
     def for_varied_ratio(self) -> ObjectConfig:
         """Return this with a body for a Poisson's ratio that varies; a clamped or a built one stays as it is."""

@@ -19,7 +19,14 @@ from softmode.deformables.materials.material import Material
 from softmode.objects.config import ObjectConfig
 from softmode.objects.object_file import file_kind, read_object, surface_cover
 from softmode.objects.soft_object import SoftObject
-from softmode.objects.source import may_turn, object_source, splats_of_body, standing_quadrature
+from softmode.objects.source import (
+    may_turn,
+    object_source,
+    splats_of_body,
+    standing_quadrature,
+    stiffness_scale,
+    with_origin,
+)
 from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.splats import Splats
 
@@ -82,30 +89,33 @@ def load(
             wide = float("inf")
             top = float(quadrature.bounds[0, 2]) + config.clamped_height
             regions = (Region(name="foot", box=((-wide,) * 3, (wide, wide, top))),)
-        body = build_body(quadrature, made, name=parts.name, regions=regions, progress=progress)
+        scale = stiffness_scale(config, quadrature)
+        body = build_body(quadrature, made, name=parts.name, regions=regions, stiffness_scale=scale, progress=progress)
         return replace(body, provenance={**body.provenance, "turn": json.dumps(turn.tolist())})
 
     clamp = (config.clamped_height,) if config.clamped_height > 0.0 else ()
-    body = cached_body((RECIPE, *parts.key, may_turn(config), config.surface_count, made, *clamp), build)
+    key = (RECIPE, *parts.key, may_turn(config), config.surface_count, made, *clamp, *config.stiffness)
+    body = cached_body(key, build)
     turn = np.array(json.loads(str(body.provenance["turn"])))
     splats = splats_of_body(parts.splats, body, turn)
+    body = with_origin(body, config, parts, splats)
     return SoftObject(body=body, splats=splats, material=material, contact_radius=config.contact_radius, config=config)
 
 
 def object_config(source: Source | str | os.PathLike[str] | None, **options: Any) -> ObjectConfig:
-    """Return the configuration of an object that is no body in memory.
+    """Return the configuration of an object that is no body in memory, with its file where it was found.
 
     Args:
         source: As for `load`.
         options: Fields of `ObjectConfig`; they replace those of a configuration.
 
     Raises:
-        AssetError: If a file is missing or cannot be read.
+        AssetError: If a file is missing or cannot be read, or has another fingerprint than the configuration says.
         ConfigError: If an option is out of range.
         TypeError: If the source is nothing that can be loaded.
     """
     if isinstance(source, ObjectConfig):
-        return replace(source, **options)
+        return source.changed(**options).located()
     if source is None:
         return ObjectConfig(**options)
     if isinstance(source, str | os.PathLike):

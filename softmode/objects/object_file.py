@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.materials.material import Material
 from softmode.errors import AssetError
 from softmode.files import damage_errors
 from softmode.objects.soft_object import SoftObject
@@ -48,13 +51,20 @@ def read_object(path: str | os.PathLike[str]) -> SoftObject:
 
         return read_usd_body(path)
     body, stored = ReducedBody.load_with(path)
+    told = stored_material(body)
+    material = replace(Material(), **told) if told else None  # type: ignore[arg-type]  # its fields are numbers
     if not stored:
-        return SoftObject(body=body)
+        return SoftObject(body=body, material=material)
     missing = {f"splats.{name}" for name in _FIELDS} ^ set(stored)
     if missing:
         raise AssetError(f"body file {path}: {sorted(missing)} do not match", hint="Build the body again.")
     fields = {name: stored[f"splats.{name}"] for name in _FIELDS}
-    return SoftObject(body=body, splats=Splats(**fields, name=f"body file {path}"))
+    return SoftObject(body=body, splats=Splats(**fields, name=f"body file {path}"), material=material)
+
+
+def stored_material(body: ReducedBody) -> dict[str, float]:
+    """Return the properties of the material that a body was given when it was built, as fields of `Material`."""
+    return json.loads(str(body.provenance.get("material", "{}")))
 
 
 def file_kind(path: str | os.PathLike[str]) -> FileKind:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.build.report import Finding, object_findings
 from softmode.deformables.materials.material import Material
 from softmode.deformables.skinning.skin_splats import average_basis
 from softmode.errors import ConfigError
@@ -54,6 +55,21 @@ class SoftObject:
         """
         lifted = 0.0 if self.body.driven_count else self.contact_radius
         return float(-self.body.surface_points[:, 2].min()) + lifted
+
+    def findings(self, *, opening: float | None = None) -> tuple[Finding, ...]:
+        """Return what its user should know before it is simulated; see `object_findings`.
+
+        Args:
+            opening: How far the gripper that is to take it opens [m]; None where nothing is to.
+        """
+        splats = None if self.splats is None else self.splats.means
+        return object_findings(self.body, splats=splats, size=self.size_asked, opening=opening)
+
+    @property
+    def size_asked(self) -> float | None:
+        """Longest edge that its file was to be given [m]; None for what has its own size."""
+        made = self.config
+        return None if made is None or made.body is not None or made.extents is not None else made.size
 
     @property
     def basis(self) -> Array:

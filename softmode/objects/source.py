@@ -14,7 +14,7 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.build.quadrature import quadrature_from_splats
 from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
-from softmode.errors import AssetError
+from softmode.errors import AssetError, ConfigError
 from softmode.objects.config import ObjectConfig
 from softmode.objects.mesh_file import read_mesh
 from softmode.objects.parts import choose_part
@@ -93,6 +93,36 @@ def standing_quadrature(config: ObjectConfig, source: ObjectSource) -> tuple[Qua
         centre = quadrature.weights @ quadrature.points / quadrature.volume
         turn = stable_rotation(quadrature.surface_points - centre)
     return (quadrature, np.eye(3)) if turn is None else (turned(quadrature, turn), turn)
+
+
+def stiffness_scale(config: ObjectConfig, quadrature: Quadrature) -> NDArray[np.float64] | None:
+    """Return the relative stiffness per quadrature point of a standing object (P,), None if it is the same everywhere.
+
+    Raises:
+        ConfigError: If a part of another stiffness holds no point.
+    """
+    if not config.stiffness:
+        return None
+    low, high = quadrature.bounds
+    points = quadrature.points - [*(0.5 * (low + high))[:2], low[2]]
+    found = np.ones(len(points))
+    for part in config.stiffness:
+        inside = (points >= part.box[:3]).all(axis=1) & (points <= part.box[3:]).all(axis=1)
+        if not inside.any():
+            low, high = np.round([points.min(axis=0), points.max(axis=0)], 4).tolist()
+            raise ConfigError(
+                f"stiffness: box {part.box} holds no point of the object", hint=f"the object fills {low} to {high} m"
+            )
+        found[inside] = part.factor
+    return found
+
+
+def with_origin(body: ReducedBody, config: ObjectConfig, source: ObjectSource, splats: Splats) -> ReducedBody:
+    """Return a body whose provenance tells the kind of its asset, and how many of the asset's splats show it."""
+    kind = "mesh" if config.mesh is not None else "splat" if config.splat is not None else config.shape
+    left_out = source.asset_splats - splats.count
+    told = {"asset": source.name, "asset_kind": kind, "asset_splats": source.asset_splats, "asset_left_out": left_out}
+    return replace(body, provenance={**body.provenance, **told})
 
 
 def may_turn(config: ObjectConfig) -> bool:

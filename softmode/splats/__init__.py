@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from softmode.splats.camera_randomization import CameraRandomization, ViewVariation
     from softmode.splats.colored_mesh import ColoredMesh
     from softmode.splats.components import split_components
-    from softmode.splats.formats import READABLE, WRITABLE, read_splats, write_ply, write_splats, write_usd
+    from softmode.splats.formats import CONVENTIONS, READABLE, WRITABLE, read_splats, write_ply, write_splats, write_usd
     from softmode.splats.mesh_samples import sample_mesh
     from softmode.splats.pinhole import PinholeCamera
     from softmode.splats.plush import make_plush, plush_bounds, plush_signed_distance
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from softmode.splats.threaded_rasterizer import ThreadedRasterizer
 
 __all__ = [
+    "CONVENTIONS",
     "READABLE",
     "WRITABLE",
     "AdjointRasterizer",

@@ -228,6 +228,11 @@ class LiveSession:
     # -- what to show -------------------------------------------------------------------------------------------------
 
     @property
+    def object(self) -> SoftObject:
+        """The first soft object."""
+        return self._object(0)
+
+    @property
     def size(self) -> float:
         """Diagonal of the first object's bounding box at rest [m]."""
         return float(self._solver.view.instances.size.numpy()[0])

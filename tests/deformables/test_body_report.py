@@ -17,7 +17,7 @@ from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
-from softmode.deformables.build.report import BodyReport, report_body
+from softmode.deformables.build.report import BodyReport, object_findings, report_body
 from softmode.envs.tasks.place_in_bin import task as place_in_bin
 from softmode.envs.tasks.push_soft import task as push_soft
 from softmode.envs.tasks.shape_soft import config as shape_soft
@@ -249,3 +249,38 @@ def test_splats_without_body_and_surface_without_splats(body: ReducedBody) -> No
     assert names(report) == {"surface without splats"}
     bottom = 0.06 * 0.05 / (2.0 * (0.06 * 0.05 + 0.05 * 0.04 + 0.04 * 0.06))
     assert 0.3 * bottom < report.measure("surface without splats") < bottom
+
+
+def told(body: ReducedBody, **options: float) -> dict[str, str]:
+    """Return what the user of an object is told, by name."""
+    return {finding.name: f"{finding.what}. {finding.remedy}" for finding in object_findings(body, **options)}
+
+
+def test_what_matters_is_told(body: ReducedBody) -> None:
+    """A box of 60 x 50 x 40 mm: its size against what was asked, its least width against the gripper, with remedies."""
+    longest = float(np.ptp(body.bounds, axis=0).max())
+    assert not told(body, size=longest, opening=0.09)
+    size = told(body, size=0.075)["size"]
+    assert "60 mm where 75 mm were asked for" in size and f"--size {0.075**2 / longest:.3g}" in size
+    assert not told(body, size=1.04 * longest) and not told(body, size=0.96 * longest)
+    width = float(np.ptp(body.surface_points[:, 1]))
+    assert not told(body, opening=width + 0.001)  # across y, not x or z
+    gripper = told(body, opening=width - 0.001)["gripper"]
+    assert f"{1e3 * width:.0f} mm wide where it is narrowest" in gripper
+    assert f"opens {1e3 * (width - 0.001):.0f} mm" in gripper and "--size 0.05" in gripper
+    report = report_body(body, size=0.075)
+    assert "size" in names(report, "warning") and report.measure("longest edge over the size asked for") < 0.82
+
+
+def test_thin_walls_are_told() -> None:
+    """A plate of 1 mm has them, one of 3 mm none, unless it was filled on a grid too coarse to resolve it."""
+
+    def plate(thickness: float) -> ReducedBody:
+        return build_body(quadrature_from_box((0.06, 0.05, thickness), point_count=1500, surface_count=400), SMALL)
+
+    thin, thick = plate(0.001), plate(0.003)
+    assert "mm: they may come out" in (said := told(thin)["thin walls"]) and said.endswith("thicken them")
+    assert report_body(thin).measure("surface that bounds thin walls") > 0.8
+    assert not told(thick) and report_body(thick).measure("surface that bounds thin walls") == 0.0
+    coarse = replace(thick, provenance={**thick.provenance, "quadrature_voxel": 0.0015})
+    assert told(coarse)["thin walls"].endswith("raise --resolution")

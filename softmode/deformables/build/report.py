@@ -45,6 +45,11 @@ BARE = 3.0
 """Surface farther than so many spacings of splats from the nearest one is not shown."""
 EMPTY = 1e-10
 """Elastic eigenvalues under this fraction of the largest cost no energy; a rope of 25:1 has 4e-7."""
+WALL, WALL_VOXELS, WALL_SHARE = 0.02, 2.5, 0.05
+"""Walls thinner than this part of the body's size, or than so many voxels of a fill, count as thin; so much of the
+surface may bound thin walls."""
+SIZE_ERROR = 0.05
+"""Longest edge that may differ so much from the size that was asked for."""
 FULL_FUNCTIONS = 100
 """From so many functions on a body wants six cubature points for each."""
 
@@ -118,7 +123,13 @@ class _Notes:
         return BodyReport(measures=tuple(self.measures), findings=tuple(found))
 
 
-def report_body(body: ReducedBody, *, quadrature: Quadrature | None = None, splats: Array | None = None) -> BodyReport:
+def report_body(
+    body: ReducedBody,
+    *,
+    quadrature: Quadrature | None = None,
+    splats: Array | None = None,
+    size: float | None = None,
+) -> BodyReport:
     """Examine a body.
 
     Args:
@@ -126,6 +137,7 @@ def report_body(body: ReducedBody, *, quadrature: Quadrature | None = None, spla
         quadrature: What it was built from, if at hand: mass and stiffness are then compared to rounding, else to the
             5 to 20 % that filling the surface samples anew is worth.
         splats: Centres of the splats that show it, in the body frame [m], shape (N, 3).
+        size: Longest edge that was asked for [m]; None where nothing was.
 
     Returns:
         Measures and findings.
@@ -148,15 +160,74 @@ def report_body(body: ReducedBody, *, quadrature: Quadrature | None = None, spla
         _check_parts(body, interior, notes)
         _check_functions(body, interior, notes)
     _check_build(body, notes)
+    _check_object(body, notes, splats, size)
+    return notes.report()
+
+
+def object_findings(
+    body: ReducedBody, *, splats: Array | None = None, size: float | None = None, opening: float | None = None
+) -> tuple[Finding, ...]:
+    """Return what the user of an object should know before it is simulated: the warnings that take no time to find.
+
+    Args:
+        body: Its body.
+        splats: Centres of its splats, in the body frame [m], shape (N, 3).
+        size: Longest edge that was asked for [m]; None where nothing was.
+        opening: How far the gripper that is to take it opens [m]; None where nothing is to.
+
+    Returns:
+        Findings from "warning" on: what was left out of its file, its size, what is bare or thin, whether it fits.
+    """
+    notes = _Notes()
+    _check_shape(body, notes)
+    _check_object(body, notes, splats, size)
+    if opening is not None:
+        _check_fit(body, opening, notes)
+    return tuple(finding for finding in notes.report().findings if finding.severity != "note")
+
+
+def _check_object(body: ReducedBody, notes: _Notes, splats: Array | None, size: float | None) -> None:
+    """Compare the body with its file: what was left out, its size, the splats that show it."""
+    _check_asset(body, _numbers_told(body), notes)
+    if size is not None:
+        longest = float(np.ptp(body.bounds, axis=0).max())
+        if abs(notes.measure("longest edge over the size asked for", longest / size) - 1.0) > SIZE_ERROR:
+            notes.find(
+                "warning",
+                "size",
+                f"its longest edge is {1e3 * longest:.0f} mm where {1e3 * size:.0f} mm were asked for: splats that are"
+                " no part of the solid were measured, or it was laid on another side",
+                f"give --size {size * size / longest:.3g}, or crop away what is not the object (--crop)",
+            )
     if splats is not None:
         _check_splats(body, np.asarray(splats, dtype=np.float64), notes)
-    return notes.report()
+
+
+def _check_fit(body: ReducedBody, opening: float, notes: _Notes) -> None:
+    """Compare the least horizontal width of a standing object with what a gripper opens."""
+    angle = np.linspace(0.0, np.pi, 180, endpoint=False)
+    across = body.surface_points[:, :2] @ np.array([np.cos(angle), np.sin(angle)])
+    width = notes.measure("least horizontal width", float(np.ptp(across, axis=0).min()), "m")
+    if width >= opening:
+        size = float(np.ptp(body.bounds, axis=0).max())
+        notes.find(
+            "warning",
+            "gripper",
+            f"it is {1e3 * width:.0f} mm wide where it is narrowest, and the gripper of this robot opens"
+            f" {1e3 * opening:.0f} mm",
+            f"give --size {0.9 * opening / width * size:.2g}, or a robot whose gripper opens farther",
+        )
+
+
+def _numbers_told(body: ReducedBody) -> dict[str, float]:
+    """Return the numbers that the build wrote down."""
+    return {key: float(value) for key, value in body.provenance.items() if isinstance(value, int | float)}
 
 
 def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
     """Compare volume, hull and what the surface samples enclose by the divergence theorem; find thin bodies."""
     extent = np.ptp(body.bounds, axis=0)
-    size, area = float(extent.max()), float(body.surface_areas.sum())
+    area = float(body.surface_areas.sum())
     volume = notes.measure("volume", body.volume, "m^3")
     notes.measure("mass at 1000 kg/m^3", 1000.0 * volume, "kg")
     for axis, length in zip("xyz", extent, strict=True):
@@ -188,17 +259,9 @@ def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
             f"{closure:.3f} of the area (a closed surface: 0)",
             "close the asset's surface and turn all its faces outwards, or take more surface samples (--surface)",
         )
-    thickness = notes.measure("mean thickness over size", 2.0 * volume / area / size)
+    _check_shape(body, notes)
     spread = np.sqrt(np.linalg.eigvalsh(np.cov(body.surface_points.T)))
     slender = notes.measure("slenderness", spread[0] / spread[-1])
-    if thickness < 0.005:
-        notes.find(
-            "warning",
-            "thin",
-            f"the body is {1e3 * thickness * size:.2g} mm thick on average, 1/{1.0 / thickness:.0f} of its size: too"
-            " thin to be integrated and touched as a solid",
-            "thicken the asset to a hundredth of its size",
-        )
     points, kernels = body.provenance.get("quadrature_count"), len(body.centres)
     if isinstance(points, int) and kernels * (REGION_POINTS if body.region_names else KERNEL_POINTS) > points:
         notes.find(
@@ -236,6 +299,53 @@ def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
             " takes the thin functions of its bending for noise",
             "build it with --rank-tolerance 1e-9",
         )
+
+
+def _check_shape(body: ReducedBody, notes: _Notes) -> None:
+    """Find bodies that are thin as a whole, and thin walls."""
+    size = float(np.ptp(body.bounds, axis=0).max())
+    thickness = notes.measure("mean thickness over size", 2.0 * body.volume / body.surface_areas.sum() / size)
+    voxel = _numbers_told(body).get("quadrature_voxel", 0.0)
+    limit = max(WALL * size, WALL_VOXELS * voxel)
+    share = float(body.surface_areas[_wall_thickness(body) < limit].sum() / body.surface_areas.sum())
+    notes.measure("surface that bounds thin walls", share)
+    if thickness < 0.005:
+        notes.find(
+            "warning",
+            "thin",
+            f"the body is {1e3 * thickness * size:.2g} mm thick on average, 1/{1.0 / thickness:.0f} of its size: too"
+            " thin to be integrated and touched as a solid",
+            "thicken the asset to a hundredth of its size",
+        )
+    elif share > WALL_SHARE:
+        notes.find(
+            "warning",
+            "thin walls",
+            f"{100.0 * share:.0f} % of the surface bounds walls thinner than {1e3 * limit:.2g} mm: they may come out"
+            " thicker and stiffer than they are, and what presses on them may pass",
+            "raise --resolution" if voxel else "thicken them",
+        )
+
+
+def _wall_thickness(body: ReducedBody) -> Array:
+    """Return how thick the body is under each surface sample [m], shape (S,); infinite where nothing lies opposite.
+
+    The line along the inward normal is cut with the tangent planes of the samples that face the other way and lie
+    within a spacing of samples beside it; the nearest cut counts.
+    """
+    points, normals = body.surface_points.astype(np.float64), body.surface_normals.astype(np.float64)
+    pitch2 = body.surface_areas.sum() / body.surface_count
+    found = np.empty(len(points))
+    for part in np.array_split(np.arange(len(points)), max(1, len(points) // 256)):
+        way = points[None] - points[part, None]
+        facing = normals[part] @ normals.T
+        depth = -np.einsum("ijc,ic->ij", way, normals[part])
+        beside = (way**2).sum(axis=2) - depth**2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            cut = -np.einsum("ijc,jc->ij", way, normals) / facing
+        opposite = (facing < -0.5) & (depth > 0.0) & (beside < pitch2) & (cut > 0.0)
+        found[part] = np.where(opposite, cut, np.inf).min(axis=1)
+    return found
 
 
 def _check_tables(body: ReducedBody, notes: _Notes) -> None:
@@ -381,7 +491,7 @@ def _check_stiffness(body: ReducedBody, interior: Interior, gradient: Array, not
 
 def _check_build(body: ReducedBody, notes: _Notes) -> None:
     """Read what the build has measured and left out."""
-    told = {key: float(v) for key, v in body.provenance.items() if isinstance(v, int | float)}
+    told = _numbers_told(body)
     held = bool(body.region_names)
     notes.measure("functions", body.function_count)
     notes.measure("cubature points", body.point_count)
@@ -404,7 +514,6 @@ def _check_build(body: ReducedBody, notes: _Notes) -> None:
             f"{body.point_count} cubature points for {body.function_count} functions",
             f"take six for each, --points {6 * body.function_count}",
         )
-    _check_asset(body, told, notes)
 
 
 def _check_asset(body: ReducedBody, told: dict[str, float], notes: _Notes) -> None:

@@ -81,6 +81,7 @@ class LiftSoft(Task):
     config: LiftSoftConfig
     config_class = LiftSoftConfig
     kernels = kernels
+    grasps = True
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
 

@@ -163,6 +163,7 @@ class PlaceInBin(Task):
     config: PlaceInBinConfig
     config_class = PlaceInBinConfig
     kernels = kernels
+    grasps = True
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
 

@@ -138,6 +138,7 @@ class RopeRoute(Task):
     config: RopeRouteConfig
     config_class = RopeRouteConfig
     kernels = kernels
+    grasps = True
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
 

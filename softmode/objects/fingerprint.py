@@ -1,0 +1,63 @@
+"""Fingerprints of the files that objects come from: what runs and datasets keep, so that the object is found again."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from softmode.errors import AssetError
+
+_INDEX = (".json", ".gltf")
+"""Suffixes of files that name others beside them: SOG v2, glTF."""
+
+
+def file_fingerprint(path: Path) -> str:
+    """Return the sha256 of a file's content, and of the files beside it that a `meta.json` or `.gltf` names.
+
+    Layers that an OpenUSD stage refers to and materials of an .obj are not followed.
+
+    Args:
+        path: The file, or the folder of a SOG v2 asset.
+
+    Raises:
+        AssetError: If it cannot be read.
+    """
+    try:
+        file = path / "meta.json" if path.is_dir() else path
+        return _fingerprint(file, file.stat().st_mtime_ns, file.stat().st_size)
+    except OSError as error:
+        what = f"object file {path}: cannot be read ({error.strerror or error})"
+        raise AssetError(what, hint="check the path") from error
+
+
+def find_file(path: Path, fingerprint: str, *folders: Path) -> Path | None:
+    """Return the file of a fingerprint: the one at a path, or one of its name in a folder; None if there is none."""
+    for candidate in (path, *(folder / path.name for folder in folders)):
+        if candidate.exists() and file_fingerprint(candidate) == fingerprint:
+            return candidate.resolve()
+    return None
+
+
+@functools.lru_cache(maxsize=64)
+def _fingerprint(file: Path, changed: int, size: int) -> str:
+    """Return the fingerprint of a file as it was at a time."""
+    digest = hashlib.sha256(file.read_bytes())
+    if file.suffix.lower() in _INDEX:
+        named = {name for name in _strings(json.loads(file.read_text())) if Path(name).name == name}
+        for beside in sorted(file.parent / name for name in named if name):
+            if beside.is_file():
+                digest.update(beside.read_bytes())
+    return digest.hexdigest()
+
+
+def _strings(tree: Any) -> Iterator[str]:
+    """Yield every string of a JSON value."""
+    if isinstance(tree, str):
+        yield tree
+    elif isinstance(tree, dict | list):
+        for part in tree.values() if isinstance(tree, dict) else tree:
+            yield from _strings(part)

@@ -1,0 +1,349 @@
+"""An object of one's own in every command: what it becomes, what is said about it, how a policy finds it again."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import os
+import re
+import shutil
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import trimesh
+
+from softmode.cli.common import finding_line
+from softmode.cli.main import main
+from softmode.cli.object_options import ObjectOptions, stiffer_box
+from softmode.deformables.build.report import Finding
+from softmode.demonstrations import read_dataset
+from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
+from softmode.envs.tasks.place_in_bin.task import PlaceInBinConfig
+from softmode.errors import AssetError, ConfigError
+from softmode.learning.config_values import config_of, joined_config, located_options, pinned_options, values_of
+from softmode.objects import ObjectConfig, load
+from softmode.objects.fingerprint import file_fingerprint
+from softmode.splats import make_plush, write_ply
+from tests.test_cli_body import QUICK, merged
+
+ID = "softmode/LiftSoft-v0"
+UP = ["--up", "+z"]
+
+
+@pytest.fixture(scope="module")
+def assets(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write a plush with a floater beside it, and a box without a lid."""
+    folder = tmp_path_factory.mktemp("assets")
+    plush = make_plush(1000)
+    speck = plush.subset(np.arange(40)).transformed(scale=0.1, translation=(0.12, 0.0, 0.05))
+    write_ply(folder / "floater.ply", merged(plush, speck))
+    box = trimesh.creation.box((0.05, 0.04, 0.04))
+    trimesh.Trimesh(box.vertices, box.faces[2:], process=False).export(folder / "open.obj")
+    return folder
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make episodes two steps long."""
+    monkeypatch.setattr(gym.spec(ID), "max_episode_steps", 2)
+
+
+def commands(folder: Path) -> dict[str, list[str]]:
+    """Return command lines that build an object, without the object."""
+    train = ["--num-envs", "1", "--total-steps", "4", "--eval-episodes", "0", "--processes", "1", "--run-dir"]
+    return {
+        "play": ["play", ID, "--policy", "zero"],
+        "record": [
+            "record",
+            ID,
+            "-o",
+            str(folder / "data"),
+            "--policy",
+            "zero",
+            "--episodes",
+            "1",
+            "--obs-type",
+            "state",
+        ],
+        "train": ["train", ID, *train, str(folder / "run"), "--set", "rollout_steps=4", "hidden=[8]", "epochs=1"],
+        "bench": ["bench", ID, "--num-envs", "1", "--steps", "1", "--warmup", "0", "--device", "cpu"],
+        "view": ["view", ID, "--policy", "zero", "--duration", "0.2", "--port", "0", "--no-open"],
+        "view object": ["view", "--duration", "0.2", "--port", "0", "--no-open"],
+        "body check": ["body", "check", *QUICK],
+        "body build": ["body", "build", *QUICK, "-o", str(folder / "toy.npz")],
+    }
+
+
+GIVEN = {
+    "splat": (["--splat", "floater.ply", *UP], "left out: 40 of 1040 splats"),
+    "object": (["--object", "open.obj", "--size", "0.06"], "open mesh: the mesh is not closed"),
+}
+
+
+@pytest.mark.parametrize("given", GIVEN)
+@pytest.mark.parametrize("command", commands(Path()))
+def test_every_command_takes_an_object_and_says_what_matters(
+    command: str,
+    given: str,
+    assets: Path,
+    tmp_path: Path,
+    short: None,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The same options name the object in each, and its defect is told once, with the remedy."""
+    pytest.importorskip({"train": "torch", "record": "pyarrow"}.get(command.split()[0], "numpy"))
+    monkeypatch.chdir(assets)
+    options, finding = GIVEN[given]
+    assert main([*commands(tmp_path)[command], *options]) == (1 if command == "body check" else 0)
+    out, err = capsys.readouterr()
+    said = out if command.startswith("body") else err
+    (line,) = [line for line in (out + err).splitlines() if finding in line]
+    assert line in said and "warning: " in line
+    assert ("--crop" if given == "splat" else "fill_holes") in line
+
+
+def test_a_policy_finds_its_object_again(
+    tmp_path: Path, short: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From another folder, and moved beside the policy; gone or changed it is refused by name, with a remedy."""
+    pytest.importorskip("torch")
+    home, away = tmp_path / "home", tmp_path / "away"
+    home.mkdir()
+    away.mkdir()
+    monkeypatch.chdir(home)
+    write_ply(Path("toy.ply"), make_plush(900))
+    train = [*commands(tmp_path)["train"], "--splat", "toy.ply", *UP, "--size", "0.07", "--youngs-modulus", "1e5"]
+    assert main([*train, "--friction", "0.7"]) == 0
+    stored = json.loads((tmp_path / "run" / "config.json").read_text())["env_options"]["config"]
+    assert stored["scene"]["object"]["splat"] == str(home / "toy.ply")
+    assert stored["scene"]["object"]["fingerprint"] == file_fingerprint(Path("toy.ply"))
+    assert stored["youngs_modulus_range"] is None and stored["scene"]["material"]["friction"] == 0.7
+
+    monkeypatch.chdir(away)
+    policy = str(tmp_path / "run" / "latest.npz")
+    assert main(["play", ID, "--policy", policy]) == 0
+    assert "body 'toy.ply'" in (said := capsys.readouterr().out) and "E 1e+05 Pa" in said
+    shutil.move(home / "toy.ply", tmp_path / "run" / "toy.ply")
+    assert main(["evaluate", ID, policy, "--episodes", "1", "--num-envs", "1"]) == 0
+    assert "1 episodes" in capsys.readouterr().out
+    (tmp_path / "run" / "toy.ply").unlink()
+    assert main(["play", ID, "--policy", policy]) == 2
+    assert f"object file {home / 'toy.ply'}: no such file any more" in (said := capsys.readouterr().err)
+    assert "put it back, or name another object" in said.replace("Put", "put")
+    write_ply(home / "toy.ply", make_plush(800))
+    assert main(["record", ID, "--policy", policy, "-o", "data", "--episodes", "1"]) == 2
+    assert "the content has changed since it was recorded" in capsys.readouterr().err
+    again = ["--splat", str(home / "toy.ply"), *UP, "--size", "0.07"]
+    assert main(["play", ID, "--policy", policy, *again]) == 0
+
+
+def test_a_dataset_says_what_was_recorded(assets: Path, tmp_path: Path, short: None) -> None:
+    """From which episode on which object; an appended recording of another one is told apart."""
+    pytest.importorskip("pyarrow")
+    record = [*commands(tmp_path)["record"], "--append"]
+    toy = ["--splat", str(assets / "floater.ply"), *UP]
+    for more in ([], [], toy):
+        assert main([*record, *more]) == 0
+    found = read_dataset(tmp_path / "data")
+    first, second = found.origins
+    assert first == {"env": ID, "env_options": {"obs_type": "state"}, "first_episode": 0}
+    assert second["first_episode"] == 2 and found.episode_count == 3
+    thing = second["env_options"]["config"]["scene"]["object"]
+    assert thing["fingerprint"] == file_fingerprint(assets / "floater.ply")
+    assert config_of(LiftSoftConfig, second["env_options"]["config"]).scene.object.file == (
+        "splat",
+        Path(thing["splat"]),
+    )
+
+
+# -- the options ------------------------------------------------------------------------------------------------------
+
+
+def test_options_become_configurations_and_back(assets: Path) -> None:
+    """Object, material and stiffer parts reach the task; as JSON and back it is the same configuration."""
+    part = "core=-0.01,-inf,-inf,0.01,inf,inf,20"
+    toy = ObjectOptions(
+        splat=assets / "floater.ply", up="+z", size=0.07, resolution=48, density=120.0, stiffness=(part,)
+    )
+    config = toy.configured(LiftSoftConfig())
+    thing = config.scene.object
+    assert (thing.size, thing.resolution, thing.up) == (0.07, 48, "+z")
+    assert thing.stiffness == (stiffer_box(part),) and thing.build == LiftSoftConfig().scene.object.build
+    assert config.scene.material.density == 120.0 and config.density_range is None
+    assert config.youngs_modulus_range == LiftSoftConfig().youngs_modulus_range
+    options = joined_config(ID, config, {"obs_type": "state"})
+    again = json.loads(json.dumps(options))
+    assert again == options and config_of(LiftSoftConfig, again["config"]) == config
+    assert pinned_options(ID, again) == again
+    bins = dataclasses.replace(PlaceInBinConfig(), image_size=64)
+    assert values_of(bins) == {"image_size": 64}
+    scene = dataclasses.replace(bins.scene, others=(bins.scene.object, thing), fixtures=bins.scene.fixtures[:2])
+    bins = dataclasses.replace(bins, scene=scene)
+    assert config_of(PlaceInBinConfig, json.loads(json.dumps(values_of(bins)))) == bins
+    with pytest.raises(ConfigError, match=r"Splats\.means"):
+        values_of(ObjectConfig(splat=make_plush(400)))
+
+
+def test_a_stiffer_part_is_in_the_body(assets: Path) -> None:
+    """Points of the half x > 0 of the loaded object are ten times as stiff; the cache tells it from the other."""
+    config = ObjectConfig(mesh=assets / "open.obj", size=0.05, build=LiftSoftConfig().scene.object.build)
+    body = load(config, stiffness=[stiffer_box("half=0,-inf,-inf,inf,inf,inf,10")]).body
+    right = body.points[:, 0] + body.offset[0] > 0.0
+    assert set(body.stiffness_scale[right]) == {10.0} and set(body.stiffness_scale[~right]) == {1.0}
+    assert set(load(config).body.stiffness_scale) == {1.0}
+
+
+def test_a_body_file_says_what_it_is_made_of(assets: Path, tmp_path: Path) -> None:
+    """What is given when it is built is what a task takes, unless the command says otherwise."""
+    out = tmp_path / "toy.npz"
+    build = ["body", "build", str(assets / "floater.ply"), *UP, *QUICK, "-o", str(out)]
+    assert main([*build, "--youngs-modulus", "3e5", "--friction", "0.9"]) == 0
+    config = ObjectOptions(object=out, friction=0.4).configured(LiftSoftConfig())
+    material = config.scene.material
+    assert (material.youngs_modulus, material.friction) == (3e5, 0.4) and config.youngs_modulus_range is None
+    assert material.density == LiftSoftConfig().scene.material.density
+    found = load(out).material
+    assert found is not None and found.youngs_modulus == 3e5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["play", ID, "--splat", "floater.ply", "--object", "open.obj"], "exclude each other"),
+        (["record", ID, "--object", "open.obj", "--crop", "0", "0", "0", "1", "1", "1"], "--crop given for the mesh"),
+        (["train", ID, "--density", "-1"], "density"),
+        (["train", ID, "--resume", "--run-dir", "run", "--splat", "floater.ply"], "--resume"),
+        (["evaluate", ID, "policy.npz", "--friction", "nan"], "friction"),
+        (["bench", ID, "--splat", "none.ply"], "none.ply"),
+        (["bench", ID, "--stiffness", "core=1,2"], "core=1,2"),
+        (["train", "Pendulum-v1", "--splat", "floater.ply"], "Pendulum-v1"),
+        (["play", "softmode/PushSoft-v0", "--size", "0.1"], "--size given for a cylinder"),
+        (["view", "floater.ply", "--object", "open.obj", "--no-open"], "two objects"),
+        (["body", "check"], "no file is given"),
+        (["body", "check", "floater.ply", "--splat", "open.obj"], "2 files are given"),
+    ],
+)
+def test_mistakes_are_named(
+    arguments: list[str],
+    named: str,
+    assets: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """One line that names the option and a remedy, exit code 2, nothing on the disk."""
+    monkeypatch.chdir(tmp_path)
+    for file in assets.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    before = sorted(path.name for path in tmp_path.iterdir())
+    if "policy.npz" in arguments:
+        arguments[2] = str(Path(__file__).resolve().parents[1] / "policies" / "lift_soft.npz")
+    assert main(arguments) == 2
+    err = capsys.readouterr().err
+    lines = [line for line in err.splitlines() if line.startswith("softmode: error: ")]
+    assert len(lines) == 1 and named in lines[0] and ". " in lines[0] and "Traceback" not in err
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_fingerprints_are_of_the_content(tmp_path: Path) -> None:
+    """A name does not matter, a byte does; a meta.json counts with the files that it names."""
+    one, other = tmp_path / "one.ply", tmp_path / "other.ply"
+    one.write_bytes(b"ply")
+    other.write_bytes(b"ply")
+    assert file_fingerprint(one) == file_fingerprint(other)
+    other.write_bytes(b"plz")
+    assert file_fingerprint(one) != file_fingerprint(other)
+    (tmp_path / "meta.json").write_text(json.dumps({"means": {"files": ["means.webp", "../one.ply"]}}))
+    (tmp_path / "means.webp").write_bytes(b"a")
+    before = file_fingerprint(tmp_path)
+    os.utime(tmp_path / "meta.json", ns=(0, 0))
+    assert file_fingerprint(tmp_path / "meta.json") == before
+    (tmp_path / "means.webp").write_bytes(b"b")
+    os.utime(tmp_path / "meta.json", ns=(1, 1))
+    assert file_fingerprint(tmp_path) != before
+    with pytest.raises(AssetError, match="none"):
+        file_fingerprint(tmp_path / "none.ply")
+    pinned = {"config": {"scene": {"object": {"splat": "/gone/one.ply", "fingerprint": file_fingerprint(one)}}}}
+    assert located_options(pinned, tmp_path)["config"]["scene"]["object"]["splat"] == str(one)
+
+
+# -- what is said -----------------------------------------------------------------------------------------------------
+
+
+def test_colour_is_for_terminals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The severity is coloured on a terminal, unless NO_COLOR is set to something, and plain elsewhere."""
+
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    finding = Finding(severity="warning", name="thin", what="it is thin", remedy="thicken it")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    plain = "warning: thin: it is thin. Thicken it."
+    assert finding_line(finding, io.StringIO()) == plain
+    assert finding_line(finding, Terminal()) == plain.replace("warning", "\x1b[33mwarning\x1b[0m")
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert finding_line(finding, Terminal()) == plain
+
+
+COMMANDS = (
+    "play",
+    "train",
+    "evaluate",
+    "export",
+    "bench",
+    "record",
+    "view",
+    "list-envs",
+    "robots",
+    "splat from-mesh",
+    "splat info",
+    "splat convert",
+    "body build",
+    "body show",
+    "body check",
+)
+SCREEN = 50
+"""Lines of 80 columns of a screen."""
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_fits_a_screen_and_has_an_example(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every group of options is at most a screen high; the example is a command line of this command that parses."""
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit) as end:
+        main([*command.split(), "--help"])
+    assert end.value.code == 0
+    said = capsys.readouterr().out
+    titles = [
+        k for k, line in enumerate(said.splitlines()) if re.match(r"\W*(positional arguments|(toy )?options)\W*$", line)
+    ]
+    heights = np.diff([*titles, len(said.splitlines())])
+    assert len(titles) and heights.max() <= SCREEN, heights
+    (example,) = [line for line in said.splitlines() if line.startswith("Example: ")]
+    assert example.startswith(f"Example: softmode {command}")
+    import tyro
+
+    real, parsed = tyro.cli, []
+
+    def parse_only(*arguments: object, **options: object) -> object:
+        parsed.append(real(*arguments, **options))  # type: ignore[call-overload]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tyro, "cli", parse_only)
+    assert main(example.removeprefix("Example: softmode ").split()) == 130 and parsed
+
+
+def test_without_arguments_the_first_steps_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    """Commands that begin, and where the rest is found."""
+    with pytest.raises(SystemExit) as end:
+        main([])
+    assert end.value.code == 2
+    said = capsys.readouterr().err
+    assert "softmode play softmode/LiftSoft-v0" in said and "softmode --help" in said
