@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.body.rkpm import BasisRKPM, make_basis
+from softmode.deformables.body.rkpm import make_basis
 from softmode.deformables.body.skinning_weights import SkinningWeights
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import BuildOptions
@@ -152,10 +152,9 @@ def mode_picture(folder: Path, painter: Painter, body: ReducedBody) -> None:
     from matplotlib import colormaps
 
     skin = SkinningWeights(coefficients=body.handles, degrees=body.handle_degrees, blends=body.handle_regions)
-    basis = BasisRKPM(centres=body.centres, radii=body.radii, kernel=body.kernel)
     means = painter.rest.means.astype(np.float64)
     covered = np.where(body.covers(means)[:, None], means, body.centres[KDTree(body.centres).query(means)[1]])
-    weight = basis.evaluate(covered).value @ skin.coefficients
+    weight = body.kernels.evaluate(covered).value @ skin.coefficients
     picture, axes = figure(6, height=2.0)
     zero = np.zeros((body.function_count, 3))
     for j, axis in enumerate(axes[0], start=1):

@@ -23,7 +23,7 @@ from benchmarks.accuracy import KERNEL_COUNT
 from benchmarks.accuracy_runner import quadrature_of
 from benchmarks.baselines.neural_weights import elastic_energy
 from benchmarks.freeform.beam import freeform, run_body
-from softmode.deformables.body.rkpm import BasisRKPM, ShapeFunctions
+from softmode.deformables.body.rkpm import ShapeFunctions
 from softmode.deformables.build import basis as basis_module
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.eigenmodes import Eigenmodes
@@ -74,9 +74,8 @@ def make_problem(kernel_count: int = KERNEL_COUNT, point_count: int = 5000) -> P
     """Evaluate the kernels of a build, whose centres another rounding of the points would move."""
     quadrature = quadrature_of(BEND.shape, point_count)
     body = build_body(quadrature, freeform(MODE_COUNT, kernel_count=kernel_count), progress=False)
-    kernels = BasisRKPM(centres=body.centres, radii=body.radii, kernel=body.kernel)
-    grid = kernels.evaluate(quadrature.points - body.offset)
-    pool = kernels.evaluate(np.random.default_rng(1).uniform(*body.bounds, size=(POOL, 3)))
+    grid = body.kernels.evaluate(quadrature.points - body.offset)
+    pool = body.kernels.evaluate(np.random.default_rng(1).uniform(*body.bounds, size=(POOL, 3)))
     share = quadrature.weights / quadrature.volume
     return Problem(quadrature.volume, grid, pool, *mass_and_gradient_matrix(grid, share, share))
 

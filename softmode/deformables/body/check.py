@@ -21,7 +21,7 @@ _KINDS = {
     "build_seconds": float,
 }
 _FLOAT32 = ("grad_basis", "surface_basis")
-_INDICES = ("handle_degrees", "handle_regions", "core_index", "region_index")
+_INDICES = ("handle_degrees", "handle_regions", "core_index", "region_index", "hidden_pairs")
 
 
 def check_fields(body: Mapping[str, Any]) -> None:
@@ -42,6 +42,7 @@ def check_fields(body: Mapping[str, Any]) -> None:
 
     p, s, n, k = count("points", "surface_points", "mean_basis", "centres")
     m, j, raw = count("eigenvalues", "handle_degrees", "transform")
+    material, hidden = count("material_points", "hidden_pairs")
     regions, cores, samples = count("region_names", "core_index", "region_index")
     r, volume, weights = body["driven_count"], body["volume"], body["weights"]
     expected = {
@@ -64,6 +65,8 @@ def check_fields(body: Mapping[str, Any]) -> None:
         "handle_degrees": (j,),
         "handle_regions": (j,),
         "transform": (raw, n),
+        "material_points": (material, 3),
+        "hidden_pairs": (hidden,),
         "region_stiffness": (regions,),
         "region_radii": (regions,),
         "region_cores": (cores, 2, 3),
@@ -91,11 +94,14 @@ def check_fields(body: Mapping[str, Any]) -> None:
         "handle_regions": (-1, exact - 1),
         "core_index": (0, regions - 1),
         "region_index": (0, regions - 1),
+        "hidden_pairs": (0, k * material - 1),
     }
     for name, (low, high) in ranges.items():
         value = body[name]
         if len(value) and not (low <= value.min() and value.max() <= high):
             raise BasisError(f"{name}: expected {low}..{high}, got {value.min()}..{value.max()}")
+    if (np.diff(body["hidden_pairs"]) <= 0).any():
+        raise BasisError("hidden_pairs: not in ascending order")
     counts = np.array([1, 4, 10])[body["handle_degrees"]]
     if counts.sum() != raw or set(body["core_index"]) != set(range(regions)):
         raise BasisError(f"transform: expected {counts.sum()} rows and a core for each region, got {raw} rows")

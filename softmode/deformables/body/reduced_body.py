@@ -24,8 +24,9 @@ from scipy.spatial import KDTree
 
 from softmode.deformables.body.check import check_fields
 from softmode.deformables.body.regions import Envelope, Region
-from softmode.deformables.body.rkpm import BasisRKPM, KernelName
+from softmode.deformables.body.rkpm import REACH, BasisRKPM, KernelName
 from softmode.deformables.body.skinning_weights import SkinningWeights, enveloped
+from softmode.deformables.body.visibility import Visibility
 from softmode.errors import AssetError, BasisError, ConfigError
 from softmode.files import read_archive, write_archive
 
@@ -40,10 +41,6 @@ RATIO_HARMLESS = 0.45
 """Poisson's ratio up to which functions made for any other serve."""
 _SOURCES = "sources."
 """What the names of the sources begin with in a file."""
-REACH = 0.35
-"""How far from its nearest kernel centre a point may lie, as a fraction of the kernel's support. Inside an object the
-ratio stays under 0.3; beyond, the functions grow as extrapolated polynomials do (tenfold at 0.5), so they are held
-constant."""
 _CHUNK = 16384
 
 
@@ -125,6 +122,10 @@ class ReducedBody:
     """What went in, what was measured, what was lost."""
     build_seconds: float
     """Wall time of the build [s]."""
+    material_points: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    """Points of the material [m], shape (N, 3); empty where every kernel acts on all within its support."""
+    hidden_pairs: Indices = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """Kernel * N + point of every kernel and point of the material, within its support, that a gap divides; (H,)."""
     sources: Mapping[str, NDArray[Any]] | None = dataclasses.field(default=None, repr=False, compare=False)
     """What it was built from, for :func:`softmode.deformables.hold`, or None; see ``build.sources``."""
 
@@ -177,8 +178,14 @@ class ReducedBody:
         return Envelope(exact, self.length) if exact else None
 
     @cached_property
-    def _kernels(self) -> tuple[BasisRKPM, KDTree]:
-        return BasisRKPM(centres=self.centres, radii=self.radii, kernel=self.kernel), KDTree(self.centres)
+    def kernels(self) -> BasisRKPM:
+        """The reproducing kernels."""
+        visibility = Visibility(points=self.material_points, hidden=self.hidden_pairs) if self._divided else None
+        return BasisRKPM(centres=self.centres, radii=self.radii, kernel=self.kernel, visibility=visibility)
+
+    @property
+    def _divided(self) -> bool:
+        return len(self.hidden_pairs) > 0
 
     def evaluate(self, points: ArrayLike, *, outside: str = "clamp") -> tuple[Array, Array]:
         """Evaluate the functions and their gradients at rest points of the body frame.
@@ -241,9 +248,8 @@ class ReducedBody:
         x = np.asarray(points, dtype=np.float64)
         if x.ndim != 2 or x.shape[1] != 3 or not np.isfinite(x).all():
             raise BasisError(f"points: expected finite positions of shape (N, 3), got shape {x.shape}")
-        basis, tree = self._kernels
-        distance, nearest = tree.query(x)
-        ratio = distance / (REACH * basis.support[nearest])
+        distance, nearest = self.kernels.nearest(x)
+        ratio = distance / (REACH * self.kernels.support[nearest])
         far = ratio > 1.0
         inner = np.where(
             far[:, None], self.centres[nearest] + (x - self.centres[nearest]) / np.maximum(ratio, 1.0)[:, None], x
@@ -256,7 +262,7 @@ class ReducedBody:
 
     def _weights_inside(self, x: Array) -> tuple[Array, Array]:
         """Evaluate weights (N, J) and gradients (N, J, 3) at points within reach."""
-        return self._skin.evaluate(*enveloped(self._kernels[0].evaluate(x), self._envelope))
+        return self._skin.evaluate(*enveloped(self.kernels.evaluate(x), self._envelope))
 
     def _evaluate_inside(self, x: Array) -> tuple[Array, Array]:
         """Evaluate functions (N, n) and gradients (N, n, 3) at points within reach."""
@@ -267,9 +273,8 @@ class ReducedBody:
 
     def covers(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Return which points (N, 3) the kernels reach, that is, which `evaluate` does not clamp."""
-        basis, tree = self._kernels
-        distance, nearest = tree.query(np.asarray(points, dtype=np.float64))
-        return distance <= REACH * basis.support[nearest]
+        distance, nearest = self.kernels.nearest(np.asarray(points, dtype=np.float64))
+        return distance <= REACH * self.kernels.support[nearest]
 
     def holds(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Return which points (N, 3) belong to the body: within the kernels' reach, or on the sampled surface.
@@ -361,6 +366,8 @@ class ReducedBody:
         values = {f.name: getattr(self, f.name) for f in _own_fields()}
         arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
         told = {name: value for name, value in values.items() if name not in arrays}
+        if not self._divided:
+            arrays = {name: value for name, value in arrays.items() if name not in _DIVIDED}
         return {"format": FORMAT, "version": FORMAT_VERSION, **told}, arrays
 
     @classmethod
@@ -379,6 +386,8 @@ class ReducedBody:
             AssetError: If they are not those of a body.
         """
         names = {f.name for f in _own_fields()}
+        if not arrays.keys() & _DIVIDED:
+            names -= _DIVIDED
         if set(header) | set(arrays) != names or set(header) & set(arrays):
             wrong = sorted(names ^ (set(header) | set(arrays)))
             raise AssetError(f"{source}: fields {wrong} do not match", hint=hint)
@@ -439,6 +448,10 @@ class ReducedBody:
             BasisError: If any is wrong.
         """
         check_fields({f.name: getattr(self, f.name) for f in _own_fields()})
+
+
+_DIVIDED = {"material_points", "hidden_pairs"}
+"""Arrays that only the file of a body has whose kernels do not act across gaps."""
 
 
 def _own_fields() -> list[dataclasses.Field[Any]]:

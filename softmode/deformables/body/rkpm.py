@@ -14,6 +14,7 @@ number of order ten.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -21,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from scipy.spatial import KDTree
 
+from softmode.deformables.body.visibility import Visibility
 from softmode.errors import BasisError, ConfigError
 
 KernelName = Literal["cubic", "gaussian"]
@@ -32,6 +34,10 @@ GAUSSIAN_SUPPORT = 5.0
 """The Gaussian exp(-(d / r_k)^2) is cut at this many r_k (1e-11); an earlier cut shows in the gradients."""
 CONDITION_LIMIT = 1e8
 """Largest 1-norm condition number of the moment matrix that counts as covered."""
+REACH = 0.35
+"""How far from its nearest kernel centre a point may lie, as a fraction of the kernel's support. Inside an object the
+ratio stays under 0.3; beyond, the functions grow as extrapolated polynomials do (tenfold at 0.5), so they are held
+constant."""
 _PAIRS_PER_CHUNK = 2_000_000
 _BLOCK_POINTS = 64
 
@@ -87,6 +93,8 @@ class BasisRKPM:
     radii: Array
     """Nominal radii r_k [m], shape (K,); the support is `support` times as wide."""
     kernel: KernelName = "cubic"
+    visibility: Visibility | None = None
+    """What of the material the kernels act on; None: all within their support."""
 
     def __post_init__(self) -> None:
         """Check shapes, finiteness and the kernel's name."""
@@ -164,12 +172,33 @@ class BasisRKPM:
             found[i + good] = np.where(np.isfinite(value), value, np.inf)
         return found
 
+    def nearest(self, points: Array) -> tuple[Array, NDArray[np.intp]]:
+        """Return the distance [m] (N,) to the nearest kernel that acts at each of points (N, 3), and which it is."""
+        found: Any = self._tree.query(points)
+        distance, nearest = found
+        if self.visibility is not None:
+            lost = np.flatnonzero(self.visibility.hides(points, np.arange(len(points)), nearest))
+            for rows in np.array_split(lost, 1 + len(lost) * self.kernel_count // _PAIRS_PER_CHUNK):
+                away = np.linalg.norm(points[rows, None] - self.centres, axis=2)
+                row, column = np.divmod(np.arange(away.size), self.kernel_count)
+                away[self.visibility.hides(points[rows], row, column).reshape(away.shape)] = np.inf
+                nearest[rows] = away.argmin(axis=1)
+                distance[rows] = away.min(axis=1)
+        return distance, nearest
+
+    @cached_property
+    def _tree(self) -> KDTree:
+        return KDTree(self.centres)
+
     def _pairs(self, x: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
         """Return the row and kernel of every pair within reach, by rows, and kernels per point (N,)."""
         origin = self.centres.mean(axis=0)
         a, b = x - origin, self.centres - origin
         distance_sq = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2.0 * (a @ b.T)
         row, column = np.nonzero(distance_sq < self.support**2 * (1.0 + 1e-9))
+        if self.visibility is not None:
+            acting = ~self.visibility.hides(x, row, column)
+            row, column = row[acting], column[acting]
         return row, column, np.bincount(row, minlength=len(x))
 
     def _evaluate_chunk(self, x: Array, first: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:

@@ -18,6 +18,7 @@ from softmode.deformables.build.galerkin import mass_matrix
 from softmode.deformables.build.options import EIGENMODE_COUNT, BuildOptions
 from softmode.deformables.build.region_samples import RegionSamples, drive_matrices
 from softmode.deformables.build.static_response import lame_parameters, solve_harmonic_weights, solve_static_responses
+from softmode.deformables.build.visibility import Material, divide_at_gaps
 from softmode.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -45,6 +46,8 @@ class Domain:
     """Regions."""
     samples: RegionSamples
     """Points of the regions."""
+    material: Material | None = None
+    """Which points of the material touch, so that kernels do not act across gaps; None: they do."""
 
     @property
     def envelope(self) -> Envelope | None:
@@ -95,6 +98,8 @@ def make_body_basis(domain: Domain, options: BuildOptions, stage: Callable[[str]
         )
     count = options.kernels(len(domain.seeds), held=bool(domain.regions))
     kernels = make_basis(domain.seeds, count, kernel=options.kernel, spacing=domain.spacing, seed=options.seed)
+    if domain.material is not None:
+        kernels = divide_at_gaps(kernels, domain.material, domain.seeds, domain.spacing)
     return (_elastic_basis if by_energy else _eigenmode_basis)(kernels, domain, options, stage)
 
 

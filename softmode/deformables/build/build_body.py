@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from softmode.deformables.body.reduced_body import FORMAT_VERSION, ReducedBody, Scalar
 from softmode.deformables.body.regions import Region
+from softmode.deformables.body.visibility import Visibility
 from softmode.deformables.build.basis import Domain, make_body_basis
 from softmode.deformables.build.cache import cache_directory, cached_body, fingerprint_of
 from softmode.deformables.build.cubature import select_cubature
@@ -21,6 +22,7 @@ from softmode.deformables.build.options import BuildOptions, HandleName
 from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.region_samples import octants_near, refine_at_faces, sample_regions
 from softmode.deformables.build.sources import Sources, pack_sources
+from softmode.deformables.build.visibility import material_of
 from softmode.errors import MaterialError
 
 __all__ = [
@@ -135,6 +137,7 @@ def _build(
                 length=length,
                 regions=regions,
                 samples=samples,
+                material=None if quadrature.cells is None else material_of(quadrature.cells, offset),
             ),
             options,
             stage,
@@ -190,6 +193,7 @@ def _build(
             provenance={},
             build_seconds=0.0,
             sources=pack_sources(sources),
+            **_divided(basis.kernels.visibility),
         )
         surface = body.evaluate(body.surface_points)[0]
         stage("surface")
@@ -214,6 +218,11 @@ def _build(
         provenance=provenance,
         build_seconds=time.perf_counter() - start,
     )
+
+
+def _divided(visibility: Visibility | None) -> dict[str, NDArray]:
+    """Return the fields of a body whose kernels do not act across gaps."""
+    return {} if visibility is None else {"material_points": visibility.points, "hidden_pairs": visibility.hidden}
 
 
 def _scalar(value: Scalar | tuple[float, ...]) -> Scalar:

@@ -45,6 +45,8 @@ class Cells:
     """Their volumes [m^3], shape (Q,)."""
     of_octant: NDArray[np.int64]
     """Cell of each octant, shape (Q,)."""
+    place: NDArray[np.int64] | None = None
+    """Place of each octant in the grid of octants, shape (Q, 3); None in files written before 0.3."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,6 +194,7 @@ def cell_points(moments: Array, lines: Sequence[Array]) -> CellPoints:
     filled = split[:, :, 0] > EMPTY / 8.0 * size[:, None]
     of_octant, where = np.nonzero(filled)
     octants = split[of_octant, where]
+    first = np.stack(np.unravel_index(np.flatnonzero(kept)[of_octant], shape), axis=1)
     alone = apart[of_octant]
     return CellPoints(
         points=np.concatenate([
@@ -203,6 +206,7 @@ def cell_points(moments: Array, lines: Sequence[Array]) -> CellPoints:
             octants=octants[:, 1:4] / octants[:, :1],
             weights=octants[:, 0],
             of_octant=of_octant,
+            place=2 * first + np.stack([where // 4, where // 2 % 2, where % 2], axis=1),
         ),
         counted=counted,
     )  # fmt: skip

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from softmode.deformables.body.rkpm import BasisRKPM
 from softmode.deformables.build.cubature import POISSON_RATIO
 from softmode.deformables.build.functions import RANK_TOLERANCE
 from softmode.deformables.build.interior import Interior, interior_from_quadrature, interior_from_surface
@@ -382,7 +381,7 @@ def _check_parts(body: ReducedBody, interior: Interior, notes: _Notes) -> None:
             "warning",
             "separate parts",
             f"the body falls into {len(share)} parts that do not touch; all but the largest hold {rest} % of its"
-            " volume. Kernels that reach across the gap glue them together",
+            " volume. Kernels that reach across glue them together",
             "keep one part (--crop, or for splats --part), or build one body for each",
         )
     first = float(body.eigenvalues[1]) * body.length**2
@@ -397,7 +396,6 @@ def _check_parts(body: ReducedBody, interior: Interior, notes: _Notes) -> None:
 
 def _check_functions(body: ReducedBody, interior: Interior, notes: _Notes) -> None:
     """Measure coverage, conditioning, mass, stiffness and Jacobians over the interior."""
-    kernels = BasisRKPM(centres=body.centres, radii=body.radii, kernel=body.kernel)
     covered = notes.measure("interior within reach of kernels", float(body.covers(interior.points).mean()))
     touched = notes.measure("surface within reach of kernels", float(body.covers(body.surface_points).mean()))
     if covered < 0.99 or touched < 0.99:
@@ -409,7 +407,7 @@ def _check_functions(body: ReducedBody, interior: Interior, notes: _Notes) -> No
             "take more kernels (--kernels)",
         )
     inside = np.concatenate([interior.points[body.covers(interior.points)], body.points])
-    condition = notes.measure("worst condition of a moment matrix", float(kernels.conditions(inside).max()))
+    condition = notes.measure("worst condition of a moment matrix", float(body.kernels.conditions(inside).max()))
     if not condition < CONDITION_WARNING:
         notes.find(
             "warning",

@@ -1,0 +1,216 @@
+"""What kernels act on: paths through the graph of an object's material, and kernels where too few are left.
+
+The points of the graph are the octants of the quadrature's grid. Two of them touch where they share a face, and also
+where they share an edge or a corner alone, as finite elements of the same bricks share the nodes there. So a gap is
+seen where an octant, half a cell, lies empty; a narrower one is not. Kernels still act across the gaps between parts
+of an object that touch nowhere, which would drift apart otherwise.
+"""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from softmode.deformables.body.rkpm import REACH, BasisRKPM
+from softmode.deformables.body.visibility import Visibility
+from softmode.deformables.build.quadrature_grid import Cells
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+NARROWER = (0.6, 0.7, 0.8, 0.9, 1.0)
+"""Supports that are tried for a kernel, as a fraction of what it has."""
+CONDITION_LEAST = 1e5
+"""Where the condition number of the moment matrix is larger, kernels are added."""
+ROUNDS = 8
+"""Most rounds of adding kernels."""
+_ENTRIES_PER_CHUNK = 8_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Material:
+    """The graph of an object's points, in lumps that no gap divides."""
+
+    points: Array
+    """Positions [m], lump by lump, shape (N, 3)."""
+    first: Indices
+    """First point of each lump, ascending from 0, shape (L,)."""
+    links: Indices
+    """Pairs of lumps that touch, shape (E, 2)."""
+    part: Indices
+    """Part of the object that each lump belongs to, shape (L,); kernels act across the gaps between parts."""
+    step: float
+    """Largest distance between points that touch [m]."""
+
+    def distances(self, centres: Array) -> tuple[Array, Array]:
+        """Return the squared distances of points [m^2] (N, K), and of lumps (L, K), to centres (K, 3)."""
+        origin = centres.mean(axis=0)
+        a, b = self.points - origin, centres - origin
+        square = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2.0 * (a @ b.T)
+        return square, np.minimum.reduceat(square, self.first)
+
+    def homes(self, centres: Array) -> Indices:
+        """Return the lump that each of some places (K, 3) [m] lies in."""
+        return np.asarray(np.searchsorted(self.first, KDTree(self.points).query(centres)[1], "right") - 1)
+
+    def apart(self, near: Mask, homes: Indices) -> Mask:
+        """Return which lumps within the supports of kernels are not connected there with the kernels' centres.
+
+        Args:
+            near: Which lumps each support reaches, shape (L, K).
+            homes: Lump of each centre, shape (K,).
+        """
+        lump, kernel = np.nonzero(near)
+        node = np.full(near.shape, -1)
+        node[lump, kernel] = np.arange(len(lump))
+        link, at = np.nonzero(near[self.links[:, 0]] & near[self.links[:, 1]])
+        label = _components(len(lump), node[self.links[link], at[:, None]])
+        own = label[node[homes, np.arange(len(homes))]]
+        found = np.zeros_like(near)
+        found[lump, kernel] = (label != own[kernel]) & (self.part[lump] == self.part[homes][kernel])
+        return found
+
+
+def material_of(cells: Cells, offset: Array) -> Material | None:
+    """Return the graph of the octants of a grid less an offset (3,) [m]; None if their places in it are not known."""
+    if cells.place is None:
+        return None
+    order = np.argsort(cells.of_octant, kind="stable")
+    place = cells.place[order] - cells.place.min(axis=0) + 1
+    shape = place.max(axis=0) + 2
+    stride = np.array([shape[1] * shape[2], shape[2], 1])
+    at = np.full(shape.prod(), -1)
+    at[place @ stride] = np.arange(len(place))
+    pairs = []
+    for towards in itertools.product((-1, 0, 1), repeat=3):
+        if towards <= (0, 0, 0):
+            continue
+        steps = np.array(towards) * stride
+        other = at[place @ stride + steps.sum()]
+        touch = other >= 0
+        if np.count_nonzero(towards) > 1:  # Not where the octants in between link them.
+            for step in steps[steps != 0]:
+                touch &= at[place @ stride + step] < 0
+        pairs.append(np.stack([np.flatnonzero(touch), other[touch]], axis=1))
+    pair = np.concatenate(pairs)
+    points = cells.octants[order] - offset
+    # The octants of a full cell are one lump, which makes the graph eight times smaller.
+    cell = cells.of_octant[order]
+    begins = (np.bincount(cell)[cell] < 8) | np.append(True, cell[1:] != cell[:-1])
+    lump = np.cumsum(begins) - 1
+    links = np.unique(np.sort(lump[pair], axis=1), axis=0)
+    links = links[links[:, 0] < links[:, 1]]
+    step = float(np.linalg.norm(points[pair[:, 0]] - points[pair[:, 1]], axis=1).max(initial=0.0))
+    return Material(
+        points=points,
+        first=np.flatnonzero(begins),
+        links=links,
+        part=_components(lump[-1] + 1, links),
+        step=step,
+    )
+
+
+def divide_at_gaps(kernels: BasisRKPM, material: Material, points: Array, spacing: float) -> BasisRKPM:
+    """Return kernels that do not act across gaps, and more of them where too few are left.
+
+    A kernel acts on what is connected to its centre within its support. Beside the end of a gap that would hold both
+    sides together as far as it reaches, so there a kernel is made narrower, until the sides are not connected within.
+
+    Args:
+        kernels: Kernels that act on all they reach.
+        material: The graph of the object's points.
+        points: What must be covered: quadrature points [m], shape (P, 3).
+        spacing: Their spacing [m].
+
+    Warns:
+        RuntimeWarning: If parts of the object are too thin for that; then kernels act across gaps.
+    """
+    factor = _narrowing(material, kernels)
+    if factor is None:
+        return kernels
+    divided = replace(kernels, radii=kernels.radii * factor)
+    for _ in range(ROUNDS):
+        divided = replace(divided, visibility=find_visibility(material, divided.centres, divided.support))
+        distance, nearest = divided.nearest(points)
+        ratio = distance / divided.support[nearest]
+        bare = np.flatnonzero((ratio > REACH) | ~(divided.conditions(points) < CONDITION_LEAST))
+        if not len(bare):
+            return divided
+        added = []
+        while len(bare):
+            worst = bare[ratio[bare].argmax()]
+            added.append(worst)
+            away = np.linalg.norm(points[bare] - points[worst], axis=1)
+            bare = bare[away > REACH * divided.support[nearest[worst]]]
+        divided = replace(
+            divided,
+            centres=np.concatenate([divided.centres, points[added]]),
+            radii=np.concatenate([divided.radii, np.maximum(distance[added], 1.5 * spacing)]),
+            visibility=None,
+        )
+    warnings.warn(
+        "the object's parts are too thin beside its gaps for its quadrature: kernels act across the gaps; build it with"
+        " more points",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+    return kernels
+
+
+def find_visibility(material: Material, centres: Array, support: Array) -> Visibility | None:
+    """Return what kernels do not act on; None if all of them act on all that they reach.
+
+    Args:
+        material: The graph of the object's points.
+        centres: Kernel centres, points of the material [m], shape (K, 3).
+        support: Support radii [m], shape (K,).
+    """
+    found = []
+    count = len(material.points)
+    size = np.diff(np.append(material.first, count))
+    for mine in _chunks(material, len(centres)):
+        points, lumps = material.distances(centres[mine])
+        reach = (support[mine] + material.step) ** 2  # The nearest point to a place in the support lies within this.
+        apart = material.apart(lumps < reach, material.homes(centres[mine]))
+        if apart.any():
+            point, kernel = np.nonzero(np.repeat(apart, size, axis=0) & (points < reach))
+            found.append((kernel + mine.start) * count + point)
+    return Visibility(points=material.points, hidden=np.sort(np.concatenate(found))) if found else None
+
+
+def _narrowing(material: Material, kernels: BasisRKPM) -> Array | None:
+    """Return the largest fraction of the support (K,) that connects no two sides of a gap; None if there is no gap.
+
+    Sides that are not connected within a support may be within a larger one.
+    """
+    factor, gaps = np.full(kernels.kernel_count, NARROWER[0]), False
+    for mine in _chunks(material, kernels.kernel_count):
+        homes, lumps = material.homes(kernels.centres[mine]), material.distances(kernels.centres[mine])[1]
+        good, before = np.ones(len(homes), dtype=bool), np.zeros(lumps.shape, dtype=bool)
+        for fraction in NARROWER:
+            near = lumps < (fraction * kernels.support[mine] + material.step) ** 2
+            apart = material.apart(near, homes)
+            good &= ~(before & near & ~apart).any(axis=0)
+            factor[mine][good] = fraction
+            before |= apart
+        gaps |= bool(before.any())
+    return factor if gaps else None
+
+
+def _chunks(material: Material, kernel_count: int) -> list[slice]:
+    step = max(1, _ENTRIES_PER_CHUNK // len(material.points))
+    return [slice(i, min(i + step, kernel_count)) for i in range(0, kernel_count, step)]
+
+
+def _components(count: int, pairs: Indices) -> Indices:
+    """Return the connected component of each of some nodes, from pairs of them (E, 2)."""
+    graph = coo_matrix((np.ones(len(pairs), dtype=bool), pairs.T), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.intp)
