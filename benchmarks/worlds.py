@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -39,10 +40,10 @@ def main() -> None:
     parser.add_argument("--random", action="store_true", help="random actions instead of a grasp")
     parser.add_argument("--warm-up", type=int, default=26, help="control steps before the clock starts")
     parser.add_argument("--preset", choices=["fine", "rl"], default="fine")
-    parser.add_argument("--grip", action="store_true", help="print what bodies and solvers change in a grip")
+    parser.add_argument("--grip", nargs="*", help="print what bodies and solvers change in a grip: all, or rows named")
     options = parser.parse_args()
-    if options.grip:
-        report_grips()
+    if options.grip is not None:
+        report_grips(options.grip)
         return
     config = rl_scene() if options.preset == "rl" else TableSceneConfig()
     wp.config.log_level = wp.LOG_WARNING
@@ -112,8 +113,12 @@ def report_pictures(scene: TableScene, camera: PinholeCamera, repeats: int) -> N
         )
 
 
-def report_grips() -> None:
-    """Print force, width and extent of the object in one grip, scripted lifts, and time, by body and solver."""
+def report_grips(chosen: Sequence[str]) -> None:
+    """Print force, width and extent of the object in one grip, scripted lifts, and time, by body and solver.
+
+    Args:
+        chosen: Names of rows; none for all.
+    """
     fine = TableSceneConfig()
 
     def body(config: TableSceneConfig, **options: Any) -> TableSceneConfig:
@@ -131,7 +136,7 @@ def report_grips() -> None:
     }
     wp.config.log_level = wp.LOG_WARNING
     print(f"{'':<30}{'force [N]':>16}{'width [mm]':>12}{'extent [mm]':>20}{'ms':>7}  scripted lifts")
-    for name, config in scenes.items():
+    for name, config in ((name, scenes[name]) for name in chosen or scenes):
         scene = TableScene(config, device="cpu")
         times = []
         for step in range(70):
