@@ -14,7 +14,7 @@ FLOORS = (
     "softmode errors",
     "files checks lazy quiet versions",
     "deformables stages",
-    "splats robots",
+    "splats robots mpm",
     "objects",
     "scenes",
     "envs usd viz",

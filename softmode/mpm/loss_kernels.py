@@ -1,0 +1,46 @@
+"""Device side of the losses: node by node, with the derivative by the node's mass."""
+
+from typing import Any
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def log_mass_at_nodes(
+    grid_mass: wp.array4d[Any], target: wp.array4d[Any], scale: Any, loss: wp.array[wp.float64], bar: wp.array4d[Any]
+):
+    """Add 1/2 (ln(m/s + 1) - ln(m*/s + 1))^2 of every node, and its derivative by m."""
+    world, i, j, k = wp.tid()
+    m = grid_mass[world, i, j, k]
+    goal = target[world % target.shape[0], i, j, k]
+    r = type(scale)(0.0)
+    if m > r or goal > r:
+        r = wp.log((m + scale) / (goal + scale))  # ln(m/s + 1) - ln(m*/s + 1)
+        wp.atomic_add(loss, world, wp.float64(0.5) * wp.float64(r) * wp.float64(r))
+    bar[world, i, j, k] = r / (m + scale)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def mass_at_nodes(
+    grid_mass: wp.array4d[Any], target: wp.array4d[Any], loss: wp.array[wp.float64], bar: wp.array4d[Any]
+):
+    """Add 1/2 (m - m*)^2 of every node, and its derivative by m."""
+    world, i, j, k = wp.tid()
+    r = grid_mass[world, i, j, k] - target[world % target.shape[0], i, j, k]
+    wp.atomic_add(loss, world, wp.float64(0.5) * wp.float64(r) * wp.float64(r))
+    bar[world, i, j, k] = r
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def position_at_particles(
+    x: wp.array2d[Any], mass: wp.array2d[Any], target: wp.array2d[Any], loss: wp.array[wp.float64], bar: wp.array2d[Any]
+):
+    """Add 1/2 |x - x*|^2 of every particle, and its derivative by x."""
+    world, p = wp.tid()
+    r = type(x[world, p])()
+    if mass[world, p] > type(r[0])(0.0):
+        r = x[world, p] - target[world % target.shape[0], p]
+    wp.atomic_add(loss, world, wp.float64(0.5) * wp.float64(wp.length_sq(r)))
+    bar[world, p] = r

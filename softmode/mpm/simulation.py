@@ -1,0 +1,457 @@
+"""MpmSimulation: particles stepped forward, and derivatives of a loss carried back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from softmode.checks import require_number
+from softmode.deformables.build.static_response import lame_parameters
+from softmode.errors import ConfigError, SolverDiverged
+from softmode.mpm.adjoint_kernels import grid_to_particles_adjoint, move_grid_adjoint, particles_to_grid_adjoint
+from softmode.mpm.options import COURANT_LIMIT, MpmOptions
+from softmode.mpm.particles import ParticleBody
+from softmode.mpm.step_kernels import grid_to_particles, mass_to_grid, move_grid, particle_volumes, particles_to_grid
+
+Array = NDArray[np.float64]
+
+TYPES = {"float32": (wp.float32, wp.vec3f, wp.mat33f), "float64": (wp.float64, wp.vec3d, wp.mat33d)}
+LEAST_MASS = 1.0e-12
+"""A node with less than this part of the lightest particle's mass stands still. A threshold in kg costs momentum."""
+REASONS = {1: "left the grid", 2: "was turned inside out (det F <= 0)", 3: "has no finite position"}
+FEW_PARTICLES = 0.5
+"""Particles per cell under which a body falls apart into unconnected clumps."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ParticleState:
+    """Particles of all worlds at one time, or what a loss asks of them."""
+
+    x: wp.array
+    """Positions [m], (W, N)."""
+    v: wp.array
+    """Velocities [m/s], (W, N)."""
+    C: wp.array
+    """Affine velocity [1/s], (W, N)."""
+    F: wp.array
+    """Deformation gradient, (W, N)."""
+
+    def copy_from(self, other: ParticleState) -> None:
+        """Take another state's values."""
+        for name in ("x", "v", "C", "F"):
+            wp.copy(getattr(self, name), getattr(other, name))
+
+    def zero(self) -> None:
+        """Set all to zero."""
+        for name in ("x", "v", "C", "F"):
+            getattr(self, name).zero_()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ParameterBars:
+    """Derivatives of a loss by what does not move."""
+
+    control: wp.array
+    """By the controls, (L, W, N)."""
+    mass: wp.array
+    """By the masses [1/kg], (W, N); rest volumes stay."""
+    mu: wp.array
+    """By mu [1/Pa], (W, N)."""
+    lam: wp.array
+    """By lambda [1/Pa], (W, N)."""
+
+
+class MpmSimulation:
+    """A run of a fixed number of steps: forward, and backward for derivatives.
+
+    Worlds are independent; those with fewer particles are padded with particles without mass. All launches are on one
+    device and can be captured in a graph.
+    """
+
+    def __init__(
+        self,
+        bodies: ParticleBody | Sequence[ParticleBody],
+        options: MpmOptions | None = None,
+        *,
+        step_count: int = 10,
+        layer_count: int = 1,
+        device: wp.DeviceLike = None,
+    ) -> None:
+        """Put bodies at rest on the grid.
+
+        Args:
+            bodies: One body for each world.
+            options: How particles are stepped.
+            step_count: Number of steps T.
+            layer_count: Number of controls L. Each acts in the first of its T / L steps; F keeps what it did.
+            device: Where to compute; Warp's preferred device when None.
+
+        Raises:
+            ConfigError: If a particle lies outside of the grid, sound crosses most of a cell in a step, particles are
+                too few for their cells, or energies differ between worlds.
+        """
+        self.options = options or MpmOptions()
+        self.bodies = (bodies,) if isinstance(bodies, ParticleBody) else tuple(bodies)
+        require_number("step_count", step_count, at_least=1)
+        require_number("layer_count", layer_count, at_least=1, at_most=step_count)
+        if not self.bodies:
+            raise ConfigError("bodies: expected one or more")
+        models = {body.material.model for body in self.bodies}
+        if len(models) > 1:
+            raise ConfigError(f"bodies: expected one energy for all worlds, got {sorted(m.name for m in models)}")
+        grid = self.options.grid
+        for body in self.bodies:
+            grid.require(body.positions, "bodies")
+        self.device = wp.get_device(device)
+        self.step_count, self.layer_count = step_count, layer_count
+        self.world_count, self.count = len(self.bodies), max(body.count for body in self.bodies)
+        self._model = int(models.pop())
+        self._real, self._vec, self._mat = TYPES[self.options.precision]
+        self.mass = self._array(self._padded([body.masses for body in self.bodies]), self._real)
+        lame = [
+            [body.material.youngs_modulus * c for c in lame_parameters(body.material.poissons_ratio)]
+            for body in self.bodies
+        ]
+        self.mu, self.lam = (self._array(np.tile([[c[k]] for c in lame], self.count), self._real) for k in (0, 1))
+        self.volume = self._zeros(self._real, self.world_count, self.count)
+        nodes = (self.world_count, *grid.shape)
+        self.grid_mass = self._zeros(self._real, *nodes)
+        """Masses of the nodes after the last step, once :meth:`scatter_mass` ran [kg]."""
+        self._grid_velocity = self._zeros(self._vec, *nodes)
+        self.grid_mass_bar = self._zeros(self._real, *nodes)
+        self._grid_bar = self._zeros(self._vec, *nodes)
+        self.failure = self._zeros(int, self.world_count, 4)
+        """Failures of a world: how many, and the first one's kind, step and particle; (W, 4)."""
+        self._least = self._real(LEAST_MASS * min(float(body.masses.min()) for body in self.bodies))
+        self._controls = self._zeros(self._mat, layer_count + 1, self.world_count, self.count)
+        self.control = cast(wp.array, self._controls[:layer_count])
+        """Controls A, (L, W, N)."""
+        per_step = 4 * (24 if self.options.precision == "float32" else 48) * self.world_count * self.count
+        fits = per_step * (step_count + 1) <= self.options.memory_limit
+        self._chunk = step_count if fits else max(1, math.isqrt(step_count))
+        if per_step * (self._chunk + 1 + math.ceil(step_count / self._chunk)) > self.options.memory_limit and not fits:
+            raise ConfigError(
+                f"memory_limit: {step_count} steps of {self.world_count} x {self.count} particles need "
+                f"{per_step * (self._chunk + 1 + math.ceil(step_count / self._chunk)):.3g} bytes, "
+                f"{self.options.memory_limit:.3g} are allowed",
+                hint="allow more, or take fewer steps or particles",
+            )
+        self._states = [self._state() for _ in range(self._chunk + 1)]
+        marks = 0 if self._chunk == step_count else math.ceil(step_count / self._chunk)
+        self._marks = [self._state() for _ in range(marks)]
+        self._bars: tuple[list[ParticleState], wp.array, ParameterBars] | None = None
+        self.start(
+            self._padded([body.positions for body in self.bodies]),
+            F=np.tile(np.eye(3), (self.world_count, self.count, 1, 1)),
+        )
+        self._find_volumes()
+
+    def _zeros(self, dtype: type, *shape: int) -> wp.array:
+        return wp.zeros(shape, dtype=dtype, device=self.device)
+
+    def _array(self, values: ArrayLike, dtype: type) -> wp.array:
+        real = np.float32 if self.options.precision == "float32" else np.float64
+        return wp.array(np.asarray(values, dtype=real), dtype=dtype, device=self.device)
+
+    def _padded(self, rows: Sequence[Array]) -> Array:
+        """Stack arrays of different length (N_w, ...), filled up with zeros or their first point."""
+        found = np.zeros((len(rows), self.count, *rows[0].shape[1:]))
+        for world, row in enumerate(rows):
+            found[world, : len(row)] = row
+            if row.ndim > 1:
+                found[world, len(row) :] = row[0]
+        return found
+
+    def _state(self) -> ParticleState:
+        shape = (self.world_count, self.count)
+        kinds = {"x": self._vec, "v": self._vec, "C": self._mat, "F": self._mat}
+        return ParticleState(**{name: self._zeros(kind, *shape) for name, kind in kinds.items()})
+
+    @property
+    def first(self) -> ParticleState:
+        """The state before the first step."""
+        return self._marks[0] if self._marks else self._states[0]
+
+    @property
+    def last(self) -> ParticleState:
+        """The state after the last step of :meth:`forward`."""
+        return self._states[self.step_count - (len(self._marks) - 1) * self._chunk if self._marks else self.step_count]
+
+    def states(self) -> list[ParticleState]:
+        """Return the states before and after every step.
+
+        Raises:
+            ConfigError: If memory did not allow to keep them.
+        """
+        if self._marks:
+            raise ConfigError("memory_limit: not all states were kept", hint="allow more, or take fewer steps")
+        return self._states
+
+    def start(
+        self,
+        x: ArrayLike | None = None,
+        v: ArrayLike | None = None,
+        C: ArrayLike | None = None,
+        F: ArrayLike | None = None,
+    ) -> None:
+        """Set the state before the first step; what is None stays.
+
+        Args:
+            x: Positions [m], shape (W, N, 3).
+            v: Velocities [m/s], shape (W, N, 3).
+            C: Affine velocities [1/s], shape (W, N, 3, 3).
+            F: Deformation gradients, shape (W, N, 3, 3).
+        """
+        for name, value in (("x", x), ("v", v), ("C", C), ("F", F)):
+            if value is not None:
+                target = getattr(self.first, name)
+                wp.copy(target, self._array(value, target.dtype))
+
+    def forward(self) -> None:
+        """Take all steps."""
+        self.failure.zero_()
+        if not self._marks:
+            self._run(0)
+            return
+        for chunk in range(len(self._marks)):
+            self._states[0].copy_from(self._marks[chunk])
+            end = self._run(chunk)
+            if chunk + 1 < len(self._marks):
+                self._marks[chunk + 1].copy_from(self._states[end])
+
+    def scatter_mass(self) -> None:
+        """Put the masses of the particles after the last step on the grid."""
+        self.grid_mass.zero_()
+        self._launch(mass_to_grid, [self.last.x, self.mass, *self._place, self.grid_mass])
+
+    def bars(self) -> tuple[ParticleState, wp.array, ParameterBars]:
+        """Return what a loss writes before :meth:`backward`: bars of the last state, of the masses, and of the rest."""
+        states, mass, parameters = self._gradients()
+        return states[0], mass, parameters
+
+    def backward(self) -> tuple[ParticleState, ParameterBars]:
+        """Carry the bars of the last state back, after :meth:`forward`.
+
+        Returns:
+            Derivatives by the first state, and by what does not move.
+        """
+        states, _, parameters = self._gradients()
+        for bar in (parameters.control, parameters.mu, parameters.lam):
+            bar.zero_()
+        now = 0
+        for chunk in reversed(range(max(len(self._marks), 1))):
+            if chunk < len(self._marks) - 1:
+                self._states[0].copy_from(self._marks[chunk])
+                self._run(chunk)
+            for step in reversed(range(self._steps_in(chunk))):
+                self._step_back(
+                    chunk * self._chunk + step,
+                    self._states[step],
+                    self._states[step + 1],
+                    states[now],
+                    states[1 - now],
+                    parameters,
+                )
+                now = 1 - now
+        return states[now], parameters
+
+    def check(self) -> None:
+        """Raise if a particle failed in the last run; reads back from the device.
+
+        Raises:
+            SolverDiverged: Naming world, step and particle.
+        """
+        found = self.failure.numpy()
+        bad = np.flatnonzero(found[:, 0])
+        if len(bad):
+            _, kind, step, particle = found[bad[0]]
+            raise SolverDiverged(
+                f"world {bad[0]}, step {step}: particle {particle} {REASONS[int(kind)]}",
+                hint="take smaller steps, a larger grid, more damping or a weaker control",
+            )
+
+    def _gradients(self) -> tuple[list[ParticleState], wp.array, ParameterBars]:
+        """Return bars, allocated when first asked for."""
+        if self._bars is None:
+            shape = (self.world_count, self.count)
+            mass = self._zeros(self._real, *shape)
+            self._control_bars = self._zeros(self._mat, self.layer_count + 1, *shape)
+            parameters = ParameterBars(
+                control=cast(wp.array, self._control_bars[: self.layer_count]),
+                mass=mass,
+                mu=self._zeros(self._real, *shape),
+                lam=self._zeros(self._real, *shape),
+            )
+            self._fs_bar = self._zeros(self._mat, *shape)
+            self._bars = ([self._state(), self._state()], mass, parameters)
+        return self._bars
+
+    def _find_volumes(self) -> None:
+        """Find rest volumes, and check what follows from them."""
+        self._launch(mass_to_grid, [self.first.x, self.mass, *self._place, self.grid_mass])
+        self._launch(particle_volumes, [self.first.x, self.mass, self.grid_mass, *self._place, self.volume])
+        dx, dt = self.options.grid.spacing, self.options.dt
+        mass, volume = self.mass.numpy(), self.volume.numpy()
+        for world, body in enumerate(self.bodies):
+            density = mass[world, : body.count] / volume[world, : body.count]
+            mu, lam = (body.material.youngs_modulus * c for c in lame_parameters(body.material.poissons_ratio))
+            courant = dt * math.sqrt((lam + 2.0 * mu) / float(density.min())) / dx
+            if courant > COURANT_LIMIT:
+                raise ConfigError(
+                    f"dt: sound crosses {courant:.2g} cells in a step, at most {COURANT_LIMIT} are stable",
+                    hint=f"take dt <= {COURANT_LIMIT * dt / courant:.2g} s, larger cells, or a softer material",
+                )
+            per_cell = dx**3 / float(np.median(volume[world, : body.count]))
+            if per_cell < FEW_PARTICLES:
+                raise ConfigError(
+                    f"bodies: {per_cell:.2g} particles per cell, at least {FEW_PARTICLES} hold together",
+                    hint="take a smaller spacing of the particles or larger cells",
+                )
+
+    @property
+    def _place(self) -> list[object]:
+        grid = self.options.grid
+        return [self._vec(*grid.origin), self._real(grid.spacing)]
+
+    def _launch(self, kernel: Callable[..., object], inputs: list[object]) -> None:
+        wp.launch(kernel, (self.world_count, self.count), inputs=inputs, device=self.device)
+
+    def _steps_in(self, chunk: int) -> int:
+        return min(self._chunk, self.step_count - chunk * self._chunk)
+
+    def _run(self, chunk: int) -> int:
+        """Take the steps of a chunk from the first of the kept states; return how many."""
+        steps = self._steps_in(chunk)
+        for k in range(steps):
+            self._step(chunk * self._chunk + k, self._states[k], self._states[k + 1])
+        return steps
+
+    def _layer(self, step: int) -> int:
+        """Return the control that acts in a step, or the row of zeros after the last."""
+        layer = step * self.layer_count // self.step_count
+        begins = step == 0 or (step - 1) * self.layer_count // self.step_count != layer
+        return layer if begins else self.layer_count
+
+    def _control_at(self, step: int) -> wp.array:
+        return cast(wp.array, self._controls[self._layer(step)])
+
+    def _particles(self, state: ParticleState, step: int) -> list[object]:
+        """Return what both transfers to the grid read."""
+        material = int(self.options.control == "material")
+        o = self.options
+        return [
+            state.x,
+            state.v,
+            state.C,
+            state.F,
+            self._control_at(step),
+            self.mass,
+            self.volume,
+            self.mu,
+            self.lam,
+            self._model,
+            material,
+            *self._place,
+            self._real(o.dt),
+            self._real(o.damping),
+        ]
+
+    def _move_grid(self, step: int, state: ParticleState) -> None:
+        """Compute the velocities of the grid in a step."""
+        self.grid_mass.zero_()
+        self._grid_velocity.zero_()
+        inputs = [*self._particles(state, step), self.grid_mass, self._grid_velocity, self.failure, step]
+        self._launch(particles_to_grid, inputs)
+        push = self._vec(*(g * self.options.dt for g in self.options.gravity))
+        shape = self.grid_mass.shape
+        inputs = [self.grid_mass, self._least, push, self._grid_velocity]
+        wp.launch(move_grid, shape, inputs=inputs, device=self.device)
+
+    def _step(self, step: int, now: ParticleState, then: ParticleState) -> None:
+        """Take one step: particles to grid, grid, grid to particles."""
+        o = self.options
+        self._move_grid(step, now)
+        self._launch(
+            grid_to_particles,
+            [
+                now.x,
+                now.F,
+                self._control_at(step),
+                self.mass,
+                int(o.control == "material"),
+                self._grid_velocity,
+                *self._place,
+                self._real(o.dt),
+                self._real(o.smoothing),
+                then.x,
+                then.v,
+                then.C,
+                then.F,
+                self.failure,
+                step,
+            ],
+        )
+
+    def _step_back(
+        self,
+        step: int,
+        now: ParticleState,
+        then: ParticleState,
+        bar_then: ParticleState,
+        bar: ParticleState,
+        parameters: ParameterBars,
+    ) -> None:
+        """Carry the bars of a step's result to its start. The grid of the step is computed again."""
+        o = self.options
+        self._move_grid(step, now)
+        self._grid_bar.zero_()
+        self._launch(
+            grid_to_particles_adjoint,
+            [
+                now.x,
+                now.F,
+                self._control_at(step),
+                then.C,
+                self.mass,
+                int(o.control == "material"),
+                self._grid_velocity,
+                *self._place,
+                self._real(o.dt),
+                self._real(o.smoothing),
+                bar_then.x,
+                bar_then.v,
+                bar_then.C,
+                bar_then.F,
+                self._grid_bar,
+                bar.x,
+                self._fs_bar,
+                bar.F,
+            ],
+        )
+        push = self._vec(*(g * o.dt for g in o.gravity))
+        inputs = [self.grid_mass, self._grid_velocity, self._least, push, self._grid_bar, self.grid_mass_bar]
+        wp.launch(move_grid_adjoint, self.grid_mass.shape, inputs=inputs, device=self.device)
+        control_bar = cast(wp.array, self._control_bars[self._layer(step)])
+        self._launch(
+            particles_to_grid_adjoint,
+            [
+                *self._particles(now, step),
+                self.grid_mass_bar,
+                self._grid_bar,
+                self._fs_bar,
+                bar.x,
+                bar.v,
+                bar.C,
+                bar.F,
+                control_bar,
+                parameters.mass,
+                parameters.mu,
+                parameters.lam,
+            ],
+        )
