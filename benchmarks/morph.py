@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import trimesh
 import warp as wp
 from scipy.spatial import KDTree
 
@@ -38,36 +39,41 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=420)
     parser.add_argument("--worlds", type=int, nargs="+", default=[1])
     parser.add_argument("--spacing", type=float, default=0.5, help="distance between particles [m]")
+    parser.add_argument("--target", default="bunny", help="an asset of newton's examples, or torus")
     parser.add_argument("--damping", type=float, nargs="+", default=[8.0], help="zeta [1/s]")
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
-    ball, bunny = bodies(options.spacing)
-    print(f"{options.device}: ball of {ball.count} particles to a bunny of {bunny.count}")
+    ball, goal = bodies(options.spacing, options.target)
+    print(f"{options.device}: ball of {ball.count} particles to {options.target} of {goal.count}")
     chosen = MorphOptions(frame_count=options.frames)
-    time_step(ball, bunny, chosen, options.device)
+    time_step(ball, goal, chosen, options.device)
     for worlds in options.worlds:
         for damping in options.damping:
-            time_morph(ball, bunny, replace(chosen, mpm=replace(chosen.mpm, damping=damping)), options.device, worlds)
+            time_morph(ball, goal, replace(chosen, mpm=replace(chosen.mpm, damping=damping)), options.device, worlds)
 
 
-def bodies(spacing: float) -> tuple[ParticleBody, ParticleBody]:
-    """Return a ball and a bunny of its volume, both with their centre of mass at the origin."""
+def bodies(spacing: float, target: str) -> tuple[ParticleBody, ParticleBody]:
+    """Return a ball and a target of its volume, both with their centre of mass at the origin."""
     bounds = [[-RADIUS] * 3, [RADIUS] * 3]
     ball = particles_from_shape(
         lambda x: (x**2).sum(axis=1) <= RADIUS**2, bounds, spacing=spacing, material=MORPH_MATERIAL
     )
-    vertices, faces = from_newton("bunny")
+    if target == "torus":
+        mesh = trimesh.creation.torus(7.0, 3.2, major_sections=96, minor_sections=48)
+        vertices, faces = mesh.vertices, mesh.faces
+    else:
+        vertices, faces = from_newton(target)
     corner = vertices[faces]
     volume = abs(np.einsum("ti,ti->", corner[:, 0], np.cross(corner[:, 1], corner[:, 2]))) / 6.0
     scale = (ball.count * spacing**3 / volume) ** (1.0 / 3.0)
-    bunny = particles_from_mesh(vertices * scale, faces, spacing=spacing, material=MORPH_MATERIAL)
-    return ball.moved(-ball.centre), bunny.moved(-bunny.centre)
+    goal = particles_from_mesh(vertices * scale, faces, spacing=spacing, material=MORPH_MATERIAL)
+    return ball.moved(-ball.centre), goal.moved(-goal.centre)
 
 
-def time_step(ball: ParticleBody, bunny: ParticleBody, options: MorphOptions, device: str) -> None:
+def time_step(ball: ParticleBody, goal: ParticleBody, options: MorphOptions, device: str) -> None:
     """Print the time of a particle's step, forward and backward with the grid computed again."""
     simulation = MpmSimulation(ball, options.mpm, step_count=options.segment_length, device=device)
-    loss = MassLoss(options.mpm.grid, bunny, device=device)
+    loss = MassLoss(options.mpm.grid, goal, device=device)
     value = wp.zeros(1, dtype=wp.float64, device=device)
 
     def gradient() -> None:
@@ -86,15 +92,15 @@ def time_step(ball: ParticleBody, bunny: ParticleBody, options: MorphOptions, de
     print(f"a particle's step: forward {forward:.3f} us, backward {backward:.3f} us")
 
 
-def time_morph(ball: ParticleBody, bunny: ParticleBody, options: MorphOptions, device: str, worlds: int) -> None:
+def time_morph(ball: ParticleBody, goal: ParticleBody, options: MorphOptions, device: str, worlds: int) -> None:
     """Print time and accuracy of a morph, after one segment that compiles."""
-    MorphPlanner([ball] * worlds, bunny, replace(options, frame_count=20), device=device).run()
-    planner = MorphPlanner([ball] * worlds, bunny, options, device=device)
+    MorphPlanner([ball] * worlds, goal, replace(options, frame_count=20), device=device).run()
+    planner = MorphPlanner([ball] * worlds, goal, options, device=device)
     start = time.process_time() if device == "cpu" else time.perf_counter()
     run = planner.run()[0]
     wp.synchronize_device(device)
     seconds = (time.process_time() if device == "cpu" else time.perf_counter()) - start
-    far = KDTree(bunny.positions).query(run.positions[-1])[0]
+    far = KDTree(goal.positions).query(run.positions[-1])[0]
     print(
         f"{worlds} morphs, zeta {options.mpm.damping:g}, {len(run.losses) - 1} segments: {seconds:.2f} s, loss "
         f"{run.losses[0]:.0f} -> {run.losses[-1]:.1f} (least {run.losses.min():.1f}), accuracy "

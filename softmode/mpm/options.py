@@ -12,6 +12,7 @@ from softmode.errors import ConfigError
 from softmode.mpm.grid import Grid
 
 Control = Literal["material", "additive"]
+RestVolume = Literal["density", "grid"]
 Precision = Literal["float32", "float64"]
 
 COURANT_LIMIT = 0.9
@@ -36,6 +37,9 @@ class MpmOptions:
     control: Control = "material"
     """What a control A does to F: "material" is F (I + A), which turns with the body; "additive" is F + A, as in the
     paper."""
+    rest_volume: RestVolume = "density"
+    """Volume that a particle's stress acts in: "density" is m / rho; "grid" is m dx^3 / sum_i w_i m_i, as in the paper,
+    which is too large at the surface: a bar three cells thick rings 29 % too high with it."""
     precision: Precision = "float32"
     """Of particles and grid. Stresses are always float64."""
     memory_limit: float = 2.0e9
@@ -49,6 +53,7 @@ class MpmOptions:
         require_number("smoothing", self.smoothing, at_least=0.0, below=1.0)
         require_number("memory_limit", self.memory_limit, above=0.0, unit="bytes")
         require_choice("control", self.control, get_args(Control))
+        require_choice("rest_volume", self.rest_volume, get_args(RestVolume))
         require_choice("precision", self.precision, get_args(Precision))
         if len(self.gravity) != 3 or not np.isfinite(self.gravity).all():
             raise ConfigError(f"gravity: expected three finite numbers [m/s^2], got {self.gravity}")

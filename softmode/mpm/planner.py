@@ -66,7 +66,9 @@ class MorphOptions:
     """Mass scale of the logarithmic loss [kg]."""
     target_accuracy: float | None = None
     """Stop when 1 - loss / first loss exceeds this, 0 < accuracy < 1; None goes on to the last frame."""
-    mpm: MpmOptions = field(default_factory=lambda: MpmOptions(damping=8.0, smoothing=0.955, control="additive"))
+    mpm: MpmOptions = field(
+        default_factory=lambda: MpmOptions(damping=8.0, smoothing=0.955, control="additive", rest_volume="grid")
+    )
     """How particles are stepped. The paper has a damping of 0.5 1/s: bodies then arrive moving and leave again."""
 
     def __post_init__(self) -> None:

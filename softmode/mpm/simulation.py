@@ -294,8 +294,12 @@ class MpmSimulation:
 
     def _find_volumes(self) -> None:
         """Find rest volumes, and check what follows from them."""
-        self._launch(mass_to_grid, [self.first.x, self.mass, *self._place, self.grid_mass])
-        self._launch(particle_volumes, [self.first.x, self.mass, self.grid_mass, *self._place, self.volume])
+        if self.options.rest_volume == "grid":
+            self._launch(mass_to_grid, [self.first.x, self.mass, *self._place, self.grid_mass])
+            self._launch(particle_volumes, [self.first.x, self.mass, self.grid_mass, *self._place, self.volume])
+        else:
+            volumes = self._padded([body.masses / body.material.density for body in self.bodies])
+            wp.copy(self.volume, self._array(volumes, self._real))
         dx, dt = self.options.grid.spacing, self.options.dt
         mass, volume = self.mass.numpy(), self.volume.numpy()
         for world, body in enumerate(self.bodies):
