@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -122,7 +123,7 @@ class UsdScene:
     scenery: Splats | None = None
     """Visible splats that belong to no deformable, in the world [m]; None where there are none."""
     notes: tuple[str, ...] = ()
-    """What was not read."""
+    """What was not read, or left to Newton's importer."""
 
 
 def read_usd_scene(path: str | os.PathLike[str], *, asset_root: str | os.PathLike[str] | None = None) -> UsdScene:
@@ -132,7 +133,8 @@ def read_usd_scene(path: str | os.PathLike[str], *, asset_root: str | os.PathLik
     `PhysxAutoDeformableBodyAPI` or `PhysxDeformableBodyAPI`, or a geometry with one of the proposal's or Omni's
     simulation schemas that no body governs. Its geometry is the prim beneath it with a simulation schema, the source of
     an automatic Omni body, itself, or the only TetMesh, Mesh, Points or splats beneath it. Splats beneath a body are
-    its picture. Disabled bodies are left out.
+    its picture. Disabled bodies are left out, and with a note what is no soft solid: cables, cloth (a surface
+    deformable that is not closed), points that a scene with `NewtonMPMSceneAPI` owns.
 
     The stage is opened in a process of its own with limited memory and time. What it refers to (layers, payloads,
     textures) must lie inside the asset root.
@@ -150,10 +152,17 @@ def read_usd_scene(path: str | os.PathLike[str], *, asset_root: str | os.PathLik
 
 
 def open_scene(
-    path: str | os.PathLike[str], asset_root: str | os.PathLike[str] | None, folder: str, *, copy: bool
+    path: str | os.PathLike[str],
+    asset_root: str | os.PathLike[str] | None,
+    folder: str,
+    *,
+    copy: bool,
+    only: Sequence[str] | None = None,
+    skip: Sequence[str] = (),
 ) -> UsdScene:
-    """Do what `read_usd_scene` says; write the rest of the stage to `rest.usdc` in the folder if `copy`."""
+    """Do what `read_usd_scene` says for some deformables; write the rest to `rest.usdc` in the folder if `copy`."""
     request = scene_request(path, asset_root, folder, copy=copy)
+    request |= {"only": None if only is None else list(only), "skip": list(skip)}
     name = f"OpenUSD file {path}"
     return scene_from_answer(process.ask(request, name=name), name)
 
@@ -166,7 +175,7 @@ def scene_request(
         "scene", path, os.path.join(folder, "answer"), asset_root=asset_root, limits=process.Limits()
     )
     rest = os.path.join(folder, "rest.usdc") if copy else None
-    return request | {"most": MAX_SPLATS, "copy": rest, "strict": True}
+    return request | {"most": MAX_SPLATS, "copy": rest, "strict": True, "only": None, "skip": []}
 
 
 def scene_from_answer(answer: process.Answer, name: str) -> UsdScene:

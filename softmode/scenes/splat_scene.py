@@ -1,18 +1,24 @@
-"""`SplatScene`: soft objects with their splats among fixed shapes, without a robot: physics, pictures, energies."""
+"""`SplatScene`: soft objects with their splats among rigid shapes, fixed or not: physics, pictures, energies."""
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Protocol
 
 import newton
 import numpy as np
 import warp as wp
+from newton.solvers import SolverMuJoCo
 from numpy.typing import NDArray
 
+from softmode.deformables.coupling.rigid_solver import mujoco_warnings
+from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
+from softmode.deformables.model.neighbours import listed, movable_bodies
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
@@ -24,6 +30,12 @@ from softmode.scenes.fixture import Fixture, add_fixture
 from softmode.scenes.scene import cameras_by_size
 from softmode.splats.camera import CameraOptions, SplatCamera
 from softmode.splats.pinhole import PinholeCamera
+
+
+@cache
+def _say_once(note: str) -> None:
+    """Write a note to the log of softmode, which ends on the standard error unless logging is set up otherwise."""
+    logging.getLogger("softmode").warning("SplatScene: %s", note)
 
 
 class FrameSink(Protocol):
@@ -64,15 +76,21 @@ class Record:
 
 
 class SplatScene:
-    """A scene of one's own: soft objects among fixed shapes in one world. Time and pictures are captured in graphs.
+    """A scene of one's own: soft objects among rigid shapes in one world. Time and pictures are captured in graphs.
+
+    Where something rigid can move, such as a free body or a joint, MuJoCo moves it in one step with the objects
+    (:class:`softmode.deformables.SolverCoupledReduced`), and :attr:`notes` and a line of the log "softmode" say so.
+    Otherwise :class:`softmode.deformables.SolverReduced` steps the objects alone.
 
     Args:
-        fixtures: The shapes that do not move; or a builder with such shapes (body -1), to which the objects are added.
+        fixtures: Shapes that do not move; or a builder with whatever is rigid, to which the objects are added.
         objects: The soft objects.
         cameras: What to draw; none draws nothing.
         dt: Physics step [s].
         steps_per_frame: Physics steps of a frame; even.
         options: How the soft step is solved.
+        rigid: Makes MuJoCo's solver of the model where something rigid can move; default ``SolverMuJoCo``, whose room
+            for contacts may be too small: ``lambda model: SolverMuJoCo(model, njmax=400, nconmax=100)``.
         camera_options: Light and background.
         grip_slots: Points of each object that may be gripped while the scene runs; see :attr:`grips`.
         grip_options: How stiff such grips are.
@@ -91,6 +109,7 @@ class SplatScene:
         dt: float = 1.0 / 240.0,
         steps_per_frame: int = 8,
         options: SolverReducedOptions | None = None,
+        rigid: Callable[[newton.Model], SolverMuJoCo] = SolverMuJoCo,
         camera_options: CameraOptions | None = None,
         grip_slots: int = 0,
         grip_options: GripOptions | None = None,
@@ -114,10 +133,24 @@ class SplatScene:
             if grip_slots:
                 add_grip_slots(builder, instance, grip_slots)
         self.model: Any = builder.finalize(device=device)  # Any: it carries the attributes of soft bodies
-        bodies = {id(thing.body): thing.body for thing in self.objects}
-        self.solver = SolverReduced(self.model, list(bodies.values()), options=options)
+        moving = movable_bodies(self.model)
+        self.notes: tuple[str, ...] = ()
+        """What the scene decided by itself."""
+        if moving:
+            self.notes = (f"{listed(moving)} can move: SolverCoupledReduced steps the scene, with MuJoCo",)
+            _say_once(self.notes[0])
+        bodies = list({id(thing.body): thing.body for thing in self.objects}.values())
+        self.solver: SolverReduced | SolverCoupledReduced
+        if moving:
+            with mujoco_warnings():
+                mujoco = rigid(self.model)
+            self.solver = SolverCoupledReduced(self.model, bodies, options=options, rigid=mujoco)
+        else:
+            self.solver = SolverReduced(self.model, bodies, options=options)
         self.state: Any = self.model.state()
         self._scratch, self.control = self.model.state(), self.model.control()
+        for state in (self.state, self._scratch):
+            newton.eval_fk(self.model, self.model.joint_q, self.model.joint_qd, state)
         self.grips = tuple(
             Grips(self.solver, i, slot_count=grip_slots, options=grip_options)
             for i in range(len(self.objects) if grip_slots else 0)
@@ -149,7 +182,7 @@ class SplatScene:
                 self.solver.step(first, second, self.control, None, self.dt)
 
     def reset(self) -> None:
-        """Put the objects back where they were placed, at rest."""
+        """Put everything back where it was placed, at rest."""
         self.solver.reset(self.state)
 
     def draw(self, name: str | None = None) -> NDArray[np.uint8]:
@@ -210,7 +243,7 @@ class SplatScene:
         return self.state.particle_q.numpy()[start : start + count].astype(np.float64)
 
     def kinetic_energy(self) -> float:
-        """Return the kinetic energy of all objects, rho V / 2 sum_k |dq_k/dt|^2 [J]; the functions are orthonormal."""
+        """Return the kinetic energy of the soft objects, rho V / 2 sum_k |dq_k/dt|^2 [J]; functions are orthonormal."""
         start, qd = self.model.softmode.function_start.numpy(), self.state.softmode.qd.numpy()
         total = 0.0
         for placed, first in zip(self.placed, start, strict=True):

@@ -17,6 +17,8 @@ BODY_API = "PhysicsDeformableBodyAPI"
 VOLUME_SIM_API = "PhysicsVolumeDeformableSimAPI"
 SURFACE_SIM_API = "PhysicsSurfaceDeformableSimAPI"
 POINTS_SIM_API = "NewtonPointsDeformableSimAPI"
+MPM_SCENE_API = "NewtonMPMSceneAPI"
+"""On a PhysicsScene whose points are grains, fluids and the like, stepped by Newton's material point method."""
 VOLUME_MATERIAL_API = "PhysicsVolumeDeformableMaterialAPI"
 """Young's modulus, Poisson's ratio and density of a soft solid."""
 

@@ -50,6 +50,8 @@ def add_usd(
     builder: newton.ModelBuilder,
     path: str | os.PathLike[str],
     *,
+    only: str | Sequence[str] | None = None,
+    skip: str | Sequence[str] = (),
     asset_root: str | os.PathLike[str] | None = None,
     position: Sequence[float] = (0.0, 0.0, 0.0),
     rotation: ArrayLike | None = None,
@@ -71,6 +73,11 @@ def add_usd(
     Args:
         builder: Builder of the world, Z up; it may be replicated afterwards.
         path: A `.usd`, `.usda`, `.usdc` or `.usdz` file.
+        only: Paths of the deformables that softmode takes, or patterns as `fnmatch` has them; what lies beneath a path
+            belongs to it. None for every one that is a soft solid: cables, cloth (a surface deformable that is not
+            closed) and points of an MPM scene are left to Newton's importer. What is named here is taken as a solid.
+        skip: Paths or patterns of deformables that are left to Newton's importer. To have one left out altogether, name
+            it in ``newton_options={"ignore_paths": [...]}`` too.
         asset_root: Folder that holds whatever the stage may read; None for the file's own.
         position: Where the origin of the stage comes to lie [m].
         rotation: How the stage is turned, shape (3, 3); not at all when None.
@@ -86,7 +93,8 @@ def add_usd(
         The soft bodies by prim path and what Newton's importer says of the rest.
 
     Raises:
-        AssetError: If the file is damaged, refers out of the root, or a body encloses no volume.
+        AssetError: If the file is damaged, refers out of the root, a body encloses no volume, or ``only`` or ``skip``
+            match no deformable.
         MaterialError: If the stage gives a material property outside its range.
         ConfigError: If an option is out of range, or names what this function decides.
         MissingExtraError: If the extra `[usd]` is not installed.
@@ -104,7 +112,8 @@ def add_usd(
             f"builder: its up axis is {builder.up_axis}", hint="use newton.ModelBuilder(), which has Z up"
         )
     with tempfile.TemporaryDirectory() as folder:
-        scene = open_scene(path, asset_root, folder, copy=True)
+        chosen = {"only": _patterns(only), "skip": _patterns(skip) or []}
+        scene = open_scene(path, asset_root, folder, copy=True, **chosen)
         # All bodies are built before anything is added: one that cannot be leaves the builder as it was.
         ready = {
             deformable.path: place_deformable(
@@ -123,6 +132,11 @@ def add_usd(
     bodies = {path: _moved(placed, turn, shift) for path, placed in ready.items()}
     instances = {path: placed.add_to(builder) for path, placed in bodies.items()}
     return UsdImport(bodies=bodies, instances=instances, scene=scene, newton=rest)
+
+
+def _patterns(given: str | Sequence[str] | None) -> list[str] | None:
+    """Return patterns as a list."""
+    return None if given is None else [given] if isinstance(given, str) else list(given)
 
 
 def _moved(placed: Placed, turn: Array, shift: Array) -> Placed:

@@ -380,3 +380,27 @@ def test_attributes_are_registered_once():
     plain.add_ground_plane()
     with pytest.raises(ConfigError, match="add_reduced_body"):
         SolverReduced(plain.finalize(device="cpu"), [cube()])
+
+
+def test_what_the_solver_does_not_move_is_told():
+    """Bodies that could move are named, kinematic ones are not; so are tetrahedra, cloth, particles."""
+    builder = world_builder()
+    free = builder.add_body(label="free")
+    for body in (free, builder.add_body(label="held", is_kinematic=True)):
+        builder.add_shape_sphere(body, radius=0.05)
+    still = {"rot": wp.quat_identity(), "vel": wp.vec3()}
+    cells = {"dim_x": 1, "dim_y": 1, "dim_z": 1, "cell_x": 0.1, "cell_y": 0.1, "cell_z": 0.1}
+    builder.add_soft_grid(pos=wp.vec3(1.0, 0.0, 0.0), **still, **cells, density=1e2, k_mu=1e4, k_lambda=1e4, k_damp=0.0)
+    weave = {"dim_x": 2, "dim_y": 1, "cell_x": 0.1, "cell_y": 0.1, "mass": 0.01}
+    builder.add_cloth_grid(pos=wp.vec3(2.0, 0.0, 0.0), **still, **weave)
+    builder.add_particle((3.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.1)
+    model = finish(builder)
+    with pytest.warns(UserWarning) as told:
+        solver_of(SolverReduced, model)
+    texts = [str(one.message) for one in told]
+    rigid, soft = (next(t for t in texts if word in t) for word in ("could move", "tetrahedra"))
+    assert "'free'" in rigid and "'held'" not in rigid and "SolverCoupledReduced" in rigid
+    assert "5 tetrahedra" in soft and "4 triangles of cloth" in soft and "1 loose particles" in soft
+    with pytest.warns(UserWarning, match="5 tetrahedra") as told:
+        solver_of(SolverCoupledReduced, model)
+    assert not any("could move" in str(one.message) for one in told)

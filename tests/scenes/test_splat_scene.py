@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 
 import newton
 import numpy as np
 import pytest
+import warp as wp
 
 from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.status import status_reasons
+from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.errors import ConfigError
 from softmode.objects import ObjectConfig, Placed, SoftObject, load
 from softmode.scenes import SplatScene
@@ -73,6 +77,7 @@ def test_stack_comes_to_rest_and_the_film_tells(cube: SoftObject, tmp_path) -> N
 def test_overlap_is_how_far_one_was_put_into_the_other(cube: SoftObject) -> None:
     """Cubes of which one was placed 2 mm into the other overlap by that at the start of the first step."""
     scene = make_scene(cube, (0.0, 0.0, 0.5), (0.0, 0.0, 0.5 + EDGE - 0.002))
+    assert isinstance(scene.solver, SolverReduced)
     scene.solver.begin(scene.state, None, DT)
     scene.solver.detect(scene.state, None, DT, prescribed=True)
     assert scene.soft_overlap() == pytest.approx(0.002, rel=0.05)
@@ -98,6 +103,57 @@ def test_graph_equals_single_steps(cube: SoftObject) -> None:
         other._steps()
     np.testing.assert_array_equal(scene.state.softmode.q.numpy(), other.state.softmode.q.numpy())
     assert not status_reasons(int(scene.solver.status.numpy()[0]))
+
+
+def test_rigid_things_that_can_move_do(cube: SoftObject, caplog: pytest.LogCaptureFixture) -> None:
+    """A free box falls as it should, a hinged flap carries the weight of a toy; the scene says once what steps it."""
+    world = newton.ModelBuilder()
+    world.add_ground_plane()
+    box = world.add_body(xform=wp.transform((0.5, 0.0, 0.5), wp.quat_identity()), label="box")
+    world.add_shape_box(box, hx=0.03, hy=0.03, hz=0.03)
+    flap = world.add_link(label="flap")
+    world.add_shape_box(flap, xform=wp.transform((0.1, 0.0, 0.0), wp.quat_identity()), hx=0.1, hy=0.05, hz=0.005)
+    limit = {"limit_upper": 0.0, "limit_ke": 100.0, "limit_kd": 1.0}
+    hinge = world.add_joint_revolute(
+        *(-1, flap), parent_xform=wp.transform((-0.1, 0.0, 0.2), wp.quat_identity()), axis=(0, 1, 0), **limit
+    )
+    world.add_articulation([hinge])
+    toys = [Placed(object=replace(cube, material=STUFF), position=p) for p in ((0.0, 0.0, 0.24), (0.5, 0.3, 0.04))]
+    with caplog.at_level("WARNING", "softmode"):
+        scenes = [SplatScene(deepcopy(world), toys, dt=DT, steps_per_frame=2) for _ in range(2)]
+    said = [line for line in caplog.messages if "SolverCoupledReduced" in line]
+    assert len(said) == 1 and "'box', 'flap' can move" in said[0] and "'box', 'flap'" in scenes[1].notes[0]
+    scene = scenes[0]
+    assert isinstance(scene.solver, SolverCoupledReduced)
+    for frame in range(1, 151):
+        scene.step()
+        if frame == 30:
+            n = 2 * frame
+            fallen = 0.5 - scene.state.body_q.numpy()[box, 2]
+            assert fallen == pytest.approx(0.5 * GRAVITY * DT**2 * n * (n + 1), rel=1e-3)
+    assert scene.state.joint_q.numpy()[-1] == pytest.approx(0.0, abs=0.02)
+    assert scene.surface(0)[:, 2].min() == pytest.approx(0.205, abs=0.004)
+    assert scene.solver.body_wrench.numpy()[flap, 2] == pytest.approx(-MASS * GRAVITY, rel=0.05)
+    assert scene.surface(1)[:, 2].min() == pytest.approx(0.0, abs=0.002)
+    assert not status_reasons(int(scene.solver.status.numpy()[0]))
+    before = scene.state.body_q.numpy().copy()
+    scene.reset()
+    np.testing.assert_array_equal(scene.state.body_q.numpy(), scenes[1].state.body_q.numpy())
+    for _ in range(150):
+        scene.step()
+    np.testing.assert_allclose(scene.state.body_q.numpy(), before, atol=1e-4)
+
+
+def test_what_cannot_move_needs_no_mujoco(cube: SoftObject) -> None:
+    """Kinematic bodies and bodies that are fixed to the world leave the soft step alone."""
+    world = newton.ModelBuilder()
+    still = world.add_body(is_kinematic=True, label="still")
+    fixed = world.add_link(label="fixed")
+    world.add_articulation([world.add_joint_fixed(-1, fixed)])
+    for body in (still, fixed):
+        world.add_shape_box(body, hx=0.1, hy=0.1, hz=0.01)
+    scene = SplatScene(world, [Placed(object=replace(cube, material=STUFF), position=(0.0, 0.0, 0.05))], dt=DT)
+    assert isinstance(scene.solver, SolverReduced) and not scene.notes
 
 
 def test_bad_scenes_are_refused(cube: SoftObject) -> None:

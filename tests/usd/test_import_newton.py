@@ -15,6 +15,7 @@ pytest.importorskip("pxr", reason="needs the extra [usd]")
 
 import newton
 import warp as wp
+from newton.solvers import SolverXPBD
 
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import BuildOptions
@@ -22,13 +23,15 @@ from softmode.deformables.build.quadrature import quadrature_from_splats
 from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
+from softmode.deformables.model.namespaces import soft
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.skinning.skin_splats import SkinSplats
+from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.errors import AssetError, ConfigError, MissingExtraError
 from softmode.splats.rasterizer import SplatArrays
 from softmode.stages import process
 from softmode.usd import add_usd, read_usd_scene
-from tests.usd.stages import KINDS, Author, Gf, Sdf, UsdGeom, UsdVol, box, shell, transform
+from tests.usd.stages import KINDS, Author, Gf, Sdf, UsdGeom, UsdPhysics, UsdShade, UsdVol, box, shell, transform
 
 EPSILON = float(np.finfo(np.float32).eps)
 SMALL = BuildOptions(mode_count=3, kernel_count=120, cubature_count=128)
@@ -223,7 +226,8 @@ def test_what_the_stage_does_not_say(tmp_path: Path) -> None:
     prim.GetAttribute("faceVertexIndices").Set(box().faces.ravel()[:33].tolist())
     author.save()
     given = Material(youngs_modulus=3e4, density=150.0)
-    found = add_usd(newton.ModelBuilder(), tmp_path / "a.usda", build_options=SMALL, material=given)
+    asked = {"only": "/World/Toy"}  # a surface that is not closed is cloth unless one asks for a solid
+    found = add_usd(newton.ModelBuilder(), tmp_path / "a.usda", build_options=SMALL, material=given, **asked)
     toy = found.bodies["/World/Toy"]
     assert toy.material == given
     assert toy.body.volume == pytest.approx(0.1 * 0.08 * 0.06, rel=0.05)
@@ -337,3 +341,114 @@ def test_importing_names_loads_no_openusd() -> None:
     """The reader of scenes itself leaves OpenUSD to another process; `newton`, which `add_usd` needs, brings it."""
     code = "import sys; from softmode.usd import read_usd_scene; sys.exit('pxr' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+GRID = [(0.02 * i - 0.04, 0.02 * j - 0.04, 0.0) for j in range(5) for i in range(5)]
+QUADS = [
+    corner for j in range(4) for i in range(4) for corner in (5 * j + i, 5 * j + i + 1, 5 * j + i + 6, 5 * j + i + 5)
+]
+
+
+def cloth_and_sand(path: Path, meters: float = 1.0, kilograms: float = 1.0) -> Path:
+    """Author a soft box, a cloth over it, and a heap of sand that a scene of Newton's material points owns."""
+    author = Author.create(path, "Z", meters, kilograms)
+    stage, pressure = author.stage, meters / kilograms
+    author.body("/World/Toy", "TetMesh", matrix=transform((0.0, 0.0, 0.035)))
+    weave = UsdShade.Material.Define(stage, "/World/Weave").GetPrim()
+    weave.AddAppliedSchema("PhysicsSurfaceDeformableMaterialAPI")
+    weave.CreateAttribute("physics:youngsModulus", Sdf.ValueTypeNames.Float).Set(1.0e5 * pressure)
+    weave.CreateAttribute("physics:density", Sdf.ValueTypeNames.Float).Set(300.0 * meters**3 / kilograms)
+    cloth = UsdGeom.Mesh.Define(stage, "/World/Cloth")
+    for name in ("PhysicsDeformableBodyAPI", "PhysicsSurfaceDeformableSimAPI"):
+        cloth.GetPrim().AddAppliedSchema(name)
+    cloth.CreatePointsAttr([author.vector(x) for x in GRID])
+    cloth.CreateFaceVertexCountsAttr([4] * 16)
+    cloth.CreateFaceVertexIndicesAttr(QUADS)
+    cloth.AddTranslateOp().Set(Gf.Vec3d(0.0, 0.0, 0.12 / meters))
+    thickness = cloth.GetPrim().CreateAttribute("physics:thicknesses", Sdf.ValueTypeNames.FloatArray)
+    thickness.Set([0.001 / meters])
+    element = cloth.GetPrim().CreateAttribute("physics:thicknesses:elementType", Sdf.ValueTypeNames.Token)
+    element.Set("constant")
+    UsdShade.MaterialBindingAPI.Apply(cloth.GetPrim()).Bind(
+        UsdShade.Material(weave), UsdShade.Tokens.weakerThanDescendants, "physics"
+    )
+    UsdPhysics.Scene.Define(stage, "/World/Physics")
+    UsdPhysics.Scene.Define(stage, "/World/Grains").GetPrim().AddAppliedSchema("NewtonMPMSceneAPI")
+    grain = UsdShade.Material.Define(stage, "/World/Grain").GetPrim()
+    grain.AddAppliedSchema("NewtonMPMMaterialAPI")
+    grain.CreateAttribute("newton:mpm:youngsModulus", Sdf.ValueTypeNames.Float).Set(1.0e6 * pressure)
+    sand = UsdGeom.Points.Define(stage, "/World/Sand")
+    for name in ("PhysicsDeformableBodyAPI", "NewtonPointsDeformableSimAPI"):
+        sand.GetPrim().AddAppliedSchema(name)
+    sand.GetPrim().CreateRelationship("physics:simulationOwner").SetTargets(["/World/Grains"])
+    sand.CreatePointsAttr([author.vector((x + 0.3, y, 0.1)) for x, y, _ in GRID])
+    sand.CreateWidthsAttr([0.02 / meters] * len(GRID))
+    sand.GetPrim().CreateAttribute("physics:mass", Sdf.ValueTypeNames.Float).Set(0.3 / kilograms)
+    UsdShade.MaterialBindingAPI.Apply(sand.GetPrim()).Bind(
+        UsdShade.Material(grain), UsdShade.Tokens.weakerThanDescendants, "physics"
+    )
+    author.save()
+    return path
+
+
+def test_cloth_and_sand_are_left_to_newton(tmp_path: Path) -> None:
+    """One cloth loses no stage and sand becomes no jelly: Newton has both, in any unit."""
+    models = []
+    for meters, kilograms in ((1.0, 1.0), (0.01, 0.001)):
+        path = cloth_and_sand(tmp_path / f"{meters}.usda", meters, kilograms)
+        builder = newton.ModelBuilder()
+        found = add_usd(builder, path, build_options=SMALL, surface_count=100)
+        assert list(found.bodies) == ["/World/Toy"]
+        left = [note for note in found.scene.notes if "left to Newton" in note]
+        assert len(left) == 2 and "/World/Cloth: is cloth" in left[0] and "/World/Sand" in left[1]
+        models.append((builder.finalize(), found))
+    (model, found), (other, _) = models
+    assert model.tri_count == 32 and model.particle_count == 25 + 25 + 100
+    for name in ("particle_q", "particle_mass", "particle_radius", "tri_materials", "tri_poses"):
+        np.testing.assert_allclose(getattr(other, name).numpy(), getattr(model, name).numpy(), rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(other.mpm.young_modulus.numpy(), model.mpm.young_modulus.numpy(), rtol=1e-5)
+    with pytest.warns(UserWarning, match=r"32 triangles of cloth.*SolverVBD.*25 loose particles.*SolverImplicitMPM"):
+        solver = SolverReduced(model, found.reduced_bodies)
+    assert solver.instance_count == 1
+
+
+@pytest.mark.slow
+def test_newton_steps_its_own_beside_the_toy(tmp_path: Path) -> None:
+    """A step of Newton's solver before softmode's, between the same states, moves the cloth alone."""
+    builder = newton.ModelBuilder()
+    found = add_usd(builder, cloth_and_sand(tmp_path / "a.usda"), build_options=SMALL, surface_count=100)
+    model = builder.finalize()
+    solver = SolverReduced(model, found.reduced_bodies)
+    cloth, state, after = SolverXPBD(model), model.state(), model.state()
+    rest = state.particle_q.numpy().copy()
+    for _ in range(4):
+        cloth.step(state, after, None, None, 1.0 / 240.0)
+        solver.step(state, after, None, None, 1.0 / 240.0)
+        state, after = after, state
+    fallen = state.particle_q.numpy()[:, 2] - rest[:, 2]
+    assert (fallen[:25] < 0.0).all() and (fallen[50:] < 0.0).all()
+    single = newton.ModelBuilder()
+    found.bodies["/World/Toy"].add_to(single)
+    alone = single.finalize()
+    lone, first, second = SolverReduced(alone, found.reduced_bodies), alone.state(), alone.state()
+    for _ in range(4):
+        lone.step(first, second, None, None, 1.0 / 240.0)
+        first, second = second, first
+    np.testing.assert_array_equal(soft(first).q.numpy(), soft(state).q.numpy())
+
+
+def test_which_deformables_are_taken(tmp_path: Path) -> None:
+    """`only` and `skip` take paths and patterns; what is not taken is Newton's; what matches nothing is refused."""
+    path = everything(tmp_path / "a.usda")
+    given = {"build_options": SMALL, "surface_count": 100}
+    found = add_usd(newton.ModelBuilder(), path, only="/World/T*", **given)
+    assert list(found.bodies) == ["/World/Toy"] and any(
+        "/World/Brick: is not asked for" in n for n in found.scene.notes
+    )
+    found = add_usd(newton.ModelBuilder(), path, skip=["/World/Toy"], **given)
+    assert list(found.bodies) == ["/World/Brick"]
+    builder = newton.ModelBuilder()
+    found = add_usd(builder, path, skip="/World", **given)
+    assert not found.bodies and not hasattr(builder.finalize(), "softmode")
+    with pytest.raises(AssetError, match="'/World/Toi' matches no deformable; there are: /World/Toy, /World/Brick"):
+        add_usd(newton.ModelBuilder(), path, skip=["/World/Toi"], **given)

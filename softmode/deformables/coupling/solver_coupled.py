@@ -34,6 +34,7 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.coupling import coupling_kernels as kernels
 from softmode.deformables.coupling.rigid_solver import dropping_overflows, mujoco_warnings, second_half
 from softmode.deformables.model.declare import WRENCH
+from softmode.deformables.model.neighbours import warn_foreign_deformables
 from softmode.deformables.model.rigid_dofs import RigidDofs
 from softmode.deformables.model.tables import allocate, host, present
 from softmode.deformables.solver import rigid_row_kernels as rows
@@ -78,7 +79,8 @@ class SolverCoupledReduced(ReducedSolver):
     ) -> None:
         """Build both solvers and tie the joint dofs into the reduced one."""
         if model.joint_dof_count == 0:
-            raise ConfigError("model has no joint dofs to couple with", hint="use SolverReduced")
+            hint = "use SolverReduced, or ModelBuilder.add_body, which gives a rigid body a free joint"
+            raise ConfigError("model has no joint dofs to couple with", hint=hint)
         with mujoco_warnings():
             self.rigid = rigid or SolverMuJoCo(model)
         if self.rigid.use_mujoco_cpu:
@@ -89,6 +91,7 @@ class SolverCoupledReduced(ReducedSolver):
         dofs = _joint_dofs(model, row_max=self.rigid.mjw_data.efc.type.shape[1])
         self.reduced = SolverReduced(model, bodies, options=options, rigid=dofs)
         super().__init__(model, self.reduced.tables)
+        warn_foreign_deformables(model, self.tables.layout)
         device, count = model.device, model.joint_dof_count
         self.predicted_state = model.state()
         self._from_forces_on, self._dropping = second_half(self.rigid), dropping_overflows()

@@ -15,6 +15,7 @@ from softmode.deformables.model.authoring import (
     register_custom_attributes,
 )
 from softmode.deformables.model.namespaces import SoftControl, soft
+from softmode.deformables.model.neighbours import warn_foreign_deformables, warn_still_bodies
 from softmode.deformables.model.rigid_dofs import RigidDofs
 from softmode.deformables.model.tables import present
 from softmode.deformables.solver import finish as last_phase
@@ -54,6 +55,9 @@ class SolverReduced(ReducedSolver):
         options: How the step is solved.
         rigid: Joint dofs that take part in the solve, as a coupling has them; default none.
 
+    Warns:
+        UserWarning: If the model has rigid bodies that could move and are not kinematic, or deformables of Newton's.
+
     Raises:
         ConfigError: If a body of the model is not among ``bodies``, or a shape cannot be touched.
     """
@@ -70,8 +74,11 @@ class SolverReduced(ReducedSolver):
         warn_untested()
         if not hasattr(model, NAMESPACE):
             raise ConfigError("model holds no reduced body", hint="call add_reduced_body before finalize")
-        rigid = rigid or RigidDofs.prescribed(model)
-        super().__init__(model, allocate_tables(model, bodies, options or SolverReducedOptions(), rigid))
+        joints = rigid or RigidDofs.prescribed(model)
+        super().__init__(model, allocate_tables(model, bodies, options or SolverReducedOptions(), joints))
+        if rigid is None:
+            warn_still_bodies(model)
+            warn_foreign_deformables(model, self.tables.layout)
         self._prescribed = True
         self._check_materials()
         warn_untold_pins(model, self.tables.layout)

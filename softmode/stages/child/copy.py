@@ -1,4 +1,4 @@
-"""Write a stage without its deformables as one crate in metres and kilograms, checked, for Newton's importer."""
+"""Write a stage without its soft solids as one crate in metres and kilograms, checked, for Newton's importer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .limits import Refused
 
 _MEND = "Mend or remove the prim"
 _LENGTH, _MASS = (1, 0), (0, 1)
-_FORCE, _TORQUE = (1, 1), (2, 1)
+_FORCE, _TORQUE, _PRESSURE = (1, 1), (2, 1), (-1, 1)
 _UNITS = {
     "physics:density": (-3, 1),
     "physics:mass": _MASS,
@@ -22,6 +22,18 @@ _UNITS = {
     "physics:maxDistance": _LENGTH,
     "physics:breakForce": _FORCE,
     "physics:breakTorque": _TORQUE,
+    "physics:masses": _MASS,
+    "physics:thicknesses": _LENGTH,
+    "physics:youngsModulus": _PRESSURE,
+    "physics:surfaceThickness": _LENGTH,
+    "physics:surfaceStretchStiffness": _MASS,
+    "physics:surfaceShearStiffness": _MASS,
+    "physics:surfaceBendStiffness": _TORQUE,
+    "newton:mpm:youngsModulus": _PRESSURE,
+    "newton:mpm:yieldPressure": _PRESSURE,
+    "newton:mpm:yieldStress": _PRESSURE,
+    "newton:mpm:elasticDamping": _PRESSURE,
+    "newton:mpm:viscosity": _PRESSURE,
 }
 """Powers of length and mass in the units of attributes; positions in a body's frame scale with the frame."""
 _PRISMATIC = {"physics:lowerLimit": _LENGTH, "physics:upperLimit": _LENGTH}
@@ -99,7 +111,7 @@ def _check(prim: Prim) -> None:
     values: dict[str, Any] = {}
     for attribute in prim.GetAuthoredAttributes():
         name = attribute.GetName()
-        if not name.startswith(("physics:", "xformOp:", "drive:", "limit:")) and name not in _CHECKED:
+        if not name.startswith(("physics:", "newton:", "xformOp:", "drive:", "limit:")) and name not in _CHECKED:
             continue
         value = attribute.Get(first)
         if value is None or isinstance(value, str | bool | int):
@@ -114,7 +126,7 @@ def _check(prim: Prim) -> None:
         if array.dtype.kind == "f":
             bad = (
                 numpy.isnan(array).any()
-                if name.startswith(("physics:", "drive:", "limit:"))
+                if name.startswith(("physics:", "newton:", "drive:", "limit:"))
                 else not numpy.isfinite(array).all()
             )
             if bad:
@@ -140,6 +152,7 @@ _CHECKED = (
     "radius",
     "height",
     "widths",
+    "velocities",
     "normals",
 )
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 
 from .. import tokens
 from ..openusd import Prim, Stage, Value, pxr
@@ -37,6 +39,26 @@ class Body:
 def applied(prim: Prim) -> list[str]:
     """Return the applied schemas, those that are not registered included."""
     return list(prim.GetPrimTypeInfo().GetAppliedAPISchemas())
+
+
+@dataclass(frozen=True)
+class Left:
+    """A deformable that is left as it is, for Newton's importer."""
+
+    path: Value
+    """Path of its prim."""
+    reason: str
+    """Why."""
+
+
+def wanted(path: str, only: list[str] | None, skip: list[str]) -> bool:
+    """Return whether a path is asked for: patterns match it, or something above it, as `fnmatch` has it."""
+    return (only is None or any(matches(path, p) for p in only)) and not any(matches(path, p) for p in skip)
+
+
+def matches(path: str, pattern: str) -> bool:
+    """Return whether a path, or something above it, matches a pattern."""
+    return fnmatchcase(path, pattern) or fnmatchcase(path, f"{pattern.rstrip('/')}/*")
 
 
 def _is_body(prim: Prim) -> bool:
@@ -76,11 +98,16 @@ def uninstance(stage: Stage, *, every: bool = False) -> None:
     raise Refused("nests instances too deeply", "Flatten the stage")
 
 
-def find_bodies(prims: list[Prim]) -> tuple[list[Body], list[tuple[str, str]]]:
-    """Return the deformable bodies, and the path and type of what ties them to others, which is not read.
+def find_bodies(prims: list[Prim], only: list[str] | None, skip: list[str]) -> tuple[list[Body], list[Left]]:
+    """Return the deformable bodies, and those that are left to Newton.
+
+    Left are those that are not asked for, and of the others what is no soft solid unless `only` asks for it: cloth (a
+    surface deformable that is not closed) and points that an MPM scene owns.
 
     Args:
         prims: All prims, parents first.
+        only: Patterns of paths of which one has to match; None for all.
+        skip: Patterns of paths of which none may match.
     """
     roots = [prim for prim in prims if _is_body(prim)]
     paths = {prim.GetPath() for prim in roots}
@@ -94,7 +121,19 @@ def find_bodies(prims: list[Prim]) -> tuple[list[Body], list[tuple[str, str]]]:
         if any(a in tokens.SIM_APIS for a in applied(prim)) and not any(path.HasPrefix(p) for p in (*paths, *disabled)):
             roots.append(prim)
             paths.add(path)
-    bodies = [body for body in (_body(root, paths) for root in roots) if body is not None]
+    _check_patterns([str(path) for path in paths], (only or []) + skip)
+    scenes = [prim for prim in prims if prim.GetTypeName() == "PhysicsScene"]
+    bodies, left = [], []
+    for root in roots:
+        if not wanted(str(root.GetPath()), only, skip):
+            left.append(Left(root.GetPath(), "is not asked for"))
+            continue
+        body = _body(root, paths)
+        reason = "is a cable" if body is None else "" if only is not None else _no_solid(body, scenes)
+        if body is None or reason:
+            left.append(Left(root.GetPath(), reason))
+        else:
+            bodies.append(body)
     by_path = {body.prim.GetPath(): body for body in bodies}
     for prim in prims:  # pictures that lie elsewhere say whose they are
         if prim.GetTypeName() == tokens.SPLATS and prim.GetRelationship(tokens.SPLAT_BODY):
@@ -102,8 +141,60 @@ def find_bodies(prims: list[Prim]) -> tuple[list[Body], list[tuple[str, str]]]:
                 body = by_path.get(target)
                 if body is not None and prim.GetPath() not in {p.GetPath() for p in body.splats} and visible(prim):
                     body.splats.append(prim)
-    between = [(str(p.GetPath()), str(p.GetTypeName())) for p in prims if p.GetTypeName() in _BETWEEN]
-    return bodies, between
+    return bodies, left
+
+
+def find_ties(prims: list[Prim], left: list[Left]) -> list[tuple[str, str]]:
+    """Return path and type of what ties deformables to others and is not read: all but what ties those left alone."""
+    ties = []
+    for prim in prims:
+        if prim.GetTypeName() in _BETWEEN:
+            targets = [target for relation in prim.GetRelationships() for target in relation.GetTargets()]
+            if not any(target.HasPrefix(one.path) for one in left for target in targets):
+                ties.append((str(prim.GetPath()), str(prim.GetTypeName())))
+    return ties
+
+
+def _check_patterns(paths: list[str], patterns: list[str]) -> None:
+    """Refuse patterns that match no deformable."""
+    for pattern in patterns:
+        if not any(matches(path, pattern) for path in paths):
+            known = ", ".join(paths[:8]) or "none"
+            raise Refused(f"{pattern!r} matches no deformable; there are: {known}", "Mend the pattern in only or skip")
+
+
+def _no_solid(body: Body, scenes: list[Prim]) -> str:
+    """Return what a body is if it is no soft solid."""
+    geometry = body.geometry
+    if body.prim.GetAttribute(tokens.FORMAT):
+        return ""
+    if any(name in tokens.SURFACE_SIM_APIS for name in applied(geometry)) and not _closed(geometry):
+        return "is cloth, a surface that is not closed"
+    if geometry.GetTypeName() == tokens.POINTS:
+        owner = body.prim.GetRelationship("physics:simulationOwner")
+        targets = owner.GetForwardedTargets() if owner else []
+        owners = [p for p in scenes if p.GetPath() in targets] if targets else scenes[:1]
+        if any(tokens.MPM_SCENE_API in applied(p) for p in owners):
+            return "is the material of an MPM scene"
+    return ""
+
+
+def _closed(mesh: Prim) -> bool:
+    """Return whether every edge of a mesh, its vertices merged by place, belongs to an even number of faces."""
+    numpy = importlib.import_module("numpy")
+    first = pxr("Usd")[0].TimeCode.EarliestTime()
+    values = [mesh.GetAttribute(name).Get(first) for name in ("points", "faceVertexCounts", "faceVertexIndices")]
+    points, counts, index = (numpy.array([] if value is None else value) for value in values)
+    bad = not len(index) or index.min() < 0 or index.max() >= len(points) or counts.min(initial=0) < 0
+    if bad or counts.sum() != len(index):
+        return True  # refused where it is read, by name
+    place = numpy.unique(points, axis=0, return_inverse=True)[1].reshape(-1)[index]
+    ends = numpy.cumsum(counts)
+    following = numpy.arange(1, len(index) + 1)
+    following[ends[counts > 0] - 1] = (ends - counts)[counts > 0]
+    edges = numpy.sort(numpy.stack([place, place[following]], axis=1), axis=1)
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    return bool((numpy.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all())
 
 
 def _body(root: Prim, roots: set[Value]) -> Body | None:

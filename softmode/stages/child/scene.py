@@ -8,7 +8,7 @@ from typing import Any
 from .. import tokens
 from ..openusd import Prim, Stage, Value, pxr
 from .answer import Arrays, prims_of
-from .deformables import applied, find_bodies, uninstance, visible
+from .deformables import applied, find_bodies, find_ties, uninstance, visible
 from .limits import Refused
 from .splats import flat, read_prim
 
@@ -18,7 +18,8 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
 
     Args:
         stage: The stage.
-        request: `most`, the largest number of splats, and `copy`: where the rest of the stage goes, None for nowhere.
+        request: `most`, the largest number of splats; `copy`: where the rest of the stage goes, None for nowhere;
+            `only` and `skip`, patterns of paths of deformables.
         arrays: Takes the arrays.
     """
     Usd, UsdGeom, UsdPhysics = pxr("Usd", "UsdGeom", "UsdPhysics")
@@ -27,7 +28,8 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
     prims = list(prims_of(stage))
     time = Usd.TimeCode.EarliestTime()
     transforms = UsdGeom.XformCache(time)
-    bodies, ignored = find_bodies(prims)
+    bodies, left = find_bodies(prims, request["only"], request["skip"])
+    ignored = find_ties(prims, left)
     described = []
     used: list[str] = []
     most = request["most"]
@@ -75,7 +77,11 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
             for prim in prims
             if prim.GetTypeName() == tokens.SPLATS and str(prim.GetPath()) not in used and visible(prim)
         ],
-        "notes": [f"{path}: {kind} between deformables is not read" for path, kind in ignored] + _other_units(stage),
+        "notes": [
+            *(f"{one.path}: {one.reason}; left to Newton's importer" for one in left),
+            *(f"{path}: {kind} between deformables is not read" for path, kind in ignored),
+            *_other_units(stage),
+        ],
     }
 
 
