@@ -25,11 +25,13 @@ from softmode.objects.placed import Placed
 from softmode.objects.stage_scene import shortest
 from softmode.scenes.binding import splats_of_states
 from softmode.splats.formats.usd import set_splat_column, splat_columns
+from softmode.splats.pinhole import PinholeCamera
 from softmode.stages import tokens
 from softmode.stages.openusd import Layer, Stage
 from softmode.usd.handles import handles_from_coordinates, local_coordinates, rigid_motion
 from softmode.usd.openusd import check_stage, openusd, whole_stage
 from softmode.usd.rigid import RigidMeshes
+from softmode.usd.staging import author_cameras, author_lights, overview, whole_codes
 from softmode.usd.writer import (
     UsdExportOptions,
     attribute,
@@ -58,7 +60,10 @@ class UsdAnimationOptions:
     """What is sampled: handle matrices only, a kilobyte per frame and body; or also all positions, orientations and
     scales of splats, 40 bytes for each splat and frame, which any viewer of splats plays."""
     fps: float = 30.0
-    """Time codes per second, and frames per second where no times are given [1/s]."""
+    """Frames per second where no times are given [1/s], and time codes per second; as many times more of these as make
+    the time codes of all frames whole, up to 64."""
+    cameras: tuple[PinholeCamera, ...] = ()
+    """Cameras of the stage, those in the world; without any there is one that sees where the bodies were."""
     sh_degree: int | None = None
     """Degree that the colours of splats are cut to, 0 to 3; None for theirs. Baked colours above degree 0 turn with
     each splat: 12 (degree + 1)^2 bytes more for each splat and frame."""
@@ -137,7 +142,7 @@ class UsdAnimation:
             path: As above.
             env: A `SoftEnv` or a `SoftVectorEnv` whose worlds live in this process, wrapped or not.
             world: Which world.
-            options: How it is written; by default with the environment's control rate as `fps`.
+            options: How it is written; by default with the environment's control rate as `fps` and its cameras.
 
         Raises:
             ConfigError: As above, or if `env` is no such environment.
@@ -146,12 +151,13 @@ class UsdAnimation:
         scene = getattr(getattr(inner, "task", None), "scene", None)
         if scene is None:
             raise ConfigError(f"env is a {type(inner).__name__}", hint="pass a softmode environment, made by gym.make")
+        still = tuple(c for drawn in scene.cameras.values() for c in drawn.cameras if c.body is None)
         made = cls(
             path,
             scene.model,
             [Placed(object=thing) for thing in scene.objects],
             world=world,
-            options=options or UsdAnimationOptions(fps=scene.config.control_hz),
+            options=options or UsdAnimationOptions(fps=scene.config.control_hz, cameras=still),
         )
         made._live = scene.state
         return made
@@ -228,13 +234,13 @@ class UsdAnimation:
         """
         if not self._times:
             raise ConfigError("no frame was recorded", hint="call record at least once")
-        codes = [time * self.options.fps for time in self._times]
+        codes, rate = whole_codes(self._times, self.options.fps)
         with contextlib.suppress(OSError):  # what is in the way will be told by the next line
             self.path.parent.mkdir(parents=True, exist_ok=True)
         with whole_stage(self.path) as file:
             layer = new_layer(str(file))
             stage = new_stage(layer)
-            stage.SetTimeCodesPerSecond(self.options.fps)
+            stage.SetTimeCodesPerSecond(rate)
             stage.SetFramesPerSecond(self.options.fps)
             stage.SetStartTimeCode(codes[0])
             stage.SetEndTimeCode(codes[-1])
@@ -243,7 +249,15 @@ class UsdAnimation:
                 self._author_motion(stage, layer, path, placed, codes, [frame[k] for frame in self._states])
             if self._meshes is not None:
                 self._meshes.author(stage, codes)
+            fixed = [camera for camera in self.options.cameras if camera.body is None]
+            author_cameras(stage, fixed or [overview(self._surfaces())])
+            author_lights(stage)
             save(layer)
+
+    def _surfaces(self) -> NDArray[np.float64]:
+        """Return where the surface samples of all bodies were in all frames [m], shape (N, 3)."""
+        bodies = [(p.body.surface_points, p.body.surface_basis.astype(np.float64)) for p in self._placed]
+        return np.concatenate([x + b @ q for frame in self._states for (x, b), q in zip(bodies, frame, strict=True)])
 
     def _author_motion(
         self,

@@ -121,7 +121,7 @@ def new_stage(layer: Layer) -> Any:
 
 def author_bodies(stage: Stage, bodies: Sequence[Placed], options: UsdExportOptions) -> list[str]:
     """Author bodies under /World and return the paths of their prims."""
-    seen: set[str] = set()
+    seen = {"Cameras", "Lights", "Rigid"}
     return [
         author_body(stage, f"/World/{prim_name(placed.name or placed.body.name, seen)}", placed, options)
         for placed in bodies
@@ -256,9 +256,9 @@ def _author_points(points: Prim, placed: Placed) -> None:
     UsdGeom, Vt = openusd("UsdGeom", "Vt")
     body = placed.body
     points.GetPrim().AddAppliedSchema(tokens.POINTS_SIM_API)
-    set_points(points, body.points)
     points.CreateWidthsAttr(float_array(np.cbrt(body.weights)))  # edge of a cube of as much volume
     points.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
+    set_points(points, body.points)
     attribute(points.GetPrim(), tokens.MASSES, "FloatArray", float_array(body.weights * (placed.mass / body.volume)))
     # What the physics is made of, not what one looks at: viewers hide it by default.
     points.CreatePurposeAttr(UsdGeom.Tokens.guide)
@@ -266,11 +266,11 @@ def _author_points(points: Prim, placed: Placed) -> None:
 
 
 def set_points(points: Prim, positions: NDArray[Any], time: float | None = None) -> None:
-    """Author where points are, and the box around them, as a time sample or for all times."""
-    (Usd,) = openusd("Usd")
-    when = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
-    points.CreatePointsAttr().Set(vectors(positions), when)
-    points.CreateExtentAttr().Set(vectors(np.stack([positions.min(axis=0), positions.max(axis=0)])), when)
+    """Author where points are, and the box around them with their widths, as a time sample or for all times."""
+    Usd, UsdGeom = openusd("Usd", "UsdGeom")
+    when, places = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time), vectors(positions)
+    points.CreatePointsAttr().Set(places, when)
+    points.CreateExtentAttr().Set(UsdGeom.Points.ComputeExtent(places, points.GetWidthsAttr().Get()), when)
 
 
 def _author_weights(prim: Prim, weights: NDArray[np.float32], precision: str) -> None:

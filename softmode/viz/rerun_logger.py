@@ -34,9 +34,9 @@ class RerunLogger:
 
     Entities, of several worlds each under ``world_3/``: ``scene/bodies`` (meshes of links, their poses per frame),
     ``scene/fixed``, ``scene/soft/NAME`` (splats) and its ``surface``, ``scene/contacts`` (forces on rigid bodies),
-    ``scene/marker`` (the goal),
-    ``scene/camera/NAME/rgb`` and ``depth``, ``energy/NAME``, ``reward``, ``success``, ``metrics``, ``action``,
-    ``solver``, ``log``. Timelines: ``step`` and ``sim_time``.
+    ``scene/marker`` (the goal), ``scene/camera/NAME/rgb`` and ``depth``, ``energy/NAME``, ``reward``, ``success``,
+    ``metrics``, ``action``, ``observation``, ``joints/position`` and ``joints/target`` (of joints with one degree of
+    freedom, [rad] or [m], named in the legend), ``solver``, ``log``. Timelines: ``step`` and ``sim_time``.
 
     Args:
         target: File to write (.rrd); or address of a running viewer, like "rerun+http://127.0.0.1:9876/proxy"; or
@@ -119,6 +119,7 @@ class RerunLogger:
                 self._stream.log(f"{self._prefix[w]}scene", rr.Transform3D(translation=shift), static=True)
             self._meshes[w] = scene_meshes(model, world=w, plane_extent=options.plane_extent)
             self._write_meshes(w)
+        self._write_joints()
         layout = seen.layout
         instances = range(int(layout.instance_start[0]), int(layout.instance_start[1]))
         self._starts = {w: int(layout.instance_start[w]) for w in self.worlds}
@@ -155,6 +156,25 @@ class RerunLogger:
             shape = rr.Mesh3D(vertex_positions=mesh.vertices, triangle_indices=mesh.faces, **look)
             self._stream.log(path, shape, static=True)
 
+    def _write_joints(self) -> None:
+        """Find the joints with one degree of freedom of each world, and write their names."""
+        model, count = self._source.model, self._source.model.joint_count
+        self._joints: dict[int, NDArray[np.intp]] = {}
+        if not count:
+            return
+        first = host(model.joint_q_start)[:count]
+        single = np.diff(np.append(first, model.joint_coord_count)) == 1
+        owner = np.maximum(host(model.joint_world)[:count], 0)
+        for w in self.worlds:
+            chosen = np.flatnonzero(single & (owner == w))
+            if not len(chosen):
+                continue
+            self._joints[w] = first[chosen]
+            names = [str(model.joint_label[j]).rpartition("/")[2] for j in chosen]
+            for kind in ("position", "target"):
+                path = f"{self._prefix[w]}joints/{kind}"
+                self._stream.log(path, self._rr.SeriesLines(names=[f"{name} {kind}" for name in names]), static=True)
+
     # -- a frame ------------------------------------------------------------------------------------------------------
 
     def record(
@@ -188,6 +208,7 @@ class RerunLogger:
             layout = make_blueprint(list(self._prefix.values()), self._soft, self._cameras, task, self.options.eye)
             stream.send_blueprint(layout)
         self._log_poses(moment)
+        self._log_joints(moment)
         self._log_soft(moment)
         self._log_contacts()
         for w in self.worlds:
@@ -214,6 +235,16 @@ class RerunLogger:
             for body, path in self._paths[w].items():
                 pose = where[body]
                 self._stream.log(path, self._rr.Transform3D(translation=pose[:3], quaternion=pose[3:]))
+
+    def _log_joints(self, moment: Moment) -> None:
+        """Write where the joints are, and where they are driven."""
+        control, position = self._source.control, host(moment.state.joint_q)
+        target = host(control.joint_target_q) if control is not None else np.zeros(0)
+        for w, columns in self._joints.items():
+            for kind, values in (("position", position), ("target", target)):
+                if len(values):
+                    numbers = values[columns].astype(float).tolist()
+                    self._stream.log(f"{self._prefix[w]}joints/{kind}", self._rr.Scalars(numbers))
 
     def _log_soft(self, moment: Moment) -> None:
         """Write splats and surface samples."""

@@ -37,6 +37,8 @@ class RerunScene:
     """What moves its soft bodies."""
     objects: Sequence[SoftObject | None] = ()
     """The soft bodies of a world in the order in which they were added, None for one without splats."""
+    control: newton.Control | None = None
+    """What drives the joints; their targets are recorded."""
     cameras: Sequence[SplatCamera] = ()
     """Cameras whose last pictures are recorded; render them before ``record``."""
 
@@ -106,6 +108,7 @@ class SceneSource:
         self.name: str = "scene"
         self.model, self.solver = scene.model, scene.solver
         self.objects: Sequence[SoftObject | None] = scene.objects
+        self.control = scene.control
         self._cameras, self._step = scene.cameras, -1
 
     def moment(self, state: newton.State | None, time: float | None) -> Moment:
@@ -139,6 +142,7 @@ class TaskSource:
         scene = task.scene
         self.name, self.model, self.solver = name, scene.model, scene.solver
         self.objects: Sequence[SoftObject | None] = scene.objects
+        self.control: newton.Control | None = scene.control
         self.task, self._world, self._step, self._elapsed = task, world, -1, 0
         self._drawn = False
 
@@ -168,13 +172,15 @@ class TaskSource:
         return replace(scene.marker, means=means.copy())
 
     def scalars(self, world: int) -> Numbers:
-        """Return reward, its terms, metrics, action, success and solver's figures; no reward before the first step."""
+        """Return reward, its terms, metrics, observation, action, success, solver; no reward before the first step."""
         task, found = self.task, dict(solver_scalars(self.solver, world))
         found["success"] = float(task.success.numpy()[world])
         for k, name in enumerate(task.metric_names):
             found[f"metrics/{name}"] = float(task.metrics.numpy()[world, k])
-        force = task.observation.numpy()[world, task.segments["finger_force"][0]]
-        found["metrics/finger_force"] = force.astype(float).tolist()
+        seen = task.observation.numpy()[world].astype(float)
+        for name, (columns, _) in task.segments.items():
+            found[f"observation/{name}"] = seen[columns].tolist()
+        found["metrics/finger_force"] = found["observation/finger_force"]
         if int(task.elapsed.numpy()[world]) > 0:
             found["reward/total"] = float(task.reward.numpy()[world])
             for k, name in enumerate(task.term_names):
@@ -229,7 +235,8 @@ def source_of(scene: object, worlds: Sequence[int]) -> Source:
         return SceneSource(scene)
     if isinstance(scene, SplatScene):
         cameras = tuple(scene.cameras.values())
-        return SceneSource(RerunScene(model=scene.model, solver=scene.solver, objects=scene.objects, cameras=cameras))
+        parts = {"model": scene.model, "solver": scene.solver, "objects": scene.objects, "control": scene.control}
+        return SceneSource(RerunScene(**parts, cameras=cameras))
     env = getattr(scene, "unwrapped", scene)
     task = scene if isinstance(scene, RecordedTask) else getattr(env, "task", None)
     if not isinstance(task, RecordedTask):

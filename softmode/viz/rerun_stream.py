@@ -21,8 +21,8 @@ PORT = 9876
 """Where a viewer listens if its address does not say."""
 CONNECT = 5.0
 """Seconds in which a viewer has to answer."""
-FLUSH = 1.0
-"""Seconds for which rows of a file are gathered into chunks."""
+FLUSH = {"flush_tick": 86400.0, "flush_num_bytes": 2**24}
+"""Rows of a file are gathered into chunks of up to 16 MiB for each entity, however long that takes [s]."""
 
 
 class RerunStream:
@@ -44,7 +44,7 @@ class RerunStream:
 
         self._file = None if live else PendingFile(target, "recording")
         # A file gains from large chunks, a viewer from prompt ones.
-        batches = rr.ChunkBatcherConfig.DEFAULT() if live else rr.ChunkBatcherConfig(flush_tick=FLUSH)
+        batches = rr.ChunkBatcherConfig.DEFAULT() if live else rr.ChunkBatcherConfig(**FLUSH)
         self._stream: rr.RecordingStream | None = rr.RecordingStream("softmode", batcher_config=batches)
         try:
             self._stream.set_log_time_enabled(False)

@@ -273,6 +273,26 @@ def test_validators_find_nothing(tmp_path: Path) -> None:
     assert count >= 20 and toys == [] and bad
 
 
+def test_extents_of_points_are_those_of_openusd(tmp_path: Path) -> None:
+    """The box around points counts their widths: what OpenUSD computes, bit for bit."""
+    write_usd(tmp_path / "toys.usdc", placed())
+    stage = opened(tmp_path / "toys.usdc")
+    points = UsdGeom.Boundable(stage.GetPrimAtPath("/World/toy/Simulation"))
+    assert points.GetExtentAttr().Get() == UsdGeom.Boundable.ComputeExtentFromPlugins(points, Usd.TimeCode.Default())
+
+
+def test_asset_validator_finds_nothing(tmp_path: Path) -> None:
+    """NVIDIA's validator passes a stage of two toys, and fails one whose extents leave out the widths."""
+    validator = pytest.importorskip("omni.asset_validator", reason="needs omniverse-asset-validator")
+    write_usd(tmp_path / "toys.usdc", [placed(), placed("quadratic")])
+    assert not list(validator.ValidationEngine().validate(str(tmp_path / "toys.usdc")).issues())
+    stage = opened(tmp_path / "toys.usdc")
+    points = UsdGeom.Points(stage.GetPrimAtPath("/World/toy/Simulation"))
+    points.GetExtentAttr().Set(UsdGeom.PointBased.ComputeExtent(points.GetPointsAttr().Get()))
+    stage.GetRootLayer().Save()
+    assert list(validator.ValidationEngine().validate(str(tmp_path / "toys.usdc")).issues())
+
+
 def test_newton_reads_the_rest(tmp_path: Path) -> None:
     """A scene that refers to a toy beside a rigid body: Newton reads that and leaves the toy, softmode takes both."""
     write_usd(tmp_path / "toy.usdc", placed())

@@ -18,6 +18,8 @@ from softmode.deformables.model.authoring import add_reduced_body
 from softmode.errors import AssetError, ConfigError, SolverDiverged, StorageError
 from softmode.objects import Placed, SoftObject
 from softmode.splats.formats import read_usd
+from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.splats import rotations_from_quats
 from softmode.stages import process
 from softmode.usd import (
     UsdAnimation,
@@ -40,7 +42,7 @@ from tests.usd.export_scenes import (
 from tests.usd.test_damage import mutate
 
 pytest.importorskip("pxr", reason="needs the extra [usd]")
-Usd, UsdGeom = (importlib.import_module(f"pxr.{name}") for name in ("Usd", "UsdGeom"))
+Gf, Usd, UsdGeom = (importlib.import_module(f"pxr.{name}") for name in ("Gf", "Usd", "UsdGeom"))
 EPSILON = float(np.finfo(np.float32).eps)
 FRAMES = 4
 BAKED = UsdAnimationOptions(mode="baked")
@@ -193,6 +195,37 @@ def test_without_handles_bodies_move_rigidly(tmp_path: Path) -> None:
     samples = prim.GetAttribute("softmode:handles").GetNumTimeSamples()
     assert samples == FRAMES
     assert not stage.GetPrimAtPath("/World/bar_affine/Splats").GetAttribute("positions").GetNumTimeSamples()
+
+
+def test_recordings_have_camera_light_and_whole_time_codes(tmp_path: Path) -> None:
+    """The default camera sees all bodies in all frames; a given one is that pinhole; codes are whole."""
+    scene, view = Scene("affine"), PinholeCamera.look_at("eye", position=(1, 0, 0.5), target=(0, 0, 0), fov_y=0.6)
+    with UsdAnimation(tmp_path / "a.usdc", scene.model, scene.bodies, world=1) as animation:
+        for frame in range(FRAMES):
+            scene.move(frame)
+            animation.record(scene.state, frame / 96.0)
+    stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
+    assert stage.GetTimeCodesPerSecond() == 480.0 and stage.GetFramesPerSecond() == 30.0
+    assert stage.GetPrimAtPath("/World/bar_affine").GetAttribute("softmode:handles").GetTimeSamples() == [0, 5, 10, 15]
+    assert {prim.GetTypeName() for prim in stage.GetPrimAtPath("/World/Lights").GetChildren()} == {
+        "DomeLight",
+        "DistantLight",
+    }
+    (camera,) = stage.GetPrimAtPath("/World/Cameras").GetChildren()
+    frustum = UsdGeom.Camera(camera).GetCamera(0).frustum
+    for frame in range(FRAMES):
+        for x in read_animation(tmp_path / "a.usdc").bodies[0].points_at(frame):
+            assert frustum.Intersects(Gf.Vec3d(*x.tolist()))
+    scene.record(tmp_path / "b.usdc", UsdAnimationOptions(cameras=(view,)))
+    stage = Usd.Stage.Open(str(tmp_path / "b.usdc"))
+    (camera,) = stage.GetPrimAtPath("/World/Cameras").GetChildren()
+    seen = UsdGeom.Camera(camera).GetCamera(0).frustum
+    assert camera.GetName() == "eye" and not seen.Intersects(Gf.Vec3d(2.0, 0.0, 1.0))
+    matrix = np.array(seen.ComputeViewMatrix()) @ np.array(seen.ComputeProjectionMatrix())
+    point = np.array([0.1, 0.05, 0.02, 1.0]) @ matrix
+    x, y, z = rotations_from_quats(np.array([view.quat]))[0].T @ (np.array([0.1, 0.05, 0.02]) - view.position)
+    expected = 2.0 * np.array([view.fx * x / z + view.cx, view.fy * y / z + view.cy]) / (view.width, view.height) - 1.0
+    np.testing.assert_allclose(point[:2] / point[3], expected * (1.0, -1.0), atol=1e-5)
 
 
 def test_half_precision_of_a_baked_stage(tmp_path: Path) -> None:

@@ -50,9 +50,11 @@ class Recording:
         reader = RrdReader(path)
         self.blueprints = len(reader.blueprints())
         self.times: dict[int, float] = {}
+        self.chunks = 0
         self._values: dict[str, dict[str, dict[int | None, Any]]] = {}
         for chunk in reader.stream():
             batch = chunk.to_record_batch()
+            self.chunks += 1
             entity = self._values.setdefault(chunk.entity_path.strip("/"), {})
             steps = [None] * chunk.num_rows if chunk.is_static else batch.column("step").to_pylist()
             if not chunk.is_static:
@@ -123,6 +125,9 @@ def test_episode_is_what_the_environment_did(env: Any, tmp_path: Path) -> None:
                 "surface": scene.state.particle_q.numpy().copy(),
                 "force": force[np.linalg.norm(force, axis=1) > 1e-3],
                 "elastic": float(energies.elastic.numpy()[0]),
+                "joints": scene.state.joint_q.numpy().copy(),
+                "targets": scene.control.joint_target_q.numpy().copy(),
+                "observation": task.observation.numpy()[0].copy(),
                 "picture": env.render(),
             }
         )
@@ -167,6 +172,14 @@ def test_episode_is_what_the_environment_did(env: Any, tmp_path: Path) -> None:
             assert file.scalars("reward/total")[k] == frame["reward"]
             for name, value in frame["info"]["reward_terms"].items():
                 assert file.scalars(f"reward/terms/{name}")[k] == value
+        np.testing.assert_array_equal(file.of("joints/position", "Scalars:scalars")[k], frame["joints"])
+        np.testing.assert_array_equal(file.of("joints/target", "Scalars:scalars")[k], frame["targets"])
+        for name, (columns, _) in task.segments.items():
+            seen = file.of(f"observation/{name}", "Scalars:scalars")[k]
+            np.testing.assert_array_equal(seen, frame["observation"][columns])
+    assert len(file.of("joints/target", "SeriesLines:names")[None]) == scene.model.joint_coord_count
+    # one chunk for each entity, one more where static or occasional values stand beside those of every frame
+    assert len(file.entities) <= file.chunks <= len(file.entities) + 16
     assert touched >= 2  # the table and a finger
     assert 0 not in file.scalars("reward/total")
     # far fewer than the frames: the object is turned and squeezed in some of them only
