@@ -11,7 +11,10 @@ from softmode.deformables.model.tables import host
 
 
 def movable_bodies(model: newton.Model) -> tuple[str, ...]:
-    """Return the labels of the rigid bodies that can move: dynamic ones with a degree of freedom, or with no joint."""
+    """Return the labels of the rigid bodies that can move: dynamic ones with a degree of freedom, or with no joint.
+
+    Bodies of one label, as worlds have them, are named once.
+    """
     if not model.body_count:
         return ()
     moves, jointed = np.zeros(model.body_count, bool), np.zeros(model.body_count, bool)
@@ -24,7 +27,7 @@ def movable_bodies(model: newton.Model) -> tuple[str, ...]:
     for parent, child, freedom in joints:  # parents come first
         jointed[child] = True
         moves[child] |= not kinematic[child] and (freedom > 0 or (parent >= 0 and moves[parent]))
-    return tuple(str(model.body_label[b]) for b in np.flatnonzero(moves | ~(jointed | kinematic)))
+    return tuple(dict.fromkeys(str(model.body_label[b]) for b in np.flatnonzero(moves | ~(jointed | kinematic))))
 
 
 def warn_still_bodies(model: newton.Model) -> None:
