@@ -15,7 +15,8 @@ import pytest
 from PIL import Image
 
 from softmode.cli.main import main
-from softmode.splats import make_plush, write_ply
+from softmode.envs.markers import dots
+from softmode.splats import make_plush, write_ply, write_splats
 from softmode.viz.film import Film
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -50,10 +51,10 @@ def test_play_films_an_episode(tmp_path: Path, capfd: pytest.CaptureFixture[str]
     assert main([*PLAY, "--video", str(video), "--seed", "3"]) == 0
     assert listing(tmp_path) == ["new", "new/lift.mp4", "new/lift.png"]
     frames = iio.imread(video)
-    assert frames.shape == (6, 256, 512, 3)
+    assert frames.shape == (6, 320, 640, 3)
     assert np.ptp(frames[-1]) > 100
     with Image.open(video.with_suffix(".png")) as sheet:
-        assert sheet.size == (3 * 512, 4 * 256)
+        assert sheet.size == (3 * 640, 4 * 320)
     umask = os.umask(0)
     os.umask(umask)
     assert [path.stat().st_mode & 0o777 for path in video.parent.iterdir()] == [0o666 & ~umask] * 2
@@ -62,6 +63,26 @@ def test_play_films_an_episode(tmp_path: Path, capfd: pytest.CaptureFixture[str]
         assert words in out
     assert "6/6" in err  # the progress bar
     assert "Module" not in out + err  # Warp's report on each module
+
+
+def test_play_films_a_room_as_a_gif(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], short: Callable[[int], None]
+) -> None:
+    """A looping GIF of the asked width; a wall of splats far behind the table stands where the sky was."""
+    short(4)
+    points = np.stack(np.meshgrid([-1.2], np.linspace(-2.0, 2.0, 60), np.linspace(-0.5, 2.0, 40)), axis=-1)
+    write_splats(tmp_path / "room.ply", dots(0.5 * points.reshape(-1, 3), 0.03, color=(0.8, 0.2, 0.1), opacity=0.99))
+    video = tmp_path / "lift.gif"
+    room = ["--background", str(tmp_path / "room.ply"), "--background-pose", *"0 0 0 0 0 0 2".split()]
+    assert main([*PLAY, "--video", str(video), "--width", "256", *room]) == 0
+    with Image.open(video) as gif:
+        assert gif.size == (256, 128) and getattr(gif, "n_frames", 1) >= 2 and gif.info["loop"] == 0
+        first = np.asarray(gif.convert("RGB")).astype(int)
+    red = (first[..., 0] > 150) & (first[..., 1] < 110)
+    assert red[:30, 128:].mean() > 0.3 and red[-20:].mean() < 0.05
+    capsys.readouterr()
+    assert main([*PLAY, "--background", str(tmp_path / "room.ply")]) == 2
+    assert "Give --video" in capsys.readouterr().err
 
 
 def test_play_lifts_a_trained_capture(capsys: pytest.CaptureFixture[str]) -> None:
@@ -220,7 +241,7 @@ def test_wrong_usage_exits_with_two(arguments: list[str], capsys: pytest.Capture
     assert "Traceback" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("module", "arguments"), [("tyro", []), ("imageio.v2", ["--video", "x.mp4"])])
+@pytest.mark.parametrize(("module", "arguments"), [("tyro", []), ("imageio_ffmpeg", ["--video", "x.mp4"])])
 def test_missing_extras_name_the_remedy(
     module: str,
     arguments: list[str],

@@ -10,16 +10,19 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from softmode.checks import require_number
+from softmode.checks import require_number, require_numbers
 from softmode.cli.common import BuildBar, bar_interval, own_object, quiet_warp, warn_of_object, warp_device
 from softmode.cli.object_options import ObjectOptions
 from softmode.envs.catalogue import registered_id
+from softmode.errors import ConfigError
 from softmode.learning.config_values import split_config
 from softmode.learning.players import check_policy, policy_factory, trained_policy
 from softmode.viz.film import Film
 
 if TYPE_CHECKING:
     import gymnasium as gym
+
+    from softmode.splats.splats import Splats
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -38,7 +41,15 @@ class Play:
     seed: int = 0
     """Seed of the first episode; the next ones count up."""
     video: Path | None = None
-    """Film to write (.mp4): the camera's view beside an overview. A contact sheet (.png) is written beside it."""
+    """Film to write (.mp4 or .gif): a camera that follows beside an overview. A contact sheet (.png) is written beside
+    it."""
+    width: int = 640
+    """Width of the film [px], of two square views: a multiple of 4 from 128 to 2048."""
+    background: Path | None = None
+    """Splat file of a captured room to film the scene in; it stands still and is touched by nothing."""
+    background_pose: tuple[float, float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    """Where it is: x y z of its origin [m], roll pitch yaw [deg] about the axes of the world, and the factor on its
+    size. The table's top is z = 0; a file whose -y is up has roll -90."""
     rerun: str | None = None
     """Recording to write for the rerun viewer (.rrd); or the address of a running one, like
     rerun+http://127.0.0.1:9876/proxy; or spawn, which opens one."""
@@ -57,6 +68,11 @@ class Play:
         registered_id(self.env)
         require_number("episodes", self.episodes, at_least=1, hint="give a count like 3")
         require_number("seed", self.seed, at_least=0, hint="give a whole number like 0")
+        require_number("width", self.width, at_least=128, at_most=2048, unit="px")
+        if self.width % 4:
+            raise ConfigError(f"width is {self.width}", hint="give a multiple of 4, like 640")
+        if self.background is not None and self.video is None:
+            raise ConfigError(f"background {self.background} without a film", hint="give --video too")
         self.toy.check()
         if self.rerun is not None:
             from softmode.viz.rerun_stream import check_target
@@ -78,7 +94,9 @@ def _play(options: Play, film: Film | None) -> int:
     trained = trained_policy(options.policy, options.env)
     given = options.toy.env_options(options.env, dict(trained.env_options) if trained else {})
     config, given = split_config(options.env, given)
-    config = dataclasses.replace(config, mesh_samples=4 if options.video else config.mesh_samples)
+    if options.video:
+        config = dataclasses.replace(config, render_size=options.width // 2)
+    background = None if options.background is None else _background(options.background, options.background_pose)
     with quiet_warp():
         with BuildBar() as progress:
             given |= {"config": config, "device": warp_device(options.device), "progress": progress}
@@ -92,6 +110,8 @@ def _play(options: Play, film: Film | None) -> int:
                 f"body {body.name!r}: {body.function_count} functions, {body.point_count} cubature points, "
                 f"built in {body.build_seconds:.2f} s; scene ready after {time.perf_counter() - started:.1f} s"
             )
+            if film and background is not None:
+                env.unwrapped.scene.film.surround(background)  # type: ignore[attr-defined]
             fps = env.metadata["render_fps"]
             policy = policy_factory(options.policy, env, trained)
             seeds = range(options.seed, options.seed + options.episodes)
@@ -160,3 +180,15 @@ def _play_episode(
         f"return {total:.1f}, success: {info['is_success']}"
     )
     return bool(info["is_success"])
+
+
+def _background(path: Path, pose: tuple[float, ...]) -> Splats:
+    """Return the splats of a captured room where they belong."""
+    from scipy.spatial.transform import Rotation
+
+    from softmode.splats.formats import read_splats
+
+    require_numbers("background-pose", pose, 7, hint="give x y z roll pitch yaw size")
+    require_number("background-pose: the factor on its size", pose[6], above=0.0)
+    turn = Rotation.from_euler("xyz", pose[3:6], degrees=True).as_matrix()
+    return read_splats(path).transformed(rotation=turn, translation=pose[:3], scale=pose[6])

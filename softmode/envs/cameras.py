@@ -1,5 +1,10 @@
 """The cameras of the table: in front of it, over all of it, and on the hand."""
 
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
 from softmode.splats.pinhole import PinholeCamera
 
 Point = tuple[float, float, float]
@@ -19,8 +24,8 @@ def square_camera(name: str, edge: int, position: Point, target: Point, fov_y: f
 
 
 def overview(name: str, edge: int) -> PinholeCamera:
-    """Return the camera that sees arm and table, with pictures of `edge` x `edge` pixels."""
-    return square_camera(name, edge, (1.05, -0.85, 0.60), (0.30, 0.0, 0.25), 0.60)
+    """Return the camera that sees the whole arm, with pictures of `edge` x `edge` pixels."""
+    return square_camera(name, edge, (1.42, -1.20, 0.86), (0.34, 0.03, 0.35), 0.60)
 
 
 def wrist_camera(name: str, edge: int) -> PinholeCamera:
@@ -35,3 +40,52 @@ def wrist_camera(name: str, edge: int) -> PinholeCamera:
         fov_y=1.1,
         body="link7",
     )
+
+
+class FollowCamera:
+    """Keeps balls in the picture of a camera that looks in a fixed direction, without jerks; per world.
+
+    Place and distance follow what would show all balls by a critically damped spring, so that neither jumps.
+
+    Args:
+        camera: Says direction, lens and size of the pictures.
+        world_count: Number of worlds.
+    """
+
+    SECONDS = 0.35
+    """Time constant of the spring [s]."""
+    ROOM = 1.12
+    """Width of the picture in units of what is to be seen."""
+
+    def __init__(self, camera: PinholeCamera, world_count: int) -> None:
+        """Start without a place."""
+        self._axes = camera.world_to_camera[:3, :3]
+        self._slope = self.ROOM * 2.0 * max(camera.fx / camera.width, camera.fy / camera.height)
+        self._place = np.zeros((world_count, 3))  # of the camera, in its own axes
+        self._speed = np.zeros((world_count, 3))
+        self._time = np.full(world_count, np.inf)
+
+    def matrices(self, balls: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the transforms from the world to the cameras, shape (world_count, 4, 4).
+
+        Args:
+            balls: Centres and radii of what is to be seen [m], shape (world_count, K, 4).
+            time: Time in the episode [s], shape (world_count,); where it went back, the camera jumps.
+        """
+        at, radius = balls[..., :3] @ self._axes.T, balls[..., 3:]
+        low, high = (at - radius).min(axis=1), (at + radius).max(axis=1)
+        wanted = 0.5 * (low + high)
+        half = 0.5 * (high - low)[:, :2].max(axis=1)
+        wanted[:, 2] = low[:, 2] - half * self._slope
+        fresh = time < self._time
+        self._place[fresh], self._speed[fresh] = wanted[fresh], 0.0
+        step = np.where(fresh, 0.0, time - self._time)[:, None]
+        self._time = time.copy()
+        rate = 2.0 / self.SECONDS
+        offset, kept = self._place - wanted, np.exp(-rate * step)
+        drive = self._speed + rate * offset
+        self._place = wanted + (offset + drive * step) * kept
+        self._speed = (self._speed - rate * drive * step) * kept
+        made = np.tile(np.eye(4), (len(time), 1, 1))
+        made[:, :3, :3], made[:, :3, 3] = self._axes, -self._place
+        return made

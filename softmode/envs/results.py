@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Any, cast
 
-import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from softmode.envs.task import Task
 from softmode.envs.tensors import map_tree
@@ -63,10 +61,3 @@ def take(tree: Tree, world: int, *, scalars: bool = False) -> Any:
         return value.item() if scalars and value.ndim == 0 else value.copy()
 
     return map_tree(row, tree)
-
-
-def render_worlds(task: Task) -> NDArray[np.uint8]:
-    """Return the rendered frame of every world, shape (world_count, height, width, 3)."""
-    cameras = task.render_cameras()
-    drawn = task.scene.render((cameras[0].width, cameras[0].height))
-    return np.concatenate([drawn.images(camera.name).numpy() for camera in cameras], axis=2)

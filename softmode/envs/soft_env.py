@@ -24,7 +24,7 @@ from softmode.envs.arguments import (
 )
 from softmode.envs.end_reason import EndReason
 from softmode.envs.parameters import check_options
-from softmode.envs.results import info_arrays, observation_arrays, render_worlds, take
+from softmode.envs.results import info_arrays, observation_arrays, take
 from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
 
@@ -139,7 +139,7 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         """Return the views of the rendering cameras side by side, uint8 (render_size, 2 render_size, 3)."""
         if self.render_mode is None:
             return None
-        return render_worlds(self.task)[0]
+        return self.task.draw_film()[0]
 
     def _observe(self) -> Any:
         """Return the observation in arrays of its own."""

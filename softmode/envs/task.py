@@ -19,7 +19,7 @@ from softmode.deformables.model import status as bits
 from softmode.deformables.model.structs import filled
 from softmode.deformables.solver.parameters import set_parameters
 from softmode.envs import task_kernels as kernels
-from softmode.envs.cameras import overview, square_camera, wrist_camera
+from softmode.envs.cameras import FollowCamera, overview, square_camera, wrist_camera
 from softmode.envs.end_reason import EndReason
 from softmode.envs.observation import PROPRIOCEPTION, ObservationLayout, Segment, object_part
 from softmode.envs.parameters import Parameter, ParameterTable
@@ -33,6 +33,10 @@ from softmode.splats.splats import Splats
 
 FALL = 0.05
 """How far under its resting height on the table object 0 counts as dropped [m]."""
+HAND = 0.07
+"""Radius about the tool that the following camera shows [m]."""
+MARKER = 0.02
+"""Radius about the goal that the following camera shows [m]."""
 MATERIAL = ("youngs_modulus", "poissons_ratio", "density", "friction", "scale")
 """Parameters of the soft bodies."""
 
@@ -104,19 +108,21 @@ class Task:
         if obs_type != "state":
             cameras.append(self.observation_camera())
         if render:
-            cameras += self.render_cameras()
+            cameras += self.render_cameras()  # for recorders, in fixed places
         labelled = "segmentation" in config.image_outputs
         options = CameraOptions(mesh_samples=config.mesh_samples, segmentation=labelled)
         self.scene = TableScene(
             self.scene_config(),
             world_count=world_count,
             cameras=cameras,
+            film=self.render_cameras() if render else (),
             camera_options=options,
             camera_randomization=config.camera_randomization,
             marker=self.marker() if cameras else None,
             device=device,
             progress=progress,
         )
+        self._follow = FollowCamera(self.render_cameras()[0], world_count)
         self.device = self.scene.device
         self.table = ParameterTable(self.parameters(), world_count, self.device)
         soft = self.scene.soft
@@ -410,6 +416,29 @@ class Task:
         if self.obs_type != "state":
             edge = self.config.image_size
             self.scene.draw(self.scene.cameras[edge, edge])
+
+    def draw_film(self) -> NDArray[np.uint8]:
+        """Return the pictures of the film cameras side by side, uint8 (world_count, edge, cameras * edge, 3)."""
+        scene, film = self.scene, self.scene.film
+        if film is not None:
+            time = self.elapsed.numpy() / self.config.scene.control_hz
+            film.aim(film.cameras[0].name, self._follow.matrices(self.in_focus(), time))
+        pictures = scene.draw_film().numpy()
+        cameras = pictures.reshape(-1, self.world_count, *pictures.shape[1:])
+        return np.concatenate(list(cameras), axis=2)
+
+    def in_focus(self) -> NDArray[np.float64]:
+        """Return balls (x, y, z, radius) [m] that the following camera shows, shape (world_count, K, 4).
+
+        They are object 0, the hand, and the goal if a marker shows it.
+        """
+        scene = self.scene
+        scale = self.table.values.numpy()[:, self.table.column("scale")]
+        radius = float(np.linalg.norm(scene.soft.body.surface_points, axis=1).max()) * scale
+        balls = [(scene.object_position.numpy()[:, 0], radius), (scene.controller.tool_pose.numpy()[:, :3], HAND)]
+        if scene.marker is not None:
+            balls.append((scene.marker_place.numpy()[:, :3], MARKER))
+        return np.stack([np.column_stack([x, np.broadcast_to(r, len(x))]) for x, r in balls], axis=1)
 
     # -- the step -----------------------------------------------------------------------------------------------------
 

@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from softmode.envs.results import info_arrays, observation_arrays, render_worlds
+from softmode.envs.results import info_arrays, observation_arrays
 from softmode.envs.task import Task
 from softmode.envs.tensors import map_tree
 from softmode.errors import SoftmodeError, WorkerError
@@ -70,7 +70,7 @@ class LocalWorlds:
 
     def render(self) -> NDArray[np.uint8]:
         """Return a frame per world."""
-        return render_worlds(self.task)
+        return self.task.draw_film()
 
     def close(self) -> None:
         """Do nothing."""

@@ -57,7 +57,9 @@ class SceneMesh:
         return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
 
 
-def scene_meshes(model: newton.Model, *, world: int = 0, plane_extent: float = PLANE_EXTENT) -> tuple[SceneMesh, ...]:
+def scene_meshes(
+    model: newton.Model, *, world: int = 0, plane_extent: float = PLANE_EXTENT, segments: int = SEGMENTS
+) -> tuple[SceneMesh, ...]:
     """Return the meshes of the shapes that cameras see in a world, its own and those that all worlds share.
 
     What counts is ``ShapeFlags.VISIBLE``, as for cameras and Newton's viewers: importers clear it for the colliders of
@@ -67,6 +69,7 @@ def scene_meshes(model: newton.Model, *, world: int = 0, plane_extent: float = P
         model: The model.
         world: Which world.
         plane_extent: Edge of the quad that stands for an infinite plane [m].
+        segments: Facets around a sphere, capsule, cylinder or cone.
 
     Raises:
         ConfigError: If there is no such world, or ``plane_extent`` is not positive.
@@ -84,7 +87,7 @@ def scene_meshes(model: newton.Model, *, world: int = 0, plane_extent: float = P
     meshes = []
     shown = np.isin(owner, [-1, world]) & ((flags & int(ShapeFlags.VISIBLE)) != 0)
     for s in np.flatnonzero(shown).tolist():
-        found = _triangles(GeoType(int(kinds[s])), scales[s].tolist(), model.shape_source[s], plane_extent)
+        found = _triangles(GeoType(int(kinds[s])), scales[s].tolist(), model.shape_source[s], plane_extent, segments)
         if found is None:
             continue
         vertices, faces, normals = found
@@ -133,14 +136,14 @@ def distinct(label: str, seen: set[str]) -> str:
 
 
 def _triangles(
-    kind: GeoType, scale: list[float], source: Any, plane_extent: float
+    kind: GeoType, scale: list[float], source: Any, plane_extent: float, segments: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.float64]] | None:
     """Return corners, triangles and normals in the shape's own frame, None for what has no surface."""
     x, y, z = scale
     z_axis: Any = newton.Axis.Z
     plain: dict[str, Any] = {"compute_inertia": False, "compute_uvs": False}
-    rings = {"num_latitudes": SEGMENTS, "num_longitudes": SEGMENTS}
-    tube = {"up_axis": z_axis, "segments": SEGMENTS}
+    rings = {"num_latitudes": segments, "num_longitudes": segments}
+    tube = {"up_axis": z_axis, "segments": segments}
     width, depth = (edge if edge > 0.0 else plane_extent for edge in (x, y))
     made = {
         GeoType.PLANE: (newton.Mesh.create_plane, (width, depth), {}),

@@ -18,6 +18,7 @@ from softmode.deformables.model.declare import launch
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
+from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
 from softmode.objects.loader import Progress, load
 from softmode.objects.placed import Placed
@@ -27,6 +28,7 @@ from softmode.robots.control import ArmController, ArmControlOptions
 from softmode.scenes import table_kernels as kernels
 from softmode.scenes.binding import BoundSplats
 from softmode.scenes.capture import capture_graph, capture_step, require_even
+from softmode.scenes.film_camera import FilmCamera, columns_of
 from softmode.scenes.fixture import Fixture, add_fixture
 from softmode.scenes.scene import cameras_by_size
 from softmode.splats.camera import CameraOptions, SplatCamera
@@ -88,6 +90,7 @@ class TableScene:
         config: What to build.
         world_count: Number of replicas.
         cameras: Cameras to draw, grouped by image size; none draws nothing.
+        film: Cameras of one image size whose pictures people look at; see :meth:`draw_film`.
         camera_options: Light and background.
         camera_randomization: What `randomize` of the cameras draws.
         marker: Splats around the origin that mark a place, such as a goal, in pictures; they touch nothing.
@@ -101,6 +104,7 @@ class TableScene:
         *,
         world_count: int = 1,
         cameras: Sequence[PinholeCamera] = (),
+        film: Sequence[PinholeCamera] = (),
         camera_options: CameraOptions | None = None,
         camera_randomization: CameraRandomization | None = None,
         marker: Splats | None = None,
@@ -128,15 +132,23 @@ class TableScene:
         """The splats of the objects, then those of the marker, as cameras see them; None without cameras."""
         self.cameras: dict[tuple[int, int], SplatCamera] = {}
         """The cameras by the width and height of their pictures [px]."""
-        if cameras:
+        self.film: FilmCamera | None = None
+        """The cameras that people look through; None without any."""
+        if cameras or film:
             self.splats = BoundSplats(self.model, self.objects, others=() if marker is None else (marker,))
-            self.cameras = cameras_by_size(
-                self.model, self.splats, cameras, options=camera_options, randomization=camera_randomization
-            )
             if marker is not None:
                 self.marker_points = wp.array(marker.means[None], dtype=wp.vec3, device=self.device)
                 """Centres of the marker's splats from `marker_place` [m], shape (1 or world_count, splats); a task may
                 put an array of its own here before the first picture, to change the marker's shape."""
+        if cameras and self.splats is not None:
+            self.cameras = cameras_by_size(
+                self.model, self.splats, cameras, options=camera_options, randomization=camera_randomization
+            )
+        if film and self.splats is not None:
+            seen, columns = self.splats.arrays, self.splats.columns
+            things = slice(0, columns[len(self.splats.indices) - 1].stop)
+            goal = None if marker is None else columns_of(seen, columns[-1])
+            self.film = FilmCamera(self.model, self.state, columns_of(seen, things), goal, film)
         self._graph: wp.Graph | None = None
         self._camera_graphs: dict[tuple[int, int], wp.Graph] = {}
         self.reset()
@@ -314,13 +326,28 @@ class TableScene:
 
     def draw(self, camera: SplatCamera) -> None:
         """Move the splats and draw one frame; capturable after a first frame."""
+        self.move_splats()
+        camera.render(self.state)
+
+    def draw_film(self) -> wp.array:
+        """Draw the cameras of the film; return uint8, shape (cameras * world_count, height, width, 3), by camera.
+
+        Raises:
+            ConfigError: If there are none.
+        """
+        if self.film is None:
+            raise ConfigError("the scene has no film cameras", hint="pass TableScene(film=...) at least one")
+        self.move_splats()
+        return self.film.render(self.state)
+
+    def move_splats(self) -> None:
+        """Move the splats of objects and marker to where they are now; capturable after a first time."""
         if self.splats is not None:
             self.splats.update(self.state)
             if self.marker is not None:
                 dim, first = (self.world_count, self.marker.count), self.splats.columns[-1].start
                 arrays = (self.marker_points, self.marker_place, first, self.splats.arrays.means)
                 launch(self.device, kernels.place_marker, dim, *arrays)
-        camera.render(self.state)
 
     # -- reading ------------------------------------------------------------------------------------------------------
 

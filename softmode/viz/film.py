@@ -15,11 +15,17 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+GIF_RATE = 20
+"""Most pictures per second of a GIF, which counts time in hundredths of a second."""
+GIF = f"fps={GIF_RATE},split[a][b];[a]palettegen=max_colors=200:stats_mode=full[p];[b][p]paletteuse=dither=none"
+"""How ffmpeg makes a GIF: one palette for the whole film, so that still parts do not flicker."""
+
+
 class Film:
     """A video and its contact sheet that appear complete or not at all.
 
     Args:
-        path: The video to write (.mp4).
+        path: The video to write (.mp4), or a .gif that loops.
 
     Raises:
         ConfigError: If it has another suffix.
@@ -31,11 +37,10 @@ class Film:
 
     def __init__(self, path: Path) -> None:
         """Claim a temporary file beside ``path``."""
-        with needs_extra("demo", "writing a video needs imageio and imageio-ffmpeg"):
-            import imageio.v2  # noqa: F401
+        with needs_extra("demo", "writing a video needs imageio-ffmpeg"):
             import imageio_ffmpeg  # noqa: F401
-        if path.suffix.lower() != ".mp4":
-            raise ConfigError(f"video {path} is no .mp4 file", hint="name it like out/lift.mp4")
+        if path.suffix.lower() not in (".mp4", ".gif"):
+            raise ConfigError(f"video {path} is no .mp4 or .gif file", hint="name it like out/lift.mp4")
         self.path = path
         self.sheet_path = path.with_suffix(".png")
         if self.sheet_path.is_dir():
@@ -56,12 +61,20 @@ class Film:
 
     def add(self, frame: NDArray[np.uint8], fps: int) -> None:
         """Append a frame."""
-        if self._writer is None:
-            import imageio.v2 as imageio
+        import numpy as np
 
-            how: dict[str, Any] = {"format": "FFMPEG", "codec": "libx264", "quality": 8, "macro_block_size": 8}
-            self._writer = imageio.get_writer(self._file.temporary, fps=fps, **how)
-        self._writer.append_data(frame)
+        if self._writer is None:
+            from imageio_ffmpeg import write_frames
+
+            how: dict[str, Any] = {"codec": "libx264", "quality": 8, "macro_block_size": 2}
+            how["output_params"] = ["-preset", "veryfast", "-threads", "1"]  # most of a small film's time otherwise
+            if self.path.suffix.lower() == ".gif":
+                how = {"codec": "gif", "quality": None, "macro_block_size": 1, "pix_fmt_out": "pal8"}
+                how["output_params"] = ["-vf", GIF, "-loop", "0"]
+            size = (frame.shape[1], frame.shape[0])
+            self._writer = write_frames(self._file.temporary, size, fps=fps, **how)
+            self._writer.send(None)
+        self._writer.send(np.ascontiguousarray(frame))
         if self._count % self._stride == 0:
             self._frames.append(frame)
         self._count += 1

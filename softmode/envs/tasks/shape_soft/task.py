@@ -45,7 +45,7 @@ class ShapeSoft(Task):
         scene, body = self.scene, self.scene.soft.body
         press = record_press(scene, self.config.goal_displacement[1])
         rest = body.surface_points[self.points]
-        if scene.cameras:  # the marker shows the whole surface
+        if scene.splats is not None:  # the marker shows the whole surface
             rest = np.concatenate([rest, body.surface_points])
             scene.marker_points = wp.zeros((self.world_count, body.surface_count), dtype=wp.vec3, device=self.device)
         self.targets = ShapeTargets.from_press(body, press, rest, self.device)
@@ -81,7 +81,7 @@ class ShapeSoft(Task):
         shape = (self.world_count, self.point_count)
         self.launch(kernels.observe_points, [self.state, self.plan], [self.result], shape)
         super().observe()
-        if self.scene.cameras:
+        if self.scene.splats is not None:
             points, inputs = self.scene.marker_points, [self.state, self.plan, self.point_count]
             self.launch(kernels.shape_marker, inputs, [points, self.result], points.shape)
 
