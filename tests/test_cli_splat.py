@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from softmode.cli.main import main
-from softmode.splats import make_plush, read_splats, write_ply
+from softmode.envs.markers import dots
+from softmode.splats import Splats, make_plush, read_splats, write_ply, write_splats
 from tests.splats.meshes import bumpy_sphere
 from tests.test_cli import listing
 
@@ -112,3 +114,55 @@ def test_expected_errors_are_one_line_and_leave_nothing(
     assert len(lines) == 1 and name in lines[0] and "Traceback" not in error
     assert ". " in lines[0]  # the remedy
     assert listing(tmp_path) == before and listing(mesh.parent) == beside
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write a plush on a ground, y down as cameras have it, with a loose block far beside."""
+    plush = make_plush(count=3000)
+    random = np.random.default_rng(0)
+    ground = np.column_stack([random.uniform(-0.15, 0.15, (4000, 2)), np.full(4000, -0.012)])
+    block = random.uniform(-0.01, 0.01, (300, 3)) + np.array([0.12, 0.12, 0.05])
+    lying = dots(np.concatenate([ground, block]), 0.002, color=(0.4, 0.4, 0.45), opacity=0.9)
+    whole = Splats(
+        **{
+            name: np.concatenate([getattr(plush.with_sh_degree(0), name), getattr(lying, name)])
+            for name in ("means", "quats", "scales", "opacities", "sh")
+        },
+        name="capture",
+    )
+    file = tmp_path_factory.mktemp("capture") / "toy.ply"
+    write_splats(file, whole, up="-y")
+    return file
+
+
+def test_show_draws_what_would_be_taken(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The sheet appears; the plush is taken, ground and block are not; a crop takes the block."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["splat", "show", str(capture)]) == 0
+    said, err = capfd.readouterr()
+    assert listing(tmp_path) == ["toy_sheet.png"] and "Module" not in said + err
+    words = said.split()
+    assert int(words[0]) >= 3 and 2700 <= int(words[2]) <= 3000 and words[4] == "7300"
+    with Image.open(tmp_path / "toy_sheet.png") as sheet:
+        picture = np.asarray(sheet.convert("RGB")).astype(int)
+    assert picture.shape[1] == 1600
+    red = (picture[..., 0] > 150) & (picture[..., 1] < 120) & (picture[..., 2] < 120)
+    assert red[: len(red) // 2].sum() < 0.25 * red[len(red) // 2 :, :500].sum()  # tinted where the cut is shown
+    box = ["--crop", "0.1", "0.1", "0.02", "0.14", "0.14", "0.08"]
+    assert main(["splat", "show", str(capture), "--out", str(tmp_path / "block.png"), *box]) == 0
+    assert "of 300 splats" in capfd.readouterr().out
+
+
+def test_show_says_what_cannot_be_built(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """A sheet of splats encloses nothing: the picture appears all the same, and says so; other names are refused."""
+    flat = np.column_stack([np.random.default_rng(1).uniform(-0.1, 0.1, (500, 2)), np.zeros(500)])
+    write_splats(tmp_path / "flat.ply", dots(flat, 0.004, opacity=0.9))
+    arguments = ["splat", "show", str(tmp_path / "flat.ply"), "--up", "+z", "--out"]
+    assert main([*arguments, str(tmp_path / "flat.png")]) == 0
+    assert "it cannot be built" in capfd.readouterr().out
+    assert (tmp_path / "flat.png").stat().st_size > 10_000
+    assert main([*arguments, str(tmp_path / "flat.jpg")]) == 2
+    assert "flat.jpg" in capfd.readouterr().err and not (tmp_path / "flat.jpg").exists()

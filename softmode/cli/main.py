@@ -13,7 +13,7 @@ from softmode.cli.body import BodyBuild, BodyCheck, BodyShow
 from softmode.cli.listing import ListEnvs, Robots
 from softmode.cli.play import Play
 from softmode.cli.record import Record
-from softmode.cli.splat import SplatConvert, SplatFromMesh, SplatInfo
+from softmode.cli.splat import SplatConvert, SplatFromMesh, SplatInfo, SplatShow
 from softmode.cli.train import Evaluate, Export, Train
 from softmode.cli.view import View
 from softmode.errors import SoftmodeError, needs_extra
@@ -51,8 +51,8 @@ def main(arguments: list[str] | None = None) -> int:
 
         kinds = one_of({"play": Play, "train": Train, "evaluate": Evaluate, "export": Export, "bench": Bench})
         kinds |= one_of({"record": Record, "view": View, "list-envs": ListEnvs, "robots": Robots})
-        splat = one_of({"from-mesh": SplatFromMesh, "info": SplatInfo, "convert": SplatConvert})
-        kinds |= Annotated[splat, subcommand("splat", description="Make, inspect and convert splat files.")]
+        splat = one_of({"show": SplatShow, "from-mesh": SplatFromMesh, "info": SplatInfo, "convert": SplatConvert})
+        kinds |= Annotated[splat, subcommand("splat", description="Draw, make, inspect and convert splat files.")]
         body = one_of({"build": BodyBuild, "show": BodyShow, "check": BodyCheck})
         kinds |= Annotated[body, subcommand("body", description="Build, draw and check the bodies of soft objects.")]
         config = (tyro.conf.PositionalRequiredArgs, tyro.conf.DisallowNone)

@@ -1,4 +1,4 @@
-"""The commands ``softmode splat from-mesh``, ``softmode splat info`` and ``softmode splat convert``."""
+"""The commands ``softmode splat show``, ``from-mesh``, ``info`` and ``convert``."""
 
 from __future__ import annotations
 
@@ -112,6 +112,46 @@ class SplatInfo:
         print(f"scales      {row(np.quantile(splats.scales.max(axis=1), deciles))}  (10, 50, 90 %, longest axis)")
         print(f"flatness    {row(np.median(splats.scales.min(axis=1) / splats.scales.max(axis=1)))}")
         print(f"opacities   {row(np.quantile(splats.opacities, deciles))}  (10, 50, 90 %)")
+        return 0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SplatShow:
+    """Draw a capture before it is built: four views, what would be cut, the section of the solid that fills it."""
+
+    file: Path
+    """The splat file."""
+    out: Path | None = None
+    """Sheet to write (.png); FILE_sheet.png in the working folder if omitted."""
+    up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
+    """Axis of the file that points up; -y if omitted."""
+    crop: tuple[float, float, float, float, float, float] | None = None
+    """Box x0 y0 z0 x1 y1 z1 of the file, once turned up, outside which splats are dropped."""
+    part: Literal["thickest", "tallest", "largest", "all"] = "thickest"
+    """Which of the separate parts is the object."""
+
+    def run(self) -> int:
+        """Look, draw, write; return the exit code."""
+        from softmode.objects.config import ObjectConfig
+        from softmode.splats.formats import read_splats
+
+        out = self.out if self.out is not None else Path(f"{self.file.stem}_sheet.png")
+        check_place(out, "sheet", make_folders=False)
+        up = self.up or "-y"
+        splats = read_splats(self.file).oriented(up)
+        if self.crop is not None:
+            splats = splats.cropped(self.crop[:3], self.crop[3:])
+        with quiet_warp():
+            from softmode.viz.splat_sheet import survey_splats, write_splat_sheet
+
+            survey = survey_splats(splats, ObjectConfig(part=self.part))
+            taken = f"up {up} of the file{'' if self.up else ' (a guess: change it with --up)'}; z is up here"
+            write_splat_sheet(out, survey, title=self.file.name, notes=[taken, f"part {self.part}"])
+        kept = int(survey.kept.sum())
+        print(f"{len(survey.parts)} parts; {kept} of {splats.count} splats would be taken")
+        if survey.fill is None:
+            print(f"it cannot be built: {survey.why}")
+        print(f"wrote {out}")
         return 0
 
 

@@ -1,0 +1,210 @@
+"""A sheet of pictures of a capture before it is built: four views, what is taken and cut, what the fill holds."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softmode.deformables.build.occupancy import Occupancy, fill_splats
+from softmode.errors import AssetError, ConfigError, needs_extra
+from softmode.files import whole_file
+from softmode.objects.config import ObjectConfig
+from softmode.objects.source import object_source
+from softmode.splats.components import split_components
+from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
+from softmode.splats.splats import SH_DC, Splats
+
+Array = NDArray[np.float64]
+
+PIXELS = 420
+"""Edge of a picture [px]."""
+FAR = 12.0
+"""Distance of the cameras in sizes of the capture, so that near and far parts have nearly one scale."""
+CUT = (0.85, 0.25, 0.22)
+"""Colour of what is cut."""
+VIEWS = {
+    "from the front (-y)": ((0.0, -1.0, 0.0), "x", "z"),
+    "from the right (+x)": ((1.0, 0.0, 0.0), "y", "z"),
+    "from above (+z)": ((0.0, 0.0, 1.0), "x", "y"),
+    "from the corner": ((0.62, -0.68, 0.40), "", ""),
+}
+"""Views by title: direction to the camera, and the axes to the right and up in the picture."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SplatSurvey:
+    """What would be taken of a capture."""
+
+    splats: Splats
+    """The capture, upright and cropped, in the unit of the file."""
+    kept: NDArray[np.bool_]
+    """Which splats are of the part that is the object, shape (N,)."""
+    parts: tuple[Splats, ...]
+    """The separate parts, the one with most splats first."""
+    fill: Occupancy | None
+    """The solid of the object; None if it encloses none."""
+    why: str
+    """Why there is none."""
+
+
+def survey_splats(splats: Splats, config: ObjectConfig) -> SplatSurvey:
+    """Return what a build would take of a capture.
+
+    Args:
+        splats: The capture, upright and cropped.
+        config: How it would be built; its `part` and `resolution` are read.
+
+    Raises:
+        AssetError: If all splats lie at one point.
+    """
+    # Colours carry the indices of the splats through the choice, whatever it does with them.
+    numbered = replace(splats, sh=np.repeat(np.arange(splats.count, dtype=np.float32)[:, None, None], 3, axis=2))
+    chosen = object_source(replace(config, splat=numbered, up=None, crop=None)).splats
+    kept = np.zeros(splats.count, bool)
+    kept[chosen.sh[:, 0, 0].astype(int)] = True
+    thing, fill, why = splats.subset(kept), None, ""
+    try:
+        fill = fill_splats(thing.means, thing.scales, thing.quats, thing.opacities)
+        member = np.flatnonzero(kept)[fill.members | fill.satellites]
+        kept = np.zeros(splats.count, bool)
+        kept[member] = True
+    except AssetError as error:
+        why = error.message
+    return SplatSurvey(splats=splats, kept=kept, parts=tuple(split_components(splats)), fill=fill, why=why)
+
+
+def write_splat_sheet(path: str | os.PathLike[str], survey: SplatSurvey, *, title: str, notes: list[str]) -> None:
+    """Draw the sheet; the file appears complete or not at all.
+
+    Args:
+        path: The .png to write.
+        survey: What is shown.
+        title: Title of the sheet.
+        notes: Lines to print on it.
+
+    Raises:
+        MissingExtraError: If matplotlib is not installed.
+        ConfigError: If the name is not that of a .png.
+        StorageError: If it cannot be written.
+    """
+    with needs_extra("viz", "a sheet of a capture needs matplotlib"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    target = Path(path)
+    if target.suffix.lower() != ".png":
+        raise ConfigError(f"sheet {target} is no .png file", hint="name it like toy.png")
+    splats, kept = survey.splats, survey.kept
+    tinted = splats.sh[:, :1].copy()
+    tinted[~kept] = 0.35 * tinted[~kept] + 0.65 * (np.array(CUT) - 0.5) / SH_DC
+    marked = replace(splats, sh=tinted)
+    thing = splats.subset(kept)
+    figure = Figure(figsize=(16.0, 8.9), dpi=100, facecolor="white")
+    canvas = FigureCanvasAgg(figure)
+    figure.text(0.015, 0.965, title, fontsize=15, weight="bold")
+    grid = figure.add_gridspec(2, 4, left=0.03, right=0.985, top=0.915, bottom=0.05, wspace=0.2, hspace=0.2)
+    for k, (name, (toward, right, up)) in enumerate(VIEWS.items()):
+        _draw_view(figure.add_subplot(grid[0, k]), name, splats, np.array(toward), right, up)
+    corner = np.array(VIEWS["from the corner"][0])
+    cut = f"red is cut: {np.count_nonzero(~kept)} of {splats.count} splats"
+    _draw_view(figure.add_subplot(grid[1, 0]), cut, marked, corner, "", "")
+    _draw_view(figure.add_subplot(grid[1, 1]), "what is taken", thing, corner, "", "")
+    _draw_fill(figure.add_subplot(grid[1, 2]), survey, thing)
+    words = figure.add_subplot(grid[1, 3])
+    words.set_axis_off()
+    words.text(0.0, 1.0, "\n".join([*notes, *_told(survey)]), va="top", fontsize=9.5, linespacing=1.5, wrap=True)
+    canvas.draw()
+    from PIL import Image
+
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3])
+    with whole_file(target, "sheet") as file:
+        picture.save(file, format="png", optimize=True)
+
+
+def _told(survey: SplatSurvey) -> list[str]:
+    """Return what was found, in lines."""
+    splats, fill = survey.splats, survey.fill
+    x, y, z = np.ptp(splats.bounds(quantile=0.002), axis=0)
+    lines = [f"{splats.count} splats, {x:.3g} x {y:.3g} x {z:.3g} (unit of the file)", f"{len(survey.parts)} parts:"]
+    for part in survey.parts[:5]:
+        low, high = part.bounds(quantile=0.002)
+        lines.append(f"   {part.count} splats, {' x '.join(f'{edge:.3g}' for edge in high - low)}")
+    if fill is None:
+        return [*lines, f"no solid: {survey.why}"]
+    low, high = survey.splats.subset(survey.kept).bounds(quantile=0.002)
+    box = " ".join(f"{value:.3g}" for value in (*low, *high))
+    return [*lines, f"taken: {np.count_nonzero(survey.kept)} splats", f"   --crop {box}"]
+
+
+def _draw_view(axes: Any, title: str, splats: Splats, toward: Array, right: str, up: str) -> None:
+    """Draw splats from one side, with a bar and the axes."""
+    toward = toward / np.linalg.norm(toward)
+    above = np.array([0.0, 1.0, 0.0]) if abs(toward[2]) > 0.9 else np.array([0.0, 0.0, 1.0])
+    across = np.cross(above, toward)
+    across /= np.linalg.norm(across)
+    upward = np.cross(toward, across)
+    low, high = splats.bounds(quantile=0.002)
+    centre, size = 0.5 * (low + high), float(np.linalg.norm(high - low)) or 1.0
+    corners = np.array(np.meshgrid(*np.stack([low, high], axis=1))).reshape(3, -1).T - centre
+    reach = 1.08 * float(np.abs(corners @ np.column_stack([across, upward])).max())
+    place, fov = centre + FAR * size * toward, 2.0 * float(np.arctan(reach / (FAR * size)))
+    (x, y, z), (u, v, w), (a, b, c) = place.tolist(), centre.tolist(), upward.tolist()
+    camera = PinholeCamera.look_at(
+        "sheet", position=(x, y, z), target=(u, v, w), up=(a, b, c), width=PIXELS, height=PIXELS, fov_y=fov
+    )
+    rasterizer = SplatRasterizer(splats.count, 1, PIXELS, PIXELS, device="cpu")
+    views = ViewArrays.from_cameras([camera], background=(1.0, 1.0, 1.0), device="cpu")
+    rasterizer.render(SplatArrays.from_splats([splats], device="cpu"), views)
+    axes.set_title(title, fontsize=11)
+    middle = (0.0, 0.0) if not right else (centre @ across, centre @ upward)
+    extent = (middle[0] - reach, middle[0] + reach, middle[1] - reach, middle[1] + reach)
+    axes.imshow(np.clip(rasterizer.rgb.numpy()[0], 0.0, 1.0), extent=extent)
+    bar = _round_length(0.6 * reach)
+    left, bottom = extent[0] + 0.06 * reach, extent[2] + 0.08 * reach
+    axes.plot([left, left + bar], [bottom, bottom], color="black", lw=3, solid_capstyle="butt")
+    axes.text(left + 0.5 * bar, bottom + 0.03 * reach, f"{bar:g}", ha="center", va="bottom", fontsize=9)
+    axes.tick_params(labelsize=8)
+    if right:
+        axes.set_xlabel(right, fontsize=10, labelpad=0)
+        axes.set_ylabel(up, fontsize=10, labelpad=0)
+        return
+    axes.set_xticks([])
+    axes.set_yticks([])
+    root = np.array([extent[0] + 0.25 * reach, extent[3] - 0.45 * reach])
+    for axis, name, color in zip(np.eye(3), "xyz", ("#c0392b", "#27964a", "#2a5bd7"), strict=True):
+        tip = root + 0.28 * reach * np.array([axis @ across, axis @ upward])
+        axes.annotate("", xy=tip, xytext=root, arrowprops={"arrowstyle": "->", "color": color, "lw": 2})
+        axes.text(*(root + 1.22 * (tip - root)), name, color=color, ha="center", va="center", fontsize=10)
+
+
+def _draw_fill(axes: Any, survey: SplatSurvey, thing: Splats) -> None:
+    """Draw the section of the solid through its middle, and the splats near that plane."""
+    low, high = thing.bounds(quantile=0.002)
+    y = float(np.median(thing.means[:, 1]))
+    near = np.abs(thing.means[:, 1] - y) < 0.04 * (high - low).max()
+    if survey.fill is None:
+        axes.set_title("no solid", fontsize=11, color="#b3261e")
+    else:
+        axes.set_title(f"section of the fill at y = {y:.3g}", fontsize=11)
+        margin = 0.08 * float((high - low).max())
+        x, z = (np.linspace(low[k] - margin, high[k] + margin, 180) for k in (0, 2))
+        points = np.stack(np.meshgrid(x, [y], z, indexing="ij"), axis=-1)
+        level = survey.fill.level(points.reshape(-1, 3)).reshape(len(x), len(z)).T
+        axes.contourf(x, z, level, levels=[-np.inf, 0.0], colors=["#f2c894"])
+        axes.contour(x, z, level, levels=[0.0], colors=["#9a5b00"], linewidths=1.2)
+    axes.scatter(thing.means[near, 0], thing.means[near, 2], s=2, color="0.25", lw=0, label="splats near it")
+    axes.set_aspect("equal")
+    axes.set_xlabel("x", fontsize=10, labelpad=0)
+    axes.set_ylabel("z", fontsize=10, labelpad=0)
+    axes.tick_params(labelsize=8)
+
+
+def _round_length(length: float) -> float:
+    """Return the largest 1, 2 or 5 times a power of ten that is no longer."""
+    decade = 10.0 ** np.floor(np.log10(length))
+    return float(decade * max(step for step in (1.0, 2.0, 5.0) if step * decade <= length * 1.0000001))
