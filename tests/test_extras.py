@@ -56,7 +56,7 @@ CASES = {
         "viz",
         "from softmode.viz.body_picture import write_body_picture as w; w('toy.png', None, None, None)",
     ),
-    "browser": ("viz", "from softmode.view.app import ViewOptions, _serve; _serve(ViewOptions())"),
+    "browser": ("viz", "from softmode.view.app import ViewOptions, start_server; start_server(ViewOptions())"),
     "rerun": ("viz", "from softmode.viz.rerun_logger import RerunLogger; RerunLogger('out.rrd', None)"),
     "SPZ version 4": ("spz", "from softmode.splats import read_splats; read_splats('toy.spz')"),
     "robot by name": ("robots", "from softmode import robots; robots.load('so101')"),

@@ -18,6 +18,7 @@ from softmode.learning.config_values import split_config
 from softmode.learning.players import trained_policy
 
 if TYPE_CHECKING:
+    from softmode.view.app import ViewOptions
     from softmode.view.session import LiveSession
 
 
@@ -35,6 +36,8 @@ class View:
     """An object hangs, held by one end, or drops on a table."""
     hold: Literal["top", "base"] = "top"
     """Which end of a hanging object is held."""
+    prepare: bool = False
+    """Turn a splat file upright and crop it on a page first, then build it; prints the command that repeats it."""
     policy: str = "scripted"
     """What moves the arm of an environment: scripted, random, zero, or the checkpoint of a run."""
     seed: int = 0
@@ -67,7 +70,10 @@ class View:
         served = ViewOptions(**same_fields(self, ViewOptions))
         served.check()  # a building that takes a minute need not come first
         with quiet_warp():
-            session = _session(self)
+            shown = _prepared(self, served) if self.prepare else self
+            if shown is None:
+                return 0
+            session = _session(shown)
             try:
                 with ViewApp(session, served) as app:
                     print(f"softmode: open {app.url} in a browser; Ctrl-C ends it", flush=True)
@@ -90,6 +96,31 @@ class View:
             finally:
                 session.close()
         return 0
+
+
+def _prepared(options: View, served: ViewOptions) -> View | None:
+    """Return the options with what a person made of a splat file on a page; None if they did not build it."""
+    from softmode.objects.object_file import file_kind
+    from softmode.view.prepare import PreparePage
+
+    toy = options.toy
+    file = toy.file if not options.target else Path(options.target[0])
+    if file is None or not file.exists() or file_kind(file) != "splat":
+        raise AssetError(
+            f"nothing to prepare in {file or 'the plush'}", hint="give a splat file, or leave out --prepare"
+        )
+    with PreparePage(file, served, up=toy.up, crop=toy.crop) as page:
+        print(f"softmode: open {page.url} in a browser; Ctrl-C ends it", flush=True)
+        if options.open:
+            _open(page.url)
+        try:
+            if not page.wait(options.duration):
+                return None
+        except KeyboardInterrupt:
+            print("softmode: stopped", file=sys.stderr)
+            return None
+        print(f"softmode: to do this again: {page.command}", flush=True)
+        return dataclasses.replace(options, toy=dataclasses.replace(toy, up=page.up, crop=page.crop))
 
 
 def _session(options: View) -> LiveSession:

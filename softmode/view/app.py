@@ -97,7 +97,7 @@ class ViewApp:
         self._sent: deque[float] = deque(maxlen=60)
         self._told = -np.inf
         self._clients = 0
-        self._server = _serve(self.options)
+        self._server = start_server(self.options)
         try:
             self._stage = Stage(
                 self._server, session, on_drag=self._on_drag, on_click=self._on_click, on_pin=self._on_pin
@@ -120,8 +120,7 @@ class ViewApp:
     @property
     def url(self) -> str:
         """Where to point the browser."""
-        host = "localhost" if self.options.host in ("0.0.0.0", "::") else self.options.host
-        return f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
+        return page_url(self.options, self._server.get_port())
 
     @property
     def frame_rate(self) -> float:
@@ -286,6 +285,12 @@ def _forward(wxyz: Vector) -> Vector:
     return np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
 
 
+def page_url(options: ViewOptions, port: int) -> str:
+    """Return where to point the browser."""
+    host = "localhost" if options.host in ("0.0.0.0", "::") else options.host
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}"
+
+
 def _viser() -> Any:
     """Import viser."""
     with needs_extra("viz", "the browser tool needs viser"):
@@ -293,7 +298,7 @@ def _viser() -> Any:
     return viser
 
 
-def _serve(options: ViewOptions) -> viser.ViserServer:
+def start_server(options: ViewOptions) -> viser.ViserServer:
     """Start viser's server where it was told to be, and nowhere else."""
     viser = _viser()
     import websockets.asyncio.server as transport  # viser's own

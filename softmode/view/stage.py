@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 GRIP_MAX = 400
 """Spheres that receive the mouse."""
 DRAG_COLOR = (255, 120, 30)
+DRAG_HINT = "drag the toy with the mouse"
+"""What is written below the object until somebody does."""
+PIN_HINT = "held here: pull the arrows to move it"
+"""What is written at the first pin."""
 Handler = Callable[[Any], Coroutine[Any, Any, None]]
 
 
@@ -67,6 +71,9 @@ class Stage:
             "/grip", radius=0.02 * self.size, color=DRAG_COLOR, visible=False, cast_shadow=False
         )
         self._gizmos: dict[int, Any] = {}
+        low, high = session.bounds()
+        below = (*(0.5 * (low + high))[:2].tolist(), float(low[2]) - 0.05 * self.size)
+        self._hint: Any = server.scene.add_label("/hint", DRAG_HINT, position=below, anchor="top-center")
 
     def update(self) -> None:
         """Show the session as it is now."""
@@ -152,6 +159,9 @@ class Stage:
     def _show_drag(self, drag: DragView | None) -> None:
         """Show a line from the gripped point to the cursor."""
         if drag is not None:
+            if self._hint is not None:  # known now
+                self._hint.remove()
+                self._hint = None
             self._line.points = np.array([[drag.point, drag.target]], np.float32)
             self._grip.position = tuple(drag.point)
         self._line.visible = self._grip.visible = drag is not None
@@ -181,6 +191,8 @@ class Stage:
             self._on_pin(number, np.array(event.target.position), np.array(event.target.wxyz))
 
         gizmo.on_update(moved)
+        if number == min(self._session.pins()):
+            self._server.scene.add_label(f"/pins/{number}/label", PIN_HINT, anchor="bottom-center")
         return gizmo
 
 

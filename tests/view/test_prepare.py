@@ -1,0 +1,86 @@
+"""The page that prepares a capture: what its gizmos and its button lead to, without a browser."""
+
+from __future__ import annotations
+
+import shlex
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from softmode.cli.main import main
+from softmode.objects import ObjectConfig
+from softmode.objects.source import object_source
+from softmode.splats import make_plush, read_splats, write_splats
+from softmode.view.app import ViewOptions
+
+pytest.importorskip("viser", reason="the extra viz is not installed")
+from softmode.view.prepare import PreparePage
+from tests.view.page_client import PageClient
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write a plush whose head points along +x of the file."""
+    file = tmp_path_factory.mktemp("capture") / "toy bear.ply"
+    write_splats(file, make_plush(count=800), up="+x")
+    return file
+
+
+@pytest.fixture
+def page(capture: Path) -> Iterator[PreparePage]:
+    """Serve it."""
+    with PreparePage(capture, ViewOptions(port=0)) as one:
+        yield one
+
+
+def test_turning_finds_the_axis_that_points_up(page: PreparePage, capture: Path) -> None:
+    """Turned to what looks upright, 10 degrees off, the page takes +x; the head is above then."""
+    assert page.up == "-y" and page.crop is None
+    # What is shown has -y of the file up; a turn that brings the file's +x there makes the bear stand.
+    shown = read_splats(capture).oriented("-y").means
+    head = shown[read_splats(capture).means[:, 0].argmax()] - shown.mean(axis=0)
+    upright = Rotation.align_vectors([[0.0, 0.0, 1.0]], [head])[0]
+    page.turn((Rotation.from_euler("x", 10.0, degrees=True) * upright).as_matrix())
+    assert page.up == "+x"
+    standing = object_source(ObjectConfig(splat=capture, up=page.up)).splats
+    np.testing.assert_allclose(standing.bounds()[:, 2], [0.0, np.ptp(standing.bounds(), axis=0).max()], atol=2e-3)
+
+
+def test_the_box_crops_and_the_command_repeats_it(page: PreparePage, tmp_path: Path) -> None:
+    """Half the bear is kept, corners do not pass each other, and the command says the same."""
+    page.turn(np.eye(3))
+    middle = 0.5 * (page.low + page.high)
+    page.move(0, np.array([middle[0], *page.low[1:]]))
+    assert page.crop is not None and page.crop[0] == pytest.approx(middle[0], rel=1e-3, abs=1e-6)
+    kept = object_source(ObjectConfig(splat=page.file, up=page.up, crop=page.crop)).asset_splats
+    assert 0.2 * 800 < kept < 0.8 * 800
+    page.move(1, page.low - 1.0)
+    assert (page.high > page.low).all()
+    words = shlex.split(page.command)
+    assert words[:4] == ["softmode", "view", str(page.file), f"--up={page.up}"]
+    assert [float(x) for x in words[words.index("--crop") + 1 :]] == list(page.crop)
+
+
+def test_a_browser_sees_the_page_and_the_button_ends_it(page: PreparePage) -> None:
+    """A client is sent splats, box and gizmos; without a press there is nothing to build, with one there is."""
+    with PageClient(page.url) as client:
+        names: set[str] = set()
+        for _ in range(20):
+            messages, _, _ = client.receive(10.0)
+            names |= {str(one.get("name")) for one in messages}
+            if {"/splats", "/box", "/corner 0", "/corner 1", "/turn"} <= names:
+                break
+        assert {"/splats", "/box", "/corner 0", "/corner 1", "/turn"} <= names
+    assert not page.wait(0.05)
+    threading.Timer(0.1, page.press).start()
+    assert page.wait(20.0)
+
+
+def test_only_splat_files_are_prepared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Nothing to prepare is an error that says so."""
+    assert main(["view", "--prepare", "--port", "0", "--no-open"]) == 2
+    assert "Give a splat file" in capsys.readouterr().err
