@@ -16,13 +16,10 @@ RL_SOLVER = SolverReducedOptions(
 size; a body at rest keeps its stiffness from step to step."""
 RL_BUILD = BuildOptions(function_count=24, cubature_count=96)
 """24 functions, a system of 72 unknowns, which on CUDA fits in shared memory."""
-RL_HELD_BUILD = BuildOptions(mode_count=5, cubature_count=96)
-"""Likewise for an object whose foot is clamped: a body with regions has FreeForm's functions."""
 
 
 def rl_scene(config: TableSceneConfig | None = None, *, dt: float = 1.0 / 120.0) -> TableSceneConfig:
     """Return a scene with the coarse body and solver, in steps of about ``dt`` [s], an even number per control step."""
     config = config or TableSceneConfig()
     substeps = 2 * max(1, round(0.5 / (config.control_hz * dt)))
-    build = RL_HELD_BUILD if config.object.clamped_height > 0.0 else RL_BUILD
-    return replace(config, object=replace(config.object, build=build), solver=RL_SOLVER, substeps=substeps)
+    return replace(config, object=replace(config.object, build=RL_BUILD), solver=RL_SOLVER, substeps=substeps)

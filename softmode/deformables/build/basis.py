@@ -12,14 +12,20 @@ from softmode.deformables.body.regions import Envelope, Region
 from softmode.deformables.body.rkpm import BasisRKPM, ShapeFunctions, make_basis
 from softmode.deformables.body.skinning_weights import SkinningWeights, enveloped
 from softmode.deformables.build.eigenmodes import solve_eigenmodes
-from softmode.deformables.build.elastic_functions import SPACE_MODE_COUNT, choose_functions
-from softmode.deformables.build.functions import Functions, affine_first, orthonormalise
+from softmode.deformables.build.elastic_functions import SPACE_MODE_COUNT, Held, choose_functions
+from softmode.deformables.build.functions import (
+    TRACE_TOLERANCE,
+    Functions,
+    affine_first,
+    driven_first,
+    orthonormal_in_mass,
+    orthonormalise,
+)
 from softmode.deformables.build.galerkin import mass_matrix
 from softmode.deformables.build.options import EIGENMODE_COUNT, BuildOptions
-from softmode.deformables.build.region_samples import RegionSamples, drive_matrices
+from softmode.deformables.build.region_samples import RegionSamples, drive_matrices, rigid_motions
 from softmode.deformables.build.static_response import lame_parameters, solve_harmonic_weights, solve_static_responses
 from softmode.deformables.build.visibility import Material, divide_at_gaps
-from softmode.errors import ConfigError
 
 Array = NDArray[np.float64]
 
@@ -90,68 +96,21 @@ def make_body_basis(domain: Domain, options: BuildOptions, stage: Callable[[str]
         BasisError: If the basis cannot be built.
         ConfigError: If options do not fit the object.
     """
-    by_energy = not domain.regions and not options.eigenmode_handles
-    if domain.regions and (options.function_count is not None or options.accuracy is not None):
-        raise ConfigError(
-            "function_count, accuracy: a body with regions has eigenmodes and static responses",
-            hint="give mode_count, or leave the regions away",
-        )
     count = options.kernels(len(domain.seeds), held=bool(domain.regions))
     kernels = make_basis(domain.seeds, count, kernel=options.kernel, spacing=domain.spacing, seed=options.seed)
     if domain.material is not None:
         kernels = divide_at_gaps(kernels, domain.material, domain.seeds, domain.spacing)
-    return (_elastic_basis if by_energy else _eigenmode_basis)(kernels, domain, options, stage)
-
-
-def _elastic_basis(
-    kernels: BasisRKPM, domain: Domain, options: BuildOptions, stage: Callable[[str], None]
-) -> BodyBasis:
-    """Choose functions by elastic energy out of quadratic handles; for a body without regions."""
-    points, volumes, total = domain.points, domain.volumes, domain.volumes.sum()
-    shape = kernels.evaluate(points)
-    stage("kernels")
-    count = min(SPACE_MODE_COUNT, shape.centre_count - 1)
-    modes = solve_eigenmodes(shape, volumes, count, stiffness_scale=domain.stiffness)
-    skin = SkinningWeights(
-        coefficients=modes.coefficients,
-        degrees=np.full(count + 1, 2, dtype=np.int64),
-        blends=np.full(count + 1, -1, dtype=np.int64),
-    )
-    stage("eigenmodes")
-    none = np.zeros((len(points), 0))
-    raw, raw_gradient = skin.products(*skin.evaluate(shape, none, none[:, :, None]), points, domain.length)
-    stage("responses")
-    mass, stiff = volumes * domain.density / total, volumes * domain.stiffness / total
-    chosen = choose_functions(
-        raw,
-        raw_gradient,
-        mass,
-        stiff,
-        quadratic=np.arange(10),
-        count=options.function_count,
-        accuracy=options.accuracy,
-        poissons_ratios=options.poissons_ratios,
-    )
-    functions = affine_first(chosen.transform, skin.leading, domain.length)
-    found = _finished(kernels, skin, modes.eigenvalues, functions, raw_gradient, None, domain, chosen.report())
-    stage("functions")
-    return found
-
-
-def _eigenmode_basis(
-    kernels: BasisRKPM, domain: Domain, options: BuildOptions, stage: Callable[[str], None]
-) -> BodyBasis:
-    """Take skinning eigenmodes times affine or quadratic motion, regions and their static responses."""
-    envelope, points, volumes, samples = domain.envelope, domain.points, domain.volumes, domain.samples
+    envelope, points, volumes = domain.envelope, domain.points, domain.volumes
     shape, blend, blend_slope = enveloped(kernels.evaluate(points), envelope)
     stage("kernels")
     springs, pull = _springs(kernels, domain)
     mu, lame = lame_parameters(_mean_ratio(options))
     scalar = 1.0 / (lame + 4.0 * mu)  # Of the weight-space Hessian, FreeForm eq. (35).
+    by_energy = not options.eigenmode_handles
     modes = solve_eigenmodes(
         shape,
         volumes,
-        options.mode_count or EIGENMODE_COUNT,
+        min(SPACE_MODE_COUNT, shape.centre_count - 1) if by_energy else options.mode_count or EIGENMODE_COUNT,
         stiffness_scale=domain.stiffness,
         springs=None if springs is None else scalar * springs,
         vanishing=envelope is not None,
@@ -163,26 +122,79 @@ def _eigenmode_basis(
     skin = _weights(domain, options, modes.coefficients, region_weights, shape, blend_slope.shape[1], springs)
     stage("responses")
     raw, raw_gradient = skin.products(*skin.evaluate(shape, blend, blend_slope), points, domain.length)
-    trace = None
-    if envelope is not None:
-        at = samples.points[samples.exact]
-        trace = skin.products(*skin.evaluate(*enveloped(kernels.evaluate(at), envelope)), at, domain.length)[0]
-    total = volumes.sum()
-    found = orthonormalise(
-        raw,
-        raw_gradient,
-        volumes * domain.density / total,
-        volumes * domain.stiffness / total,
-        leading=skin.leading,
-        length=domain.length,
-        kept=skin.translating,
-        held=bool(domain.regions),
-        rank_tolerance=options.rank_tolerance,
-        trace=trace,
-    )
-    basis = _finished(kernels, skin, modes.eigenvalues, found, raw_gradient, trace, domain, {})
+    total, samples = volumes.sum(), domain.samples
+
+    def at_regions(rows: NDArray[np.bool_]) -> Array:
+        """Return the raw functions at region samples, (rows, R)."""
+        at = samples.points[rows]
+        return skin.products(*skin.evaluate(*enveloped(kernels.evaluate(at), envelope)), at, domain.length)[0]
+
+    trace = None if envelope is None else at_regions(samples.exact)
+    fields = raw, raw_gradient, volumes * domain.density / total, volumes * domain.stiffness / total
+    if by_energy:
+        springs_at = np.sqrt(_strength(domain) / total)[:, None] * at_regions(~samples.exact)
+        found, report = _chosen(fields, skin, domain, options, trace, springs_at)
+    else:
+        found, report = (
+            orthonormalise(
+                *fields,
+                leading=skin.leading,
+                length=domain.length,
+                kept=skin.translating,
+                held=bool(domain.regions),
+                rank_tolerance=options.rank_tolerance,
+                trace=trace,
+            ),
+            {},
+        )
+    basis = _finished(kernels, skin, modes.eigenvalues, found, raw_gradient, trace, domain, report)
     stage("functions")
     return basis
+
+
+def _chosen(
+    fields: tuple[Array, Array, Array, Array],
+    skin: SkinningWeights,
+    domain: Domain,
+    options: BuildOptions,
+    trace: Array | None,
+    springs: Array,
+) -> tuple[Functions, dict[str, float]]:
+    """Return functions chosen by elastic energy, those of exact regions first, and what the choice says of itself.
+
+    Args:
+        fields: Raw functions (P, R), their gradients [1/m] (P, R, 3), fractions of mass (P,), of stiffness (P,).
+        skin: Skinning weights.
+        domain: What the body is.
+        options: How many functions, and for which Poisson's ratios.
+        trace: Raw functions at points that fill the exact regions, (T, R); None without such regions.
+        springs: Raw functions at points of soft regions, times the root of their springs per E and volume, (S, R).
+    """
+    raw, _, mass, _ = fields
+    leading = np.concatenate([skin.leading[[3, 0, 1, 2]], skin.leading[4:]])  # 1 first: then only it has a mean.
+    lead, driven = np.eye(raw.shape[1])[:, leading], np.zeros((raw.shape[1], 0))
+    motions = np.zeros((0, 0))
+    if trace is not None:
+        lead = orthonormal_in_mass(lead, raw, mass)
+        size, across = np.linalg.svd(np.linalg.qr(trace @ lead, mode="r"))[1:]
+        count = int((size > TRACE_TOLERANCE * size[0]).sum())
+        lead, driven = lead @ across[count:].T, lead @ across[:count].T
+        motions = rigid_motions(domain.samples, trace @ driven, len(domain.regions))
+    soft = (skin.owner > 0) & (skin.owner < len(domain.regions))
+    chosen = choose_functions(
+        *fields,
+        lead=lead,
+        kept=np.setdiff1d(np.flatnonzero(soft), leading),
+        others=np.setdiff1d(np.flatnonzero(~soft), leading),
+        quadratic=np.arange(10) if trace is None else None,
+        held=Held(driven=driven, motions=motions, springs=springs) if domain.regions else None,
+        count=options.function_count,
+        accuracy=options.accuracy,
+        poissons_ratios=options.poissons_ratios,
+    )
+    if trace is None:
+        return affine_first(chosen.transform, skin.leading, domain.length), chosen.report()
+    return driven_first(driven, chosen.transform, raw, mass, skin.leading, domain.length), chosen.report()
 
 
 def _finished(
@@ -235,12 +247,18 @@ def _springs(kernels: BasisRKPM, domain: Domain) -> tuple[Array | None, Array | 
     soft = np.flatnonzero(~samples.exact)
     if not len(soft):
         return None, None
-    stiffness = np.array([region.stiffness or 0.0 for region in domain.regions])[samples.index[soft]]
+    strength = _strength(domain)
     shape, blend, _ = enveloped(kernels.evaluate(samples.points[soft]), envelope)
     own = samples.index[soft][:, None] == np.unique(samples.index[soft])
-    strength = stiffness * samples.weights[soft]
     pull = shape.value.T @ (strength[:, None] * np.concatenate([-blend, own.astype(np.float64)], axis=1))
     return mass_matrix(shape, strength), np.asarray(pull)
+
+
+def _strength(domain: Domain) -> Array:
+    """Return the springs of the samples of soft regions, per E [m], (S,)."""
+    samples = domain.samples
+    stiffness = np.array([region.stiffness or 0.0 for region in domain.regions])[samples.index[~samples.exact]]
+    return stiffness * samples.weights[~samples.exact]
 
 
 def _region_weights(
@@ -276,7 +294,7 @@ def _weights(
     springs: Array | None,
 ) -> SkinningWeights:
     """Gather the weights: constant handle, regions, eigenmodes, static responses."""
-    degree = 2 if options.handles == "quadratic" else 1
+    degree = 1 if options.eigenmode_handles and options.handles != "quadratic" else 2
     region_count = region_weights.shape[1]
     # Squares and products of coordinates do not vanish on a region: there the constant handle stays affine.
     parts, degrees = [modes[:, :1], region_weights], [degree if exact_count == 0 else 1, *[1] * region_count]
@@ -290,7 +308,7 @@ def _weights(
             poissons_ratio=_mean_ratio(options),
             stiffness_scale=domain.stiffness,
             springs=springs,
-            derivative_count=options.response_derivatives,
+            derivative_count=options.response_derivatives if options.eigenmode_handles else 0,
         )
         parts.append(responses)
         degrees += [0] * responses.shape[1]

@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from softmode.deformables.build.functions import orthonormal_in_mass
-from softmode.deformables.build.options import FUNCTION_COUNT, FUNCTION_LIMIT
+from softmode.deformables.build.functions import KEPT_TOLERANCE, orthonormal_in_mass
+from softmode.deformables.build.options import FUNCTION_COUNT, FUNCTION_LEAST, FUNCTION_LIMIT
 from softmode.deformables.build.reduced_stiffness import elastic_stiffness
-from softmode.deformables.build.static_response import lame_parameters
+from softmode.deformables.build.static_response import lame_parameters, second_order_load
 from softmode.errors import BasisError, ConfigError
 
 Array = NDArray[np.float64]
@@ -41,6 +41,13 @@ JUDGED_COUNT = 6
 """The error of a choice is that of the first so many frequencies."""
 SPACE_TOLERANCE = 1e-9
 """Directions of the scaled mass Gram matrix of the space under this fraction of the largest are rounding."""
+NEGLIGIBLE = 1e-13
+"""Singular vectors under this fraction of the largest energy are rounding."""
+EQUAL = 0.95
+"""Singular vectors whose energies are nearer than this contribute alike: symmetric bodies have clusters of them. Those
+of a star differ by 4 % at most within a cluster and by 6 % and more between two."""
+AMPLITUDE = 0.25
+"""Half the angle [rad] through which a body turns where static responses of first and second order weigh alike."""
 BLOCK, BLOCK_STEPS = 16, 12
 """Vectors in a block of Lanczos, and the least number of blocks."""
 RIGID = 6
@@ -48,19 +55,38 @@ RIGID = 6
 
 
 @dataclass(frozen=True, kw_only=True)
+class Held:
+    """What the regions of a body ask of its functions."""
+
+    driven: Array
+    """Functions = raw @ driven that carry the motion of exact regions, orthonormal in mass, shape (R, r)."""
+    motions: Array
+    """Rigid motions of every exact region in the driven functions, shape (3 r, M); M = 0 for fewer than two."""
+    springs: Array
+    """Raw functions at points of soft regions, times the root of kappa V_p / (E V) [1/m], shape (S, R)."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ElasticChoice:
     """Functions in the order of what they carry."""
 
     transform: Array
-    """Functions = raw @ transform, orthonormal in mass, 1 and three linear ones first, shape (R, n)."""
+    """Functions = raw @ transform, orthonormal in mass, shape (R, n): without regions 1 and three linear ones first,
+    with exact ones those that vanish there."""
     frequency_error: float
-    """Largest relative error of the first six free frequencies against the whole space, at the worst of the ratios."""
+    """Largest relative error of the first six frequencies against the whole space, at the worst of the ratios."""
     space_count: int
     """Dimension of the space."""
+    complete_count: int
+    """Functions with all that contribute as much as the last of them, those of exact regions included."""
 
     def report(self) -> dict[str, float]:
         """Return what a body's provenance keeps."""
-        return {"frequency_error": self.frequency_error, "space_functions": float(self.space_count)}
+        return {
+            "frequency_error": self.frequency_error,
+            "space_functions": float(self.space_count),
+            "complete_functions": float(self.complete_count),
+        }
 
 
 def choose_functions(
@@ -69,7 +95,11 @@ def choose_functions(
     mass: Array,
     stiff: Array,
     *,
-    quadratic: NDArray[np.intp],
+    lead: Array,
+    kept: NDArray[np.intp],
+    others: NDArray[np.intp],
+    quadratic: NDArray[np.intp] | None,
+    held: Held | None,
     count: int | None,
     accuracy: float | None,
     poissons_ratios: tuple[float, ...],
@@ -81,8 +111,12 @@ def choose_functions(
         raw_gradient: Their gradients [1/m], (P, R, 3).
         mass: Fractions of mass, shape (P,).
         stiff: Fractions of volume times relative Young's modulus, shape (P,).
-        quadratic: The ten raw functions x, y, z, 1, xx, ..., zx.
-        count: Number of functions, the four affine ones among them; None for 48, or for as many as `accuracy` takes.
+        lead: Functions = raw @ lead that come first, shape (R, f): 1, x, y, z of a body without exact regions.
+        kept: Raw functions that come next: affine motions of soft regions.
+        others: Raw functions that the rest is chosen from. On a body with exact regions all of these vanish there.
+        quadratic: The ten raw functions x, y, z, 1, xx, ..., zx; None on a body with exact regions.
+        held: What regions ask for; None for a body without regions.
+        count: Number of functions, all that come first among them; None for 48, or for as many as `accuracy` takes.
         accuracy: Largest relative error of the first six frequencies, or None.
         poissons_ratios: The body's own, or several.
 
@@ -90,121 +124,237 @@ def choose_functions(
         RuntimeWarning: If there are fewer functions than asked for, which begins at about 130.
 
     Raises:
-        ConfigError: If the accuracy is not reached within 120 functions.
+        ConfigError: If the accuracy is not reached within 120 functions, or the regions alone need more than `count`.
         BasisError: If the elastic stiffness is singular.
     """
-    space = _ElasticSpace(raw, raw_gradient, mass, stiff, quadratic[:4])
-    fields = space.transform.T @ (raw.T @ (mass[:, None] * raw[:, quadratic]))
-    limit = min(FUNCTION_LIMIT if accuracy is not None else count or FUNCTION_COUNT, space.count)
-    order, modes = space.order(fields, poissons_ratios, limit)
-    errors = {limit: space.frequency_error(order, modes)}
-    chosen = limit
+    space = _ElasticSpace(raw, raw_gradient, mass, stiff, lead, kept, others, held)
+    fields = None if quadratic is None else space.transform.T @ (raw.T @ (mass[:, None] * raw[:, quadratic]))
+    driven = 0 if held is None else held.driven.shape[1]
+    most = FUNCTION_LIMIT if accuracy is not None else count or FUNCTION_COUNT
+    least = driven + space.fixed
+    if most <= least:
+        raise ConfigError(
+            f"function_count: {most} asked for, affine motions of the body and its regions are {least}",
+            hint=f"give {least + FUNCTION_LEAST} or more",
+        )
+    order, shares, modes = space.order(fields, poissons_ratios, min(most - driven, space.count))
+    chosen = order.shape[1]
+    error = space.frequency_error(order, modes)
     if accuracy is not None:
-        if errors[limit] > accuracy:
+        if error > accuracy:
             raise ConfigError(
-                f"accuracy: {limit} functions reach {errors[limit]:.2g}, {accuracy:g} was asked for",
+                f"accuracy: {chosen + driven} functions reach {error:.2g}, {accuracy:g} was asked for",
                 hint="ask for less, or give function_count",
             )
-        low = 4  # The error falls with the number of functions, because they are nested.
+        low = space.fixed  # The error falls with the number of functions, because they are nested.
         while chosen - low > 1:
             middle = (low + chosen) // 2
-            errors[middle] = space.frequency_error(order[:, :middle], modes)
-            low, chosen = (low, middle) if errors[middle] <= accuracy else (middle, chosen)
-    if count is not None and order.shape[1] < count:
+            reached = space.frequency_error(order[:, :middle], modes)
+            low, chosen = (low, middle) if reached <= accuracy else (middle, chosen)
+        chosen = min(_complete(shares, chosen), order.shape[1])
+        error = space.frequency_error(order[:, :chosen], modes)
+    if count is not None and chosen + driven < count:
         warnings.warn(
-            f"function_count: {count} asked for, the object's elastic modes make {order.shape[1]}",
+            f"function_count: {count} asked for, the object's elastic modes make {chosen + driven}",
             RuntimeWarning,
             stacklevel=2,
         )
-    transform = orthonormal_in_mass(space.transform @ order[:, :chosen], raw, mass)
-    return ElasticChoice(transform=transform, frequency_error=errors[chosen], space_count=space.count)
+    return ElasticChoice(
+        transform=orthonormal_in_mass(space.transform @ order[:, :chosen], raw, mass),
+        frequency_error=error,
+        space_count=space.count + driven,
+        complete_count=_complete(shares, chosen) + driven,
+    )
+
+
+def _complete(shares: Array, count: int) -> int:
+    """Return a number of functions, `count` or the next larger one, after which shares fall."""
+    while count < len(shares) and shares[count] > EQUAL * shares[count - 1]:
+        count += 1
+    return count
 
 
 class _ElasticSpace:
     """A space of scalar functions, orthonormal in mass, with the products of their gradients."""
 
-    def __init__(self, raw: Array, raw_gradient: Array, mass: Array, stiff: Array, leading: NDArray[np.intp]) -> None:
-        lead = leading[[3, 0, 1, 2]]  # 1 first: then only it has a mean.
-        others = np.setdiff1d(np.arange(raw.shape[1]), lead)
+    def __init__(
+        self,
+        raw: Array,
+        raw_gradient: Array,
+        mass: Array,
+        stiff: Array,
+        lead: Array,
+        kept: NDArray[np.intp],
+        others: NDArray[np.intp],
+        held: Held | None,
+    ) -> None:
         weighted = raw * np.sqrt(mass)[:, None]
         scale = 1.0 / np.maximum(np.linalg.norm(weighted, axis=0), 1e-300)
         weighted *= scale
-        affine, upper = np.linalg.qr(weighted[:, lead])
+        lead = lead / scale[:, None]
+        lead /= np.abs(lead).max(axis=0)
+        value, upper = np.linalg.qr(weighted @ lead)
         sign = np.sign(np.diag(upper))
-        affine *= sign
-        rest, content = weighted[:, others], np.zeros((4, len(others)))
-        for _ in range(2):
-            found = affine.T @ rest
-            rest -= affine @ found
-            content += found
-        value, vector = linalg.eigh(rest.T @ rest, check_finite=False)
-        keep = value > SPACE_TOLERANCE * value[-1]
-        turn = vector[:, keep] / np.sqrt(value[keep])
-        affine_part = np.zeros((raw.shape[1], 4))
-        affine_part[lead] = np.linalg.inv(upper * sign[:, None])
-        other_part = np.zeros((raw.shape[1], turn.shape[1]))
-        other_part[others] = turn
-        other_part -= affine_part @ (content @ turn)
-        self.transform = np.concatenate([affine_part, other_part], axis=1) * scale[:, None]
-        """Functions = raw @ transform, 1 and three linear ones first, shape (R, V)."""
-        self.count = self.transform.shape[1]
+        value *= sign
+        transform = lead @ np.linalg.inv(upper * sign[:, None])
+        counts = [lead.shape[1]]
+        for index, tolerance in ((kept, KEPT_TOLERANCE), (others, SPACE_TOLERANCE)):
+            if not len(index):
+                counts.append(counts[-1])
+                continue
+            rest, content = weighted[:, index], np.zeros((value.shape[1], len(index)))
+            for _ in range(2):
+                found = value.T @ rest
+                rest -= value @ found
+                content += found
+            size, vector = linalg.eigh(rest.T @ rest, check_finite=False)
+            keep = size > tolerance * size[-1]
+            turn = vector[:, keep] / np.sqrt(size[keep])
+            part = np.zeros((raw.shape[1], turn.shape[1]))
+            part[index] = turn
+            value = np.concatenate([value, rest @ turn], axis=1)
+            transform = np.concatenate([transform, part - transform @ (content @ turn)], axis=1)
+            counts.append(value.shape[1])
+        self.fixed, self.count = counts[1:]
+        """How many functions come first in any case, and how many there are."""
+        self.transform = transform * scale[:, None]
+        """Functions = raw @ transform, shape (R, V)."""
+        every = self.transform if held is None else np.concatenate([self.transform, held.driven], axis=1)
         root = np.sqrt(stiff)[:, None]
         slopes = [raw_gradient[:, :, d] * root for d in range(3)]
-        self.products = np.empty((3, self.count, 3, self.count))
-        """sum_p s_p d_i b_k d_j b_l, shape (3, V, 3, V)."""
+        self.products = np.empty((3, every.shape[1], 3, every.shape[1]))
+        """sum_p s_p d_i b_k d_j b_l, driven functions last, shape (3, V + r, 3, V + r)."""
         for d in range(3):
             for e in range(d + 1):
-                block = self.transform.T @ (slopes[d].T @ slopes[e]) @ self.transform
+                block = every.T @ (slopes[d].T @ slopes[e]) @ every
                 self.products[d, :, e], self.products[e, :, d] = block, block.T
+        self.free = self.products[:, : self.count, :, : self.count]
+        """Those of the functions that are chosen from, shape (3, V, 3, V)."""
+        self.energy = np.einsum("kakb->ab", self.free)
+        self.springs = np.zeros_like(self.energy)
+        """What soft regions add to the stiffness of each component, per E, shape (V, V)."""
+        self.held, self.exact = held, held is not None and held.driven.shape[1] > 0
+        self.rigid = RIGID if held is None else 0
+        if held is not None:
+            pull = held.springs @ self.transform
+            self.springs = pull.T @ pull
+            self.energy = self.energy + self.springs
+            self.mean = self.transform.T @ (raw.T @ mass)
+            self.slopes, self.stiff = [raw_gradient[:, :, d] for d in range(3)], stiff
 
-    def order(self, fields: Array, poissons_ratios: tuple[float, ...], count: int) -> tuple[Array, dict[float, Array]]:
-        """Return functions (V, count) in the order of what they carry, and the first eigenvalues by Poisson's ratio.
+    def order(
+        self, fields: Array | None, poissons_ratios: tuple[float, ...], count: int
+    ) -> tuple[Array, Array, dict[float, Array]]:
+        """Return functions (V, count) in the order of what they carry, what all carry, and eigenvalues by ratio.
 
         Args:
-            fields: The ten monomials up to degree two in this space, shape (V, 10).
+            fields: The ten monomials up to degree two in this space, shape (V, 10), or None.
             poissons_ratios: At which targets are sought.
             count: How many functions.
         """
-        energy = np.einsum("kakb->ab", self.products)
-        scalar = linalg.eigh(energy[4:, 4:], eigvals_only=True, check_finite=False)
-        columns, judged = [], {}
+        scalar = linalg.eigh(self.energy[self.fixed :, self.fixed :], eigvals_only=True, check_finite=False)
+        targets, judged = [], {}
         for ratio in poissons_ratios:
             floor = 1e-5 * lame_parameters(ratio)[0] * float(scalar[scalar > 1e-9 * scalar[-1]][0])
             target, value = self._targets(fields, ratio, floor)
-            judged[ratio] = value[:JUDGED_COUNT]
+            judged[ratio] = value[: JUDGED_COUNT + (0 if self.exact else RIGID - self.rigid)]
             first = value[value > floor][0]  # Of a body in several parts, these move against each other for nothing.
-            scaled = target * (np.minimum(1.0, first / np.maximum(value, floor)) / np.sqrt(np.maximum(value, floor)))
-            columns.append(scaled.reshape(3, self.count, -1).transpose(1, 0, 2).reshape(self.count, -1))
-        stacked = np.concatenate(columns, axis=1)
-        stacked[:4] = 0.0
-        value, vector = linalg.eigh(stacked.T @ energy @ stacked, check_finite=False)
-        best = np.argsort(-value, kind="stable")[: count - 4]
-        best = best[value[best] > 1e-13 * value[-1]]
-        # In order: the first n span what the first n singular vectors span.
-        found, upper = np.linalg.qr(stacked @ (vector[:, best] / np.sqrt(value[best])))
-        return np.concatenate([np.eye(self.count, 4), found * np.sign(np.diag(upper))], axis=1), judged
+            share = np.minimum(1.0, first / np.maximum(value, floor))
+            if self.held is not None:
+                share = np.sqrt(share)
+            targets.append(target * (share / np.sqrt(np.maximum(value, floor))))
+        blocks = []
+        if self.held is not None:
+            responses, more = self._responses(self.held, sum(poissons_ratios) / len(poissons_ratios))
+            blocks.append(responses)
+            targets.append(more)
+        found, shares = np.eye(self.count, self.fixed), np.full(self.fixed, np.inf)
+        for block in [*blocks, np.concatenate(targets, axis=1)]:
+            found, share = self._extend(found, block, count)
+            shares = np.concatenate([shares, share])
+        return found, shares, judged
 
     def frequency_error(self, chosen: Array, modes: dict[float, Array]) -> float:
         """Return the largest relative error of the first frequencies of chosen functions (V, n)."""
-        part = np.einsum("ak,iajb,bl->ikjl", chosen, self.products, chosen, optimize=True)
-        worst = 0.0
+        part = np.einsum("ak,iajb,bl->ikjl", chosen, self.free, chosen, optimize=True)
+        springs, worst = chosen.T @ self.springs @ chosen, 0.0
         for ratio, value in modes.items():
-            last = min(RIGID + len(value), 3 * chosen.shape[1]) - 1
+            last = min(self.rigid + len(value), 3 * chosen.shape[1]) - 1
             found = linalg.eigh(
-                elastic_stiffness(part, ratio), eigvals_only=True, subset_by_index=[RIGID, last], check_finite=False
+                elastic_stiffness(part, ratio) + np.kron(np.eye(3), springs),
+                eigvals_only=True,
+                subset_by_index=[self.rigid, last],
+                check_finite=False,
             )
             real = value[: len(found)] > 1e-9 * value[-1]
             worst = max(worst, float((np.sqrt(found[real] / value[: len(found)][real]) - 1.0).max()))
         return worst
 
-    def _targets(self, fields: Array, poissons_ratio: float, floor: float) -> tuple[Array, Array]:
+    def _stiffness(self, poissons_ratio: float) -> Array:
+        """Return the stiffness of the free functions with the springs of soft regions, (3 V, 3 V)."""
+        return elastic_stiffness(self.free, poissons_ratio) + np.kron(np.eye(3), self.springs)
+
+    def _targets(self, fields: Array | None, poissons_ratio: float, floor: float) -> tuple[Array, Array]:
         """Return the lowest elastic modes, then Ritz modes of fields, (3 V, T), and their eigenvalues (T,)."""
-        stiffness = elastic_stiffness(self.products, poissons_ratio)
+        stiffness = self._stiffness(poissons_ratio)
         value, mode = _lowest(stiffness, 1e3 * floor, min(TARGET_COUNT + RIGID, 3 * self.count - 1))
+        value, mode = value[self.rigid :], mode[:, self.rigid :]
+        if fields is None:
+            return mode, value
         span = np.kron(np.eye(3), np.linalg.qr(fields)[0])
         ritz, turn = linalg.eigh(span.T @ stiffness @ span, check_finite=False)
-        modes = np.concatenate([mode[:, RIGID:], span @ turn[:, RIGID:]], axis=1)
-        return modes, np.concatenate([value[RIGID:], ritz[RIGID:]])
+        modes = np.concatenate([mode, span @ turn[:, self.rigid :]], axis=1)
+        return modes, np.concatenate([value, ritz[self.rigid :]])
+
+    def _responses(self, held: Held, poissons_ratio: float) -> tuple[Array, Array]:
+        """Return static responses to unit body forces (3 V, 3), and those of second order and of moved regions."""
+        try:
+            factor = linalg.cho_factor(self._stiffness(poissons_ratio), check_finite=False)
+        except linalg.LinAlgError as error:
+            raise BasisError("the static response has no solution", hint="Hold the body by a region.") from error
+        force = np.kron(np.eye(3), self.mean[:, None])
+        first = linalg.cho_solve(factor, force)
+        first /= np.sqrt(np.einsum("ak,ak->k", first, force))
+        raw = np.einsum("rv,avm->mar", self.transform, first.reshape(3, self.count, 3))
+        load, turn = second_order_load(self.slopes, self.stiff, raw, poissons_ratio)
+        reduced = np.einsum("rv,arp->avp", self.transform, load.reshape(3, len(self.transform), -1))
+        i, j = np.triu_indices(3)
+        more = [AMPLITUDE * np.sqrt(turn[i] * turn[j]) * linalg.cho_solve(factor, reduced.reshape(len(first), -1))]
+        if held.motions.shape[1]:
+            # Constraint modes: the body's answer to rigid motions of its exact regions, as Ritz modes of unit energy.
+            whole, free = elastic_stiffness(self.products, poissons_ratio), np.zeros(3 * self.products.shape[1], bool)
+            free.reshape(3, -1)[:, : self.count] = True
+            pull = whole[np.ix_(free, ~free)] @ held.motions
+            answer = -linalg.cho_solve(factor, pull)
+            energy = held.motions.T @ whole[np.ix_(~free, ~free)] @ held.motions + pull.T @ answer
+            value, vector = linalg.eigh(energy, held.motions.T @ held.motions + answer.T @ answer)
+            more.append(answer @ (vector[:, RIGID:] / np.sqrt(value[RIGID:])))
+        return first, np.concatenate(more, axis=1)
+
+    def _extend(self, found: Array, block: Array, count: int) -> tuple[Array, Array]:
+        """Add to functions (V, k) singular vectors of the components of a block (3 V, T), up to a count in all.
+
+        Returns:
+            All functions, and the energies of all singular vectors of the block, in their order.
+        """
+        stacked = block.reshape(3, self.count, -1).transpose(1, 0, 2).reshape(self.count, -1)
+        affine = 0 if self.exact else self.fixed  # Constants have no energy to be orthogonal in.
+        stacked[:affine] = 0.0
+        known = found[:, affine:]
+        if known.shape[1]:
+            inner = known.T @ self.energy
+            for _ in range(2):
+                stacked = stacked - known @ linalg.solve(inner @ known, inner @ stacked, assume_a="pos")
+        value, vector = linalg.eigh(stacked.T @ self.energy @ stacked, check_finite=False)
+        best = np.argsort(-value, kind="stable")
+        best = best[value[best] > NEGLIGIBLE * value[-1]]
+        share, best = value[best], best[: count - found.shape[1]]
+        # In order: the first n span what the first n singular vectors span.
+        added = stacked @ (vector[:, best] / np.sqrt(value[best]))
+        for _ in range(2):
+            added -= found @ (found.T @ added)
+        more, upper = np.linalg.qr(added)
+        return np.concatenate([found, more * np.sign(np.diag(upper))], axis=1), share
 
 
 def _lowest(stiffness: Array, shift: float, count: int) -> tuple[Array, Array]:

@@ -130,6 +130,27 @@ def affine_first(transform: Array, leading: NDArray[np.intp], length: float) -> 
     return Functions(transform=transform, mean=np.eye(1, transform.shape[1])[0], linear=linear, driven_count=0)
 
 
+def driven_first(
+    driven: Array, free: Array, raw: Array, mass: Array, leading: NDArray[np.intp], length: float
+) -> Functions:
+    """Return functions of a body with exact regions: those that carry the regions, then those that vanish there.
+
+    Args:
+        driven: Functions = raw @ driven that carry the regions, shape (R, r).
+        free: Functions = raw @ free that vanish there, orthonormal in mass, shape (R, m); they stay as they are.
+        raw: Raw functions at the quadrature points, (P, R).
+        mass: V_p rho_p / V, shape (P,).
+        leading: The raw functions x, y, z and 1, in the span of all.
+        length: Unit of length of the raw functions [m].
+    """
+    weighted = mass[:, None] * raw
+    for _ in range(2):
+        driven = driven - free @ (free.T @ (weighted.T @ (raw @ driven)))
+    transform = np.concatenate([orthonormal_in_mass(driven, raw, mass), free], axis=1)
+    linear = transform.T @ (weighted.T @ raw[:, leading[:4]]) * [length, length, length, 1.0]
+    return Functions(transform=transform, mean=linear[:, 3].copy(), linear=linear, driven_count=driven.shape[1])
+
+
 def orthonormal_in_mass(transform: Array, raw: Array, mass: Array) -> Array:
     """Return a transform (R, n) whose functions are orthonormal, from one whose functions nearly are.
 

@@ -27,8 +27,7 @@ def hold(
 ) -> ReducedBody:
     """Return the body that a build told of further regions would have given.
 
-    It takes as long as the build. Motion goes over by :func:`carry_over`. A number of functions that was asked for is
-    not kept: a body with regions has eigenmodes and static responses.
+    It takes as long as the build. Motion goes over by :func:`carry_over`.
 
     Args:
         body: A body that keeps its sources: one that was built, or read from a file that was saved with them.
@@ -51,16 +50,14 @@ def hold(
     given = unpack_sources(body)
     held = build_body(
         given.quadrature,
-        given.options.for_regions(),
+        given.options,
         name=body.name,
         regions=(*given.regions, *regions),
         stiffness_scale=given.stiffness_scale,
         density_scale=given.density_scale,
         progress=progress,
     )
-    own = {"frequency_error", "space_functions"} | held.provenance.keys()
-    added = {key: value for key, value in body.provenance.items() if key not in own}
-    return dataclasses.replace(held, provenance={**held.provenance, **added})
+    return dataclasses.replace(held, provenance={**body.provenance, **held.provenance})
 
 
 def carry_over(old: ReducedBody, new: ReducedBody, q: ArrayLike, qd: ArrayLike) -> tuple[Array, Array]:

@@ -38,16 +38,17 @@ FUNCTION_LIMIT = 120
 class BuildOptions:
     """How a body is reduced.
 
-    By default a body without regions has 48 functions that are chosen by elastic energy. `function_count` or `accuracy`
-    change how many. Either of `mode_count` and `handles` asks for FreeForm's functions instead: eigenmodes times affine
-    or quadratic motion. A body with regions has those in any case, and static responses.
+    By default a body has 48 functions that are chosen by elastic energy, also with regions. `function_count` or
+    `accuracy` change how many. Either of `mode_count` and `handles` asks for FreeForm's functions instead: eigenmodes
+    times affine or quadratic motion, and on a body with regions static responses.
     """
 
     function_count: int | None = None
     """Scalar functions n, chosen by elastic energy; the body has 3 n unknowns. None takes 48, or follows `accuracy`."""
     accuracy: float | None = None
-    """Largest relative error of the first six free frequencies against the whole space that the functions are chosen
-    from, for instance 0.02. The fewest functions that reach it are taken, up to 120."""
+    """Largest relative error of the first six frequencies against the whole space that the functions are chosen from,
+    for instance 0.02: free ones, or those of the held body. The fewest functions that reach it are taken, up to 120,
+    and those that contribute as much as the last of them: symmetric bodies have clusters of such functions."""
     poissons_ratio: float | tuple[float, ...] | None = None
     """Poisson's ratio that the functions are made for; None means that of the material that an object is loaded with,
     else 0.4. Any other can be simulated, but functions made for 0.4 are 28 % too stiff in a plate of 0.49. Several,
@@ -59,13 +60,14 @@ class BuildOptions:
     kernel_count: int | None = None
     """Reproducing kernels. None takes 1000 where functions are chosen by elastic energy: corners and crossings need
     them (a cross is 7 % too stiff with 400, 4 % with 1000). FreeForm's functions take 400, which give the first 16
-    eigenvalues of a box to 0.3 %. Below 3,200 quadrature points None takes a fifth of them at most, with regions an
-    eighth: kernels that are narrower move between the points and cost no energy (a bar of 1,000 points and 1,000
+    eigenvalues of a box to 0.3 %. Below 3,200 quadrature points None takes a fifth of them at most, with regions always
+    an eighth: kernels that are narrower move between the points and cost no energy (a bar of 1,000 points and 1,000
     kernels was 38 % too soft, with 200 kernels it is 2.5 %)."""
     kernel: KernelName = "cubic"
     """Bell of the reproducing kernels."""
     static_responses: bool = True
-    """On a body with regions: nine more weights, one function each, from its response to unit body forces."""
+    """FreeForm's functions, on a body with regions: nine more weights, one function each, from its response to unit
+    body forces. Functions chosen by elastic energy have these in any case."""
     response_derivatives: int = 12
     """Likewise, up to 18 from the second order of that response; a beam that bends far needs them, and then needs few
     eigenmodes: with 2 modes and 87 unknowns it is as accurate as with 16 and 189."""
@@ -89,6 +91,11 @@ class BuildOptions:
             require_number("function_count", self.function_count, at_least=FUNCTION_LEAST)
         if self.accuracy is not None:
             require_number("accuracy", self.accuracy, above=0.0, below=1.0)
+        if not self.eigenmode_handles and not (self.static_responses and self.response_derivatives == 12):
+            raise ConfigError(
+                "static_responses, response_derivatives: functions chosen by elastic energy have what they need",
+                hint="leave them out, or ask for FreeForm's functions by mode_count",
+            )
         asked = [name for name in ("function_count", "accuracy") if getattr(self, name) is not None]
         if asked and (self.eigenmode_handles or len(asked) == 2):
             others = [name for name in ("mode_count", "handles") if getattr(self, name) is not None]
@@ -131,17 +138,13 @@ class BuildOptions:
         count = None if self.accuracy is not None else (self.function_count or FUNCTION_COUNT) * 5 // 4
         return replace(self, poissons_ratio=VARIED_RATIOS, function_count=count)
 
-    def for_regions(self) -> BuildOptions:
-        """Return these options for a body with regions, which has FreeForm's functions and static responses."""
-        return replace(self, function_count=None, accuracy=None)
-
     def kernels(self, point_count: int, *, held: bool) -> int:
         """Return how many kernels a body of so many quadrature points has, `held` if it has regions."""
         if self.kernel_count is not None:
             return self.kernel_count
-        most = EIGENMODE_KERNEL_COUNT if held or self.eigenmode_handles else KERNEL_COUNT
+        most = EIGENMODE_KERNEL_COUNT if self.eigenmode_handles else KERNEL_COUNT
         few = max(point_count // (8 if held else 5), KERNEL_LEAST)
-        return most if point_count >= MANY_POINTS else min(most, few)
+        return most if point_count >= MANY_POINTS and not held else min(most, few)
 
     @property
     def eigenmode_handles(self) -> bool:

@@ -125,6 +125,28 @@ def drive_matrices(samples: RegionSamples, values: Array, region_count: int) -> 
     return drive, np.stack(affine) if affine else np.zeros((0, count, 4))
 
 
+def rigid_motions(samples: RegionSamples, values: Array, region_count: int) -> Array:
+    """Return the rigid motions of every exact region while the others stand still, in the driven functions.
+
+    Args:
+        samples: The samples.
+        values: Driven functions at the samples of exact regions, (N_exact, r).
+        region_count: Number of regions.
+
+    Returns:
+        Coordinates (3 r, 6 E) for E exact regions, all x components first; none for a single one, which moves with all.
+    """
+    moved = np.unique(samples.index[samples.exact])
+    if len(moved) < 2:
+        return np.zeros((3 * values.shape[1], 0))
+    generator = np.zeros((6, 4, 3))
+    generator[range(3), 3, range(3)] = 1.0
+    for k, (a, b) in enumerate(((0, 1), (1, 2), (2, 0)), start=3):
+        generator[k, a, b], generator[k, b, a] = 1.0, -1.0
+    found = np.einsum("erc,kca->arek", drive_matrices(samples, values, region_count)[1][moved], generator)
+    return found.reshape(3 * values.shape[1], -1)
+
+
 def refine_at_faces(
     regions: Sequence[Region], points: Array, weights: Array, spacing: float
 ) -> tuple[Array, Array, NDArray[np.intp]]:

@@ -278,6 +278,15 @@ def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
             " functions",
             "build it with --accuracy 0.03, or more --functions",
         )
+    complete = body.provenance.get("complete_functions")
+    if isinstance(complete, float) and complete > body.function_count:
+        notes.find(
+            "note",
+            "cluster",
+            f"its last functions are some of a cluster that contribute alike, as on symmetric bodies:"
+            f" {complete:.0f} would have all of it",
+            f"build it with --functions {complete:.0f}",
+        )
     if error is not None or body.region_names:
         return
     degrees = body.handle_degrees

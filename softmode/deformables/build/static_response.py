@@ -12,11 +12,11 @@ is too stiff. Few of their eighteen components matter; those of most gradient en
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import linalg, sparse
 
 from softmode.deformables.body.rkpm import ShapeFunctions
 from softmode.deformables.build.galerkin import elastic_matrix, mass_and_gradient_matrix
@@ -74,7 +74,7 @@ def solve_static_responses(
     size = np.sqrt(np.einsum("ik,kl,il->i", first, mass, first, optimize=True))
     parts = [first[size > NEGLIGIBLE * size.max()]]
     if derivative_count:
-        load = second_order_load(shape, stiff, response.T.reshape(3, 3, count), poissons_ratio)
+        load = second_order_load(shape.gradient, stiff, response.T.reshape(3, 3, count), poissons_ratio)[0]
         second = solve(load).reshape(3, count, -1).transpose(2, 0, 1).reshape(-1, count)
         # Without what the first order holds, in the gradient energy, and the rest by its share of that energy.
         flat = parts[0] / np.sqrt(np.einsum("ik,kl,il->i", parts[0], energy, parts[0], optimize=True))[:, None]
@@ -89,23 +89,26 @@ def solve_static_responses(
     return (found / np.sqrt(np.einsum("ik,kl,il->i", found, mass, found, optimize=True))[:, None]).T
 
 
-def second_order_load(shape: ShapeFunctions, stiff: Array, response: Array, poissons_ratio: float) -> Array:
-    """Return the forces -d2f/dq_i dq_j of u = sum_i q_i u_i in St. Venant-Kirchhoff material, shape (3 K, 6).
+def second_order_load(
+    gradient: Sequence[sparse.csr_matrix | Array], stiff: Array, response: Array, poissons_ratio: float
+) -> tuple[Array, Array]:
+    """Return the forces -d2f/dq_i dq_j of u = sum_i q_i u_i in St. Venant-Kirchhoff material, (3 K, 6), and sizes (3,).
 
     With H_i the gradient and e_i the strain of u_i, the second derivative of the stress is
     P_ij = C : sym(H_i^T H_j) + H_j C : e_i + H_i C : e_j.
 
     Args:
-        shape: Kernels at the quadrature points, (P, K).
+        gradient: Gradients of K functions at the quadrature points along each axis, three matrices (P, K).
         stiff: Volumes times relative Young's modulus, shape (P,).
-        response: Coefficients of u_i, (3, 3, K), scaled here to equal gradients.
+        response: Coefficients of u_i, (3, 3, K), divided here by the root mean squares of their gradients, the sizes.
         poissons_ratio: Poisson's ratio.
     """
     mu, lame = lame_parameters(poissons_ratio)
-    slopes = []
+    slopes, sizes = [], []
     for u in response:
-        slope = np.stack([g @ u.T for g in shape.gradient], axis=2)  # (P, component, axis)
-        slopes.append(slope / np.sqrt((stiff @ (slope**2).sum(axis=(1, 2))) / stiff.sum()))
+        slope = np.stack([g @ u.T for g in gradient], axis=2)  # (P, component, axis)
+        sizes.append(np.sqrt((stiff @ (slope**2).sum(axis=(1, 2))) / stiff.sum()))
+        slopes.append(slope / sizes[-1])
 
     def stress(matrix: Array) -> Array:
         strain = 0.5 * (matrix + matrix.transpose(0, 2, 1))
@@ -116,8 +119,8 @@ def second_order_load(shape: ShapeFunctions, stiff: Array, response: Array, pois
         for j in range(i, 3):
             h, k = slopes[i], slopes[j]
             p = (stress(h.transpose(0, 2, 1) @ k) + k @ stress(h) + h @ stress(k)) * stiff[:, None, None]
-            loads.append(-np.sum([(g.T @ p[:, :, d]).T for d, g in enumerate(shape.gradient)], axis=0).ravel())
-    return np.array(loads).T
+            loads.append(-np.sum([(g.T @ p[:, :, d]).T for d, g in enumerate(gradient)], axis=0).ravel())
+    return np.array(loads).T, np.array(sizes)
 
 
 def solve_harmonic_weights(
