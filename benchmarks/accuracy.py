@@ -130,6 +130,9 @@ def suite_beyond() -> Work:
             for m in modes:
                 options = affine(m, kernel_count=HELD_KERNEL_COUNT, **changes)
                 yield Row(label=label, scene=scene, options=options, stiffness=None, regions="exact"), [scene]
+        for count in (37, 48, 53, 93):
+            options = BuildOptions(function_count=count)
+            yield Row(label="chosen, exact", scene=scene, options=options, stiffness=None, regions="exact"), [scene]
     for m in (2, 4, 6, 16):
         options = affine(m, kernel_count=HELD_KERNEL_COUNT, static_responses=True)
         yield (

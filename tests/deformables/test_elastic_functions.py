@@ -14,14 +14,20 @@ from softmode.deformables.body.regions import Region
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import FUNCTION_COUNT, BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_mesh, quadrature_from_sphere
+from softmode.deformables.build.reduced_stiffness import reduced_stiffness
+from softmode.deformables.build.report import report_body
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.errors import ConfigError
 from tests.oracle.solids import eigenvalues
-from tests.shapes import box, together
+from tests.shapes import SHAPES, box, together
 
 ALL = {"cubature_count": None, "kernel_count": 200}
 SIZE = (0.12, 0.05, 0.03)
+LEFT = Region(name="left", box=((-1.0, -1.0, -1.0), (-0.04, 1.0, 1.0)))
+RIGHT = Region(name="right", box=((0.04, -1.0, -1.0), (1.0, 1.0, 1.0)))
+SOFT = Region(name="foot", box=((0.02, -1.0, -1.0), (1.0, 1.0, 0.0)), stiffness=1e4)
+OTHER = Region(name="other", box=((-1.0, -1.0, -1.0), (-0.03, 1.0, 0.0)), stiffness=1e3)
 
 
 def built(**options: object) -> ReducedBody:
@@ -135,11 +141,76 @@ def test_detached_parts_move_against_each_other() -> None:
     assert (value[:6] < 1e-4 * value[-1]).all()
 
 
-def test_regions_take_no_count() -> None:
-    """A body with regions has eigenmodes and responses; the message says what to give."""
-    held = Region(name="held", box=((-1.0, -1.0, -1.0), (-0.04, 1.0, 1.0)))
+def held(count: int | None = None, regions: tuple[Region, ...] = (LEFT,), **options: object) -> ReducedBody:
+    """Return the box held in regions, with all of its points and few kernels."""
+    given = BuildOptions(**{**ALL, "kernel_count": 120, "function_count": count, **options})
+    return build_body(quadrature_from_box(SIZE, point_count=1500), given, regions=regions, progress=False)
+
+
+@pytest.mark.parametrize("regions", [(LEFT,), (LEFT, RIGHT), (LEFT, SOFT), (SOFT,), (SOFT, OTHER)])
+def test_functions_of_held_bodies_are_nested(regions: tuple[Region, ...]) -> None:
+    """Functions that vanish on exact regions are the first of a larger count; all span what the larger ones span."""
+    few, many = held(24, regions), held(40, regions)
+    exact = sum(region.stiffness is None for region in regions)
+    assert few.driven_count == many.driven_count == 4 * exact
+    points = many.points[::3]
+    less, more = few.evaluate(points)[0], many.evaluate(points)[0]
+    free = slice(few.driven_count, 24)
+    np.testing.assert_allclose(less[:, free], more[:, free], atol=1e-7 * np.abs(more).max())
+    rest = less - more @ np.linalg.lstsq(more, less, rcond=None)[0]
+    assert np.abs(rest).max() < 1e-7 * np.abs(less).max()
+
+
+def test_held_bodies_know_their_response() -> None:
+    """The linear sag under gravity is that of 120 functions with 13: four driven ones and the response's nine."""
+    work = []
+    for count in (13, 120):
+        body = held(count)
+        r, n = body.driven_count, body.function_count - body.driven_count
+        slope = body.grad_basis[:, r:].astype(float).transpose(1, 2, 0)
+        stiffness = reduced_stiffness(slope, body.weights * body.stiffness_scale, 0.4)
+        force = np.kron([[0.0], [0.0], [1.0]], body.mean_basis[r:, None]).ravel()
+        assert len(stiffness) == 3 * n
+        work.append(force @ np.linalg.solve(stiffness, force))
+    assert work[0] == pytest.approx(work[1], rel=2e-3)
+
+
+def test_accuracy_of_held_bodies() -> None:
+    """Accuracy is that of the frequencies of the held body, and default bodies have 48 functions too."""
+    rough, fine = held(accuracy=0.1), held(accuracy=0.01)
+    assert 8 < rough.function_count < fine.function_count
+    assert float(str(fine.provenance["frequency_error"])) <= 0.01 < float(str(rough.provenance["frequency_error"]))
+    assert held().function_count == FUNCTION_COUNT
+
+
+def test_too_few_functions_for_the_regions() -> None:
+    """Affine motions of three exact regions are twelve functions; the message says how many to give."""
+    middle = Region(name="middle", box=((-0.01, -1.0, -1.0), (0.01, 1.0, 1.0)))
+    with pytest.raises(ConfigError, match="are 12"):
+        held(12, (LEFT, middle, RIGHT))
+
+
+@pytest.mark.parametrize("options", [{"static_responses": False}, {"response_derivatives": 6}])
+def test_responses_of_eigenmodes_are_refused(options: dict[str, object]) -> None:
+    """They belong to FreeForm's functions."""
     with pytest.raises(ConfigError, match="mode_count"):
-        build_body(quadrature_from_box(SIZE), BuildOptions(function_count=40), regions=(held,), progress=False)
+        BuildOptions(**options)
+
+
+@pytest.mark.parametrize("name", ["star", "hollow sphere"])
+def test_clusters(name: str) -> None:
+    """Symmetric bodies have functions that contribute alike: accuracy takes all of them, the report tells of cuts."""
+    quadrature = SHAPES[name].quadrature(point_count=3000)
+    whole = build_body(quadrature, BuildOptions(accuracy=0.1, kernel_count=300), progress=False)
+    assert whole.provenance["complete_functions"] == whole.function_count
+    cut = build_body(quadrature, BuildOptions(function_count=46, kernel_count=300), progress=False)
+    complete = float(str(cut.provenance["complete_functions"]))
+    assert complete > 46
+    found = {finding.name: finding for finding in report_body(cut).findings}
+    assert f"--functions {complete:.0f}" in found["cluster"].remedy
+    full = build_body(quadrature, BuildOptions(function_count=int(complete), kernel_count=300), progress=False)
+    assert full.provenance["complete_functions"] == full.function_count
+    assert "cluster" not in {finding.name for finding in report_body(full).findings}
 
 
 def test_a_ratio_that_varies() -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks.accuracy import affine
 from benchmarks.accuracy_runner import Result, Row, run
+from softmode.deformables.build.options import BuildOptions
 
 MARGIN = 1.3
 """Slack over the measured figures: the build's choices (kernels, cubature) may move within it, the method may not."""
@@ -68,3 +69,12 @@ def test_known_clamp_reaches_the_target():
         errors[static] = result.nmse
     assert errors[True] < 2e-5
     assert errors[True] < 1e-2 * errors[False]
+
+
+@pytest.mark.parametrize(("scene", "count", "bound"), [("bend", 40, 2e-5), ("twist_360", 53, 5e-6)])
+def test_functions_chosen_for_a_held_body(scene: str, count: int, bound: float):
+    """Chosen by elastic energy, they carry a bend and a whole turn between two clamps: 2.8e-6 with 159 unknowns."""
+    options = BuildOptions(function_count=count)
+    result = run(Row(label=scene, scene=scene, options=options, stiffness=None, regions="exact"))
+    assert result.unknowns == 3 * count and result.status == 0
+    assert result.nmse < bound
