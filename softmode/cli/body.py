@@ -34,10 +34,9 @@ class _Asset:
     functions: int | None = None
     """Scalar functions, chosen by elastic energy; 48 if omitted."""
     accuracy: float | None = None
-    """Or as many as the first six free frequencies take to be this near to those of the whole space, such as 0.02."""
+    """Or as many as the first six frequencies take to be this near to those of the whole space, such as 0.02."""
     modes: int | None = None
-    """FreeForm's functions instead: so many skinning eigenmodes beside the constant handle; a body with regions has
-    those in any case, 8 if omitted."""
+    """FreeForm's functions instead: so many skinning eigenmodes beside the constant handle."""
     handles: Literal["affine", "quadratic"] | None = None
     """What each eigenmode carries: (X, Y, Z, 1), or all ten monomials up to degree two, for slender and flat bodies."""
     kernels: int | None = None

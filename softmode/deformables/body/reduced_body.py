@@ -4,9 +4,9 @@ x(X) = X + sum_k b_k(X) q_k in the body frame (origin: centre of mass). The func
 skinning products W_j times monomials, orthonormal in the mass inner product (1 / V) sum_p V_p rho_p b_k b_l = delta_kl.
 So the kinetic energy is mass / 2 |qdot|^2 and |q| is the rms displacement in metres. Every affine motion is exact.
 
-Without exact regions b_0 = 1, b_1..b_3 are linear, and the others, free of mean and linear moment, are ordered by the
-mean square of their gradient. With them the first `driven_count` functions span every motion of the regions and the
-others vanish there: to hold or move a region exactly is to prescribe the first coordinates.
+Without exact regions b_0 = 1, b_1..b_3 are linear, and the others are free of mean and linear moment. With them the
+first `driven_count` functions span every motion of the regions and the others vanish there: to hold or move a region
+exactly is to prescribe the first coordinates.
 """
 
 from __future__ import annotations
