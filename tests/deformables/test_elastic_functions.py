@@ -80,7 +80,7 @@ def test_functions_are_orthonormal_in_mass() -> None:
 
 
 def test_accuracy_chooses_the_count(bodies: dict[int, ReducedBody]) -> None:
-    """The fewest functions that reach the accuracy are taken, with all of a cluster; the report says what they reach."""
+    """The fewest functions that reach it are taken, with all of a cluster, and the report says what they reach."""
     counts = []
     for accuracy in (0.2, 0.05, 0.01):
         body = built(accuracy=accuracy)
