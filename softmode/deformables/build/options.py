@@ -23,7 +23,7 @@ MANY_POINTS = 3200
 KERNEL_LEAST = 60
 """The fewest kernels where none are asked for."""
 EIGENMODE_COUNT = 8
-"""Skinning eigenmodes where FreeForm's functions are asked for, or regions are given, without a number."""
+"""Skinning eigenmodes where FreeForm's functions are asked for without a number."""
 FUNCTION_COUNT = 48
 """Functions where neither a number nor an accuracy is given."""
 VARIED_RATIOS = (0.3, 0.45, 0.49)
