@@ -555,6 +555,38 @@ def free_modes(
         count: How many.
         stiffness: Relative Young's modulus of every element, shape (element_count,); ones when None.
     """
+    K, M = linear_matrices(mesh, poissons_ratio, stiffness)
+    shift = 1e-3 / np.ptp(mesh.nodes, axis=0).max() ** 2
+    shifted = sparse_linalg.splu((K + shift * M).tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    inverse = sparse_linalg.LinearOperator(K.shape, matvec=shifted.solve, dtype=np.float64)
+    start = np.random.default_rng(0).normal(size=K.shape[0])
+    value, mode = sparse_linalg.eigsh(K, k=count + 6, M=M, sigma=-shift, OPinv=inverse, v0=start)
+    order = np.argsort(value)[6:]
+    return value[order], mode[:, order].reshape(len(mesh.nodes), 3, -1)
+
+
+def spring_work(mesh: Mesh, poissons_ratio: float, held: NDArray[np.bool_], stiffness: float, load: ArrayLike) -> float:
+    """Return the work [m^5] of a body force (3,) per E on a solid that springs hold, in linear elasticity.
+
+    Args:
+        mesh: Elements of the solid.
+        poissons_ratio: nu.
+        held: Which elements the springs hold, shape (element_count,).
+        stiffness: Of the springs per volume and E [1/m^2].
+        load: Force per volume and E [1/m].
+    """
+    K = linear_matrices(mesh, poissons_ratio)[0]
+    springs = _mass(mesh, stiffness * held[:, None] * mesh.weights)
+    force = np.outer(_mass(mesh, mesh.weights) @ np.ones(len(mesh.nodes)), load).ravel()
+    whole = (K + sparse.kron(springs, sparse.identity(3))).tocsc()
+    solved = sparse_linalg.splu(whole, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(force)
+    return float(force @ solved)
+
+
+def linear_matrices(
+    mesh: Mesh, poissons_ratio: float, stiffness: ArrayLike | None = None
+) -> tuple[sparse.csc_matrix, sparse.csc_matrix]:
+    """Return the stiffness [m] per E of linear elasticity, and the mass [m^3] per density, both (3 N, 3 N)."""
     mu, lam = 1.0 / (2.0 * (1.0 + poissons_ratio)), poissons_ratio / ((1 + poissons_ratio) * (1 - 2 * poissons_ratio))
     G, w = mesh.gradients, mesh.weights
     scale = np.ones(len(mesh.elements)) if stiffness is None else np.asarray(stiffness, dtype=np.float64)
@@ -567,14 +599,11 @@ def free_modes(
     row, column = np.repeat(dof, 81, axis=1).ravel(), np.tile(dof, (1, 81)).ravel()
     size = 3 * len(mesh.nodes)
     K = sparse.csc_matrix((block.ravel(), (row, column)), shape=(size, size))
-    gram = np.einsum("eq,qa,qb->eab", w, mesh.values, mesh.values, optimize=True)
+    return K, sparse.csc_matrix(sparse.kron(_mass(mesh, w), sparse.identity(3)))
+
+
+def _mass(mesh: Mesh, weights: Array) -> sparse.csr_matrix:
+    """Return sum_q w_q N_a N_b, (N, N), of weights at the quadrature points (E, 27)."""
+    gram = np.einsum("eq,qa,qb->eab", weights, mesh.values, mesh.values, optimize=True)
     row, column = np.repeat(mesh.elements, 27, axis=1).ravel(), np.tile(mesh.elements, (1, 27)).ravel()
-    mass = sparse.csr_matrix((gram.ravel(), (row, column)), shape=(len(mesh.nodes),) * 2)
-    M = sparse.kron(mass, sparse.identity(3)).tocsc()
-    shift = 1e-3 / np.ptp(mesh.nodes, axis=0).max() ** 2
-    shifted = sparse_linalg.splu((K + shift * M).tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-    inverse = sparse_linalg.LinearOperator(K.shape, matvec=shifted.solve, dtype=np.float64)
-    start = np.random.default_rng(0).normal(size=size)
-    value, mode = sparse_linalg.eigsh(K, k=count + 6, M=M, sigma=-shift, OPinv=inverse, v0=start)
-    order = np.argsort(value)[6:]
-    return value[order], mode[:, order].reshape(len(mesh.nodes), 3, -1)
+    return sparse.csr_matrix((gram.ravel(), (row, column)), shape=(len(mesh.nodes),) * 2)

@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from tests.oracle.fem import Mesh, free_eigenvalues
+from tests.oracle.fem import Mesh, free_eigenvalues, spring_work
 from tests.shapes import voxels
 
 Array = NDArray[np.float64]
+GRAVITY = (0.48, 0.6, 0.64)
+"""Direction of gravity, along no axis [per E, 1/m]."""
 Mask = NDArray[np.bool_]
 
 
@@ -26,6 +28,8 @@ class Bricks:
     """Edges of a brick [m]."""
     refine: int = 1
     """Finite elements per brick and axis."""
+    end: tuple[int, int] = (0, 1)
+    """The end that springs hold: an axis, and how many layers of bricks from its lower side."""
 
     def surface(self) -> tuple[Array, NDArray[np.int64]]:
         """Return the closed surface: vertices [m] (V, 3), triangles (T, 3)."""
@@ -42,6 +46,28 @@ class Bricks:
             fine = fine.repeat(self.refine, axis=axis)
         lines = tuple(np.arange(n + 1) * (p / self.refine) for n, p in zip(fine.shape, self.pitch, strict=True))
         return Mesh(lines, fine)  # type: ignore[arg-type]
+
+    @property
+    def end_width(self) -> float:
+        """Width of the end that springs hold [m]."""
+        return self.end[1] * self.pitch[self.end[0]]
+
+    def spring_works(self, body: ReducedBody, poissons_ratio: float, hardness: float = 30.0) -> tuple[float, float]:
+        """Return the work of gravity on a body, and on finite elements, that springs hold at the end, per E [m^5].
+
+        Args:
+            body: The body; its functions are summed over the finite elements' own points of the end.
+            poissons_ratio: nu.
+            hardness: Springs per volume, in units of E over the square of the end's width.
+        """
+        mesh, (axis, _) = self.mesh(), self.end
+        held = 0.5 * (mesh.lower + mesh.upper)[:, axis] < self.end_width
+        kappa = hardness / self.end_width**2
+        value = body.evaluate(mesh.points[held].reshape(-1, 3) - body.offset)[0]
+        springs = value.T @ (kappa * mesh.weights[held].reshape(-1, 1) * value)
+        whole = stiffness(body, poissons_ratio) + np.kron(np.eye(3), springs)
+        force = np.outer(GRAVITY, body.volume * body.mean_basis).ravel()
+        return float(force @ np.linalg.solve(whole, force)), spring_work(mesh, poissons_ratio, held, kappa, GRAVITY)
 
 
 def _full(*counts: int) -> Mask:
@@ -91,6 +117,55 @@ def _steps() -> Mask:
     return mask
 
 
+def _walk(shape: tuple[int, int, int], moves: str, start: tuple[int, int, int] = (0, 0, 0)) -> Mask:
+    """Return what a block of 2 x 2 x 2 bricks sweeps: "x6" goes six bricks on, "X6" back."""
+    mask, at = np.zeros(shape, dtype=bool), np.array(start)
+    for move in ["x0", *moves.split()]:
+        axis, way = "xyz".index(move[0].lower()), 1 if move[0].islower() else -1
+        for _ in range(max(1, int(move[1:]))):
+            at[axis] += way * (int(move[1:]) > 0)
+            mask[tuple(slice(a, a + 2) for a in at)] = True
+    return mask
+
+
+def _ring() -> Mask:
+    x, y = np.meshgrid(np.arange(12) - 5.5, np.arange(12) - 5.5, indexing="ij")
+    radius = np.hypot(x, y)
+    return np.repeat(((radius > 3.6) & (radius < 6.2))[:, :, None], 2, axis=2)
+
+
+def _t() -> Mask:
+    mask = np.zeros((10, 2, 9), dtype=bool)
+    mask[:, :, 7:] = mask[4:6] = True
+    return mask
+
+
+def _dumbbell() -> Mask:
+    mask = np.zeros((14, 4, 4), dtype=bool)
+    mask[:4] = mask[10:] = mask[:, 1:3, 1:3] = True
+    return mask
+
+
+def _tube() -> Mask:
+    mask = _full(5, 5, 12)
+    mask[1:-1, 1:-1] = False
+    return mask
+
+
+def _cup() -> Mask:
+    mask = _full(6, 6, 6)
+    mask[1:-1, 1:-1, 1:] = False
+    return mask
+
+
+def _fork() -> Mask:
+    mask = _full(7, 2, 10)
+    mask[2:5, :, 3:] = False
+    return mask
+
+
+HELIX = "x6 z2 y6 z2 X6 z2 Y6 z2 x6 z2 y6"
+SPIRAL = "x10 y10 X10 Y6 x6 y2"
 SOLIDS: dict[str, Callable[[], Bricks]] = {
     "bar 3:1": lambda: Bricks(mask=_full(9, 3, 3), pitch=(0.01, 0.01, 0.01)),
     "bar 10:1": lambda: Bricks(mask=_full(24, 3, 3), pitch=(0.0125, 0.01, 0.01)),
@@ -103,20 +178,35 @@ SOLIDS: dict[str, Callable[[], Bricks]] = {
     "Y": lambda: Bricks(mask=_y(), pitch=(0.01, 0.01, 0.01)),
     "hand": lambda: Bricks(mask=_hand(), pitch=(0.01, 0.01, 0.01)),
     "steps": lambda: Bricks(mask=_steps(), pitch=(0.01, 0.01, 0.01)),
+    "ring": lambda: Bricks(mask=_ring(), pitch=(0.01, 0.01, 0.01)),
+    "T": lambda: Bricks(mask=_t(), pitch=(0.01, 0.01, 0.01), end=(2, 1)),
+    "dumbbell": lambda: Bricks(mask=_dumbbell(), pitch=(0.01, 0.01, 0.01)),
+    "tube": lambda: Bricks(mask=_tube(), pitch=(0.01, 0.01, 0.01)),
+    "cup": lambda: Bricks(mask=_cup(), pitch=(0.01, 0.01, 0.01)),
+    "fork": lambda: Bricks(mask=_fork(), pitch=(0.01, 0.01, 0.01)),
+    "plate 40:1": lambda: Bricks(mask=_full(20, 12, 2), pitch=(0.05, 0.05, 0.0125)),
+    "rod 50:1": lambda: Bricks(mask=_full(50, 2, 2), pitch=(0.02, 0.01, 0.01), end=(0, 2)),
+    "helix": lambda: Bricks(mask=_walk((8, 8, 12), HELIX), pitch=(0.01, 0.01, 0.01), end=(2, 1)),
+    "spiral": lambda: Bricks(mask=_walk((12, 12, 2), SPIRAL), pitch=(0.01, 0.01, 0.01), end=(1, 2)),
 }
 """Solids by name."""
 
 
 def eigenvalues(body: ReducedBody, poissons_ratio: float, count: int = 6) -> Array:
     """Return the first free eigenvalues of a body per E / rho [1/m^2], from its points and gradients alone."""
+    value = np.linalg.eigvalsh(stiffness(body, poissons_ratio))
+    return np.asarray(value[6 : 6 + count] / body.volume, dtype=np.float64)
+
+
+def stiffness(body: ReducedBody, poissons_ratio: float) -> Array:
+    """Return the stiffness of a body at rest per E [m], (3 n, 3 n), from its points and gradients alone."""
     mu, lam = 1.0 / (2.0 * (1.0 + poissons_ratio)), poissons_ratio / ((1 + poissons_ratio) * (1 - 2 * poissons_ratio))
     G, n = body.grad_basis.astype(np.float64), body.function_count
     product = np.einsum("p,pai,pbj->iajb", body.weights * body.stiffness_scale, G, G, optimize=True)
     K = lam * product + mu * product.transpose(2, 1, 0, 3)
     for i in range(3):
         K[i, :, i] += mu * np.einsum("kakb->ab", product)
-    value = np.linalg.eigvalsh(K.reshape(3 * n, 3 * n))
-    return np.asarray(value[6 : 6 + count] / body.volume, dtype=np.float64)
+    return np.asarray(K.reshape(3 * n, 3 * n))
 
 
 def frequency_errors(body: ReducedBody, reference: Array, poissons_ratio: float) -> tuple[float, float]:
