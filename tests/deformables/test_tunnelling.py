@@ -269,3 +269,22 @@ def test_inner_offsets_of_a_sheet_stay_inside():
     offsets = inner_offsets(points, normals, np.sqrt(2.0))
     reached = points[:, 2] + offsets[:, 2]
     assert (np.abs(offsets[:, 2]) > 0.0).all() and (np.sign(reached) != -normals[:, 2]).all()
+
+
+def test_inner_offsets_of_a_thin_wall_stay_inside():
+    """In a tube whose wall is a third of the spacing of its samples thick, no offset goes through the wall.
+
+    The samples of one face lie between those of the other, so that none is nearer to a point outside than its own.
+    """
+    outer, wall, step = 0.03, 0.004, 2.0 * np.pi / 15
+    found = []
+    for k in range(12):
+        radius, side = (outer, 1.0) if k % 2 else (outer - wall, -1.0)
+        angle = step * (np.arange(15) + 0.5 * (k % 2))
+        way = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(15)])
+        found.append((radius * way + [0.0, 0.0, 0.006 * k], side * way))
+    points, normals = np.concatenate([x for x, _ in found]), np.concatenate([n for _, n in found])
+    offsets = inner_offsets(points, normals, 0.11)
+    away, some = np.hypot(*(points + offsets)[:, :2].T), (offsets != 0.0).any(axis=1)
+    assert some.mean() > 0.9
+    assert (away[some] < outer).all() and (away[some] > outer - wall).all()

@@ -13,7 +13,8 @@ def inner_offsets(points: Array, normals: Array, size: float) -> Array:
     """Find for every sample the way to a point inside the body.
 
     Against the mean normal of the samples around that face the same way, for a tenth of the body's size or as far as
-    the nearest sample still is not one of another face: half of a thin sheet.
+    the nearest sample still is not one of another face: half of a thin sheet. Where samples are farther from each other
+    than a wall is thick, none may be near: a point behind the plane of a sample that faces the other way is outside.
 
     Args:
         points: Surface samples [m], shape (N, 3).
@@ -24,6 +25,7 @@ def inner_offsets(points: Array, normals: Array, size: float) -> Array:
         Offsets [m], shape (N, 3); zero where no point inside was found.
     """
     tree = KDTree(points)
+    spacing = 1.5 * float(np.median(tree.query(points, k=min(2, len(points)))[0][:, -1]))
     offsets = np.zeros_like(points)
     todo = np.arange(len(points))
     for length in 0.1 * size * 0.5 ** np.arange(6):
@@ -38,6 +40,14 @@ def inner_offsets(points: Array, normals: Array, size: float) -> Array:
         distance, nearest = tree.query(x)
         depth = ((points[nearest] - x) * normals[nearest]).sum(axis=1)
         good = (depth > 0.3 * length) & (distance > 0.5 * length)
+        between = tree.query_ball_point(points[todo] + 0.5 * length * inward, np.hypot(0.5 * length, spacing))
+        for j in np.flatnonzero(good):
+            k = np.array(between[j])
+            way = points[k] - points[todo[j]]
+            along = way @ inward[j]
+            opposite = (normals[k] @ normals[todo[j]] < -0.5) & (along > 0.0)
+            opposite &= (way**2).sum(axis=1) - along**2 < spacing**2
+            good[j] = not (opposite & (((points[k] - x[j]) * normals[k]).sum(axis=1) < 0.0)).any()
         offsets[todo[good]] = length * inward[good]
         todo = todo[~good]
     return offsets
