@@ -43,6 +43,10 @@ class ConfigError(SoftmodeError, ValueError):
     """An option or argument is unknown or outside its range."""
 
 
+class GraspError(SoftmodeError, ValueError):
+    """A gripper has no grasp of an object."""
+
+
 class MissingExtraError(SoftmodeError, ImportError):
     """An optional dependency is absent."""
 

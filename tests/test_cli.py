@@ -12,6 +12,7 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from softmode.cli.main import main
@@ -109,6 +110,16 @@ def test_other_policies_play(policy: str, capsys: pytest.CaptureFixture[str], sh
     assert main([*PLAY, "--policy", policy, "--episodes", "2", "--youngs-modulus", "1e5"]) == 0
     out = capsys.readouterr().out
     assert "seed 0: E 1e+05 Pa" in out and "seed 1" in out and "0 of 2 episodes succeeded" in out
+    assert out.count("success: False, never touched") == 2
+
+
+def test_play_says_what_the_gripper_cannot_take(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A block of 12 cm: exit code 2, its width, the gripper's, and the size that fits; no episode is told."""
+    file = tmp_path / "block.stl"
+    trimesh.creation.box((1.0, 1.0, 1.0)).export(file)
+    assert main([*PLAY, "--object", str(file), "--size", "0.12"]) == 2
+    out, err = capsys.readouterr()
+    assert "120 mm wide" in err and "takes 84 mm" in err and "--size times 0.70" in err and "seed 0" not in out
 
 
 def test_a_task_of_ones_own_plays(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:

@@ -142,7 +142,13 @@ def test_show_draws_modes_weights_and_spectra(assets: Path, tmp_path: Path, caps
     out = tmp_path / "toy.png"
     assert run(assets, "show", "box.obj", "-o", str(out)) == 0
     said = capsys.readouterr().out
-    for words in ("cubature_force_error ", "eigenvalues [1/m^2]", "frequencies [Hz]", f"wrote {out}"):
+    for words in (
+        "cubature_force_error ",
+        "eigenvalues [1/m^2]",
+        "frequencies [Hz]",
+        "grasp [mm, mm, deg]",
+        f"wrote {out}",
+    ):
         assert words in said
     assert listing(tmp_path) == ["toy.png"]
     picture = np.asarray(Image.open(out).convert("RGB")).astype(int)

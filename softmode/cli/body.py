@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from softmode.cli.common import finding_line, optional_argument, own_object, quiet_warp, same_fields, short_name
 from softmode.cli.object_options import ObjectOptions, named_numbers
-from softmode.errors import ConfigError
+from softmode.errors import ConfigError, GraspError
 from softmode.files import check_place
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ class BodyBuild(_Asset):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BodyShow(_Asset):
-    """Draw a body: soft modes, skinning weights, cubature, kernels, spectra, report.
+    """Draw a body: soft modes, skinning weights, cubature, kernels, grasps, spectra, report.
 
     Example: softmode body show toy.npz -o toy.png
     """
@@ -124,7 +125,7 @@ class BodyShow(_Asset):
     def run(self) -> int:
         """Draw, print, return 0."""
         out = self.target(self.out, ".png")
-        from softmode.viz.body_picture import mode_frequencies, write_body_picture
+        from softmode.viz.body_picture import mode_frequencies, rest_grasps, write_body_picture
 
         body, splats, report = _examined(self)
         material = _material(body)
@@ -135,6 +136,14 @@ class BodyShow(_Asset):
         print(f"{'eigenvalues [1/m^2]':34} {'  '.join(f'{value:.4g}' for value in body.eigenvalues)}")
         lowest = mode_frequencies(body, **material)[:8]
         print(f"{'frequencies [Hz]':34} {'  '.join(f'{value:.4g}' for value in lowest)}")
+        try:
+            best = rest_grasps(body, **material)[0]
+            width, height = 1e3 * best.width, 1e3 * (best.position[2] - body.bounds[0, 2])
+            print(
+                f"{'grasp [mm, mm, deg]':34} {width:.0f} wide, {height:.0f} high, turned {math.degrees(best.yaw):.0f}"
+            )
+        except GraspError as error:
+            print(f"{'grasp':34} none: {error}")
         _print_report(report, measures=True)
         print(f"wrote {out}")
         return 0

@@ -155,11 +155,15 @@ def _play_episode(
     import gymnasium as gym
     from tqdm import tqdm
 
+    from softmode.envs.tasks.lift_soft.log import LiftLog
+    from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
+
     observation, info = env.reset(seed=seed)
     policy = factory(seed)
     for log in logs:
         log.record()
     total, steps, seconds = 0.0, 0, 0.0
+    story = LiftLog(config) if isinstance(config := env.unwrapped.config, LiftSoftConfig) else None
     limit = gym.spec(registered_id(options.env)).max_episode_steps
     with tqdm(total=limit, desc=f"seed {seed}", unit="step", mininterval=bar_interval()) as bar:
         done = False
@@ -173,11 +177,14 @@ def _play_episode(
                 film.add(env.render(), fps)
             for log in logs:
                 log.record()
+            if story is not None:
+                story.record(info)
             bar.update()
+    why = "" if story is None or info["is_success"] else f", {story.reason(info)}"
     modulus = info["parameters"]["youngs_modulus"]
     print(
         f"seed {seed}: E {modulus:.3g} Pa, {1e3 * seconds / max(steps - 1, 1):.1f} ms per control step, "
-        f"return {total:.1f}, success: {info['is_success']}"
+        f"return {total:.1f}, success: {info['is_success']}{why}"
     )
     return bool(info["is_success"])
 

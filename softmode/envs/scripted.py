@@ -6,8 +6,11 @@ import importlib
 from collections.abc import Callable
 from typing import Any
 
-import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
 
+from softmode.envs.scripted_base import Environment, ScriptedPolicy
+from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.errors import ConfigError
 
 _POLICIES = {
@@ -20,22 +23,47 @@ _POLICIES = {
 }
 
 
-def scripted_policy(env: gym.Env) -> Callable[[Any], Any]:
+def scripted_policy(env: Environment) -> Callable[[Any], Any]:
     """Return the scripted policy of an environment: called with an observation it returns an action.
 
+    That of a vector environment returns one action per world, each what it would be in an environment of its own.
+
     Args:
-        env: An environment of one world, wrapped or not.
+        env: An environment, wrapped or not; all worlds of a vector environment live in this process.
 
     Raises:
         ConfigError: If its task has none, or it takes other actions than tool steps.
     """
-    kind = type(getattr(env.unwrapped, "task", None))
+    base = env.unwrapped
+    kind = type(getattr(base, "task", None))
     own = getattr(kind, "scripted_policy", None)
     if own is not None:
         return own(env)
-    for base in kind.__mro__:
-        if base.__name__ in _POLICIES:
-            module, _, name = _POLICIES[base.__name__].partition(":")
-            return getattr(importlib.import_module(f"softmode.envs.tasks.{module}"), name)(env)
+    for parent in kind.__mro__:
+        if parent.__name__ in _POLICIES:
+            module, _, name = _POLICIES[parent.__name__].partition(":")
+            policy = getattr(importlib.import_module(f"softmode.envs.tasks.{module}"), name)
+            return ScriptedWorlds(base, policy) if isinstance(base, SoftVectorEnv) else policy(env)
     hint = f"there is one for {', '.join(_POLICIES)}; a task of yours may set scripted_policy"
     raise ConfigError(f"there is no scripted policy for {env}", hint=hint)
+
+
+class ScriptedWorlds:
+    """A scripted policy in every world of a vector environment; it notices by itself when an episode begins.
+
+    Args:
+        env: The environment.
+        policy: Class of the policy.
+    """
+
+    def __init__(self, env: SoftVectorEnv, policy: type[ScriptedPolicy]) -> None:
+        """Make a policy per world."""
+        self._task = env.task
+        self._policies = [policy(env, world=world) for world in range(env.num_envs)]
+
+    def __call__(self, observation: object = None) -> NDArray[np.float32]:
+        """Return the actions for the present state, shape (num_envs, action_size)."""
+        for policy, elapsed in zip(self._policies, self._task.elapsed.numpy(), strict=True):
+            if elapsed == 0:
+                policy.reset()
+        return np.stack([policy() for policy in self._policies])

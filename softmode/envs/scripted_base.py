@@ -1,4 +1,4 @@
-"""What the scripted policies share: reading world 0 of a task, and actions from ways of the tool."""
+"""What the scripted policies share: reading one world of a task, and actions from ways of the tool."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ from numpy.typing import NDArray
 
 from softmode.envs.reward_kernels import TOUCH_FORCE
 from softmode.envs.soft_env import SoftEnv
+from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.task import Task
 from softmode.errors import ConfigError
 
 Vector = NDArray[np.float64]
+Environment = gym.Env | gym.vector.VectorEnv
 
 
 class ScriptedPolicy:
     """A policy that reads the simulation, not the observation; called with an observation it returns an action.
 
     Args:
-        env: An environment of one world, wrapped or not, with the task that the policy plays.
+        env: An environment, wrapped or not, with the task that the policy plays.
+        world: Which world of a vector environment, all of whose worlds live in this process.
 
     Raises:
         ConfigError: If the environment is another one, or its actions are not tool steps.
@@ -29,16 +32,16 @@ class ScriptedPolicy:
     task_class: ClassVar[type[Task]] = Task
     """The task that it plays."""
 
-    def __init__(self, env: gym.Env) -> None:
+    def __init__(self, env: Environment, *, world: int = 0) -> None:
         """Remember the environment."""
         base = env.unwrapped
-        task = base.task if isinstance(base, SoftEnv) else None
+        task = base.task if isinstance(base, (SoftEnv, SoftVectorEnv)) else None
         if not isinstance(task, self.task_class) or task.config.scene.control.mode != "pose_delta":
             raise ConfigError(
                 f"this scripted policy plays {self.task_class.__name__} in pose_delta mode only",
                 hint="make the environment with control_mode='pose_delta'",
             )
-        self.task, self.scene = task, task.scene
+        self.task, self.scene, self.world = task, task.scene, world
         self.arm, self.control = task.config.scene.arm, task.config.scene.control
 
     def reset(self) -> None:
@@ -53,30 +56,48 @@ class ScriptedPolicy:
     @property
     def tool(self) -> Vector:
         """Commanded position of the tool [m]."""
-        return self.scene.controller.target_position.numpy()[0].astype(float)
+        return self.scene.controller.target_position.numpy()[self.world].astype(float)
+
+    @property
+    def measured(self) -> Vector:
+        """Measured position of the tool [m]."""
+        return self.scene.controller.tool_pose.numpy()[self.world, :3].astype(float)
 
     @property
     def yaw(self) -> float:
         """Commanded yaw of the tool [rad]."""
-        return float(self.scene.controller.target_yaw.numpy()[0])
+        return float(self.scene.controller.target_yaw.numpy()[self.world])
 
     @property
     def centre(self) -> Vector:
         """Centre of mass of object 0 [m]."""
-        return self.scene.object_position.numpy()[0, 0].astype(float)
+        return self.scene.object_position.numpy()[self.world, 0].astype(float)
+
+    @property
+    def velocity(self) -> Vector:
+        """Its velocity [m/s]."""
+        return self.scene.object_velocity.numpy()[self.world, 0].astype(float)
 
     @property
     def weaker_force(self) -> np.floating:
         """Force on the finger that feels less [N]."""
-        return np.linalg.norm(self.scene.finger_force.numpy()[0], axis=1).min()
+        return np.linalg.norm(self.scene.finger_force.numpy()[self.world], axis=1).min()
 
     def segment(self, name: str) -> Vector:
         """Return a segment of the observation vector."""
-        return self.task.observation.numpy()[0, self.task.segments[name][0]].astype(float)
+        return self.task.observation.numpy()[self.world, self.task.segments[name][0]].astype(float)
 
     def drawn(self, name: str) -> Vector:
         """Return a parameter of the episode."""
-        return self.task.table.values.numpy()[0, self.task.table.columns(name)].astype(float)
+        return self.task.table.values.numpy()[self.world, self.task.table.columns(name)].astype(float)
+
+    def surfaces(self) -> list[Vector]:
+        """Return the surface samples of every object [m], each of shape (N, 3)."""
+        counts = [thing.body.surface_count for thing in self.scene.objects]
+        state = self.task.state
+        start = int(state.particle_start.numpy()[self.world * state.stride])
+        points = self.scene.state.particle_q.numpy()[start : start + sum(counts)].astype(float)
+        return np.split(points, np.cumsum(counts)[:-1])
 
     # -- acting -------------------------------------------------------------------------------------------------------
 
@@ -90,6 +111,12 @@ class ScriptedPolicy:
         """
         spin = np.clip(turn / self.control.rotation_scale, -1.0, 1.0)
         return np.array([*np.clip(move / self.control.translation_scale, -1.0, 1.0), spin, grip], np.float32)
+
+    def entry(self, opening: float) -> float:
+        """Return the gripper's entry that asks for an opening [m]."""
+        gripper = self.arm.gripper
+        lead = self.control.squeeze_lead * 2.0 * gripper.force_limit / gripper.drive_stiffness
+        return float(np.clip(2.0 * (opening + lead) / (gripper.stroke + lead) - 1.0, -1.0, 1.0))
 
     def regulated(self, grip: float, wanted: float, *, closing: float, holding: float) -> float:
         """Return the gripper's next entry: it closes while the weaker finger feels too little, and opens otherwise.

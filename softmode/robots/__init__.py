@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from softmode.robots.assets import available, fetch
     from softmode.robots.control import ArmController, ArmControlOptions
     from softmode.robots.description import JointDrive, RobotDescription, RobotGripper, RobotIndices
+    from softmode.robots.grasp_planner import Grasp, plan_grasps
+    from softmode.robots.jaws import ParallelJaw
     from softmode.robots.loading import load
     from softmode.robots.soft_fingertips import SoftFingertips, add_soft_fingertips
 
@@ -23,8 +25,10 @@ __all__ = [
     "ArmController",
     "ArmDescription",
     "ArmIndices",
+    "Grasp",
     "GripperDescription",
     "JointDrive",
+    "ParallelJaw",
     "RobotDescription",
     "RobotGripper",
     "RobotIndices",
@@ -34,6 +38,7 @@ __all__ = [
     "available",
     "fetch",
     "load",
+    "plan_grasps",
 ]
 
 __getattr__, __dir__ = lazy_names(__name__)

@@ -6,6 +6,7 @@ to begin; `marker_place` where the splats of a goal are.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, get_args
@@ -17,7 +18,7 @@ from softmode.checks import SEED_MAX, require_choice, require_number
 from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.materials.material import Material
 from softmode.deformables.tools.grips import GripOptions
-from softmode.errors import ConfigError
+from softmode.errors import ConfigError, GraspError
 from softmode.learning.players import check_policy, policy_factory, trained_policy
 from softmode.objects.config import ObjectConfig
 from softmode.objects.placed import Placed
@@ -184,6 +185,7 @@ class EnvScene:
         self.config = base
         self._factory = policy_factory(policy, self._env, trained)
         self.seed, self.episode = seed, 0
+        self._told = ""
         self.reset()
 
     @property
@@ -197,7 +199,14 @@ class EnvScene:
 
     def step(self) -> None:
         """Take a control step."""
-        self._observation, _, terminated, truncated, info = self._env.step(self._policy(self._observation))
+        try:
+            action = self._policy(self._observation)
+        except GraspError as error:  # the arm waits; the object may be pulled to where it can be grasped
+            action = np.zeros(self._env.action_space.shape, np.float32)
+            if str(error) != self._told:
+                self._told = str(error)
+                print(f"softmode: {error}", file=sys.stderr)
+        self._observation, _, terminated, truncated, info = self._env.step(action)
         self._done, self._failed = terminated or truncated, terminated
         self.terms = dict(info["reward_terms"])
         self.success = bool(info["is_success"])

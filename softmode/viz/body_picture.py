@@ -1,4 +1,4 @@
-"""One picture of a body: rest, soft modes, skinning weights, cubature, kernels, spectrum, and what its report says."""
+"""One picture of a body: rest, soft modes, skinning weights, cubature, kernels, grasps, spectra, and its report."""
 
 from __future__ import annotations
 
@@ -11,13 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.cubature import POISSON_RATIO
-from softmode.deformables.build.reduced_stiffness import elastic_modes, reduced_stiffness
+from softmode.deformables.build.body_modes import soft_modes, surface_modes
 from softmode.deformables.build.report import BodyReport
-from softmode.errors import ConfigError, needs_extra
+from softmode.deformables.materials.material import Material
+from softmode.errors import ConfigError, GraspError, needs_extra
 from softmode.files import whole_file
+from softmode.robots.arm import ArmDescription
+from softmode.robots.grasp_planner import Grasp, plan_grasps
+from softmode.robots.jaws import ParallelJaw
 from softmode.splats.splats import SH_DC, Splats
 
 Array = NDArray[np.float64]
@@ -37,26 +41,6 @@ _COLORS = {"broken": "#b3261e", "warning": "#9a5b00", "note": "#44546a"}
 _REGION = np.array([0.85, 0.15, 0.45])
 
 
-def soft_modes(body: ReducedBody, count: int) -> tuple[Array, Array]:
-    """Return elastic modes at rest, by the body's own cubature.
-
-    Args:
-        body: The body.
-        count: How many modes, at most.
-
-    Returns:
-        All eigenvalues lambda > 0 for E = 1 and nu = `cubature.POISSON_RATIO` [m], ascending, with omega^2 = E lambda /
-        (rho V); and the lowest modes as coordinates q, shape (count, n, 3).
-    """
-    free = slice(body.driven_count, None)
-    gradient = body.grad_basis.astype(np.float64)[:, free].transpose(1, 2, 0)
-    value, mode = elastic_modes(reduced_stiffness(gradient, body.weights * body.stiffness_scale, POISSON_RATIO))
-    count = min(count, len(value))
-    q = np.zeros((count, body.function_count, 3))
-    q[:, free] = mode[:, :count].T.reshape(count, 3, body.function_count - body.driven_count).transpose(0, 2, 1)
-    return value, q
-
-
 def mode_frequencies(body: ReducedBody, *, youngs_modulus: float, density: float) -> Array:
     """Return the natural frequencies of the undamped body [Hz], ascending, without rigid motions.
 
@@ -67,6 +51,33 @@ def mode_frequencies(body: ReducedBody, *, youngs_modulus: float, density: float
     """
     value = soft_modes(body, 0)[0]
     return np.sqrt(youngs_modulus * value / (density * body.volume)) / (2.0 * np.pi)
+
+
+def rest_grasps(body: ReducedBody, *, youngs_modulus: float, density: float) -> tuple[Grasp, ...]:
+    """Return the best grasps of a body that stands as it is built, by the built-in arm, in the body frame.
+
+    Args:
+        body: The body.
+        youngs_modulus: Young's modulus [Pa].
+        density: Density [kg/m^3].
+
+    Raises:
+        GraspError: If none fits.
+    """
+    weight, friction = 9.81 * density * body.volume, Material().friction
+    return plan_grasps(
+        body.surface_points,
+        body.surface_normals,
+        body.surface_areas,
+        ParallelJaw.of(ArmDescription()),
+        friction=friction,
+        force=max(6.0, 2.5 * weight / friction),
+        weight=weight,
+        centre=np.zeros(3),
+        modes=surface_modes(body) / np.sqrt(youngs_modulus),
+        ground=float(body.surface_points[:, 2].min()),
+        count=3,
+    )
 
 
 def write_body_picture(
@@ -124,14 +135,15 @@ def write_body_picture(
     titles = ["at rest", *(f"soft mode {k + 1}: {frequency[k]:.3g} Hz" for k in range(len(modes)))]
     _strip(figure, rows[0], titles, pictures[: len(titles)])
     _strip(figure, rows[1], names, pictures[len(titles) :])
-    lower = rows[2].subgridspec(1, 4, width_ratios=(1.0, 1.0, 0.9, 1.9), wspace=0.14)
+    lower = rows[2].subgridspec(1, 5, width_ratios=(0.85, 0.85, 0.85, 0.8, 2.1), wspace=0.24)
     _draw_points(figure.add_subplot(lower[0]), body)
     _draw_kernels(figure.add_subplot(lower[1]), body)
-    spectra = lower[2].subgridspec(2, 1, hspace=0.75)
+    _draw_grasps(figure.add_subplot(lower[2]), body, youngs_modulus, density)
+    spectra = lower[3].subgridspec(2, 1, hspace=0.75)
     _draw_spectrum(figure.add_subplot(spectra[0]), body.eigenvalues[1:], "skinning eigenvalues [1/m$^2$]", "eigenmode")
-    title = f"frequencies [Hz], E = {youngs_modulus:.3g} Pa, {density:.3g} kg/m$^3$"
+    title = f"[Hz], E = {youngs_modulus:.3g} Pa, {density:.3g} kg/m$^3$"
     _draw_spectrum(figure.add_subplot(spectra[1]), frequency, title, "elastic mode")
-    _write_report(figure.add_subplot(lower[3]), body, report)
+    _write_report(figure.add_subplot(lower[4]), body, report)
     canvas.draw()
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3])
     with whole_file(target, "picture") as file:
@@ -268,7 +280,7 @@ def _plane(axes: Any, body: ReducedBody, title: str) -> tuple[Array, Array]:
 
 def _draw_points(axes: Any, body: ReducedBody) -> None:
     """Draw the cubature points, as large as their volume, near ones darker."""
-    right, up = _plane(axes, body, "cubature points, area by volume")
+    right, up = _plane(axes, body, "cubature points by volume")
     order = np.argsort(body.points @ TOWARDS)
     depth = body.points[order] @ TOWARDS
     shade = (depth - depth[0]) / max(float(np.ptp(depth)), 1e-300)
@@ -281,11 +293,39 @@ def _draw_kernels(axes: Any, body: ReducedBody) -> None:
     """Draw the kernel centres, and the nominal radius of a few."""
     from matplotlib.patches import Circle
 
-    right, up = _plane(axes, body, "kernel centres, radii of every tenth")
+    right, up = _plane(axes, body, "kernels, some radii")
     x, y = body.centres @ right, body.centres @ up
     axes.scatter(x, y, s=5, color="#7a3e9d", linewidths=0)
     for place in np.column_stack([x, y, body.radii])[::10].tolist():
         axes.add_patch(Circle(place[:2], place[2], fill=False, color="#7a3e9d", alpha=0.35, lw=0.7))
+    axes.autoscale_view()
+
+
+def _draw_grasps(axes: Any, body: ReducedBody, youngs_modulus: float, density: float) -> None:
+    """Draw the pads of the best grasps, and the line between what they touch; or say why there is none."""
+    from matplotlib.colors import to_rgb
+    from matplotlib.patches import Polygon
+
+    try:
+        found = rest_grasps(body, youngs_modulus=youngs_modulus, density=density)
+    except GraspError as error:
+        _plane(axes, body, "no grasp of the arm")
+        words = "\n".join(textwrap.wrap(str(error), 34))
+        axes.text(
+            0.5, -0.04, words, fontsize=7.5, color=_COLORS["warning"], transform=axes.transAxes, ha="center", va="top"
+        )
+        return
+    best, jaw = found[0], ParallelJaw.of(ArmDescription())
+    title = f"best grasps, {1e3 * best.width:.0f} mm wide"
+    right, up = _plane(axes, body, title)
+    view = np.stack([right, up], axis=1)
+    pad = 0.5 * np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]]) * (jaw.pad_width, 0.0, jaw.pad_length)
+    for grasp, color in reversed(list(zip(found, ("#b3261e", "#e39b3c", "#ecc98f"), strict=False))):
+        turn, beside = Rotation.from_euler("z", grasp.yaw), np.array([0.0, 0.5 * grasp.width, 0.0])
+        faces = [turn.apply(pad + side * beside) + grasp.position for side in (1.0, -1.0)]
+        for face in sorted(faces, key=lambda face: float(face.mean(axis=0) @ TOWARDS)):
+            axes.add_patch(Polygon(face @ view, facecolor=(*to_rgb(color), 0.25), edgecolor=color, lw=1.1))
+        axes.plot(*(np.array(grasp.contacts) @ view).T, color=color, lw=1.4, marker="o", ms=3)
     axes.autoscale_view()
 
 
@@ -298,7 +338,7 @@ def _draw_spectrum(axes: Any, values: Array, title: str, label: str) -> None:
         axes.set_yscale("log")
     axes.set_title(title, fontsize=9, pad=3)
     axes.set_xlabel(label, fontsize=8, labelpad=1)
-    axes.tick_params(labelsize=7)
+    axes.tick_params(which="both", labelsize=7)
     axes.spines[["top", "right"]].set_visible(False)
 
 

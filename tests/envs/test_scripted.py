@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import trimesh
 
+from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.lift_soft.scripted import ScriptedLift
-from softmode.envs.tasks.lift_soft.task import LiftSoftEnv
-from softmode.errors import ConfigError
+from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv, lift_scene
+from softmode.errors import ConfigError, GraspError
+from softmode.objects.config import ObjectConfig
+from softmode.splats.colored_mesh import ColoredMesh
+from tests.shapes import SHAPES
 
 
 def play(env: gym.Env, seed: int, **options: float) -> tuple[dict[str, Any], list[bool]]:
@@ -72,7 +78,7 @@ def test_tries_again_after_a_loss(lift: LiftSoftEnv) -> None:
 
 def test_lifts_a_trained_capture(playbot: Path) -> None:
     """A robot from a trained splat, which cannot stand on its pointed foot, is lifted from where it lies."""
-    env = LiftSoftEnv(splat=playbot, size=0.08)
+    env = LiftSoftEnv(splat=playbot)
     assert play(env, 0, youngs_modulus=3.0e4)[0]["is_success"]
 
 
@@ -82,6 +88,51 @@ def test_lifts_a_trained_capture_on_ten_seeds(playbot: Path) -> None:
     env = LiftSoftEnv(splat=playbot, size=0.08)
     results = [play(env, seed)[0]["is_success"] for seed in range(10)]
     assert sum(results) == 10, [seed for seed, won in enumerate(results) if not won]
+
+
+def test_worlds_equal_single_environments(lift: LiftSoftEnv) -> None:
+    """World i of three plays bitwise what the single environment plays with its seed, into the next episode too."""
+    envs: Any = gym.make_vec("softmode/LiftSoft-v0", num_envs=3, max_episode_steps=40)
+    try:
+        observations, _ = envs.reset(seed=4)
+        policy, history = scripted_policy(envs), [observations]
+        for _ in range(70):
+            observations = envs.step(policy(observations))[0]
+            history.append(observations)
+    finally:
+        envs.close()
+    for world in range(3):
+        observation, _ = lift.reset(seed=4 + world)
+        single, steps = ScriptedLift(lift), []
+        for step in range(70):
+            steps.append(observation)
+            if step == 40:  # the vector environment resets where the single one is told to
+                observation, _ = lift.reset()
+                single.reset()
+            else:
+                observation = lift.step(single(observation))[0]
+        np.testing.assert_array_equal(np.array(history)[:70, world], steps)
+
+
+def test_what_does_not_fit_is_told_before_anything_moves() -> None:
+    """A box of 12 cm: the width, the opening and a size that fits; the state keeps its bits."""
+    cube = ObjectConfig(shape="box", extents=(0.12, 0.12, 0.12), build=lift_scene().object.build)
+    env = LiftSoftEnv(config=LiftSoftConfig(scene=replace(lift_scene(), object=cube)))
+    env.reset(seed=0)
+    before = env.scene.state.joint_q.numpy().copy()
+    with pytest.raises(GraspError, match=r"mm wide.*gripper takes 84 mm.*--size times 0\.[67]"):
+        ScriptedLift(env)()
+    np.testing.assert_array_equal(env.scene.state.joint_q.numpy(), before)
+
+
+@pytest.mark.parametrize("name", ["cup", "ring chain"])
+def test_lifts_what_the_middle_does_not_hold(name: str) -> None:
+    """A cup with a wall of 3 mm, and three linked rings, both of 80 mm: lifted on three seeds."""
+    mesh = ColoredMesh.from_trimesh(trimesh.Trimesh(*SHAPES[name].geometry(), process=False), name=name)
+    scene = replace(lift_scene(), object=replace(lift_scene().object, mesh=mesh))
+    env = LiftSoftEnv(config=LiftSoftConfig(scene=scene))
+    results = [play(env, seed)[0]["is_success"] for seed in range(3)]
+    assert all(results), results
 
 
 def test_needs_its_own_environment(joints: LiftSoftEnv) -> None:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.envs.scripted_base import ScriptedPolicy, Vector, bounded
+from softmode.envs.scripted_base import Environment, ScriptedPolicy, Vector, bounded
 from softmode.envs.scripted_grasp import ScriptedGrasp
 from softmode.envs.tasks.place_in_bin.kernels import Metric
 from softmode.envs.tasks.place_in_bin.task import PlaceInBin
@@ -20,6 +19,7 @@ class ScriptedPlace(ScriptedPolicy):
 
     Args:
         env: A PlaceInBin environment, wrapped or not.
+        world: Which world of a vector environment.
         squeeze: Force of each finger as a multiple of the least that friction needs to carry the weight.
         speed: Tool travel per control step with the toy [m].
 
@@ -43,10 +43,10 @@ class ScriptedPlace(ScriptedPolicy):
     task_class = PlaceInBin
     task: PlaceInBin
 
-    def __init__(self, env: gym.Env, *, squeeze: float = 5.0, speed: float = 0.010) -> None:
+    def __init__(self, env: Environment, *, world: int = 0, squeeze: float = 5.0, speed: float = 0.010) -> None:
         """Remember the environment and plan nothing yet."""
-        super().__init__(env)
-        self._grasp, self._speed = ScriptedGrasp(env, self._carry, squeeze=squeeze), speed
+        super().__init__(env, world=world)
+        self._grasp, self._speed = ScriptedGrasp(env, self._carry, squeeze=squeeze, world=world), speed
         self.reset()
 
     def reset(self) -> None:
@@ -70,20 +70,20 @@ class ScriptedPlace(ScriptedPolicy):
 
     def _let_go(self) -> NDArray[np.float32]:
         """Open far enough, then rise; start again if the toy ended up beside the bin."""
-        measured = float(self.scene.controller.opening.numpy()[0])
+        measured = float(self.scene.controller.opening.numpy()[self.world])
         if self._opening is None:
             self._opening = min(measured + self.SPREAD, self.arm.gripper.stroke)
         missing = self.task.rim[2] + self.RISE - self.tool[2]
         opened = measured > self._opening - 0.002
         if not opened:
             self._grip = min(self._grip + 0.1, 1.0)
-        elif missing < 0.01 and self.task.metrics.numpy()[0, Metric.bin_distance] > 0.0:
+        elif missing < 0.01 and self.task.metrics.numpy()[self.world, Metric.bin_distance] > 0.0:
             self.reset()
         return self.action(np.array([0.0, 0.0, np.clip(missing, 0.0, self._speed) * opened]), 0.0, self._grip)
 
     def _carry(self, centre: Vector) -> Vector:
         """Return the next move of the held toy: up, across once it clears the rim, down over its place."""
-        points = self._surfaces()
+        points = self.surfaces()
         lowest = min(float(points[0][:, 2].min()), float(self.tool[2]) - 0.5 * self.arm.gripper.pad_size[2])
         if self._place is None:
             self._place = self._roomiest()
@@ -99,16 +99,10 @@ class ScriptedPlace(ScriptedPolicy):
             way[:2] = 0.0
         return bounded(way, self._speed)
 
-    def _surfaces(self) -> list[Vector]:
-        """Return the surface samples of every object [m]."""
-        points = self.scene.state.particle_q.numpy().astype(float)
-        counts = [thing.body.surface_count for thing in self.scene.objects]
-        return np.split(points[: sum(counts)], np.cumsum(counts)[:-1])
-
     def _roomiest(self) -> Vector:
         """Return the place in the bin that is farthest from the other objects."""
         task = self.task
-        others = self.scene.object_position.numpy()[0, 1:, :2].astype(float)
+        others = self.scene.object_position.numpy()[self.world, 1:, :2].astype(float)
         span = [np.linspace(-1.0, 1.0, 9) * max(half - self.WALL, 0.0) for half in task.half]
         grid = np.stack(np.meshgrid(*span), axis=-1).reshape(-1, 2) + np.array(task.rim[:2])
         if not len(others):

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.envs.scripted_base import ScriptedPolicy
+from softmode.envs.scripted_base import Environment, ScriptedPolicy
 from softmode.envs.tasks.press_soft.kernels import Metric
 from softmode.envs.tasks.press_soft.task import PressSoft
 
@@ -19,6 +18,7 @@ class ScriptedPress(ScriptedPolicy):
 
     Args:
         env: A PressSoft environment, wrapped or not.
+        world: Which world of a vector environment.
         gain: Share of the missing force that a step is to bring.
 
     Raises:
@@ -37,14 +37,14 @@ class ScriptedPress(ScriptedPolicy):
     task_class = PressSoft
     task: PressSoft
 
-    def __init__(self, env: gym.Env, *, gain: float = 0.25) -> None:
+    def __init__(self, env: Environment, *, world: int = 0, gain: float = 0.25) -> None:
         """Remember the environment and plan nothing yet."""
-        super().__init__(env)
+        super().__init__(env, world=world)
         self._gain = gain
 
     def __call__(self, observation: object = None) -> NDArray[np.float32]:
         """Return the action for the present state."""
-        metrics = self.task.metrics.numpy()[0].astype(float)
+        metrics = self.task.metrics.numpy()[self.world].astype(float)
         force, error = metrics[Metric.contact_force], metrics[Metric.force_error]
         aside = (self.centre - self.tool)[:2]
         step = np.zeros(3)

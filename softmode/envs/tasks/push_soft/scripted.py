@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.envs.scripted_base import ScriptedPolicy, Vector, half_turn
+from softmode.envs.scripted_base import Environment, ScriptedPolicy, Vector, half_turn
 from softmode.envs.tasks.push_soft.task import PushSoft
 
 
@@ -18,6 +17,7 @@ class ScriptedPush(ScriptedPolicy):
 
     Args:
         env: A PushSoft environment, wrapped or not.
+        world: Which world of a vector environment.
         speed: Tool travel per control step while pushing [m].
 
     Raises:
@@ -36,9 +36,9 @@ class ScriptedPush(ScriptedPolicy):
     task_class = PushSoft
     task: PushSoft
 
-    def __init__(self, env: gym.Env, *, speed: float = 0.006) -> None:
+    def __init__(self, env: Environment, *, world: int = 0, speed: float = 0.006) -> None:
         """Remember the environment and plan nothing yet."""
-        super().__init__(env)
+        super().__init__(env, world=world)
         self._speed = speed
         self.reset()
 

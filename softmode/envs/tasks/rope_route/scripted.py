@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from softmode.envs.reward_kernels import TOUCH_FORCE
-from softmode.envs.scripted_base import ScriptedPolicy, Vector, bounded
+from softmode.envs.scripted_base import Environment, ScriptedPolicy, Vector, bounded
 from softmode.envs.tasks.rope_route.task import RopeRoute
 
 
@@ -18,6 +17,7 @@ class ScriptedRope(ScriptedPolicy):
 
     Args:
         env: A RopeRoute environment, wrapped or not.
+        world: Which world of a vector environment.
         squeeze: Force of each finger [N].
 
     Raises:
@@ -36,9 +36,9 @@ class ScriptedRope(ScriptedPolicy):
     task_class = RopeRoute
     task: RopeRoute
 
-    def __init__(self, env: gym.Env, *, squeeze: float = 4.0) -> None:
+    def __init__(self, env: Environment, *, world: int = 0, squeeze: float = 4.0) -> None:
         """Remember the environment and plan nothing yet."""
-        super().__init__(env)
+        super().__init__(env, world=world)
         self._squeeze = squeeze
         self.reset()
 
@@ -49,7 +49,7 @@ class ScriptedRope(ScriptedPolicy):
     def __call__(self, observation: object = None) -> NDArray[np.float32]:
         """Return the action for the present state."""
         task, control, tool, force = self.task, self.control, self.tool, self.weaker_force
-        axis = task.axis.numpy()[0].astype(float)
+        axis = task.axis.numpy()[self.world].astype(float)
         grasp, end = axis[task.grasp_point], axis[-1]
         lowest = control.workspace_lower[2]
         along = end - axis[task.grasp_point - 2]

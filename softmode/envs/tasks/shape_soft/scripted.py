@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.envs.scripted_base import ScriptedPolicy, bounded, half_turn
+from softmode.envs.scripted_base import Environment, ScriptedPolicy, bounded, half_turn
 from softmode.envs.tasks.shape_soft.task import ShapeSoft
 
 
@@ -15,6 +14,7 @@ class ScriptedShape(ScriptedPolicy):
 
     Args:
         env: A ShapeSoft environment, wrapped or not.
+        world: Which world of a vector environment.
         speed: Greatest tool travel per control step [m].
         gain: Share of the free end's error that a control step removes.
 
@@ -25,9 +25,9 @@ class ScriptedShape(ScriptedPolicy):
     task_class = ShapeSoft
     task: ShapeSoft
 
-    def __init__(self, env: gym.Env, *, speed: float = 0.005, gain: float = 0.25) -> None:
+    def __init__(self, env: Environment, *, world: int = 0, speed: float = 0.005, gain: float = 0.25) -> None:
         """Remember the environment and plan nothing yet."""
-        super().__init__(env)
+        super().__init__(env, world=world)
         self._speed, self._gain = speed, gain
         rest = self.scene.soft.body.surface_points[self.task.points][:, 2]
         self._end = rest > rest.max() - 0.02

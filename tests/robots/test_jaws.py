@@ -1,0 +1,60 @@
+"""The fingers of a gripper as they are measured: the built-in arm's, and those of robots from files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softmode import robots
+from softmode.errors import ConfigError, GraspError
+from softmode.robots import ArmDescription, GripperDescription, ParallelJaw, plan_grasps
+from tests.robots.files import write_mjcf, write_urdf
+from tests.robots.test_grasp_planner import block, check
+
+
+def test_jaw_of_the_built_in_arm() -> None:
+    """Opening, pads and reach are those of the description; a finger is as thick as pad and finger bar together."""
+    gripper = GripperDescription(stroke=0.07, pad_size=(0.02, 0.005, 0.03), finger_length=0.05)
+    jaw = ParallelJaw.of(ArmDescription(gripper=gripper, home_opening=0.06))
+    assert (jaw.opening, jaw.pad_width, jaw.pad_length, jaw.reach) == (0.07, 0.02, 0.03, 0.05)
+    assert jaw.tip == 0.015 and jaw.thickness == pytest.approx(0.014) and jaw.friction == gripper.friction
+
+
+def test_jaw_of_an_mjcf(tmp_path: Path) -> None:
+    """The small robot's fingers meet at y = -5 mm and travel 40 mm each; the box is 60 x 20 mm."""
+    jaw = ParallelJaw.of(robots.load(write_mjcf(tmp_path)))
+    assert jaw.opening == pytest.approx(0.08, abs=1e-6)
+    assert jaw.frame[1] == pytest.approx(-0.005, abs=1e-6)
+    assert jaw.finger_width == pytest.approx(0.02, abs=1e-6)
+    assert 0.01 <= jaw.thickness <= 0.02 + 1e-6
+
+
+def test_jaw_of_a_urdf(tmp_path: Path) -> None:
+    """Fingers at +-1 cm with a half thickness of 5 mm that travel 3 cm each: 7 cm; they stand out along x."""
+    jaw = ParallelJaw.of(robots.load(write_urdf(tmp_path), asset_root=tmp_path))
+    assert jaw.opening == pytest.approx(0.07, abs=1e-6)
+    assert jaw.pad_length == pytest.approx(0.04, abs=1e-6)
+    np.testing.assert_allclose(jaw.frame[:3], 0.0, atol=1e-6)
+
+
+@pytest.mark.skipif("aloha_arm" not in robots.available(), reason="this mujoco-warp ships no ALOHA arm")
+def test_jaw_of_the_aloha_arm_plans_a_grasp() -> None:
+    """Its tips are 4 mm behind the tool point and close 3.5 mm below it; it takes a block of 40 mm, not of 70 mm."""
+    robot = robots.load("aloha_arm")
+    jaw = ParallelJaw.of(robot)
+    assert jaw.frame[2] == pytest.approx(-0.0035, abs=5e-4)
+    assert jaw.frame[0] + jaw.tip == pytest.approx(-0.004, abs=5e-4)
+    assert 0.05 < jaw.opening < 0.07  # 35 mm of travel each, and the gap between the closed fingers
+    points, normals, areas = block((0.04, 0.04, 0.04))
+    check(points, normals, areas, plan_grasps(points, normals, areas, jaw)[0], jaw)
+    with pytest.raises(GraspError, match="70 mm wide"):
+        plan_grasps(*block((0.07, 0.07, 0.07)), jaw)
+
+
+@pytest.mark.parametrize(("gripper", "words"), [({}, "0 driven fingers"), ({"left": (0.0, 0.04)}, "1 driven fingers")])
+def test_other_grippers_are_refused(gripper: dict[str, tuple[float, float]], words: str, tmp_path: Path) -> None:
+    """No gripper, or one finger, is no parallel gripper."""
+    with pytest.raises(ConfigError, match=words):
+        ParallelJaw.of(robots.load(write_mjcf(tmp_path), gripper=gripper))
