@@ -160,6 +160,26 @@ def whole_file(path: str | os.PathLike[str], what: str = "file", *, make_folders
 # -- archives ---------------------------------------------------------------------------------------------------------
 
 
+def require_content(path: Path, name: str) -> None:
+    """Raise if a file holds nothing, or is a .ply by its name alone.
+
+    Args:
+        path: A file that exists.
+        name: What messages call it.
+
+    Raises:
+        AssetError: If it is empty or mislabelled.
+    """
+    with path.open("rb") as file:
+        head = file.read(80)
+    if not head:
+        raise AssetError(f"{name}: the file is empty", hint="Copy or export it again")
+    if path.suffix.lower() == ".ply" and not head.startswith(b"ply"):
+        raise AssetError(
+            f"{name}: no .ply, it does not begin with 'ply'", hint="Name the file after its kind (.obj, .stl, ...)"
+        )
+
+
 @contextlib.contextmanager
 def damage_errors(what: str, *, hint: str, error: type[SoftmodeError] = AssetError) -> Iterator[None]:
     """Turn whatever reading an .npz in a block raises into one typed error.

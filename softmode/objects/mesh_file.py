@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from softmode.errors import AssetError
+from softmode.files import require_content
 from softmode.splats.colored_mesh import ColoredMesh
 from softmode.stages import tokens
 
@@ -35,6 +36,7 @@ def read_mesh(path: str | os.PathLike[str]) -> ColoredMesh:
     if file.suffix.lower().lstrip(".") not in known:
         hint = f"Readable here are {', '.join('.' + kind for kind in known)}; convert others to .glb"
         raise AssetError(f"{name}: unknown kind {file.suffix or '(no suffix)'!r}", hint=hint)
+    require_content(file, name)
     try:
         scene = trimesh.load_scene(file)
     except Exception as error:  # its readers raise whatever a damaged file leads them to

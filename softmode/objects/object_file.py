@@ -83,6 +83,10 @@ def file_kind(path: str | os.PathLike[str]) -> FileKind:
     if suffix == ".ply":
         found = ply_kind(file)
         return "splat" if found == "splats" else "mesh" if found == "mesh" else "points"
+    if suffix == ".xyz":
+        return "points"
+    if not suffix and file.is_file():
+        raise AssetError(f"file {file}: has no suffix", hint="name it after its kind: .ply, .splat, .glb, .obj, ...")
     if suffix in tokens.SUFFIXES:
         from softmode.objects.stage_asset import asset_kind
 

@@ -8,6 +8,8 @@ from scipy.spatial import ConvexHull, QhullError
 
 STABLE_TILT = 0.1
 """A pose is stable if tilting the object by this angle [rad] in any direction raises its centre of mass."""
+STABLE_RISE = 0.003
+"""By this fraction of its height at least: the facets between samples of a round rim, on which it rolls, are lower."""
 
 
 def stable_rotation(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -34,7 +36,7 @@ def stable_rotation(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
         tilted = np.cos(STABLE_TILT) * candidates + np.sin(STABLE_TILT) * (
             np.cos(azimuth) * side + np.sin(azimuth) * other
         )
-        stable &= (tilted @ points.T).max(axis=1) > height
+        stable &= (tilted @ points.T).max(axis=1) > (1.0 + STABLE_RISE) * height
     if stable[0] or not stable.any():
         return None
     normal = candidates[stable][(candidates[stable] @ down[0]).argmax()]

@@ -102,6 +102,25 @@ def turned(quadrature: Quadrature, rotation: ArrayLike) -> Quadrature:
         surface_points=surface,
         surface_normals=quadrature.surface_normals @ turn.T,
         bounds=np.stack([surface.min(axis=0), surface.max(axis=0)]),
+        cells=quadrature.cells and replace(quadrature.cells, octants=quadrature.cells.octants @ turn.T),
+    )
+
+
+def scaled(quadrature: Quadrature, factor: float) -> Quadrature:
+    """Return the quadrature of an object that is `factor` times as large."""
+    cells, lengths = quadrature.cells, ("voxel", "smoothing", "wall")
+    told = {key: value * factor if key in lengths else value for key, value in quadrature.report.items()}
+    return replace(
+        quadrature,
+        points=quadrature.points * factor,
+        weights=quadrature.weights * factor**3,
+        spacing=quadrature.spacing * factor,
+        surface_points=quadrature.surface_points * factor,
+        surface_areas=quadrature.surface_areas * factor**2,
+        volume=quadrature.volume * factor**3,
+        bounds=quadrature.bounds * factor,
+        report=told,
+        cells=cells and replace(cells, octants=cells.octants * factor, weights=cells.weights * factor**3),
     )
 
 

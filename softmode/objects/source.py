@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +19,14 @@ from softmode.objects.config import ObjectConfig
 from softmode.objects.mesh_file import read_mesh
 from softmode.objects.parts import choose_part
 from softmode.objects.pose import stable_rotation
-from softmode.objects.primitives import Color, primitive_mesh, primitive_quadrature, surface_splats, turned
+from softmode.objects.primitives import (
+    Color,
+    primitive_mesh,
+    primitive_quadrature,
+    scaled,
+    surface_splats,
+    turned,
+)
 from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.formats import read_splats
 from softmode.splats.plush import make_plush
@@ -31,12 +38,16 @@ DEFAULT_COLORS: tuple[Color, Color] = ((0.93, 0.55, 0.22), (0.97, 0.90, 0.76))
 """Colours of a shape that is given none."""
 
 
+SIZE_TOLERANCE = 0.02
+"""Relative error of the size of a fill that is left: bumps of that height lie on its surface."""
+
+
 @dataclass(frozen=True)
 class ObjectSource:
     """What an object is made of, before it is turned to a stable pose."""
 
     splats: Splats
-    """What shows it, upright, standing on z = 0 around the origin, at its size [m]."""
+    """What shows it, upright, standing on z = 0 around the origin, at its size [m] or near it."""
     integrate: Callable[[], Quadrature]
     """Integrates its solid."""
     name: str
@@ -45,6 +56,10 @@ class ObjectSource:
     """What the body depends on beside the configuration."""
     asset_splats: int
     """Number of splats of its file, once cropped, before one part of them was chosen."""
+    fill_size: float | None = None
+    """Longest edge to which its solid is scaled, since a fill may hold more or less than its splats [m]."""
+    capture: dict[str, str | int | float] = field(default_factory=dict)
+    """What was found in its file beside it, for the report."""
 
 
 def object_source(config: ObjectConfig) -> ObjectSource:
@@ -65,21 +80,22 @@ def object_source(config: ObjectConfig) -> ObjectSource:
         splats = surface_splats(mesh, config.splat_count, config.colors or DEFAULT_COLORS)
         solid = partial(primitive_quadrature, shape, extents, count)
         return ObjectSource(splats, solid, shape, (shape, extents), splats.count)
-    splats, given, name = _upright_splats(config)
+    splats, capture, name = _upright_splats(config)
     arrays = (splats.means, splats.scales, splats.quats, splats.opacities)
     solid = partial(quadrature_from_splats, *arrays, surface_count=count, resolution=config.resolution)
-    return ObjectSource(splats, solid, name, ("splats", *arrays, config.resolution), given)
+    key = ("splats", *arrays, config.resolution)
+    return ObjectSource(splats, solid, name, key, int(capture["asset_splats"]), config.size, capture)
 
 
 def standing_quadrature(config: ObjectConfig, source: ObjectSource) -> tuple[Quadrature, NDArray[np.float64]]:
-    """Integrate an object and lay it on a stable side if its pose is to be stable.
+    """Integrate an object, bring it to its size, and lay it on a stable side if its pose is to be stable.
 
     Args:
         config: Which object.
         source: What it is made of.
 
     Returns:
-        The quadrature, and the rotation that was applied, shape (3, 3).
+        The quadrature, and the rotation times the factor that was applied, shape (3, 3).
 
     Raises:
         AssetError: If it encloses no volume.
@@ -88,11 +104,17 @@ def standing_quadrature(config: ObjectConfig, source: ObjectSource) -> tuple[Qua
         quadrature = source.integrate()
     except AssetError as error:
         raise AssetError(f"{source.splats.name}: {error.message}", hint=error.hint) from error
+    quadrature, factor = replace(quadrature, report={**quadrature.report, **source.capture}), 1.0
+    if source.fill_size is not None:
+        extent = float(np.ptp(quadrature.bounds, axis=0).max())
+        if abs(extent / source.fill_size - 1.0) > SIZE_TOLERANCE:
+            factor = source.fill_size / extent
+            quadrature = scaled(quadrature, factor)
     turn = None
     if may_turn(config):
         centre = quadrature.weights @ quadrature.points / quadrature.volume
         turn = stable_rotation(quadrature.surface_points - centre)
-    return (quadrature, np.eye(3)) if turn is None else (turned(quadrature, turn), turn)
+    return (quadrature, factor * np.eye(3)) if turn is None else (turned(quadrature, turn), factor * turn)
 
 
 def stiffness_scale(config: ObjectConfig, quadrature: Quadrature) -> NDArray[np.float64] | None:
@@ -138,10 +160,12 @@ def splats_of_body(splats: Splats, body: ReducedBody, turn: NDArray[np.float64])
     Args:
         splats: Splats of the source, N.
         body: The body.
-        turn: The rotation by which it was laid down, shape (3, 3).
+        turn: The rotation by which it was laid down times the factor that brought it to its size, shape (3, 3).
     """
     if not np.array_equal(turn, np.eye(3)):
-        splats = splats.transformed(rotation=turn)
+        factor = float(np.cbrt(np.linalg.det(turn)))
+        rotation = turn / factor
+        splats = splats.transformed(None if np.allclose(rotation, np.eye(3), atol=1e-12) else rotation, scale=factor)
     low, high = body.bounds + body.offset
     margin = 0.125 * np.linalg.norm(high - low)
     near = ((splats.means >= low - margin) & (splats.means <= high + margin)).all(axis=1)
@@ -174,21 +198,29 @@ def _mesh_solid(mesh: ColoredMesh, surface_count: int) -> Quadrature:
         )
 
 
-def _upright_splats(config: ObjectConfig) -> tuple[Splats, int, str]:
-    """Return the object's splats upright, standing on z = 0, scaled; how many there were; the name of the object."""
+def _upright_splats(config: ObjectConfig) -> tuple[Splats, dict[str, str | int | float], str]:
+    """Return the object's splats upright, standing on z = 0, scaled; what else there was; the name of the object."""
+    capture: dict[str, str | int | float] = {}
     if config.splat is None:
-        cropped = splats = make_plush()
-        name, stray = "plush", 0.0
+        splats = make_plush()
+        name, stray, given = "plush", 0.0, splats.count
     else:
         cropped, name = _cropped_splats(config, config.splat)
-        splats, stray = choose_part(cropped, config.part), 0.002
+        choice = choose_part(cropped, config.part)
+        splats, stray, given = choice.part, 0.002, cropped.count
+        capture = {"part_splats": splats.count, "ground_splats": choice.ground_count}
+        if choice.other is not None:
+            low, high = choice.other.bounds(quantile=0.002)
+            box = np.concatenate([low - 0.02 * (high - low), high + 0.02 * (high - low)])
+            capture |= {"other_splats": choice.other.count, "other_crop": " ".join(f"{x:.4g}" for x in box)}
     low, high = splats.bounds(quantile=stray)
     extent = float((high - low).max())
     if not extent > 0.0:
         raise AssetError(f"{splats.name}: all splats lie at one point", hint="export the asset again")
     scale = config.size / extent
     centre = np.array([*(0.5 * (low + high))[:2], low[2]])
-    return splats.transformed(translation=-scale * centre, scale=scale), cropped.count, name
+    capture["asset_splats"] = given
+    return splats.transformed(translation=-scale * centre, scale=scale), capture, name
 
 
 def _cropped_splats(config: ObjectConfig, given: str | Path | Splats) -> tuple[Splats, str]:

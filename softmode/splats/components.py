@@ -10,6 +10,9 @@ from scipy.spatial import KDTree
 from softmode.checks import require_number
 from softmode.splats.splats import Splats
 
+DENSE = 20_000
+"""Above so many splats a capture is thinned out before its splats are linked."""
+
 
 def split_components(
     splats: Splats, *, gap: float | None = None, min_opacity: float = 0.2, min_count: int = 20
@@ -36,12 +39,17 @@ def split_components(
     solid = np.flatnonzero(splats.opacities >= min_opacity)
     if len(solid) == 0:
         return []
-    tree = KDTree(splats.means[solid])
+    # Of a dense capture one splat in each cell of a quarter of the gap makes the chains.
+    links = solid
+    if len(solid) > DENSE:
+        cell = np.floor(splats.means[solid] / (0.25 * gap)).astype(np.int64)
+        links = solid[np.sort(np.unique(cell, axis=0, return_index=True)[1])]
+    tree = KDTree(splats.means[links])
     pairs = tree.query_pairs(gap, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs), dtype=bool), pairs.T), shape=(len(solid), len(solid)))
+    graph = coo_matrix((np.ones(len(pairs), dtype=bool), pairs.T), shape=(len(links), len(links)))
     label = connected_components(graph, directed=False)[1]
     distance, nearest = tree.query(splats.means)
     every = np.where(distance <= gap, label[nearest], -1)
-    count = np.bincount(label)
+    count = np.bincount(every[solid], minlength=label.max() + 1)
     order = np.argsort(-count, kind="stable")
     return [splats.subset(every == part) for part in order if count[part] >= min_count]

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from softmode.errors import AssetError
-from softmode.files import read_arrays
+from softmode.files import read_arrays, require_content
 from softmode.splats.formats.common import sh_from_colors
 from softmode.splats.mesh_samples import frames_of
 from softmode.splats.splats import MAX_SPLATS, Splats, quats_from_rotations
@@ -21,9 +21,9 @@ _HINT = "Give an .npz with points (N, 3), and normals and colors (N, 3) if there
 
 
 def is_point_cloud(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file is a point cloud: an .npz, or a .ply without faces and without splats."""
+    """Return whether a file is a point cloud: an .npz or .xyz, or a .ply without faces and without splats."""
     file = Path(path)
-    if file.suffix.lower() == ".npz":
+    if file.suffix.lower() in (".npz", ".xyz"):
         return True
     return file.suffix.lower() == ".ply" and ply_kind(file) == "points"
 
@@ -32,14 +32,17 @@ def ply_kind(path: str | os.PathLike[str]) -> str:
     """Return what a .ply holds by its header: "splats", "mesh" or "points".
 
     Raises:
-        AssetError: If the file is missing or cannot be read.
+        AssetError: If the file is missing, cannot be read, holds nothing, or is no .ply.
     """
     try:
+        require_content(Path(path), f"file {path}")
         with open(path, "rb") as file:
             head = file.read(64 * 1024).split(b"end_header")[0]
     except OSError as error:
         raise AssetError(f"file {path}: cannot be read ({error.strerror or error})", hint="Check the path") from error
     words = [line.split() for line in head.splitlines()]
+    if [b"element", b"vertex", b"0"] in words:
+        raise AssetError(f"file {path}: holds no points", hint="Export the asset again")
     names = {line[-1] for line in words if line[:1] == [b"property"]}
     if b"f_dc_0" in names or b"packed_position" in names:
         return "splats"
@@ -48,7 +51,7 @@ def ply_kind(path: str | os.PathLike[str]) -> str:
 
 
 def read_points(path: str | os.PathLike[str]) -> Splats:
-    """Read a point cloud: an .npz with `points` and, if there are any, `normals` and `colors`, or a .ply.
+    """Read a point cloud: an .npz with `points` and, if there are any, `normals` and `colors`, a .ply, or a .xyz.
 
     Args:
         path: The file; positions keep its frame and unit. Colours are 0..1, or integers 0..255.
@@ -60,6 +63,7 @@ def read_points(path: str | os.PathLike[str]) -> Splats:
     name = f"point cloud {file}"
     if not file.is_file():
         raise AssetError(f"{name}: no such file", hint="Check the path")
+    require_content(file, name)
     if file.suffix.lower() == ".npz":
         arrays = read_arrays(file, ("points", "normals", "colors"), what="point cloud", hint=_HINT)
         if "points" not in arrays:

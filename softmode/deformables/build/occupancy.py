@@ -7,16 +7,18 @@ camera looked. `fill_splats` states the rule that turns it into a solid.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import fft, ndimage, sparse
+from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from softmode.deformables.build.indicator import grid_of, solve_indicator
+from softmode.deformables.build.shell_views import orient, splat_normals, spread_samples, wall_thickness
 from softmode.errors import AssetError
 
 Array = NDArray[np.float64]
@@ -32,8 +34,19 @@ LINK = 2.0
 or within a half-opaque disc."""
 PART_LIMIT = 6
 """At most this many parts, the largest by area, are tried as the object."""
-VIEW_COUNT = 96
-"""Directions from which the shell is looked at."""
+RESOLUTIONS = (64, 96, 128, 192, 256, 384)
+"""Voxels along the longest edge that are tried in turn."""
+NODE_LIMIT = 2**24
+"""Most nodes of a grid: 1 GB of memory and ten seconds."""
+VOXELS_ACROSS = 3.0
+"""Voxels across the thinnest walls."""
+SHARE_NOISE = 0.005
+"""A finer fill that holds fewer splats than the coarser one by more than this is not taken."""
+SETTLED = 0.01
+"""Relative change of the volume from one resolution to the next below which walls count as resolved."""
+KEPT_SHARE, KEPT_EXTENT = 0.98, 0.95
+"""Share of the object's splats that the solid holds, and of their extent along every axis, below which the resolution
+is raised."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +57,8 @@ class Occupancy:
     """Level-set function of points (N, 3), negative inside, trilinear."""
     bounds: Array
     """Corners of a box that holds the solid [m], shape (2, 3)."""
+    voxel: float
+    """Distance between the nodes of its grid [m]."""
     members: NDArray[np.bool_]
     """Which splats belong to the object: its shell, what it hides, and the haze on it; shape (N,)."""
     satellites: NDArray[np.bool_]
@@ -58,8 +73,8 @@ def fill_splats(
     quats: ArrayLike,
     opacities: ArrayLike,
     *,
-    resolution: int = 64,
-    outset: float = 0.0,
+    resolution: int | None = None,
+    outset: ArrayLike = 0.0,
 ) -> Occupancy:
     """Turn a shell of splats into a level-set function of the solid it encloses.
 
@@ -67,25 +82,26 @@ def fill_splats(
        parts (linked when closer than twice their distance to the sixth neighbour, or within the half-opaque disc of
        one of them) with less than 1 % of the area.
     2. *The object* is the part whose solid holds the largest ball: a floor slab under the object loses, however wide.
-    3. *Samples*: each splat is spread over its disc with one sample per voxel. The surface lies where a splat seen
-       edge-on is half opaque: outside the centre by sigma_n sqrt(2 ln(2 alpha)), zero for flat splats, so the shell's
-       thickness does not inflate the volume.
-    4. *Orientation by views*: 96 orthographic depth buffers tell which samples are seen from where. The normal (the
-       splat's thin axis; of round splats, that of the neighbourhood) points to the side seen more. Samples that no
-       view sees (inside) or seen equally from both sides (open sheets) are dropped.
-    5. *Fill*: with a_i the area of a sample from the local density, solve  lap(chi) = -div(sum_i a_i n_i G(X - X_i))
-       (Poisson reconstruction with a sine transform). chi is the indicator of the solid smoothed over about one sample
-       spacing; a hole in the shell is closed by a smooth cap.
-    6. *The solid* is chi > the mean of chi over the samples: the connected part that holds the largest ball, without
+    3. *Samples*: each splat is spread over its disc with one sample per voxel. The surface lies where half of the
+       opacity along its normal is passed, which is at the centres: a splat's thickness does not inflate the volume.
+    4. *Orientation by views*: 256 orthographic depth buffers tell which splats are seen from where. The normal (the
+       splat's thin axis; of round splats, that of the neighbourhood) points to the side seen more. Splats that no view
+       sees (inside) or seen equally from both sides (open sheets) are dropped.
+    5. *Fill*: `indicator.solve_indicator` finds the indicator of the solid, smoothed over about one sample spacing, and
+       the level on which the samples lie. A hole in the shell is closed by a smooth cap.
+    6. *The solid* is where the indicator is above that level: the connected part that holds the largest ball, without
        internal voids.
+    7. *Resolution*: from 64 voxels along the longest edge it rises until voxels are a third of the thinnest walls, or
+       the volume changes by less than 1 %, and the solid holds 98 % of the object's splats and 95 % of their extent
+       along every axis; up to 2^24 nodes, and not beyond where it holds fewer splats again.
 
     Args:
         means: Splat centres [m], shape (N, 3).
         scales: Standard deviations [m], shape (N, 3).
         quats: Orientations, xyzw, shape (N, 4).
         opacities: Opacities 0..1, shape (N,).
-        resolution: Voxels along the longest edge; sparse shells get larger voxels.
-        outset: Distance [m] added outside every sample.
+        resolution: Voxels along the longest edge; None chooses. Sparse shells get larger voxels.
+        outset: Distance [m] added outside every sample, one for all or shape (N,).
 
     Returns:
         The occupancy.
@@ -94,10 +110,11 @@ def fill_splats(
         AssetError: If the arrays do not match, hold NaN, or enclose no volume.
     """
     mean, scale, axes, opacity = _validate(means, scales, quats, opacities)
+    beyond = np.broadcast_to(np.asarray(outset, dtype=np.float64), len(mean))
     part, link, report = _split_parts(mean, scale, opacity)
 
-    def fill(index: NDArray[np.intp], voxels: int) -> _Solid:
-        return _fill_part(mean[index], scale[index], axes[index], opacity[index], voxels, outset)
+    def shell(index: NDArray[np.intp]) -> _Shell:
+        return _orient_part(mean[index], scale[index], axes[index], beyond[index])
 
     bulk = np.bincount(part[part >= 0], _area_of(scale, opacity, link)[part >= 0])
     tried = [k for k in np.argsort(-bulk, kind="stable")[:PART_LIMIT] if bulk[k] >= SMALL_PART * bulk.sum()]
@@ -107,17 +124,16 @@ def fill_splats(
         balls = []
         for index in members:
             try:
-                balls.append(fill(index, resolution // 2).ball)
+                balls.append(_fill_shell(shell(index), 32).ball)
             except AssetError:
                 balls.append(0.0)
         best = int(np.argmax(balls))
-    solid = fill(members[best], resolution)
-    chosen = members[best]
+    solid, chosen = _fill_adaptively(shell(members[best]), mean[members[best]], resolution), members[best]
 
     tree = KDTree(mean[chosen])
     size = np.ptp(mean[chosen], axis=0)
     member, satellite = np.zeros(len(mean), dtype=bool), np.zeros(len(mean), dtype=bool)
-    member[chosen] = True
+    member[chosen[solid.kept]] = True
     loose = np.flatnonzero((part < 0) & (scale[:, 0] < 0.25 * float(np.linalg.norm(size))))
     if len(loose):
         member[loose[tree.query(mean[loose])[0] < 0.5 * link]] = True
@@ -132,65 +148,138 @@ def fill_splats(
         "parts": len(tried),
         **solid.report,
     }
-    return Occupancy(level=solid.level, bounds=solid.bounds, members=member, satellites=satellite, report=report)
+    return Occupancy(
+        level=solid.level,
+        bounds=solid.bounds,
+        voxel=solid.voxel,
+        members=member,
+        satellites=satellite,
+        report=report,
+    )
+
+
+@dataclass(frozen=True)
+class _Shell:
+    """The splats of a part that are seen from outside."""
+
+    mean: Array
+    tangent: Array
+    normal: Array
+    confidence: Array
+    outset: Array
+    spacing: float
+    """What the splats resolve: the lesser of their distance and their width [m]."""
+    extent: float
+    """Longest edge of the box that holds them [m]."""
+    thickness: float
+    """Thickness of the thinnest walls [m], infinite if there are none."""
+    hidden: float
+    """Share of the part's splats that is seen from nowhere or from both sides."""
 
 
 @dataclass(frozen=True)
 class _Solid:
     level: Callable[[Array], Array]
     bounds: Array
+    voxel: float
     ball: float
+    volume: float
+    holds: Callable[[Array], NDArray[np.bool_]]
+    """Tells whether points (N, 3) lie in it, or on it to two voxels."""
     report: dict[str, Any]
+    kept: NDArray[np.bool_]
+    """Which splats of the part it holds."""
 
 
-def _fill_part(mean: Array, scale: Array, axes: Array, opacity: Array, resolution: int, outset: float) -> _Solid:
-    """Fill one linked part; steps 3 to 6 of `fill_splats`."""
+def _orient_part(mean: Array, scale: Array, axes: Array, outset: Array) -> _Shell:
+    """Find the outside of one linked part; steps 3 and 4 of `fill_splats`."""
     if len(mean) < 16:
         raise _no_volume(f"{len(mean)} splats")
-    extent = np.ptp(mean, axis=0)
-    if not extent.max() > 0.0:
+    extent = float(np.ptp(mean, axis=0).max())
+    if not extent > 0.0:
         raise _no_volume("all splats lie at one point")
     spacing = _typical_spacing(mean)
     width = float(np.median(scale[:, 1])) if scale.any() else spacing
-    voxel = float(max(extent.max() / resolution, 0.7 * min(spacing, width)))
-    voxel = min(voxel, float(extent.max()) / 12.0)
+    normal, tangent, nearest, scatter = splat_normals(mean, scale, axes)
+    pixel = min(max(extent / RESOLUTIONS[1], 0.7 * min(spacing, width)), extent / 12.0)
+    sign, confidence, seen = orient(mean, normal, tangent, nearest, pixel)
+    keep = seen & (confidence > 0.0)
+    if keep.sum() < 16:
+        raise _no_volume("no closed shell is seen from outside")
+    normal = (normal * sign[:, None])[keep]
+    low, high = np.quantile(mean[keep], [0.002, 0.998], axis=0)
+    extent = float((high - low).max())
+    # What lies within the scatter of the centres is no wall.
+    least = min(max(extent / 256.0, 4.0 * scatter), extent / 16.0)
+    wall = wall_thickness(mean[keep], normal, least, extent / 8.0)
+    return _Shell(
+        mean=mean[keep],
+        tangent=tangent[keep],
+        normal=normal,
+        confidence=confidence[keep],
+        outset=outset[keep],
+        spacing=min(spacing, width),
+        extent=extent,
+        thickness=float(np.quantile(wall, 0.05, method="nearest")),
+        hidden=float(1.0 - keep.mean()),
+    )
 
-    sample, owner = _spread(mean, scale, axes, voxel)
+
+def _fill_adaptively(shell: _Shell, mean: Array, resolution: int | None) -> _Solid:
+    """Fill a shell so finely that thin parts are not lost; step 7 of `fill_splats`, for splats (N, 3) of its part."""
+    low, high = np.quantile(mean, [0.005, 0.995], axis=0)
+    wide = (high - low) > 0.1 * (high - low).max()
+    best, limited = None, False
+    for count in RESOLUTIONS if resolution is None else (resolution,):
+        voxel, _, margin = _lengths(shell, count)
+        limited = best is not None and (
+            voxel >= best.voxel or bool(np.prod(grid_of(low, high, margin, voxel), dtype=float) > NODE_LIMIT)
+        )
+        if limited:
+            break
+        try:
+            found = _fill_shell(shell, count)
+        except AssetError:
+            continue
+        kept = found.holds(mean)
+        span = np.minimum(found.bounds[1], high) - np.maximum(found.bounds[0], low)
+        share, extent = float(kept.mean()), float((span / (high - low))[wide].min())
+        if best is not None and share < best.report["kept_share"] - SHARE_NOISE:
+            break  # Finer than the capture is sharp: the solid breaks up.
+        settled = best is not None and abs(found.volume / best.volume - 1.0) < SETTLED
+        best = replace(found, kept=kept)
+        best.report.update(resolution=count, kept_share=share, kept_extent=extent)
+        if share >= KEPT_SHARE and extent >= KEPT_EXTENT and (settled or VOXELS_ACROSS * voxel <= shell.thickness):
+            break
+    if best is None:
+        raise _no_volume("the splats enclose nothing")
+    best.report["resolution_limited"] = limited
+    return best
+
+
+def _lengths(shell: _Shell, resolution: int) -> tuple[float, float, float]:
+    """Return voxel, smoothing and margin [m] at a resolution; sparse splats are not resolved more finely."""
+    voxel = min(max(shell.extent / resolution, 0.5 * shell.spacing), shell.extent / 12.0)
+    sigma = max(1.2 * voxel, 0.6 * shell.spacing)
+    return voxel, sigma, max(8.0 * voxel, 3.0 * sigma, 0.15 * shell.extent)
+
+
+def _fill_shell(shell: _Shell, resolution: int) -> _Solid:
+    """Fill an oriented shell; steps 5 and 6 of `fill_splats`."""
+    voxel, _, margin = _lengths(shell, resolution)
+    sample, owner = spread_samples(shell.mean + shell.outset[:, None] * shell.normal, shell.tangent, voxel)
     # Samples of one splat are a voxel apart; where splats do not overlap, the gap between them decides how much to
     # smooth.
-    gap = float(np.median(KDTree(sample).query(sample, k=7)[0][:, 6]))
-    sigma = max(1.2 * voxel, 0.6 * gap)
-    normal = _normals(mean, scale, axes)
-    sign, confidence, seen = _orient(sample, normal[owner], owner, len(mean), max(voxel, gap))
-    normal *= sign[:, None]
-    lift = scale[:, 2] * _half_opaque(opacity) + outset
-    keep = seen & (confidence[owner] > 0.0)
-    sample = (sample + (lift[:, None] * normal)[owner])[keep]
-    owner = owner[keep]
-    if len(sample) < 32:
-        raise _no_volume("no closed shell is seen from outside")
-
-    margin = max(8.0 * voxel, 3.0 * sigma, 0.15 * float(extent.max()))
-    origin = sample.min(axis=0) - margin
-    cells = np.ceil((np.ptp(sample, axis=0) + 2.0 * margin) / voxel) + 1
-    shape = np.array([fft.next_fast_len(int(k), real=True) for k in cells])
-    where = (sample - origin) / voxel
-    blur = sigma / voxel
-    density = ndimage.gaussian_filter(_deposit(where, np.ones(len(sample)), shape), blur, mode="constant")
-    # A plane with one sample per area a shows the density 1 / (a sqrt(2 pi) blur); depositing and reading back widen
-    # the filter.
-    area = 1.0 / (np.maximum(_read(density, where), 1e-12) * np.sqrt(2.0 * np.pi * (blur**2 + 1.0 / 3.0)))
-    weight = area * confidence[owner]
-    source = np.zeros(tuple(shape))
-    for d in range(3):
-        flux = _deposit(where, weight * normal[owner, d], shape)
-        source -= np.gradient(ndimage.gaussian_filter(flux, blur, mode="constant"), axis=d)
-    chi = _solve_poisson(source)
-    level = float(np.average(_read(chi, where), weights=weight))
-    solid = chi > level
+    sigma = max(1.2 * voxel, 0.6 * _typical_spacing(sample))
+    field = solve_indicator(
+        sample, shell.normal[owner], shell.confidence[owner], voxel=voxel, sigma=sigma, margin=max(margin, 3.0 * sigma)
+    )
+    level = field.mean_level
+    difference = field.level - field.value
+    solid = difference < 0.0
     labelled: Any = ndimage.label(solid)
     label, count = labelled
-    if not level > 0.15 or count == 0 or float(chi.max()) < 1.3 * level:
+    if not level > 0.1 or count == 0 or float(field.value.max()) < 1.1 * level:
         raise _no_volume("the splats enclose nothing")
     depth: Any = ndimage.distance_transform_edt(solid)
     largest: Any = ndimage.maximum(depth, label, np.arange(1, count + 1))
@@ -198,25 +287,43 @@ def _fill_part(mean: Array, scale: Array, axes: Array, opacity: Array, resolutio
     main = label == 1 + int(balls.argmax())
     whole: Any = ndimage.binary_fill_holes(main)
     inside = np.argwhere(whole)
-    if len(inside) < 64 or balls.max() < 1.5:
+    if len(inside) < 64:
         raise _no_volume(f"{len(inside)} voxels are enclosed")
-    chi = np.where(solid & ~main, 0.5 * level, chi)
-    chi = np.where(whole & ~main, np.maximum(chi, 1.5 * level), chi)
+    difference[solid & ~main] = 0.5 * level
+    difference[whole & ~main] = np.minimum(difference[whole & ~main], -0.5 * level)
     # One and a half voxels around the outermost inner nodes hold the whole zero level of the trilinear field.
-    bounds = origin + voxel * np.stack([inside.min(axis=0) - 1.5, inside.max(axis=0) + 1.5])
+    bounds = field.origin + voxel * np.stack([inside.min(axis=0) - 1.5, inside.max(axis=0) + 1.5])
+    near: Any = ndimage.binary_dilation(whole, ndimage.generate_binary_structure(3, 2), iterations=2)
 
     def signed(x: Array) -> Array:
-        return (level - _read(chi, (x - origin) / voxel)) * voxel
+        where = (x - field.origin) / voxel
+        return ndimage.map_coordinates(difference, where.T, order=1, mode="nearest", output=np.float64) * voxel
+
+    def holds(x: Array) -> NDArray[np.bool_]:
+        node = np.rint((x - field.origin) / voxel).astype(np.int64)
+        inner = ((node >= 0) & (node < near.shape)).all(axis=1)
+        found = np.zeros(len(x), dtype=bool)
+        found[inner] = near[tuple(node[inner].T)]
+        return found
 
     report = {
-        "hidden_samples": float(1.0 - keep.mean()),
+        "hidden_samples": shell.hidden,
         "voxel": voxel,
         "smoothing": sigma,
         "level": level,
         "detached_volume": float(1.0 - main.sum() / solid.sum()),
         "void_volume": float((whole & ~main).sum() / len(inside)),
     }
-    return _Solid(signed, bounds, float(balls.max()) * voxel, report)
+    return _Solid(
+        signed,
+        bounds,
+        voxel,
+        float(balls.max()) * voxel,
+        len(inside) * voxel**3,
+        holds,
+        report,
+        np.zeros(0, dtype=bool),
+    )
 
 
 def _no_volume(reason: str) -> AssetError:
@@ -252,7 +359,8 @@ def _validate(
 
 def _typical_spacing(x: Array) -> float:
     """Return the median distance to the sixth neighbour, about one and a half spacings on a surface."""
-    return float(np.median(KDTree(x).query(x, k=min(7, len(x)))[0][:, -1]))
+    few = x[:: max(1, len(x) // 20_000)]
+    return float(np.median(KDTree(x).query(few, k=min(7, len(x)))[0][:, -1]))
 
 
 def _half_opaque(opacity: Array) -> Array:
@@ -288,99 +396,3 @@ def _split_parts(mean: Array, scale: Array, opacity: Array) -> tuple[NDArray[np.
     found: Any = connected_components(graph, directed=False)
     part[index] = found[1]
     return part, link, {"faint": int(faint.sum()), "huge": int((huge & ~faint).sum())}
-
-
-def _spread(mean: Array, scale: Array, axes: Array, voxel: float) -> tuple[Array, NDArray[np.intp]]:
-    """Cover each splat's disc (one standard deviation) with samples a voxel apart; return them and their splat."""
-    steps = np.clip(np.ceil(2.0 * scale[:, :2] / voxel), 1, 9).astype(int)
-    position, owner = [], []
-    for a, b in np.unique(steps, axis=0):
-        member = np.flatnonzero((steps == (a, b)).all(axis=1))
-        u, v = ((np.arange(k) + 0.5) * (2.0 / k) - 1.0 for k in (a, b))
-        u, v = (g.ravel() for g in np.meshgrid(u, v, indexing="ij"))
-        keep = (u * u + v * v) <= 1.0 if a > 2 and b > 2 else np.ones(len(u), dtype=bool)
-        du = axes[member, :, 0] * scale[member, 0, None]
-        dv = axes[member, :, 1] * scale[member, 1, None]
-        grid = mean[member, None] + u[keep, None] * du[:, None] + v[keep, None] * dv[:, None]
-        position.append(grid.reshape(-1, 3))
-        owner.append(np.repeat(member, int(keep.sum())))
-    return np.concatenate(position), np.concatenate(owner)
-
-
-def _normals(mean: Array, scale: Array, axes: Array) -> Array:
-    """Return unit normals (N, 3) without orientation: the thin axis; of round splats, the neighbourhood's."""
-    normal = axes[:, :, 2].copy()
-    round_ = np.flatnonzero(scale[:, 2] > 0.5 * scale[:, 1] - 1e-300)
-    if len(round_):
-        near = mean[KDTree(mean).query(mean[round_], k=min(12, len(mean)))[1]]
-        near = near - near.mean(axis=1, keepdims=True)
-        normal[round_] = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, 0]
-    return normal
-
-
-def _orient(
-    sample: Array, normal: Array, owner: NDArray[np.intp], splat_count: int, pixel: float
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Look at the samples from all sides.
-
-    Returns:
-        Sign per splat that turns its normal outside, confidence 0..1 per splat, and whether each sample is seen at all.
-    """
-    k = np.arange(VIEW_COUNT) + 0.5
-    polar, azimuth = np.arccos(1.0 - 2.0 * k / VIEW_COUNT), np.pi * (1.0 + np.sqrt(5.0)) * k
-    toward = np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=1)
-    vote, most, views = np.zeros(splat_count), np.zeros(splat_count), np.zeros(len(sample), dtype=int)
-    cell = 1.5 * pixel
-    for direction in toward:
-        helper = np.eye(3)[np.abs(direction).argmin()]
-        right = np.cross(direction, helper)
-        right /= np.linalg.norm(right)
-        flat = np.floor(sample @ np.stack([right, np.cross(direction, right)], axis=1) / cell).astype(np.int64)
-        flat -= flat.min(axis=0)
-        key = flat[:, 0] * (flat[:, 1].max() + 1) + flat[:, 1]
-        depth = -(sample @ direction)
-        front = np.full(key.max() + 1, np.inf)
-        np.minimum.at(front, key, depth)
-        visible = depth <= front[key] + 0.75 * cell
-        views += visible
-        facing = np.where(visible, normal @ direction, 0.0)
-        vote += np.bincount(owner, facing, minlength=splat_count)
-        most += np.bincount(owner, np.abs(facing), minlength=splat_count)
-    trust = np.abs(vote) / np.maximum(most, 1e-300)
-    # Seen almost as much from behind: an open sheet. A wall opposite a hole keeps most of its votes.
-    confidence = np.clip((trust - 0.1) / 0.3, 0.0, 1.0)
-    return np.where(vote < 0.0, -1.0, 1.0), confidence, views >= 2
-
-
-def _corners(where: Array) -> list[tuple[NDArray[np.int64], Array]]:
-    base = np.floor(where).astype(np.int64)
-    part = where - base
-    found = []
-    for corner in np.ndindex(2, 2, 2):
-        found.append((base + corner, np.prod(np.where(corner, part, 1.0 - part), axis=1)))
-    return found
-
-
-def _deposit(where: Array, value: Array, shape: NDArray[np.int64]) -> Array:
-    """Spread values at fractional grid positions trilinearly; the sum is kept."""
-    grid = np.zeros(int(np.prod(shape)))
-    for node, part in _corners(where):
-        grid += np.bincount(np.ravel_multi_index(tuple(node.T), tuple(shape)), part * value, minlength=len(grid))
-    return grid.reshape(tuple(shape))
-
-
-def _read(grid: Array, where: Array) -> Array:
-    """Interpolate trilinearly; positions outside the grid take the border's value."""
-    return ndimage.map_coordinates(grid, where.T, order=1, mode="nearest")
-
-
-def _solve_poisson(source: Array) -> Array:
-    """Solve lap(u) = source on the unit grid with u = 0 outside (seven-point stencil, sine transform)."""
-    eigen: Array = np.zeros((1, 1, 1))
-    for axis, n in enumerate(source.shape):
-        shape = [1, 1, 1]
-        shape[axis] = n
-        eigen = eigen + (2.0 * np.cos(np.pi * np.arange(1, n + 1) / (n + 1)) - 2.0).reshape(shape)
-    spectrum: Any = fft.dstn(source, type=1)
-    solution: Any = fft.idstn(spectrum / eigen, type=1)
-    return solution

@@ -22,6 +22,9 @@ from softmode.errors import AssetError
 Array = NDArray[np.float64]
 SignedDistance = Callable[[Array], ArrayLike]
 
+FINEST = 32
+"""Most sub-cells per axis of a cell."""
+
 
 def quadrature_from_implicit(
     signed_distance: SignedDistance,
@@ -32,6 +35,7 @@ def quadrature_from_implicit(
     seed: int = 0,
     volume: float | None = None,
     area: float | None = None,
+    detail: float | None = None,
 ) -> Quadrature:
     """Integrate the inside (negative side) of a level-set function.
 
@@ -45,6 +49,8 @@ def quadrature_from_implicit(
         seed: Seed of the surface samples.
         volume: Exact volume [m^3] when known; else the sub-sampled one is taken.
         area: Exact surface area [m^2] when known.
+        detail: What the function resolves, such as a third of its thinnest walls [m]; None for what an eighth of a
+            cell resolves.
 
     Returns:
         The quadrature.
@@ -66,7 +72,9 @@ def quadrature_from_implicit(
         return value
 
     # A coarse pass fits the box to the object and estimates volume and area for the choice of the grid.
-    coarse_shape = np.maximum(np.ceil((box[1] - box[0]) / (box[1] - box[0]).max() * 32.0), 4).astype(int)
+    span = box[1] - box[0]
+    coarse = 32.0 if detail is None else float(np.clip(span.max() / detail, 32.0, 128.0))
+    coarse_shape = np.maximum(np.ceil(span / span.max() * coarse), 4).astype(int)
     distance, value, nodes, width = _sample_grid(level, box, coarse_shape)
     reach = distance < width.max()
     if not (distance < 0.5 * width.max()).any():
@@ -79,9 +87,12 @@ def quadrature_from_implicit(
     rough_area = float((np.abs(distance) < width.max()).sum() * width.prod() / (2.0 * width.max()))
     shape = grid_shape(box[1] - box[0], volume or rough_volume, area or rough_area, point_count)
 
-    distance, value, nodes, width = _sample_grid(level, box, shape * SUBDIVISION)
+    cuts = np.full(3, SUBDIVISION)
+    if detail is not None:
+        cuts = np.clip(2 * np.ceil(0.5 * (box[1] - box[0]) / shape / detail), SUBDIVISION, FINEST).astype(int)
+    distance, value, nodes, width = _sample_grid(level, box, shape * cuts)
     filled = _filled(distance, width)
-    axes = [np.arange(n * SUBDIVISION) // (SUBDIVISION // 2) for n in shape]
+    axes = [np.arange(n * cut) // (cut // 2) for n, cut in zip(shape, cuts, strict=True)]
     octant = np.ravel_multi_index(np.meshgrid(*axes, indexing="ij"), tuple(2 * shape)).ravel()
     keep = filled > 0.0
     middle = box.mean(axis=0)
@@ -124,7 +135,7 @@ def _gradient(level: Callable[[Array], Array], points: Array, step: float) -> Ar
 
 def _surface_area(level: Callable[[Array], Array], distance: Array, value: Array, nodes: Array, width: Array) -> float:
     """Return the area [m^2] by the co-area formula, int delta(f) |grad f| dX, with a hat for delta."""
-    near = np.flatnonzero(np.abs(distance) < 3.0 * width.max())
+    near = np.flatnonzero(np.abs(distance) < 6.0 * width.max())
     slope = np.linalg.norm(_gradient(level, nodes[near], 0.25 * float(width.min())), axis=1)
     reach = 1.5 * float(width.max() * np.median(slope[np.abs(distance[near]) < 0.5 * width.max()]))
     hat = np.maximum(1.0 - np.abs(value[near]) / reach, 0.0) / reach

@@ -39,7 +39,8 @@ def quadrature_from_mesh(
 
     Args:
         vertices: Vertex positions [m], shape (V, 3).
-        faces: Vertex indices of the triangles, counter-clockwise seen from outside, shape (T, 3).
+        faces: Vertex indices of the triangles, counter-clockwise seen from outside, shape (T, 3). If they are all the
+            other way round they are turned, and the report says `inside_out`.
         point_count: Target number of quadrature points; the result is near it.
         surface_count: Number of surface samples.
         seed: Seed of the surface samples.
@@ -48,8 +49,7 @@ def quadrature_from_mesh(
         The quadrature; weights sum to the mesh volume, less what overlapping parts count repeatedly (by the chords).
 
     Raises:
-        AssetError: If the mesh is empty, not finite, not closed, not consistently oriented, or of zero or negative
-            volume.
+        AssetError: If the mesh is empty, not finite, not closed, not consistently oriented, or of zero volume.
     """
     check_counts(point_count, surface_count)
     vertex, face = _load_mesh(vertices, faces)
@@ -61,10 +61,12 @@ def quadrature_from_mesh(
     centre = 0.5 * (lower + upper)
     local = corner - centre
     volume = float(np.einsum("ti,ti->", local[:, 0], np.cross(local[:, 1], local[:, 2]))) / 6.0
+    inside_out = volume < 0.0
+    if inside_out:
+        face, corner, local, normal, volume = face[:, ::-1], corner[:, ::-1], local[:, ::-1], -normal, -volume
     if not volume > 1e-9 * float(np.prod(upper - lower)) or not volume > 0.0:
         raise AssetError(
-            f"mesh: the enclosed volume is {volume:.3g} m^3, it must be positive",
-            hint="Flip the faces (inside out) or close and thicken the mesh.",
+            f"mesh: the enclosed volume is {volume:.3g} m^3, it must be positive", hint="Close and thicken the mesh."
         )
     aligned = (np.abs(normal).max(axis=1) > (1.0 - 1e-9) * twice_area) | (twice_area == 0.0)
     shape = grid_shape(upper - lower, volume, 0.5 * float(twice_area[~aligned].sum()), point_count)
@@ -88,7 +90,7 @@ def quadrature_from_mesh(
     surface = select_surface(
         np.einsum("nk,nki->ni", bary, corner[pick]), normal[pick] / twice_area[pick, None], area, surface_count, seed
     )
-    report = {"source": "mesh", "triangles": len(face), "overlapping": overlapping}
+    report = {"source": "mesh", "triangles": len(face), "overlapping": overlapping, "inside_out": inside_out}
     extent = np.stack([lower, upper])
     return finish_quadrature(found, centre, volume, edges, surface, extent, report)
 

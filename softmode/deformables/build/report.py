@@ -16,6 +16,7 @@ from scipy.spatial import ConvexHull, QhullError
 from softmode.deformables.build.cubature import POISSON_RATIO
 from softmode.deformables.build.functions import RANK_TOLERANCE
 from softmode.deformables.build.interior import Interior, interior_from_quadrature, interior_from_surface
+from softmode.deformables.build.occupancy import KEPT_EXTENT, KEPT_SHARE
 from softmode.deformables.build.reduced_stiffness import elastic_modes, reduced_stiffness
 from softmode.errors import BasisError
 
@@ -532,14 +533,28 @@ def _check_asset(body: ReducedBody, told: dict[str, float], notes: _Notes) -> No
             "the mesh is not closed: the body is what its surface encloses when the holes are covered smoothly",
             "close the holes (trimesh.repair.fill_holes, or a modelling tool), and build again",
         )
-    given, left_out = told.get("asset_splats", 0.0), told.get("asset_left_out", 0.0)
+    told_splats = told.get("quadrature_asset_splats", 0.0)
+    given = told.get("asset_splats", told_splats)
+    left_out = told.get("asset_left_out", told_splats - told.get("quadrature_part_splats", told_splats))
     if left_out > 0.0:
         notes.measure("splats of the file left out", left_out)
+        ground, other = told.get("quadrature_ground_splats", 0.0), told.get("quadrature_other_splats", 0.0)
+        what = f"{left_out:.0f} of {given:.0f} splats are floaters or separate parts and were left out"
+        remedy = "look at the picture (softmode body show); crop the capture (--crop), or choose --part"
+        if ground:
+            what += f"; {ground:.0f} of them are the ground beneath"
+            remedy += "; --part all keeps the ground"
+        if other:
+            what += f"; another part has {other:.0f} splats"
+            remedy += f"; --crop {body.provenance['quadrature_other_crop']} takes that one"
+        notes.find("warning" if left_out > 0.002 * given else "note", "left out", what, remedy)
+    _check_fill(told, notes)
+    if told.get("quadrature_inside_out"):
         notes.find(
-            "warning" if left_out > 0.002 * given else "note",
-            "left out",
-            f"{left_out:.0f} of {given:.0f} splats are floaters or separate parts and were left out",
-            "look at the picture (softmode body show); crop the capture (--crop), or choose --part",
+            "note",
+            "inside out",
+            "all faces of the mesh pointed inwards and were turned",
+            "export it with outward faces",
         )
     if told.get("quadrature_overlapping"):
         notes.find(
@@ -563,6 +578,28 @@ def _check_asset(body: ReducedBody, told: dict[str, float], notes: _Notes) -> No
             " fills its object, whose surface may come out too small",
             "give surface points only",
         )
+
+
+def _check_fill(told: dict[str, float], notes: _Notes) -> None:
+    """Read how much of a capture the solid holds that was made of it."""
+    if "quadrature_volume_uncertainty" in told:
+        notes.measure("uncertainty of the volume", told["quadrature_volume_uncertainty"])
+    share, extent = told.get("quadrature_kept_share", 1.0), told.get("quadrature_kept_extent", 1.0)
+    if "quadrature_kept_share" in told:
+        notes.measure("splats of the part in the solid", share)
+        notes.measure("extent of the solid over that of the part", extent)
+    if share >= KEPT_SHARE and extent >= KEPT_EXTENT:
+        return
+    limited = "; finer voxels were over the limit of memory" if told.get("quadrature_resolution_limited") else ""
+    notes.find(
+        "warning",
+        "incomplete fill",
+        f"with {told.get('quadrature_resolution', 0.0):.0f} voxels along its longest edge the solid holds"
+        f" {100.0 * share:.1f} % of the object's splats and {100.0 * min(extent, 1.0):.0f} % of their extent: thin"
+        f" parts or open sheets are missing{limited}",
+        "crop to the part that matters (--crop), fill it more finely (--resolution), or capture thin parts from more"
+        " sides",
+    )
 
 
 def _check_splats(body: ReducedBody, splats: Array, notes: _Notes) -> None:

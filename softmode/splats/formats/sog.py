@@ -162,6 +162,12 @@ def _decode(source: str, read: _Reader) -> Splats:
         meta = _SogMeta(json.loads(read("meta.json", _META_LIMIT)), source)
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise unreadable(source, f"meta.json is no JSON ({error})") from error
+    if "gaussians" in meta and "particles" in meta:
+        raise unreadable(
+            source,
+            "describes a body of particles with Gaussians bound to them, which is no splat file",
+            hint="Write its Gaussians to a .ply: means, scales, rotations, opacities, colours",
+        )
     if "version" not in meta or meta["version"].value != 2:
         raise unreadable(source, "not SOG version 2", hint="Convert it with splat-transform to SOG v2 or to .ply")
     count = meta["count"].integer(1, MAX_SPLATS)

@@ -1,0 +1,76 @@
+"""Fill of captures: shells of known volume, and twelve captures of known objects.
+
+Run with `python -m benchmarks.captures [--scenes]`. Volumes and extents are relative to the truth, times are of one
+core (processor time).
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import numpy as np
+
+from softmode.deformables.build.quadrature import quadrature_from_splats
+from softmode.objects import ObjectConfig
+from softmode.objects.source import object_source, standing_quadrature
+from tests.captures import CAPTURES, SHELLS, render_shell
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=20_000, help="splats of a shell")
+    parser.add_argument("--sigmas", type=float, nargs="+", default=[0.05e-3, 0.4e-3, 1e-3], help="their thickness [m]")
+    parser.add_argument("--scenes", action="store_true", help="the twelve captures instead")
+    options = parser.parse_args()
+    if options.scenes:
+        print_scenes()
+    else:
+        print_shells(options.count, options.sigmas)
+
+
+def print_shells(count: int, sigmas: list[float]) -> None:
+    """Fill every shell at every thickness."""
+    print(f"{'shell':8}{'sigma mm':>10}{'volume':>9}{'+-':>7}{'centre %':>10}{'voxels':>8}{'s':>7}")
+    for name, make in SHELLS.items():
+        solid = make()
+        volume, centre = solid.moments
+        for sigma in sigmas:
+            splats = render_shell(solid, count, sigma=sigma)
+            start = time.process_time()
+            found = quadrature_from_splats(splats.means, splats.scales, splats.quats, splats.opacities)
+            seconds = time.process_time() - start
+            off = (
+                np.linalg.norm(found.weights @ found.points / found.volume - centre)
+                / np.ptp(solid.bounds, axis=0).max()
+            )
+            print(
+                f"{name:8}{1e3 * sigma:10.2f}{found.volume / volume:9.3f}{found.report['volume_uncertainty']:7.3f}"
+                f"{100.0 * off:10.2f}{found.report['resolution']:8d}{seconds:7.1f}",
+                flush=True,
+            )
+
+
+def print_scenes() -> None:
+    """Load every capture as it is."""
+    print(f"{'capture':16}{'splats':>8}{'of part':>9}{'volume':>9}{'extent':>9}{'kept':>7}{'voxels':>8}{'s':>7}")
+    for name, capture in CAPTURES.items():
+        solid, scene = capture.solid(), capture.scene()
+        size = np.ptp(solid.bounds, axis=0)
+        start = time.process_time()
+        config = ObjectConfig(splat=scene, size=float(size.max()), pose="captured", **capture.options)
+        source = object_source(config)
+        found = standing_quadrature(config, source)[0]
+        seconds = time.process_time() - start
+        ratio = np.sort(np.ptp(found.bounds, axis=0)) / np.sort(size)
+        print(
+            f"{name:16}{scene.count:8d}{source.splats.count:9d}{found.volume / solid.volume:9.3f}"
+            f"{ratio[np.abs(ratio - 1.0).argmax()]:9.3f}{found.report['kept_share']:7.3f}"
+            f"{found.report['resolution']:8d}{seconds:7.1f}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
