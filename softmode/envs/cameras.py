@@ -52,7 +52,7 @@ class FollowCamera:
         world_count: Number of worlds.
     """
 
-    SECONDS = 0.35
+    SECONDS = 0.2
     """Time constant of the spring [s]."""
     ROOM = 1.12
     """Width of the picture in units of what is to be seen."""
