@@ -19,6 +19,7 @@ ROOMS = (
     "deformables",
     "splats",
     "robots",
+    "mpm",
     "objects",
     "scenes",
     "envs",
