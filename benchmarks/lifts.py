@@ -1,7 +1,7 @@
 """Count scripted lifts of files and shapes that nobody prepared, without options; what failed is told with its reason.
 
-Run: ``python benchmarks/lifts.py [FILE ...] [--seeds 20] [--only cup torus]``: splat files, or the shapes of
-the tests. Every object is brought to 80 mm; Young's modulus is drawn from 2e4 to 2e6 Pa.
+Run: ``python benchmarks/lifts.py [FILE ...] [--captures] [--only cup torus]``: splat files, or the shapes or
+captures of the tests. Every object is brought to 80 mm; Young's modulus is drawn from 2e4 to 2e6 Pa.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv, lift
 from softmode.errors import GraspError, SoftmodeError
 from softmode.objects.config import ObjectConfig
 from softmode.splats.colored_mesh import ColoredMesh
+from tests.captures import CAPTURES
 from tests.shapes import SHAPES
 
 STEPS = 150
@@ -31,6 +32,13 @@ def files(paths: list[Path]) -> Iterator[tuple[str, ObjectConfig]]:
     """Yield what splat files hold."""
     for path in paths:
         yield path.name, replace(lift_scene().object, splat=path)
+
+
+def captures(names: list[str]) -> Iterator[tuple[str, ObjectConfig]]:
+    """Yield the captures of the tests."""
+    for name, capture in CAPTURES.items():
+        if not names or name in names:
+            yield name, replace(lift_scene().object, splat=capture.scene(), **capture.options)
 
 
 def shapes(names: list[str]) -> Iterator[tuple[str, ObjectConfig]]:
@@ -60,11 +68,14 @@ def main() -> None:
     """Print a line per object."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("files", nargs="*", type=Path)
+    parser.add_argument("--captures", action="store_true", help="the captures of the tests")
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--only", nargs="*", default=[])
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
-    for name, thing in files(options.files) if options.files else shapes(options.only):
+    named = captures if options.captures else shapes
+    things = files(options.files) if options.files else named(options.only)
+    for name, thing in things:
         try:
             env = LiftSoftEnv(config=LiftSoftConfig(scene=replace(lift_scene(), object=thing)), progress=False)
         except SoftmodeError as error:
