@@ -32,11 +32,13 @@ def stable_rotation(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     other = np.cross(candidates, side)
     stable = np.ones(len(candidates), bool)
+    # Half of it keeps an object where it is, so that what was laid down stays.
+    rise = np.where(np.arange(len(candidates)) == 0, 0.5, 1.0) * STABLE_RISE
     for azimuth in np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False):
         tilted = np.cos(STABLE_TILT) * candidates + np.sin(STABLE_TILT) * (
             np.cos(azimuth) * side + np.sin(azimuth) * other
         )
-        stable &= (tilted @ points.T).max(axis=1) > (1.0 + STABLE_RISE) * height
+        stable &= (tilted @ points.T).max(axis=1) > (1.0 + rise) * height
     if stable[0] or not stable.any():
         return None
     normal = candidates[stable][(candidates[stable] @ down[0]).argmax()]
