@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     Source = ObjectConfig | ReducedBody | Splats | ColoredMesh | trimesh.Trimesh | trimesh.Scene
     """What can be loaded beside a file."""
 
-RECIPE = 5
+RECIPE = 6
 """Part of the cache key; raise it when the way from a file or shape to a body changes."""
 Progress = Callable[[str, float], None] | bool | None
 

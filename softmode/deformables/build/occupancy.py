@@ -290,7 +290,11 @@ def _fill_shell(shell: _Shell, resolution: int) -> _Solid:
     if len(inside) < 64:
         raise _no_volume(f"{len(inside)} voxels are enclosed")
     difference[solid & ~main] = 0.5 * level
-    difference[whole & ~main] = np.minimum(difference[whole & ~main], -0.5 * level)
+    # Samples seen through gaps of the shell raise the level around them to about the indicator: deep inside there is no
+    # surface, whatever their noise says.
+    deep: Any = ndimage.binary_erosion(whole, ndimage.generate_binary_structure(3, 3), iterations=2)
+    deep |= whole & ~main
+    difference[deep] = np.minimum(difference[deep], -0.5 * level)
     # One and a half voxels around the outermost inner nodes hold the whole zero level of the trilinear field.
     bounds = field.origin + voxel * np.stack([inside.min(axis=0) - 1.5, inside.max(axis=0) + 1.5])
     near: Any = ndimage.binary_dilation(whole, ndimage.generate_binary_structure(3, 2), iterations=2)
