@@ -1,34 +1,60 @@
 """Frequencies of free bodies beside finite elements, for every solid, Poisson's ratio and number of functions.
 
-Run from the repository root: ``python -m benchmarks.modes [--only NAME ...] [--functions N ...] [--all-points]``.
+Run from the repository root: ``python -m benchmarks.modes [--only NAME ...] [--functions N ...] [--all-points]
+[--monotone]``.
 
 A row: the smallest and largest relative error of the first six frequencies, in percent, of a body as a user builds it
 from the closed surface (cubature included), for each number of functions; "FreeForm" are 8 eigenmodes times affine
-motion, 36 functions.
+motion, 36 functions. With ``--monotone`` a row is the largest rise of one of the frequencies from a number of functions
+to the next larger one: more functions never make a body stiffer, but for what cubature leaves of its error.
 """
 
 from __future__ import annotations
 
 import argparse
 
-from softmode.deformables import BuildOptions, build_body, quadrature_from_mesh
-from tests.oracle.solids import SOLIDS, frequency_errors
+import numpy as np
+
+from softmode.deformables import BuildOptions, Quadrature, build_body, quadrature_from_mesh
+from tests.oracle.solids import SOLIDS, TUBES, eigenvalues, frequency_errors
 
 RATIOS = (0.3, 0.45, 0.49)
+ALL = {**SOLIDS, **TUBES}
+
+
+COUNTS = (10, 16, 24, 36, 48, 64, 80)
+"""Numbers of functions of ``--monotone``."""
+
+
+def largest_rise(quadrature: Quadrature, poissons_ratio: float, cubature_count: int | None) -> float:
+    """Return how much one of the first six frequencies rises at most from a number of functions to the next."""
+    last, rise = np.full(6, np.inf), -np.inf
+    for count in COUNTS:
+        options = BuildOptions(function_count=count, poissons_ratio=poissons_ratio, cubature_count=cubature_count)
+        value = np.sqrt(eigenvalues(build_body(quadrature, options, progress=False), poissons_ratio))
+        last, rise = value, max(rise, float((value / last - 1.0).max()))
+    return rise
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", default=list(SOLIDS), choices=list(SOLIDS), metavar="NAME")
+    parser.add_argument("--only", nargs="+", default=list(ALL), choices=list(ALL), metavar="NAME")
     parser.add_argument("--functions", nargs="+", type=int, default=[24, 36, 48, 80])
     parser.add_argument("--points", type=int, default=4000, help="quadrature points")
     parser.add_argument("--all-points", action="store_true", help="no cubature")
+    parser.add_argument("--monotone", action="store_true", help="the largest rise of a frequency with more functions")
     options = parser.parse_args()
     count = None if options.all_points else BuildOptions().cubature_count
+    if options.monotone:
+        for name in options.only:
+            quadrature = quadrature_from_mesh(*ALL[name]().surface(), point_count=options.points)
+            rises = [f"{nu}: {100.0 * largest_rise(quadrature, nu, count):+.2f} %" for nu in RATIOS]
+            print(f"{name:<26}{'   '.join(rises)}", flush=True)
+        return
     print(f"{'solid':<26}{'nu':>6}{'FreeForm':>16}" + "".join(f"{f'{n} functions':>18}" for n in options.functions))
     for name in options.only:
-        solid = SOLIDS[name]()
+        solid = ALL[name]()
         quadrature = quadrature_from_mesh(*solid.surface(), point_count=options.points)
         freeform = build_body(quadrature, BuildOptions(mode_count=8, cubature_count=count), progress=False)
         for ratio in RATIOS:

@@ -93,7 +93,8 @@ def test_final(seesaw: Seesaw, rows: np.ndarray) -> None:
     assert kinetic[-1] < 1e-3 * kinetic.max()
     wrench = seesaw.scene.solver.body_wrench.numpy()
     np.testing.assert_allclose(wrench[seesaw.plank, :3], (0.0, 0.0, -seesaw.weight), atol=0.01 * seesaw.weight)
-    assert not status_reasons(int(seesaw.scene.solver.status.numpy()[0]))
+    # A toy that lands on the plank may be deep for a step; anything else went wrong.
+    assert set(status_reasons(int(seesaw.scene.solver.status.numpy()[0]))) <= {"penetration"}
 
 
 def main() -> None:

@@ -85,6 +85,10 @@ class CheckpointError(SoftmodeError, ValueError):
     """A policy or checkpoint file is missing, damaged, foreign, or belongs to another environment or version."""
 
 
+class StateError(SoftmodeError, ValueError):
+    """A saved state is damaged, or belongs to another version, task, robot or object."""
+
+
 class RunError(StorageError):
     """The folder of a training run exists, is missing, or cannot be written."""
 

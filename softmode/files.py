@@ -214,13 +214,21 @@ def write_archive(
     Raises:
         StorageError: If it cannot be written; what was there before stays.
     """
-    stored = {**arrays, "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}
+    content = archive_bytes(header, arrays)
     with whole_file(path, what) as file:
-        np.savez(file, allow_pickle=False, **stored)
+        file.write(content)
+
+
+def archive_bytes(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """Return the bytes of the file that :func:`write_archive` writes."""
+    stored = {**arrays, "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, **stored)
+    return stream.getvalue()
 
 
 def read_archive(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | bytes,
     kind: str,
     version: int,
     *,
@@ -231,7 +239,7 @@ def read_archive(
     """Read a file that :func:`write_archive` wrote; no code in it is run, nothing larger than the file is allocated.
 
     Args:
-        path: The file.
+        path: The file, or its bytes.
         kind: Its `format`.
         version: Its `version`.
         what: What it is, for messages.
@@ -244,8 +252,9 @@ def read_archive(
     Raises:
         AssetError: Or ``error``, if the file is missing, damaged, of another kind or of another version.
     """
+    source, path = (io.BytesIO(path), "of bytes") if isinstance(path, bytes) else (Path(path), path)
     with damage_errors(f"{what} {path}", hint=hint, error=error):
-        arrays = _stored_arrays(Path(path))
+        arrays = _stored_arrays(source)
         header = json.loads(arrays.pop("header").tobytes()) if "header" in arrays else None
     if not isinstance(header, dict) or header.pop("format", None) != kind:
         raise error(f"{what} {path}: not a {kind}", hint=hint)
@@ -278,10 +287,10 @@ def read_arrays(
         return {name: file[name] for name in file.files if names is None or name in names}
 
 
-def _stored_arrays(path: Path) -> dict[str, NDArray[Any]]:
+def _stored_arrays(source: Path | io.BytesIO) -> dict[str, NDArray[Any]]:
     """Return the arrays of an uncompressed .npz."""
     arrays: dict[str, NDArray[Any]] = {}
-    with zipfile.ZipFile(path) as archive:
+    with zipfile.ZipFile(source) as archive:
         for member in archive.infolist():
             name = member.filename.removesuffix(".npy")
             if member.compress_type != zipfile.ZIP_STORED or member.file_size != member.compress_size:

@@ -32,9 +32,10 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
     def homes() -> dict[str, str]:
         """Return the module of each public name."""
         import ast
+        import inspect
 
-        spec = sys.modules[package].__spec__
-        source = spec.loader.get_source(package)  # type: ignore[union-attr]  # a package that is imported has both
+        # Not by the package's loader: pytest's, which loads the packages of its plug-ins, gives no source.
+        source = inspect.getsource(sys.modules[package])
         imports = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ImportFrom))
         found = {name.name: "." * node.level + (node.module or "") for node in imports for name in node.names}
         return {name: found[name] for name in sys.modules[package].__all__}

@@ -14,10 +14,12 @@ if TYPE_CHECKING:
     from softmode.deformables.body.regions import Region
     from softmode.deformables.build.build_body import build_body
     from softmode.deformables.build.cache import cached_body
+    from softmode.deformables.build.cut import Cut, cut_body
     from softmode.deformables.build.eigenmodes import Eigenmodes, solve_eigenmodes
-    from softmode.deformables.build.hold import carry_over, hold
+    from softmode.deformables.build.hold import carry_over, hold, paint
     from softmode.deformables.build.occupancy import Occupancy, fill_splats
     from softmode.deformables.build.options import BuildOptions
+    from softmode.deformables.build.patch import Patch
     from softmode.deformables.build.quadrature import (
         quadrature_from_box,
         quadrature_from_capsule,
@@ -25,6 +27,8 @@ if TYPE_CHECKING:
         quadrature_from_sphere,
         quadrature_from_splats,
     )
+    from softmode.deformables.build.quadrature_cuboids import with_integrator_points
+    from softmode.deformables.build.quadrature_density import quadrature_from_density
     from softmode.deformables.build.quadrature_grid import Quadrature
     from softmode.deformables.build.quadrature_implicit import quadrature_from_implicit
     from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
@@ -35,6 +39,7 @@ if TYPE_CHECKING:
     from softmode.deformables.gradients.adjoint import AdjointOptions, AdjointReduced, ReducedGradients
     from softmode.deformables.gradients.adjoint_torch import rollout
     from softmode.deformables.materials.material import Material
+    from softmode.deformables.materials.material_kernels import MaterialModel
     from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
     from softmode.deformables.model.status import status_reasons
     from softmode.deformables.model.velocities import set_velocity
@@ -45,6 +50,7 @@ if TYPE_CHECKING:
     from softmode.deformables.solver.parameters import PARAMETER_FLAGS, ShapeFriction, set_parameters
     from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
     from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
+    from softmode.deformables.tools.inverse_map import InverseMap
     from softmode.deformables.tools.markers import Markers
     from softmode.deformables.tools.sensing import ContactSensor, ForceTorqueSensor, SurfacePressure
 
@@ -57,13 +63,17 @@ __all__ = [
     "BodyReport",
     "BuildOptions",
     "ContactSensor",
+    "Cut",
     "Eigenmodes",
     "ForceTorqueSensor",
     "GripOptions",
     "Grips",
+    "InverseMap",
     "Markers",
     "Material",
+    "MaterialModel",
     "Occupancy",
+    "Patch",
     "Quadrature",
     "ReducedBody",
     "ReducedGradients",
@@ -84,11 +94,14 @@ __all__ = [
     "build_body",
     "cached_body",
     "carry_over",
+    "cut_body",
     "elastic_modes",
     "fill_splats",
     "hold",
+    "paint",
     "quadrature_from_box",
     "quadrature_from_capsule",
+    "quadrature_from_density",
     "quadrature_from_implicit",
     "quadrature_from_mesh",
     "quadrature_from_points",
@@ -101,6 +114,7 @@ __all__ = [
     "set_velocity",
     "solve_eigenmodes",
     "status_reasons",
+    "with_integrator_points",
 ]
 
 __getattr__, __dir__ = lazy_names(__name__)

@@ -479,26 +479,3 @@ def test_contact_of_soft_bodies_is_refused():
     with pytest.raises(ConfigError, match="soft_contact"):
         AdjointReduced(Scene(populate, [body]).reduced, 1)
     AdjointReduced(Scene(populate, [body], options=SolverReducedOptions(soft_contact=False)).reduced, 1)
-
-
-def test_contact_of_automatic_stiffness_is_refused() -> None:
-    """Its stiffness follows E, nu and density, which the gradients do not know: the error names both remedies."""
-    body = cube()
-
-    def gradients(stiffness: float | None, height: float = 0.0498, **options: bool) -> dict[str, np.ndarray]:
-        def populate(world):
-            add_reduced_body(world, body, position=(0.0, 0.0, height), contact_stiffness_per_area=stiffness)
-
-        scene = Scene(populate, [body], gravity=(0.0, 0.0, -GRAVITY), ground=0.3, options=EXACT)
-        adjoint = AdjointReduced(scene.reduced, 2, options=AdjointOptions(**options))
-        adjoint.start(scene.state)
-        for _ in range(2):
-            adjoint.step(scene.state, scene.next_state, scene.control, 0.004)
-            scene.state, scene.next_state = scene.next_state, scene.state
-        return adjoint.backward(loss_q=np.ones((3, len(scene.q()), 3))).numpy()
-
-    with pytest.raises(ConfigError, match=r"contact_stiffness_per_area.*constant_contact_stiffness"):
-        gradients(None)
-    assert np.isfinite(gradients(3.0e6)["youngs_modulus"]).all()
-    assert np.isfinite(gradients(None, constant_contact_stiffness=True)["q"]).all()
-    assert np.isfinite(gradients(None, height=1.0)["youngs_modulus"]).all()  # nothing to touch there

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import warnings
 
 import newton
 import numpy as np
 import pytest
+import trimesh
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
 from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.elastic_functions import SPACE_ERROR, SPACE_MODE_COUNTS
 from softmode.deformables.build.options import FUNCTION_COUNT, BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_mesh, quadrature_from_sphere
 from softmode.deformables.build.reduced_stiffness import reduced_stiffness
@@ -99,6 +102,21 @@ def test_accuracy_out_of_reach_is_refused() -> None:
     """The message says what the most functions reach."""
     with pytest.raises(ConfigError, match="120 functions reach"):
         build_body(quadrature_from_sphere(0.05, point_count=3000), BuildOptions(accuracy=1e-7), progress=False)
+
+
+def test_the_space_grows_where_it_must() -> None:
+    """A bar keeps the smaller space, a thin tube takes the larger one, and says how far from settled it is."""
+    wide = 10 * (min(SPACE_MODE_COUNTS) + 1)
+    assert float(str(built().provenance["space_functions"])) <= wide
+    tube = trimesh.creation.annulus(0.015, 0.025, 0.12, sections=96)
+    quadrature = quadrature_from_mesh(tube.vertices, tube.faces, point_count=2000)
+    options = BuildOptions(cubature_count=None, poissons_ratio=0.3)
+    body = build_body(quadrature, options, progress=False)
+    assert float(str(body.provenance["space_functions"])) > wide
+    assert SPACE_ERROR < float(str(body.provenance["space_error"])) < 0.2
+    fewer = build_body(quadrature, dataclasses.replace(options, function_count=24), progress=False)
+    both = np.concatenate([body.evaluate(body.points)[0], fewer.evaluate(body.points)[0]], axis=1)
+    assert np.linalg.matrix_rank(both, tol=1e-7 * np.linalg.norm(both, 2)) == body.function_count  # Still nested.
 
 
 def test_functions_for_several_ratios(bodies: dict[int, ReducedBody]) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from softmode.deformables.materials.material import Material
-from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.model.authoring import add_pins, add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.errors import ConfigError
 from tests import reference
@@ -22,6 +22,30 @@ def scene_of(integrator, material, *, dt, spin=(0.0, 0.0, 0.0), world_count=1):
         add_reduced_body(world, body, material=material, angular_velocity=spin)
 
     return Scene(populate, [body], options=options, dt=dt, world_count=world_count)
+
+
+@pytest.mark.parametrize(("dt", "printed"), [(0.05, 7.0 / 3.0), (0.1, np.inf)])
+@pytest.mark.filterwarnings("ignore:pins hold")  # a cube that moves as a whole is not stiff there
+def test_step_of_a_spring(dt, printed):
+    """A spring, m = 1 kg, k = 100 N/m, released at 1 m: implicit Euler takes it to 1 / (1 + h^2 k / m), 0.8 at 0.05 s.
+
+    Feng et al. 2024, equation 18, has the stiffness with the other sign, and not the force of the present iterate: the
+    printed increment is x / (1 - h^2 k / m), which goes to 2.33 and is singular at h = 0.1 s.
+    """
+    body, k = cube(), 100.0
+
+    def populate(world):
+        material = Material(youngs_modulus=1.0e6, viscosity=0.0, density=1.0 / body.volume)
+        instance = add_reduced_body(world, body, material=material, position=(1.0, 0.0, 0.0))
+        add_pins(world, instance, body.points, stiffness=k * body.weights / body.volume)
+
+    scene = Scene(populate, [body], options=SolverReducedOptions(tolerance=1.0e-9), dt=dt)
+    scene.step()
+    found = float((body.mean_basis @ scene.q())[0])
+    assert found == pytest.approx(1.0 / (1.0 + dt**2 * k), abs=1e-5)
+    with np.errstate(divide="ignore"):
+        as_printed = 1.0 + 1.0 / np.abs(np.round(1.0 - dt**2 * k, 12))
+    assert as_printed == pytest.approx(printed) and as_printed > found + 1.0
 
 
 @pytest.mark.parametrize(("omega", "kept"), [(1.0, 1.000), (5.0, 0.995), (10.0, 0.967), (30.0, 0.655)])

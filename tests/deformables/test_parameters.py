@@ -75,13 +75,74 @@ def test_a_bad_parameter_written_into_the_model_is_flagged(name, bad):
     array.assign(values)
     scene.solver.notify_model_changed(0)  # density counts from here on
     replay()
-    status = scene.reduced.status.numpy() & bits.WORLD_PARAMETER_RANGE
-    assert status[1] and not status[[0, 2]].any()
+    status = scene.reduced.status.numpy()
+    assert {"parameter_range", f"{name}_range"} <= set(bits.status_reasons(int(status[1])))
+    assert not status[[0, 2]].any()
     values[1] = GIVEN.get(name, 0.0)
     array.assign(values)
     scene.solver.notify_model_changed(0)
     scene.solver.reset(scene.state)
     replay()
+    assert not scene.reduced.status.numpy().any()
+
+
+@pytest.mark.parametrize(
+    ("name", "bad"),
+    [
+        *((name, np.nan) for name in ("pin_stiffness", "pin_target", "shape_material_mu", "gravity")),
+        *((name, -1.0) for name in ("scale", "contact_stiffness", "contact_radius", "shape_material_mu")),
+        ("material_model", 6),
+        ("density", -100.0),
+    ],
+)
+def test_whatever_else_is_written_is_flagged_by_name(name, bad):
+    """Pins, targets, contact, shapes and gravity of one of two worlds; without ``notify_model_changed``."""
+
+    def populate(world):
+        index = add_reduced_body(world, cube(), position=(0.0, 0.0, 0.2))
+        add_pins(world, index, cube().points[:3], stiffness=20.0)
+        world.add_shape_box(-1, hx=0.05, hy=0.05, hz=0.05)
+
+    scene = Scene(populate, [cube()], gravity=DOWN, world_count=2)
+    scene.step()
+    assert not scene.reduced.status.numpy().any()
+    owner = scene.control.softmode if name == "pin_target" else scene.model.softmode
+    array = getattr(scene.model if name in ("shape_material_mu", "gravity") else owner, name)
+    values = array.numpy()
+    values[len(values) // 2] = bad  # the first of the second world
+    array.assign(values)
+    scene.step()
+    first, second = (bits.status_reasons(int(status)) for status in scene.reduced.status.numpy())
+    assert not first and {"parameter_range", f"{name}_range"} <= set(second)
+
+
+def test_a_driven_target_that_is_no_number_is_flagged():
+    """NaN in where a driven region is to be names ``q_driven``."""
+    scene = Scene(lambda world: add_reduced_body(world, clamped()), [clamped()])
+    target = scene.control.softmode.q_driven.numpy()
+    target[0] = np.nan
+    scene.control.softmode.q_driven.assign(target)
+    scene.step()
+    assert "q_driven_range" in bits.status_reasons(int(scene.reduced.status.numpy()[0]))
+
+
+def test_a_body_that_sinks_in_is_flagged():
+    """Of three cubes the one that starts deeper than a twentieth of its size is flagged, and only while it is."""
+
+    def populate(world):
+        add_reduced_body(world, cube(), position=(0.0, 0.0, EDGE / 2))
+
+    scene = Scene(populate, [cube()], gravity=DOWN, ground=0.5, world_count=3)
+    size = float(scene.reduced.view.instances.size.numpy()[0])
+    q = scene.state.softmode.q.numpy().reshape(3, -1, 3)
+    q[1] -= 0.06 * size * cube().linear_coordinates[:, 3:] * np.array([0.0, 0.0, 1.0])
+    scene.state.softmode.q.assign(q.reshape(-1, 3))
+    scene.step()
+    status = scene.reduced.status.numpy()
+    assert "penetration" in bits.status_reasons(int(status[1])) and not status[[0, 2]].any()
+    scene.step(20)
+    scene.reduced.status.zero_()
+    scene.step()
     assert not scene.reduced.status.numpy().any()
 
 

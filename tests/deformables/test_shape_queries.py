@@ -343,6 +343,7 @@ def test_is_closed():
 def test_status_reasons():
     """Every status bit has a name; several come lowest first; an unknown bit is refused."""
     every = [value for name, value in vars(bits).items() if name.startswith("WORLD_")]
+    every += bits.PARAMETER_BITS.values()
     assert sorted(bits.REASONS) == sorted(every) and len(set(bits.REASONS.values())) == len(every)
     assert sorted(bits.REMEDIES) == sorted(bits.REASONS)
     assert bits.status_reasons(bits.WORLD_CONTACT_OVERFLOW, remedies=True) == ("contact_overflow (raise contact_max)",)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from softmode.deformables.body.qgmls import FUNCTIONS
 from softmode.errors import BasisError
 
 _KINDS = {
@@ -102,6 +103,7 @@ def check_fields(body: Mapping[str, Any]) -> None:
             raise BasisError(f"{name}: expected {low}..{high}, got {value.min()}..{value.max()}")
     if (np.diff(body["hidden_pairs"]) <= 0).any():
         raise BasisError("hidden_pairs: not in ascending order")
+    own = FUNCTIONS * k if body["kernel"] == "qgmls" else 0
     counts = np.array([1, 4, 10])[body["handle_degrees"]]
-    if counts.sum() != raw or set(body["core_index"]) != set(range(regions)):
-        raise BasisError(f"transform: expected {counts.sum()} rows and a core for each region, got {raw} rows")
+    if counts.sum() + own != raw or set(body["core_index"]) != set(range(regions)):
+        raise BasisError(f"transform: expected {counts.sum() + own} rows and a core for each region, got {raw} rows")

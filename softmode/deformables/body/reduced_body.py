@@ -1,7 +1,8 @@
 """ReducedBody: the frozen, saveable product of the build.
 
-x(X) = X + sum_k b_k(X) q_k in the body frame (origin: centre of mass). The functions b_k are combinations of the
-skinning products W_j times monomials, orthonormal in the mass inner product (1 / V) sum_p V_p rho_p b_k b_l = delta_kl.
+x(X) = X + sum_k b_k(X) q_k in the body frame (origin: centre of mass). The functions b_k are combinations of raw
+functions, skinning weights W_j times monomials or those of Q-GMLS, orthonormal in the mass inner product (1 / V) sum_p
+V_p rho_p b_k b_l = delta_kl.
 So the kinetic energy is mass / 2 |qdot|^2 and |q| is the rms displacement in metres. Every affine motion is exact.
 
 Without exact regions b_0 = 1, b_1..b_3 are linear, and the others are free of mean and linear moment. With them the
@@ -16,16 +17,18 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from softmode.deformables.body.check import check_fields
+from softmode.deformables.body.qgmls import BasisQGMLS
+from softmode.deformables.body.raw_functions import QuadraticFunctions, RawFunctions, SkinningFunctions
 from softmode.deformables.body.regions import Envelope, Region
-from softmode.deformables.body.rkpm import REACH, BasisRKPM, KernelName
-from softmode.deformables.body.skinning_weights import SkinningWeights, enveloped
+from softmode.deformables.body.rkpm import BasisRKPM, KernelName
+from softmode.deformables.body.skinning_weights import SkinningWeights
 from softmode.deformables.body.visibility import Visibility
 from softmode.errors import AssetError, BasisError, ConfigError
 from softmode.files import read_archive, write_archive
@@ -73,7 +76,8 @@ class ReducedBody:
     linear_coordinates: Array
     """Coefficients c (n, 4) with sum_k b_k c_kj = (X, Y, Z, 1)_j for every X."""
     eigenvalues: Array
-    """Eigenvalues of the skinning eigenmodes [1/m^2], the constant handle's 0 first, shape (m + 1,)."""
+    """Eigenvalues of the skinning eigenmodes [1/m^2], the constant handle's 0 first, shape (m + 1,); of local handles
+    the mean square of the gradient over that of the weight, likewise."""
     bounds: Array
     """Corners of the bounding box in the body frame [m], shape (2, 3)."""
     offset: Array
@@ -81,9 +85,9 @@ class ReducedBody:
     centres: Array
     """Kernel centres [m], shape (K, 3)."""
     radii: Array
-    """Nominal kernel radii [m], shape (K,)."""
-    kernel: KernelName
-    """Bell of the kernels."""
+    """Nominal kernel radii [m], shape (K,); of Q-GMLS those of the supports."""
+    kernel: KernelName | Literal["qgmls"]
+    """Bell of the kernels, or "qgmls" for those of :class:`BasisQGMLS`."""
     handles: Array
     """Coefficients of the weights W_j in the kernels, shape (K, J): constant handle, regions, eigenmodes, responses."""
     handle_degrees: Indices
@@ -91,7 +95,8 @@ class ReducedBody:
     handle_regions: Indices
     """Exact region whose blend is part of a weight, counted among the exact ones, or -1, int64, shape (J,)."""
     transform: Array
-    """b = (W_0 Z, ..., W_J Z) @ transform, Z monomials in (X, Y, Z) over `length`; shape (raw functions, n)."""
+    """b = (W_0 Z, ..., W_J Z) @ transform, Z monomials in (X, Y, Z) over `length`; shape (raw functions, n). Those of
+    Q-GMLS follow after the Z of the constant handle."""
     length: float
     """Unit of length of the raw functions [m]."""
     driven_count: int
@@ -146,7 +151,7 @@ class ReducedBody:
 
     @property
     def mode_count(self) -> int:
-        """Number of skinning eigenmodes m, without the constant handle."""
+        """Number of skinning eigenmodes m, or of local handles, without the constant handle."""
         return len(self.eigenvalues) - 1
 
     @property
@@ -179,9 +184,37 @@ class ReducedBody:
 
     @cached_property
     def kernels(self) -> BasisRKPM:
-        """The reproducing kernels."""
+        """The reproducing kernels.
+
+        Raises:
+            ConfigError: If the functions are those of Q-GMLS.
+        """
+        if self.kernel == "qgmls":
+            raise ConfigError(
+                f"body {self.name!r}: functions of Q-GMLS are made of no skinning weights and reproducing kernels",
+                hint="build it with other handles, such as handles='local'",
+            )
         visibility = Visibility(points=self.material_points, hidden=self.hidden_pairs) if self._divided else None
         return BasisRKPM(centres=self.centres, radii=self.radii, kernel=self.kernel, visibility=visibility)
+
+    @property
+    def skinned(self) -> bool:
+        """Whether the functions are products of skinning weights; those of Q-GMLS are none."""
+        return self.kernel != "qgmls"
+
+    @cached_property
+    def raw(self) -> RawFunctions:
+        """What the functions are combinations of."""
+        return (
+            self._skinning
+            if self.skinned
+            else QuadraticFunctions(kernels=BasisQGMLS(centres=self.centres, radii=self.radii), length=self.length)
+        )
+
+    @cached_property
+    def _skinning(self) -> SkinningFunctions:
+        skin = SkinningWeights(coefficients=self.handles, degrees=self.handle_degrees, blends=self.handle_regions)
+        return SkinningFunctions(kernels=self.kernels, skin=skin, envelope=self._envelope, length=self.length)
 
     @property
     def _divided(self) -> bool:
@@ -235,12 +268,13 @@ class ReducedBody:
 
         Raises:
             BasisError: If points are not finite.
+            ConfigError: If the functions are those of Q-GMLS.
         """
-        inner = self._within_reach(points)[1]
+        skinning, inner = self._skinning, self._within_reach(points)[1]
         weight = np.empty((len(inner), len(self.handle_degrees)))
         gradient = np.empty((*weight.shape, 3))
         for i in range(0, len(inner), _CHUNK):
-            weight[i : i + _CHUNK], gradient[i : i + _CHUNK] = self._weights_inside(inner[i : i + _CHUNK])
+            weight[i : i + _CHUNK], gradient[i : i + _CHUNK] = skinning.weights(inner[i : i + _CHUNK])
         return weight, gradient
 
     def _within_reach(self, points: ArrayLike) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -248,33 +282,20 @@ class ReducedBody:
         x = np.asarray(points, dtype=np.float64)
         if x.ndim != 2 or x.shape[1] != 3 or not np.isfinite(x).all():
             raise BasisError(f"points: expected finite positions of shape (N, 3), got shape {x.shape}")
-        distance, nearest = self.kernels.nearest(x)
-        ratio = distance / (REACH * self.kernels.support[nearest])
+        ratio, centre = self.raw.reach(x)
         far = ratio > 1.0
-        inner = np.where(
-            far[:, None], self.centres[nearest] + (x - self.centres[nearest]) / np.maximum(ratio, 1.0)[:, None], x
-        )
+        inner = np.where(far[:, None], centre + (x - centre) / np.maximum(ratio, 1.0)[:, None], x)
         return x, inner, far
-
-    @cached_property
-    def _skin(self) -> SkinningWeights:
-        return SkinningWeights(coefficients=self.handles, degrees=self.handle_degrees, blends=self.handle_regions)
-
-    def _weights_inside(self, x: Array) -> tuple[Array, Array]:
-        """Evaluate weights (N, J) and gradients (N, J, 3) at points within reach."""
-        return self._skin.evaluate(*enveloped(self.kernels.evaluate(x), self._envelope))
 
     def _evaluate_inside(self, x: Array) -> tuple[Array, Array]:
         """Evaluate functions (N, n) and gradients (N, n, 3) at points within reach."""
-        weight, slope = self._weights_inside(x)
-        raw, raw_gradient = self._skin.products(weight, slope, x, self.length)
+        raw, raw_gradient = self.raw.evaluate(x)
         gradient = np.stack([raw_gradient[:, :, d] @ self.transform for d in range(3)], axis=2)
         return raw @ self.transform, gradient
 
     def covers(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Return which points (N, 3) the kernels reach, that is, which `evaluate` does not clamp."""
-        distance, nearest = self.kernels.nearest(np.asarray(points, dtype=np.float64))
-        return distance <= REACH * self.kernels.support[nearest]
+        return self.raw.reach(np.asarray(points, dtype=np.float64))[0] <= 1.0
 
     def holds(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Return which points (N, 3) belong to the body: within the kernels' reach, or on the sampled surface.

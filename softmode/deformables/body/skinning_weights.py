@@ -93,3 +93,12 @@ class SkinningWeights:
             sloping = np.flatnonzero(np.any(slope[:, :, d], axis=0)[monomial])
             found[d][:, sloping] += weight[:, sloping] * slope[:, monomial[sloping], d]
         return weight * factor, found.transpose(1, 2, 0)
+
+
+def constant_handle(kernel_count: int) -> SkinningWeights:
+    """Return the constant handle alone, with all ten monomials, over so many kernels."""
+    return SkinningWeights(
+        coefficients=np.ones((kernel_count, 1)),
+        degrees=np.full(1, 2, dtype=np.int64),
+        blends=np.full(1, -1, dtype=np.int64),
+    )

@@ -8,12 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from softmode.deformables.body.qgmls import BasisQGMLS
+from softmode.deformables.body.raw_functions import QuadraticFunctions
 from softmode.deformables.body.regions import Envelope, Region
 from softmode.deformables.body.rkpm import BasisRKPM, ShapeFunctions, make_basis
-from softmode.deformables.body.skinning_weights import SkinningWeights, enveloped
-from softmode.deformables.build.eigenmodes import solve_eigenmodes
-from softmode.deformables.build.elastic_functions import SPACE_MODE_COUNT, Held, choose_functions
+from softmode.deformables.body.skinning_weights import SkinningWeights, constant_handle, enveloped
+from softmode.deformables.build.eigenmodes import Eigenmodes, solve_eigenmodes
+from softmode.deformables.build.elastic_functions import SPACE_ERROR, SPACE_MODE_COUNTS, Held, choose_functions
 from softmode.deformables.build.functions import (
+    HELD_RANK_TOLERANCE,
     TRACE_TOLERANCE,
     Functions,
     affine_first,
@@ -21,11 +24,13 @@ from softmode.deformables.build.functions import (
     orthonormal_in_mass,
     orthonormalise,
 )
-from softmode.deformables.build.galerkin import mass_matrix
+from softmode.deformables.build.galerkin import mass_and_gradient_matrix, mass_matrix
+from softmode.deformables.build.local_handles import gather_weights, place_kernels
 from softmode.deformables.build.options import EIGENMODE_COUNT, BuildOptions
 from softmode.deformables.build.region_samples import RegionSamples, drive_matrices, rigid_motions
 from softmode.deformables.build.static_response import lame_parameters, solve_harmonic_weights, solve_static_responses
 from softmode.deformables.build.visibility import Material, divide_at_gaps
+from softmode.errors import ConfigError
 
 Array = NDArray[np.float64]
 
@@ -52,6 +57,8 @@ class Domain:
     """Regions."""
     samples: RegionSamples
     """Points of the regions."""
+    added: Array
+    """Places and radii of further local handles [m], shape (A, 4)."""
     material: Material | None = None
     """Which points of the material touch, so that kernels do not act across gaps; None: they do."""
 
@@ -66,12 +73,12 @@ class Domain:
 class BodyBasis:
     """Kernels, weights and functions of a body."""
 
-    kernels: BasisRKPM
-    """Reproducing kernels."""
+    kernels: BasisRKPM | BasisQGMLS
+    """Kernels."""
     weights: SkinningWeights
-    """Skinning weights."""
+    """Skinning weights; of Q-GMLS the constant handle alone."""
     eigenvalues: Array
-    """Eigenvalues of the eigenmodes among them, the constant handle's 0 first [1/m^2], shape (m + 1,)."""
+    """Eigenvalues of the eigenmodes, or of local handles, the constant handle's 0 first [1/m^2], shape (m + 1,)."""
     functions: Functions
     """Orthonormal functions."""
     gradient: Array
@@ -96,33 +103,129 @@ def make_body_basis(domain: Domain, options: BuildOptions, stage: Callable[[str]
         BasisError: If the basis cannot be built.
         ConfigError: If options do not fit the object.
     """
+    if options.handles == "qgmls":
+        return _quadratic_basis(domain, options, stage)
+    ground = _ground(domain, options)
+    stage("kernels")
+    if options.local:
+        return _basis(ground, domain, options, _local_modes(ground, domain, options), stage)
+    if not options.chosen:
+        return _basis(ground, domain, options, _modes(ground, domain, options.mode_count or EIGENMODE_COUNT), stage)
+    small, large = (min(count, ground.shape.centre_count - 1) for count in SPACE_MODE_COUNTS)
+    basis = _basis(ground, domain, options, _modes(ground, domain, small), stage)
+    if basis.report["space_error"] > SPACE_ERROR and large > small:
+        basis = _basis(ground, domain, options, _modes(ground, domain, large), stage)
+    return basis
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Ground:
+    """Kernels at the quadrature points, and what regions ask of the weights."""
+
+    kernels: BasisRKPM
+    shape: ShapeFunctions
+    blend: Array
+    blend_slope: Array
+    scalar: float
+    """E over the factor of the weight-space Hessian, FreeForm eq. (35)."""
+    springs: Array | None
+    """What soft regions add to the stiffness of the kernels, per E [m], (K, K)."""
+    region_weights: Array
+
+
+def _ground(domain: Domain, options: BuildOptions) -> _Ground:
+    """Return the kernels of a domain and the weights of its regions."""
     count = options.kernels(len(domain.seeds), held=bool(domain.regions))
     kernels = make_basis(domain.seeds, count, kernel=options.kernel, spacing=domain.spacing, seed=options.seed)
     if domain.material is not None:
         kernels = divide_at_gaps(kernels, domain.material, domain.seeds, domain.spacing)
-    envelope, points, volumes = domain.envelope, domain.points, domain.volumes
-    shape, blend, blend_slope = enveloped(kernels.evaluate(points), envelope)
-    stage("kernels")
+    shape, blend, blend_slope = enveloped(kernels.evaluate(domain.points), domain.envelope)
     springs, pull = _springs(kernels, domain)
     mu, lame = lame_parameters(_mean_ratio(options))
-    scalar = 1.0 / (lame + 4.0 * mu)  # Of the weight-space Hessian, FreeForm eq. (35).
-    by_energy = not options.eigenmode_handles
-    modes = solve_eigenmodes(
-        shape,
-        volumes,
-        min(SPACE_MODE_COUNT, shape.centre_count - 1) if by_energy else options.mode_count or EIGENMODE_COUNT,
+    scalar = 1.0 / (lame + 4.0 * mu)
+    return _Ground(
+        kernels=kernels,
+        shape=shape,
+        blend=blend,
+        blend_slope=blend_slope,
+        scalar=scalar,
+        springs=springs,
+        region_weights=_region_weights(
+            domain, shape, blend_slope, *(None if x is None else scalar * x for x in (springs, pull))
+        ),
+    )
+
+
+def _modes(ground: _Ground, domain: Domain, count: int) -> Eigenmodes:
+    """Return a number of eigenmodes."""
+    return solve_eigenmodes(
+        ground.shape,
+        domain.volumes,
+        count,
         stiffness_scale=domain.stiffness,
-        springs=None if springs is None else scalar * springs,
-        vanishing=envelope is not None,
+        springs=None if ground.springs is None else ground.scalar * ground.springs,
+        vanishing=domain.envelope is not None,
     )
+
+
+def _local_modes(ground: _Ground, domain: Domain, options: BuildOptions) -> Eigenmodes:
+    """Return local handles in the place of eigenmodes."""
+    local = gather_weights(ground.kernels, options.local, domain.added)
+    fraction = domain.volumes / domain.volumes.sum()
+    mass, energy = mass_and_gradient_matrix(ground.shape, fraction, fraction * domain.stiffness)
+    size, slope = (np.einsum("kj,kl,lj->j", local, matrix, local, optimize=True) for matrix in (mass, energy))
+    return Eigenmodes(
+        coefficients=np.concatenate([np.ones((len(local), 1)), local], axis=1),
+        eigenvalues=np.concatenate([[0.0], slope / np.maximum(size, 1e-300)]),
+    )
+
+
+def _quadratic_basis(domain: Domain, options: BuildOptions, stage: Callable[[str], None]) -> BodyBasis:
+    """Return the basis of Q-GMLS."""
+    if domain.regions:
+        raise ConfigError("regions: functions of Q-GMLS know none", hint="build it without, or with handles='local'")
+    kernels = place_kernels(domain.points, domain.volumes, options.local, domain.added, seed=options.seed)
+    stage("kernels")
     stage("eigenmodes")
-    region_weights = _region_weights(
-        domain, shape, blend_slope, *(None if x is None else scalar * x for x in (springs, pull))
-    )
-    skin = _weights(domain, options, modes.coefficients, region_weights, shape, blend_slope.shape[1], springs)
+    stage("responses")
+    raw, raw_gradient = QuadraticFunctions(kernels=kernels, length=domain.length).evaluate(domain.points)
+    total, every = domain.volumes.sum(), np.arange(raw.shape[1])
+    fields = raw, raw_gradient, domain.volumes * domain.density / total, domain.volumes * domain.stiffness / total
+    if options.chosen:
+        choice = choose_functions(
+            *fields,
+            lead=np.eye(raw.shape[1])[:, [3, 0, 1, 2]],
+            kept=every[:0],
+            others=every[4:],
+            half=None,
+            quadratic=every[:10],
+            held=None,
+            count=options.function_count,
+            accuracy=options.accuracy,
+            poissons_ratios=options.poissons_ratios,
+        )
+        found, report = affine_first(choice.transform, every[:4], domain.length), choice.report()
+    else:
+        tolerance = min(options.rank_tolerance, HELD_RANK_TOLERANCE)
+        found = orthonormalise(*fields, leading=every[:4], length=domain.length, rank_tolerance=tolerance)
+        report = {}
+    skin = constant_handle(len(kernels.centres))
+    basis = _finished(kernels, skin, np.zeros(1), found, raw_gradient, None, domain, report)
+    stage("functions")
+    return basis
+
+
+def _basis(
+    ground: _Ground, domain: Domain, options: BuildOptions, modes: Eigenmodes, stage: Callable[[str], None]
+) -> BodyBasis:
+    """Return the basis of eigenmodes or local handles: the handles themselves, or the space of the functions."""
+    kernels, shape, blend, blend_slope = ground.kernels, ground.shape, ground.blend, ground.blend_slope
+    envelope, points, springs = domain.envelope, domain.points, ground.springs
+    stage("eigenmodes")
+    skin = _weights(domain, options, modes.coefficients, ground.region_weights, shape, blend_slope.shape[1], springs)
     stage("responses")
     raw, raw_gradient = skin.products(*skin.evaluate(shape, blend, blend_slope), points, domain.length)
-    total, samples = volumes.sum(), domain.samples
+    total, samples = domain.volumes.sum(), domain.samples
 
     def at_regions(rows: NDArray[np.bool_]) -> Array:
         """Return the raw functions at region samples, (rows, R)."""
@@ -130,23 +233,23 @@ def make_body_basis(domain: Domain, options: BuildOptions, stage: Callable[[str]
         return skin.products(*skin.evaluate(*enveloped(kernels.evaluate(at), envelope)), at, domain.length)[0]
 
     trace = None if envelope is None else at_regions(samples.exact)
-    fields = raw, raw_gradient, volumes * domain.density / total, volumes * domain.stiffness / total
-    if by_energy:
-        springs_at = np.sqrt(_strength(domain) / total)[:, None] * at_regions(~samples.exact)
-        found, report = _chosen(fields, skin, domain, options, trace, springs_at)
-    else:
+    fields = raw, raw_gradient, domain.volumes * domain.density / total, domain.volumes * domain.stiffness / total
+    if not options.chosen:
         found, report = (
             orthonormalise(
                 *fields,
                 leading=skin.leading,
                 length=domain.length,
                 kept=skin.translating,
-                held=bool(domain.regions),
+                held=bool(domain.regions or options.local),
                 rank_tolerance=options.rank_tolerance,
                 trace=trace,
             ),
             {},
         )
+    else:
+        springs_at = np.sqrt(_strength(domain) / total)[:, None] * at_regions(~samples.exact)
+        found, report = _chosen(fields, skin, len(modes.eigenvalues) - 1, domain, options, trace, springs_at)
     basis = _finished(kernels, skin, modes.eigenvalues, found, raw_gradient, trace, domain, report)
     stage("functions")
     return basis
@@ -155,6 +258,7 @@ def make_body_basis(domain: Domain, options: BuildOptions, stage: Callable[[str]
 def _chosen(
     fields: tuple[Array, Array, Array, Array],
     skin: SkinningWeights,
+    mode_count: int,
     domain: Domain,
     options: BuildOptions,
     trace: Array | None,
@@ -165,6 +269,7 @@ def _chosen(
     Args:
         fields: Raw functions (P, R), their gradients [1/m] (P, R, 3), fractions of mass (P,), of stiffness (P,).
         skin: Skinning weights.
+        mode_count: How many eigenmodes, or local handles, are among them, after the constant handle and the regions.
         domain: What the body is.
         options: How many functions, and for which Poisson's ratios.
         trace: Raw functions at points that fill the exact regions, (T, R); None without such regions.
@@ -181,11 +286,15 @@ def _chosen(
         lead, driven = lead @ across[count:].T, lead @ across[:count].T
         motions = rigid_motions(domain.samples, trace @ driven, len(domain.regions))
     soft = (skin.owner > 0) & (skin.owner < len(domain.regions))
+    others = np.setdiff1d(np.flatnonzero(~soft), leading)
+    first_mode = max(1, len(domain.regions))
+    late = (skin.owner >= first_mode + mode_count // 2) & (skin.owner < first_mode + mode_count)
     chosen = choose_functions(
         *fields,
         lead=lead,
         kept=np.setdiff1d(np.flatnonzero(soft), leading),
-        others=np.setdiff1d(np.flatnonzero(~soft), leading),
+        others=others,
+        half=None if options.local else others[~late[others]],
         quadratic=np.arange(10) if trace is None else None,
         held=Held(driven=driven, motions=motions, springs=springs) if domain.regions else None,
         count=options.function_count,
@@ -198,7 +307,7 @@ def _chosen(
 
 
 def _finished(
-    kernels: BasisRKPM,
+    kernels: BasisRKPM | BasisQGMLS,
     skin: SkinningWeights,
     eigenvalues: Array,
     functions: Functions,
@@ -210,9 +319,9 @@ def _finished(
     """Return the basis with what follows from its functions: gradients, and how regions drive it.
 
     Args:
-        kernels: Reproducing kernels.
+        kernels: Kernels.
         skin: Skinning weights.
-        eigenvalues: Of the eigenmodes, shape (m + 1,).
+        eigenvalues: Of the eigenmodes or local handles, shape (m + 1,).
         functions: The functions.
         raw_gradient: Gradients of the raw functions [1/m], (P, R, 3).
         trace: Raw functions at points that fill the exact regions, (T, R); None without such regions.
@@ -293,8 +402,8 @@ def _weights(
     exact_count: int,
     springs: Array | None,
 ) -> SkinningWeights:
-    """Gather the weights: constant handle, regions, eigenmodes, static responses."""
-    degree = 1 if options.eigenmode_handles and options.handles != "quadratic" else 2
+    """Gather the weights: constant handle, regions, eigenmodes or local handles, static responses."""
+    degree = 1 if not (options.chosen or options.local or options.handles == "quadratic") else 2
     region_count = region_weights.shape[1]
     # Squares and products of coordinates do not vanish on a region: there the constant handle stays affine.
     parts, degrees = [modes[:, :1], region_weights], [degree if exact_count == 0 else 1, *[1] * region_count]
@@ -308,7 +417,7 @@ def _weights(
             poissons_ratio=_mean_ratio(options),
             stiffness_scale=domain.stiffness,
             springs=springs,
-            derivative_count=options.response_derivatives if options.eigenmode_handles else 0,
+            derivative_count=0 if options.chosen else options.response_derivatives,
         )
         parts.append(responses)
         degrees += [0] * responses.shape[1]

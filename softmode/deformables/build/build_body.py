@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from softmode.deformables.body.reduced_body import FORMAT_VERSION, ReducedBody, Scalar
 from softmode.deformables.body.regions import Region
+from softmode.deformables.body.rkpm import BasisRKPM
 from softmode.deformables.body.visibility import Visibility
 from softmode.deformables.build.basis import Domain, make_body_basis
 from softmode.deformables.build.cache import cache_directory, cached_body, fingerprint_of
@@ -98,8 +99,8 @@ def _build(
 ) -> ReducedBody:
     """Do what :func:`build_body` says."""
     start = time.perf_counter()
-    stiffness = _positive_field("stiffness_scale", stiffness_scale, quadrature.points)
-    density = _positive_field("density_scale", density_scale, quadrature.points)
+    stiffness = positive_field("stiffness_scale", stiffness_scale, quadrature.points)
+    density = positive_field("density_scale", density_scale, quadrature.points)
     fingerprint = fingerprint_of(FORMAT_VERSION, quadrature, options, name, list(regions), stiffness, density)
     sources = Sources(
         quadrature=quadrature,
@@ -137,6 +138,7 @@ def _build(
                 length=length,
                 regions=regions,
                 samples=samples,
+                added=np.reshape([np.append(*pair) for pair in options.add_kernels], (-1, 4)) - np.append(offset, 0.0),
                 material=None if quadrature.cells is None else material_of(quadrature.cells, offset),
             ),
             options,
@@ -172,7 +174,7 @@ def _build(
             offset=offset,
             centres=basis.kernels.centres,
             radii=basis.kernels.radii,
-            kernel=options.kernel,
+            kernel=options.kernel if isinstance(basis.kernels, BasisRKPM) else "qgmls",
             handles=basis.weights.coefficients,
             handle_degrees=basis.weights.degrees,
             handle_regions=basis.weights.blends,
@@ -193,7 +195,7 @@ def _build(
             provenance={},
             build_seconds=0.0,
             sources=pack_sources(sources),
-            **_divided(basis.kernels.visibility),
+            **_divided(basis.kernels.visibility if isinstance(basis.kernels, BasisRKPM) else None),
         )
         surface = body.evaluate(body.surface_points)[0]
         stage("surface")
@@ -203,7 +205,7 @@ def _build(
         **{f"seconds_{key}": v for key, v in seconds.items()},
         "quadrature_count": len(points),
         "function_count": function_count,
-        "dropped_functions": len(basis.weights.owner) - function_count if options.eigenmode_handles else 0,
+        "dropped_functions": 0 if options.chosen else len(basis.functions.transform) - function_count,
         **basis.report,
         "heterogeneous": stiffness_scale is not None or density_scale is not None,
         "cubature_count": len(chosen.index),
@@ -225,12 +227,14 @@ def _divided(visibility: Visibility | None) -> dict[str, NDArray]:
     return {} if visibility is None else {"material_points": visibility.points, "hidden_pairs": visibility.hidden}
 
 
-def _scalar(value: Scalar | tuple[float, ...]) -> Scalar:
+def _scalar(value: Scalar | tuple[object, ...]) -> Scalar:
     """Return an option as the header of a file holds it."""
-    return " ".join(f"{v:g}" for v in value) if isinstance(value, tuple) else value
+    if not isinstance(value, tuple):
+        return value
+    return " ".join(str(_scalar(v)) if isinstance(v, tuple) else f"{v:g}" for v in value)
 
 
-def _positive_field(name: str, value: Field | None, points: Array) -> Array:
+def positive_field(name: str, value: Field | None, points: Array) -> Array:
     """Return a field's values at points (P, 3), shape (P,)."""
     if value is None:
         return np.ones(len(points))

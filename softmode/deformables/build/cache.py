@@ -14,12 +14,14 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from softmode.deformables.body.reduced_body import FORMAT_VERSION, ReducedBody
 from softmode.errors import AssetError, ConfigError
+
+Product = TypeVar("Product")
 
 
 def cached_body(
@@ -39,19 +41,42 @@ def cached_body(
     Returns:
         The body.
     """
-    folder = Path(directory) if directory is not None else cache_directory() / "bodies"
-    path = folder / f"{fingerprint_of(FORMAT_VERSION, *key)}.npz"
+    key = (FORMAT_VERSION, *key)
+    return cached("bodies", key, build, ReducedBody.load, ReducedBody.save, directory=directory)
+
+
+def cached(
+    folder: str,
+    key: tuple[Any, ...],
+    make: Callable[[], Product],
+    read: Callable[[Path], Product],
+    write: Callable[[Product, Path], None],
+    *,
+    directory: str | os.PathLike[str] | None = None,
+) -> Product:
+    """Return what is stored under a key, making it once when it is absent or damaged; see `cached_body`.
+
+    Args:
+        folder: Folder in the cache.
+        key: Everything that it depends on.
+        make: Called when the cache has no usable entry.
+        read: Reads it from a file, and raises `AssetError` where it cannot.
+        write: Writes it to a file, which appears complete or not at all.
+        directory: Folder in place of the one in the cache.
+    """
+    place = Path(directory) if directory is not None else cache_directory() / folder
+    path = place / f"{fingerprint_of(*key)}.npz"
     with contextlib.suppress(AssetError):
-        return ReducedBody.load(path)
+        return read(path)
     if directory is None:
-        path = _writable_cache(folder) / path.name
+        path = _writable_cache(place) / path.name
     path.parent.mkdir(parents=True, exist_ok=True)
     with _locked(path.with_suffix(".lock")):
         with contextlib.suppress(AssetError):
-            return ReducedBody.load(path)
-        body = build()
-        body.save(path)
-    return body
+            return read(path)
+        made = make()
+        write(made, path)
+    return made
 
 
 def cache_directory() -> Path:

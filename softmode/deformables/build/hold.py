@@ -1,4 +1,4 @@
-"""Clamps told late: the body that a build told of further regions would have given.
+"""Clamps and fields told late: the body that a build told of further regions, or of other stiffness, would have given.
 
 Smooth functions cannot be held hard where the build was not told of it: stiffer springs make such a body move less and
 less, whatever its functions. A body keeps what it was built from, so that it can be built again with the region, and
@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.sources import mass_points, unpack_sources
+from softmode.deformables.build.build_body import Field, build_body, positive_field
+from softmode.deformables.build.sources import Sources, mass_points, unpack_sources
 from softmode.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -42,22 +42,49 @@ def hold(
     """
     if not regions:
         raise ConfigError("regions: none given", hint="name what is to be held, such as Region(name='end', box=...)")
-    if not body.sources:
-        raise ConfigError(
-            f"body {body.name!r} does not keep what it was built from",
-            hint="give the regions to build_body, or save the body with sources=True",
-        )
     given = unpack_sources(body)
-    held = build_body(
+    return _again(body, dataclasses.replace(given, regions=(*given.regions, *regions)), progress)
+
+
+def paint(
+    body: ReducedBody,
+    *,
+    stiffness_scale: Field | None = None,
+    density_scale: Field | None = None,
+    progress: bool | Callable[[str, float], None] | None = None,
+) -> ReducedBody:
+    """Return the body that a build with other fields would have given.
+
+    Args:
+        body: As for :func:`hold`.
+        stiffness_scale: Relative Young's modulus, as for :func:`build_body`; None leaves what it has.
+        density_scale: Relative density, likewise.
+        progress: As for :func:`build_body`.
+
+    Raises:
+        ConfigError: If the body keeps no sources.
+        MaterialError: If a scale is not finite and positive.
+        AssetError: If the sources are damaged.
+    """
+    given = unpack_sources(body)
+    points = given.quadrature.points
+    fields = {"stiffness_scale": stiffness_scale, "density_scale": density_scale}
+    changed = {name: positive_field(name, value, points) for name, value in fields.items() if value is not None}
+    return _again(body, dataclasses.replace(given, **changed), progress)
+
+
+def _again(body: ReducedBody, given: Sources, progress: bool | Callable[[str, float], None] | None) -> ReducedBody:
+    """Build a body again from sources like its own."""
+    made = build_body(
         given.quadrature,
         given.options,
         name=body.name,
-        regions=(*given.regions, *regions),
+        regions=given.regions,
         stiffness_scale=given.stiffness_scale,
         density_scale=given.density_scale,
         progress=progress,
     )
-    return dataclasses.replace(held, provenance={**body.provenance, **held.provenance})
+    return dataclasses.replace(made, provenance={**body.provenance, **made.provenance})
 
 
 def carry_over(old: ReducedBody, new: ReducedBody, q: ArrayLike, qd: ArrayLike) -> tuple[Array, Array]:
@@ -84,5 +111,8 @@ def carry_over(old: ReducedBody, new: ReducedBody, q: ArrayLike, qd: ArrayLike) 
     X, mass = mass_points(new)
     shift = new.offset - old.offset  # X of the new body is X + shift of the old one
     before = old.evaluate(X + shift)[0]
-    found = new.fit(np.hstack([before @ place + shift, before @ rate]), X, mass)
+    values = np.hstack([before @ place + shift, before @ rate])
+    found = new.fit(values, X, mass)
+    # Where a point lies beyond the kernels' reach, the mean of the build is not that of `evaluate`: to rounding again.
+    found = found + new.linear_coordinates[:, 3:] * (mass @ values / mass.sum() - new.mean_basis @ found)
     return found[:, :3], found[:, 3:]

@@ -103,15 +103,15 @@ def interior_from_surface(body: ReducedBody, *, point_count: int = 4000) -> Inte
     return Interior(points=inside, weights=weights, spacing=float(edges.prod() ** (1.0 / 3.0)), exact=False)
 
 
-def winding_numbers(body: ReducedBody, points: Array) -> Array:
-    """Return how often the surface samples of a body wind around points (N, 3) [m], shape (N,).
+def winding_numbers(body: ReducedBody | Quadrature, points: Array) -> Array:
+    """Return how often the surface samples of a body or quadrature wind around points (N, 3) [m], shape (N,).
 
     Within the radius of a sample's own disc the distance is held at that radius, so that no sample outweighs the rest.
     """
     found = np.empty(len(points))
     strength = body.surface_normals * body.surface_areas[:, None]
     near = body.surface_areas / np.pi
-    step = max(1, _PAIRS_PER_CHUNK // max(body.surface_count, 1))
+    step = max(1, _PAIRS_PER_CHUNK // max(len(body.surface_points), 1))
     for i in range(0, len(points), step):
         away = body.surface_points[None] - points[i : i + step, None]
         distance_sq = np.maximum(np.einsum("nsi,nsi->ns", away, away), near)

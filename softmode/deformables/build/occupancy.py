@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,9 @@ SHARE_NOISE = 0.005
 """A finer fill that holds fewer splats than the coarser one by more than this is not taken."""
 SETTLED = 0.01
 """Relative change of the volume from one resolution to the next below which walls count as resolved."""
+POINT_WIDTH = 0.6
+"""Width of splats without extent, over the distance to the sixth neighbour: discs so wide let no view through to the
+wall behind."""
 KEPT_SHARE, KEPT_EXTENT = 0.98, 0.95
 """Share of the object's splats that the solid holds, and of their extent along every axis, below which the resolution
 is raised."""
@@ -84,6 +88,8 @@ def fill_splats(
     2. *The object* is the part whose solid holds the largest ball: a floor slab under the object loses, however wide.
     3. *Samples*: each splat is spread over its disc with one sample per voxel. The surface lies where half of the
        opacity along its normal is passed, which is at the centres: a splat's thickness does not inflate the volume.
+       Points without extent get discs that meet: between them views would reach the wall behind and take its back for
+       its outside.
     4. *Orientation by views*: 256 orthographic depth buffers tell which splats are seen from where. The normal (the
        splat's thin axis; of round splats, that of the neighbourhood) points to the side seen more. Splats that no view
        sees (inside) or seen equally from both sides (open sheets) are dropped.
@@ -146,6 +152,7 @@ def fill_splats(
         "splats_of_object": int(member.sum()),
         "splats_of_satellites": int(satellite.sum()),
         "parts": len(tried),
+        "buried_share": 0.0 if beyond.any() else float(solid.buries(mean[part >= 0]).sum() / len(chosen)),
         **solid.report,
     }
     return Occupancy(
@@ -186,6 +193,8 @@ class _Solid:
     volume: float
     holds: Callable[[Array], NDArray[np.bool_]]
     """Tells whether points (N, 3) lie in it, or on it to two voxels."""
+    buries: Callable[[Array], NDArray[np.bool_]]
+    """Tells whether points (N, 3) lie in it, deeper than a voxel."""
     report: dict[str, Any]
     kept: NDArray[np.bool_]
     """Which splats of the part it holds."""
@@ -199,7 +208,9 @@ def _orient_part(mean: Array, scale: Array, axes: Array, outset: Array) -> _Shel
     if not extent > 0.0:
         raise _no_volume("all splats lie at one point")
     spacing = _typical_spacing(mean)
-    width = float(np.median(scale[:, 1])) if scale.any() else spacing
+    if not scale.any():
+        scale = np.full_like(scale, POINT_WIDTH * spacing)
+    width = float(np.median(scale[:, 1]))
     normal, tangent, nearest, scatter = splat_normals(mean, scale, axes)
     pixel = min(max(extent / RESOLUTIONS[1], 0.7 * min(spacing, width)), extent / 12.0)
     sign, confidence, seen = orient(mean, normal, tangent, nearest, pixel)
@@ -292,7 +303,9 @@ def _fill_shell(shell: _Shell, resolution: int) -> _Solid:
     difference[solid & ~main] = 0.5 * level
     # Samples seen through gaps of the shell raise the level around them to about the indicator: deep inside there is no
     # surface, whatever their noise says.
-    deep: Any = ndimage.binary_erosion(whole, ndimage.generate_binary_structure(3, 3), iterations=2)
+    cube = ndimage.generate_binary_structure(3, 3)
+    core: Any = ndimage.binary_erosion(whole, cube)
+    deep: Any = ndimage.binary_erosion(core, cube)
     deep |= whole & ~main
     difference[deep] = np.minimum(difference[deep], -0.5 * level)
     # One and a half voxels around the outermost inner nodes hold the whole zero level of the trilinear field.
@@ -303,11 +316,11 @@ def _fill_shell(shell: _Shell, resolution: int) -> _Solid:
         where = (x - field.origin) / voxel
         return ndimage.map_coordinates(difference, where.T, order=1, mode="nearest", output=np.float64) * voxel
 
-    def holds(x: Array) -> NDArray[np.bool_]:
+    def lies_in(nodes: NDArray[np.bool_], x: Array) -> NDArray[np.bool_]:
         node = np.rint((x - field.origin) / voxel).astype(np.int64)
-        inner = ((node >= 0) & (node < near.shape)).all(axis=1)
+        inner = ((node >= 0) & (node < nodes.shape)).all(axis=1)
         found = np.zeros(len(x), dtype=bool)
-        found[inner] = near[tuple(node[inner].T)]
+        found[inner] = nodes[tuple(node[inner].T)]
         return found
 
     report = {
@@ -324,7 +337,8 @@ def _fill_shell(shell: _Shell, resolution: int) -> _Solid:
         voxel,
         float(balls.max()) * voxel,
         len(inside) * voxel**3,
-        holds,
+        partial(lies_in, near),
+        partial(lies_in, core),
         report,
         np.zeros(0, dtype=bool),
     )

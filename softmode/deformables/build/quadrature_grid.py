@@ -47,6 +47,8 @@ class Cells:
     """Cell of each octant, shape (Q,)."""
     place: NDArray[np.int64] | None = None
     """Place of each octant in the grid of octants, shape (Q, 3); None in files written before 0.3."""
+    severed: NDArray[np.int64] | None = None
+    """Pairs of octants that a cut divides, though they are neighbours, the lower one first, shape (E, 2)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from softmode.deformables.build.quadrature_grid import (
     SUBDIVISION,
@@ -93,6 +95,37 @@ def quadrature_from_mesh(
     report = {"source": "mesh", "triangles": len(face), "overlapping": overlapping, "inside_out": inside_out}
     extent = np.stack([lower, upper])
     return finish_quadrature(found, centre, volume, edges, surface, extent, report)
+
+
+def cap_holes(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, NDArray[np.int64], int]:
+    """Close the holes of a triangle mesh by fans about the middle of each rim; flat where the rim is.
+
+    Trimesh's own `fill_holes` closes holes of three and four edges only.
+
+    Args:
+        vertices: Vertex positions [m], shape (V, 3).
+        faces: Vertex indices of the triangles, oriented alike, shape (T, 3).
+
+    Returns:
+        The vertices and faces with equal vertices merged and the caps at the end, and how many holes were closed.
+    """
+    import trimesh
+
+    mesh = trimesh.Trimesh(vertices, faces, process=True)
+    vertex, face = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+    edge = np.concatenate([face[:, [0, 1]], face[:, [1, 2]], face[:, [2, 0]]])
+    rim = edge[~np.isin(edge @ [len(vertex), 1], edge @ [1, len(vertex)])]
+    if not len(rim):
+        return vertex, face, 0
+    graph = coo_array((np.ones(len(rim)), (rim[:, 0], rim[:, 1])), shape=(len(vertex), len(vertex)))
+    _, hole = np.unique(connected_components(graph, directed=False)[1][rim[:, 0]], return_inverse=True)
+    count = int(hole.max()) + 1
+    length = np.linalg.norm(vertex[rim[:, 0]] - vertex[rim[:, 1]], axis=1)
+    middle = np.zeros((count, 3))
+    np.add.at(middle, hole, length[:, None] * 0.5 * vertex[rim].sum(axis=1))
+    middle /= np.bincount(hole, length)[:, None]
+    caps = np.column_stack([rim[:, ::-1], len(vertex) + hole])
+    return np.concatenate([vertex, middle]), np.concatenate([face, caps]), count
 
 
 def _load_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, NDArray[np.int64]]:

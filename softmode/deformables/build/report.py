@@ -48,6 +48,9 @@ EMPTY = 1e-10
 WALL, WALL_VOXELS, WALL_SHARE = 0.02, 2.5, 0.05
 """Walls thinner than this part of the body's size, or than so many voxels of a fill, count as thin; so much of the
 surface may bound thin walls."""
+BURIED_SHARE = 0.005
+"""Share of a capture's splats deeper than a voxel in its solid above which something hollow may have been filled. Clean
+captures of 20,000 splats have at most 0.0008, a cup that is filled in a few places 0.0085, a filled one 0.09."""
 SIZE_ERROR = 0.05
 """Longest edge that may differ so much from the size that was asked for."""
 FULL_FUNCTIONS = 100
@@ -165,7 +168,7 @@ def report_body(
 
 
 def object_findings(
-    body: ReducedBody, *, splats: Array | None = None, size: float | None = None, opening: float | None = None
+    body: ReducedBody, *, splats: Array | None = None, size: float | None = None
 ) -> tuple[Finding, ...]:
     """Return what the user of an object should know before it is simulated: the warnings that take no time to find.
 
@@ -173,16 +176,13 @@ def object_findings(
         body: Its body.
         splats: Centres of its splats, in the body frame [m], shape (N, 3).
         size: Longest edge that was asked for [m]; None where nothing was.
-        opening: How far the gripper that is to take it opens [m]; None where nothing is to.
 
     Returns:
-        Findings from "warning" on: what was left out of its file, its size, what is bare or thin, whether it fits.
+        Findings from "warning" on: what was left out of its file, its size, what is bare or thin.
     """
     notes = _Notes()
     _check_shape(body, notes)
     _check_object(body, notes, splats, size)
-    if opening is not None:
-        _check_fit(body, opening, notes)
     return tuple(finding for finding in notes.report().findings if finding.severity != "note")
 
 
@@ -201,22 +201,6 @@ def _check_object(body: ReducedBody, notes: _Notes, splats: Array | None, size: 
             )
     if splats is not None:
         _check_splats(body, np.asarray(splats, dtype=np.float64), notes)
-
-
-def _check_fit(body: ReducedBody, opening: float, notes: _Notes) -> None:
-    """Compare the least horizontal width of a standing object with what a gripper opens."""
-    angle = np.linspace(0.0, np.pi, 180, endpoint=False)
-    across = body.surface_points[:, :2] @ np.array([np.cos(angle), np.sin(angle)])
-    width = notes.measure("least horizontal width", float(np.ptp(across, axis=0).min()), "m")
-    if width >= opening:
-        size = float(np.ptp(body.bounds, axis=0).max())
-        notes.find(
-            "warning",
-            "gripper",
-            f"it is {1e3 * width:.0f} mm wide where it is narrowest, and the gripper of this robot opens"
-            f" {1e3 * opening:.0f} mm",
-            f"give --size {0.9 * opening / width * size:.2g}, or a robot whose gripper opens farther",
-        )
 
 
 def _numbers_told(body: ReducedBody) -> dict[str, float]:
@@ -279,6 +263,15 @@ def _check_geometry(body: ReducedBody, notes: _Notes) -> None:
             " functions",
             "build it with --accuracy 0.03, or more --functions",
         )
+    space = float(body.provenance.get("space_error") or 0.0)
+    if notes.measure("second half of the space", space) > FREQUENCY_WARNING:
+        notes.find(
+            "warning",
+            "space",
+            f"corners, branches or thin walls that its kernels do not resolve: its first six frequencies may be"
+            f" {100.0 * space:.0f} % too high, whatever the number of functions",
+            "build it with twice the points (--points): more points allow narrower kernels",
+        )
     complete = body.provenance.get("complete_functions")
     if isinstance(complete, float) and complete > body.function_count + 1:  # A pair may be near each other by chance.
         notes.find(
@@ -340,7 +333,8 @@ def _wall_thickness(body: ReducedBody) -> Array:
     """Return how thick the body is under each surface sample [m], shape (S,); infinite where nothing lies opposite.
 
     The line along the inward normal is cut with the tangent planes of the samples that face the other way and lie
-    within a spacing of samples beside it; the nearest cut counts.
+    within a spacing of samples beside it; the nearest cut counts. Behind the planes of an inner wall that curves away
+    the surface is deeper, by 1/2 dn . d where the normal changes by dn over the distance d.
     """
     points, normals = body.surface_points.astype(np.float64), body.surface_normals.astype(np.float64)
     pitch2 = body.surface_areas.sum() / body.surface_count
@@ -351,7 +345,8 @@ def _wall_thickness(body: ReducedBody) -> Array:
         depth = -np.einsum("ijc,ic->ij", way, normals[part])
         beside = (way**2).sum(axis=2) - depth**2
         with np.errstate(divide="ignore", invalid="ignore"):
-            cut = -np.einsum("ijc,jc->ij", way, normals) / facing
+            along = np.einsum("ijc,jc->ij", way, normals)
+            cut = -along / facing - np.minimum(0.5 * (facing * depth + along), 0.0)
         opposite = (facing < -0.5) & (depth > 0.0) & (beside < pitch2) & (cut > 0.0)
         found[part] = np.where(opposite, cut, np.inf).min(axis=1)
     return found
@@ -394,7 +389,7 @@ def _check_parts(body: ReducedBody, interior: Interior, notes: _Notes) -> None:
             " volume. Kernels that reach across glue them together",
             "keep one part (--crop, or for splats --part), or build one body for each",
         )
-    first = float(body.eigenvalues[1]) * body.length**2
+    first = float(body.eigenvalues[1:].min(initial=np.inf)) * body.length**2
     if first < 1e-6 and not body.region_names:
         notes.find(
             "broken",
@@ -417,7 +412,8 @@ def _check_functions(body: ReducedBody, interior: Interior, notes: _Notes) -> No
             "take more kernels (--kernels)",
         )
     inside = np.concatenate([interior.points[body.covers(interior.points)], body.points])
-    condition = notes.measure("worst condition of a moment matrix", float(body.kernels.conditions(inside).max()))
+    worst = float(body.kernels.conditions(inside).max()) if body.skinned else 1.0
+    condition = notes.measure("worst condition of a moment matrix", worst)
     if not condition < CONDITION_WARNING:
         notes.find(
             "warning",
@@ -526,11 +522,13 @@ def _check_build(body: ReducedBody, notes: _Notes) -> None:
 
 def _check_asset(body: ReducedBody, told: dict[str, float], notes: _Notes) -> None:
     """Read what became of the asset: holes that were closed, parts that were left out."""
-    if body.provenance.get("asset_kind") == "mesh" and body.provenance.get("quadrature_source") == "splats":
+    mended, capped = body.provenance.get("quadrature_source") == "splats", told.get("quadrature_capped_holes", 0.0)
+    if body.provenance.get("asset_kind") == "mesh" and (mended or capped):
+        how = "when its surface is covered smoothly" if mended else f"when its holes ({capped:.0f}) are capped"
         notes.find(
             "warning",
             "open mesh",
-            "the mesh is not closed: the body is what its surface encloses when the holes are covered smoothly",
+            f"the mesh is not closed: the body is what it encloses {how}",
             "close the holes (trimesh.repair.fill_holes, or a modelling tool), and build again",
         )
     told_splats = told.get("quadrature_asset_splats", 0.0)
@@ -588,6 +586,15 @@ def _check_fill(told: dict[str, float], notes: _Notes) -> None:
     if "quadrature_kept_share" in told:
         notes.measure("splats of the part in the solid", share)
         notes.measure("extent of the solid over that of the part", extent)
+    if (buried := told.get("quadrature_buried_share", 0.0)) > BURIED_SHARE:
+        notes.find(
+            "warning",
+            "filled inside",
+            f"{100.0 * buried:.0f} % of the splats or points lie inside the solid: what they enclose was filled, and"
+            " the volume is too large if the object is hollow there (closed all round, or its walls are thinner than"
+            " twice the distance between points)",
+            "if it is hollow, give a mesh, or more points, with normals; if it is solid, crop what is inside",
+        )
     if share >= KEPT_SHARE and extent >= KEPT_EXTENT:
         return
     limited = "; finer voxels were over the limit of memory" if told.get("quadrature_resolution_limited") else ""

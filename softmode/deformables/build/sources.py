@@ -15,7 +15,7 @@ from softmode.deformables.body.regions import Region
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature_grid import Cells, Quadrature
 from softmode.deformables.build.region_samples import octants_near, refine_at_faces
-from softmode.errors import AssetError, SoftmodeError
+from softmode.errors import AssetError, ConfigError, SoftmodeError
 
 Array = NDArray[np.float64]
 
@@ -57,9 +57,15 @@ def unpack_sources(body: ReducedBody) -> Sources:
     """Return what a body was built from.
 
     Raises:
+        ConfigError: If the body keeps no sources.
         AssetError: If a file held something else.
     """
-    stored = dict(body.sources or {})
+    if not body.sources:
+        raise ConfigError(
+            f"body {body.name!r} does not keep what it was built from",
+            hint="build it again, or save it with sources=True",
+        )
+    stored = dict(body.sources)
     try:
         document = json.loads(stored.pop("document").tobytes())
         stiffness, density = stored.pop("stiffness_scale", None), stored.pop("density_scale", None)

@@ -72,19 +72,21 @@ class Material:
         node = np.full(near.shape, -1)
         node[lump, kernel] = np.arange(len(lump))
         link, at = np.nonzero(near[self.links[:, 0]] & near[self.links[:, 1]])
-        label = _components(len(lump), node[self.links[link], at[:, None]])
+        label = components(len(lump), node[self.links[link], at[:, None]])
         own = label[node[homes, np.arange(len(homes))]]
         found = np.zeros_like(near)
         found[lump, kernel] = (label != own[kernel]) & (self.part[lump] == self.part[homes][kernel])
         return found
 
 
-def material_of(cells: Cells, offset: Array) -> Material | None:
-    """Return the graph of the octants of a grid less an offset (3,) [m]; None if their places in it are not known."""
+def touching(cells: Cells) -> Indices | None:
+    """Return the pairs of octants of a grid that touch, the lower one first (E, 2); None if their places are not known.
+
+    Two touch where they share a face; where they share an edge or a corner, unless others between link them.
+    """
     if cells.place is None:
         return None
-    order = np.argsort(cells.of_octant, kind="stable")
-    place = cells.place[order] - cells.place.min(axis=0) + 1
+    place = cells.place - cells.place.min(axis=0) + 1
     shape = place.max(axis=0) + 2
     stride = np.array([shape[1] * shape[2], shape[2], 1])
     at = np.full(shape.prod(), -1)
@@ -96,24 +98,40 @@ def material_of(cells: Cells, offset: Array) -> Material | None:
         steps = np.array(towards) * stride
         other = at[place @ stride + steps.sum()]
         touch = other >= 0
-        if np.count_nonzero(towards) > 1:  # Not where the octants in between link them.
+        if np.count_nonzero(towards) > 1:
             for step in steps[steps != 0]:
                 touch &= at[place @ stride + step] < 0
         pairs.append(np.stack([np.flatnonzero(touch), other[touch]], axis=1))
-    pair = np.concatenate(pairs)
+    pair = np.sort(np.concatenate(pairs), axis=1)
+    if cells.severed is None:
+        return pair
+    key = np.array([len(place), 1])
+    return pair[~np.isin(pair @ key, cells.severed @ key)]
+
+
+def material_of(cells: Cells, offset: Array) -> Material | None:
+    """Return the graph of the octants of a grid less an offset (3,) [m]; None if their places in it are not known."""
+    pair = touching(cells)
+    if pair is None:
+        return None
+    order = np.argsort(cells.of_octant, kind="stable")
     points = cells.octants[order] - offset
-    # The octants of a full cell are one lump, which makes the graph eight times smaller.
+    # The octants of a full cell are one lump, which makes the graph eight times smaller; not of one that is cut.
+    size = np.bincount(cells.of_octant)
+    if cells.severed is not None:
+        size[cells.of_octant[cells.severed]] = 0
     cell = cells.of_octant[order]
-    begins = (np.bincount(cell)[cell] < 8) | np.append(True, cell[1:] != cell[:-1])
-    lump = np.cumsum(begins) - 1
+    begins = (size[cell] < 8) | np.append(True, cell[1:] != cell[:-1])
+    lump = np.empty(len(order), dtype=np.intp)
+    lump[order] = np.cumsum(begins) - 1
     links = np.unique(np.sort(lump[pair], axis=1), axis=0)
     links = links[links[:, 0] < links[:, 1]]
-    step = float(np.linalg.norm(points[pair[:, 0]] - points[pair[:, 1]], axis=1).max(initial=0.0))
+    step = float(np.linalg.norm(cells.octants[pair[:, 0]] - cells.octants[pair[:, 1]], axis=1).max(initial=0.0))
     return Material(
         points=points,
         first=np.flatnonzero(begins),
         links=links,
-        part=_components(lump[-1] + 1, links),
+        part=components(int(lump.max()) + 1, links),
         step=step,
     )
 
@@ -210,7 +228,7 @@ def _chunks(material: Material, kernel_count: int) -> list[slice]:
     return [slice(i, min(i + step, kernel_count)) for i in range(0, kernel_count, step)]
 
 
-def _components(count: int, pairs: Indices) -> Indices:
+def components(count: int, pairs: Indices) -> Indices:
     """Return the connected component of each of some nodes, from pairs of them (E, 2)."""
     graph = coo_matrix((np.ones(len(pairs), dtype=bool), pairs.T), shape=(count, count))
     return connected_components(graph, directed=False)[1].astype(np.intp)

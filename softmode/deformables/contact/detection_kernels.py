@@ -21,7 +21,13 @@ from softmode.deformables.contact.shape_query_kernels import (
 )
 from softmode.deformables.model.declare import struct
 from softmode.deformables.model.lane_kernels import barrier
-from softmode.deformables.model.status import WORLD_CONTACT_OVERFLOW, WORLD_RIGID_NOT_FINITE
+from softmode.deformables.model.status import (
+    PARAMETER_BITS,
+    WORLD_CONTACT_OVERFLOW,
+    WORLD_PARAMETER_RANGE,
+    WORLD_PENETRATION,
+    WORLD_RIGID_NOT_FINITE,
+)
 from softmode.deformables.model.struct_kernels import (
     OVERLAP,
     SLOTS,
@@ -145,7 +151,9 @@ def cull_shapes(
     near_out: wp.array2d[int],  # (instance_count, candidate_max)
     status: wp.array[int],  # (world_count,)
 ):
-    """Mark the candidate shapes whose bounding sphere reaches the bounds of the instance; flag one that is nowhere.
+    """Mark the candidate shapes whose bounding sphere reaches the bounds of the instance.
+
+    One that is nowhere, or whose friction is no number or negative, is flagged.
 
     A body does not touch the shapes of a rigid body that it is fixed to, until it is released.
     """
@@ -154,6 +162,10 @@ def cull_shapes(
     near_out[i, c] = 0
     if shape < 0:
         return
+    mu = shapes.friction[shape]
+    if not (wp.isfinite(mu) and mu >= 0.0):
+        bits = WORLD_PARAMETER_RANGE | wp.static(PARAMETER_BITS["shape_material_mu"])
+        wp.atomic_or(status, instances.world[i], bits)
     body = shapes.body[shape]
     if body >= 0:
         place = shapes.body_q[body]
@@ -467,7 +479,10 @@ def gather_contacts(
             samples.constraint[i, s, slot] = -1
             if shape < 0:
                 continue
-            gap = wp.max(samples.gap[i, s, slot], -wp.float64(OVERLAP * instances.size[i]))
+            deepest = -wp.float64(OVERLAP * instances.size[i])
+            if samples.gap[i, s, slot] < deepest:
+                wp.atomic_or(status, instances.world[i], WORLD_PENETRATION)
+            gap = wp.max(samples.gap[i, s, slot], deepest)
             e = at_close
             if gap <= wp.float64(0.0):
                 e = at_touching
@@ -537,8 +552,9 @@ def gather_pins(
     dt: float,
     # Out:
     constraints: PointConstraints,
+    status: wp.array[int],  # (world_count,)
 ):
-    """Write the pins of an instance as its first constraints: offset = x_n - target."""
+    """Write the pins of an instance as its first constraints: offset = x_n - target; flag what is no number."""
     i, e = wp.tid()
     if e >= instances.pin_count[i]:
         return
@@ -548,6 +564,13 @@ def gather_pins(
     constraints.row[i, e] = row
     body = pin_body[pin]
     target = pin_target[pin]
+    bits = int(0)
+    if not wp.isfinite(pin_stiffness[pin]):
+        bits = wp.static(PARAMETER_BITS["pin_stiffness"])
+    if pin_stiffness[pin] > 0.0 and not wp.isfinite(target):
+        bits |= wp.static(PARAMETER_BITS["pin_target"])
+    if bits != 0:
+        wp.atomic_or(status, instances.world[i], bits | WORLD_PARAMETER_RANGE)
     if body >= 0:
         pose = shapes.body_q[body]
         rotation = wp.transform_get_rotation(pose)

@@ -29,7 +29,7 @@ from softmode.deformables.contact.penalty_kernels import stiffness_per_area
 from softmode.deformables.model.declare import struct
 from softmode.deformables.model.deformation_kernels import displacement_gradient
 from softmode.deformables.model.lane_kernels import vec8
-from softmode.deformables.model.status import WORLD_CONTACT_OVERFLOW
+from softmode.deformables.model.status import WORLD_CONTACT_OVERFLOW, WORLD_PENETRATION
 from softmode.deformables.model.struct_kernels import (
     OVERLAP,
     SLOTS,
@@ -508,6 +508,8 @@ def write_pairs(
     friction = wp.float64(wp.sqrt(instances.friction[i] * instances.friction[j]))
     n = pairs.normal[i, s, slot]
     deepest = -wp.float64(OVERLAP * wp.min(instances.size[i], instances.size[j]))
+    if pairs.gap[i, s, slot] < deepest:
+        wp.atomic_or(state.status, instances.world[i], WORLD_PENETRATION)
     offset = wp.max(pairs.gap[i, s, slot], deepest) * n
     particle = instances.particle_start[i] + s
     for before in range(SLOTS):

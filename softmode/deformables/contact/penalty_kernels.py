@@ -105,6 +105,19 @@ def slip_potential(y: wp.float64, limit: wp.float64, stick: wp.float64, stick_ra
 
 
 @wp.func
+def stiffness_sources(
+    instances: Instances, i: int, relative: float, partner_mass: float, partner_area: float, dt: float
+):
+    """Return what the contact stiffness per area [Pa/m] would be of the material alone, and of the inertia alone."""
+    wave = p_wave_modulus(relative * instances.youngs_modulus[i], instances.poissons_ratio[i])
+    mass = float(instances.mass[i])
+    if partner_mass > 0.0:
+        mass *= partner_mass / (mass + partner_mass)
+    inertia = mass / (wp.min(instances.area[i], partner_area) * dt * dt)
+    return BULK_FACTOR * wave / instances.size[i], INERTIA_FACTOR * inertia
+
+
+@wp.func
 def stiffness_per_area(
     instances: Instances, i: int, relative: float, partner_mass: float, partner_area: float, dt: float
 ):
@@ -123,12 +136,29 @@ def stiffness_per_area(
     """
     if instances.contact_stiffness[i] > 0.0:
         return instances.contact_stiffness[i]
-    wave = p_wave_modulus(relative * instances.youngs_modulus[i], instances.poissons_ratio[i])
-    mass = float(instances.mass[i])
-    if partner_mass > 0.0:
-        mass *= partner_mass / (mass + partner_mass)
-    inertia = mass / (wp.min(instances.area[i], partner_area) * dt * dt)
-    return wp.max(wp.max(BULK_FACTOR * wave / instances.size[i], INERTIA_FACTOR * inertia), STIFFNESS_FLOOR)
+    bulk, inertia = stiffness_sources(instances, i, relative, partner_mass, partner_area, dt)
+    return wp.max(wp.max(bulk, inertia), STIFFNESS_FLOOR)
+
+
+@wp.func
+def stiffness_exponents(instances: Instances, i: int, relative: float, partner_area: float, dt: float):
+    """Return d ln(A kappa) / d(ln E, nu, ln m, ln s) of a contact with what does not yield, s the body's scale.
+
+    The sample's area A grows with s^2. Where two sources of the stiffness are equal it has a kink, and no derivative.
+    """
+    none = wp.float64(0.0)
+    one = wp.float64(1.0)
+    two = wp.float64(2.0)
+    if instances.contact_stiffness[i] > 0.0:
+        return wp.vec4d(none, none, none, two)
+    bulk, inertia = stiffness_sources(instances, i, relative, 0.0, partner_area, dt)
+    if wp.max(bulk, inertia) <= STIFFNESS_FLOOR:
+        return wp.vec4d(none, none, none, two)
+    if inertia > bulk:
+        return wp.vec4d(none, none, one, wp.where(instances.area[i] < partner_area, none, two))
+    nu = wp.float64(instances.poissons_ratio[i])
+    by_nu = two / (one - two * nu) - one / (one - nu) - one / (one + nu)
+    return wp.vec4d(one, by_nu, none, one)
 
 
 @wp.kernel

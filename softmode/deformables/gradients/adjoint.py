@@ -25,10 +25,12 @@ from numpy.typing import ArrayLike, NDArray
 from softmode.checks import require_fields, require_number
 from softmode.deformables.gradients import adjoint_kernels as kernels
 from softmode.deformables.gradients.krylov import Gmres
+from softmode.deformables.gradients.turning_kernels import find_turning
+from softmode.deformables.model.declare import WRENCH
 from softmode.deformables.model.lane_kernels import vec8d
 from softmode.deformables.model.namespaces import soft
 from softmode.deformables.model.status import WORLD_NOT_FINITE
-from softmode.deformables.model.struct_kernels import PointConstraints, Points
+from softmode.deformables.model.struct_kernels import OVERLAP, PointConstraints, Points
 from softmode.deformables.model.tables import allocate
 from softmode.deformables.solver.detect import adapt
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient
@@ -39,9 +41,11 @@ from softmode.errors import ConfigError, SolverDiverged
 
 Array = NDArray[np.float64]
 
-_CONSTRAINT = ("row", "normal", "offset", "stiffness", "friction")
+_CONSTRAINT = ("row", "shape", "normal", "offset", "stiffness", "friction", "stick")
 """What a step's point constraints are made of, besides their count: members of the solver's ``PointConstraints``."""
-_TOTALS = ("youngs_modulus", "poissons_ratio", "viscosity", "friction", "density", "mass_damping", "gravity")
+FLAT = 0.02
+"""Turn of a normal [rad] over the size of a body up to which a shape counts as flat: what float32 leaves of a plane."""
+_TOTALS = ("youngs_modulus", "poissons_ratio", "viscosity", "friction", "density", "mass_damping", "gravity", "scale")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,9 +62,10 @@ class AdjointOptions:
     """|r| / |f| of a step above which a warning is given: away from the root the theorem does not hold."""
     residual_max: float = 1.0e-2
     """|r| / |f| of a step above which it is refused."""
-    constant_contact_stiffness: bool = False
-    """Whether a contact stiffness that follows E, nu and mass is taken for a constant. The gradients by these three are
-    then wrong by more than their size; all others are right."""
+
+    fixed_normals: bool = False
+    """Whether contacts with curved shapes, across edges and with what a fast sample flies past keep their normals, as
+    far as gradients know. They are then wrong, to the sign; without friction by more than their size."""
 
     def __post_init__(self) -> None:
         """Check every range."""
@@ -102,6 +107,9 @@ class ReducedGradients:
     """By the body's friction coefficient, (I,)."""
     gravity: wp.array
     """By the gravity that each instance feels, vec3d (I,)."""
+    scale: wp.array
+    """By the size of the rest shape over that of the asset, (I,), at the same initial state. ``reset`` gives a body of
+    another size another initial state, linear in its scale: add the sum of ``q`` times its derivative."""
     grad_residual: wp.array
     """|r| / |f| of each step and instance, (T, I): how far from its root the solver stopped."""
 
@@ -116,22 +124,21 @@ class AdjointReduced:
     ``start(state)``, then ``step`` (or ``solver.step`` and ``record``) up to ``step_max`` times, then ``backward``.
 
     Differentiated: elasticity, viscosity, inertia and mass damping, gravity, external forces, pins and driven functions
-    (exactly); contact at the normals of the start of each step, the normal force of friction included. Not
-    differentiated: the turning of contact normals with the point of contact, contacts appearing or vanishing at the end
-    of their detection range (where they carry no force), the motion of rigid shapes, what BDF2 remembers from before
-    the record, and how the automatic contact stiffness follows E, nu and density: a record with contacts of such
-    stiffness is refused, unless ``contact_stiffness_per_area`` or an option says otherwise. Friction must be without
-    memory. Parameters must not change between recording and ``backward``.
+    (exactly); contact with flat faces: its stiffness, which follows E, nu, mass and size, its friction with the normal
+    force, and what friction remembers. Not differentiated: the turning of contact normals with the point of contact
+    (refused unless ``fixed_normals`` is set), contacts appearing or vanishing at the end of their detection range
+    (where they carry no force), the motion of rigid shapes, and what BDF2 remembers from before the record. Parameters
+    must not change between recording and ``backward``.
 
     Args:
         solver: The solver; rigid dofs must not take part in its solve.
-        step_max: Steps that can be recorded. A step keeps four vec3d per function, and 68 bytes per pin and, with
+        step_max: Steps that can be recorded. A step keeps four vec3d per function, and 80 bytes per pin and, with
             shapes in the model, per contact slot; ``backward`` takes as much again.
         options: Tolerances.
 
     Raises:
         ConfigError: If rigid joints are unknowns of the solver, soft bodies may touch each other, a pin follows a rigid
-            body, or friction has memory.
+            body, or ``friction_lag`` is 0 where there are shapes.
     """
 
     def __init__(self, solver: SolverReduced, step_max: int, *, options: AdjointOptions | None = None) -> None:
@@ -149,10 +156,10 @@ class AdjointReduced:
             )
         if t.instances.link_pin_count.numpy().any():
             raise ConfigError("pins that follow a rigid body have no derivative", hint="pin to the world (link=-1)")
-        if solver.model.shape_count and solver.options.stick_ratio > 0.0:
+        if solver.model.shape_count and solver.options.friction_lag == 0:
             raise ConfigError(
-                "friction remembers where contacts stick, and that memory has no derivative",
-                hint="use SolverReducedOptions(stick_ratio=0.0), friction smoothed over stick_velocity",
+                "friction_lag=0: the normal force of friction never follows the contact",
+                hint="use SolverReducedOptions(friction_lag=...) as large as iteration_max",
             )
         self.solver, self.options, self.step_max = solver, options or AdjointOptions(), step_max
         self.device, layout = solver.model.device, t.layout
@@ -168,6 +175,10 @@ class AdjointReduced:
         self._q, self._qd = self._zeros(states, wp.vec3d), self._zeros(states, wp.vec3d)
         self._dt_before = self._zeros((step_max + 1, self.instances), wp.float64)
         self._force, self._costate = (self._zeros((step_max, *t.unknowns), vec8d) for _ in range(2))
+        self._iteration = self._zeros((step_max, layout.world_count), int)
+        bodies = (step_max, max(solver.model.body_count, 1))
+        self._pose, self._twist = self._zeros(bodies, wp.transform), self._zeros(bodies, WRENCH)
+        self._turning = self._zeros((step_max, self.instances), wp.float32)
         self._constraint_count = self._zeros((step_max, self.instances), int)
         kinds = {name: getattr(t.constraints, name).dtype for name in _CONSTRAINT}
         self._constraint = {name: self._zeros((step_max, *constraints), kind) for name, kind in kinds.items()}
@@ -179,7 +190,8 @@ class AdjointReduced:
             "pin": self.pin_total,
             "unknown": 3 * layout.block_count,
         }
-        axes = {"": "instance point", "constraint_slip constraint_hessian constraint": "instance constraint"}
+        of_constraints = "constraint_slip constraint_size constraint_hessian constraint memory memory_start"
+        axes = {"": "instance point", of_constraints: "instance constraint"}
         self._step = allocate(kernels.Linearised, axes, self._sizes, self.device)
         points, constraints = Points(), PointConstraints()
         points.stress, constraints.force = self._step.point, self._step.constraint
@@ -251,8 +263,16 @@ class AdjointReduced:
             raise ConfigError(f"{t} steps are recorded, the most there is room for", hint="raise step_max")
         self._copy_state(state, t + 1)
         wp.copy(self._force[t], self.tables.motion.force)
+        wp.copy(self._iteration[t], self.tables.newton.iteration)
+        if self.solver.model.body_count:
+            wp.copy(self._pose[t], self.tables.shapes.body_q)
+            wp.copy(self._twist[t], self.tables.shapes.body_qd)
         for stored, values in self._constraints(t):
             wp.copy(stored, values)
+        if self.solver.model.shape_count:
+            self._turning[t].zero_()
+            found = (self.tables.instances, self.tables.samples, self.tables.shapes, self.tables.constraints)
+            self.tables.launch(find_turning, self._dims[1], *found, self._turning[t])
         self.dt.append(float(dt))
 
     def _copy_state(self, state: newton.State, t: int) -> None:
@@ -286,9 +306,10 @@ class AdjointReduced:
             The gradients; arrays are new with each call.
 
         Raises:
-            ConfigError: If nothing is recorded, a shape does not fit, or a contact whose stiffness follows the body is
-                part of the record.
-            SolverDiverged: If a step is further from its root than ``residual_max``, or its linear system is singular.
+            ConfigError: If nothing is recorded, a shape does not fit, or the normal of a contact turns as its point
+                moves and ``fixed_normals`` is not set.
+            SolverDiverged: If a step is further from its root than ``residual_max``, its linear system is singular, or
+                it starts with a contact so deep that a bound decides how far it is pushed out.
 
         Warns:
             RuntimeWarning: If a step is further from its root than ``residual_warning``.
@@ -296,36 +317,39 @@ class AdjointReduced:
         steps, t = self.step_count, self.tables
         if steps == 0:
             raise ConfigError("no step is recorded", hint="call start and step first")
-        self._check_contacts()
+        self._check_normals()
         q_bar, qd_bar = self._cotangent("loss_q", loss_q), self._cotangent("loss_qd", loss_qd)
         axes = {
             "": "instance unknown",
-            "log_modulus poissons_ratio viscosity": "instance point",
-            "friction": "instance constraint",
+            "log_modulus poissons_ratio viscosity point_scale": "instance point",
+            "friction contact": "instance constraint",
             "pin_stiffness": "pin",
         }
         sums = allocate(kernels.Sums, axes, self._sizes, self.device)
         totals = allocate(kernels.Totals, "instance", self._sizes, self.device)
         pin_target = self._zeros((steps, max(self.pin_total, 1)), wp.vec3d)
-        residual, error = (self._zeros((steps, self.instances), wp.float64) for _ in range(2))
+        residual, error, overlap = (self._zeros((steps, self.instances), wp.float64) for _ in range(3))
         bodies, (points, constraints) = (t.instances, t.basis), self._dims
 
         for k in reversed(range(steps)):
             costate, dt = self._costate[k], wp.float64(self.dt[k])
             self._restore(k)
-            self._measure(k, residual[k])
+            self._measure(k, residual[k], overlap[k])
             t.launch(kernels.add_velocity, t.unknowns, t.motion, qd_bar[k + 2], dt, q_bar[k + 2])
+            if self.solver.model.shape_count and k + 1 < steps:
+                self._pull_memory(k, q_bar[k + 2])
             self._solve(k, q_bar[k + 2], costate)
             wp.copy(error[k], self._gmres.error)
             t.launch(kernels.accumulate_points, points, *bodies, costate, dt, sums, self._step)
             if self.constraint_max:
-                found = (costate, sums, pin_target[k], self._step)
-                t.launch(kernels.accumulate_constraints, constraints, *bodies, t.constraints, *found)
+                contacts = (t.shapes, t.constraints, t.surface_stiffness, costate, self.dt[k])
+                found = (sums, pin_target[k], self._step)
+                t.launch(kernels.accumulate_constraints, constraints, *bodies, *contacts, *found)
             self._sum_points(t.newton.active)
             given = (t.motion, t.arrays, t.model.gravity, costate, self._driven, dt, k)
             t.launch(kernels.propagate, t.unknowns, *bodies, *given, q_bar, qd_bar, sums)
 
-        self._check(residual.numpy(), error.numpy())
+        self._check(residual.numpy(), error.numpy(), overlap.numpy())
         density = self.solver.parameters.density
         t.launch(kernels.sum_gradients, self.instances, t.instances, density, sums, totals)
         return ReducedGradients(
@@ -340,19 +364,18 @@ class AdjointReduced:
             **{name: getattr(totals, name) for name in _TOTALS},
         )
 
-    def _check_contacts(self) -> None:
-        """Refuse contacts whose stiffness follows parameters by which the loss is differentiated."""
-        if self.options.constant_contact_stiffness or not self.constraint_max:
+    def _check_normals(self) -> None:
+        """Refuse contacts whose normals turn, unless an option takes them for fixed."""
+        turning = self._turning[: self.step_count].numpy()
+        if self.options.fixed_normals or not turning.max() > FLAT:
             return
-        most = self._constraint_count[: self.step_count].numpy().max(axis=0)
-        automatic = self.solver.parameters.contact_stiffness.numpy() == 0.0
-        follows = (most > self.tables.layout.pin_count) & automatic
-        if follows.any():
-            raise ConfigError(
-                f"instance {follows.argmax()} has contacts whose stiffness follows its E, nu and density",
-                hint="give contact_stiffness_per_area to add_reduced_body or, for other gradients alone,"
-                " AdjointOptions(constant_contact_stiffness=True)",
-            )
+        t, i = np.unravel_index((turning > FLAT).argmax(), turning.shape)
+        raise ConfigError(
+            f"step {t}: instance {i} presses on a curved shape, on an edge or on what a fast sample flies past, and the"
+            " turning of the contact's normal has no derivative",
+            hint="touch planes and flat faces, for fast samples with a larger contact_margin or shorter steps; or pass"
+            " AdjointOptions(fixed_normals=True), whose gradients may have the wrong sign",
+        )
 
     def _cotangent(self, name: str, values: wp.array | ArrayLike | None) -> Any:
         """Return dL/dq or dL/dv in blocks, with a row of zeros for the state before the record."""
@@ -391,22 +414,23 @@ class AdjointReduced:
         t.launch(kernels.pack, (1, *self._blocks), t.instances, self._q[k + 2 : k + 3], end)
         for stored, values in self._constraints(k):
             wp.copy(values, stored)
+        t.shapes.body_q, t.shapes.body_qd = self._pose[k], self._twist[k]
         adapt(t, dt)
         progress = t.newton
         for flag in (progress.active, progress.refresh, progress.exact):
             flag.fill_(1)
         progress.project.zero_()
-        progress.iteration.zero_()
+        progress.iteration.fill_(1)  # at 0 the normal force of friction is bounded
         evaluate(t, dt, derivatives=True)
         gather_gradient(t, dt)
         assemble(t, dt)
         t.system.factor(progress.active)
 
-    def _measure(self, k: int, residual: wp.array) -> None:
+    def _measure(self, k: int, residual: wp.array, overlap: wp.array) -> None:
         """Measure the residual of the restored step and linearise it."""
         t, dt, (points, constraints) = self.tables, self.dt[k], self._dims
         step = (t.motion, t.constraints, self._resolution, t.arrays, wp.float64(dt))
-        t.launch(kernels.measure_residual, self.instances, t.instances, *step, residual)
+        t.launch(kernels.measure_residual, self.instances, t.instances, *step, residual, overlap)
         bodies = (t.instances, t.basis, t.motion)
         t.launch(kernels.place_points, points, *bodies, t.arrays.q, self._step)
         if self.constraint_max:
@@ -414,6 +438,13 @@ class AdjointReduced:
             t.launch(
                 kernels.place_constraints, constraints, *bodies, t.constraints, stick_range, t.arrays.q, self._step
             )
+
+    def _pull_memory(self, k: int, q_bar: wp.array) -> None:
+        """Add what the step after k feels of where its contacts stick to dL/dq_t."""
+        t, constraints = self.tables, self._dims[1]
+        after = (self._constraint_count[k + 1], self._constraint["row"][k + 1], self._constraint["shape"][k + 1])
+        t.launch(kernels.pull_memory, constraints, t.instances, t.shapes, t.constraints, *after, self._step)
+        t.launch(kernels.add_memory, t.unknowns, t.instances, t.basis, t.constraints, self._step, q_bar)
 
     def _solve(self, k: int, right: wp.array, solution: wp.array) -> None:
         """Solve H_t^T solution = right at the free functions; leave H_t^T solution at the driven ones."""
@@ -440,15 +471,22 @@ class AdjointReduced:
         dim = (self.instances, t.arrays.gradient_chunk.shape[1], t.layout.block_count)
         t.launch(sum_forces, dim, self._sums, active)
 
-    def _check(self, residual: Array, error: Array) -> None:
+    def _check(self, residual: Array, error: Array, overlap: Array) -> None:
         """Refuse steps that are no roots and systems that were not solved."""
         status = self.solver.status.numpy()
         if (status & WORLD_NOT_FINITE).any() or not np.isfinite(residual).all():
             raise SolverDiverged("a recorded step produced no finite state", hint="shorten dt or soften the load")
+        if overlap.max() > 1.0 - 1.0e-6:
+            t, i = np.unravel_index(overlap.argmax(), overlap.shape)
+            raise SolverDiverged(
+                f"step {t} of instance {i} starts with a contact deeper than {OVERLAP:g} of the body's size, which is"
+                " pushed out by a rule that has no derivative",
+                hint="place bodies apart, or shorten dt",
+            )
         if residual.max() > self.options.residual_warning:
             t, i = np.unravel_index(residual.argmax(), residual.shape)
             message = f"step {t} of instance {i} stopped at a residual of {residual[t, i]:.1e} of the forces"
-            hint = "lower SolverReducedOptions.tolerance (and force_tolerance)"
+            hint = self._why_inexact(int(t), int(i))
             if residual[t, i] > self.options.residual_max:
                 raise SolverDiverged(f"{message}, above residual_max = {self.options.residual_max:.1e}", hint=hint)
             warnings.warn(f"{message}: its gradient is as inexact; {hint}", RuntimeWarning, stacklevel=3)
@@ -458,6 +496,21 @@ class AdjointReduced:
                 f"the linear system of step {t}, instance {i}, was solved to {error[t, i]:.1e} only",
                 hint="raise AdjointOptions.cycle_length or cycle_max; at a bifurcation there is no gradient",
             )
+
+    def _why_inexact(self, t: int, i: int) -> str:
+        """Return what to change so that step t of instance i comes closer to its root."""
+        instances, options = self.tables.instances, self.solver.options
+        iterations = self._iteration[t].numpy()[instances.world.numpy()[i]]
+        contacts = slice(instances.pin_count.numpy()[i], self._constraint_count[t].numpy()[i])
+        rubs = self.constraint_max and self._constraint["friction"][t].numpy()[i, contacts].any()
+        if rubs and iterations > options.friction_lag:
+            return (
+                f"the normal force of friction was frozen after SolverReducedOptions.friction_lag ="
+                f" {options.friction_lag} of {iterations} iterations: raise it to iteration_max"
+            )
+        if iterations >= options.iteration_max:
+            return f"raise SolverReducedOptions.iteration_max, which all {iterations} were taken of, or shorten dt"
+        return "lower SolverReducedOptions.tolerance (and force_tolerance)"
 
     @property
     def _blocks(self) -> tuple[int, int]:

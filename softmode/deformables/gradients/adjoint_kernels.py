@@ -6,13 +6,20 @@ linear system: contact couples a body with rigid shapes only. Every sum runs in 
 
 import warp as wp
 
-from softmode.deformables.contact.penalty_kernels import friction_potential, normal_potential
+from softmode.deformables.contact.detection_kernels import Shapes, shape_area, shape_frame
+from softmode.deformables.contact.penalty_kernels import (
+    friction_potential,
+    normal_potential,
+    slip_potential,
+    stiffness_exponents,
+)
 from softmode.deformables.materials.hessian_kernels import stress_derivative
 from softmode.deformables.materials.material_kernels import green_strain, hooke_stress, stress
 from softmode.deformables.model.declare import struct
 from softmode.deformables.model.deformation_kernels import displacement_gradient, elastic_gradient
 from softmode.deformables.model.lane_kernels import LANES, free_part, vec8d
 from softmode.deformables.model.struct_kernels import (
+    OVERLAP,
     Basis,
     Instances,
     Motion,
@@ -33,11 +40,14 @@ class Linearised:
     place: wp.array2d[wp.mat33d]  # (instance_count, point_max), G = F / s - I, s the scale of the body
     place_start: wp.array2d[wp.mat33d]  # the same at the start of the step
     point: wp.array2d[wp.mat33d]  # V times what is summed over the points next [N m]
-    constraint_slip: wp.array2d[
-        wp.vec3d
-    ]  # pins: x - target [m]; contacts: friction force per coefficient, times -1 [N]
+    constraint_slip: wp.array2d[wp.vec3d]  # pins: x - target [m]; contacts: -d force / d friction coefficient [N]
+    constraint_size: wp.array2d[wp.vec3d]  # contacts: d force / d(ln scale) at the same stiffness [N]
     constraint_hessian: wp.array2d[wp.mat33d]  # -d force / d displacement [N/m]; not symmetric where a contact slips
     constraint: wp.array2d[wp.vec3d]  # what is summed over the constraints next [N]
+    memory: wp.array2d[wp.vec3d]  # what the next step feels of a contact's memory, over the stick stiffness
+    memory_start: wp.array2d[
+        wp.vec3d
+    ]  # the loss by the memory that a contact begins the step with, shape's frame [1/m]
 
 
 @struct
@@ -47,7 +57,9 @@ class Sums:
     log_modulus: wp.array2d[wp.float64]  # (instance_count, point_max), as the next two
     poissons_ratio: wp.array2d[wp.float64]
     viscosity: wp.array2d[wp.float64]
+    point_scale: wp.array2d[wp.float64]  # by ln s
     friction: wp.array2d[wp.float64]  # (instance_count, constraint_max)
+    contact: wp.array2d[wp.vec4d]  # likewise, by ln E, nu, ln m and ln s
     pin_stiffness: wp.array[wp.float64]  # (pin_count,)
     mass: wp.array2d[vec8d]  # (instance_count, 3 block_count), as what follows
     mass_damping: wp.array2d[vec8d]
@@ -65,6 +77,7 @@ class Totals:
     density: wp.array[wp.float64]
     mass_damping: wp.array[wp.float64]
     gravity: wp.array[wp.vec3d]
+    scale: wp.array[wp.float64]
 
 
 # -- layout ------------------------------------------------------------------------------------------------------------
@@ -161,7 +174,11 @@ def place_constraints(
     # Out:
     step: Linearised,
 ):
-    """Linearise pins and contacts, the normal force of friction included, at fixed normals."""
+    """Linearise pins and contacts, the normal force of friction included, at fixed normals.
+
+    With x = offset + d, p = -n . x and t the tangential part of x, a contact's force is
+    f = k psi_n'(p) n - secant(|t|, c k psi_n'(p)) t, see ``penalty_kernels``.
+    """
     i, e = wp.tid()
     if e >= constraints.count[i]:
         return
@@ -174,19 +191,79 @@ def place_constraints(
         step.constraint_hessian[i, e] = k * identity
         return
     n = constraints.normal[i, e]
-    _psi, slope, curvature = normal_potential(-wp.dot(n, x), wp.float64(instances.smoothing[i]))
-    t = x - wp.dot(n, x) * n
+    p = -wp.dot(n, x)
+    _psi, slope, curvature = normal_potential(p, wp.float64(instances.smoothing[i]))
+    t = x + p * n
     y = wp.length(t)
-    _f0, f1_over_y, f1_slope = friction_potential(y, stick_range)
     c = constraints.friction[i, e]
+    stick = constraints.stick[i, e]
+    limit = c * k * slope
+    _energy, secant, tangent = slip_potential(y, limit, stick, stick_range)
+    _f0, by_limit, _f1_slope = friction_potential(y, stick_range)
+    if stick > wp.float64(0.0):
+        by_limit = wp.float64(0.0)
+        if stick * y > limit:
+            by_limit = wp.float64(1.0) / y
     N = wp.outer(n, n)
-    slip = f1_over_y * (identity - N)
+    slip = secant * (identity - N)
     if y > wp.float64(1.0e-9) * stick_range:
-        slip += (f1_slope - f1_over_y) / (y * y) * wp.outer(t, t)
-    step.constraint_slip[i, e] = k * slope * f1_over_y * t
-    step.constraint_hessian[i, e] = (
-        k * curvature * N + c * k * slope * slip - c * k * curvature * f1_over_y * wp.outer(t, n)
-    )
+        slip += (tangent - secant) / (y * y) * wp.outer(t, t)
+    # psi_n' is of degree one in p and its range, which grows with s
+    size = k * (slope - p * curvature)
+    step.constraint_slip[i, e] = k * slope * by_limit * t
+    step.constraint_size[i, e] = size * (n - c * by_limit * t)
+    step.constraint_hessian[i, e] = k * curvature * N + slip - c * k * curvature * by_limit * wp.outer(t, n)
+
+
+@wp.kernel
+def pull_memory(
+    instances: Instances,
+    shapes: Shapes,
+    constraints: PointConstraints,
+    next_count: wp.array[int],  # (instance_count,), point constraints of the next step, and which they are
+    next_row: wp.array2d[int],
+    next_shape: wp.array2d[int],
+    # In: memory_start of the next step. Out: memory of this one; constraint, what it pulls at the end of the step
+    step: Linearised,
+):
+    """Take over what the next step feels of where the contacts stick.
+
+    A contact ends the step with the elastic slip -P f / k_t, P f the tangential force, whether it sticks or slides.
+    """
+    i, e = wp.tid()
+    if e >= constraints.count[i]:
+        return
+    memory = wp.vec3d()
+    if e >= instances.pin_count[i] and constraints.stick[i, e] > wp.float64(0.0):
+        shape = constraints.shape[i, e]
+        _origin, rotation = shape_frame(shapes, shape)
+        n = constraints.normal[i, e]
+        for k in range(instances.pin_count[i], next_count[i]):
+            if next_row[i, k] == constraints.row[i, e] and next_shape[i, k] == shape:
+                g = wp.quat_rotate(rotation, step.memory_start[i, k])
+                memory = (g - wp.dot(n, g) * n) / constraints.stick[i, e]
+    step.memory[i, e] = memory
+    step.constraint[i, e] = wp.transpose(step.constraint_hessian[i, e]) * memory
+
+
+@wp.kernel
+def add_memory(
+    instances: Instances,
+    basis: Basis,
+    constraints: PointConstraints,
+    step: Linearised,
+    # In and out:
+    q_bar: wp.array2d[vec8d],
+):
+    """Add what the memory pulls at the contacts to dL/dq_t."""
+    i, e = wp.tid()
+    stride = basis.row.shape[1]
+    b = e % stride
+    axis = e / stride
+    total = q_bar[i, e]
+    for k in range(instances.pin_count[i], constraints.count[i]):
+        total = total + step.constraint[i, k][axis] * vec8d(basis.row[constraints.row[i, k], b])
+    q_bar[i, e] = total
 
 
 @wp.kernel
@@ -199,6 +276,7 @@ def measure_residual(
     dt: wp.float64,
     # Out:
     ratio_out: wp.array[wp.float64],  # (instance_count,)
+    overlap_out: wp.array[wp.float64],  # (instance_count,), deepest contact at the start of the step over its bound
 ):
     """Compute |r| / |f|: the residual of a step against the largest of the forces that it balances."""
     i = wp.tid()
@@ -221,8 +299,12 @@ def measure_residual(
             stress = stress + internal[i, chunk, e]
         elastic += wp.dot(stress, stress)
     scale = wp.sqrt(wp.max(inertial, wp.max(elastic, external)))
+    deepest = wp.float64(0.0)
     for e in range(constraints.count[i]):
         scale += wp.length(constraints.force[i, e])
+        if e >= instances.pin_count[i]:
+            deepest = wp.max(deepest, -wp.dot(constraints.normal[i, e], constraints.offset[i, e]))
+    overlap_out[i] = deepest / wp.float64(OVERLAP * instances.size[i])
     ratio_out[i] = wp.sqrt(total) / (scale + weight * resolution[i])
 
 
@@ -328,7 +410,7 @@ def accumulate_points(
     # Out:
     step: Linearised,  # point: V dP_start^T[Lambda], what the start of the step feels through dissipation
 ):
-    """Add -V Lambda : dP/d(ln E, nu, tau); the stress is linear in mu, in lambda and in tau."""
+    """Add -V Lambda : dP/d(ln E, nu, tau, ln s); the stress is linear in mu, in lambda and in tau."""
     i, p = wp.tid()
     if p >= instances.point_count[i]:
         return
@@ -365,6 +447,11 @@ def accumulate_points(
     by_tau = one / dt * (F * hooke_stress(material, green_strain(G) - green_strain(G_start)))
     sums.viscosity[i, p] = sums.viscosity[i, p] - V * wp.ddot(L, by_tau)
     F_start = wp.identity(n=3, dtype=wp.float64) + G_start
+
+    # the elastic F and F_start go with 1 / s, V with s^2
+    by_size = two * stress(material, G, G_start, dt) - stress_derivative(material, G, G_start, dt, F)
+    by_size += material.viscosity / dt * (F * hooke_stress(material, wp.transpose(F_start) * F_start))
+    sums.point_scale[i, p] = sums.point_scale[i, p] - V * wp.ddot(L, by_size)
     strain = wp.float64(0.5) / s * (wp.transpose(F) * L + wp.transpose(L) * F)
     step.point[i, p] = -V * material.viscosity / dt * (F_start * hooke_stress(material, strain))
 
@@ -373,28 +460,48 @@ def accumulate_points(
 def accumulate_constraints(
     instances: Instances,
     basis: Basis,
+    shapes: Shapes,
     constraints: PointConstraints,
+    relative_stiffness: wp.array[float],  # (sample_total,), Young's modulus relative to the body's
     costate: wp.array2d[vec8d],
+    dt: float,
     # In and out:
     sums: Sums,
     # Out:
     pin_target_out: wp.array[wp.vec3d],  # (pin_count,), of this step
-    step: Linearised,  # constraint: what the start of the step feels through slip
+    step: Linearised,  # constraint: what the start of the step feels through slip; memory_start
 ):
-    """Add the gradients of pins, friction and of where a slipping contact started."""
+    """Add the gradients of pins, of friction, of the contacts' stiffness, and of where a contact started."""
     i, e = wp.tid()
     if e >= constraints.count[i]:
         return
-    L = interpolate(basis.row, constraints.row[i, e], costate, i, instances.function_count[i])
+    row = constraints.row[i, e]
+    L = interpolate(basis.row, row, costate, i, instances.function_count[i])
     step.constraint[i, e] = wp.vec3d()
     if e < instances.pin_count[i]:
         pin = instances.pin_start[i] + e
         pin_target_out[pin] = constraints.stiffness[i, e] * L
         sums.pin_stiffness[pin] = sums.pin_stiffness[pin] - wp.dot(L, step.constraint_slip[i, e])
         return
+    # all force of a contact is in proportion to its stiffness, what it remembers does not depend on it
+    shape = constraints.shape[i, e]
+    powers = stiffness_exponents(instances, i, relative_stiffness[row], shape_area(shapes, shape), dt)
+    gain = wp.dot(L, constraints.force[i, e]) * powers
+    L -= step.memory[i, e]
+    gain[3] += wp.dot(L, step.constraint_size[i, e])
+    sums.contact[i, e] = sums.contact[i, e] + gain
+    # of x = gap n + slip - drift + d, the gap grows along n as the sample's place at the start does, d falls by as much
+    # as that, and the drift of a shape that turns by R within the step grows by R - I of it
     n = constraints.normal[i, e]
     back = wp.transpose(step.constraint_hessian[i, e]) * L
-    step.constraint[i, e] = back - wp.dot(n, back) * n
+    across = back - wp.dot(n, back) * n
+    _origin, rotation = shape_frame(shapes, shape)
+    step.memory_start[i, e] = -wp.quat_rotate_inv(rotation, across)
+    body = shapes.body[shape]
+    if body >= 0:
+        spin = wp.float64(dt) * wp.vec3d(wp.spatial_bottom(shapes.body_qd[body]))
+        across += wp.quat_rotate_inv(wp.quat_from_axis_angle(wp.normalize(spin), wp.length(spin)), back) - back
+    step.constraint[i, e] = across
     # c = sqrt(friction of body * friction of shape)
     if instances.friction[i] > 0.0:
         share = wp.float64(0.5) * constraints.friction[i, e] / wp.float64(instances.friction[i])
@@ -466,26 +573,31 @@ def sum_gradients(
     modulus = wp.float64(0.0)
     nu = wp.float64(0.0)
     tau = wp.float64(0.0)
+    size = wp.float64(0.0)
     for p in range(instances.point_count[i]):
         modulus += sums.log_modulus[i, p]
         nu += sums.poissons_ratio[i, p]
         tau += sums.viscosity[i, p]
-    totals.youngs_modulus[i] = modulus / wp.float64(instances.youngs_modulus[i])
-    totals.poissons_ratio[i] = nu
-    totals.viscosity[i] = tau
+        size += sums.point_scale[i, p]
     c = wp.float64(0.0)
+    contact = wp.vec4d()
     for e in range(sums.friction.shape[1]):
         c += sums.friction[i, e]
-    totals.friction[i] = c
-    mass = wp.float64(0.0)
+        contact += sums.contact[i, e]
+    mass = contact[2]
     alpha = wp.float64(0.0)
     g = wp.vec3d()
     stride = sums.mass.shape[1] / 3
     for e in range(3 * stride):
         for lane in range(LANES):
-            mass += sums.mass[i, e][lane]
+            mass += instances.mass[i] * sums.mass[i, e][lane]
             alpha += sums.mass_damping[i, e][lane]
             g[e / stride] += sums.gravity[i, e][lane]
-    totals.density[i] = instances.mass[i] / wp.float64(density[i]) * mass
+    totals.youngs_modulus[i] = (modulus + contact[0]) / wp.float64(instances.youngs_modulus[i])
+    totals.poissons_ratio[i] = nu + contact[1]
+    totals.viscosity[i] = tau
+    totals.friction[i] = c
+    totals.density[i] = mass / wp.float64(density[i])
     totals.mass_damping[i] = alpha
     totals.gravity[i] = g
+    totals.scale[i] = (size + contact[3] + wp.float64(3.0) * mass) / wp.float64(instances.scale[i])

@@ -14,7 +14,10 @@ from softmode.errors import ConfigError, MissingExtraError
 if TYPE_CHECKING:
     from torch import Tensor
 
-INSTANCE_PARAMETERS = ("youngs_modulus", "poissons_ratio", "density", "viscosity", "mass_damping")
+INSTANCE_PARAMETERS = (
+    *("youngs_modulus", "poissons_ratio", "density", "viscosity"),
+    *("mass_damping", "friction", "scale"),
+)
 INPUTS = (*INSTANCE_PARAMETERS, "q", "qd", "pin_target", "q_driven", "force")
 
 
@@ -26,9 +29,9 @@ def rollout(adjoint: AdjointReduced, step_count: int, dt: float, **inputs: Tenso
         step_count: Steps T, at most ``adjoint.step_max``.
         dt: Step [s].
         **inputs: Any of ``youngs_modulus``, ``poissons_ratio``, ``density``, ``viscosity``, ``mass_damping``,
-            shape (I,), written to the model, which keeps float32; ``q``, ``qd``: initial state, (N, 3);
-            ``pin_target``: (T, pins, 3); ``q_driven``: (T, N, 3), read at the driven functions; ``force``: extra
-            generalised force, (T, N, 3). What is not given comes from the model.
+            ``friction``, ``scale``, shape (I,), written to the model, which keeps float32; ``q``, ``qd``: initial
+            state, (N, 3); ``pin_target``: (T, pins, 3); ``q_driven``: (T, N, 3), read at the driven functions;
+            ``force``: extra generalised force, (T, N, 3). What is not given comes from the model.
 
     Returns:
         q [m] and qd [m/s], float64, shape (T + 1, N, 3).

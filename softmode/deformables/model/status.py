@@ -18,7 +18,21 @@ WORLD_RIGID_OVERFLOW = 64
 """Status bit: MuJoCo dropped contacts or constraint rows between rigid bodies, for which it had no room."""
 WORLD_PARAMETER_RANGE = 128
 """Status bit: a parameter of a soft body is no number, infinite or outside the range of ``Material``, as one written
-into ``model.softmode`` may be."""
+into ``model.softmode`` may be; a bit of ``PARAMETER_BITS`` says which."""
+WORLD_PENETRATION = 256
+"""Status bit: a body began a step deeper in what it touches than ``OVERLAP`` (0.05) of its size; what is deeper than
+that is pushed out by as much as that a step."""
+PARAMETER_BITS = {
+    name: 1 << (16 + k)
+    for k, name in enumerate(
+        (
+            *("youngs_modulus", "poissons_ratio", "density", "viscosity", "mass_damping", "friction", "scale"),
+            *("contact_stiffness", "contact_radius", "material_model", "pin_stiffness", "pin_target", "q_driven"),
+            *("shape_material_mu", "gravity"),
+        )
+    )
+}
+"""Status bits, set with ``WORLD_PARAMETER_RANGE``: which array of the model or its control holds what cannot be."""
 
 REASONS = {
     WORLD_ITERATION_LIMIT: "iteration_limit",
@@ -29,6 +43,8 @@ REASONS = {
     WORLD_RIGID_NOT_FINITE: "rigid_not_finite",
     WORLD_RIGID_OVERFLOW: "rigid_overflow",
     WORLD_PARAMETER_RANGE: "parameter_range",
+    WORLD_PENETRATION: "penetration",
+    **{bit: f"{name}_range" for name, bit in PARAMETER_BITS.items()},
 }
 """Name of every status bit, as ``info`` of the environments gives it."""
 
@@ -41,6 +57,8 @@ REMEDIES = {
     WORLD_RIGID_NOT_FINITE: "look for NaN in drives, forces and teleported bodies; reset the world",
     WORLD_RIGID_OVERFLOW: "pass rigid=SolverMuJoCo(model, njmax=..., nconmax=...)",
     WORLD_PARAMETER_RANGE: "write parameters by set_parameters, which clamps them",
+    WORLD_PENETRATION: "place bodies apart, shorten the step, or give contact_stiffness_per_area",
+    **{bit: f"write finite values inside the range of {name}" for name, bit in PARAMETER_BITS.items()},
 }
 """What to do about every status bit."""
 

@@ -61,7 +61,7 @@ def _gather_pins(t: StepTables, control: SoftControl, dt: float, prescribed: boo
     layout, bodies, row = t.layout, (t.instances, t.basis), t.layout.first_pin_row
     dim = (layout.instance_count, layout.pin_max)
     pins = (*t.pin_arrays, control.pin_target, int(prescribed), float(dt))
-    t.launch(kernels.gather_pins, dim, *bodies, t.motion, t.shapes, row, *pins, t.constraints)
+    t.launch(kernels.gather_pins, dim, *bodies, t.motion, t.shapes, row, *pins, t.constraints, t.newton.status)
     dim = (layout.instance_count, layout.block_count, layout.block_count)
     t.launch(assembly.assemble_pins, dim, *bodies, row, t.parameters.pin_stiffness, t.arrays.pins)
 

@@ -21,4 +21,5 @@ def predict(tables: StepTables, state: newton.State, control: SoftControl, dt: f
     tables.launch(kernels.sum_external, (count, chunks, blocks), step, state.particle_f)
     before = (data.q, data.qd, data.q_before, data.qd_before, data.dt_before)
     bdf2 = int(tables.options.integrator == "bdf2")
-    tables.launch(kernels.begin_step, (count, blocks), step, tables.model.gravity, *before, control.q_driven, bdf2)
+    given = (control.q_driven, tables.parameters.density, tables.parameters.scale, bdf2)
+    tables.launch(kernels.begin_step, (count, blocks), step, tables.model.gravity, *before, *given)

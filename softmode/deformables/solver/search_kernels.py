@@ -7,6 +7,7 @@ from softmode.deformables.model.lane_kernels import barrier, team_sum, vec8d
 from softmode.deformables.model.status import WORLD_ITERATION_LIMIT, WORLD_NO_DESCENT, WORLD_NOT_FINITE
 from softmode.deformables.model.struct_kernels import (
     Instances,
+    first_coupled,
     has_contacts,
     hessian_key,
     pushes,
@@ -70,11 +71,37 @@ def potential_share(step: NewtonStep, q: wp.array2d[vec8d], r: wp.array2d[wp.flo
 
 
 @wp.func
-def check_convergence(step: NewtonStep, team: int, w: int, member: int):
-    """Sum the potential; stop a world whose last step was small and whose residual is small near its contacts.
+def rigid_excess(step: NewtonStep, w: int, member: int, team: int):
+    """Return how many of one thread's joint dofs have a residual above the tolerance of the forces on them."""
+    excess = wp.float64(0.0)
+    for j in range(member, step.rigid.count[w], team):
+        residual = wp.float64(0.0)
+        scale = step.rigid.inertia[w, j, j] * wp.float64(step.arrays.rigid_tolerance[w])
+        for k in range(step.rigid.count[w]):
+            residual += step.rigid.inertia[w, j, k] * (step.rigid.r[w, k] - step.rigid.predicted[w, k])
+        for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
+            for e in range(first_coupled(step.instances, i), step.constraints.count[i]):
+                if j >= step.constraints.dof_begin[i, e] and j < step.constraints.dof_end[i, e]:
+                    force = wp.dot(wp.vec3d(step.constraints.jacobian[i, e, j]), step.constraints.force[i, e])
+                    residual += force
+                    scale += wp.abs(force)
+        for k in range(step.rigid.row_count[w]):
+            force = wp.float64(step.rigid.row_jacobian[w, k, j]) * step.rigid.row_force[w, k]
+            residual += force
+            scale += wp.abs(force)
+        if not (wp.abs(residual) <= step.options.force_tolerance * scale):
+            excess += wp.float64(1.0)
+    return excess
 
-    The second condition matters in contact: within a step's tolerance friction goes from one side of its cone to the
-    other, and a residual is momentum that the other body receives and this one does not.
+
+@wp.func
+def check_convergence(step: NewtonStep, team: int, w: int, member: int):
+    """Sum the potential; stop a world whose residual is small, and whose last step was where nothing is touched.
+
+    Near contacts the residual decides, of bodies and of joints: it is momentum that the other side receives and this
+    one does not. A small step says little there, because within it friction goes from one side of its cone to the
+    other; and to wait for one after the residual is small costs an iteration or two more than the forces need. This
+    test comes before the Hessian is assembled and factorised.
     """
     if step.state.active[w] == 0:
         return
@@ -83,9 +110,13 @@ def check_convergence(step: NewtonStep, team: int, w: int, member: int):
     dt = step.options.dt
     share = potential_share(step, step.arrays.q, step.rigid.r, w, member, team)
     potential = team_sum(share)
-    done = step.state.last[w]
+    done = int(1)
+    if step.state.iteration[w] == 0:
+        done = 0
     for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
-        if done == 1 and step.state.iteration[w] > 0 and pushes(step.instances, step.constraints, i):
+        if done == 1 and not pushes(step.instances, step.constraints, i):
+            done = step.state.last[w]
+        elif done == 1:
             residual = wp.float64(0.0)
             external = wp.float64(0.0)
             scale = wp.float64(0.0)
@@ -99,6 +130,11 @@ def check_convergence(step: NewtonStep, team: int, w: int, member: int):
             floor = wp.float64(1.0e-5) * step.instances.mass[i] * wp.float64(step.instances.tolerance[i]) / (dt * dt)
             if not (wp.sqrt(residual) <= step.options.force_tolerance * scale + floor):
                 done = 0
+    if done == 1 and step.rigid.count[w] > 0:
+        excess = rigid_excess(step, w, member, team)
+        excess = team_sum(excess)
+        if excess > wp.float64(0.0):
+            done = 0
     if member != 0:
         return
     step.state.potential[w] = potential

@@ -31,7 +31,12 @@ from softmode.deformables.materials.material_kernels import (
 from softmode.deformables.model.declare import kernel_over
 from softmode.deformables.model.deformation_kernels import elastic_gradient
 from softmode.deformables.model.lane_kernels import LANES, team_sum, vec8d
-from softmode.deformables.model.status import WORLD_COLLAPSED, WORLD_NOT_FINITE, WORLD_PARAMETER_RANGE
+from softmode.deformables.model.status import (
+    PARAMETER_BITS,
+    WORLD_COLLAPSED,
+    WORLD_NOT_FINITE,
+    WORLD_PARAMETER_RANGE,
+)
 from softmode.deformables.model.struct_kernels import (
     Basis,
     Instances,
@@ -74,15 +79,39 @@ def sum_external(
 
 
 @wp.func
-def has_sound_parameters(instances: Instances, i: int):
-    """Return whether the parameters of an instance are finite and in the ranges of ``Material``."""
-    positive = wp.vec3(instances.youngs_modulus[i], instances.scale[i], float(instances.mass[i]))
-    damping = wp.vec2(instances.viscosity[i], instances.mass_damping[i])
-    contact = wp.vec3(instances.friction[i], instances.contact_stiffness[i], instances.contact_radius[i])
-    finite = wp.isfinite(positive) and wp.isfinite(damping) and wp.isfinite(contact)
+def range_bit(value: float, sound: bool, bit: int):
+    """Return the status bits of a parameter that is not finite or, as ``sound`` says, outside its range."""
+    if sound and wp.isfinite(value):
+        return 0
+    return bit | WORLD_PARAMETER_RANGE
+
+
+@wp.func
+def parameter_bits(instances: Instances, density: float, scale: float, i: int):
+    """Return the status bits of the parameters of an instance that are not finite or not in the range of ``Material``.
+
+    Density and scale are given as written: mass and sizes follow them from ``notify_model_changed`` on.
+    """
+    E = instances.youngs_modulus[i]
     nu = instances.poissons_ratio[i]
-    inside = wp.min(positive) > 0.0 and wp.min(damping) >= 0.0 and wp.min(contact) >= 0.0 and nu > -1.0 and nu < 0.5
-    return finite and inside
+    model = instances.material_model[i]
+    tau = instances.viscosity[i]
+    alpha = instances.mass_damping[i]
+    mu = instances.friction[i]
+    kappa = instances.contact_stiffness[i]
+    radius = instances.contact_radius[i]
+    bits = range_bit(E, E > 0.0, wp.static(PARAMETER_BITS["youngs_modulus"]))
+    bits |= range_bit(nu, nu > -1.0 and nu < 0.5, wp.static(PARAMETER_BITS["poissons_ratio"]))
+    bits |= range_bit(density, density > 0.0, wp.static(PARAMETER_BITS["density"]))
+    bits |= range_bit(scale, scale > 0.0, wp.static(PARAMETER_BITS["scale"]))
+    bits |= range_bit(tau, tau >= 0.0, wp.static(PARAMETER_BITS["viscosity"]))
+    bits |= range_bit(alpha, alpha >= 0.0, wp.static(PARAMETER_BITS["mass_damping"]))
+    bits |= range_bit(mu, mu >= 0.0, wp.static(PARAMETER_BITS["friction"]))
+    bits |= range_bit(kappa, kappa >= 0.0, wp.static(PARAMETER_BITS["contact_stiffness"]))
+    bits |= range_bit(radius, radius >= 0.0, wp.static(PARAMETER_BITS["contact_radius"]))
+    known = model >= 0 and model < wp.static(len(MaterialModel))
+    bits |= range_bit(0.0, known, wp.static(PARAMETER_BITS["material_model"]))
+    return bits
 
 
 @wp.kernel
@@ -96,13 +125,18 @@ def begin_step(
     qd_before: wp.array[wp.vec3d],  # v_(n-1)
     dt_before: wp.array[wp.float64],  # (instance_count,) [s], 0 where there was no step before
     q_driven: wp.array[wp.vec3d],  # (function_total,), where the driven functions are to be at the end of the step
+    density: wp.array[float],  # (instance_count,) [kg/m^3], as the model has them, which may not be in use yet
+    scale: wp.array[float],
     bdf2: int,
 ):
     """Read the state, predict where the body goes, and add gravity to the external forces; flag bad parameters."""
     dt = step.options.dt
     i, b = wp.tid()
-    if b == 0 and not has_sound_parameters(step.instances, i):
-        wp.atomic_or(step.state.status, step.instances.world[i], WORLD_PARAMETER_RANGE)
+    g = gravity[wp.max(step.instances.world[i], 0)]
+    bits = int(0)
+    if b == 0:
+        bits = parameter_bits(step.instances, density[i], scale[i], i)
+        bits |= range_bit(0.0, wp.isfinite(g), wp.static(PARAMETER_BITS["gravity"]))
     n = step.instances.function_count[i]
     if LANES * b >= n:
         return
@@ -139,6 +173,7 @@ def begin_step(
                     change[lane] = ahead * dt * (qd[lane] - qd_before[first + lane][axis])
                 if lane < driven:
                     start[lane] = q_driven[first + lane][axis]
+                    bits |= range_bit(0.0, wp.isfinite(start[lane]), wp.static(PARAMETER_BITS["q_driven"]))
                     change[lane] = wp.float64(0.0)
         e = axis * stride + b
         step.motion.q_start[i, e] = q
@@ -149,9 +184,10 @@ def begin_step(
         step.arrays.q[i, e] = start
     step.motion.rate[i] = c
     weight = step.instances.mass[i] * vec8d(step.basis.mean[step.instances.asset[i], b])
-    g = wp.vec3d(gravity[wp.max(step.instances.world[i], 0)])
+    if bits != 0:
+        wp.atomic_or(step.state.status, step.instances.world[i], bits)
     for axis in range(3):
-        force = g[axis] * weight
+        force = wp.float64(g[axis]) * weight
         for chunk in range(step.arrays.gradient_chunk.shape[1]):
             force = force + step.arrays.gradient_chunk[i, chunk, axis * stride + b]
         step.motion.force[i, axis * stride + b] = force

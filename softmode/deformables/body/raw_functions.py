@@ -1,0 +1,76 @@
+"""Raw functions: what a body's functions are combinations of, b = raw @ transform."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softmode.deformables.body.qgmls import BasisQGMLS
+from softmode.deformables.body.regions import Envelope
+from softmode.deformables.body.rkpm import REACH, BasisRKPM
+from softmode.deformables.body.skinning_weights import SkinningWeights, constant_handle, enveloped
+
+Array = NDArray[np.float64]
+
+
+class RawFunctions(Protocol):
+    """Scalar functions of rest points of the body frame, (x, y, z, 1) over a length first."""
+
+    def reach(self, points: Array) -> tuple[Array, Array]:
+        """Return how far points lie from the nearest centre that acts there, over its reach (N,), and it (N, 3) [m]."""
+        ...
+
+    def evaluate(self, points: Array) -> tuple[Array, Array]:
+        """Return values (N, R) and gradients [1/m] (N, R, 3) at points within reach."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkinningFunctions:
+    """Products of skinning weights and monomials."""
+
+    kernels: BasisRKPM
+    """Reproducing kernels."""
+    skin: SkinningWeights
+    """Weights in them."""
+    envelope: Envelope | None
+    """What makes kernels vanish on exact regions."""
+    length: float
+    """Unit of length of the monomials [m]."""
+
+    def reach(self, points: Array) -> tuple[Array, Array]:
+        """Return how far points lie from the nearest centre that acts there, over its reach (N,), and it (N, 3) [m]."""
+        distance, nearest = self.kernels.nearest(points)
+        return distance / (REACH * self.kernels.support[nearest]), self.kernels.centres[nearest]
+
+    def weights(self, points: Array) -> tuple[Array, Array]:
+        """Return the skinning weights (N, J) and their gradients [1/m] (N, J, 3) at points within reach."""
+        return self.skin.evaluate(*enveloped(self.kernels.evaluate(points), self.envelope))
+
+    def evaluate(self, points: Array) -> tuple[Array, Array]:
+        """Return values (N, R) and gradients [1/m] (N, R, 3) at points within reach."""
+        return self.skin.products(*self.weights(points), points, self.length)
+
+
+@dataclass(frozen=True, kw_only=True)
+class QuadraticFunctions:
+    """The ten monomials up to degree two, and the functions of Q-GMLS, of which those are combinations."""
+
+    kernels: BasisQGMLS
+    """Kernels."""
+    length: float
+    """Unit of length of the monomials [m]."""
+
+    def reach(self, points: Array) -> tuple[Array, Array]:
+        """Return how far points lie from the centre that covers each best, over its reach (N,), and it (N, 3) [m]."""
+        return self.kernels.reach(points)
+
+    def evaluate(self, points: Array) -> tuple[Array, Array]:
+        """Return values (N, 10 + 10 n) and gradients [1/m] (N, 10 + 10 n, 3) at points within reach."""
+        one, flat = np.ones((len(points), 1)), np.zeros((len(points), 1, 3))
+        whole = constant_handle(1).products(one, flat, points, self.length)
+        own = self.kernels.evaluate(points)
+        return np.concatenate([whole[0], own[0]], axis=1), np.concatenate([whole[1], own[1]], axis=1)

@@ -1,0 +1,262 @@
+"""Gradients through contact: against central differences, by everything that a contact follows, and what is refused."""
+
+import dataclasses
+import functools
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+
+from softmode.deformables.gradients.adjoint import AdjointOptions, AdjointReduced
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.solver.solver_reduced import SolverReducedOptions
+from softmode.errors import ConfigError, SolverDiverged
+from tests.scenes import GRAVITY, Scene, cube
+
+EXACT = SolverReducedOptions(tolerance=1.0e-12, force_tolerance=1.0e-12, iteration_max=100, friction_lag=100)
+"""Solved to rounding, the normal force of friction too: central differences divide what is left by their step."""
+SMOOTHED = dataclasses.replace(EXACT, stick_ratio=0.0)
+STEPS, DT = 12, 0.004
+SPIN = 20.0
+"""Of the turntable [rad/s]."""
+
+
+class Landing:
+    """A cube that lands askew on the ground or on a turntable, and a loss of where it ends up.
+
+    Args:
+        youngs_modulus: E of every world [Pa].
+        friction: Of the cube and of what it lands on.
+        options: How the steps are solved.
+        turntable: Whether it lands on a box that turns, instead of on the ground.
+        height: Of its centre at the start [m].
+        stiffness: Contact stiffness per area [Pa/m]; None for the one that follows the body.
+    """
+
+    def __init__(
+        self,
+        *youngs_modulus: float,
+        friction: float = 0.0,
+        options: SolverReducedOptions = EXACT,
+        turntable: bool = False,
+        height: float = 0.0505,
+        stiffness: float | None = None,
+    ) -> None:
+        """Build the scene and random weights of the loss."""
+        body, worlds = cube(), len(youngs_modulus)
+        self.friction = friction
+
+        def populate(world: newton.ModelBuilder) -> None:
+            material = Material(viscosity=0.005, density=500.0, friction=friction)
+            add_reduced_body(
+                world,
+                body,
+                material=material,
+                position=(0.0, 0.0, height),
+                velocity=(0.3, 0.1, -1.0),
+                angular_velocity=(2.0, 1.0, 0.5),
+                contact_stiffness_per_area=stiffness,
+            )
+            if turntable:
+                table = world.add_body(
+                    xform=wp.transform(wp.vec3(0.02, 0.0, -0.05), wp.quat_identity()), is_kinematic=True
+                )
+                config = newton.ModelBuilder.ShapeConfig(mu=friction)
+                world.add_shape_box(table, hx=0.3, hy=0.3, hz=0.05, cfg=config)
+
+        self.scene = Scene(
+            populate,
+            [body],
+            world_count=worlds,
+            gravity=(0.0, 0.0, -GRAVITY),
+            ground=None if turntable else friction,
+            options=options,
+            dt=DT,
+        )
+        self.scene.set_parameter("youngs_modulus", youngs_modulus)
+        self.adjoint = AdjointReduced(self.scene.reduced, STEPS)
+        rng, n = np.random.default_rng(0), body.function_count
+        self.weight = np.zeros((STEPS + 1, n * worlds, 3))
+        self.weight[-1] = np.tile(rng.normal(size=(n, 3)), (worlds, 1))
+        self.path = {name: size * rng.normal(size=(n, 3)) for name, size in (("q", 1.0e-3), ("qd", 1.0))}
+        self.turntable = turntable
+
+    def run(self, **change: float) -> float:
+        """Return the loss after moving the initial state along random paths."""
+        scene = self.scene
+        scene.restart()
+        for name, amount in change.items():
+            array = getattr(scene.state.softmode, name)
+            array.assign(array.numpy() + amount * np.tile(self.path[name], (scene.reduced.world_count, 1)))
+        self.adjoint.start(scene.state)
+        for t in range(STEPS):
+            if self.turntable:
+                pose = wp.transform(wp.vec3(0.02, 0.0, -0.05), wp.quat_rpy(0.0, 0.0, SPIN * t * DT))
+                scene.state.body_q.fill_(pose)
+                scene.state.body_qd.fill_(wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, SPIN))
+            self.adjoint.step(scene.state, scene.next_state, scene.control, DT)
+            scene.state, scene.next_state = scene.next_state, scene.state
+        return float((self.weight * self.adjoint.q.numpy()).sum())
+
+    def gradients(self) -> dict[str, np.ndarray]:
+        """Return the gradients of the unchanged run, which must touch something."""
+        self.run()
+        assert self.scene.reduced.view.constraints.count.numpy().min() > 10
+        return self.adjoint.backward(loss_q=self.weight).numpy()
+
+    def difference(self, name: str, relative: float) -> float:
+        """Return the central difference by a parameter, or along a path; the model stores float32, read back."""
+        if name in self.path:
+            return (self.run(**{name: relative}) - self.run(**{name: -relative})) / (2.0 * relative)
+        array = getattr(self.scene.model.softmode, name)
+        before, x, losses = float(array.numpy()[0]), [], []
+        for factor in (1.0 - relative, 1.0 + relative):
+            self.scene.set_parameter(name, before * factor)
+            x.append(float(array.numpy()[0]))
+            losses.append(self.run())
+        self.scene.set_parameter(name, before)
+        return (losses[1] - losses[0]) / (x[1] - x[0])
+
+    def gradient(self, gradients: dict[str, np.ndarray], name: str) -> float:
+        """Return what ``difference`` approximates."""
+        return float((gradients[name] * self.path[name]).sum()) if name in self.path else float(gradients[name][0])
+
+
+@functools.cache
+def stiff_landing() -> Landing:
+    """Return a landing whose contact stiffness follows E, built once."""
+    return Landing(2.0e6)
+
+
+@pytest.mark.parametrize("youngs_modulus", [1.0e4, 1.0e5, 2.0e6, 1.0e7])
+def test_frictionless_contact(youngs_modulus: float) -> None:
+    """DL/d(E, nu, rho, scale, v_0) within 1e-3 of differences at the default contact stiffness.
+
+    It follows the mass for E up to 1e5 here, and E and nu for the two others.
+    """
+    case = stiff_landing() if youngs_modulus == 2.0e6 else Landing(youngs_modulus)
+    gradients = case.gradients()
+    for name in ("youngs_modulus", "poissons_ratio", "density", "scale", "qd"):
+        found = case.gradient(gradients, name)
+        assert found == pytest.approx(case.difference(name, 1.0e-3), rel=1.0e-3), name
+    assert gradients["grad_residual"].max() < 1.0e-10
+
+
+def test_given_contact_stiffness() -> None:
+    """The same of a stiffness that is given, which still grows with the samples' area: dL/d(E, rho, scale)."""
+    case = Landing(2.0e6, stiffness=3.0e8)
+    gradients = case.gradients()
+    for name in ("youngs_modulus", "density", "scale"):
+        assert case.gradient(gradients, name) == pytest.approx(case.difference(name, 1.0e-3), rel=1.0e-3), name
+
+
+def test_scale_of_a_body_that_is_placed_anew() -> None:
+    """DL/ds of a run that ``reset`` begins: the gradient at the same state and what reset moves, linear in s."""
+    case, s = stiff_landing(), 1.0e-3
+    scene, gradients = case.scene, case.gradients()
+    start = {name: getattr(scene.model.softmode, name) for name in ("q", "qd")}
+    before = {name: array.numpy().copy() for name, array in start.items()}
+    placed, losses = [], []
+    try:
+        for scale in (1.0 - s, 1.0 + s):
+            scene.set_parameter("scale", scale)
+            state = scene.model.state()
+            scene.reduced.reset(state)
+            placed.append({name: getattr(state.softmode, name).numpy() for name in start})
+            for name, array in start.items():
+                array.assign(placed[-1][name])
+            losses.append(case.run())
+            for name, array in start.items():
+                array.assign(before[name])
+    finally:
+        scene.set_parameter("scale", 1.0)
+    moved = sum(float((gradients[name] * (placed[1][name] - placed[0][name])).sum()) for name in start) / (2.0 * s)
+    assert gradients["scale"][0] + moved == pytest.approx((losses[1] - losses[0]) / (2.0 * s), rel=1.0e-3)
+
+
+@pytest.mark.parametrize("options", [EXACT, SMOOTHED], ids=["remembers", "smoothed"])
+def test_frictional_contact(options: SolverReducedOptions) -> None:
+    """DL/d(E, nu, rho, mu, v_0, q_0) within 1e-2 of differences, samples sticking, sliding and leaving.
+
+    The steps are small: the force has a kink where a sample begins to slide, and a difference may cross it.
+    """
+    case = Landing(1.0e5, friction=0.8, options=options)
+    gradients = case.gradients()
+    steps = {"youngs_modulus": 1e-3, "poissons_ratio": 1e-4, "density": 1e-3, "friction": 1e-3, "qd": 1e-5, "q": 1e-5}
+    for name, relative in steps.items():
+        assert case.gradient(gradients, name) == pytest.approx(case.difference(name, relative), rel=1.0e-2), name
+    assert gradients["grad_residual"].max() < 1.0e-10
+    if options is EXACT:
+        constraints = case.scene.reduced.view.constraints
+        count = constraints.count.numpy()[0]
+        force, slip = (getattr(constraints, name).numpy()[0, :count] for name in ("force", "slip"))
+        sticks = np.isclose(np.linalg.norm(force[:, :2], axis=1), force[:, 2] * 0.8, rtol=1e-3)
+        assert slip.any() and 0 < sticks.sum() < count
+
+
+def test_friction_on_a_turntable() -> None:
+    """What sticks to a shape that turns is remembered in the shape's frame: dL/d(q_0) within 1e-2.
+
+    The gap is a float32 in the box's frame, 4e-9 m here, which smaller differences drown in.
+    """
+    case = Landing(1.0e5, friction=0.8, turntable=True)
+    gradients = case.gradients()
+    assert case.gradient(gradients, "q") == pytest.approx(case.difference("q", 3.0e-4), rel=1.0e-2)
+
+
+def test_worlds_in_contact_are_independent() -> None:
+    """World i of 2 that land with other E has the gradients of the single world, bit for bit."""
+    batch = Landing(1.0e5, 2.0e6, friction=0.8).gradients()
+    for world, modulus in enumerate((1.0e5, 2.0e6)):
+        single = Landing(modulus, friction=0.8).gradients()
+        for name in ("youngs_modulus", "poissons_ratio", "density", "friction", "scale"):
+            np.testing.assert_array_equal(batch[name][world], single[name][0], err_msg=name)
+
+
+def test_frozen_normal_force_is_named() -> None:
+    """A frictional landing that freezes the normal force after 8 iterations is refused, and the error says so."""
+    case = Landing(1.0e5, friction=0.8, options=dataclasses.replace(EXACT, friction_lag=8))
+    case.adjoint = AdjointReduced(
+        case.scene.reduced, STEPS, options=AdjointOptions(residual_warning=1.0e-9, residual_max=1.0e-9)
+    )
+    case.run()
+    with pytest.raises(SolverDiverged, match=r"friction_lag = 8 of \d+ iterations: raise it to iteration_max"):
+        case.adjoint.backward(loss_q=case.weight)
+
+
+def test_a_normal_that_turns_is_refused() -> None:
+    """On a sphere the normal turns: refused, unless it is taken for fixed. On the face of a box it does not."""
+    body = cube()
+
+    def gradients(shape: str, **options: bool) -> dict[str, np.ndarray]:
+        def populate(world: newton.ModelBuilder) -> None:
+            add_reduced_body(world, body, material=Material(friction=0.0), position=(0.0, 0.0, 0.047))
+            below = wp.transform(wp.vec3(0.0, 0.0, -0.2), wp.quat_identity())
+            if shape == "sphere":
+                world.add_shape_sphere(-1, xform=below, radius=0.2)
+            else:
+                world.add_shape_box(-1, xform=below, hx=0.2, hy=0.2, hz=0.2)
+
+        scene = Scene(populate, [body], gravity=(0.0, 0.0, -GRAVITY), options=EXACT)
+        adjoint = AdjointReduced(scene.reduced, 1, options=AdjointOptions(**options))
+        adjoint.start(scene.state)
+        adjoint.step(scene.state, scene.next_state, None, DT)
+        assert scene.reduced.instance_force.numpy()[0, 2] > 0.0
+        return adjoint.backward(loss_q=np.ones((2, adjoint.total, 3))).numpy()
+
+    gradients("box")
+    with pytest.raises(ConfigError, match="fixed_normals=True"):
+        gradients("sphere")
+    gradients("sphere", fixed_normals=True)
+
+
+def test_deep_overlap_is_refused() -> None:
+    """What starts deeper than a twentieth of the body's size is pushed out by a rule without derivative."""
+    case = Landing(1.0e5, height=0.03)
+    case.run()
+    with pytest.raises(SolverDiverged, match=r"deeper than 0\.05.*Place bodies apart"):
+        case.adjoint.backward(loss_q=case.weight)
+    with pytest.raises(ConfigError, match="friction_lag"):
+        Landing(1.0e5, options=dataclasses.replace(EXACT, friction_lag=0))
