@@ -1,19 +1,21 @@
-"""Morphs: time per particle and step forward and backward, and of whole morphs, on a CPU core or a GPU.
+"""Morphs: time per particle and step forward and backward, whole morphs, and a table of pairs, on a CPU core or a GPU.
 
 Run from the repository root: ``python -m benchmarks.morph [--device cuda:0] [--frames 420] [--worlds 1 64] [--spacing
-0.5] [--damping 8 0.5]``. A ball of radius 6.93 m becomes newton's bunny of the same volume, with the paper's grid,
-material and step (Xu, Song, Levin, Hyde 2025); times are processor time on a CPU, wall clock on a GPU.
+0.5] [--damping 4 0.5] [--pairs sphere bunny duck cow car]``. Bodies of the volume of a ball of radius 6.93 m on the
+paper's grid, with its material and step (Xu, Song, Levin, Hyde 2025); times are processor time on a CPU, wall clock on
+a GPU. ``--bodies FILE`` keeps the particles of the pairs, for machines without the assets.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
-import trimesh
 import warp as wp
 from scipy.spatial import KDTree
 
@@ -22,14 +24,15 @@ from softmode.mpm import (
     MassLoss,
     MorphOptions,
     MorphPlanner,
+    MorphRun,
     MpmSimulation,
     ParticleBody,
-    particles_from_mesh,
-    particles_from_shape,
 )
-from tests.shapes import from_newton
+from softmode.objects.solids import filled, solid_of
 
-RADIUS = 6.93
+PAIRS = ("sphere", "bunny", "duck", "cow", "car")
+REST = 60
+"""Frames without control after a morph, in which the shape should stay."""
 
 
 def main() -> None:
@@ -39,35 +42,113 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=420)
     parser.add_argument("--worlds", type=int, nargs="+", default=[1])
     parser.add_argument("--spacing", type=float, default=0.5, help="distance between particles [m]")
-    parser.add_argument("--target", default="bunny", help="an asset of newton's examples, or torus")
-    parser.add_argument("--damping", type=float, nargs="+", default=[8.0], help="zeta [1/s]")
+    parser.add_argument("--target", default="bunny", help="what the ball becomes")
+    parser.add_argument("--damping", type=float, nargs="+", default=[4.0], help="zeta [1/s]")
+    parser.add_argument(
+        "--coarse", type=float, default=MorphOptions().coarse, help="0 compares masses on one grid alone"
+    )
+    parser.add_argument("--pairs", nargs="*", help=f"all ordered pairs of these; {' '.join(PAIRS)} if none is named")
+    parser.add_argument("--sources", nargs="+", help="only pairs that begin with these")
+    parser.add_argument("--bodies", type=Path, help="particles of the pairs (.npz): read if it is there, else written")
+    parser.add_argument("--json", type=Path, help="where to write the table")
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
-    ball, goal = bodies(options.spacing, options.target)
+    chosen = MorphOptions(frame_count=options.frames, coarse=options.coarse)
+    if options.pairs is not None:
+        bodies = pair_bodies(options.pairs or PAIRS, options.spacing, options.bodies)
+        rows = []
+        for damping in options.damping:
+            made = replace(chosen, mpm=replace(chosen.mpm, damping=damping))
+            for target in bodies:
+                sources = [name for name in options.sources or bodies if name != target]
+                rows += morph_pairs(bodies, sources, target, made, options.device)
+                if options.json is not None:
+                    options.json.write_text(json.dumps(rows, indent=1))
+            if rows:
+                found = [row["accuracy"] for row in rows if row["damping"] == damping]
+                print(f"zeta {damping:g}: median {np.median(found):.2f} %, worst {min(found):.2f} %", flush=True)
+        return
+    ball, goal = centred(filled([solid_of("sphere"), solid_of(options.target)], spacing=options.spacing)[1])
     print(f"{options.device}: ball of {ball.count} particles to {options.target} of {goal.count}")
-    chosen = MorphOptions(frame_count=options.frames)
     time_step(ball, goal, chosen, options.device)
     for worlds in options.worlds:
         for damping in options.damping:
             time_morph(ball, goal, replace(chosen, mpm=replace(chosen.mpm, damping=damping)), options.device, worlds)
 
 
-def bodies(spacing: float, target: str) -> tuple[ParticleBody, ParticleBody]:
-    """Return a ball and a target of its volume, both with their centre of mass at the origin."""
-    bounds = [[-RADIUS] * 3, [RADIUS] * 3]
-    ball = particles_from_shape(
-        lambda x: (x**2).sum(axis=1) <= RADIUS**2, bounds, spacing=spacing, material=MORPH_MATERIAL
-    )
-    if target == "torus":
-        mesh = trimesh.creation.torus(7.0, 3.2, major_sections=96, minor_sections=48)
-        vertices, faces = mesh.vertices, mesh.faces
-    else:
-        vertices, faces = from_newton(target)
-    corner = vertices[faces]
-    volume = abs(np.einsum("ti,ti->", corner[:, 0], np.cross(corner[:, 1], corner[:, 2]))) / 6.0
-    scale = (ball.count * spacing**3 / volume) ** (1.0 / 3.0)
-    goal = particles_from_mesh(vertices * scale, faces, spacing=spacing, material=MORPH_MATERIAL)
-    return ball.moved(-ball.centre), goal.moved(-goal.centre)
+def centred(bodies: list[ParticleBody]) -> list[ParticleBody]:
+    """Return bodies with their centres of mass at the origin, which is the middle of the grid but for half a cell."""
+    return [body.moved(-body.centre) for body in bodies]
+
+
+def pair_bodies(names: tuple[str, ...] | list[str], spacing: float, file: Path | None) -> dict[str, ParticleBody]:
+    """Return bodies of one volume by name, from a file where there is one."""
+    if file is not None and file.exists():
+        with np.load(file) as stored:
+            arrays = {name: (stored[name], stored[f"{name}.masses"]) for name in names}
+        return {name: ParticleBody(positions=x, masses=m, material=MORPH_MATERIAL) for name, (x, m) in arrays.items()}
+    found = dict(zip(names, centred(filled([solid_of(name) for name in names], spacing=spacing)[1]), strict=True))
+    if file is not None:
+        parts = {name: body.positions for name, body in found.items()}
+        parts |= {f"{name}.masses": body.masses for name, body in found.items()}
+        np.savez(file, allow_pickle=False, **parts)
+    return found
+
+
+def morph_pairs(
+    bodies: dict[str, ParticleBody], sources: list[str], target: str, options: MorphOptions, device: str
+) -> list[dict[str, float | str]]:
+    """Morph several bodies into one at once; print and return a row for each."""
+    goal = bodies[target]
+    start = time.process_time() if device == "cpu" else time.perf_counter()
+    planner = MorphPlanner([bodies[name] for name in sources], goal, options, device=device)
+    runs = planner.run()
+    seconds = (time.process_time() if device == "cpu" else time.perf_counter()) - start
+    rested = rest(planner)
+    rows: list[dict[str, float | str]] = []
+    for name, run, after in zip(sources, runs, rested, strict=True):
+        row = {
+            "source": name,
+            "target": target,
+            "particles": bodies[name].count,
+            "damping": options.mpm.damping,
+            "segments": run.segment_count,
+            "first_loss": float(run.losses[0]),
+            "loss": float(run.losses[-1]),
+            "least_loss": float(run.losses.min()),
+            "rested_loss": float(after),
+            "accuracy": 100.0 * run.accuracy,
+            "ejected": 100.0 * ejected(run, goal),
+            "kinetic_energy": float(run.kinetic_energy[-1]),
+            "seconds_of_all": seconds,
+            "notes": "; ".join(run.notes),
+        }
+        print(
+            f"zeta {row['damping']:g} {name} -> {target}: {row['first_loss']:.1f} -> {row['loss']:.2f} "
+            f"({row['accuracy']:.2f} %), least {row['least_loss']:.2f}, rested {after:.2f}, "
+            f"ejected {row['ejected']:.2f} %, E {row['kinetic_energy']:.3g} J, "
+            f"{run.segment_count} segments, {seconds:.1f} s for {len(sources)} {row['notes']}",
+            flush=True,
+        )
+        rows.append(row)
+    return rows
+
+
+def rest(planner: MorphPlanner) -> np.ndarray:
+    """Step on without control; return the losses of the worlds."""
+    s = planner.simulation
+    s.control.zero_()
+    loss = wp.zeros(s.world_count, dtype=wp.float64, device=s.device)
+    for _ in range(REST // planner.options.segment_length):
+        s.forward()
+        planner.loss.after(s, loss)
+        s.first.copy_from(s.last)
+    return loss.numpy().copy()
+
+
+def ejected(run: MorphRun, goal: ParticleBody) -> float:
+    """Return the part of the particles that lie over a cell away from every particle of the target."""
+    return float((KDTree(goal.positions).query(run.positions[-1])[0] > 1.0).mean())
 
 
 def time_step(ball: ParticleBody, goal: ParticleBody, options: MorphOptions, device: str) -> None:
@@ -76,19 +157,12 @@ def time_step(ball: ParticleBody, goal: ParticleBody, options: MorphOptions, dev
     loss = MassLoss(options.mpm.grid, goal, device=device)
     value = wp.zeros(1, dtype=wp.float64, device=device)
 
-    def gradient() -> None:
-        """Carry the loss back."""
-        bar, mass_bar, _ = simulation.bars()
-        bar.zero()
-        loss.spread(simulation.last.x, simulation.mass, simulation.grid_mass_bar, bar.x, mass_bar)
-        simulation.backward()
-
     simulation.forward()
-    simulation.scatter_mass()
-    loss.evaluate(simulation.grid_mass, value, simulation.grid_mass_bar)
-    gradient()
+    loss.after(simulation, value)
+    loss.gradient(simulation)
     count = ball.count * options.segment_length
-    forward, backward = (1e6 * clock(run, device) / count for run in (simulation.forward, gradient))
+    runs = (simulation.forward, lambda: loss.gradient(simulation))
+    forward, backward = (1e6 * clock(run, device) / count for run in runs)
     print(f"a particle's step: forward {forward:.3f} us, backward {backward:.3f} us")
 
 
@@ -100,16 +174,15 @@ def time_morph(ball: ParticleBody, goal: ParticleBody, options: MorphOptions, de
     run = planner.run()[0]
     wp.synchronize_device(device)
     seconds = (time.process_time() if device == "cpu" else time.perf_counter()) - start
-    far = KDTree(goal.positions).query(run.positions[-1])[0]
     print(
         f"{worlds} morphs, zeta {options.mpm.damping:g}, {len(run.losses) - 1} segments: {seconds:.2f} s, loss "
         f"{run.losses[0]:.0f} -> {run.losses[-1]:.1f} (least {run.losses.min():.1f}), accuracy "
         f"{100.0 * run.accuracy:.2f} %, {run.gradient_count} gradients, {run.trial_count} trials, "
-        f"{100.0 * (far > 1.0).mean():.2f} % over a cell away, kinetic energy {run.kinetic_energy[-1]:.3g} J"
+        f"{100.0 * ejected(run, goal):.2f} % over a cell away, kinetic energy {run.kinetic_energy[-1]:.3g} J"
     )
 
 
-def clock(run: Callable[[], None], device: str) -> float:
+def clock(run: Callable[[], object], device: str) -> float:
     """Return the median time of five runs [s]."""
     times = []
     for _ in range(5):

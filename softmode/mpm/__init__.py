@@ -11,15 +11,21 @@ from softmode.lazy import lazy_names
 
 if TYPE_CHECKING:
     from softmode.mpm.grid import Grid
-    from softmode.mpm.losses import MassLoss, position_loss
+    from softmode.mpm.losses import CoarseMassLoss, MassLoss, position_loss
+    from softmode.mpm.morphing import morph
     from softmode.mpm.options import MpmOptions
     from softmode.mpm.particles import ParticleBody, particles_from_body, particles_from_mesh, particles_from_shape
-    from softmode.mpm.planner import MORPH_MATERIAL, MorphOptions, MorphPlanner, MorphRun, morph
+    from softmode.mpm.planner import MORPH_MATERIAL, MorphOptions, MorphPlanner
+    from softmode.mpm.replaying import ReplayFrame, replay
+    from softmode.mpm.run import MorphRun
+    from softmode.mpm.shapes import GridShapes
     from softmode.mpm.simulation import MpmSimulation, ParameterBars, ParticleState
 
 __all__ = [
     "MORPH_MATERIAL",
+    "CoarseMassLoss",
     "Grid",
+    "GridShapes",
     "MassLoss",
     "MorphOptions",
     "MorphPlanner",
@@ -29,11 +35,13 @@ __all__ = [
     "ParameterBars",
     "ParticleBody",
     "ParticleState",
+    "ReplayFrame",
     "morph",
     "particles_from_body",
     "particles_from_mesh",
     "particles_from_shape",
     "position_loss",
+    "replay",
 ]
 
 __getattr__, __dir__ = lazy_names(__name__)

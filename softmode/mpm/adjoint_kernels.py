@@ -8,8 +8,8 @@ from typing import Any
 import warp as wp
 
 from softmode.mpm.spline_kernels import cell_of, spline, spline_slope
-from softmode.mpm.step_kernels import controlled, in_grid
-from softmode.mpm.stress_kernels import kirchhoff, kirchhoff_adjoint
+from softmode.mpm.step_kernels import add_to_node, controlled, in_grid, in_lane
+from softmode.mpm.stress_kernels import kirchhoff, kirchhoff_adjoint, polar_rotation
 
 wp.set_module_options({"enable_backward": False})
 
@@ -42,14 +42,18 @@ def grid_to_particles_adjoint(
     v_bar_next: wp.array2d[Any],
     C_bar_next: wp.array2d[Any],
     F_bar_next: wp.array2d[Any],
-    # Bars out:
-    grid_velocity_bar: wp.array4d[Any],
+    # Bars out: that of the velocity, and zero.
+    scattered: wp.array4d[Any],
     x_bar: wp.array2d[Any],
     Fs_bar: wp.array2d[Any],
     F_bar: wp.array2d[Any],
+    lanes: int,
 ):
-    """Adjoint of the gather: scatter to the grid what particles ask of its velocity."""
-    world, p = wp.tid()
+    """Adjoint of the gather: scatter to the grid what particles ask of its velocity.
+
+    The ``lanes`` threads of a particle share the scatter; the first writes what the particle's bars are.
+    """
+    world, lane, p = wp.tid()
     x = x_in[world, p]
     i, j, k, f = cell_of(x, origin, dx)
     shape = wp.vec3i(grid_velocity.shape[1], grid_velocity.shape[2], grid_velocity.shape[3])
@@ -61,8 +65,9 @@ def grid_to_particles_adjoint(
         Fs = controlled(F, control[world, p], material_control)
         v_bar = v_bar_next[world, p] + dt * x_bar_next[world, p]
         B_bar = (C_bar_next[world, p] + (rest * dt) * (G * wp.transpose(Fs))) * (type(dx)(3.0) / (dx * dx))
-        Fs_bar[world, p] = rest * (G + dt * (wp.transpose(C) * G))
-        F_bar[world, p] = smoothing * G
+        if lane == 0:
+            Fs_bar[world, p] = rest * (G + dt * (wp.transpose(C) * G))
+            F_bar[world, p] = smoothing * G
         wx = spline(f[0])
         wy = spline(f[1])
         wz = spline(f[2])
@@ -84,15 +89,19 @@ def grid_to_particles_adjoint(
                 for c in range(4):
                     asked = row + type(dx)(c - 1) * lift
                     node = grid_velocity[world, i + a - 1, j + b - 1, k + c - 1]
-                    wp.atomic_add(grid_velocity_bar, world, i + a - 1, j + b - 1, k + c - 1, (wxy * wz[c]) * asked)
+                    if in_lane(a, b, lane, lanes):
+                        push = (wxy * wz[c]) * asked
+                        both = scattered.dtype(push[0], push[1], push[2], type(dx)(0.0))
+                        add_to_node(scattered, world, i + a - 1, j + b - 1, k + c - 1, both)
                     power = wp.dot(node, asked)
                     work += wz[c] * power
                     slope_z += hz[c] * power
                     along += wz[c] * node
                 slope += type(x)(hx[a] * wy[b] * work, wx[a] * hy[b] * work, wxy * slope_z)
                 v += wxy * along
-        x_bar[world, p] = x_bar_next[world, p] + slope / dx - wp.transpose(B_bar) * v
-    else:
+        if lane == 0:
+            x_bar[world, p] = x_bar_next[world, p] + slope / dx - wp.transpose(B_bar) * v
+    elif lane == 0:
         x_bar[world, p] = x_bar_next[world, p]
         Fs_bar[world, p] = F_in.dtype()
         F_bar[world, p] = F_bar_next[world, p]
@@ -104,21 +113,22 @@ def move_grid_adjoint(
     grid_velocity: wp.array4d[Any],
     least_mass: Any,
     gravity_dt: Any,
-    # In: bar of velocity; out: bar of momentum.
+    # In: bar of velocity; out: zero, for the next scatter.
+    scattered: wp.array4d[Any],
+    # Out: bars of momentum and mass.
     grid_bar: wp.array4d[Any],
-    grid_mass_bar: wp.array4d[Any],
 ):
     """Adjoint of v = p / m + dt g."""
     world, i, j, k = wp.tid()
     m = grid_mass[world, i, j, k]
-    bar = grid_bar[world, i, j, k]
+    both = grid_bar.dtype()
     if m > least_mass:
-        bar = bar / m
-        grid_mass_bar[world, i, j, k] = -wp.dot(grid_velocity[world, i, j, k] - gravity_dt, bar)
-    else:
-        bar = type(bar)()
-        grid_mass_bar[world, i, j, k] = m * type(m)(0.0)
-    grid_bar[world, i, j, k] = bar
+        given = scattered[world, i, j, k]
+        bar = type(gravity_dt)(given[0], given[1], given[2]) / m
+        by_mass = -wp.dot(grid_velocity[world, i, j, k] - gravity_dt, bar)
+        both = grid_bar.dtype(bar[0], bar[1], bar[2], by_mass)
+    scattered[world, i, j, k] = grid_bar.dtype()
+    grid_bar[world, i, j, k] = both
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -142,8 +152,7 @@ def particles_to_grid_adjoint(
     dt: Any,
     damping: Any,
     # Bars in:
-    grid_mass_bar: wp.array4d[Any],
-    grid_momentum_bar: wp.array4d[Any],
+    grid_bar: wp.array4d[Any],
     Fs_bar_in: wp.array2d[Any],
     # Bars out, added to:
     x_bar: wp.array2d[Any],
@@ -160,14 +169,15 @@ def particles_to_grid_adjoint(
     x = x_in[world, p]
     m = mass[world, p]
     i, j, k, f = cell_of(x, origin, dx)
-    shape = wp.vec3i(grid_mass_bar.shape[1], grid_mass_bar.shape[2], grid_mass_bar.shape[3])
+    shape = wp.vec3i(grid_bar.shape[1], grid_bar.shape[2], grid_bar.shape[3])
     if m > type(dx)(0.0) and in_grid(i, j, k, shape):
         F = F_in[world, p]
         A_control = control[world, p]
         C = C_in[world, p]
         Fs = controlled(F, A_control, material_control)
         scale = -type(dx)(3.0) * dt * volume[world, p] / (dx * dx)
-        A = m * C + scale * kirchhoff(model, mu[world, p], lam[world, p], Fs)
+        R = polar_rotation(model, Fs)
+        A = m * C + scale * kirchhoff(model, mu[world, p], lam[world, p], Fs, R)
         kept = type(dx)(1.0) - damping * dt
         momentum = (m * kept) * v_in[world, p]
         wx = spline(f[0])
@@ -193,8 +203,9 @@ def particles_to_grid_adjoint(
                 work = type(dx)(0.0)
                 slope_z = type(dx)(0.0)
                 for c in range(4):
-                    bar = grid_momentum_bar[world, i + a - 1, j + b - 1, k + c - 1]
-                    node = grid_mass_bar[world, i + a - 1, j + b - 1, k + c - 1]
+                    both = grid_bar[world, i + a - 1, j + b - 1, k + c - 1]
+                    bar = type(x)(both[0], both[1], both[2])
+                    node = both[3]
                     weighed = wz[c] * bar
                     along += weighed
                     first += type(dx)(c - 1) * weighed
@@ -214,7 +225,7 @@ def particles_to_grid_adjoint(
         x_bar[world, p] = x_bar[world, p] + slope / dx - wp.transpose(A) * p_bar
         v_bar[world, p] = (m * kept) * p_bar
         C_bar[world, p] = m * A_bar
-        by_F, by_mu, by_lam = kirchhoff_adjoint(model, mu[world, p], lam[world, p], Fs, scale * A_bar)
+        by_F, by_mu, by_lam = kirchhoff_adjoint(model, mu[world, p], lam[world, p], Fs, R, scale * A_bar)
         by_F, by_control = control_adjoint(F, A_control, Fs_bar_in[world, p] + by_F, material_control)
         F_bar[world, p] = F_bar[world, p] + by_F
         control_bar[world, p] = control_bar[world, p] + by_control
@@ -233,7 +244,7 @@ def mass_to_grid_adjoint(
     origin: Any,
     dx: Any,
     grid_mass_bar: wp.array4d[Any],
-    # Out:
+    # Out, added to:
     x_bar: wp.array2d[Any],
     mass_bar: wp.array2d[Any],
 ):
@@ -258,5 +269,5 @@ def mass_to_grid_adjoint(
                     node = grid_mass_bar[world, i + a - 1, j + b - 1, k + c - 1]
                     m_bar += wx[a] * wy[b] * wz[c] * node
                     slope += node * type(x)(hx[a] * wy[b] * wz[c], wx[a] * hy[b] * wz[c], wx[a] * wy[b] * hz[c])
-    x_bar[world, p] = (m / dx) * slope
-    mass_bar[world, p] = m_bar
+    x_bar[world, p] = x_bar[world, p] + (m / dx) * slope
+    mass_bar[world, p] = mass_bar[world, p] + m_bar

@@ -9,17 +9,22 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel(enable_backward=False, module="unique")
 def log_mass_at_nodes(
-    grid_mass: wp.array4d[Any], target: wp.array4d[Any], scale: Any, loss: wp.array[wp.float64], bar: wp.array4d[Any]
+    grid_mass: wp.array4d[Any],
+    target: wp.array4d[Any],
+    scale: Any,
+    weight: wp.array[wp.float64],
+    loss: wp.array[wp.float64],
+    bar: wp.array4d[Any],
 ):
-    """Add 1/2 (ln(m/s + 1) - ln(m*/s + 1))^2 of every node, and its derivative by m."""
+    """Add a weight times 1/2 (ln(m/s + 1) - ln(m*/s + 1))^2 of every node; write its derivative by m."""
     world, i, j, k = wp.tid()
     m = grid_mass[world, i, j, k]
     goal = target[world % target.shape[0], i, j, k]
     r = type(scale)(0.0)
     if m > r or goal > r:
         r = wp.log((m + scale) / (goal + scale))  # ln(m/s + 1) - ln(m*/s + 1)
-        wp.atomic_add(loss, world, wp.float64(0.5) * wp.float64(r) * wp.float64(r))
-    bar[world, i, j, k] = r / (m + scale)
+        wp.atomic_add(loss, world, wp.float64(0.5) * weight[0] * wp.float64(r) * wp.float64(r))
+    bar[world, i, j, k] = type(scale)(weight[0]) * r / (m + scale)
 
 
 @wp.kernel(enable_backward=False, module="unique")

@@ -6,6 +6,8 @@ being thrown out for a small gain (Xu, Song, Levin, Hyde 2025, eqs. (5) to (7)).
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Literal, get_args
 
 import numpy as np
@@ -15,9 +17,10 @@ from numpy.typing import ArrayLike
 from softmode.checks import require_choice, require_number
 from softmode.errors import ConfigError
 from softmode.mpm.adjoint_kernels import mass_to_grid_adjoint
-from softmode.mpm.grid import Grid
+from softmode.mpm.grid import MARGIN, Grid
 from softmode.mpm.loss_kernels import log_mass_at_nodes, mass_at_nodes, position_at_particles
 from softmode.mpm.particles import ParticleBody
+from softmode.mpm.simulation import MpmSimulation, ParameterBars, ParticleState
 from softmode.mpm.step_kernels import mass_to_grid
 
 MassLossKind = Literal["log", "squared"]
@@ -54,16 +57,25 @@ class MassLoss:
         """
         require_choice("kind", kind, get_args(MassLossKind))
         require_number("mass_scale", mass_scale, above=0.0, unit="kg")
-        grid.require(target.positions, "target")
         self.grid, self.kind, self.device = grid, kind, wp.get_device(device)
         vec = wp.vec3f if dtype is wp.float32 else wp.vec3d
         self._place = [vec(*grid.origin), dtype(grid.spacing)]
         self._scale = dtype(mass_scale)
-        self._dtype, self._vec = dtype, vec
-        self._target = self._on_grid(
-            wp.array(target.positions[None], dtype=vec, device=self.device),
-            wp.array(target.masses[None], dtype=dtype, device=self.device),
-        )
+        self.dtype, self.mass_scale, self._vec = dtype, mass_scale, vec
+        self._one = wp.full(1, 1.0, dtype=wp.float64, device=self.device)
+        self.target_mass = wp.zeros((1, *grid.shape), dtype=dtype, device=self.device)
+        """Masses that the nodes should come to [kg], (1, nx, ny, nz)."""
+        self.aim(target)
+
+    def aim(self, target: ParticleBody) -> None:
+        """Take another target, in the same arrays.
+
+        Raises:
+            ConfigError: If one of its particles lies outside of the grid.
+        """
+        self.grid.require(target.positions, "target")
+        x = wp.array(target.positions[None], dtype=self._vec, device=self.device)
+        wp.copy(self.target_mass, self._on_grid(x, wp.array(target.masses[None], dtype=self.dtype, device=self.device)))
 
     def evaluate(self, grid_mass: wp.array, loss: wp.array, grid_mass_bar: wp.array) -> None:
         """Write the loss of masses on the grid and its derivative by them.
@@ -75,10 +87,15 @@ class MassLoss:
         """
         loss.zero_()
         if self.kind == "log":
-            kernel, inputs = log_mass_at_nodes, [grid_mass, self._target, self._scale, loss, grid_mass_bar]
+            self.add_log(grid_mass, self._one, loss, grid_mass_bar)
         else:
-            kernel, inputs = mass_at_nodes, [grid_mass, self._target, loss, grid_mass_bar]
-        wp.launch(kernel, grid_mass.shape, inputs=inputs, device=self.device)
+            inputs = [grid_mass, self.target_mass, loss, grid_mass_bar]
+            wp.launch(mass_at_nodes, grid_mass.shape, inputs=inputs, device=self.device)
+
+    def add_log(self, grid_mass: wp.array, weight: wp.array, loss: wp.array, grid_mass_bar: wp.array) -> None:
+        """Add the logarithmic loss times a weight, and write its derivative."""
+        inputs = [grid_mass, self.target_mass, self._scale, weight, loss, grid_mass_bar]
+        wp.launch(log_mass_at_nodes, grid_mass.shape, inputs=inputs, device=self.device)
 
     def spread(self, x: wp.array, mass: wp.array, grid_mass_bar: wp.array, x_bar: wp.array, mass_bar: wp.array) -> None:
         """Turn derivatives by nodes into those by particles.
@@ -87,11 +104,41 @@ class MassLoss:
             x: Positions [m], (W, N).
             mass: Masses [kg], (W, N).
             grid_mass_bar: Derivatives by the masses of the nodes, (W, nx, ny, nz).
-            x_bar: Where to write the derivatives by positions [1/m], (W, N).
-            mass_bar: Where to write those by masses [1/kg], (W, N).
+            x_bar: What the derivatives by positions [1/m] are added to, (W, N).
+            mass_bar: What those by masses [1/kg] are added to, (W, N).
         """
         inputs = [x, mass, *self._place, grid_mass_bar, x_bar, mass_bar]
         wp.launch(mass_to_grid_adjoint, x.shape, inputs=inputs, device=self.device)
+
+    def after(self, simulation: MpmSimulation, loss: wp.array) -> None:
+        """Write the loss of the particles after the last step of a simulation, and keep its derivative on the grid.
+
+        Args:
+            simulation: A simulation on the same grid, after :meth:`MpmSimulation.forward`.
+            loss: Where to write the losses of its worlds, float64, (W,).
+        """
+        simulation.scatter_mass()
+        self.evaluate(simulation.grid_mass, loss, simulation.grid_mass_bar)
+
+    def gradient(
+        self, simulation: MpmSimulation, coarse: Sequence[CoarseMassLoss] = ()
+    ) -> tuple[ParticleState, ParameterBars]:
+        """Carry the loss of :meth:`after` back to a simulation's start.
+
+        Args:
+            simulation: That of :meth:`after`.
+            coarse: Losses on coarser grids that were added to it.
+
+        Returns:
+            What :meth:`MpmSimulation.backward` returns.
+        """
+        bar, parameters = simulation.bars()
+        bar.zero()
+        parameters.mass.zero_()
+        self.spread(simulation.last.x, simulation.mass, simulation.grid_mass_bar, bar.x, parameters.mass)
+        for level in coarse:
+            level.spread(simulation, bar.x, parameters.mass)
+        return simulation.backward()
 
     def value_and_gradient(self, points: ArrayLike, masses: ArrayLike) -> tuple[float, np.ndarray, np.ndarray]:
         """Return the loss of particles, and its derivatives by their positions and masses.
@@ -109,7 +156,7 @@ class MassLoss:
         found = np.asarray(points, dtype=np.float64)
         self.grid.require(found, "points")
         x = wp.array(found[None], dtype=self._vec, device=self.device)
-        mass = wp.array(np.asarray(masses, dtype=np.float64)[None], dtype=self._dtype, device=self.device)
+        mass = wp.array(np.asarray(masses, dtype=np.float64)[None], dtype=self.dtype, device=self.device)
         if mass.shape != x.shape:
             raise ConfigError(f"masses: expected shape ({len(found)},), got {np.shape(masses)}")
         grid_mass = self._on_grid(x, mass)
@@ -119,10 +166,66 @@ class MassLoss:
         self.spread(x, mass, bar, x_bar, mass_bar)
         return float(loss.numpy()[0]), x_bar.numpy()[0], mass_bar.numpy()[0]
 
-    def _on_grid(self, x: wp.array, mass: wp.array) -> wp.array:
-        grid_mass = wp.zeros((x.shape[0], *self.grid.shape), dtype=self._dtype, device=self.device)
+    def scatter(self, x: wp.array, mass: wp.array, grid_mass: wp.array) -> None:
+        """Write the masses of the nodes [kg], (W, nx, ny, nz), of particles x [m] and masses [kg], (W, N)."""
+        grid_mass.zero_()
         wp.launch(mass_to_grid, x.shape, inputs=[x, mass, *self._place, grid_mass], device=self.device)
+
+    def _on_grid(self, x: wp.array, mass: wp.array) -> wp.array:
+        grid_mass = wp.zeros((x.shape[0], *self.grid.shape), dtype=self.dtype, device=self.device)
+        self.scatter(x, mass, grid_mass)
         return grid_mass
+
+
+class CoarseMassLoss:
+    """The logarithmic loss on a coarser grid, added to that of a :class:`MassLoss`.
+
+    The logarithm is flat where nodes are full: particles within a hole that should open are hardly pushed. On a coarser
+    grid the hole is a node that is too heavy.
+    """
+
+    def __init__(self, fine: MassLoss, simulation: MpmSimulation, target: ParticleBody, *, factor: int) -> None:
+        """Put the target on a grid with cells ``factor`` times as wide; a node is compared with as much more mass.
+
+        Args:
+            fine: The loss that it is added to.
+            simulation: Whose particles are compared.
+            target: Particles that masses should come to.
+            factor: Width of its cells over the grid's; also the factor of the loss, while :attr:`weight` is 1.
+        """
+        low, width = np.array(fine.grid.origin), factor * fine.grid.spacing
+        shape = [math.ceil((n - 1) / factor) + 2 * MARGIN + 1 for n in fine.grid.shape]
+        origin = low - MARGIN * width
+        grid = Grid(
+            shape=(shape[0], shape[1], shape[2]),
+            spacing=width,
+            origin=(float(origin[0]), float(origin[1]), float(origin[2])),
+        )
+        scale = factor**3 * fine.mass_scale
+        self._loss = MassLoss(grid, target, mass_scale=scale, dtype=fine.dtype, device=fine.device)
+        self._factor = factor
+        nodes = (simulation.world_count, *grid.shape)
+        with wp.ScopedDevice(fine.device):
+            self._mass, self._bar = (wp.zeros(nodes, dtype=fine.dtype) for _ in range(2))
+            self._weight = wp.zeros(1, dtype=wp.float64)
+        self.weigh(1.0)
+
+    def weigh(self, weight: float) -> None:
+        """Set the factor of the loss, beside that of its cells; graphs that were captured read it."""
+        self._weight.fill_(weight * self._factor)
+
+    def aim(self, target: ParticleBody) -> None:
+        """Take another target, in the same arrays."""
+        self._loss.aim(target)
+
+    def add(self, simulation: MpmSimulation, loss: wp.array) -> None:
+        """Add the loss after the last step of a simulation, and keep its derivative on the grid."""
+        self._loss.scatter(simulation.last.x, simulation.mass, self._mass)
+        self._loss.add_log(self._mass, self._weight, loss, self._bar)
+
+    def spread(self, simulation: MpmSimulation, x_bar: wp.array, mass_bar: wp.array) -> None:
+        """Add the derivatives by positions and masses, after :meth:`add`."""
+        self._loss.spread(simulation.last.x, simulation.mass, self._bar, x_bar, mass_bar)
 
 
 def position_loss(x: wp.array, mass: wp.array, target: wp.array, loss: wp.array, x_bar: wp.array) -> None:

@@ -8,19 +8,25 @@ steps, trials and their acceptance.
 
 from __future__ import annotations
 
+import hashlib
+import os
+import time
 import warnings
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import cast
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from softmode.checks import require_number
 from softmode.deformables import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
-from softmode.errors import SolverDiverged
-from softmode.mpm.losses import MassLoss
+from softmode.errors import AssetError, ConfigError, SolverDiverged
+from softmode.mpm.losses import CoarseMassLoss, MassLoss
 from softmode.mpm.options import MpmOptions
 from softmode.mpm.particles import ParticleBody
 from softmode.mpm.planner_kernels import (
@@ -34,9 +40,17 @@ from softmode.mpm.planner_kernels import (
     keep_trial,
     try_control,
 )
+from softmode.mpm.run import MorphRun
 from softmode.mpm.simulation import TYPES, MpmSimulation
 
 Array = NDArray[np.float64]
+
+UNEQUAL_MASS = 0.3
+"""Part by which masses may differ before it is told."""
+COARSE = (2, 4)
+"""Cells of the coarser grids over those of the particles'."""
+WRITING = 9.0
+"""Time between two writings of a file over the time that one takes."""
 
 MORPH_MATERIAL = Material(
     youngs_modulus=1.4e5, poissons_ratio=0.2, density=75.0, viscosity=0.0, model=MaterialModel.COROTATED
@@ -65,11 +79,17 @@ class MorphOptions:
     mass_scale: float = 1.0
     """Mass scale of the logarithmic loss [kg]."""
     target_accuracy: float | None = None
-    """Stop when 1 - loss / first loss exceeds this, 0 < accuracy < 1; None goes on to the last frame."""
-    mpm: MpmOptions = field(
-        default_factory=lambda: MpmOptions(damping=8.0, smoothing=0.955, control="additive", rest_volume="grid")
-    )
-    """How particles are stepped. The paper has a damping of 0.5 1/s: bodies then arrive moving and leave again."""
+    """Leave a target when 1 - loss / first loss exceeds this, 0 < accuracy < 1; None goes on to the last frame."""
+    coarse: float = 0.7
+    """First part of the segments to a target, 0..1, whose loss also compares masses on grids with two and four times
+    as wide cells, where particles in a hole that should open feel a push."""
+    settling: float = 0.15
+    """Last part of the segments to the last target, 0..1. Each of them begins, and the run ends, with half of the
+    velocity and without stress: the shape at hand becomes the rest shape (F = I). Else the body moves on, and what
+    stress is left bends it, when control ends."""
+    mpm: MpmOptions = field(default_factory=lambda: MpmOptions(damping=4.0, smoothing=0.955, control="additive"))
+    """How particles are stepped. The paper has a damping of 0.5 1/s, with which bodies arrive moving and leave again;
+    and `rest_volume="grid"`, with which thin parts such as ears are too stiff for its steps."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -78,33 +98,43 @@ class MorphOptions:
         require_number("step_length", self.step_length, above=0.0)
         require_number("gradient_tolerance", self.gradient_tolerance, at_least=0.0, below=1.0)
         require_number("mass_scale", self.mass_scale, above=0.0, unit="kg")
+        require_number("coarse", self.coarse, at_least=0.0, at_most=1.0)
+        require_number("settling", self.settling, at_least=0.0, at_most=1.0)
         if self.target_accuracy is not None:
             require_number("target_accuracy", self.target_accuracy, above=0.0, below=1.0)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MorphRun:
-    """What a morph did."""
+class _Log:
+    """What all worlds did so far."""
 
-    positions: Array
-    """Particles at the start and after each segment [m], shape (S + 1, N, 3)."""
-    deformation: Array
-    """Deformation gradients at the end, shape (N, 3, 3)."""
-    losses: Array
-    """Loss at the start and after each segment, shape (S + 1,)."""
-    kinetic_energy: Array
-    """Kinetic energy after each segment [J], shape (S,)."""
-    gradient_count: int
-    """Gradients taken."""
-    trial_count: int
-    """Trial steps taken."""
-    notes: tuple[str, ...] = ()
-    """What the planner says of the run."""
+    def __init__(self, fingerprint: str, names: tuple[str, ...], offsets: Array, notes: tuple[str, ...]) -> None:
+        """Begin with nothing."""
+        self.fingerprint, self.names, self.offsets, self.notes = fingerprint, names, offsets, notes
+        self.rows: defaultdict[str, list[np.ndarray]] = defaultdict(list)
+        """Arrays of a :class:`MorphRun` by name, row by row, with the world as first axis."""
+        self.ends: list[int] = []
+        self.counts: tuple[int, int] = (0, 0)
+        """Gradients and trials of the part that a file held."""
 
     @property
-    def accuracy(self) -> float:
-        """1 - last loss / first loss."""
-        return float(1.0 - self.losses[-1] / self.losses[0])
+    def segment_count(self) -> int:
+        """Number of segments so far."""
+        return len(self.rows["control"])
+
+    def add(self, **rows: wp.array | np.ndarray) -> None:
+        """Append rows."""
+        for name, row in rows.items():
+            self.rows[name].append(row.numpy().copy() if isinstance(row, wp.array) else row)
+
+    def of_world(self, world: int, count: int) -> dict[str, np.ndarray]:
+        """Return the rows of a world without padding, stacked."""
+        tensors = {"positions": (3,), "deformation": (3, 3), "control": (3, 3)}
+        found = {
+            name: np.array([row[world, :count] for row in self.rows[name]]).reshape(-1, count, *shape)
+            for name, shape in tensors.items()
+        }
+        losses = ("losses", "first_losses", "kinetic_energy")
+        return found | {name: np.array([row[world] for row in self.rows[name]]) for name in losses}
 
 
 class MorphPlanner:
@@ -113,7 +143,7 @@ class MorphPlanner:
     def __init__(
         self,
         source: ParticleBody | Sequence[ParticleBody],
-        target: ParticleBody,
+        target: ParticleBody | Sequence[ParticleBody],
         options: MorphOptions | None = None,
         *,
         device: wp.DeviceLike = None,
@@ -122,25 +152,34 @@ class MorphPlanner:
 
         Args:
             source: The body that is turned into another; several bodies are one world each.
-            target: The body that it becomes.
+            target: The body that it becomes; several are become one after another, by all worlds at once.
             options: How the morph is planned.
             device: Where to compute; Warp's preferred device when None.
 
         Raises:
-            ConfigError: If a body does not fit into the grid or a step is not stable.
+            ConfigError: If a body does not fit into the grid, a step is not stable, or there is no target.
         """
         self.options = options or MorphOptions()
+        self.targets = (target,) if isinstance(target, ParticleBody) else tuple(target)
+        if not self.targets:
+            raise ConfigError("target: expected one or more")
         o, mpm = self.options, self.options.mpm
         self.simulation = MpmSimulation(source, mpm, step_count=o.segment_length, device=device)
         s = self.simulation
         real, _, mat = TYPES[mpm.precision]
-        self.loss = MassLoss(mpm.grid, target, mass_scale=o.mass_scale, dtype=real, device=s.device)
+        for goal in self.targets:
+            mpm.grid.require(goal.positions, "target")
+        self.loss = MassLoss(mpm.grid, self.targets[0], mass_scale=o.mass_scale, dtype=real, device=s.device)
+        factors = COARSE if o.coarse else ()
+        self._coarse = [CoarseMassLoss(self.loss, s, self.targets[0], factor=factor) for factor in factors]
         self.notes = tuple(
-            f"world {world}: masses differ by {100.0 * abs(ratio - 1.0):.0f} % ({body.mass:.4g} and {target.mass:.4g} "
+            f"world {world}: masses differ by {100.0 * abs(ratio - 1.0):.0f} % ({body.mass:.4g} and {goal.mass:.4g} "
             "kg), so the loss cannot vanish"
+            for goal in self.targets
             for world, body in enumerate(s.bodies)
-            if abs((ratio := body.mass / target.mass) - 1.0) > 0.3
+            if abs((ratio := body.mass / goal.mass) - 1.0) > UNEQUAL_MASS
         )
+        """What is to be known before the run."""
         worlds, shape = s.world_count, (s.world_count, s.count)
         with wp.ScopedDevice(s.device):
             self._search = Search()
@@ -149,7 +188,7 @@ class MorphPlanner:
             self._search.step = wp.zeros(worlds, dtype=float)
             for name in ("adam_count", "halvings", "searching", "active", "gradient_count", "trial_count"):
                 setattr(self._search, name, wp.zeros(worlds, dtype=int))
-            self._search.any_searching = wp.zeros(1, dtype=int)
+            self._search.any_searching, self._search.stale = wp.zeros(1, dtype=int), wp.zeros(1, dtype=int)
             self._accepted_now = wp.zeros(worlds, dtype=int)
             names = ("accepted", "first_moment", "second_moment", "first_trial", "second_trial", "direction")
             self._accepted, self._first, self._second, self._first_trial, self._second_trial, self._direction = (
@@ -158,60 +197,156 @@ class MorphPlanner:
         self._graph: wp.Graph | None = None
         self._compiled = False
         """Whether a segment has run, which compiles kernels and allocates what a graph needs."""
-        self._evaluate()
-        self.first_loss = self._search.trial_loss.numpy().copy()
 
-    def run(self, progress: Callable[[int, float], None] | None = None) -> list[MorphRun]:
-        """Plan all segments.
+    def run(
+        self,
+        progress: Callable[[int, float], None] | None = None,
+        *,
+        file: str | os.PathLike[str] | None = None,
+        names: Sequence[str] = (),
+        offsets: ArrayLike | None = None,
+    ) -> list[MorphRun]:
+        """Plan all segments, or those that a file does not have yet.
 
         Args:
             progress: Called after each segment with its number and the largest loss of the worlds.
+            file: Where to keep the run while it goes on; one that is there is gone on with. Only with one world.
+                Writing takes at most a tenth of the time, so that of a fast run not every segment is on the disk.
+            names: What source and targets were made from, for the file.
+            offsets: By how much they were moved [m], shape (targets + 1, 3), for the file.
 
         Returns:
             One run for each world.
 
         Raises:
+            AssetError: If the file is no morph, or that of another source, target or options.
             SolverDiverged: If no control keeps the particles of the first segment on the grid and finite.
 
         Warns:
             RuntimeWarning: If none does in a later one: the runs then end with the last good segment.
         """
         o, s = self.options, self.simulation
-        positions, losses = [s.first.x.numpy().copy()], [self.first_loss]
-        kinetic, notes, F = [], self.notes, s.first.F.numpy().copy()
-        for segment in range(-(-o.frame_count // o.segment_length)):
-            self.plan_segment()
-            try:
-                s.check()
-            except SolverDiverged as error:
-                if segment == 0:
-                    raise
-                notes = (*notes, f"ended after {segment} segments: {error}")
-                warnings.warn(notes[-1], RuntimeWarning, stacklevel=2)
-                break
-            found = self._search.loss.numpy()
-            v, m = s.first.v.numpy().astype(np.float64), s.mass.numpy().astype(np.float64)
-            kinetic.append(0.5 * (m * (v**2).sum(axis=2)).sum(axis=1))
-            positions.append(s.first.x.numpy().copy())
-            F = s.first.F.numpy().copy()
-            losses.append(found.copy())
-            if progress is not None:
-                progress(segment, float(found.max()))
-            if o.target_accuracy is not None and (found <= (1.0 - o.target_accuracy) * self.first_loss).all():
-                break
-        gradients, trials = self._search.gradient_count.numpy(), self._search.trial_count.numpy()
-        return [
+        if file is not None and s.world_count > 1:
+            raise ConfigError(f"file: holds one morph, there are {s.world_count}", hint="save the runs one by one")
+        self._log = log = _Log(
+            self.fingerprint,
+            tuple(names),
+            np.zeros((len(self.targets) + 1, 3)) if offsets is None else np.asarray(offsets, dtype=np.float64),
+            self.notes,
+        )
+        if file is not None and Path(file).exists():
+            self._resume(MorphRun.load(file), file)
+        else:
+            log.add(positions=s.first.x, deformation=s.first.F)
+        due = 0.0
+        for target in range(len(log.ends), len(self.targets)):
+            for loss in (self.loss, *self._coarse):
+                loss.aim(self.targets[target])
+            if len(log.rows["first_losses"]) == target:
+                loss = self._loss_at_hand()
+                log.add(first_losses=loss, **({} if target else {"losses": loss}))
+            while log.segment_count < sum(self._settling(target)):
+                begun, count = log.ends[target - 1] if target else 0, -(-o.frame_count // o.segment_length)
+                for level in self._coarse:
+                    level.weigh(float(log.segment_count - begun < int(o.coarse * count)))
+                self.plan_segment()
+                try:
+                    s.check()
+                except SolverDiverged as error:
+                    if not log.segment_count:
+                        raise
+                    log.notes = (*log.notes, f"ended after {log.segment_count} segments: {error}")
+                    warnings.warn(log.notes[-1], RuntimeWarning, stacklevel=2)
+                    return self._runs(file)
+                log.add(losses=self._loss_at_hand())
+                first, more = self._settling(target)
+                if more and log.segment_count + 1 >= first:
+                    s.first.F.fill_(np.eye(3))
+                    s.start(v=0.5 * s.first.v.numpy(), C=0.5 * s.first.C.numpy())
+                v, m = s.first.v.numpy().astype(np.float64), s.mass.numpy().astype(np.float64)
+                log.add(
+                    positions=s.first.x,
+                    deformation=s.first.F,
+                    control=cast(wp.array, s.control[0]),
+                    kinetic_energy=0.5 * (m * (v**2).sum(axis=2)).sum(axis=1),
+                )
+                if progress is not None:
+                    progress(log.segment_count - 1, float(log.rows["losses"][-1].max()))
+                now = time.monotonic()
+                if file is not None and now >= due:
+                    self._runs(file)
+                    due = time.monotonic() + WRITING * (time.monotonic() - now)
+            log.ends.append(log.segment_count)
+        return self._runs(file)
+
+    def _settling(self, target: int) -> tuple[int, int]:
+        """Return how many segments of the run end before a target settles or is left, and how many settle."""
+        o, log = self.options, self._log
+        count = -(-o.frame_count // o.segment_length)
+        settling = int(o.settling * count) if target + 1 == len(self.targets) else 0
+        begun = log.ends[target - 1] if target else 0
+        first = count - settling
+        if o.target_accuracy is not None:
+            goal = (1.0 - o.target_accuracy) * log.rows["first_losses"][target]
+            reached = [k for k, loss in enumerate(log.rows["losses"][begun + 1 :], 1) if (loss <= goal).all()]
+            first = min([first, *reached])
+        return begun + first, settling
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of bodies, targets and options."""
+        found = hashlib.sha256(repr(self.options).encode())
+        for body in (*self.simulation.bodies, *self.targets):
+            found.update(repr((body.count, body.material)).encode())
+            for array in (body.positions, body.masses):
+                found.update(np.ascontiguousarray(array, dtype=np.float64).tobytes())
+        return found.hexdigest()
+
+    def _resume(self, run: MorphRun, file: str | os.PathLike[str]) -> None:
+        """Take up a run where it was cut off."""
+        if run.fingerprint != self.fingerprint:
+            raise AssetError(
+                f"morph {file}: is that of another source, target or options", hint="name another file, or remove it"
+            )
+        log, s = self._log, self.simulation
+        for name in ("positions", "deformation", "control", "losses", "kinetic_energy", "first_losses"):
+            log.rows[name] = [row[None] for row in getattr(run, name)]
+        log.ends = list(run.ends)
+        log.counts = (run.gradient_count, run.trial_count)
+        log.names, log.offsets = run.names, run.offsets
+        ends = (run.positions[-1], run.velocity, run.affine_velocity, run.deformation[-1])
+        s.start(*(value[None] for value in ends))
+
+    def _runs(self, file: str | os.PathLike[str] | None) -> list[MorphRun]:
+        """Return the runs as they are, and write that of a file."""
+        s, log = self.simulation, self._log
+        counts = (self._search.gradient_count.numpy(), self._search.trial_count.numpy())
+        v, C = s.first.v.numpy(), s.first.C.numpy()
+        found = [
             MorphRun(
-                positions=np.stack([p[w, : body.count] for p in positions]).astype(np.float64),
-                deformation=F[w, : body.count].astype(np.float64),
-                losses=np.array([loss[w] for loss in losses]),
-                kinetic_energy=np.array([k[w] for k in kinetic]),
-                gradient_count=int(gradients[w]),
-                trial_count=int(trials[w]),
-                notes=notes,
+                **log.of_world(w, body.count),
+                velocity=v[w, : body.count].copy(),
+                affine_velocity=C[w, : body.count].copy(),
+                offsets=log.offsets,
+                ends=tuple(log.ends),
+                gradient_count=log.counts[0] + int(counts[0][w]),
+                trial_count=log.counts[1] + int(counts[1][w]),
+                fingerprint=log.fingerprint,
+                names=log.names,
+                notes=log.notes,
             )
             for w, body in enumerate(s.bodies)
         ]
+        if file is not None:
+            found[0].save(file)
+        return found
+
+    def _loss_at_hand(self) -> Array:
+        """Return the losses of the state that the next segment begins with."""
+        s = self.simulation
+        s.scatter_mass(s.first)
+        self.loss.evaluate(s.grid_mass, self._search.trial_loss, s.grid_mass_bar)
+        return self._search.trial_loss.numpy().copy()
 
     def plan_segment(self) -> None:
         """Find the controls of the next segment and step through it; nothing is read back from the second on."""
@@ -236,27 +371,28 @@ class MorphPlanner:
             self._per_world(begin_pass, [self._search, o.step_length])
             for iteration in range(o.iteration_count):
                 self._descend(first=iteration == 0)
-        self._per_particle(try_control, [self._search, self._accepted, self._direction, s.control[0]])
-        s.forward()
         s.first.copy_from(s.last)
 
     def _descend(self, *, first: bool) -> None:
         """Take a gradient and step along it."""
         o, s = self.options, self.simulation
-        # The last trial may have been rejected: states are those of the accepted control before a gradient is taken.
-        self._per_particle(try_control, [self._search, self._accepted, self._direction, s.control[0]])
-        self._evaluate()
-        bar, mass_bar, _ = s.bars()
-        bar.zero()
-        self.loss.spread(s.last.x, s.mass, s.grid_mass_bar, bar.x, mass_bar)
-        control_bar = s.backward()[1].control[0]
+        control_bar = self.loss.gradient(s, self._coarse)[1].control[0]
         self._search.norm.zero_()
         self._search.any_searching.zero_()
         self._per_particle(gradient_norm, [control_bar, self._search.norm])
         self._per_world(begin_search, [self._search, wp.float64(o.gradient_tolerance), int(first)])
         moments = [self._first, self._second, self._first_trial, self._second_trial]
         self._per_particle(adam_direction, [self._search, control_bar, *moments, self._direction])
+        # Without a trial, and after one that was rejected for good, the states are not those of the accepted control.
+        self._search.stale.fill_(1)
         wp.capture_while(self._search.any_searching, self._try)
+        wp.capture_while(self._search.stale, self._restore)
+
+    def _restore(self) -> None:
+        """Step with the accepted controls."""
+        self._per_particle(try_control, [self._search, self._accepted, self._direction, self.simulation.control[0]])
+        self._evaluate()
+        self._search.stale.zero_()
 
     def _try(self) -> None:
         """Try the step at hand in every world that searches."""
@@ -264,6 +400,7 @@ class MorphPlanner:
         self._per_particle(try_control, [self._search, self._accepted, self._direction, s.control[0]])
         self._evaluate()
         self._search.any_searching.zero_()
+        self._search.stale.zero_()
         inputs = [self._search, s.failure, self.options.most_halvings, self._accepted_now]
         self._per_world(judge_trial, inputs)
         self._per_particle(
@@ -283,8 +420,9 @@ class MorphPlanner:
         """Step with the controls at hand and find the loss."""
         s = self.simulation
         s.forward()
-        s.scatter_mass()
-        self.loss.evaluate(s.grid_mass, self._search.trial_loss, s.grid_mass_bar)
+        self.loss.after(s, self._search.trial_loss)
+        for level in self._coarse:
+            level.add(s, self._search.trial_loss)
 
     def _per_world(self, kernel: Callable[..., object], inputs: list[object]) -> None:
         wp.launch(kernel, self.simulation.world_count, inputs=inputs, device=self.simulation.device)
@@ -292,34 +430,3 @@ class MorphPlanner:
     def _per_particle(self, kernel: Callable[..., object], inputs: list[object]) -> None:
         shape = (self.simulation.world_count, self.simulation.count)
         wp.launch(kernel, shape, inputs=inputs, device=self.simulation.device)
-
-
-def morph(
-    source: ParticleBody,
-    target: ParticleBody,
-    options: MorphOptions | None = None,
-    *,
-    device: wp.DeviceLike = None,
-    progress: Callable[[int, float], None] | None = None,
-) -> MorphRun:
-    """Turn a body into another.
-
-    Both are moved so that their centres of mass lie in the middle of the grid: aligned boxes nearly double the loss at
-    the start.
-
-    Args:
-        source: The body that is turned.
-        target: What it becomes.
-        options: How the morph is planned; by default a grid of 32^3 nodes of 1 m, which suits bodies 14 to 20 m long.
-        device: Where to compute; Warp's preferred device when None.
-        progress: Called after each segment with its number and its loss.
-
-    Raises:
-        ConfigError: If a body does not fit into the grid or a step is not stable.
-        SolverDiverged: If no control keeps a segment's particles on the grid and finite.
-    """
-    chosen = options or MorphOptions()
-    grid = chosen.mpm.grid
-    middle = np.array(grid.origin) + 0.5 * (np.array(grid.shape) - 1) * grid.spacing
-    bodies = [body.moved(middle - body.centre) for body in (source, target)]
-    return MorphPlanner(bodies[0], bodies[1], chosen, device=device).run(progress)[0]

@@ -31,6 +31,8 @@ class Search:
     """Whether the world's pass goes on, (W,)."""
     any_searching: wp.array[int]
     """Whether any world searches, (1,)."""
+    stale: wp.array[int]
+    """Whether any world's states are those of a control that was not accepted, (1,)."""
     gradient_count: wp.array[int]
     """Gradients taken, (W,)."""
     trial_count: wp.array[int]
@@ -141,6 +143,7 @@ def judge_trial(search: Search, failure: wp.array2d[int], most_halvings: int, ac
             if search.halvings[world] > most_halvings:
                 search.searching[world] = 0
                 search.active[world] = 0
+                wp.atomic_max(search.stale, 0, 1)
         if search.searching[world] != 0:
             wp.atomic_max(search.any_searching, 0, 1)
 

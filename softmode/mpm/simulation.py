@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import cast
 
+import newton
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +18,8 @@ from softmode.errors import ConfigError, SolverDiverged
 from softmode.mpm.adjoint_kernels import grid_to_particles_adjoint, move_grid_adjoint, particles_to_grid_adjoint
 from softmode.mpm.options import COURANT_LIMIT, MpmOptions
 from softmode.mpm.particles import ParticleBody
+from softmode.mpm.shape_kernels import add_wrenches, collide_grid, collide_grid_adjoint, find_inside
+from softmode.mpm.shapes import GridShapes
 from softmode.mpm.step_kernels import grid_to_particles, mass_to_grid, move_grid, particle_volumes, particles_to_grid
 
 Array = NDArray[np.float64]
@@ -24,7 +27,14 @@ Array = NDArray[np.float64]
 TYPES = {"float32": (wp.float32, wp.vec3f, wp.mat33f), "float64": (wp.float64, wp.vec3d, wp.mat33d)}
 LEAST_MASS = 1.0e-12
 """A node with less than this part of the lightest particle's mass stands still. A threshold in kg costs momentum."""
-REASONS = {1: "left the grid", 2: "was turned inside out (det F <= 0)", 3: "has no finite position"}
+REASONS = {
+    1: "left the grid",
+    2: "was turned inside out (det F <= 0)",
+    3: "has no finite position",
+    4: "began inside of a shape",
+}
+FILLS_GPU = 30_000
+"""Fewer particles do not fill a GPU: two threads scatter each (8 to 10 % of a morph's time)."""
 FEW_PARTICLES = 0.5
 """Particles per cell under which a body falls apart into unconnected clumps."""
 
@@ -81,6 +91,7 @@ class MpmSimulation:
         *,
         step_count: int = 10,
         layer_count: int = 1,
+        shapes: GridShapes | None = None,
         device: wp.DeviceLike = None,
     ) -> None:
         """Put bodies at rest on the grid.
@@ -90,11 +101,13 @@ class MpmSimulation:
             options: How particles are stepped.
             step_count: Number of steps T.
             layer_count: Number of controls L. Each acts in the first of its T / L steps; F keeps what it did.
+            shapes: Rigid shapes that act on the grid.
             device: Where to compute; Warp's preferred device when None.
 
         Raises:
             ConfigError: If a particle lies outside of the grid, sound crosses most of a cell in a step, particles are
-                too few for their cells, or energies differ between worlds.
+                too few for their cells, energies differ between worlds, or shapes are on another device, of worlds
+                that there are not, thinner than a cell, or hold particles.
         """
         self.options = options or MpmOptions()
         self.bodies = (bodies,) if isinstance(bodies, ParticleBody) else tuple(bodies)
@@ -111,6 +124,7 @@ class MpmSimulation:
         self.device = wp.get_device(device)
         self.step_count, self.layer_count = step_count, layer_count
         self.world_count, self.count = len(self.bodies), max(body.count for body in self.bodies)
+        self._lanes = 2 if self.device.is_cuda and self.world_count * self.count < FILLS_GPU else 1
         self._model = int(models.pop())
         self._real, self._vec, self._mat = TYPES[self.options.precision]
         self.mass = self._array(self._padded([body.masses for body in self.bodies]), self._real)
@@ -125,32 +139,44 @@ class MpmSimulation:
         """Masses of the nodes after the last step, once :meth:`scatter_mass` ran [kg]."""
         self._grid_velocity = self._zeros(self._vec, *nodes)
         self.grid_mass_bar = self._zeros(self._real, *nodes)
-        self._grid_bar = self._zeros(self._vec, *nodes)
+        four = wp.types.vector(4, self._real)
+        # Momentum and mass of a node lie side by side: one operation adds to both. Who reads the sums clears them.
+        self._scattered, self._grid_bar = self._zeros(four, *nodes), self._zeros(four, *nodes)
+        self.shapes = shapes
+        self._free_velocity = self._grid_velocity if shapes is None else self._zeros(self._vec, *nodes)
+        self.impulse = self._zeros(
+            wp.spatial_vectord, step_count, self.world_count, 0 if shapes is None else shapes.model.shape_count
+        )
+        """What each step gave to each shape of the model [N s] and [N m s], about the centre of mass of its body or, of
+        a shape without one, about the origin; (T, W, shapes)."""
         self.failure = self._zeros(int, self.world_count, 4)
         """Failures of a world: how many, and the first one's kind, step and particle; (W, 4)."""
         self._least = self._real(LEAST_MASS * min(float(body.masses.min()) for body in self.bodies))
         self._controls = self._zeros(self._mat, layer_count + 1, self.world_count, self.count)
         self.control = cast(wp.array, self._controls[:layer_count])
         """Controls A, (L, W, N)."""
-        per_step = 4 * (24 if self.options.precision == "float32" else 48) * self.world_count * self.count
-        fits = per_step * (step_count + 1) <= self.options.memory_limit
+        limit = self.options.memory_limit
+        per_state = 4 * (24 if self.options.precision == "float32" else 48) * self.world_count * self.count
+        fits = per_state * (step_count + 1) <= limit
         self._chunk = step_count if fits else max(1, math.isqrt(step_count))
-        if per_step * (self._chunk + 1 + math.ceil(step_count / self._chunk)) > self.options.memory_limit and not fits:
+        marks = 0 if fits else math.ceil(step_count / self._chunk)
+        needed = per_state * (self._chunk + 1 + marks)
+        if needed > limit:
             raise ConfigError(
                 f"memory_limit: {step_count} steps of {self.world_count} x {self.count} particles need "
-                f"{per_step * (self._chunk + 1 + math.ceil(step_count / self._chunk)):.3g} bytes, "
-                f"{self.options.memory_limit:.3g} are allowed",
+                f"{needed:.3g} bytes, {limit:.3g} are allowed",
                 hint="allow more, or take fewer steps or particles",
             )
         self._states = [self._state() for _ in range(self._chunk + 1)]
-        marks = 0 if self._chunk == step_count else math.ceil(step_count / self._chunk)
         self._marks = [self._state() for _ in range(marks)]
-        self._bars: tuple[list[ParticleState], wp.array, ParameterBars] | None = None
+        self._bars: tuple[list[ParticleState], ParameterBars] | None = None
         self.start(
             self._padded([body.positions for body in self.bodies]),
             F=np.tile(np.eye(3), (self.world_count, self.count, 1, 1)),
         )
         self._find_volumes()
+        if shapes is not None:
+            self._check_shapes(shapes)
 
     def _zeros(self, dtype: type, *shape: int) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=self.device)
@@ -225,15 +251,24 @@ class MpmSimulation:
             if chunk + 1 < len(self._marks):
                 self._marks[chunk + 1].copy_from(self._states[end])
 
-    def scatter_mass(self) -> None:
-        """Put the masses of the particles after the last step on the grid."""
-        self.grid_mass.zero_()
-        self._launch(mass_to_grid, [self.last.x, self.mass, *self._place, self.grid_mass])
+    def find_velocities(self, step: int) -> wp.array:
+        """Compute again the velocities that the grid had in a step of :meth:`forward`, (W, nx, ny, nz) [m/s].
 
-    def bars(self) -> tuple[ParticleState, wp.array, ParameterBars]:
-        """Return what a loss writes before :meth:`backward`: bars of the last state, of the masses, and of the rest."""
-        states, mass, parameters = self._gradients()
-        return states[0], mass, parameters
+        Raises:
+            ConfigError: If memory did not allow to keep all states.
+        """
+        self._move_grid(step, self.states()[step])
+        return self._grid_velocity
+
+    def scatter_mass(self, state: ParticleState | None = None) -> None:
+        """Put the masses of the particles on the grid: those after the last step, or of another state."""
+        self.grid_mass.zero_()
+        self._launch(mass_to_grid, [(state or self.last).x, self.mass, *self._place, self.grid_mass])
+
+    def bars(self) -> tuple[ParticleState, ParameterBars]:
+        """Return what a loss writes before :meth:`backward`: bars of the last state, and those of the masses."""
+        states, parameters = self._gradients()
+        return states[0], parameters
 
     def backward(self) -> tuple[ParticleState, ParameterBars]:
         """Carry the bars of the last state back, after :meth:`forward`.
@@ -241,7 +276,7 @@ class MpmSimulation:
         Returns:
             Derivatives by the first state, and by what does not move.
         """
-        states, _, parameters = self._gradients()
+        states, parameters = self._gradients()
         for bar in (parameters.control, parameters.mu, parameters.lam):
             bar.zero_()
         now = 0
@@ -276,20 +311,48 @@ class MpmSimulation:
                 hint="take smaller steps, a larger grid, more damping or a weaker control",
             )
 
-    def _gradients(self) -> tuple[list[ParticleState], wp.array, ParameterBars]:
+    def wrenches(self) -> Array:
+        """Return the mean wrench of the last run on each shape of the model [N] and [N m], shape (W, shapes, 6)."""
+        return self.impulse.numpy().sum(axis=0) / (self.step_count * self.options.dt)
+
+    def add_wrenches(self, state: newton.State) -> None:
+        """Add the mean wrench of the last run, over all worlds, to the forces on the bodies of a state (``body_f``)."""
+        if self.shapes is not None and state.body_f is not None:
+            model = self.shapes.model
+            duration = wp.float64(self.step_count * self.options.dt)
+            inputs = [self.impulse, duration, model.shape_body, state.body_f]
+            wp.launch(add_wrenches, model.shape_count, inputs=inputs, device=self.device)
+
+    def _check_shapes(self, shapes: GridShapes) -> None:
+        """Raise unless shapes can act on the grid and no particle begins in one."""
+        if shapes.model.device != self.device:
+            raise ConfigError(f"shapes: are on {shapes.model.device}, particles on {self.device}")
+        if shapes.worlds.max() >= self.world_count:
+            raise ConfigError(f"shapes: of world {shapes.worlds.max()}, there are {self.world_count} worlds")
+        shapes.require_wide(self.options.grid.spacing)
+        self._launch(find_inside, [shapes.obstacles, self.first.x, self.mass, self.failure])
+        found = self.failure.numpy().copy()
+        self.failure.zero_()
+        for world in np.flatnonzero(found[:, 0]):
+            raise ConfigError(
+                f"bodies: {found[world, 0]} particles of world {world} begin inside of a shape, the first is "
+                f"{found[world, 3]}",
+                hint="move the body or the shape",
+            )
+
+    def _gradients(self) -> tuple[list[ParticleState], ParameterBars]:
         """Return bars, allocated when first asked for."""
         if self._bars is None:
             shape = (self.world_count, self.count)
-            mass = self._zeros(self._real, *shape)
             self._control_bars = self._zeros(self._mat, self.layer_count + 1, *shape)
             parameters = ParameterBars(
                 control=cast(wp.array, self._control_bars[: self.layer_count]),
-                mass=mass,
+                mass=self._zeros(self._real, *shape),
                 mu=self._zeros(self._real, *shape),
                 lam=self._zeros(self._real, *shape),
             )
             self._fs_bar = self._zeros(self._mat, *shape)
-            self._bars = ([self._state(), self._state()], mass, parameters)
+            self._bars = ([self._state(), self._state()], parameters)
         return self._bars
 
     def _find_volumes(self) -> None:
@@ -325,6 +388,19 @@ class MpmSimulation:
 
     def _launch(self, kernel: Callable[..., object], inputs: list[object]) -> None:
         wp.launch(kernel, (self.world_count, self.count), inputs=inputs, device=self.device)
+
+    def _scatter(self, kernel: Callable[..., object], inputs: list[object]) -> None:
+        shape = (self.world_count, self._lanes, self.count)
+        wp.launch(kernel, shape, inputs=[*inputs, self._lanes], device=self.device)
+
+    def _at_nodes(self, kernel: Callable[..., object], inputs: list[object]) -> None:
+        wp.launch(kernel, self.grid_mass.shape, inputs=inputs, device=self.device)
+
+    def _obstacles(self, step: int) -> list[object]:
+        """Return what both kernels of the shapes read."""
+        assert self.shapes is not None
+        time = wp.float32(step * self.options.dt)
+        return [self.shapes.obstacles, self.grid_mass, self._least, *self._place, time]
 
     def _steps_in(self, chunk: int) -> int:
         return min(self._chunk, self.step_count - chunk * self._chunk)
@@ -368,14 +444,15 @@ class MpmSimulation:
 
     def _move_grid(self, step: int, state: ParticleState) -> None:
         """Compute the velocities of the grid in a step."""
-        self.grid_mass.zero_()
-        self._grid_velocity.zero_()
-        inputs = [*self._particles(state, step), self.grid_mass, self._grid_velocity, self.failure, step]
-        self._launch(particles_to_grid, inputs)
+        inputs = [*self._particles(state, step), self._scattered, self.failure, step]
+        self._scatter(particles_to_grid, inputs)
         push = self._vec(*(g * self.options.dt for g in self.options.gravity))
-        shape = self.grid_mass.shape
-        inputs = [self.grid_mass, self._least, push, self._grid_velocity]
-        wp.launch(move_grid, shape, inputs=inputs, device=self.device)
+        self._at_nodes(move_grid, [self._scattered, self._least, push, self.grid_mass, self._grid_velocity])
+        if self.shapes is not None:
+            wp.copy(self._free_velocity, self._grid_velocity)
+            received = cast(wp.array, self.impulse[step : step + 1])
+            received.zero_()
+            self._at_nodes(collide_grid, [*self._obstacles(step), self._grid_velocity, received])
 
     def _step(self, step: int, now: ParticleState, then: ParticleState) -> None:
         """Take one step: particles to grid, grid, grid to particles."""
@@ -414,8 +491,7 @@ class MpmSimulation:
         """Carry the bars of a step's result to its start. The grid of the step is computed again."""
         o = self.options
         self._move_grid(step, now)
-        self._grid_bar.zero_()
-        self._launch(
+        self._scatter(
             grid_to_particles_adjoint,
             [
                 now.x,
@@ -432,21 +508,22 @@ class MpmSimulation:
                 bar_then.v,
                 bar_then.C,
                 bar_then.F,
-                self._grid_bar,
+                self._scattered,
                 bar.x,
                 self._fs_bar,
                 bar.F,
             ],
         )
+        if self.shapes is not None:
+            self._at_nodes(collide_grid_adjoint, [*self._obstacles(step), self._free_velocity, self._scattered])
         push = self._vec(*(g * o.dt for g in o.gravity))
-        inputs = [self.grid_mass, self._grid_velocity, self._least, push, self._grid_bar, self.grid_mass_bar]
-        wp.launch(move_grid_adjoint, self.grid_mass.shape, inputs=inputs, device=self.device)
+        inputs = [self.grid_mass, self._free_velocity, self._least, push, self._scattered, self._grid_bar]
+        self._at_nodes(move_grid_adjoint, inputs)
         control_bar = cast(wp.array, self._control_bars[self._layer(step)])
         self._launch(
             particles_to_grid_adjoint,
             [
                 *self._particles(now, step),
-                self.grid_mass_bar,
                 self._grid_bar,
                 self._fs_bar,
                 bar.x,

@@ -36,3 +36,17 @@ def spline_slope(f: Any):
     two = type(f)(2.0)
     three_halves = type(f)(1.5)
     return wp.vector(-half * g * g, three_halves * f * f - two * f, two * g - three_halves * g * g, half * f * f)
+
+
+@wp.func
+def spline_at(x: Any):
+    """Return the weight of a node that lies x cells away along each axis."""
+    w = type(x[0])(1.0)
+    for axis in range(3):
+        r = wp.abs(x[axis])
+        rest = wp.max(type(r)(2.0) - r, type(r)(0.0))
+        if r < type(r)(1.0):
+            w *= type(r)(0.5) * r * r * r - r * r + type(r)(2.0) / type(r)(3.0)
+        else:
+            w *= rest * rest * rest / type(r)(6.0)
+    return w

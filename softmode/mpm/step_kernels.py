@@ -9,7 +9,7 @@ from typing import Any
 import warp as wp
 
 from softmode.mpm.spline_kernels import cell_of, spline
-from softmode.mpm.stress_kernels import kirchhoff
+from softmode.mpm.stress_kernels import kirchhoff, polar_rotation
 
 wp.set_module_options({"enable_backward": False})
 
@@ -44,6 +44,31 @@ def in_grid(i: int, j: int, k: int, shape: wp.vec3i):
     return i >= 1 and j >= 1 and k >= 1 and i < shape[0] - 2 and j < shape[1] - 2 and k < shape[2] - 2
 
 
+# Four floats in one operation where the GPU has it: scatters are bound by the number of atomic operations.
+@wp.func_native("""
+    wp::vec_t<4, wp::float32>* at = wp::address(grid, world, i, j, k);
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
+    atomicAdd(reinterpret_cast<float4*>(at), make_float4(value[0], value[1], value[2], value[3]));
+#else
+    wp::atomic_add(at, value);
+#endif
+""")
+def add_to_node(grid: wp.array4d[wp.vec4f], world: int, i: int, j: int, k: int, value: wp.vec4f):
+    """Add to a node."""
+
+
+@wp.func
+def add_to_node(grid: wp.array4d[wp.vec4d], world: int, i: int, j: int, k: int, value: wp.vec4d):  # noqa: F811
+    """Add to a node."""
+    wp.atomic_add(grid, world, i, j, k, value)
+
+
+@wp.func
+def in_lane(a: int, b: int, lane: int, lanes: int):
+    """Return whether row (a, b) of the nodes around a particle is served by its thread ``lane`` of ``lanes``."""
+    return ((4 * a + b) & (lanes - 1)) == lane
+
+
 @wp.kernel(enable_backward=False, module="unique")
 def particles_to_grid(
     # State in:
@@ -65,24 +90,28 @@ def particles_to_grid(
     dt: Any,
     damping: Any,
     # Out:
-    grid_mass: wp.array4d[Any],
-    grid_momentum: wp.array4d[Any],
+    scattered: wp.array4d[Any],
     failure: wp.array2d[int],
     step: int,
+    lanes: int,
 ):
-    """Scatter mass and momentum: p_i = sum_p w_ip (m v (1 - zeta dt) + A (x_i - x_p)), A = m C - 3/dx^2 dt V tau."""
-    world, p = wp.tid()
+    """Scatter momentum and mass: p_i = sum_p w_ip (m v (1 - zeta dt) + A (x_i - x_p)), A = m C - 3/dx^2 dt V tau.
+
+    Each of the ``lanes`` threads of a particle, a power of two, serves its share of the 16 rows of nodes.
+    """
+    world, lane, p = wp.tid()
     m = mass[world, p]
     if m > type(dx)(0.0):
         x = x_in[world, p]
         i, j, k, f = cell_of(x, origin, dx)
-        shape = wp.vec3i(grid_mass.shape[1], grid_mass.shape[2], grid_mass.shape[3])
+        shape = wp.vec3i(scattered.shape[1], scattered.shape[2], scattered.shape[3])
         if in_grid(i, j, k, shape):
             F = controlled(F_in[world, p], control[world, p], material_control)
-            if wp.determinant(F) <= type(dx)(0.0):
+            if lane == 0 and wp.determinant(F) <= type(dx)(0.0):
                 fail(failure, world, INVERTED, step, p)
             scale = type(dx)(3.0) * dt * volume[world, p] / (dx * dx)
-            A = m * C_in[world, p] - scale * kirchhoff(model, mu[world, p], lam[world, p], F)
+            R = polar_rotation(model, F)
+            A = m * C_in[world, p] - scale * kirchhoff(model, mu[world, p], lam[world, p], F, R)
             base = (m * (type(dx)(1.0) - damping * dt)) * v_in[world, p] - (A * f) * dx
             wx = spline(f[0])
             wy = spline(f[1])
@@ -90,13 +119,15 @@ def particles_to_grid(
             A = A * dx
             for a in range(4):
                 for b in range(4):
-                    wxy = wx[a] * wy[b]
-                    row = base + A * type(x)(type(dx)(a - 1), type(dx)(b - 1), type(dx)(0.0))
-                    for c in range(4):
-                        w = wxy * wz[c]
-                        lift = type(x)(A[0, 2], A[1, 2], A[2, 2]) * type(dx)(c - 1)
-                        wp.atomic_add(grid_mass, world, i + a - 1, j + b - 1, k + c - 1, w * m)
-                        wp.atomic_add(grid_momentum, world, i + a - 1, j + b - 1, k + c - 1, w * (row + lift))
+                    if in_lane(a, b, lane, lanes):
+                        wxy = wx[a] * wy[b]
+                        row = base + A * type(x)(type(dx)(a - 1), type(dx)(b - 1), type(dx)(0.0))
+                        for c in range(4):
+                            w = wxy * wz[c]
+                            lift = type(x)(A[0, 2], A[1, 2], A[2, 2]) * type(dx)(c - 1)
+                            q = w * (row + lift)
+                            both = scattered.dtype(q[0], q[1], q[2], w * m)
+                            add_to_node(scattered, world, i + a - 1, j + b - 1, k + c - 1, both)
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -143,20 +174,23 @@ def particle_volumes(
 
 @wp.kernel(enable_backward=False, module="unique")
 def move_grid(
-    grid_mass: wp.array4d[Any],
+    # In: momentum and mass; out: zero, for the next scatter.
+    scattered: wp.array4d[Any],
     least_mass: Any,
     gravity_dt: Any,
-    # In: momentum; out: velocity.
+    # Out:
+    grid_mass: wp.array4d[Any],
     grid_velocity: wp.array4d[Any],
 ):
     """Turn momentum into velocity, v = p / m + dt g; nodes without mass stand still."""
     world, i, j, k = wp.tid()
-    m = grid_mass[world, i, j, k]
-    v = grid_velocity[world, i, j, k]
+    both = scattered[world, i, j, k]
+    scattered[world, i, j, k] = scattered.dtype()
+    m = both[3]
+    v = type(gravity_dt)()
     if m > least_mass:
-        v = v / m + gravity_dt
-    else:
-        v = type(v)()
+        v = type(gravity_dt)(both[0], both[1], both[2]) / m + gravity_dt
+    grid_mass[world, i, j, k] = m
     grid_velocity[world, i, j, k] = v
 
 

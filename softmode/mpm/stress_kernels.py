@@ -42,34 +42,43 @@ def _nearest_rotation(F: wp.mat33d):
 
 
 @wp.func
-def _has_polar(model: int, F: wp.mat33d):
-    """Return whether the energy has the term |F - R|^2 and R is well defined.
+def polar_rotation(model: int, F: Any):
+    """Return the rotation R of F = R S where the energy has the term |F - R|^2 and R is well defined, else zero.
 
     Newton's iteration then takes a sixth of the time of singular values, which the materials need for inverted states.
     """
-    return has_rotation(model) and wp.determinant(F) > wp.float64(0.02)
+    Fd = wp.mat33d(F)
+    if has_rotation(model) and wp.determinant(Fd) > wp.float64(0.02):
+        return _nearest_rotation(Fd)
+    return wp.mat33d()
 
 
 @wp.func
-def first_piola(material: MaterialParameters, F: wp.mat33d):
-    """Return the first Piola-Kirchhoff stress P [Pa] at F."""
+def _is_rotation(R: wp.mat33d):
+    """Return whether :func:`polar_rotation` found one."""
+    return wp.ddot(R, R) > wp.float64(0.0)
+
+
+@wp.func
+def first_piola(material: MaterialParameters, F: wp.mat33d, R: wp.mat33d):
+    """Return the first Piola-Kirchhoff stress P [Pa] at F, R from :func:`polar_rotation`."""
     I = wp.identity(n=3, dtype=wp.float64)
-    if _has_polar(material.model, F):
+    if _is_rotation(R):
         p = hooke_lambda(material) * (wp.determinant(F) - wp.float64(1.0))
-        return (wp.float64(2.0) * material.mu) * (F - _nearest_rotation(F)) + p * cofactor(F)
+        return (wp.float64(2.0) * material.mu) * (F - R) + p * cofactor(F)
     return stress(material, F - I, wp.mat33d(), wp.float64(1.0))
 
 
 @wp.func
-def kirchhoff(model: int, mu: Any, lam: Any, F: Any):
-    """Return the Kirchhoff stress tau = P F^T [Pa] at F."""
+def kirchhoff(model: int, mu: Any, lam: Any, F: Any, R: wp.mat33d):
+    """Return the Kirchhoff stress tau = P F^T [Pa] at F, R from :func:`polar_rotation`."""
     Fd = wp.mat33d(F)
-    return type(F)(first_piola(_material(model, wp.float64(mu), wp.float64(lam)), Fd) * wp.transpose(Fd))
+    return type(F)(first_piola(_material(model, wp.float64(mu), wp.float64(lam)), Fd, R) * wp.transpose(Fd))
 
 
 @wp.func
-def kirchhoff_adjoint(model: int, mu: Any, lam: Any, F: Any, bar: Any):
-    """Return dL/dF, dL/dmu and dL/dlambda from bar = dL/dtau.
+def kirchhoff_adjoint(model: int, mu: Any, lam: Any, F: Any, R: wp.mat33d, bar: Any):
+    """Return dL/dF, dL/dmu and dL/dlambda from bar = dL/dtau, R from :func:`polar_rotation`.
 
     dL/dF = H[bar F] + bar^T P with H the (symmetric) derivative of P. Every energy is linear in mu and lambda. The
     derivative of the rotation is dR = R skew(K^-1 v), K = tr(S) I - S with F = R S, v the axial vector of R^T dF.
@@ -81,8 +90,7 @@ def kirchhoff_adjoint(model: int, mu: Any, lam: Any, F: Any, bar: Any):
     bF = b * Fd
     m = _material(model, wp.float64(mu), wp.float64(lam))
     I = wp.identity(n=3, dtype=wp.float64)
-    if _has_polar(model, Fd):
-        R = _nearest_rotation(Fd)
+    if _is_rotation(R):
         S = wp.transpose(R) * Fd
         A = wp.transpose(R) * bF
         v = wp.inverse(wp.trace(S) * I - S) * wp.vec3d(A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1])
@@ -101,8 +109,8 @@ def kirchhoff_adjoint(model: int, mu: Any, lam: Any, F: Any, bar: Any):
             type(mu)(wp.ddot(bF, P_mu)),
             type(mu)(by_lam),
         )
-    P_mu = first_piola(_material(model, one, wp.float64(0.0)), Fd)
-    P_lam = first_piola(_material(model, wp.float64(0.0), one), Fd)
+    P_mu = first_piola(_material(model, one, wp.float64(0.0)), Fd, R)
+    P_lam = first_piola(_material(model, wp.float64(0.0), one), Fd, R)
     P = m.mu * P_mu + m.lam * P_lam
     H = stress_derivative(m, Fd - I, wp.mat33d(), one, bF)
     return (

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from softmode.usd.animation import UsdAnimation, UsdAnimationOptions
     from softmode.usd.importer import UsdImport, add_usd
     from softmode.usd.playback import PlayedBody, UsdPlayback, read_animation
+    from softmode.usd.splat_animation import write_splat_animation
     from softmode.usd.writer import UsdExportOptions, write_usd
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "add_usd",
     "read_animation",
     "read_usd_scene",
+    "write_splat_animation",
     "write_usd",
 ]
 

@@ -11,7 +11,7 @@ import warp as wp
 from softmode.deformables import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.errors import ConfigError
-from softmode.mpm import MassLoss, MpmOptions, MpmSimulation, position_loss
+from softmode.mpm import CoarseMassLoss, MassLoss, MpmOptions, MpmSimulation, position_loss
 from tests.mpm.scenes import ball, moving, torus
 
 
@@ -19,17 +19,13 @@ def loss_of(s: MpmSimulation, loss: MassLoss) -> float:
     """Step and return the loss of the masses at the end."""
     value = wp.zeros(1, dtype=wp.float64, device="cpu")
     s.forward()
-    s.scatter_mass()
-    loss.evaluate(s.grid_mass, value, s.grid_mass_bar)
+    loss.after(s, value)
     return float(value.numpy()[0])
 
 
 def gradient_of(s: MpmSimulation, loss: MassLoss) -> dict[str, np.ndarray]:
     """Return all derivatives of the loss after :func:`loss_of`."""
-    bar, mass_bar, _ = s.bars()
-    bar.zero()
-    loss.spread(s.last.x, s.mass, s.grid_mass_bar, bar.x, mass_bar)
-    first, parameters = s.backward()
+    first, parameters = loss.gradient(s)
     found = {name: getattr(first, name).numpy() for name in ("x", "v", "C", "F")}
     return found | {name: getattr(parameters, name).numpy().copy() for name in ("control", "mass", "mu", "lam")}
 
@@ -81,9 +77,9 @@ def test_gradients_by_control_and_by_deformation_differ_by_smoothing() -> None:
     options = MpmOptions(precision="float64", control="additive", smoothing=gamma)
     s = moving(ball(2.2), options, step_count=1)
     s.forward()
-    bar, mass_bar, _ = s.bars()
+    bar, parameters = s.bars()
     bar.zero()
-    mass_bar.zero_()
+    parameters.mass.zero_()
     rng = np.random.default_rng(3)
     asked = rng.standard_normal((1, s.count, 3, 3))
     bar.F.assign(asked)
@@ -128,6 +124,38 @@ def test_mass_loss_of_points(kind: str) -> None:
     ends = [loss.value_and_gradient(x + e * dx, m + e * dm)[0] for e in (1e-5, -1e-5)]
     assert (ends[0] - ends[1]) / 2e-5 == pytest.approx((by_x * dx).sum() + by_m @ dm, rel=1e-6)
     assert value > 0.0
+
+
+def test_coarse_losses_are_added() -> None:
+    """The gradient of the sum is that of differences; a weight of 0 leaves the fine loss to the bit."""
+    options = MpmOptions(precision="float64")
+    s, target = moving(ball(2.2), options, step_count=3), torus(2.5, 1.2)
+    fine = MassLoss(options.grid, target, dtype=wp.float64, device="cpu")
+    levels = [CoarseMassLoss(fine, s, target, factor=factor) for factor in (2, 4)]
+    value = wp.zeros(1, dtype=wp.float64, device="cpu")
+
+    def evaluate() -> float:
+        s.forward()
+        fine.after(s, value)
+        for level in levels:
+            level.add(s, value)
+        return float(value.numpy()[0])
+
+    total = evaluate()
+    first, parameters = fine.gradient(s, levels)
+    bars = {"x": first.x.numpy().copy(), "mass": parameters.mass.numpy().copy()}
+    rng = np.random.default_rng(6)
+    for name, array in (("x", s.first.x), ("mass", s.mass)):
+        start, along = array.numpy().copy(), rng.standard_normal(array.numpy().shape)
+        ends = []
+        for sign in (1.0, -1.0):
+            array.assign(start + sign * 1e-5 * along)
+            ends.append(evaluate())
+        array.assign(start)
+        assert (ends[0] - ends[1]) / 2e-5 == pytest.approx((bars[name] * along).sum(), rel=1e-5), name
+    for level in levels:
+        level.weigh(0.0)
+    assert evaluate() == loss_of(s, fine) < 0.9 * total
 
 
 def test_symmetric_loss() -> None:

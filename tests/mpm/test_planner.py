@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from softmode.errors import ConfigError
-from softmode.mpm import MorphOptions, MorphPlanner, morph
+from softmode.errors import AssetError, ConfigError
+from softmode.mpm import MassLoss, MorphOptions, MorphPlanner, MorphRun, MpmOptions, morph
+from softmode.mpm.run import ARRAYS
 from tests.mpm.scenes import ball, torus
 
 
 def test_ball_becomes_a_torus() -> None:
-    """A hundred frames with an eighth of the paper's particles take away 70 % of the loss, falling in every segment."""
+    """With an eighth of the paper's particles 60 frames take 60 % of the loss and 100 frames 75 %, always falling."""
     run = morph(ball(6.93, 1.0), torus(7.0, 3.2, 1.0), MorphOptions(frame_count=100), device="cpu")
     assert (np.diff(run.losses) < 0.0).all()
-    assert run.accuracy > 0.7
+    assert 1.0 - run.losses[6] / run.losses[0] >= 0.6
+    assert run.accuracy > 0.75
     assert run.positions.shape == (11, ball(6.93, 1.0).count, 3)
 
 
@@ -31,11 +37,32 @@ def test_worlds_are_planned_alike_alone_and_together() -> None:
 
 
 def test_stops_at_the_accuracy_asked_for() -> None:
-    """A morph ends with the segment that reaches its accuracy."""
+    """A morph settles, with the last 15 % of its segments, after the one that reaches its accuracy."""
     options = MorphOptions(frame_count=400, target_accuracy=0.2)
     run = morph(ball(6.93, 1.0), torus(7.0, 3.2, 1.0), options, device="cpu")
     assert run.accuracy >= 0.2
-    assert 1.0 - run.losses[-2] / run.losses[0] < 0.2
+    reached = 1.0 - run.losses[-8:-6] / run.losses[0]
+    assert reached[0] < 0.2 <= reached[1]
+    found = np.abs(run.deformation - np.eye(3)).max(axis=(1, 2, 3)) > 0.0
+    assert found[1:-7].all() and not found[-7:].any()
+
+
+def test_a_morph_that_has_settled_stays() -> None:
+    """Sixty steps without control change the loss by at most 5 %; without settling stress bends the body back."""
+    source, target = ball(6.93, 1.0), torus(7.0, 3.2, 1.0)
+    rises = {}
+    for settling in (0.15, 0.0):
+        planner = MorphPlanner(source, target, MorphOptions(frame_count=200, settling=settling), device="cpu")
+        run = planner.run()[0]
+        planner.simulation.control.zero_()
+        for _ in range(6):
+            planner.simulation.forward()
+            planner.simulation.first.copy_from(planner.simulation.last)
+        planner.simulation.check()
+        at_last = MassLoss(MpmOptions().grid, planner.targets[0], device="cpu")
+        x = planner.simulation.first.x.numpy()[0]
+        rises[settling] = at_last.value_and_gradient(x, source.masses)[0] / run.losses[-1] - 1.0
+    assert rises[0.15] < 0.05 < rises[0.0]
 
 
 def test_line_search_never_accepts_a_rise() -> None:
@@ -70,3 +97,80 @@ def test_a_morph_that_fails_keeps_what_it_reached() -> None:
     assert 2 <= len(run.losses) < 7
     assert np.isfinite(run.positions).all()
     assert "ended after" in run.notes[-1]
+
+
+def planner(frame_count: int = 20, target_radius: float = 1.4) -> MorphPlanner:
+    """Return a small morph to two targets in a row."""
+    targets = [torus(3.5, target_radius), ball(3.1)]
+    return MorphPlanner(ball(2.9), targets, MorphOptions(frame_count=frame_count), device="cpu")
+
+
+class Killed(Exception):
+    """Stands for a process that ends."""
+
+
+def kill_after(segments: int) -> Callable[[int, float], None]:
+    """Return a progress callback that ends the run when a number of segments are planned and written."""
+
+    def told(segment: int, loss: float) -> None:
+        if segment == segments:
+            raise Killed
+
+    return told
+
+
+def equal(a: MorphRun, b: MorphRun) -> bool:
+    """Return whether two runs are equal to the bit."""
+    return a.ends == b.ends and all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ARRAYS)
+
+
+def test_several_targets_in_a_row() -> None:
+    """The particles go on from one target to the next; the loss jumps when the target changes, and falls again."""
+    run = planner().run()[0]
+    assert run.ends == (2, 4)
+    assert run.legs.tolist() == [0] * 2 + [1] * 2
+    assert (np.diff(run.losses[:3]) < 0.0).all()
+    assert run.losses[3] < run.first_losses[1]
+    alone = MorphPlanner(ball(2.9), torus(3.5, 1.4), MorphOptions(frame_count=20), device="cpu").run()[0]
+    assert np.array_equal(alone.positions, run.positions[:3])
+    assert np.array_equal(alone.deformation, run.deformation[:3])
+
+
+@pytest.mark.parametrize("segments", [1, 3])
+def test_a_run_that_was_cut_off_is_gone_on_with(segments: int, tmp_path: Path) -> None:
+    """Killed in its first or second target and started again, a run has the bits of one that was not."""
+    file = tmp_path / "run.npz"
+    whole = planner().run()[0]
+    with pytest.raises(Killed):
+        planner().run(kill_after(segments), file=file)
+    part = MorphRun.load(file)
+    assert 0 < part.segment_count <= segments
+    resumed = planner().run(file=file)[0]
+    assert equal(resumed, whole)
+    assert (resumed.gradient_count, resumed.trial_count) == (whole.gradient_count, whole.trial_count)
+    assert equal(MorphRun.load(file), whole)
+    before = file.stat().st_mtime_ns
+    assert equal(planner().run(file=file)[0], whole)
+    assert file.stat().st_mtime_ns >= before
+
+
+def test_foreign_files_are_refused(tmp_path: Path) -> None:
+    """A run of another target, a file of another kind and a damaged one are named, and stay as they are."""
+    file = tmp_path / "run.npz"
+    planner(10).run(file=file)
+    content = file.read_bytes()
+    with pytest.raises(AssetError, match="another source, target or options"):
+        planner(10, target_radius=1.2).run(file=file)
+    assert file.read_bytes() == content
+    file.write_bytes(content[: len(content) // 2])
+    with pytest.raises(AssetError, match="damaged"):
+        planner(10).run(file=file)
+    np.savez(file, positions=np.zeros(3))
+    with pytest.raises(AssetError, match="not a softmode-morph"):
+        planner(10).run(file=file)
+    with pytest.raises(ConfigError, match="one morph"):
+        MorphPlanner([ball(2.9)] * 2, torus(3.5, 1.4), device="cpu").run(file=file)
+    with pytest.raises(AssetError, match="belong together"):
+        run = planner(10).run()[0]
+        replace(run, control=run.control[:0]).save(file)
+        MorphRun.load(file)
