@@ -11,10 +11,13 @@ import time
 
 import numpy as np
 
-from softmode.deformables.build.quadrature import quadrature_from_splats
+from softmode.deformables.build.quadrature import quadrature_from_points, quadrature_from_splats
 from softmode.objects import ObjectConfig
 from softmode.objects.source import object_source, standing_quadrature
 from tests.captures import CAPTURES, SHELLS, render_shell
+
+BARE = 4e-4
+"""Thickness of the splats whose centres stand for a cloud of points [m]; it does not matter."""
 
 
 def main() -> None:
@@ -31,23 +34,27 @@ def main() -> None:
 
 
 def print_shells(count: int, sigmas: list[float]) -> None:
-    """Fill every shell at every thickness."""
+    """Fill every shell from the bare centres of its splats and at every thickness."""
     print(f"{'shell':8}{'sigma mm':>10}{'volume':>9}{'+-':>7}{'centre %':>10}{'voxels':>8}{'s':>7}")
     for name, make in SHELLS.items():
         solid = make()
         volume, centre = solid.moments
-        for sigma in sigmas:
-            splats = render_shell(solid, count, sigma=sigma)
+        for sigma in [None, *sigmas]:
+            splats = render_shell(solid, count, sigma=sigma or BARE)
             start = time.process_time()
-            found = quadrature_from_splats(splats.means, splats.scales, splats.quats, splats.opacities)
+            if sigma is None:
+                found = quadrature_from_points(splats.means)
+            else:
+                found = quadrature_from_splats(splats.means, splats.scales, splats.quats, splats.opacities)
             seconds = time.process_time() - start
             off = (
                 np.linalg.norm(found.weights @ found.points / found.volume - centre)
                 / np.ptp(solid.bounds, axis=0).max()
             )
             print(
-                f"{name:8}{1e3 * sigma:10.2f}{found.volume / volume:9.3f}{found.report['volume_uncertainty']:7.3f}"
-                f"{100.0 * off:10.2f}{found.report['resolution']:8d}{seconds:7.1f}",
+                f"{name:8}{'points' if sigma is None else f'{1e3 * sigma:.2f}':>10}{found.volume / volume:9.3f}"
+                f"{found.report['volume_uncertainty']:7.3f}{100.0 * off:10.2f}"
+                f"{found.report['resolution']:8d}{seconds:7.1f}",
                 flush=True,
             )
 

@@ -1,6 +1,6 @@
 """What the preset objects cost, and how far a rope bends with which handles.
 
-The first table has one line per preset of `softmode.objects.presets`: sizes, processor time of the build without a
+The first table has one line per object of `softmode.objects.task_objects`: sizes, processor time of the build without a
 cache, time of a step at rest on the ground. The second one presses on their tops and compares with many functions. The
 third one holds a rope in its middle and compares the drop of its ends with the heavy elastica's.
 
@@ -22,7 +22,7 @@ from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.reduced_stiffness import reduced_stiffness
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReduced
-from softmode.objects import ObjectConfig, load, presets
+from softmode.objects import ObjectConfig, load, task_objects
 from tests.objects.test_primitives import hang, heavy_elastica
 from tests.scenes import GRAVITY
 
@@ -44,7 +44,7 @@ ROPES = (
 def step_time(name: str) -> str:
     """Return the table row of a preset."""
     clock = time.process_time()
-    thing, material = load(getattr(presets, name), progress=False), getattr(presets, f"{name}_MATERIAL")
+    thing, material = load(getattr(task_objects, name), progress=False), getattr(task_objects, f"{name}_MATERIAL")
     seconds = time.process_time() - clock
     world = newton.ModelBuilder()
     add_reduced_body(world, thing.body, material=material, position=(0.0, 0.0, thing.height))
@@ -90,22 +90,22 @@ def main() -> None:
     print("| preset | functions | points | samples | splats | build [s] | ms per step |\n|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         os.environ["SOFTMODE_CACHE"] = folder
-        load(presets.CUBE, progress=False)  # imports what builds need
+        load(task_objects.CUBE, progress=False)  # imports what builds need
         for name in ("BEAM", "CUBE", "PAD", "ROPE"):
             os.environ["SOFTMODE_CACHE"] = os.path.join(folder, name)
             print(step_time(name), flush=True)
         print(f"\npatch of {1e3 * PATCH:.0f} mm: compliance over that of quadratic handles of 16 modes")
         for name in ("BEAM", "CUBE", "PAD"):
-            config, ratio = getattr(presets, name), getattr(presets, f"{name}_MATERIAL").poissons_ratio
+            config, ratio = getattr(task_objects, name), getattr(task_objects, f"{name}_MATERIAL").poissons_ratio
             print(name, round(compliance(config, ratio, config.build) / compliance(config, ratio, FINE), 2), flush=True)
-        half, radius = 0.5 * presets.ROPE.extents[0], 0.5 * presets.ROPE.extents[1]  # type: ignore[index]
+        half, radius = 0.5 * task_objects.ROPE.extents[0], 0.5 * task_objects.ROPE.extents[1]  # type: ignore[index]
         modulus = 1000.0 * GRAVITY * 4.0 * half**3 / (pull * radius**2)
-        material = replace(presets.ROPE_MATERIAL, youngs_modulus=modulus, density=1000.0)
+        material = replace(task_objects.ROPE_MATERIAL, youngs_modulus=modulus, density=1000.0)
         exact = half * heavy_elastica(pull)[0]
         print(f"\nelastica: {exact / half:.3f} of half the length")
         print("| handles | modes | rank tolerance | functions | drop over the elastica's |\n|---|---|---|---|---|")
         for build in ROPES:
-            thing = load(replace(presets.ROPE, build=build), progress=False)
+            thing = load(replace(task_objects.ROPE, build=build), progress=False)
             drop = float(np.asarray(hang(thing, material, half))[0])
             row = f"{build.handles} | {build.mode_count} | {build.rank_tolerance:g} | {thing.body.function_count}"
             print(f"| {row} | {drop / exact:.3f} |", flush=True)

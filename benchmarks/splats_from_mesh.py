@@ -17,9 +17,10 @@ import numpy as np
 import warp as wp
 
 from softmode.objects.mesh_file import read_mesh
-from softmode.objects.mesh_fit import FIELD_OF_VIEW, FitOptions, splats_from_mesh
+from softmode.objects.mesh_fit import FitOptions, splats_from_mesh
 from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.mesh_samples import sample_mesh
+from softmode.splats.picture_fit import FIELD_OF_VIEW
 from softmode.splats.rasterizer import SplatArrays, SplatRasterizer
 from softmode.splats.reference_views import orbit_poses, render_mesh
 from softmode.splats.splats import Splats

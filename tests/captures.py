@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from softmode.objects.level_sets import Level, ball, box, cylinder, ellipsoid, torus, union, without
 from softmode.splats.splats import SH_DC, Splats, rotations_from_quats
 
 Array = NDArray[np.float64]
-Level = Callable[[Array], Array]
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -119,67 +119,6 @@ def render_shell(
 # -- solids -----------------------------------------------------------------------------------------------------------
 
 
-def ball(radius: float, centre: Any = (0.0, 0.0, 0.0)) -> Level:
-    """Return a ball."""
-    return lambda x: np.linalg.norm(x - np.asarray(centre), axis=1) - radius
-
-
-def ellipsoid(radii: Any, centre: Any = (0.0, 0.0, 0.0)) -> Level:
-    """Return an ellipsoid, a distance to first order at its surface."""
-    r = np.asarray(radii)
-
-    def level(x: Array) -> Array:
-        local = x - np.asarray(centre)
-        k0, k1 = np.linalg.norm(local / r, axis=1), np.linalg.norm(local / r**2, axis=1)
-        return k0 * (k0 - 1.0) / np.maximum(k1, 1e-9)
-
-    return level
-
-
-def box(size: Any, centre: Any = (0.0, 0.0, 0.0), rounding: float = 0.0) -> Level:
-    """Return a box with edges `size`, rounded."""
-    half = 0.5 * np.asarray(size) - rounding
-
-    def level(x: Array) -> Array:
-        away = np.abs(x - np.asarray(centre)) - half
-        return np.linalg.norm(np.maximum(away, 0.0), axis=1) + np.minimum(away.max(axis=1), 0.0) - rounding
-
-    return level
-
-
-def cylinder(radius: float, low: float, high: float) -> Level:
-    """Return an upright cylinder."""
-
-    def level(x: Array) -> Array:
-        away = np.stack(
-            [np.hypot(x[:, 0], x[:, 1]) - radius, np.abs(x[:, 2] - 0.5 * (low + high)) - 0.5 * (high - low)]
-        )
-        return np.linalg.norm(np.maximum(away, 0.0), axis=0) + np.minimum(away.max(axis=0), 0.0)
-
-    return level
-
-
-def torus(major: float, minor: float, centre: Any = (0.0, 0.0, 0.0), axis: int = 2) -> Level:
-    """Return a ring about an axis."""
-    others = [d for d in range(3) if d != axis]
-
-    def level(x: Array) -> Array:
-        local = x - np.asarray(centre)
-        return np.hypot(np.linalg.norm(local[:, others], axis=1) - major, local[:, axis]) - minor
-
-    return level
-
-
-def union(*parts: Level) -> Level:
-    """Return what lies in any of the parts."""
-    return lambda x: np.min([part(x) for part in parts], axis=0)
-
-
-def without(solid: Level, cavity: Level) -> Level:
-    """Return a solid less a cavity."""
-    return lambda x: np.maximum(solid(x), -cavity(x))
-
-
 def _solid(level: Level, low: Any, high: Any) -> Solid:
     return Solid(level=level, bounds=np.array([low, high], dtype=np.float64))
 
@@ -194,6 +133,11 @@ def bowl(wall: float = 0.005) -> Solid:
     """Return a hemispherical bowl of 80 mm."""
     level = without(without(ball(0.04), ball(0.04 - wall)), lambda x: 0.0 - x[:, 2])
     return _solid(level, (-0.04, -0.04, -0.04), (0.04, 0.04, 0.0))
+
+
+def hollow_ball(wall: float = 0.006) -> Solid:
+    """Return a closed ball of 80 mm with a void inside."""
+    return _solid(without(ball(0.04), ball(0.04 - wall)), [-0.04] * 3, [0.04] * 3)
 
 
 def mug() -> Solid:

@@ -13,14 +13,21 @@ from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
 from softmode.errors import AssetError, ConfigError
 from softmode.objects.fingerprint import file_fingerprint, find_file
+from softmode.objects.paint import StifferColor
 from softmode.objects.parts import Part
+from softmode.objects.presets import find_preset
 from softmode.objects.primitives import Color, Extents, find_axis
+from softmode.radiance.grid import RadianceGrid
 from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.splats import Splats, UpAxis
 
 Box = tuple[float, float, float, float, float, float]
 Shape = Literal["plush", "box", "cylinder", "capsule", "sphere"]
 Pose = Literal["stable", "captured"]
+SIZE = 0.08
+"""Longest edge of what has no size of its own and is given none [m]."""
+FILES = ("splat", "mesh", "radiance", "body")
+"""Options that name a file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,37 +51,43 @@ class StifferBox:
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectConfig:
-    """Which soft object, how large, how finely reduced: the built-in plush, a shape, a file, or a body as it is."""
+    """Which soft object, how large, how finely reduced: the built-in plush, a shape, a preset, a file, or a body."""
 
     shape: Shape = "plush"
-    """What it is where neither `splat` nor `mesh` is given: "plush", or a "box", "cylinder", "capsule" or "sphere" of
+    """What it is where no file is given: "plush", or a "box", "cylinder", "capsule" or "sphere" of
     `extents`."""
     extents: Extents | None = None
     """Edges of a shape's bounding box along x, y and z [m]. A round shape needs two that are equal, a sphere three; a
     capsule lies along the third, its longest, a cylinder along the third, its length or the thickness of a disc."""
+    preset: str | None = None
+    """Name of an object of the library, `PRESETS`: "sponge", "mug", ...; `load` gives it the preset's material."""
     splat: str | Path | Splats | None = None
     """Splat file (.ply, SOG v2, .spz, .splat, OpenUSD), or a point cloud (.npz, see `read_points`, or .ply); or splats
     that have been read."""
     mesh: str | Path | ColoredMesh | None = None
     """Mesh file (.obj, .glb, .stl, ... whatever trimesh reads, OpenUSD), or a mesh that has been read. One that is not
     closed stands for what it encloses."""
+    radiance: str | Path | RadianceGrid | None = None
+    """Radiance field (.npz, Plenoxels, .nvdb, see `read_radiance`), or one that has been read; it is shown by splats
+    baked of it, or marched (`SplatScene(march=True)`)."""
     body: str | Path | None = None
     """File of a body (`softmode body build`, `ReducedBody.save`, or a stage with one from `usd.write_usd`): taken as it
     is, with its own size, pose, surface samples, regions and splats."""
-    size: float = 0.08
-    """Longest edge of the bounding box of plush, splat file or mesh, upright [m]; the gripper opens 0.09 m."""
+    size: float | None = None
+    """Longest edge of the bounding box of plush, preset, splat file, mesh or field, upright [m]; None for a preset's
+    own, else 0.08. The gripper opens 0.09 m."""
     colors: tuple[Color, Color] | None = None
     """Two colours, 0..1, of a shape or mesh, as a checker pattern; None for orange and cream, or the mesh's own."""
-    splat_count: int = 2000
-    """Number of splats on a shape or mesh."""
+    splat_count: int | None = None
+    """Number of splats on a shape, preset or mesh, or baked of a field; None for 6000 on a preset, else 2000."""
     surface_count: int = 400
     """Number of surface samples, the points that feel contact."""
     up: UpAxis | None = None
     """Axis of the file that points up; None for "-y" (splat files: trained captures mostly have y down), "+y" (glTF) or
     "+z" (OpenUSD, which is read with z up, point clouds, other meshes, and what has been read)."""
     crop: tuple[float, float, float, float, float, float] | None = None
-    """Box (x0, y0, z0, x1, y1, z1) of the splat file, after turning it up, outside which splats are dropped; cuts an
-    object off what it touched when it was captured."""
+    """Box (x0, y0, z0, x1, y1, z1) of the splat file or field, after turning it up, outside which there is nothing;
+    cuts an object off what it touched when it was captured."""
     part: Part = "thickest"
     """Which of the separate parts of a splat file is the object: the one with the largest least spread, so that neither
     the ground it was captured on, wide but thin, nor loose small parts win; the one with the greatest height; the one
@@ -89,6 +102,8 @@ class ObjectConfig:
     an edge that presses between them from catching on them."""
     stiffness: tuple[StifferBox, ...] = ()
     """Parts of another stiffness; where they overlap, the last one counts."""
+    stiffness_colors: tuple[StifferColor, ...] = ()
+    """Parts of another stiffness by the colour of the nearest splat; times what `stiffness` says."""
     clamped_height: float = 0.0
     """Height of the foot that is fixed to the table [m], 0 for an object that stands free. A clamped object keeps its
     scale."""
@@ -101,9 +116,15 @@ class ObjectConfig:
     def __post_init__(self) -> None:
         """Check the ranges."""
         object.__setattr__(self, "stiffness", tuple(self.stiffness))
-        require_number("size", self.size, at_least=0.005, at_most=1.0, unit="m", hint="give the longest edge in metres")
+        object.__setattr__(self, "stiffness_colors", tuple(self.stiffness_colors))
+        if self.size is not None:
+            hint = "give the longest edge in metres"
+            require_number("size", self.size, at_least=0.005, at_most=1.0, unit="m", hint=hint)
+        if self.preset is not None:
+            find_preset(self.preset)
         require_fields(self, ("contact_radius", "clamped_height"), at_least=0.0, unit="m")
-        require_number("splat_count", self.splat_count, at_least=100)
+        if self.splat_count is not None:
+            require_number("splat_count", self.splat_count, at_least=100)
         require_number("surface_count", self.surface_count, at_least=16)
         if self.resolution is not None:
             require_number("resolution", self.resolution, at_least=16, at_most=512)
@@ -112,24 +133,38 @@ class ObjectConfig:
         for name, known in (("shape", Shape), ("up", UpAxis), ("part", Part), ("pose", Pose)):
             if name != "up" or self.up is not None:
                 require_choice(name, getattr(self, name), get_args(known))
-        files = (self.splat, self.mesh, self.body)
+        files = (self.preset, self.splat, self.mesh, self.radiance, self.body)
         if sum(file is not None for file in files) + (self.shape != "plush") > 1:
             raise ConfigError(
-                f"shape {self.shape!r}, splat {self.splat!r}, mesh {self.mesh!r} and body {self.body!r} exclude each"
-                " other",
+                f"shape {self.shape!r}, preset {self.preset!r}, splat {self.splat!r}, mesh {self.mesh!r}, radiance"
+                f" {self.radiance!r} and body {self.body!r} exclude each other",
                 hint="give one of them",
             )
         if self.body is not None and self.clamped_height > 0.0:
             hint = "build it with a region for its foot: softmode body build FILE --region foot=..."
             raise ConfigError(f"clamped_height is {self.clamped_height} m for a body that is built", hint=hint)
-        if self.body is not None and self.stiffness:
+        if self.body is not None and (self.stiffness or self.stiffness_colors):
             raise ConfigError(f"stiffness given for the body {self.body}", hint="give it when the body is built")
         self._check_extents()
         if self.colors is not None:
-            if self.shape == "plush" and self.mesh is None:
-                raise ConfigError("colors are for shapes and meshes", hint="leave them out; splats have their own")
+            if self.shape == "plush" and self.mesh is None and self.preset is None:
+                raise ConfigError(
+                    "colors are for shapes, presets and meshes", hint="leave them out; splats have their own"
+                )
             if np.shape(self.colors) != (2, 3) or not all(0.0 <= x <= 1.0 for color in self.colors for x in color):
                 raise ConfigError(f"colors {self.colors} are not two colours", hint="give two of (r, g, b) in 0..1")
+
+    @property
+    def longest_edge(self) -> float | None:
+        """Longest edge that it is brought to [m]; None for what has its own: shapes, bodies, most presets."""
+        if self.body is not None or self.extents is not None:
+            return None
+        return self.size if self.preset is not None else self.size or SIZE
+
+    @property
+    def material(self) -> Material | None:
+        """What a preset is made of; None for anything else."""
+        return None if self.preset is None else find_preset(self.preset).material
 
     def for_material(self, material: Material | None) -> ObjectConfig:
         """Return this with a body for a material's own Poisson's ratio, unless its options name one."""
@@ -137,15 +172,15 @@ class ObjectConfig:
 
     @property
     def file(self) -> tuple[str, Path] | None:
-        """Which of `splat`, `mesh` and `body` names a file, and the file; None where there is none."""
-        for kind in ("splat", "mesh", "body"):
+        """Which of `splat`, `mesh`, `radiance` and `body` names a file, and the file; None where there is none."""
+        for kind in FILES:
             if isinstance(given := getattr(self, kind), str | Path):
                 return kind, Path(given)
         return None
 
     def changed(self, **options: Any) -> ObjectConfig:
         """Return this with other options; another file comes without the fingerprint of the one before."""
-        if any(options.get(kind) is not None for kind in ("splat", "mesh", "body")):
+        if any(options.get(kind) is not None for kind in FILES):
             options = {"fingerprint": None, **options}
         return replace(self, **options)
 

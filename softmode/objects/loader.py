@@ -20,6 +20,7 @@ from softmode.objects.config import ObjectConfig
 from softmode.objects.object_file import file_kind, read_object, surface_cover
 from softmode.objects.soft_object import SoftObject
 from softmode.objects.source import (
+    field_of_body,
     may_turn,
     object_source,
     splats_of_body,
@@ -27,13 +28,14 @@ from softmode.objects.source import (
     stiffness_scale,
     with_origin,
 )
+from softmode.radiance.grid import RadianceGrid
 from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.splats import Splats
 
 if TYPE_CHECKING:
     import trimesh
 
-    Source = ObjectConfig | ReducedBody | Splats | ColoredMesh | trimesh.Trimesh | trimesh.Scene
+    Source = ObjectConfig | ReducedBody | Splats | RadianceGrid | ColoredMesh | trimesh.Trimesh | trimesh.Scene
     """What can be loaded beside a file."""
 
 RECIPE = 6
@@ -51,10 +53,11 @@ def load(
     """Return a soft object: read or make its splats, build or recall its body.
 
     Args:
-        source: A configuration; a file of splats, of a point cloud, of a mesh or of a body, or an OpenUSD stage with
-            any of these; a body; splats or a mesh (also of trimesh) in memory; None for the built-in plush.
-        material: What it is made of; None for what its file says. The body is built for its Poisson's ratio, unless
-            `BuildOptions` name one.
+        source: A configuration; a file of splats, of a point cloud, of a mesh, of a radiance field or of a body, or an
+            OpenUSD stage with any of these but a field; a body; splats, a field or a mesh (also of trimesh) in memory;
+            None for the built-in plush.
+        material: What it is made of; None for what its file or preset says. The body is built for its Poisson's ratio,
+            unless `BuildOptions` name one.
         progress: Passed to :func:`softmode.deformables.build.build_body.build_body`.
         options: Fields of `ObjectConfig`, such as ``size=0.08``; they replace those of a configuration. A body takes
             only ``contact_radius``.
@@ -70,6 +73,7 @@ def load(
     if isinstance(source, ReducedBody):
         return SoftObject(body=source, splats=surface_cover(source), material=material, **options)
     config = object_config(source, **options)
+    material = material or config.material
     made = config.for_material(material).build
     if config.body is not None:
         found = read_object(config.body)
@@ -89,17 +93,26 @@ def load(
             wide = float("inf")
             top = float(quadrature.bounds[0, 2]) + config.clamped_height
             regions = (Region(name="foot", box=((-wide,) * 3, (wide, wide, top))),)
-        scale = stiffness_scale(config, quadrature)
+        scale = stiffness_scale(config, quadrature, parts, turn)
         body = build_body(quadrature, made, name=parts.name, regions=regions, stiffness_scale=scale, progress=progress)
         return replace(body, provenance={**body.provenance, "turn": json.dumps(turn.tolist())})
 
     clamp = (config.clamped_height,) if config.clamped_height > 0.0 else ()
     key = (RECIPE, *parts.key, may_turn(config), config.surface_count, made, *clamp, *config.stiffness)
+    if config.stiffness_colors:  # A mesh's key does not hold its colours.
+        key = (*key, *config.stiffness_colors, parts.splats.means, parts.splats.sh)
     body = cached_body(key, build)
     turn = np.array(json.loads(str(body.provenance["turn"])))
     splats = splats_of_body(parts.splats, body, turn)
     body = with_origin(body, config, parts, splats)
-    return SoftObject(body=body, splats=splats, material=material, contact_radius=config.contact_radius, config=config)
+    return SoftObject(
+        body=body,
+        splats=splats,
+        material=material,
+        contact_radius=config.contact_radius,
+        config=config,
+        radiance=field_of_body(parts, body, turn),
+    )
 
 
 def object_config(source: Source | str | os.PathLike[str] | None, **options: Any) -> ObjectConfig:
@@ -123,10 +136,14 @@ def object_config(source: Source | str | os.PathLike[str] | None, **options: Any
         return ObjectConfig(**{"splat" if kind == "points" else kind: Path(source)}, **options)
     if isinstance(source, Splats):
         return ObjectConfig(splat=source, **options)
+    if isinstance(source, RadianceGrid):
+        return ObjectConfig(radiance=source, **options)
     if isinstance(source, ColoredMesh):
         return ObjectConfig(mesh=source, **options)
     import trimesh
 
     if isinstance(source, trimesh.Trimesh | trimesh.Scene):
         return ObjectConfig(mesh=ColoredMesh.from_trimesh(source), **options)
-    raise TypeError(f"source is a {type(source).__name__}: give a file, a configuration, a body, splats or a mesh")
+    raise TypeError(
+        f"source is a {type(source).__name__}: give a file, a configuration, a body, splats, a field or a mesh"
+    )

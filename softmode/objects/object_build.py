@@ -18,6 +18,7 @@ from softmode.errors import ConfigError
 from softmode.objects.loader import Progress, object_config
 from softmode.objects.soft_object import SoftObject
 from softmode.objects.source import (
+    field_of_body,
     object_source,
     splats_of_body,
     standing_quadrature,
@@ -59,6 +60,7 @@ def build_object(
         BasisError: If the basis cannot be built, or a region holds too little.
     """
     config = object_config(source, **options)
+    material = material or config.material
     if config.body is not None:
         raise ConfigError(f"{config.body} is a body already", hint="give the file that it was built from")
     parts = object_source(config)
@@ -70,11 +72,18 @@ def build_object(
         config.for_material(material).build,
         name=parts.name,
         regions=[region.moved(-seat, quadrature.bounds) for region in regions],
-        stiffness_scale=stiffness_scale(config, quadrature),
+        stiffness_scale=stiffness_scale(config, quadrature, parts, turn),
         progress=progress,
     )
     splats = splats_of_body(parts.splats, body, turn)
     frame = {"turn": json.dumps(turn.tolist()), "seat": json.dumps(seat.tolist())}
     body = with_origin(replace(body, provenance={**body.provenance, **frame}), config, parts, splats)
-    found = SoftObject(body=body, splats=splats, material=material, contact_radius=config.contact_radius, config=config)
+    found = SoftObject(
+        body=body,
+        splats=splats,
+        material=material,
+        contact_radius=config.contact_radius,
+        config=config,
+        radiance=field_of_body(parts, body, turn),
+    )
     return found, quadrature

@@ -6,7 +6,7 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,34 +14,48 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
 from softmode.errors import AssetError
 from softmode.files import damage_errors
+from softmode.objects.presets import PRESETS
 from softmode.objects.soft_object import SoftObject
+from softmode.radiance.formats import is_radiance
+from softmode.radiance.grid import RadianceGrid
 from softmode.splats.formats import READABLE
 from softmode.splats.point_cloud import ply_kind, splats_from_points
 from softmode.splats.splats import Splats
 from softmode.stages import tokens
 
-FileKind = Literal["splat", "points", "mesh", "body"]
-_FIELDS = ("means", "quats", "scales", "opacities", "sh")
+FileKind = Literal["splat", "points", "mesh", "radiance", "body"]
+_PARTS = {
+    "splats": ("means", "quats", "scales", "opacities", "sh"),
+    "radiance": ("density", "sh", "origin", "axes"),
+}
+"""What a file may hold beside the body, and the names of its arrays."""
 _LIGHT = np.array([0.37, 0.29, 0.88])
 
 
-def write_object(path: str | os.PathLike[str], body: ReducedBody, splats: Splats | None = None) -> None:
-    """Write a body with its splats; the file appears complete or not at all.
+def write_object(
+    path: str | os.PathLike[str],
+    body: ReducedBody,
+    splats: Splats | None = None,
+    radiance: RadianceGrid | None = None,
+) -> None:
+    """Write a body with its splats and its radiance field; the file appears complete or not at all.
 
     Args:
         path: The .npz to write.
         body: The body.
-        splats: Its splats in the body frame; None writes the body alone, as `ReducedBody.save` does.
+        splats: Its splats in the body frame, if it has any.
+        radiance: The radiance field that it was made from, in the body frame, if there is one.
     """
-    fields = {} if splats is None else {f"splats.{name}": getattr(splats, name) for name in _FIELDS}
-    body.save(path, beside=fields)
+    given = {"splats": splats, "radiance": radiance}
+    held = {kind: part for kind, part in given.items() if part is not None}
+    body.save(path, beside={f"{kind}.{n}": getattr(part, n) for kind, part in held.items() for n in _PARTS[kind]})
 
 
 def read_object(path: str | os.PathLike[str]) -> SoftObject:
     """Read a file written by `write_object` or `ReducedBody.save`, or a stage with one body from `usd.write_usd`.
 
     Returns:
-        The body, with its splats in the body frame if the file has any.
+        The body, with its splats and its radiance field in the body frame if the file has any.
 
     Raises:
         AssetError: If the file is missing, damaged, foreign, or of another version.
@@ -53,13 +67,17 @@ def read_object(path: str | os.PathLike[str]) -> SoftObject:
     body, stored = ReducedBody.load_with(path)
     told = stored_material(body)
     material = replace(Material(), **told) if told else None  # type: ignore[arg-type]  # its fields are numbers
-    if not stored:
-        return SoftObject(body=body, material=material)
-    missing = {f"splats.{name}" for name in _FIELDS} ^ set(stored)
+    held = {kind for kind in _PARTS if any(name.startswith(f"{kind}.") for name in stored)}
+    missing = {f"{kind}.{name}" for kind in held for name in _PARTS[kind]} ^ set(stored)
     if missing:
         raise AssetError(f"body file {path}: {sorted(missing)} do not match", hint="Build the body again.")
-    fields = {name: stored[f"splats.{name}"] for name in _FIELDS}
-    return SoftObject(body=body, splats=Splats(**fields, name=f"body file {path}"), material=material)
+    parts: dict[str, dict[str, Any]] = {kind: {n: stored[f"{kind}.{n}"] for n in _PARTS[kind]} for kind in held}
+    return SoftObject(
+        body=body,
+        splats=Splats(**parts["splats"], name=f"body file {path}") if "splats" in held else None,
+        material=material,
+        radiance=RadianceGrid(**parts["radiance"], name=f"body file {path}") if "radiance" in held else None,
+    )
 
 
 def stored_material(body: ReducedBody) -> dict[str, float]:
@@ -75,8 +93,12 @@ def file_kind(path: str | os.PathLike[str]) -> FileKind:
     """
     file = Path(path)
     if not file.exists():
-        raise AssetError(f"file {file}: no such file", hint="check the path")
+        named = len(file.parts) == 1 and not file.suffix
+        hint = f"check the path, or name a preset: {', '.join(PRESETS)}" if named else "check the path"
+        raise AssetError(f"file {file}: no such file", hint=hint)
     suffix = file.suffix.lower()
+    if is_radiance(file):
+        return "radiance"
     if suffix == ".npz":
         with damage_errors(f"file {file}", hint="build or write it again"), np.load(file, allow_pickle=False) as stored:
             return "points" if "points" in stored.files and "header" not in stored.files else "body"

@@ -1,49 +1,183 @@
-"""Soft objects and materials that the tasks use: a beam, a cube, a pad to press, a rope.
+"""Presets: a library of soft objects made by code, each with its shape, its colours and what it is made of."""
 
-Few functions, points and samples each, for training; `docs/objects.md` has what that costs in accuracy. The functions
-are chosen by elastic energy, at the Poisson's ratio of the material.
-"""
+from __future__ import annotations
 
-from softmode.deformables.build.options import BuildOptions
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
 from softmode.deformables.materials.material import Material
-from softmode.objects.config import ObjectConfig
+from softmode.errors import ConfigError
+from softmode.objects import preset_shapes as shapes
+from softmode.objects.level_sets import level_mesh, level_slope
+from softmode.objects.preset_shapes import PaintedSolid
+from softmode.splats.colored_mesh import ColoredMesh
 
-BEAM = ObjectConfig(
-    shape="box",
-    extents=(0.30, 0.04, 0.04),
-    surface_count=200,
-    build=BuildOptions(function_count=30, poissons_ratio=0.3, cubature_count=256),
-)
-"""The beam of Isaac Lab's `Isaac-Lift-Soft-Franka`, lying along x."""
-BEAM_MATERIAL = Material(youngs_modulus=2.0e5, poissons_ratio=0.3, density=1000.0)
-"""Its material there."""
+if TYPE_CHECKING:
+    import trimesh
 
-CUBE = ObjectConfig(
-    shape="box",
-    extents=(0.06, 0.06, 0.06),
-    surface_count=200,
-    build=BuildOptions(function_count=32, poissons_ratio=0.3, cubature_count=256),
-)
-"""A cube that fits between the fingers."""
-CUBE_MATERIAL = Material(youngs_modulus=1.0e5, poissons_ratio=0.3, density=300.0)
-"""Soft foam."""
+SHADE, SHADE_REACH = 0.45, 0.05
+"""How much darker the deepest corner is, and how far from the surface what stands in the light is looked for, over the
+size."""
 
-PAD = ObjectConfig(
-    shape="cylinder",
-    extents=(0.10, 0.10, 0.03),
-    surface_count=200,
-    build=BuildOptions(function_count=32, poissons_ratio=0.4, cubature_count=256),
-)
-"""A flat disc to press on."""
-PAD_MATERIAL = Material(youngs_modulus=5.0e4, poissons_ratio=0.4, density=500.0)
-"""Soft foam rubber."""
 
-ROPE = ObjectConfig(
-    shape="capsule",
-    extents=(0.40, 0.016, 0.016),
-    surface_count=200,
-    build=BuildOptions(function_count=48, poissons_ratio=0.3),
-)
-"""A rope along x, 8 mm in radius."""
-ROPE_MATERIAL = Material(youngs_modulus=3.0e5, poissons_ratio=0.3, density=800.0)
-"""Soft rubber: held in the middle, its ends hang down steeply."""
+@dataclass(frozen=True, kw_only=True)
+class Preset:
+    """One soft object of the library."""
+
+    what: str
+    """What it is."""
+    shape: Callable[[], PaintedSolid]
+    """Makes its solid."""
+    material: Material
+    """What it is made of."""
+    why: str
+    """Where the material's numbers come from."""
+
+    @property
+    def properties(self) -> dict[str, float]:
+        """The properties of the material that differ between presets, as fields of `Material`."""
+        names = ("youngs_modulus", "poissons_ratio", "density", "friction")
+        return {name: getattr(self.material, name) for name in names}
+
+
+def _material(youngs_modulus: float, poissons_ratio: float, density: float, friction: float) -> Material:
+    return Material(youngs_modulus=youngs_modulus, poissons_ratio=poissons_ratio, density=density, friction=friction)
+
+
+def _block(letter: str, tint: str) -> Preset:
+    return Preset(
+        what=f"letter block {letter}, a cube with sunken letters",
+        shape=functools.partial(shapes.letter_block, letter, tint),
+        material=_material(3e5, 0.3, 100.0, 0.8),
+        why="EVA play foam",
+    )
+
+
+PRESETS: dict[str, Preset] = {
+    "bear": Preset(
+        what="sitting teddy bear",
+        shape=shapes.bear,
+        material=_material(3e4, 0.3, 80.0, 0.8),
+        why="polyester filling in cloth",
+    ),
+    "sponge": Preset(
+        what="kitchen sponge with a waist and pores",
+        shape=shapes.sponge,
+        material=_material(6e4, 0.3, 40.0, 0.8),
+        why="open-celled polyurethane foam",
+    ),
+    "ball": Preset(
+        what="small basketball",
+        shape=shapes.toy_ball,
+        material=_material(3e5, 0.4, 200.0, 0.9),
+        why="moulded polyurethane foam",
+    ),
+    "rope": Preset(
+        what="rope of three strands, slender",
+        shape=shapes.rope,
+        material=_material(1e6, 0.3, 700.0, 0.7),
+        why="cotton: its strands slide, so it bends far more easily than its fibres stretch",
+    ),
+    "cable": Preset(
+        what="cable with plug and connector, slender",
+        shape=shapes.cable,
+        material=_material(4e6, 0.4, 1200.0, 0.6),
+        why="soft PVC, 70 Shore A",
+    ),
+    "mug": Preset(
+        what="mug with a handle, thin and concave",
+        shape=shapes.mug,
+        material=_material(2e6, 0.45, 1150.0, 0.8),
+        why="silicone rubber, 45 Shore A",
+    ),
+    "banana": Preset(
+        what="banana",
+        shape=shapes.banana,
+        material=_material(1e6, 0.4, 950.0, 0.6),
+        why="flesh of some 0.3 MPa in a stiffer peel",
+    ),
+    "bread": Preset(
+        what="loaf of tin bread, cut at one end",
+        shape=shapes.bread,
+        material=_material(3e4, 0.2, 250.0, 0.7),
+        why="crumb of some 10 kPa in a stiffer crust",
+    ),
+    "doughnut": Preset(
+        what="doughnut with icing, a ring",
+        shape=shapes.doughnut,
+        material=_material(3e4, 0.3, 350.0, 0.7),
+        why="yeast dough, denser than bread",
+    ),
+    "cushion": Preset(
+        what="small cushion with piping and a button",
+        shape=shapes.cushion,
+        material=_material(3e4, 0.3, 80.0, 0.7),
+        why="polyester filling in cloth",
+    ),
+    "glove": Preset(
+        what="child's knitted glove, branching, its cuff open",
+        shape=shapes.glove,
+        material=_material(1e5, 0.3, 150.0, 0.8),
+        why="padded wool",
+    ),
+    "fish": Preset(
+        what="clownfish, a bath toy with thin fins",
+        shape=shapes.fish,
+        material=_material(8e5, 0.45, 1000.0, 0.8),
+        why="soft vinyl, 25 Shore A",
+    ),
+    "block-a": _block("A", "c8402f"),
+    "block-b": _block("B", "2f6fb0"),
+    "block-c": _block("C", "3f8f4f"),
+}
+"""The presets by name."""
+
+
+def find_preset(name: str) -> Preset:
+    """Return a preset.
+
+    Raises:
+        ConfigError: If there is none of that name.
+    """
+    if name not in PRESETS:
+        raise ConfigError(f"there is no preset {name!r}", hint=f"use one of {', '.join(PRESETS)}")
+    return PRESETS[name]
+
+
+@functools.cache
+def preset_mesh(name: str) -> ColoredMesh:
+    """Return the surface of a preset at its own size, z up [m].
+
+    Raises:
+        ConfigError: If there is none of that name.
+    """
+    return ColoredMesh.from_trimesh(preset_surface(name), name=name)
+
+
+def preset_surface(name: str) -> trimesh.Trimesh:
+    """Return the surface of a preset with colours at its vertices: closed, z up, standing on z = 0 over the origin [m].
+
+    Corners that little light reaches are painted darker.
+
+    Raises:
+        ConfigError: If there is none of that name.
+    """
+    import trimesh
+
+    solid = find_preset(name).shape()
+    mesh = level_mesh(solid.level, solid.low, solid.high, solid.cell)
+    points = np.asarray(mesh.vertices)
+    reach = SHADE_REACH * float(np.ptp(points, axis=0).max())
+    normals = level_slope(solid.level, points, 0.5 * solid.cell)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    open_ = np.mean([np.clip(solid.level(points + r * normals) / r, 0.0, 1.0) for r in (0.3 * reach, reach)], axis=0)
+    colors = np.clip(solid.paint(points) * (1.0 - SHADE * (1.0 - open_))[:, None], 0.02, 0.98)
+    painted = np.round(255.0 * np.column_stack([colors, np.ones(len(colors))])).astype(np.uint8)
+    mesh = trimesh.Trimesh(points, mesh.faces, vertex_colors=painted, process=False)
+    low, high = mesh.bounds
+    mesh.apply_translation([*(-0.5 * (low + high)[:2]), -low[2]])
+    return mesh

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,8 +13,11 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.build.report import Finding, object_findings
 from softmode.deformables.materials.material import Material
 from softmode.deformables.skinning.skin_splats import average_basis
-from softmode.errors import ConfigError
+from softmode.errors import ConfigError, GraspError
 from softmode.objects.config import ObjectConfig
+from softmode.objects.rest_grasps import rest_grasps
+from softmode.radiance.grid import RadianceGrid
+from softmode.robots.jaws import ParallelJaw
 from softmode.splats.splats import Splats
 
 Array = NDArray[np.float64]
@@ -33,6 +37,8 @@ class SoftObject:
     """How far the surface that touches stands out from the body's [m]."""
     config: ObjectConfig | None = None
     """What it was made from, to make it anew with other options; None if that is not known."""
+    radiance: RadianceGrid | None = None
+    """The radiance field that it was made from, in the body frame."""
     notes: tuple[str, ...] = ()
     """What was read from its file in another way than it was meant."""
 
@@ -56,20 +62,27 @@ class SoftObject:
         lifted = 0.0 if self.body.driven_count else self.contact_radius
         return float(-self.body.surface_points[:, 2].min()) + lifted
 
-    def findings(self, *, opening: float | None = None) -> tuple[Finding, ...]:
+    def findings(self, *, jaw: ParallelJaw | None = None) -> tuple[Finding, ...]:
         """Return what its user should know before it is simulated; see `object_findings`.
 
         Args:
-            opening: How far the gripper that is to take it opens [m]; None where nothing is to.
+            jaw: The gripper that is to take it from where it stands, see `plan_grasps`; None where none is to.
         """
         splats = None if self.splats is None else self.splats.means
-        return object_findings(self.body, splats=splats, size=self.size_asked, opening=opening)
+        found = object_findings(self.body, splats=splats, size=self.size_asked)
+        if jaw is None:
+            return found
+        friction = math.sqrt((self.material or Material()).friction * jaw.friction)
+        try:
+            rest_grasps(self.body, jaw, friction=max(friction, 1e-3))
+        except GraspError as error:
+            return (*found, Finding(severity="warning", name="gripper", what=error.message, remedy=error.hint))
+        return found
 
     @property
     def size_asked(self) -> float | None:
         """Longest edge that its file was to be given [m]; None for what has its own size."""
-        made = self.config
-        return None if made is None or made.body is not None or made.extents is not None else made.size
+        return None if self.config is None else self.config.longest_edge
 
     @property
     def basis(self) -> Array:

@@ -12,7 +12,7 @@ from softmode.deformables.build.cache import cached_body
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_points, quadrature_from_splats
 from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
+from softmode.deformables.build.quadrature_mesh import cap_holes, quadrature_from_mesh
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import SCALE_MAX, SCALE_MIN
 from softmode.errors import AssetError, BasisError
@@ -25,7 +25,7 @@ from softmode.objects.stage_scene import UsdDeformable
 from softmode.splats.mesh_samples import sample_mesh
 from softmode.splats.splats import Splats
 
-RECIPE = 3
+RECIPE = 4
 """Raise it when a stage's body comes to be built in another way: cached bodies are keyed by it."""
 _COVER = 8000
 """Points on a mesh that is not closed, whose inside is then what they enclose."""
@@ -144,7 +144,8 @@ def _integrate(deformable: UsdDeformable, surface_count: int) -> Quadrature:
     surface, splats = deformable.surface, deformable.splats
     if surface is not None:
         try:
-            return quadrature_from_mesh(surface.vertices, surface.faces, surface_count=surface_count)
+            vertices, faces, _ = cap_holes(surface.vertices, surface.faces)
+            return quadrature_from_mesh(vertices, faces, surface_count=surface_count)
         except AssetError:
             cover = sample_mesh(colored_mesh([surface], deformable.path), _COVER)
             return quadrature_from_points(cover.means, surface_count=surface_count)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from softmode.scenes.capture import capture_graph, capture_step
     from softmode.scenes.fixture import Fixture, add_fixture
     from softmode.scenes.meshes import SceneMesh, scene_meshes, scene_poses
+    from softmode.scenes.motion import Motion, motion_of, set_motion
     from softmode.scenes.scene import Scene
     from softmode.scenes.splat_scene import Record, SplatScene
     from softmode.scenes.table_scene import TableScene, TableSceneConfig
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 __all__ = [
     "BoundSplats",
     "Fixture",
+    "Motion",
     "Record",
     "Scene",
     "SceneMesh",
@@ -31,8 +33,10 @@ __all__ = [
     "add_fixture",
     "capture_graph",
     "capture_step",
+    "motion_of",
     "scene_meshes",
     "scene_poses",
+    "set_motion",
     "splats_of_states",
 ]
 

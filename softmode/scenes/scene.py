@@ -11,7 +11,7 @@ from softmode.deformables.solver.reduced_solver import ReducedSolver
 from softmode.deformables.tools.grips import Grips
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.binding import BoundSplats
-from softmode.splats.camera import CameraOptions, SplatCamera
+from softmode.splats.camera import CameraOptions, Overlay, SplatCamera
 from softmode.splats.camera_randomization import CameraRandomization
 from softmode.splats.pinhole import PinholeCamera
 
@@ -54,28 +54,31 @@ class Scene(Protocol):
 
 def cameras_by_size(
     model: newton.Model,
-    splats: BoundSplats,
+    splats: BoundSplats | None,
     cameras: Sequence[PinholeCamera],
     *,
     options: CameraOptions | None = None,
     randomization: CameraRandomization | None = None,
+    overlay: Overlay | None = None,
 ) -> dict[tuple[int, int], SplatCamera]:
     """Return one :class:`softmode.splats.camera.SplatCamera` per image size; they share the splats.
 
     Args:
         model: The model.
-        splats: The splats of its objects.
+        splats: The splats of its objects; None draws none.
         cameras: What to draw.
         options: Light and background.
         randomization: What `randomize` of the cameras draws.
+        overlay: What else they draw.
     """
     return {
         size: SplatCamera(
             model,
-            splats.arrays,
+            None if splats is None else splats.arrays,
             [camera for camera in cameras if (camera.width, camera.height) == size],
             options=options,
             randomization=randomization,
+            overlay=overlay,
         )
         for size in sorted({(camera.width, camera.height) for camera in cameras})
     }

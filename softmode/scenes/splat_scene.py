@@ -24,6 +24,7 @@ from softmode.deformables.solver.solver_reduced import SolverReduced, SolverRedu
 from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.errors import ConfigError
 from softmode.objects.placed import Placed
+from softmode.radiance.march import MarchOptions, RadianceMarch
 from softmode.scenes.binding import BoundSplats
 from softmode.scenes.capture import capture_graph, capture_step, require_even
 from softmode.scenes.fixture import Fixture, add_fixture
@@ -94,10 +95,12 @@ class SplatScene:
         camera_options: Light and background.
         grip_slots: Points of each object that may be gripped while the scene runs; see :attr:`grips`.
         grip_options: How stiff such grips are.
+        march: March rays through the radiance fields of objects that have one, instead of drawing splats baked of them:
+            sharper, slower, and without shadows.
         device: Warp device; the default one if None.
 
     Raises:
-        ConfigError: If there is no object, or the number of steps is odd.
+        ConfigError: If there is no object, the number of steps is odd, or there is nothing to march.
     """
 
     def __init__(
@@ -113,6 +116,7 @@ class SplatScene:
         camera_options: CameraOptions | None = None,
         grip_slots: int = 0,
         grip_options: GripOptions | None = None,
+        march: bool | MarchOptions = False,
         device: wp.DeviceLike = None,
     ) -> None:
         """Build model, solver, splats and cameras."""
@@ -156,12 +160,24 @@ class SplatScene:
             for i in range(len(self.objects) if grip_slots else 0)
         )
         """Grips of each object, that pull and hold it while the scene runs; none without slots."""
-        self.splats = BoundSplats(self.model, self.objects) if cameras else None
-        """The splats of the objects as cameras see them; None without cameras."""
+        marched = [(i, thing.radiance) for i, thing in enumerate(self.objects) if march and thing.radiance is not None]
+        if march and not marched:
+            raise ConfigError("march: no object has a radiance field", hint="load one, or leave it out")
+        self.fields: RadianceMarch | None = None
+        """Radiance fields that cameras march through; None if there are none."""
+        if cameras and marched:
+            how = march if isinstance(march, MarchOptions) else None
+            self.fields = RadianceMarch.of_bodies(self.solver, marched, options=how)
+        hidden = {i for i, _ in marched}
+        shown = [None if i in hidden else thing for i, thing in enumerate(self.objects)]
+        self.splats = BoundSplats(self.model, shown) if cameras and any(thing is not None for thing in shown) else None
+        """The splats of the objects as cameras see them; None without cameras, or if all objects are marched."""
         self.cameras: dict[tuple[int, int], SplatCamera] = {}
         """The cameras by the width and height of their pictures [px]."""
-        if self.splats is not None:
-            self.cameras = cameras_by_size(self.model, self.splats, cameras, options=camera_options)
+        if cameras:
+            self.cameras = cameras_by_size(
+                self.model, self.splats, cameras, options=camera_options, overlay=self.fields
+            )
         self._step_graph: wp.Graph | None = None
         self._draw_graph: wp.Graph | None = None
 
@@ -204,8 +220,10 @@ class SplatScene:
 
     def _draw(self) -> None:
         """Move the splats and draw every camera."""
-        assert self.splats is not None
-        self.splats.update(self.state)
+        if self.splats is not None:
+            self.splats.update(self.state)
+        if self.fields is not None:
+            self.fields.update(self.state)
         for camera in self.cameras.values():
             camera.render(self.state)
 

@@ -137,6 +137,15 @@ def tile_place(frame: Frame, tile: int):
 
 
 @wp.func
+def is_covered(frame: Frame, tile: int) -> bool:
+    """Return whether a splat may be seen in a tile."""
+    for word in range(frame.cover.shape[1]):
+        if frame.cover[tile, word] != wp.uint32(0):
+            return True
+    return False
+
+
+@wp.func
 def seen_from_tile(center: wp.vec4, shape: wp.vec4, left: int, top: int) -> vec5:
     """Return u, v from the tile's first pixel centre and the a, b, peak of `splat_alpha`.
 
@@ -178,6 +187,22 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
         """Blend front to back: C = sum_i c_i alpha_i T_i + T c_behind."""
         tile = wp.tid()
         view, left, top, columns, rows, pairs = tile_place(frame, tile)
+        behind_rgb = frame.background[view % frame.background.shape[0]]
+        if not is_covered(frame, tile):  # most tiles of a large picture
+            for y in range(top, top + rows):
+                for x in range(left, left + columns):
+                    behind = float(0.0)
+                    if wp.static(has_mesh):
+                        behind_rgb = frame.mesh_rgb[view, y, x]
+                        behind = frame.mesh_depth[view, y, x]
+                    rgb_out[view, y, x] = behind_rgb
+                    depth_out[view, y, x] = behind
+                    alpha_out[view, y, x] = 0.0
+                    if wp.static(object_ids):
+                        object_out[view, y, x] = -1
+                    if wp.static(median_depth):
+                        median_out[view, y, x] = behind
+            return
 
         light = tile_mat(1.0)  # transmittance; its negative once the pixel is finished
         if rows < TILE or columns < TILE:
@@ -239,7 +264,6 @@ def blend_kernel(has_mesh: bool, object_ids: bool, median_depth: bool) -> wp.Ker
                     if not running:
                         break
 
-        behind_rgb = frame.background[view % frame.background.shape[0]]
         for y in range(rows):
             for x in range(columns):
                 pair = y / 2

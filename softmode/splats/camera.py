@@ -7,7 +7,7 @@ Cameras are pinholes with the OpenCV frame, see `softmode.splats.pinhole`.
 import fnmatch
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Protocol, get_args
 
 import newton
 import numpy as np
@@ -32,6 +32,32 @@ Output = Literal["rgb", "depth", "median_depth", "alpha", "object_id", "segmenta
 """What a camera writes."""
 
 
+class Overlay(Protocol):
+    """Something that is neither mesh nor splat and is put into a picture by its depth, such as a radiance field."""
+
+    def draw(
+        self,
+        views: ViewArrays,
+        *,
+        mesh_rgb: wp.array,
+        mesh_depth: wp.array,
+        rgb: wp.array,
+        depth: wp.array,
+        alpha: wp.array | None,
+    ) -> None:
+        """Draw into pictures; capturable after a first time.
+
+        Args:
+            views: The cameras.
+            mesh_rgb: Meshes and sky, vec3, shape (view_count, height, width).
+            mesh_depth: Their forward depth [m], 0 for the sky, same shape.
+            rgb: Meshes with splats before them, written, same shape; may be `mesh_rgb`.
+            depth: Forward depth of what is seen [m], written, same shape; may be `mesh_depth`.
+            alpha: Coverage by splats, written, same shape; None without splats.
+        """
+        ...
+
+
 class SplatCamera:
     """Renders cameras of one image size in all worlds of a Newton model, with deforming splats.
 
@@ -53,6 +79,7 @@ class SplatCamera:
         options: Light and background.
         rasterizer_options: How the splats are drawn.
         randomization: What `randomize` draws; nothing is drawn before its first call.
+        overlay: What else is drawn: `rgb`, `depth` and `alpha` have it, `median_depth` and the ids do not.
 
     Raises:
         ConfigError: If the cameras disagree in size, share a name, or name a body that some world lacks, or the splats
@@ -68,9 +95,10 @@ class SplatCamera:
         options: CameraOptions | None = None,
         rasterizer_options: RasterizerOptions | None = None,
         randomization: CameraRandomization | None = None,
+        overlay: Overlay | None = None,
     ) -> None:
         """Allocate images and build the mesh sensor."""
-        self.model, self.splats, self.cameras = model, splats, tuple(cameras)
+        self.model, self.splats, self.cameras, self.overlay = model, splats, tuple(cameras), overlay
         self.options = options if options is not None else CameraOptions()
         self.device = model.device
         self.world_count = worlds = max(int(model.world_count), 1)
@@ -291,6 +319,9 @@ class SplatCamera:
                 self._shadow.cast(self.splats, views, pose, meshes, self._mesh_rgb)
             self.rasterizer.render(self.splats, views, mesh_rgb=self._mesh_rgb, mesh_depth=meshes.depth)
             rgb, alpha, object_id = self.rasterizer.rgb, self.rasterizer.alpha, self.rasterizer.object_id
+        if self.overlay is not None:
+            given = {"mesh_rgb": self._mesh_rgb, "mesh_depth": meshes.depth}
+            self.overlay.draw(views, **given, rgb=rgb, depth=self.depth, alpha=alpha)
         launch(self.device, kernels.pack_bytes, size, rgb, self.rgb)
         if self._segmentation is not None:
             shapes = (meshes.shape_index, self._shape_segment)

@@ -130,6 +130,12 @@ class ViewVariation:
         self._seed.assign(np.where(mask, values, self._seed.numpy()))
         self._episode.assign(np.where(mask, 0, self._episode.numpy()).astype(np.int32))
 
+    def state_arrays(self) -> dict[str, wp.array]:
+        """Return what draws have written and what the next depends on; views or worlds first."""
+        drawn = ("offset", "intrinsics", "horizon", "zenith", "light_gain", "splat_gain")
+        arrays = {name: getattr(self, name) for name in drawn}
+        return {**arrays, "seed": self._seed, "episode": self._episode}
+
     def draw(self, world_mask: wp.array | None = None) -> None:
         """Draw new values for the masked worlds; capturable.
 

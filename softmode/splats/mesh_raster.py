@@ -106,7 +106,8 @@ class MeshRaster:
         shape, cells = (view_count, height, width), (self._worlds, CELLS, CELLS)
         self._shadow, self._still_shadow = (wp.full(cells, FAR, dtype=wp.float32, device=device) for _ in range(2))
         self._still_known = False
-        self._key = wp.zeros((view_count, height * width * kernels.SAMPLES), dtype=wp.uint64, device=device)
+        samples = (view_count, height * width * kernels.SAMPLES)
+        self._key = wp.full(samples, value=kernels.NOTHING, dtype=wp.uint64, device=device)
         self.rgb = wp.zeros(shape, dtype=wp.vec3, device=device)
         self.depth = wp.zeros(shape, dtype=wp.float32, device=device)
         self._near = wp.zeros(shape, dtype=kernels.layer, device=device)
@@ -132,7 +133,6 @@ class MeshRaster:
         corner, faces = self._corner, triangles.face.shape[0]
         launch(device, kernels.move_corners, corner.shape, triangles, body_q, corner, self._normal)
         self._cast(casters)
-        self._key.fill_(kernels.NOTHING)
         bands, span = (1, width) if device.is_cpu else (BANDS, 1)
         rows = (count, height, width // span)
         launch(

@@ -29,6 +29,8 @@ SOLID = wp.constant(0.3)
 """Least opacity of a splat that casts a shadow."""
 WIDEST = wp.constant(8.0)
 """Largest half width of a splat in the map of shadows [cells]."""
+WIDE = wp.constant(16)
+"""Pixels across a triangle from which the ends of its rows are found before its pixels are tested."""
 ENCODED = 1024
 """Steps of the table of gamma-encoded light."""
 
@@ -146,6 +148,10 @@ def fill_samples(
     far = wp.max(v0[2], wp.max(v1[2], v2[2]))
     if far <= NEAR:
         return
+    n = wp.cross(v1 - v0, v2 - v0)
+    det = wp.dot(n, v0)
+    if wp.abs(det) < 1.0e-20 or (det > 0.0 and triangles.closed[f]):
+        return
     lens = views.intrinsics[view]
     box = wp.vec4(1.0e30, 1.0e30, -1.0e30, -1.0e30)
     box = reached(box, lens, v0, v1)
@@ -158,10 +164,6 @@ def fill_samples(
     top = int(wp.max(box[1], 0.0))
     bottom = int(wp.min(box[3], float(size[1] - 1)))
     # Of the ray d = (x, y, 1): edge i is e_i . d, positive inside; the plane is 1 / z = plane . d.
-    n = wp.cross(v1 - v0, v2 - v0)
-    det = wp.dot(n, v0)
-    if wp.abs(det) < 1.0e-20 or (det > 0.0 and triangles.closed[f]):
-        return
     sign = wp.sign(det)
     e0 = sign * wp.cross(v1, v2)
     e1 = sign * wp.cross(v2, v0)
@@ -175,16 +177,29 @@ def fill_samples(
     inside = 0.376 * inside
     id = wp.uint64(f)
     for row in range(top + (band - top % bands + bands) % bands, bottom + 1, bands):
-        place = (row * size[0] + left) * wp.static(SAMPLES)
-        for column in range(left, right + 1):
+        begin = left
+        end = right
+        if right - left > WIDE:
+            for edge in range(3):
+                across = (-inside[edge] - origin[edge] - (float(row) + 0.5) * dy[edge]) / dx[edge] - 0.5
+                if dx[edge] > 0.0:
+                    begin = int(wp.clamp(wp.floor(across), float(begin), float(right)))
+                if dx[edge] < 0.0:
+                    end = int(wp.clamp(wp.ceil(across), float(left), float(end)))
+        place = (row * size[0] + begin) * wp.static(SAMPLES)
+        for column in range(begin, end + 1):
             at = origin + (float(column) + 0.5) * dx + (float(row) + 0.5) * dy
             if at[0] >= -inside[0] and at[1] >= -inside[1] and at[2] >= -inside[2]:
                 full = at[0] >= inside[0] and at[1] >= inside[1] and at[2] >= inside[2]
                 for sample in range(wp.static(SAMPLES)):
                     spot = sample_place(sample)
-                    e = at + spot[0] * dx + spot[1] * dy
-                    if (full or (e[0] >= 0.0 and e[1] >= 0.0 and e[2] >= 0.0)) and e[3] > 0.0 and e[3] < 1.0 / NEAR:
-                        bits = wp.uint64(~wp.cast(e[3], wp.uint32))
+                    hit = full
+                    if not full:
+                        e = at + spot[0] * dx + spot[1] * dy
+                        hit = e[0] >= 0.0 and e[1] >= 0.0 and e[2] >= 0.0
+                    near = at[3] + spot[0] * dx[3] + spot[1] * dy[3]
+                    if hit and near > 0.0 and near < 1.0 / NEAR:
+                        bits = wp.uint64(~wp.cast(near, wp.uint32))
                         wp.atomic_min(key_out, view, place + sample, (bits << wp.uint64(32)) | id)
             place += wp.static(SAMPLES)
 
@@ -209,6 +224,7 @@ def fill_shadow(
     area = a[0] * b[1] - a[1] * b[0]
     if wp.abs(area) < 1.0e-12 or (area > 0.0 and triangles.closed[first + f]):
         return
+    per_area = 1.0 / area
     last = depth_out.shape[1] - 1
     left = wp.max(0, int(wp.ceil(wp.min(v0[0], wp.min(v1[0], v2[0])))))
     right = wp.min(last, int(wp.floor(wp.max(v0[0], wp.max(v1[0], v2[0])))))
@@ -218,8 +234,8 @@ def fill_shadow(
         y = float(row) - v0[1]
         for column in range(left, right + 1):
             x = float(column) - v0[0]
-            s = (x * b[1] - y * b[0]) / area
-            t = (a[0] * y - a[1] * x) / area
+            s = (x * b[1] - y * b[0]) * per_area
+            t = (a[0] * y - a[1] * x) * per_area
             if s >= 0.0 and t >= 0.0 and s + t <= 1.0:
                 wp.atomic_min(depth_out, world, row, column, v0[2] + s * a[2] + t * b[2])
 
@@ -228,7 +244,8 @@ def fill_shadow(
 def to_map(light: Light, p: wp.vec3) -> wp.vec3:
     """Return where a point is in the map, in cells from the centre of the first one, and its depth [m]."""
     q = light.frame * p
-    return wp.vec3((q[0] - light.corner[0]) / light.cell - 0.5, (q[1] - light.corner[1]) / light.cell - 0.5, q[2])
+    scale = 1.0 / light.cell
+    return wp.vec3(scale * (q[0] - light.corner[0]) - 0.5, scale * (q[1] - light.corner[1]) - 0.5, q[2])
 
 
 @wp.kernel
@@ -273,9 +290,6 @@ def fill_splat_shadow(
 @wp.func
 def hidden(depth: wp.array3d[float], world: int, column: int, row: int, z: float) -> float:
     """Return 1 where something stands between a cell's light and that depth, else 0."""
-    cells = depth.shape[1]
-    if column < 0 or row < 0 or column >= cells or row >= cells:
-        return 0.0
     return wp.where(depth[world, row, column] < z, 1.0, 0.0)
 
 
@@ -286,6 +300,9 @@ def shaded(light: Light, depth: wp.array3d[float], world: int, p: wp.vec3) -> fl
     column = int(wp.floor(q[0]))
     row = int(wp.floor(q[1]))
     far = REACH + 1
+    last = depth.shape[1] - 1 - far
+    if column < REACH or row < REACH or column > last or row > last:
+        return 0.0
     corners = (
         hidden(depth, world, column - REACH, row - REACH, q[2])
         + hidden(depth, world, column + far, row - REACH, q[2])
@@ -386,7 +403,7 @@ def shade_pixels(
     views: Views,
     light: Light,
     shadow: wp.array3d[float],
-    key: wp.array2d[wp.uint64],
+    key: wp.array2d[wp.uint64],  # left without triangles, for the next frame
     # What is behind and between the meshes, of size zero without:
     plate_rgb: wp.array3d[wp.vec3],
     plate_alpha: wp.array3d[float],
@@ -487,6 +504,8 @@ def shade_pixels(
             depth_out[view, row, column] = wp.where(far_depth < 1.0e29, far_depth, 0.0)
             near_out[view, row, column] = near / float(wp.static(SAMPLES))
             near_depth_out[view, row, column] = nearest
+        for sample in range(wp.static(SAMPLES)):
+            key[view, place + sample] = wp.uint64(wp.static(NOTHING))
 
 
 @wp.kernel

@@ -199,31 +199,56 @@ def _even_surface_points(count: int, rng: np.random.Generator) -> tuple[NDArray[
     return points, np.clip(cells, 0.1 * mean, 2.0 * mean)
 
 
-def _paint(points: NDArray[np.float64], normals: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
-    """Return the colours: parts, seams, fur noise, and baked light and occlusion."""
-    x, y, z = points[:, 0], np.abs(points[:, 1]), points[:, 2]
+def plush_colors(points: ArrayLike, height: float = 0.08) -> NDArray[np.float64]:
+    """Return the colours of the plush at points of its surface, without light and fur, 0..1, shape (N, 3).
 
-    def blot(center: ArrayLike, radii: ArrayLike, soft: float = 0.15) -> NDArray[np.float64]:
-        c, r = np.asarray(center), np.asarray(radii)
-        inside = 1.0 - np.linalg.norm((np.column_stack([x, y, z]) - c) / r, axis=1)
-        return np.clip(inside / soft, 0.0, 1.0)[:, None]
+    Args:
+        points: Positions as for :func:`plush_signed_distance` [m], shape (N, 3).
+        height: Height of the plush [m], > 0.
+    """
+    unit = np.asarray(points, dtype=np.float64) / _checked_height(height)
+    return _with_face(unit, _pattern(unit))
 
-    def mix(base: NDArray[np.float64], top: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
-        return base + weight * (top - base)
 
+def _mix(base: NDArray[np.float64], top: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return colours between two, shape (N, 3)."""
+    return base + weight * (top - base)
+
+
+def _blot(points: NDArray[np.float64], center: ArrayLike, radii: ArrayLike, soft: float = 0.15) -> NDArray[np.float64]:
+    """Return how far points are inside an ellipsoid or its mirror image, 0..1, shape (N, 1)."""
+    half = np.column_stack([points[:, 0], np.abs(points[:, 1]), points[:, 2]])
+    inside = 1.0 - np.linalg.norm((half - np.asarray(center)) / np.asarray(radii), axis=1)
+    return np.clip(inside / soft, 0.0, 1.0)[:, None]
+
+
+def _pattern(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the colours of the parts and seams (height one)."""
+    z = points[:, 2]
     color = np.tile(_FUR, (len(points), 1))
-    color = mix(color, _CREAM, blot((0.27, 0.0, 0.27), (0.16, 0.19, 0.20)))
-    color = mix(color, _CREAM, blot((0.26, 0.0, 0.645), (0.12, 0.13, 0.098)))
-    color = mix(color, _CREAM, blot((0.07, 0.205, 0.905), (0.08, 0.07, 0.07)))
-    color = mix(color, _CREAM, blot((0.47, 0.21, 0.115), (0.06, 0.085, 0.085)))
-    color = mix(color, _CHEEK, 0.55 * blot((0.20, 0.165, 0.655), (0.07, 0.05, 0.045), 0.6))
-    color = mix(color, color * 0.62, blot((0.0, 0.0, 0.27), (0.40, 0.012, 0.40), 0.5))
+    color = _mix(color, _CREAM, _blot(points, (0.27, 0.0, 0.27), (0.16, 0.19, 0.20)))
+    color = _mix(color, _CREAM, _blot(points, (0.26, 0.0, 0.645), (0.12, 0.13, 0.098)))
+    color = _mix(color, _CREAM, _blot(points, (0.07, 0.205, 0.905), (0.08, 0.07, 0.07)))
+    color = _mix(color, _CREAM, _blot(points, (0.47, 0.21, 0.115), (0.06, 0.085, 0.085)))
+    color = _mix(color, _CHEEK, 0.55 * _blot(points, (0.20, 0.165, 0.655), (0.07, 0.05, 0.045), 0.6))
+    color = _mix(color, color * 0.62, _blot(points, (0.0, 0.0, 0.27), (0.40, 0.012, 0.40), 0.5))
     scarf = _scarf_distance(points) < 0.006
     around = np.arctan2(points[:, 1], points[:, 0] - 0.01)
     stripes = np.where((np.sin(9.0 * around) > 0.35)[:, None], _STRIPE, _SCARF)
     end = (_ellipsoid(points, (0.235, -0.10, 0.42), (0.035, 0.062, 0.11)) < 0.01) & (z < 0.47)
     stripes = np.where(end[:, None], np.where((np.sin(70.0 * z) > 0.2)[:, None], _STRIPE, _SCARF), stripes)
-    color = np.where(scarf[:, None], stripes, color)
+    return np.where(scarf[:, None], stripes, color)
+
+
+def _with_face(points: NDArray[np.float64], color: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the colours with eyes and nose."""
+    color = _mix(color, _DARK, _blot(points, (0.215, 0.098, 0.755), (0.05, 0.038, 0.042), 0.25))
+    return _mix(color, _DARK, _blot(points, (0.315, 0.0, 0.695), (0.05, 0.042, 0.032), 0.25))
+
+
+def _paint(points: NDArray[np.float64], normals: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return the colours: parts, seams, fur noise, and baked light and occlusion."""
+    color = _pattern(points)
     color *= 1.0 + 0.05 * rng.normal(size=(len(points), 1)) + 0.015 * rng.normal(size=(len(points), 3))
 
     key = np.array([0.45, 0.35, 0.82])
@@ -231,6 +256,4 @@ def _paint(points: NDArray[np.float64], normals: NDArray[np.float64], rng: np.ra
     reach = 0.06
     occlusion = np.clip(_unit_distance(points + reach * normals) / reach, 0.0, 1.0)
     color = color * (light * (0.62 + 0.38 * occlusion))[:, None]
-    color = mix(color, _DARK, blot((0.215, 0.098, 0.755), (0.05, 0.038, 0.042), 0.25))
-    color = mix(color, _DARK, blot((0.315, 0.0, 0.695), (0.05, 0.042, 0.032), 0.25))
-    return np.clip(color, 0.02, 0.98)
+    return np.clip(_with_face(points, color), 0.02, 0.98)

@@ -295,6 +295,15 @@ def multiply_quats(left: ArrayLike, right: ArrayLike) -> NDArray[np.float64]:
     return np.concatenate([xyz, w], axis=-1)
 
 
+def joined(parts: list[Splats], name: str) -> Splats:
+    """Return several sets of splats as one of the highest degree among them."""
+    if len(parts) == 1:
+        return parts[0]
+    columns = ("means", "quats", "scales", "opacities")
+    joint = {column: np.concatenate([getattr(part, column) for part in parts]) for column in columns}
+    return Splats(**joint, sh=padded_sh(parts), name=name)
+
+
 def padded_sh(parts: Sequence[Splats], width: int | None = None) -> NDArray[np.float32]:
     """Return the coefficients of several sets, one after another, with zeros above the degree of each.
 

@@ -13,10 +13,12 @@ from scipy.integrate import solve_bvp
 from trimesh.visual import ColorVisuals
 
 from softmode.deformables import Material
+from softmode.deformables.build.quadrature_mesh import cap_holes
 from softmode.deformables.model.authoring import add_pins, add_reduced_body
 from softmode.errors import ConfigError
-from softmode.objects import ObjectConfig, SoftObject, load, loader, presets
+from softmode.objects import ObjectConfig, SoftObject, load, loader, task_objects
 from softmode.objects.primitives import checker, primitive_mesh, primitive_quadrature
+from softmode.splats import ColoredMesh
 from softmode.splats.splats import rotations_from_quats
 from tests.scenes import GRAVITY, Scene
 
@@ -102,24 +104,48 @@ def test_mesh_file_becomes_a_body_of_its_size_and_colour(tmp_path: Path) -> None
 
 
 def test_open_mesh_stands_for_what_it_encloses(tmp_path: Path) -> None:
-    """A sphere with a small hole is filled like a shell of splats, whose voxels err by some per cent."""
+    """The hole of a sphere is capped flat: the volume is the sphere's less that of the cap that is missing."""
     write_mesh(tmp_path / "shell.ply", closed=False)
+    mesh = trimesh.load_mesh(tmp_path / "shell.ply")
     thing = load(ObjectConfig(mesh=tmp_path / "shell.ply", size=0.1, up="+y", splat_count=300))
-    assert thing.body.volume == pytest.approx(np.pi / 6 * 0.1**3, rel=0.08)
+    assert thing.body.provenance["quadrature_capped_holes"] == 1
+    hull = mesh.convex_hull  # closes the hole flat too
+    assert thing.body.volume == pytest.approx(hull.volume * (0.1 / np.ptp(mesh.vertices, axis=0).max()) ** 3, rel=5e-3)
+
+
+def test_box_without_a_face_keeps_its_size() -> None:
+    """A box of 50 mm without its lid is 50 mm in every direction, and as large as the box."""
+    box = trimesh.creation.box((0.05, 0.05, 0.05))
+    box.update_faces(box.triangles_center[:, 2] < 0.0249)
+    thing = load(ObjectConfig(mesh=ColoredMesh.from_trimesh(box), size=0.05, splat_count=300))
+    np.testing.assert_allclose(np.ptp(thing.body.bounds, axis=0), 0.05, rtol=1e-6)
+    assert thing.body.volume == pytest.approx(0.05**3, rel=1e-6)
+
+
+def test_cap_holes_closes_every_rim() -> None:
+    """A tube has two rims; with both capped it is closed, oriented and a prism. A closed mesh has none."""
+    tube = trimesh.creation.cylinder(0.02, 0.1, sections=24)
+    open_ = tube.submesh([np.abs(tube.face_normals[:, 2]) < 0.5], append=True)
+    assert isinstance(open_, trimesh.Trimesh) and not open_.is_watertight
+    vertices, faces, holes = cap_holes(open_.vertices, open_.faces)
+    closed = trimesh.Trimesh(vertices, faces)
+    assert holes == 2 and closed.is_watertight and closed.is_winding_consistent
+    assert closed.volume == pytest.approx(tube.volume, rel=1e-9)
+    assert cap_holes(tube.vertices, tube.faces)[2] == 0
 
 
 def test_shape_comes_from_the_cache_the_second_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A second load builds nothing and gives the same object; other colours share the body, other samples do not."""
     monkeypatch.setenv("SOFTMODE_CACHE", str(tmp_path))
-    first = load(presets.CUBE)
+    first = load(task_objects.CUBE)
     monkeypatch.setattr(loader, "build_body", lambda *_, **__: pytest.fail("built again"))
-    second = load(presets.CUBE)
+    second = load(task_objects.CUBE)
     np.testing.assert_array_equal(first.basis, second.basis)
     np.testing.assert_array_equal(first.splats.sh, second.splats.sh)
-    painted = load(replace(presets.CUBE, colors=((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))))
+    painted = load(replace(task_objects.CUBE, colors=((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))))
     assert painted.body.fingerprint == first.body.fingerprint
     with pytest.raises(pytest.fail.Exception, match="built again"):
-        load(replace(presets.CUBE, surface_count=150))
+        load(replace(task_objects.CUBE, surface_count=150))
 
 
 def hang(thing: SoftObject, material: Material, half: float) -> np.ndarray:
@@ -166,28 +192,28 @@ def heavy_elastica(load: float, cap: float = 0.0) -> np.ndarray:
 @pytest.mark.parametrize("modulus", [2.0e6, 6.0e5])
 def test_rope_bends_like_a_heavy_elastica(modulus: float) -> None:
     """Ends drop by 0.28 and 0.61 of their length, the elastica's to 2 %: neither locked nor torn."""
-    half, radius = 0.5 * presets.ROPE.extents[0], 0.5 * presets.ROPE.extents[1]  # type: ignore[index]
-    material = replace(presets.ROPE_MATERIAL, youngs_modulus=modulus, density=1000.0)
+    half, radius = 0.5 * task_objects.ROPE.extents[0], 0.5 * task_objects.ROPE.extents[1]  # type: ignore[index]
+    material = replace(task_objects.ROPE_MATERIAL, youngs_modulus=modulus, density=1000.0)
     pull = 1000.0 * GRAVITY * 4.0 * half**3 / (modulus * radius**2)
     np.testing.assert_allclose(
-        hang(load(presets.ROPE), material, half) / half, heavy_elastica(pull, radius / half), rtol=0.02
+        hang(load(task_objects.ROPE), material, half) / half, heavy_elastica(pull, radius / half), rtol=0.02
     )
 
 
 def test_beam_sags_like_a_timoshenko_beam() -> None:
     """Drop of the ends: the elastica's and shear's w L^2 / (2 k G A), k = 10 (1 + nu) / (12 + 11 nu), to 4 %."""
-    material, half, edge = presets.BEAM_MATERIAL, 0.15, 0.04
+    material, half, edge = task_objects.BEAM_MATERIAL, 0.15, 0.04
     E, nu = material.youngs_modulus, material.poissons_ratio
     weight = material.density * GRAVITY * edge**2
     bending = half * heavy_elastica(12.0 * weight * half**3 / (E * edge**4))[0]
     shear = weight * half**2 * (1.0 + nu) * (12.0 + 11.0 * nu) / (E * edge**2 * 10.0 * (1.0 + nu))
-    assert hang(load(presets.BEAM), material, half)[0] == pytest.approx(bending + shear, rel=0.04)
+    assert hang(load(task_objects.BEAM), material, half)[0] == pytest.approx(bending + shear, rel=0.04)
 
 
 @pytest.mark.parametrize("name", ["BEAM", "CUBE", "PAD", "ROPE"])
 def test_presets_are_small(name: str) -> None:
     """At most 48 functions, 384 cubature points, 200 samples and 3,000 splats; centred, standing on their height."""
-    config = getattr(presets, name)
+    config = getattr(task_objects, name)
     thing = load(config)
     assert thing.body.function_count <= 48 and thing.body.point_count <= 384
     assert thing.body.surface_count <= 200 and 1000 <= thing.splats.count <= 3000

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from softmode.deformables.build.quadrature import quadrature_from_splats
 from softmode.errors import ConfigError
-from softmode.objects import mesh_fit_kernels as kernels
 from softmode.objects.mesh_fit import FitOptions, MeshFit, splats_from_mesh
+from softmode.splats import picture_fit_kernels as kernels
 from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.mesh_samples import sample_mesh
 from softmode.splats.rasterizer import SplatArrays, SplatRasterizer

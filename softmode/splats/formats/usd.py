@@ -25,7 +25,7 @@ from softmode.checks import require_number
 from softmode.errors import AssetError, ConfigError, MissingExtraError
 from softmode.files import whole_file
 from softmode.splats.formats.common import REEXPORT, typed_errors, unreadable
-from softmode.splats.splats import MAX_SPLATS, Splats, UpAxis, padded_sh, rotate_sh, up_rotation
+from softmode.splats.splats import MAX_SPLATS, Splats, UpAxis, joined, rotate_sh, up_rotation
 from softmode.stages import process
 from softmode.stages.openusd import pxr
 
@@ -145,15 +145,6 @@ def placed(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
     if np.allclose(linear @ linear.T, scale**2 * np.eye(3), atol=1e-6 * scale**2):
         return splats.transformed(rotation=linear / scale, translation=offset, scale=scale)
     return splats.deformed(splats.means.astype(np.float64) @ linear.T + offset, linear)
-
-
-def joined(parts: list[Splats], name: str) -> Splats:
-    """Return several sets of splats as one of the highest degree among them."""
-    if len(parts) == 1:
-        return parts[0]
-    columns = ("means", "quats", "scales", "opacities")
-    joint = {column: np.concatenate([getattr(part, column) for part in parts]) for column in columns}
-    return Splats(**joint, sh=padded_sh(parts), name=name)
 
 
 def write_usd(path: str | os.PathLike[str], splats: Splats | Sequence[Splats], *, fps: float = 24.0) -> None:

@@ -1,4 +1,4 @@
-"""Device code of `mesh_fit`: parameters to splats, the loss, and a step of selective Adam."""
+"""Device code of `picture_fit`: parameters to splats, the loss, and a step of selective Adam."""
 
 import warp as wp
 

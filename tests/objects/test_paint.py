@@ -1,0 +1,108 @@
+"""Painted materials: fields by label, colour, file and brush; what is refused; what a body keeps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softmode.cli.object_options import ObjectOptions
+from softmode.deformables import BuildOptions, ReducedBody, build_body, elastic_modes, paint, quadrature_from_box
+from softmode.deformables.build.reduced_stiffness import reduced_stiffness
+from softmode.deformables.build.sources import unpack_sources
+from softmode.errors import AssetError, ConfigError, MaterialError
+from softmode.objects import ObjectConfig, StifferColor, color_field, load, nearest_field, read_field
+from softmode.objects.paint import brushed
+from softmode.splats.point_cloud import splats_from_points
+
+SIZE = (0.1, 0.03, 0.03)
+OPTIONS = BuildOptions(function_count=24, cubature_count=128, kernel_count=150)
+RED, BLUE = (0.8, 0.1, 0.1), (0.1, 0.1, 0.8)
+
+
+def test_painted_late_is_painted_at_once() -> None:
+    """Bit for bit the body that a build with the field gives, and softer; the density goes likewise."""
+    quadrature = quadrature_from_box(SIZE, point_count=1000, surface_count=100)
+    free = build_body(quadrature, OPTIONS, name="bar", progress=False)
+    field = np.where(quadrature.points[:, 0] > 0.0, 0.1, 1.0)
+    told = build_body(quadrature, OPTIONS, name="bar", stiffness_scale=field, progress=False)
+    late = paint(free, stiffness_scale=lambda X: np.where(X[:, 0] > 0.0, 0.1, 1.0))
+    assert late.fingerprint == told.fingerprint and np.array_equal(late.transform, told.transform)
+    heavy = paint(late, density_scale=np.where(field < 1.0, 3.0, 1.0))
+    assert heavy.offset[0] > late.offset[0] + 0.2 * SIZE[0] * 0.5
+    np.testing.assert_array_equal(unpack_sources(heavy).stiffness_scale, field)
+    with pytest.raises(MaterialError, match="finite values > 0"):
+        paint(free, stiffness_scale=-field)
+
+    def lowest(body: ReducedBody) -> float:
+        """Return the first elastic eigenvalue at rest."""
+        gradient = body.grad_basis.astype(np.float64).transpose(1, 2, 0)
+        return float(elastic_modes(reduced_stiffness(gradient, body.weights * body.stiffness_scale, 0.3))[0][0])
+
+    assert lowest(late) < 0.5 * lowest(free)
+
+
+def test_labels_and_files(tmp_path: Path) -> None:
+    """Every place has the factor of its nearest point."""
+    rng = np.random.default_rng(0)
+    points, labels = rng.normal(size=(40, 3)), rng.integers(0, 3, 40)
+    factors = np.array([0.1, 1.0, 10.0])
+    field = nearest_field(points, factors[labels])
+    np.testing.assert_array_equal(field(points + 1e-6), factors[labels])
+    np.savez(tmp_path / "field.npz", points=points, factors=factors[labels])
+    np.testing.assert_array_equal(read_field(tmp_path / "field.npz")(points), factors[labels])
+    np.savez(tmp_path / "half.npz", points=points)
+    for name in ("none.npz", "half.npz"):
+        with pytest.raises(AssetError):
+            read_field(tmp_path / name)
+    for bad in (1e-4, 2e3, np.nan):
+        with pytest.raises(MaterialError, match=r"0\.001"):
+            nearest_field(points, np.full(40, bad))
+    with pytest.raises(MaterialError, match="expected points"):
+        nearest_field(points, factors)
+
+
+def test_colours() -> None:
+    """The nearest colour within reach counts; one that no splat has is refused; text is parsed."""
+    points = np.stack([np.linspace(-1.0, 1.0, 60), np.zeros(60), np.zeros(60)], axis=1)
+    colors = np.where(points[:, :1] < -0.3, RED, np.where(points[:, :1] > 0.3, BLUE, (0.5, 0.5, 0.1)))
+    splats = splats_from_points(points, np.tile([0.0, 0.0, 1.0], (60, 1)), colors)
+    field = color_field(splats, [StifferColor(color=RED, factor=0.1), StifferColor.parse("#1a1acc:20")])
+    np.testing.assert_array_equal(field(np.array([[-0.8, 0, 0], [0.8, 0.1, 0], [0.0, 0, 0]])), [0.1, 20.0, 1.0])
+    with pytest.raises(ConfigError, match="no splat is near"):
+        color_field(splats, [StifferColor(color=(0.0, 1.0, 1.0), factor=2.0)])
+    with pytest.raises(MaterialError, match="factor"):
+        StifferColor.parse("#ff0000:0.0001")
+    for text in ("red:2", "#ff00:2", "#ff0000", "#ff0000:soft"):
+        with pytest.raises(ConfigError):
+            StifferColor.parse(text)
+
+
+def test_an_object_by_its_colours() -> None:
+    """Cream squares of the checker pattern are softer, through the option that every command has."""
+    shape = {"shape": "box", "extents": SIZE, "splat_count": 800, "surface_count": 80, "build": OPTIONS}
+    base = ObjectConfig(**shape, colors=(RED, BLUE))
+    config = ObjectOptions(stiffness_by_color=("#cc1a1a:0.1",)).object_of(base)
+    thing = load(config)
+    scale = unpack_sources(thing.body).stiffness_scale
+    assert scale is not None and set(np.unique(scale)) == {0.1, 1.0}
+    points = unpack_sources(thing.body).quadrature.points - thing.body.offset
+    splats = thing.visible_splats
+    near = np.linalg.norm(points[:, None] - splats.means, axis=2).argmin(axis=1)
+    red = np.linalg.norm(splats.colors()[near] - RED, axis=1) < 0.25
+    assert (scale == np.where(red, 0.1, 1.0)).mean() > 0.995  # all but ties of two splats to rounding
+    assert 0.2 < red.mean() < 0.7
+    assert load(base).body.fingerprint != thing.body.fingerprint
+
+
+def test_the_reach_of_a_brush() -> None:
+    """A cylinder along the normal, of radius and depth; strokes are unions."""
+    points = np.random.default_rng(1).uniform(-1.0, 1.0, (500, 3))
+    touched, inward = np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 1.0]]), np.tile([0.0, 0.0, -1.0], (2, 1))
+    one, both = (brushed(points, touched[:k], inward[:k], 0.3, 0.5) for k in (1, 2))
+    wide = np.linalg.norm(points[:, :2], axis=1) <= 0.3
+    np.testing.assert_array_equal(one, wide & (points[:, 2] >= 0.5))
+    assert (both >= one).all() and both.sum() > one.sum()
+    with pytest.raises(ConfigError, match="radius"):
+        brushed(points, touched, inward, 0.0, 1.0)
