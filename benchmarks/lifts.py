@@ -1,7 +1,8 @@
 """Count scripted lifts of files and shapes that nobody prepared, without options; what failed is told with its reason.
 
-Run: ``python benchmarks/lifts.py [FILE ...] [--captures] [--only cup torus]``: splat files, or the shapes or
-captures of the tests. Every object is brought to 80 mm; Young's modulus is drawn from 2e4 to 2e6 Pa.
+Run: ``python benchmarks/lifts.py [FILE ...] [--captures | --presets] [--only cup torus]``: splat files, or the shapes
+or captures of the tests, or the presets. Every object is brought to 80 mm, and Young's modulus is drawn from 2e4 to 2e6
+Pa; the presets have their own size and material.
 """
 
 from __future__ import annotations
@@ -15,11 +16,13 @@ from pathlib import Path
 import trimesh
 import warp as wp
 
+from softmode.cli.object_options import ObjectOptions
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.lift_soft.log import LiftLog
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv, lift_scene
 from softmode.errors import GraspError, SoftmodeError
 from softmode.objects.config import ObjectConfig
+from softmode.objects.presets import PRESETS
 from softmode.splats.colored_mesh import ColoredMesh
 from tests.captures import CAPTURES
 from tests.shapes import SHAPES
@@ -28,25 +31,40 @@ STEPS = 150
 """Control steps of an episode."""
 
 
-def files(paths: list[Path]) -> Iterator[tuple[str, ObjectConfig]]:
+Named = Iterator[tuple[str, LiftSoftConfig]]
+
+
+def lifting(thing: ObjectConfig) -> LiftSoftConfig:
+    """Return the task with an object."""
+    return LiftSoftConfig(scene=replace(lift_scene(), object=thing))
+
+
+def files(paths: list[Path]) -> Named:
     """Yield what splat files hold."""
     for path in paths:
-        yield path.name, replace(lift_scene().object, splat=path)
+        yield path.name, lifting(replace(lift_scene().object, splat=path))
 
 
-def captures(names: list[str]) -> Iterator[tuple[str, ObjectConfig]]:
+def presets(names: list[str]) -> Named:
+    """Yield the presets, each of its own size and material."""
+    for name in PRESETS:
+        if not names or name in names:
+            yield name, ObjectOptions(object=Path(name)).configured(LiftSoftConfig())
+
+
+def captures(names: list[str]) -> Named:
     """Yield the captures of the tests."""
     for name, capture in CAPTURES.items():
         if not names or name in names:
-            yield name, replace(lift_scene().object, splat=capture.scene(), **capture.options)
+            yield name, lifting(replace(lift_scene().object, splat=capture.scene(), **capture.options))
 
 
-def shapes(names: list[str]) -> Iterator[tuple[str, ObjectConfig]]:
+def shapes(names: list[str]) -> Named:
     """Yield the shapes of the tests that are meshes in one piece."""
     for name, shape in SHAPES.items():
         if shape.source == "mesh" and shape.connected and (not names or name in names):
             mesh = trimesh.Trimesh(*shape.geometry(), process=False)
-            yield name, replace(lift_scene().object, mesh=ColoredMesh.from_trimesh(mesh, name=name))
+            yield name, lifting(replace(lift_scene().object, mesh=ColoredMesh.from_trimesh(mesh, name=name)))
 
 
 def lift(env: LiftSoftEnv, seed: int) -> str:
@@ -68,16 +86,18 @@ def main() -> None:
     """Print a line per object."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("files", nargs="*", type=Path)
-    parser.add_argument("--captures", action="store_true", help="the captures of the tests")
+    kinds = parser.add_mutually_exclusive_group()
+    kinds.add_argument("--captures", action="store_true", help="the captures of the tests")
+    kinds.add_argument("--presets", action="store_true", help="the presets")
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--only", nargs="*", default=[])
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
-    named = captures if options.captures else shapes
+    named = captures if options.captures else presets if options.presets else shapes
     things = files(options.files) if options.files else named(options.only)
-    for name, thing in things:
+    for name, config in things:
         try:
-            env = LiftSoftEnv(config=LiftSoftConfig(scene=replace(lift_scene(), object=thing)), progress=False)
+            env = LiftSoftEnv(config=config, progress=False)
         except SoftmodeError as error:
             print(f"{name:20} cannot be built: {error}", flush=True)
             continue

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from softmode.envs.adapters import RslRlVecEnv, SkrlWrapper, StableBaselinesVecEnv
     from softmode.envs.check import VectorEnvReport, check_vector_env
     from softmode.envs.end_reason import EndReason
+    from softmode.envs.env_state import EnvState
     from softmode.envs.observation import Segment
     from softmode.envs.parameters import Parameter
     from softmode.envs.presets import rl_scene
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "EndReason",
+    "EnvState",
     "LiftSoft",
     "LiftSoftConfig",
     "LiftSoftEnv",

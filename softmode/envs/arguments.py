@@ -70,7 +70,7 @@ def checked_config(wanted: type[TaskConfig], config: TaskConfig | None, given: S
 
 def _with_splat(thing: ObjectConfig, given: Shortcuts) -> ObjectConfig:
     """Return an object of another splat file or size."""
-    if given.splat is not None and (thing.extents is not None or thing.mesh is not None or thing.body is not None):
+    if given.splat is not None and any(other is not None for other in (thing.extents, thing.preset, thing.file)):
         thing = ObjectConfig(surface_count=thing.surface_count, build=thing.build)
     if thing.extents is not None or thing.body is not None:
         what = f"a {thing.shape} of {thing.extents} m" if thing.body is None else f"the body {thing.body}"

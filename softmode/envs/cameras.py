@@ -65,6 +65,10 @@ class FollowCamera:
         self._speed = np.zeros((world_count, 3))
         self._time = np.full(world_count, np.inf)
 
+    def forget(self, mask: NDArray[np.bool_]) -> None:
+        """Let the cameras of the masked worlds jump to their next place, shape (world_count,)."""
+        self._time[mask] = np.inf
+
     def matrices(self, balls: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the transforms from the world to the cameras, shape (world_count, 4, 4).
 

@@ -12,8 +12,8 @@ from softmode.scenes.table_scene import TableSceneConfig
 RL_SOLVER = SolverReducedOptions(
     carry_stiffness=True, tolerance=1.0e-4, force_tolerance=1.0e-3, iteration_max=12, friction_lag=4
 )
-"""Steps end when the residual force is below a thousandth of the forces on a body and it moves by less than 1e-4 of its
-size; a body at rest keeps its stiffness from step to step."""
+"""Steps end when the residual force is below a thousandth of the forces on a body in contact and on the joints that it
+pushes, or when a free one moves by less than 1e-4 of its size; a body at rest keeps its stiffness from step to step."""
 RL_BUILD = BuildOptions(function_count=24, cubature_count=96)
 """24 functions, a system of 72 unknowns, which on CUDA fits in shared memory."""
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Any, cast
 
+import numpy as np
 import warp as wp
 
+from softmode.deformables.model.status import status_reasons
 from softmode.envs.task import Task
 from softmode.envs.tensors import map_tree
 
@@ -40,6 +42,15 @@ def info_arrays(task: Task, *, final: bool = False) -> dict[str, Tree]:
         "solver_status": status,
         "end_reason": task.end,
     }
+
+
+def named_reasons(infos: dict[str, Any]) -> None:
+    """Add the names of the solver's flags of every world to infos in NumPy, with their mask."""
+    status = infos["solver_status"]
+    names = np.empty(len(status), dtype=object)
+    for world, bits in enumerate(status):
+        names[world] = status_reasons(int(bits))
+    infos["solver_reasons"], infos["_solver_reasons"] = names, infos["_solver_status"].copy()
 
 
 def columns_of(array: wp.array, columns: int | slice) -> wp.array:

@@ -61,13 +61,15 @@ class ScriptedGrasp(ScriptedPolicy):
     ) -> None:
         """Remember the environment and plan nothing yet."""
         super().__init__(env, world=world)
+        self.trouble = ""
+        """Why no grasp fits any more where the object lies now; empty while one does."""
         self._way, self._squeeze, self._least_force = way, squeeze, least_force
         self._jaw = ParallelJaw.of(self.arm)
         self.reset()
 
     def reset(self) -> None:
         """Forget the episode; call after ``env.reset``."""
-        self._attempts, self._grip = 0, 1.0
+        self._attempts, self._grip, self.trouble = 0, 1.0, ""
         self._grasp: Grasp | None = None
         self._again()
 
@@ -174,10 +176,12 @@ class ScriptedGrasp(ScriptedPolicy):
                 obstacles=np.concatenate(points[1:]) if points[1:] else None,
                 yaw=self.yaw,
             )
-        except GraspError:
+        except GraspError as error:
             if self._attempts or np.isfinite(self._planned_at).all():
+                self.trouble = error.message
                 return None
             raise
+        self.trouble = ""
         return found[self._attempts % len(found)]
 
     def _weight(self) -> float:

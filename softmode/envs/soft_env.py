@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import gymnasium as gym
 import numpy as np
@@ -23,10 +24,19 @@ from softmode.envs.arguments import (
     world_seed,
 )
 from softmode.envs.end_reason import EndReason
+from softmode.envs.env_state import (
+    EnvState,
+    checked_state,
+    generator_of,
+    generator_state,
+    set_worlds_state,
+    worlds_state,
+)
 from softmode.envs.parameters import check_options
 from softmode.envs.results import info_arrays, observation_arrays, take
 from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
+from softmode.errors import ConfigError
 
 
 class SoftEnv(gym.Env, gym.utils.EzPickle):
@@ -55,7 +65,9 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
 
     ``reset`` takes as ``options`` any of the parameters, such as ``position`` (x, y) [m], ``yaw`` [rad],
     ``youngs_modulus`` [Pa]; what is not given is drawn from the configured ranges. Draws depend on the seed and on
-    how many episodes were played since it was given.
+    how many episodes were played since it was given. ``options={"state": state}`` begins with a state of `get_state`
+    instead, with its draws, so without a seed or other options; time counts from zero. ``copy.deepcopy`` copies an
+    environment in its state; a pickled one begins anew.
 
     Args:
         obs_type: What ``reset`` and ``step`` return.
@@ -113,7 +125,16 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
 
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode."""
-        given = check_options(self.task.table.parameters, checked_options(options), 1)
+        given = checked_options(options)
+        if "state" in given:
+            if seed is not None or len(given) > 1:
+                raise ConfigError(
+                    "a state excludes a seed and other options, it brings its own", hint="give the state alone"
+                )
+            self.set_state(checked_state(given["state"]))
+            self.task.begin()
+            return self._observe(), self._info()
+        given = check_options(self.task.table.parameters, given, 1)
         fresh = seed is not None or self._np_random is None
         super().reset(seed=seed)
         seeds = np.array([world_seed(self.np_random)]) if fresh else None
@@ -134,6 +155,49 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         if terminated:
             info["failure"] = EndReason(info["end_reason"]).name.lower()
         return self._observe(), float(task.reward.numpy()[0]), terminated, bool(task.truncated.numpy()[0]), info
+
+    def get_state(self) -> EnvState:
+        """Return the state, from which `set_state` goes on with the same bits on CPU.
+
+        Raises:
+            ConfigError: If the scene has grips, which are not part of a state.
+        """
+        owner, arrays = worlds_state(self.task)
+        return EnvState(owner=owner, arrays=arrays, random=(generator_state(self._np_random),))
+
+    def set_state(self, state: EnvState | bytes) -> None:
+        """Go on from a state, of this environment or of another of the same task, robot and objects.
+
+        Wrappers, such as Gymnasium's time limit, count on.
+
+        Args:
+            state: What `get_state` returned, of one world, or its bytes.
+
+        Raises:
+            StateError: If it is damaged, or of another version, task, robot or object; nothing has changed then.
+        """
+        state = checked_state(state)
+        if state.world_count != 1:
+            raise ConfigError(f"the state has {state.world_count} worlds", hint="choose one with state.worlds([0])")
+        random = generator_of(state.random[0])
+        set_worlds_state(self.task, state.owner, state.arrays, np.ones(1, bool))
+        self._np_random = random
+
+    def twin(self, **changes: Any) -> Self:
+        """Return another environment in the same state.
+
+        Args:
+            changes: Arguments that it is made with in place of those of this one, such as ``render_mode``.
+        """
+        made = type(self)(*self._ezpickle_args, **{**self._ezpickle_kwargs, **changes})
+        made.spec, made._np_random_seed = copy.deepcopy(self.spec), self._np_random_seed
+        made.set_state(self.get_state())
+        return made
+
+    def __deepcopy__(self, memo: dict[int, object]) -> Self:
+        """Return another environment in the same state."""
+        memo[id(self)] = made = self.twin()
+        return made
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the views of the rendering cameras side by side, uint8 (render_size, 2 render_size, 3)."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, Self, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -28,7 +29,9 @@ from softmode.envs.arguments import (
     checked_processes,
     world_seed,
 )
+from softmode.envs.env_state import EnvState, checked_state, generator_of, generator_state
 from softmode.envs.parameters import check_options
+from softmode.envs.results import named_reasons
 from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.envs.tensors import Tensor, host_array, map_tree
@@ -93,6 +96,22 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         progress: bool | Progress | None = None,
     ) -> None:
         """Build the scene, capture the step and make the spaces."""
+        self._arguments = {
+            "num_envs": num_envs,
+            "obs_type": obs_type,
+            "render_mode": render_mode,
+            "control_mode": control_mode,
+            "splat": splat,
+            "size": size,
+            "preset": preset,
+            "config": config,
+            "max_episode_steps": max_episode_steps,
+            "autoreset_mode": autoreset_mode,
+            "output": output,
+            "processes": processes,
+            "device": device,
+        }
+        """What a copy is made from; a callback is not."""
         self.num_envs = checked_count("num_envs", num_envs)
         if max_episode_steps is not None:
             max_episode_steps = checked_count("max_episode_steps", max_episode_steps)
@@ -157,10 +176,20 @@ class SoftVectorEnv(gym.vector.VectorEnv):
 
         Args:
             seed: Seed s, for s + i in world i; or one per world, None among them to go on; or None.
-            options: ``reset_mask`` (num_envs,) bool, and parameters of the task, one value or one per world.
+            options: ``reset_mask`` (num_envs,) bool, and parameters of the task, one value or one per world; or
+                ``state`` beside the mask alone: episodes begin with a state, see `set_state`, and count time from zero.
         """
         given = checked_options(options)
         mask = self._checked_mask(given.pop("reset_mask", None))
+        if "state" in given:
+            if seed is not None or len(given) > 1:
+                raise ConfigError(
+                    "a state excludes a seed and other options, it brings its own",
+                    hint="give the state and reset_mask alone",
+                )
+            self._set_state(given["state"], mask, begin=True)
+            with self._stream():
+                return self._gather("observation"), self._masked(self._gather("info"), self._everywhere())
         chosen = check_options(self._worlds[0].parameters, given, self.num_envs)
         seeds = self._seeds(seed, mask)
         with self._stream():
@@ -168,7 +197,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
                 mine = {name: numbers[part] for name, numbers in chosen.items()}
                 worlds.reset(mask[part], seeds[part], mine)
             self._results = [worlds.result() for worlds in self._worlds]
-            return self._gather("observation"), self._masked(self._gather("info"), self._everywhere())
+            return self._gather("observation"), self._infos(self._gather("info"), self._everywhere())
 
     def step(self, actions: ArrayLike | Tensor) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Advance every world by one control step.
@@ -193,10 +222,69 @@ class SoftVectorEnv(gym.vector.VectorEnv):
                 worlds.step(None if numbers is None else numbers[part])
             self._results = [worlds.result() for worlds in self._worlds]
             terminated, truncated = self._gather("terminated"), self._gather("truncated")
-            infos = self._masked(self._gather("info"), self._everywhere())
+            infos = self._infos(self._gather("info"), self._everywhere())
             if self.autoreset_mode == AutoresetMode.SAME_STEP:
                 self._add_final(infos, terminated | truncated)
             return self._gather("observation"), self._gather("reward"), terminated, truncated, infos
+
+    def get_state(self) -> EnvState:
+        """Return the state of all worlds, from which `set_state` goes on with the same bits on CPU.
+
+        Raises:
+            ConfigError: If the scene has grips, which are not part of a state.
+        """
+        with self._stream():
+            states = [worlds.get_state() for worlds in self._worlds]
+        random = self._random if self._random is not None else [None] * self.num_envs
+        parts = [
+            EnvState(owner=owner, arrays=arrays, random=tuple(generator_state(one) for one in random[part]))
+            for (owner, arrays), part in zip(states, self._slices, strict=True)
+        ]
+        return EnvState.joined(parts)
+
+    def set_state(self, state: EnvState | bytes, mask: NDArray[np.bool_] | None = None) -> None:
+        """Let worlds go on from a state; the others keep every bit.
+
+        Args:
+            state: What `get_state` returned, here or of a single environment, or its bytes: of one world, which all
+                masked worlds get, or of `num_envs`.
+            mask: Which worlds, shape (num_envs,) bool; all if None.
+
+        Raises:
+            StateError: If it is damaged, or of another version, task, robot or object; nothing has changed then.
+            ConfigError: If mask or number of worlds do not fit, or only some worlds get one before the first reset.
+        """
+        self._set_state(state, self._checked_mask(mask), begin=False)
+
+    def _set_state(self, given: object, mask: NDArray[np.bool_], *, begin: bool) -> None:
+        """Give the masked worlds a state."""
+        state = checked_state(given)
+        if state.world_count not in (1, self.num_envs):
+            hint = f"give the state of 1 or {self.num_envs} worlds, see EnvState.worlds"
+            raise ConfigError(f"the state has {state.world_count} worlds, the environment {self.num_envs}", hint=hint)
+        if state.world_count < self.num_envs:
+            state = state.worlds(np.zeros(self.num_envs, int))
+        random = [generator_of(one) for one in state.random]
+        with self._stream():
+            for worlds, part in zip(self._worlds, self._slices, strict=True):
+                rows = {name: values[part] for name, values in state.arrays.items()}
+                worlds.set_state(state.owner, rows, mask[part], begin)
+            self._results = [worlds.result() for worlds in self._worlds]
+        if self._random is None:
+            self._random = [np.random.default_rng() for _ in range(self.num_envs)]
+        for i in np.flatnonzero(mask):
+            self._random[i] = random[i] or self._random[i]
+
+    def __deepcopy__(self, memo: dict[int, object]) -> Self:
+        """Return another environment in the same state."""
+        made = type(self)(**self._arguments)
+        memo[id(self)] = made
+        made.spec = copy.deepcopy(self.spec, memo)
+        state = self.get_state()
+        made.set_state(state)
+        if self._random is None:
+            made._random = None
+        return made
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a frame per world."""
@@ -332,7 +420,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
                 rows[i] = map_tree(lambda array, i=i: array[i].copy(), observation)
             observation = rows
         infos["final_obs"], infos["_final_obs"] = observation, _copy(ended)
-        infos["final_info"], infos["_final_info"] = self._masked(final["info"], ended), _copy(ended)
+        infos["final_info"], infos["_final_info"] = self._infos(final["info"], ended), _copy(ended)
         # What stays are the infos of the new episodes, which have earned nothing yet.
         terms = [value for name, value in infos["reward_terms"].items() if not name.startswith("_")]
         for values in (*terms, infos["end_reason"]):
@@ -348,6 +436,13 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         import torch
 
         return torch.ones(self.num_envs, dtype=torch.bool, device=wp.device_to_torch(self.device))
+
+    def _infos(self, tree: dict[str, Any], mask: Any) -> dict[str, Any]:
+        """Return infos with their masks and, where they lie on the host, the names of the solver's flags."""
+        infos = self._masked(tree, mask)
+        if self.output == "numpy":
+            named_reasons(infos)
+        return infos
 
     def _masked(self, tree: dict[str, Any], mask: Any) -> dict[str, Any]:
         """Add the mask `_key` of every key."""

@@ -286,6 +286,15 @@ class Task:
         if self.kernels is not None:
             self.launch(self.kernels.evaluate, [self.state, self.plan], [self.result])
 
+    def state_arrays(self) -> dict[str, wp.array]:
+        """Return what episodes go on from beside the physics, by name, worlds first.
+
+        Whoever keeps something from step to step that is no function of the physical state adds it.
+        """
+        names = ("seed", "episode", "elapsed", "end", "failure", "held", "terminated", "truncated", "success", "done")
+        written = ("finite", "observation", "reward", "terms", "metrics")
+        return {"parameters": self.table.values, **{name: getattr(self, name) for name in (*names, *written)}}
+
     def marker(self) -> Splats | None:
         """Return the splats that mark the goal in pictures; `observe` writes `scene.marker_place`."""
         return None
@@ -384,6 +393,14 @@ class Task:
         self.write_observation()
         self.draw_pictures()
 
+    def begin(self, mask: NDArray[np.bool_] | None = None) -> None:
+        """Let episodes begin in the masked worlds, all if None, from where they are: time counts from zero."""
+        chosen = np.ones(self.world_count, bool) if mask is None else mask
+        for array in (self.elapsed, self.terminated, self.truncated, self.done, self.end, self.terms):
+            values = array.numpy().copy()
+            values[chosen] = 0
+            array.assign(values)
+
     def _draw(self) -> None:
         """Draw the parameters of the worlds in `scene.world_mask`."""
         table = self.table
@@ -393,16 +410,21 @@ class Task:
     def _start(self) -> None:
         """Set those worlds up from their parameters."""
         scene = self.scene
-        mask, values = scene.world_mask, self._material
-        self.launch(kernels.spread_materials, [self.state, self._material_columns], [values], values.shape[1])
-        wp.copy(self._solver_mask, mask, count=self.world_count)
-        set_parameters(scene.solver, self._solver_mask, **self._materials)
+        mask = scene.world_mask
+        self.apply_materials()
         self.place()
         scene.reset_worlds()
         for camera in scene.cameras.values():
             camera.randomize(mask)
         self.launch(kernels.clear_worlds, [mask], [self._episode, self.result])
         self.clear()
+
+    def apply_materials(self) -> None:
+        """Give the bodies of the worlds in `scene.world_mask` the materials and sizes of their parameters."""
+        values = self._material
+        self.launch(kernels.spread_materials, [self.state, self._material_columns], [values], values.shape[1])
+        wp.copy(self._solver_mask, self.scene.world_mask, count=self.world_count)
+        set_parameters(self.scene.solver, self._solver_mask, **self._materials)
 
     def write_observation(self) -> None:
         """Write the observation and the metrics of all worlds."""
@@ -426,6 +448,10 @@ class Task:
         pictures = scene.draw_film().numpy()
         cameras = pictures.reshape(-1, self.world_count, *pictures.shape[1:])
         return np.concatenate(list(cameras), axis=2)
+
+    def forget_film(self, mask: NDArray[np.bool_]) -> None:
+        """Let the following camera jump to its place in the masked worlds, shape (world_count,)."""
+        self._follow.forget(mask)
 
     def in_focus(self) -> NDArray[np.float64]:
         """Return balls (x, y, z, radius) [m] that the following camera shows, shape (world_count, K, 4).

@@ -15,10 +15,14 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from softmode.envs.env_state import set_worlds_state, worlds_state
 from softmode.envs.results import info_arrays, observation_arrays
 from softmode.envs.task import Task
 from softmode.envs.tensors import map_tree
 from softmode.errors import SoftmodeError, WorkerError
+
+ANSWERED = ("reset", "step", "set_state")
+"""Calls whose answer is the result of all worlds."""
 
 
 class LocalWorlds:
@@ -45,6 +49,18 @@ class LocalWorlds:
         for some, value in ((mask & (seeds >= 0), seeds), (mask & (seeds < 0), None)):
             if some.any():
                 self.task.reset(world_mask=some, seeds=value, options=options)
+
+    def get_state(self) -> tuple[dict[str, str], dict[str, NDArray[Any]]]:
+        """Return whose the state is, and its arrays by world."""
+        return worlds_state(self.task)
+
+    def set_state(
+        self, owner: dict[str, str], arrays: dict[str, NDArray[Any]], mask: NDArray[np.bool_], begin: bool
+    ) -> None:
+        """Give the masked worlds a state; `begin` lets episodes begin there, see :meth:`Task.begin`."""
+        set_worlds_state(self.task, owner, arrays, mask)
+        if begin:
+            self.task.begin(mask)
 
     def step(self, actions: NDArray[np.float32] | None) -> None:
         """Advance all worlds; None takes the actions that are on the device already."""
@@ -107,6 +123,17 @@ class RemoteWorlds:
     def reset(self, mask: NDArray[np.bool_], seeds: NDArray[np.int64], options: dict[str, NDArray[np.float32]]) -> None:
         """Start episodes; see :meth:`LocalWorlds.reset`."""
         self._send("reset", mask, seeds, options)
+
+    def get_state(self) -> tuple[dict[str, str], dict[str, NDArray[Any]]]:
+        """Return whose the state is, and its arrays by world."""
+        self._send("get_state")
+        return self._receive()
+
+    def set_state(
+        self, owner: dict[str, str], arrays: dict[str, NDArray[Any]], mask: NDArray[np.bool_], begin: bool
+    ) -> None:
+        """Give the masked worlds a state; `result` waits for it. See :meth:`LocalWorlds.set_state`."""
+        self._send("set_state", owner, arrays, mask, begin)
 
     def step(self, actions: NDArray[np.float32] | None) -> None:
         """Have the child advance its worlds; `result` waits for it."""
@@ -193,7 +220,7 @@ def _serve(pipe: Connection, task_class: type[Task], arguments: dict[str, Any]) 
                 return
             try:
                 value = getattr(worlds, name)(*given)
-                answer = (True, map_tree(_on_host, worlds.result() if name in ("reset", "step") else value))
+                answer = (True, map_tree(_on_host, worlds.result() if name in ANSWERED else value))
             except Exception as error:
                 answer = (False, _portable(error))
             pipe.send(answer)

@@ -121,9 +121,11 @@ def located_options(options: Any, folder: Path) -> Any:
         return [located_options(part, folder) for part in options]
     if not isinstance(options, dict):
         return options
+    from softmode.objects.config import FILES
+
     found = {name: located_options(value, folder) for name, value in options.items()}
     fingerprint = found.get("fingerprint")
-    for kind in ("splat", "mesh", "body"):
+    for kind in FILES:
         if isinstance(fingerprint, str) and isinstance(path := found.get(kind), str):
             found[kind] = str(find_file(Path(path), fingerprint, folder) or path)
     return found

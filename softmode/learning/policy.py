@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import os
 import sys
 from collections.abc import Callable
@@ -22,6 +21,7 @@ with needs_extra("rl", "trained policies need torch"):
 from softmode.learning.checkpoints import Checkpoint, check_env, read_checkpoint
 from softmode.learning.config_values import located_options, with_config
 from softmode.learning.distributed import local_device
+from softmode.learning.intervals import wilson_interval
 from softmode.learning.networks import Actor
 from softmode.learning.spaces import Interface
 from softmode.learning.vector_tensors import TensorVectorEnv, action_range, tensors_of
@@ -157,10 +157,7 @@ class Evaluation:
 
     def interval(self) -> tuple[float, float]:
         """Return the 95 % interval of the success rate (Wilson 1927)."""
-        n, p, z = self.episodes, self.success_rate or 0.0, 1.96
-        center = (p + z * z / (2 * n)) / (1 + z * z / n)
-        half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-        return max(center - half, 0.0), min(center + half, 1.0)
+        return wilson_interval((self.success_rate or 0.0) * self.episodes, self.episodes)
 
     def __str__(self) -> str:
         """Return one line for people."""

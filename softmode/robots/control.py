@@ -142,7 +142,9 @@ class ArmController:
         self.opening = wp.zeros(w, dtype=wp.float32, device=device)
         self.target_position = wp.zeros(w, dtype=wp.vec3, device=device)
         self.target_yaw = wp.zeros(w, dtype=wp.float32, device=device)
-        self._command = filled(kernels.Command, self, previous_q=wp.zeros_like(self.commanded_q))
+        self.previous_q = wp.zeros_like(self.commanded_q)
+        """The command before the last one, from which targets move on."""
+        self._command = filled(kernels.Command, self)
         """What moves when the command does."""
         self._everywhere = wp.ones(w, dtype=wp.bool, device=device)
         self._device = device

@@ -12,6 +12,12 @@ import pytest
 
 import softmode  # noqa: F401  (registers the environments)
 from softmode.envs.tasks.lift_soft.task import LiftSoftEnv
+from softmode.testing.plugin import Episodes
+
+__all__ = ["Episodes", "MakeEnv"]
+
+MakeEnv = Callable[..., gym.Env]
+"""Type of the fixture `soft_env`."""
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -13,6 +13,8 @@ from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.press_soft.scripted import ScriptedPress
 from softmode.envs.tasks.press_soft.task import START_HEIGHT, THICKNESS, PressSoftConfig, PressSoftEnv
 from softmode.errors import ConfigError
+from softmode.testing import assert_success
+from tests.envs.conftest import Episodes, MakeEnv
 
 ENV_ID = "softmode/PressSoft-v0"
 IDLE = np.zeros(5, np.float32)
@@ -217,10 +219,10 @@ def test_scripted_policy_holds_the_force(press: PressSoftEnv, modulus: float, go
 
 
 @pytest.mark.slow
-def test_scripted_policy_succeeds_on_twenty_of_twenty_seeds(press: PressSoftEnv) -> None:
+@pytest.mark.episodes(20)
+def test_scripted_policy_succeeds_on_twenty_of_twenty_seeds(soft_env: MakeEnv, episode: Episodes) -> None:
     """20 of 20 seeds with random stiffness, place and force."""
-    results = [play(press, seed)[0]["is_success"] for seed in range(20)]
-    assert sum(results) == 20, [seed for seed, won in enumerate(results) if not won]
+    assert_success(episode(soft_env("softmode/PressSoft-v0")))
 
 
 def test_scripted_policy_needs_its_own_environment() -> None:

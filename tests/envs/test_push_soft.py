@@ -16,6 +16,8 @@ from softmode.envs.tasks.push_soft.scripted import ScriptedPush
 from softmode.envs.tasks.push_soft.task import PushSoftConfig, PushSoftEnv, push_scene
 from softmode.errors import ConfigError
 from softmode.objects import ObjectConfig
+from softmode.testing import assert_success
+from tests.envs.conftest import Episodes, MakeEnv
 
 ENV_ID = "softmode/PushSoft-v0"
 IDLE = np.zeros(5, np.float32)
@@ -187,12 +189,13 @@ def test_script_goes_around(push: PushSoftEnv) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.episodes(20)
 @pytest.mark.parametrize("directions", [(-1.0, 1.0), (-np.pi, np.pi)])
-def test_script_succeeds_on_twenty_of_twenty_seeds(directions: tuple[float, float]) -> None:
+def test_script_succeeds_on_twenty_of_twenty_seeds(
+    soft_env: MakeEnv, episode: Episodes, directions: tuple[float, float]
+) -> None:
     """20 of 20 seeds with random stiffness, place and goal."""
-    env = PushSoftEnv(config=PushSoftConfig(goal_direction=directions))
-    won = [play(env, seed)["is_success"] for seed in range(20)]
-    assert sum(won) == 20, won
+    assert_success(episode(soft_env("softmode/PushSoft-v0", goal_direction=directions)))
 
 
 def test_script_needs_its_own_environment() -> None:

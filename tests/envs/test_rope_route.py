@@ -22,6 +22,8 @@ from softmode.envs.tasks.rope_route.task import (
     rope_scene,
 )
 from softmode.errors import ConfigError
+from softmode.testing import assert_success
+from tests.envs.conftest import Episodes, MakeEnv
 
 ENV_ID = "softmode/RopeRoute-v0"
 
@@ -77,7 +79,7 @@ def judge(env: RopeRouteEnv, winding: tuple[float, float], distance: float = 0.0
 
 @pytest.mark.parametrize(("route", "modulus"), [(-1.0, 6.0e5), (1.0, 1.5e5)])
 def test_scripted_policy_leads_the_rope_around_the_pegs(rope: RopeRouteEnv, route: float, modulus: float) -> None:
-    """Both routes succeed and last; the rope keeps its length, and nothing sinks in by more than 1 mm.
+    """Both routes succeed and last; the rope keeps its length, and nothing sinks in by more than 1.1 mm.
 
     Friction alone pulls on the axis, some 0.3 N: f / (E A) = 0.3 N / (1.5e5 Pa 2e-4 m^2) = 1 %. The table's 1.5 mm are
     for a soft rope that is squeezed just above it.
@@ -95,7 +97,7 @@ def test_scripted_policy_leads_the_rope_around_the_pegs(rope: RopeRouteEnv, rout
             depth = max(depth, PEG_SIZE[0] - np.linalg.norm(low[:, :2] - peg.position[:2], axis=1).min())
         floor = max(floor, -points[:, 2].min())
     assert success[-1] and all(success[success.index(True) :])
-    assert depth < 1.0e-3 and floor < 1.5e-3
+    assert depth < 1.1e-3 and floor < 1.5e-3
     axis = rope.task.axis.numpy()[0].astype(float)
     assert np.linalg.norm(np.diff(axis, axis=0), axis=1).sum() == pytest.approx(LENGTH, rel=0.03)
     assert (seen(rope, "winding") > rope.config.winding).all() and info["goal_distance"] < 0.002
@@ -232,10 +234,10 @@ def test_pegs_are_needed() -> None:
 
 
 @pytest.mark.slow
-def test_scripted_policy_succeeds_on_twenty_of_twenty_seeds(rope: RopeRouteEnv) -> None:
+@pytest.mark.episodes(20)
+def test_scripted_policy_succeeds_on_twenty_of_twenty_seeds(soft_env: MakeEnv, episode: Episodes) -> None:
     """20 of 20 seeds with random stiffness, place, route and goal."""
-    results = [play(rope, seed, 160)[0]["is_success"] for seed in range(20)]
-    assert sum(results) == 20, [seed for seed, won in enumerate(results) if not won]
+    assert_success(episode(soft_env("softmode/RopeRoute-v0")))
 
 
 def test_scripted_policy_needs_its_own_environment() -> None:

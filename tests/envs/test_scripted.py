@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from softmode.cli.play import _why
 from softmode.envs.scripted import scripted_policy
+from softmode.envs.tasks.lift_soft.log import LiftLog
 from softmode.envs.tasks.lift_soft.scripted import ScriptedLift
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv, lift_scene
 from softmode.errors import ConfigError, GraspError
@@ -123,6 +125,28 @@ def test_what_does_not_fit_is_told_before_anything_moves() -> None:
     with pytest.raises(GraspError, match=r"mm wide.*gripper takes 84 mm.*--size times 0\.[67]"):
         ScriptedLift(env)()
     np.testing.assert_array_equal(env.scene.state.joint_q.numpy(), before)
+
+
+def test_a_grasp_that_is_gone_is_told(lift: LiftSoftEnv) -> None:
+    """A gripper that opens less once the object has moved: no error, but the planner's reason, until one fits again."""
+    observation, info = lift.reset(seed=0)
+    policy = ScriptedLift(lift)
+    policy(observation)
+    assert policy.trouble == "" and _why(None, policy, info) == ""
+    grasp = policy._grasp
+    whole, grasp._jaw = grasp._jaw, replace(grasp._jaw, opening=0.02)
+    grasp._planned_at = np.add(grasp.centre, [0.01, 0.0, 0.0])  # as if it had been planned a centimetre beside
+    action = policy(observation)
+    np.testing.assert_array_equal(action[:4], 0.0)  # it waits
+    assert "the gripper takes 14 mm" in policy.trouble
+    told = _why(LiftLog(lift.config), policy, {**info, "end_reason": 0})
+    assert told == f", never touched, no grasp fits where it lies now: {policy.trouble}"
+    grasp._jaw, grasp._planned_at = whole, grasp._planned_at + 0.01
+    policy(observation)
+    assert policy.trouble == ""
+    grasp._attempts, policy._grasp.trouble = 1, "left over"
+    policy.reset()
+    assert policy.trouble == ""
 
 
 @pytest.mark.parametrize("name", ["cup", "ring chain"])

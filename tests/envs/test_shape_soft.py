@@ -12,13 +12,16 @@ import warp as wp
 
 import softmode  # noqa: F401  (registers the environments)
 from softmode.envs.scripted import scripted_policy
-from softmode.envs.tasks.shape_soft.config import ShapeSoftConfig, shape_scene
+from softmode.envs.tasks.shape_soft.config import POST, ShapeSoftConfig, shape_scene
 from softmode.envs.tasks.shape_soft.scripted import ScriptedShape
 from softmode.envs.tasks.shape_soft.targets import record_press
 from softmode.envs.tasks.shape_soft.task import ShapeSoftEnv, ShapeSoftVectorEnv
 from softmode.errors import ConfigError
+from softmode.mpm import Grid, MassLoss, ParticleBody
 from softmode.objects import ObjectConfig
 from softmode.scenes.table_scene import GAP
+from softmode.testing import assert_success
+from tests.envs.conftest import Episodes, MakeEnv
 
 ENV_ID = "softmode/ShapeSoft-v0"
 IDLE = np.array([0.0, 0.0, 0.0, 0.0, 2.0 * 0.08 / 0.09 - 1.0], np.float32)
@@ -184,6 +187,46 @@ def test_success_takes_holding_still(shape: ShapeSoftEnv) -> None:
         assert (won.index(True) == shape.config.hold_steps - 1) if expected else not any(won)
 
 
+def test_log_mass_is_the_distance_of_masses(shape: ShapeSoftEnv) -> None:
+    """The error is sqrt(L / L_0) of MassLoss on a grid through the foot, L_0 that of nothing; order does not matter."""
+    config = ShapeSoftConfig(reward="log_mass")
+    env = ShapeSoftEnv(config=config)
+    observation, info = env.reset(seed=2)
+    random = np.random.default_rng(1)
+    achieved, desired = points(observation["achieved_goal"]), points(observation["desired_goal"])
+    h = config.log_mass_spacing
+    grid = Grid(shape=(21, 21, 21), spacing=h, origin=(-10 * h, -10 * h, -10 * h))
+    one = np.ones(12)
+    loss = MassLoss(grid, ParticleBody(positions=desired, masses=one), mass_scale=0.1, dtype=wp.float64, device="cpu")
+    nothing = 0.5 * (np.log(loss.target_mass.numpy() / 0.1 + 1.0) ** 2).sum()
+    error = np.sqrt(loss.value_and_gradient(achieved, one)[0] / nothing)
+    assert info["shape_error"] == pytest.approx(error, rel=1e-4) and error > 0.2
+    shuffled = random.permutation(achieved).ravel()
+    reward = env.compute_reward(achieved.ravel(), desired.ravel())
+    assert reward == pytest.approx(1.0 - np.tanh(error / config.log_mass_length), rel=1e-4)
+    assert env.compute_reward(shuffled, desired.ravel()) == pytest.approx(reward, rel=1e-5)
+    assert shape.compute_reward(shuffled, desired.ravel()) < 0.5 * shape.compute_reward(
+        achieved.ravel(), desired.ravel()
+    )
+    assert env.compute_reward(random.permutation(desired).ravel(), desired.ravel()) == pytest.approx(2.0, abs=1e-3)
+
+
+def test_the_goal_is_another_body() -> None:
+    """A round post is bent like a square one, which made the targets; every reward is that of its goals."""
+    square = replace(POST, shape="box", extents=(0.024, 0.024, 0.12))
+    env = ShapeSoftEnv(config=ShapeSoftConfig(reward="log_mass", goal_object=square))
+    given = {"position": (0.45, 0.0), "yaw": 0.0}
+    observation, info = env.reset(seed=0, options={**given, "goal": (0.0, 0.0)})
+    low = points(observation["desired_goal"])
+    low[:, 2] -= env.task.targets.points.numpy()[0, 0, :, 2].min()
+    assert np.abs(low[:, :2]).max() == pytest.approx(0.012, abs=1e-3)  # the square's side, not the post's radius
+    assert np.hypot(*points(observation["achieved_goal"])[:, :2].T).max() > 0.0145
+    at_rest = info["shape_error"]
+    info = play(env, 0, **given, goal=(0.05, 1.0))
+    assert info["is_success"] and info["shape_error"] < at_rest + 0.05 < env.config.log_mass_tolerance
+    assert info["solver_reasons"] == ()
+
+
 # -- physics ----------------------------------------------------------------------------------------------------------
 
 
@@ -215,10 +258,10 @@ def test_script_bends_the_post(shape: ShapeSoftEnv, seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_script_succeeds_on_twenty_of_twenty_seeds(shape: ShapeSoftEnv) -> None:
+@pytest.mark.episodes(20)
+def test_script_succeeds_on_twenty_of_twenty_seeds(soft_env: MakeEnv, episode: Episodes) -> None:
     """20 of 20 seeds with random stiffness, place, yaw and target."""
-    won = [play(shape, seed)["is_success"] for seed in range(20)]
-    assert sum(won) == 20, won
+    assert_success(episode(soft_env("softmode/ShapeSoft-v0")))
 
 
 def test_script_needs_its_own_environment() -> None:
@@ -276,6 +319,10 @@ def test_marker_shows_the_target() -> None:
         {"reward_length": 0.0},
         {"goal_tolerance": -1.0},
         {"hold_steps": 0},
+        {"log_mass_spacing": 0.0},
+        {"log_mass_length": 2.0},
+        {"goal_object": POST},
+        {"goal_object": replace(POST, extents=(0.03, 0.03, 0.1)), "reward": "log_mass"},
         {"scale_range": (0.9, 1.1)},
     ],
 )

@@ -69,6 +69,15 @@ def test_a_world_that_is_not_finite_is_reset_alone(mode: AutoresetMode, part: st
     if mode == AutoresetMode.SAME_STEP:
         flag = bits.WORLD_NOT_FINITE if part == "object" else bits.WORLD_RIGID_NOT_FINITE
         assert info["final_info"]["solver_status"][broken] & flag
+        names = info["final_info"]["solver_reasons"]
+        assert bits.REASONS[flag] in names[broken] and info["final_info"]["_solver_reasons"].tolist() == [
+            False,
+            True,
+            False,
+        ]
+    else:
+        assert info["solver_reasons"][broken] == bits.status_reasons(int(info["solver_status"][broken]))
+    assert not any(info["solver_reasons"][world] for world in others)
     assert (runs[1][-1][0][broken] != 0.0).any() and runs[1][-1][4]["solver_status"][broken] == 0
 
 

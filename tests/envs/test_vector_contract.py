@@ -153,7 +153,7 @@ def test_world_0_is_the_single_environment(
 ) -> None:
     """`check_environments_match` finds the same spaces, bits and infos in the first of two worlds.
 
-    The single environment's infos hold all that the vector's do, and the solver's flags by name.
+    The single environment's infos hold all that the vector's do, the solver's flags by name too.
     """
     steps = LIMIT - 1  # an episode that ends would go on in the vector
     check_environments_match(FirstWorld(vector(task)), single(task), num_steps=steps, info_comparison="superset")
@@ -183,7 +183,7 @@ def first(tree: Any) -> Any:
     if isinstance(tree, dict):
         keys = [key for key in tree if not (key.startswith("_") and key[1:] in tree)]
         return {key: first(tree[key]) for key in keys if key not in ("final_obs", "final_info")}
-    return tree[0].item() if tree.ndim == 1 else tree[0]
+    return tree[0].item() if tree.ndim == 1 and tree.dtype != object else tree[0]
 
 
 @pytest.mark.parametrize("task", [TASKS[0], *(pytest.param(task, marks=pytest.mark.slow) for task in TASKS[1:])])

@@ -1,4 +1,4 @@
-"""Grasps of twenty shapes: antipodal within friction, inside the opening, clear of table and object; and refusals."""
+"""Grasps of twenty shapes, captures and presets: antipodal, inside the opening, clear of all around; and refusals."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from softmode.errors import ConfigError, GraspError
+from softmode.objects import ObjectConfig
+from softmode.objects.source import object_source, standing_quadrature
 from softmode.robots import ArmDescription, Grasp, ParallelJaw, plan_grasps
 from softmode.robots.grasp_planner import DEPTH, MARGIN
+from tests.captures import CAPTURES
 from tests.shapes import SHAPES, box, sample_surface
 
 Array = NDArray[np.float64]
@@ -25,11 +28,24 @@ NAMES = [name for name in SHAPES if name not in ("plate 40:1", "bunny", "bear") 
     "star, splats",
     "L-shape, points",
 ]
+OBJECTS = {f"{name}, capture": name for name in ("thin neck", "mug", "ground beneath")} | {
+    f"{name}, preset": name for name in ("cable", "glove", "mug")
+}
+"""Captures as they are filled, and presets at their own size."""
 
 
 @functools.cache
 def surface(name: str, count: int = 400) -> tuple[Array, Array, Array]:
-    """Return points, normals and areas of a shape of 80 mm that stands on the table."""
+    """Return points, normals and areas of a shape of 80 mm, or of an object, that stands on the table."""
+    if name in OBJECTS:
+        given: dict[str, Any] = {"preset": OBJECTS[name]}
+        if name.endswith("capture"):
+            capture = CAPTURES[OBJECTS[name]]
+            given = {"splat": capture.scene(), **capture.options}
+        config = ObjectConfig(surface_count=count, **given)
+        found = standing_quadrature(config, object_source(config))[0]
+        at = found.surface_points - [*found.surface_points[:, :2].mean(axis=0), found.surface_points[:, 2].min()]
+        return at, found.surface_normals, found.surface_areas
     shape = SHAPES[name]
     if shape.source in ("implicit", "splats", "points"):
         found = shape.quadrature(surface_count=count)
@@ -87,7 +103,7 @@ def check(points: Array, normals: Array, areas: Array, grasp: Grasp, jaw: Parall
     assert (x[palm, 2] <= jaw.reach - jaw.tip - MARGIN + 1e-9).all()
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *OBJECTS])
 def test_shapes_are_grasped_within_friction_opening_and_room(name: str) -> None:
     """Every grasp of a shape is antipodal, fits the opening, hits neither table nor object; equal calls agree."""
     points, normals, areas = surface(name)

@@ -40,6 +40,11 @@ class ScriptedLift(ScriptedPolicy):
         self._grasp.reset()
         self._hang: Vector | None = None
 
+    @property
+    def trouble(self) -> str:
+        """Why no grasp fits any more where the object lies now; empty while one does."""
+        return self._grasp.trouble
+
     def __call__(self, observation: object = None) -> NDArray[np.float32]:
         """Return the action for the present state."""
         action = self._grasp()

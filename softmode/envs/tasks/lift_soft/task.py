@@ -20,7 +20,7 @@ from softmode.envs.task_config import TaskConfig
 from softmode.envs.tasks.lift_soft import kernels
 from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
-from softmode.objects.presets import BEAM, BEAM_MATERIAL
+from softmode.objects.task_objects import BEAM, BEAM_MATERIAL
 from softmode.robots.arm import ArmDescription
 from softmode.scenes.table_scene import TableSceneConfig
 from softmode.splats.splats import Splats

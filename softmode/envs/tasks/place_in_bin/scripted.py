@@ -57,6 +57,11 @@ class ScriptedPlace(ScriptedPolicy):
         self._opening: float | None = None
         self._grip = 0.0
 
+    @property
+    def trouble(self) -> str:
+        """Why no grasp fits any more where the object lies now; empty while one does."""
+        return self._grasp.trouble
+
     def __call__(self, observation: object = None) -> NDArray[np.float32]:
         """Return the action for the present state."""
         if self._opening is None:

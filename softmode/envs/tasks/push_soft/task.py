@@ -150,6 +150,10 @@ class PushSoft(Task):
         super().clear()
         self.launch(forget, [self.scene.world_mask, -1.0], [self.before])
 
+    def state_arrays(self) -> dict[str, wp.array]:
+        """Add how far the object was from its goal a step ago."""
+        return {**super().state_arrays(), "before": self.before}
+
     def marker(self) -> Splats:
         """Return the outline of the object, to be drawn on the table."""
         soft = load(self.scene_config().object, material=self.config.scene.material)

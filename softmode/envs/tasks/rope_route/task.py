@@ -20,7 +20,7 @@ from softmode.envs.task import Task
 from softmode.envs.task_config import TaskConfig
 from softmode.envs.tasks.rope_route import kernels
 from softmode.errors import ConfigError
-from softmode.objects.presets import ROPE, ROPE_MATERIAL
+from softmode.objects.task_objects import ROPE, ROPE_MATERIAL
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
 from softmode.scenes.table_scene import Fixture, TableSceneConfig

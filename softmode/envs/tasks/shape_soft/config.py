@@ -18,7 +18,7 @@ from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
 from softmode.scenes.table_scene import TableSceneConfig
 
-RewardType = Literal["dense", "sparse"]
+RewardType = Literal["dense", "sparse", "log_mass"]
 
 POST = ObjectConfig(
     shape="cylinder",
@@ -60,18 +60,29 @@ class ShapeSoftConfig(TaskConfig):
     goal_direction: tuple[float, float] = (-np.pi, np.pi)
     """Range of the direction in which it is bent, about z from the x axis [rad]."""
     reward: RewardType = "dense"
-    """"dense": 1 - tanh(error / `reward_length`), and 1 more at the target; "sparse": 0 there and -1 elsewhere."""
+    """"dense": 1 - tanh(error / `reward_length`), and 1 more at the target; "sparse": 0 there and -1 elsewhere;
+    "log_mass": as dense, with the distance of masses on a grid (:class:`softmode.mpm.MassLoss`), which needs no points
+    that correspond."""
+    goal_object: ObjectConfig | None = None
+    """Another upright, clamped body of the same height, whose bends are the targets; None for the one that is bent.
+    Only with "log_mass"."""
     reward_length: float = 0.02
     """Error of the shape that matters to the dense reward [m]."""
     goal_tolerance: float = 0.005
     """Error of the shape, root mean square over the points, that counts as at the target [m]."""
+    log_mass_spacing: float = 0.03
+    """Spacing of the grid of "log_mass" [m]; what is farther away than four cells is not felt."""
+    log_mass_length: float = 0.5
+    """Error that matters to its reward: root of the loss over that without a body, 0 at the target."""
+    log_mass_tolerance: float = 0.25
+    """Error that counts as at the target; points of another body that is bent alike are 0.2 apart."""
     hold_steps: int = 10
     """Control steps in a row at the target that make a success."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         super().__post_init__()
-        thing = self.scene.object
+        thing, goal = self.scene.object, self.goal_object
         upright = thing.shape == "cylinder" and thing.extents is not None and thing.extents[0] == thing.extents[1]
         if not upright or not thing.clamped_height > 0.0:
             raise ConfigError(
@@ -83,9 +94,21 @@ class ShapeSoftConfig(TaskConfig):
                 f"scale_range is {self.scale_range}", hint="a clamped object keeps its scale; leave it out"
             )
         height = thing.extents[2] if thing.extents is not None else 0.0
+        if goal is not None and self.reward != "log_mass":
+            raise ConfigError(
+                f"goal_object needs points that do not correspond, reward is {self.reward!r}",
+                hint='take reward="log_mass"',
+            )
+        if goal is not None and (goal.extents is None or goal.extents[2] != height or not goal.clamped_height > 0.0):
+            raise ConfigError(
+                f"goal_object: expected extents of the same height, {height} m, and clamped_height > 0, got "
+                f"{goal.extents} and {goal.clamped_height}"
+            )
         require_range("goal_displacement", self.goal_displacement, at_least=0.0, at_most=0.6 * height, unit="m")
         require_number("goal_displacement[1]", self.goal_displacement[1], above=0.0, unit="m")
         require_range("goal_direction", self.goal_direction, at_least=-np.pi, at_most=np.pi, unit="rad")
         require_choice("reward", self.reward, get_args(RewardType))
         require_fields(self, ("reward_length", "goal_tolerance"), above=0.0, at_most=0.1, unit="m")
+        require_number("log_mass_spacing", self.log_mass_spacing, above=0.0, at_most=0.1, unit="m")
+        require_fields(self, ("log_mass_length", "log_mass_tolerance"), above=0.0, at_most=1.0)
         require_fields(self, ("hold_steps",), at_least=1)

@@ -25,7 +25,12 @@ POINTS = 12
 
 def reward_rules(config: ShapeSoftConfig) -> Any:
     """Return what the reward depends on beside the goals."""
-    return filled(kernels.Rules, config, point_count=POINTS, sparse=int(config.reward == "sparse"))
+    rules = filled(kernels.Rules, config, point_count=POINTS, sparse=int(config.reward == "sparse"))
+    if config.reward == "log_mass":
+        rules.reward_length, rules.goal_tolerance = config.log_mass_length, config.log_mass_tolerance
+    else:
+        rules.log_mass_spacing = 0.0
+    return rules
 
 
 class _GoalMethod:

@@ -5,9 +5,12 @@ from enum import IntEnum
 import warp as wp
 
 from softmode.envs.reward_kernels import StepResult, WorldState, count_held, surface_point, write
+from softmode.mpm.spline_kernels import spline_at
 
 wp.set_module_options({"enable_backward": False})
 
+LOG_MASS_SCALE = wp.constant(0.1)
+"""Mass of a node that the logarithm compares with, over the mass of a point."""
 TURN = wp.constant(6.283185307179586)
 Term = IntEnum("Term", "shape there", start=0)
 Metric = IntEnum("Metric", "shape_error", start=0)
@@ -46,8 +49,9 @@ class Rules:
 
     point_count: int
     sparse: int
-    reward_length: float  # [m]
-    goal_tolerance: float  # [m]
+    reward_length: float  # [m], or relative for masses
+    goal_tolerance: float  # likewise
+    log_mass_spacing: float  # of the grid [m]; 0 compares point by point
     hold_steps: int
 
 
@@ -111,8 +115,70 @@ def shape_error(
 
 
 @wp.func
+def place_of(goal: wp.array2d[float], column: int, p: int, w: int, spacing: float):
+    """Return a point in cells of the grid."""
+    return wp.vec3(goal[w, column + 3 * p], goal[w, column + 3 * p + 1], goal[w, column + 3 * p + 2]) / spacing
+
+
+@wp.func
+def log_mass_error(
+    achieved: wp.array2d[float],
+    achieved_column: int,
+    desired: wp.array2d[float],
+    desired_column: int,
+    rules: Rules,
+    w: int,
+):
+    """Return sqrt(L / L_0), L the loss of :class:`softmode.mpm.MassLoss` and L_0 that without any achieved point.
+
+    Every point is one unit of mass. The nodes are those around the points, each taken once: its part is divided by the
+    number of points that reach it. There is no grid to allocate, and the bits do not depend on the order of threads.
+    """
+    count = rules.point_count
+    total = float(0.0)
+    alone = float(0.0)
+    for p in range(2 * count):
+        at = place_of(achieved, achieved_column, p, w, rules.log_mass_spacing)
+        if p >= count:
+            at = place_of(desired, desired_column, p - count, w, rules.log_mass_spacing)
+        low = wp.vec3(wp.floor(at[0]) - 1.0, wp.floor(at[1]) - 1.0, wp.floor(at[2]) - 1.0)
+        for n in range(64):
+            node = low + wp.vec3(float(n // 16), float(n // 4 % 4), float(n % 4))
+            if spline_at(node - at) > 0.0:
+                mass = float(0.0)
+                goal = float(0.0)
+                sharing = float(0.0)
+                for q in range(count):
+                    m = spline_at(node - place_of(achieved, achieved_column, q, w, rules.log_mass_spacing))
+                    g = spline_at(node - place_of(desired, desired_column, q, w, rules.log_mass_spacing))
+                    mass += m
+                    goal += g
+                    sharing += wp.where(m > 0.0, 1.0, 0.0) + wp.where(g > 0.0, 1.0, 0.0)
+                r = wp.log((mass + LOG_MASS_SCALE) / (goal + LOG_MASS_SCALE))
+                r0 = wp.log(goal / LOG_MASS_SCALE + 1.0)
+                total += r * r / sharing
+                alone += r0 * r0 / sharing
+    return wp.sqrt(total / alone)
+
+
+@wp.func
+def goal_error(
+    achieved: wp.array2d[float],
+    achieved_column: int,
+    desired: wp.array2d[float],
+    desired_column: int,
+    rules: Rules,
+    w: int,
+):
+    """Return how far two shapes are apart: by points that correspond [m], or by masses."""
+    if rules.log_mass_spacing > 0.0:
+        return log_mass_error(achieved, achieved_column, desired, desired_column, rules, w)
+    return shape_error(achieved, achieved_column, desired, desired_column, rules.point_count, w)
+
+
+@wp.func
 def reward_terms(error: float, rules: Rules):
-    """Return the terms `shape` and `there` of an error [m]."""
+    """Return the terms `shape` and `there` of an error."""
     there = float(0.0)
     if error <= rules.goal_tolerance:
         there = 1.0
@@ -139,7 +205,7 @@ def observe(state: WorldState, plan: Plan, result: StepResult):
     for k in range(plan.arm_size):
         result.observation[w, plan.columns.arm + k] = result.observation[w, plan.columns.tool_position + k]
     seen = result.observation
-    error = shape_error(seen, plan.columns.achieved_goal, seen, plan.columns.desired_goal, plan.rules.point_count, w)
+    error = goal_error(seen, plan.columns.achieved_goal, seen, plan.columns.desired_goal, plan.rules, w)
     result.metrics[w, Metric.shape_error] = error
 
 
@@ -164,7 +230,7 @@ def evaluate(state: WorldState, plan: Plan, result: StepResult):
     """Reward nearness to the target shape, and being there."""
     w = wp.tid()
     seen = result.observation  # bounded by now, as the goals are that learners compute rewards from
-    error = shape_error(seen, plan.columns.achieved_goal, seen, plan.columns.desired_goal, plan.rules.point_count, w)
+    error = goal_error(seen, plan.columns.achieved_goal, seen, plan.columns.desired_goal, plan.rules, w)
     pair = reward_terms(error, plan.rules)
     result.terms[w, Term.shape] = pair[0]
     result.terms[w, Term.there] = pair[1]
@@ -181,5 +247,5 @@ def compute_reward(
 ):
     """Compute the reward of any pairs of goals as `evaluate` and the step's sum do."""
     n = wp.tid()
-    pair = reward_terms(shape_error(achieved, 0, desired, 0, rules.point_count, n), rules)
+    pair = reward_terms(goal_error(achieved, 0, desired, 0, rules, n), rules)
     reward[n] = pair[0] + pair[1]

@@ -29,8 +29,8 @@ class ScriptedShape(ScriptedPolicy):
         """Remember the environment and plan nothing yet."""
         super().__init__(env, world=world)
         self._speed, self._gain = speed, gain
-        rest = self.scene.soft.body.surface_points[self.task.points][:, 2]
-        self._end = rest > rest.max() - 0.02
+        bent = self.scene.soft.body.surface_points[self.task.points]
+        self._ends = [rest[:, 2] > rest[:, 2].max() - 0.02 for rest in (self.task.goal_rest, bent)]
         self.reset()
 
     def reset(self) -> None:
@@ -40,7 +40,8 @@ class ScriptedShape(ScriptedPolicy):
     def __call__(self, observation: object = None) -> NDArray[np.float32]:
         """Return the action for the present state."""
         desired, achieved = (
-            self.segment(name).reshape(-1, 3)[self._end, :2].mean(axis=0) for name in ("desired_goal", "achieved_goal")
+            self.segment(name).reshape(-1, 3)[end, :2].mean(axis=0)
+            for name, end in zip(("desired_goal", "achieved_goal"), self._ends, strict=True)
         )
         tool, arm = self.tool, self.arm
         # the fingers close along the tool's y axis

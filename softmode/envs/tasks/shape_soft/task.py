@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import warp as wp
 
+from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.model.structs import filled
 from softmode.envs.markers import dots
 from softmode.envs.observation import PROPRIOCEPTION, Segment
@@ -17,6 +20,7 @@ from softmode.envs.tasks.shape_soft.config import ShapeSoftConfig
 from softmode.envs.tasks.shape_soft.goals import POINTS, GoalMethods, reward_rules
 from softmode.envs.tasks.shape_soft.targets import ShapeTargets, record_press
 from softmode.objects.loader import load
+from softmode.scenes.table_scene import TableScene
 from softmode.splats.splats import Splats
 
 
@@ -42,9 +46,18 @@ class ShapeSoft(Task):
 
     def build(self) -> None:
         """Record the targets."""
-        scene, body = self.scene, self.scene.soft.body
-        press = record_press(scene, self.config.goal_displacement[1])
-        rest = body.surface_points[self.points]
+        scene, goal = self.scene, self.config.goal_object
+        if goal is None:
+            body, chosen = scene.soft.body, self.points
+            press = record_press(scene, self.config.goal_displacement[1])
+        else:
+            other = TableScene(replace(self.scene_config(), object=goal), device=self.device)
+            body = other.soft.body
+            chosen = sample_farthest(body.surface_points, self.point_count, first=0)
+            press = record_press(other, self.config.goal_displacement[1])
+        rest = body.surface_points[chosen]
+        self.goal_rest = rest
+        """Rest points of the targets in the frame of their body [m], shape (points, 3)."""
         if scene.splats is not None:  # the marker shows the whole surface
             rest = np.concatenate([rest, body.surface_points])
             scene.marker_points = wp.zeros((self.world_count, body.surface_count), dtype=wp.vec3, device=self.device)
@@ -86,9 +99,10 @@ class ShapeSoft(Task):
             self.launch(kernels.shape_marker, inputs, [points, self.result], points.shape)
 
     def marker(self) -> Splats:
-        """Return the surface of the post; `observe` bends it."""
+        """Return the surface of the body that makes the targets; `observe` bends it."""
+        thing = self.config.goal_object or self.scene_config().object
         return dots(
-            load(self.scene_config().object, material=self.config.scene.material).body.surface_points,
+            load(thing, material=self.config.scene.material).body.surface_points,
             0.004,
             opacity=0.35,
         )

@@ -1,0 +1,258 @@
+"""The pytest plug-in: fixtures `soft_env`, `episode` and `golden`, and the marker `episodes`.
+
+It loads nothing heavy until a fixture is used; ``-p no:softmode`` leaves it out.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Generator, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+
+    from softmode.testing.episode import Episode, Player
+
+_PLAYED = pytest.StashKey[list["Episode"]]()
+"""Episodes that a test has played, the last one last."""
+_RATE = "episodes"
+"""Property of a report: how many episodes succeeded."""
+_MARKER = (
+    "episodes(count, min_success=1.0, first_seed=0, proven=False): play the test for so many seeds; it fails if the "
+    "95 % interval of its success rate (Wilson) lies below min_success, or if proven unless it lies above"
+)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the options."""
+    group = parser.getgroup("softmode", "episodes of softmode")
+    group.addoption(
+        "--episodes-dir",
+        type=Path,
+        help="folder for films, recordings and states of failed episodes (default: beside the file of --junitxml, or "
+        "failed-episodes)",
+    )
+    group.addoption(
+        "--episodes-golden",
+        choices=("check", "update"),
+        default="check",
+        help="compare golden episodes, or write them anew",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Register the marker."""
+    config.addinivalue_line("markers", _MARKER)
+
+
+# -- fixtures ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="session")
+def soft_env() -> Iterator[Callable[..., gym.Env]]:
+    """Return a function from an id, and options or fields of the configuration, to an environment.
+
+    ``soft_env("softmode/PushSoft-v0", obs_type="pixels", goal_tolerance=0.01)``. Equal arguments give the same
+    environment throughout the session, which an episode resets; ``copy.deepcopy`` gives one of its own.
+    """
+    made: dict[str, gym.Env] = {}
+
+    def make(env: str, **config: Any) -> gym.Env:
+        """Return an environment."""
+        key = repr((env, sorted(config.items())))
+        if key not in made:
+            made[key] = _made(env, config)
+        return made[key]
+
+    yield make
+    for env in made.values():
+        env.close()
+
+
+class Episodes:
+    """The fixture `episode`: plays episodes and remembers them for the report.
+
+    Args:
+        played: Where they are remembered.
+    """
+
+    def __init__(self, played: list[Episode]) -> None:
+        """Start with seed 0."""
+        self.seed = 0
+        """Seed of the next episode that names none; the marker `episodes` counts it up."""
+        self._played = played
+
+    def __call__(
+        self, env: gym.Env, policy: str | Player = "scripted", seed: int | None = None, **options: Any
+    ) -> Episode:
+        """Play an episode; see :func:`softmode.testing.play_episode`."""
+        from softmode.testing.episode import play_episode
+
+        return play_episode(env, policy, self.seed if seed is None else seed, begun=self._played.append, **options)
+
+
+@pytest.fixture
+def episode(request: pytest.FixtureRequest) -> Episodes:
+    """Return a function that plays an episode: ``episode(env, policy, seed)``."""
+    return Episodes(request.node.stash.setdefault(_PLAYED, []))
+
+
+@pytest.fixture
+def golden(request: pytest.FixtureRequest) -> Callable[..., None]:
+    """Return a function that compares an episode with the golden one: ``golden(episode, name, atol=0.0)``.
+
+    It lies in the folder ``golden`` beside the test, and is named after the test, and `name` if it has several.
+    """
+    update = request.config.getoption("--episodes-golden") == "update"
+
+    def check(episode: Episode, name: str = "", *, atol: float = 0.0) -> None:
+        """Compare an episode, or write it as the golden one."""
+        from softmode.testing.golden import assert_golden, write_golden
+
+        file = _file_name("-".join(part for part in (request.path.stem, request.node.name, name) if part))
+        path = request.path.parent / "golden" / f"{file}.npz"
+        if update:
+            write_golden(episode, path)
+        else:
+            assert_golden(episode, path, atol=atol)
+
+    return check
+
+
+def _made(env: str, given: dict[str, Any]) -> gym.Env:
+    """Make an environment from options of its class and fields of its configuration."""
+    import dataclasses
+
+    import gymnasium as gym
+
+    from softmode.envs.catalogue import config_class, env_class
+    from softmode.errors import ConfigError
+    from softmode.learning.config_values import split_config
+
+    names = {item.name for item in dataclasses.fields(config_class(env))}
+    options = {*inspect.signature(env_class(env).__init__).parameters, "max_episode_steps"} - {"self"}
+    if unknown := sorted(set(given) - names - options):
+        hint = f"give one of {', '.join(sorted(names | options))}"
+        raise ConfigError(f"{env} has neither an option nor a field {unknown[0]!r}", hint=hint)
+    fields = {name: value for name, value in given.items() if name in names}
+    config, rest = split_config(env, {name: value for name, value in given.items() if name not in names})
+    return gym.make(env, config=dataclasses.replace(config, **fields), **rest)
+
+
+# -- the marker -------------------------------------------------------------------------------------------------------
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Call a marked test once for every seed, and judge how many passed."""
+    marker = pyfuncitem.get_closest_marker("episodes")
+    if marker is None:
+        return None
+    seeds, judge = _rule(*marker.args, **marker.kwargs)
+    player = pyfuncitem.funcargs.get("episode")
+    if not isinstance(player, Episodes):
+        raise pytest.UsageError(f"{pyfuncitem.nodeid} is marked with episodes and has no argument `episode`")
+    arguments = {name: pyfuncitem.funcargs[name] for name in inspect.signature(pyfuncitem.obj).parameters}
+    played = pyfuncitem.stash[_PLAYED]
+    failures, shown = {}, []
+    for player.seed in seeds:
+        played.clear()
+        try:
+            pyfuncitem.obj(**arguments)
+        except (AssertionError, pytest.fail.Exception) as error:
+            failures[player.seed] = str(error).partition("\n")[0]
+            shown = shown or list(played)
+    rate, fine = judge(len(seeds) - len(failures))
+    pyfuncitem.user_properties.append((_RATE, rate))
+    if not fine:
+        played[:] = shown
+        pytest.fail("\n".join([rate, *(f"  seed {seed}: {why}" for seed, why in failures.items())]), pytrace=False)
+    return True
+
+
+def _rule(
+    count: int, *, min_success: float = 1.0, first_seed: int = 0, proven: bool = False
+) -> tuple[range, Callable[[int], tuple[str, bool]]]:
+    """Return the seeds of a marker, and what judges a number of successes.
+
+    Raises:
+        ConfigError: If a number is out of range, or the count is too small to prove the rate.
+    """
+    from softmode.checks import require_number
+    from softmode.errors import ConfigError
+    from softmode.learning.intervals import wilson_interval
+
+    require_number("episodes: count", count, at_least=1)
+    require_number("episodes: first_seed", first_seed, at_least=0)
+    require_number("episodes: min_success", min_success, at_least=0.0, at_most=1.0)
+    if proven and (best := wilson_interval(count, count)[0]) < min_success:
+        hint = "give a larger count or a lower min_success"
+        raise ConfigError(f"{count} of {count} successes prove {best:.1%}, not {min_success:.1%}", hint=hint)
+
+    def judge(successes: int) -> tuple[str, bool]:
+        """Return the rate in words, and whether it is enough."""
+        low, high = wilson_interval(successes, count)
+        wanted = f"wanted {min_success:.1%}{' proven' if proven else ''}"
+        words = f"{successes} of {count} episodes succeeded (95 %: {low:.1%} to {high:.1%}, {wanted})"
+        return words, (low if proven else high) >= min_success
+
+    return range(first_seed, first_seed + count), judge
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Print the success rates."""
+    reports = [report for found in terminalreporter.stats.values() for report in found]
+    rates = {
+        report.nodeid: value
+        for report in reports
+        for name, value in getattr(report, "user_properties", ())
+        if name == _RATE
+    }
+    if rates:
+        terminalreporter.section("episodes")
+    for nodeid, rate in rates.items():
+        terminalreporter.line(f"{nodeid}: {rate}")
+
+
+# -- failures ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Play the episode of a failure again, and put film, recording and state beside the report."""
+    report = yield
+    played = item.stash.get(_PLAYED, [])
+    if call.when == "call" and report.failed and played:
+        from softmode.errors import SoftmodeError
+        from softmode.testing.failure import save_failure
+
+        shown = next((one for one in played if one.failed_at is not None), played[-1])
+        folder = _folder(item.config) / f"{_file_name(item.nodeid)}-seed{shown.seed}"
+        try:
+            lines = save_failure(shown, folder)
+        except (SoftmodeError, OSError) as error:
+            lines = [f"the episode could not be saved: {error}"]
+        report.sections.append(("Episode", "\n".join([f"seed {shown.seed}", *lines])))
+    return report
+
+
+def _folder(config: pytest.Config) -> Path:
+    """Return where failed episodes go."""
+    chosen, report = config.getoption("--episodes-dir"), config.getoption("xmlpath", None)
+    if chosen is not None:
+        return config.invocation_params.dir / chosen
+    if report:
+        return config.invocation_params.dir / Path(report).with_suffix("").with_name(f"{Path(report).stem}-episodes")
+    return config.rootpath / "failed-episodes"
+
+
+def _file_name(text: str) -> str:
+    """Return a text as the name of a file."""
+    return re.sub(r"[^\w.-]+", "_", text).strip("_")

@@ -1,0 +1,36 @@
+"""A scripted episode of every task: it succeeds within forces and depths that a robot would survive, and replays."""
+
+from __future__ import annotations
+
+import pytest
+
+from softmode.testing import (
+    assert_max_force,
+    assert_max_penetration,
+    assert_no_flag,
+    assert_replays,
+    assert_success,
+)
+from tests.envs.conftest import Episodes, MakeEnv
+
+LIMITS = {
+    "LiftSoft": (9.0, 0.5),
+    "PushSoft": (0.6, 0.13),
+    "PressSoft": (7.7, 2.6),
+    "RopeRoute": (21.0, 2.2),
+    "ShapeSoft": (1.1, 2.0),
+    "PlaceInBin": (2.8, 0.22),
+}
+"""Largest force on a rigid body [N] and depth in one [mm]: one and a half times those of the episode."""
+
+
+@pytest.mark.parametrize("task", LIMITS)
+def test_a_scripted_episode(soft_env: MakeEnv, episode: Episodes, task: str) -> None:
+    """With seed 2, whatever the material that it draws."""
+    played = episode(soft_env(f"softmode/{task}-v0"), "scripted", 2)
+    assert_success(played)
+    assert_no_flag(played, allow=["iteration_limit"])
+    force, depth = LIMITS[task]
+    assert_max_force(played, force)
+    assert_max_penetration(played, depth)
+    assert_replays(played)

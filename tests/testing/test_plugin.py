@@ -1,0 +1,156 @@
+"""The plug-in in pytest runs of its own, in a subprocess: what it loads, its marker, its options and its report."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+from tests.documentation.pages import fences
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def installed(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> pytest.Pytester:
+    """Return a folder in which pytest finds the plug-in by its entry point, as after an installation."""
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]["pytest11"]
+    info = pytester.mkdir("site") / "softmode_checkout-0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: softmode-checkout\nVersion: 0\n")
+    lines = [f"{name} = {module}" for name, module in scripts.items()]
+    (info / "entry_points.txt").write_text("\n".join(["[pytest11]", *lines]))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), str(info.parent)]))
+    return pytester
+
+
+HEAVY = """
+import sys
+
+def test_light():
+    heavy = {"warp", "newton", "mujoco", "torch", "scipy", "rerun", "imageio"} & set(sys.modules)
+    assert not heavy, heavy
+"""
+
+
+def test_it_loads_nothing_heavy_and_can_be_left_out(installed: pytest.Pytester) -> None:
+    """A test without its fixtures has loaded no simulator; without the plug-in there are no fixtures."""
+    installed.makepyfile(test_light=HEAVY, test_fixture="def test_fixture(episode):\n    assert episode.seed == 0\n")
+    installed.runpytest_subprocess().assert_outcomes(passed=2)
+    result = installed.runpytest_subprocess("-p", "no:softmode")
+    result.assert_outcomes(passed=1, errors=1)
+    result.stdout.fnmatch_lines(["*fixture 'episode' not found*"])
+
+
+MARKED = """
+import pytest
+
+def coin(episode, bad):
+    assert episode.seed not in bad, "tails"
+
+@pytest.mark.episodes(20, min_success=0.9)
+def test_enough(episode):
+    coin(episode, range(4))
+
+@pytest.mark.episodes(20, min_success=0.9)
+def test_too_few(episode):
+    coin(episode, range(5))
+
+@pytest.mark.episodes(40, min_success=0.9, proven=True, first_seed=100)
+def test_proven(episode):
+    assert episode.seed >= 100
+
+@pytest.mark.episodes(40, min_success=0.9, proven=True)
+def test_not_proven(episode):
+    coin(episode, [7])
+
+@pytest.mark.episodes(3)
+def test_all(episode):
+    coin(episode, [2])
+
+@pytest.mark.episodes(20, min_success=0.9, proven=True)
+def test_cannot_be_proven(episode):
+    pass
+
+@pytest.mark.episodes(3)
+def test_without_the_fixture():
+    pass
+
+@pytest.mark.episodes(3)
+def test_an_error_is_no_lost_episode(episode):
+    raise RuntimeError("broken")
+"""
+
+
+def test_the_marker_judges_by_wilsons_interval(installed: pytest.Pytester) -> None:
+    """16 of 20 (58 to 92 %) leave 90 % open, 15 (53 to 89 %) do not; 40 of 40 (91 to 100 %) prove it, 39 do not."""
+    installed.makepyfile(MARKED)
+    result = installed.runpytest_subprocess("--strict-markers")
+    result.assert_outcomes(passed=2, failed=6)
+    result.stdout.fnmatch_lines(
+        [
+            "15 of 20 episodes succeeded (95 %: 53.1% to 88.8%, wanted 90.0%)",
+            "  seed 0: tails*",
+            "39 of 40 episodes succeeded (95 %: 87.1% to 99.6%, wanted 90.0% proven)",
+            "2 of 3 episodes succeeded (95 %: 20.8% to 93.9%, wanted 100.0%)",
+            "*20 of 20 successes prove 83.9%, not 90.0%. Give a larger count or a lower min_success*",
+            "*marked with episodes and has no argument `episode`*",
+            "*RuntimeError: broken*",
+            "*= episodes =*",
+            "*::test_enough: 16 of 20 episodes succeeded (95 %: 58.4% to 91.9%, wanted 90.0%)",
+        ],
+        consecutive=False,
+    )
+
+
+PLAYED = """
+import numpy as np
+from softmode.testing import assert_max_penetration
+
+def env_of(soft_env):
+    return soft_env("softmode/PressSoft-v0", max_episode_steps=12, render_size=64)
+
+def test_depth(soft_env, episode):
+    assert_max_penetration(episode(env_of(soft_env), "scripted", 1), 0.001)
+
+def test_policy(soft_env, episode):
+    def policy(observation):
+        if observation[0] and len(seen) == 5:
+            raise RuntimeError("the policy is broken")
+        seen.append(observation)
+        return np.zeros(5, np.float32)
+    seen = []
+    episode(env_of(soft_env), policy)
+
+def test_golden(soft_env, episode, golden):
+    golden(episode(env_of(soft_env), "scripted"))
+"""
+
+
+def test_failures_lie_beside_the_report(installed: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On two workers that share a new cache, where the body is built once."""
+    cache = installed.path / "cache"
+    monkeypatch.setenv("SOFTMODE_CACHE", str(cache))
+    installed.makepyfile(test_played=PLAYED)
+    result = installed.runpytest_subprocess("--junitxml=out/report.xml", "-n", "2")
+    result.assert_outcomes(failed=3)
+    kept = installed.path / "out" / "report-episodes"
+    for name in ("test_played.py_test_depth-seed1", "test_played.py_test_policy-seed0"):
+        assert {file.name for file in (kept / name).iterdir()} >= {"film.mp4", "episode.rrd", "before.npz"}
+    result.stdout.fnmatch_lines([f"film: {kept}/*/film.mp4"])
+    result.stdout.fnmatch_lines(["*there is no golden episode*--episodes-golden update*"])
+    failures = ET.parse(installed.path / "out" / "report.xml").getroot().iter("failure")
+    assert sum("RuntimeError: the policy is broken" in (failure.text or "") for failure in failures) == 1
+    assert len(list((cache / "bodies").glob("*.npz"))) == 1
+
+
+def test_the_page_runs(installed: pytest.Pytester) -> None:
+    """The tests that the documentation shows pass as they stand; the golden one after an update."""
+    page = ROOT / "docs" / "testing_policies.md"
+    installed.makepyfile("\n".join(fence.text for fence in fences(page, "python")))
+    installed.runpytest_subprocess("--episodes-golden", "update").assert_outcomes(passed=3)
+    assert len(list((installed.path / "golden").glob("*.npz"))) == 1
+    installed.runpytest_subprocess("-k", "changed").assert_outcomes(passed=1)
