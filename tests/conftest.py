@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,11 @@ _TESTS = Path(__file__).resolve().parent
 _CACHE = _TESTS.parent / ".cache"
 os.environ.setdefault("WARP_CACHE_PATH", str(_CACHE / "warp"))
 os.environ.setdefault("SOFTMODE_CACHE", str(_CACHE / "softmode"))
+
+# softmode's plug-in registers itself where softmode is installed, and not where a checkout is on the path alone.
+pytest_plugins = ["pytester"]
+if not entry_points(group="pytest11", name="softmode"):
+    pytest_plugins.append("softmode.testing.plugin")
 
 _FAST = {
     "deformables/test_adjoint.py": "gradient_by_a_parameter",

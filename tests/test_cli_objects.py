@@ -298,17 +298,55 @@ COMMANDS = (
     "bench",
     "record",
     "view",
+    "morph",
+    "check",
     "list-envs",
     "robots",
+    "splat show",
     "splat from-mesh",
     "splat info",
     "splat convert",
     "body build",
     "body show",
     "body check",
+    "body cut",
+    "radiance info",
+    "radiance bake",
+    "objects list",
+    "objects show",
+    "objects export",
 )
 SCREEN = 50
 """Lines of 80 columns of a screen."""
+
+
+def help_of(words: list[str], capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """Return the lines of a help page."""
+    with pytest.raises(SystemExit) as end:
+        main([*words, "--help"])
+    assert end.value.code == 0
+    return capsys.readouterr().out.splitlines()
+
+
+def listed(lines: list[str]) -> list[str]:
+    """Return the commands that a help page lists."""
+    return [found[1] for line in lines if (found := re.match(r"\W*• ([a-z-]+) ", line))]
+
+
+def test_help_of_groups_fits_a_screen_and_lists_what_is_tested(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All commands and each group's fit a screen; a group's have an example each; no command is left untested."""
+    monkeypatch.setenv("COLUMNS", "80")
+    top, groups = help_of([], capsys), {command.split()[0] for command in COMMANDS if " " in command}
+    names = [name for name in listed(top) if name not in groups]
+    assert groups <= set(listed(top)) and len(top) <= SCREEN, len(top)
+    for group in sorted(groups):
+        lines = help_of([group], capsys)
+        assert len(lines) <= SCREEN
+        names += [f"{group} {name}" for name in listed(lines)]
+        assert sum(f"Example: softmode {group} " in line for line in lines) == len(listed(lines))
+    assert sorted(names) == sorted(COMMANDS)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -317,16 +355,11 @@ def test_help_fits_a_screen_and_has_an_example(
 ) -> None:
     """Every group of options is at most a screen high; the example is a command line of this command that parses."""
     monkeypatch.setenv("COLUMNS", "80")
-    with pytest.raises(SystemExit) as end:
-        main([*command.split(), "--help"])
-    assert end.value.code == 0
-    said = capsys.readouterr().out
-    titles = [
-        k for k, line in enumerate(said.splitlines()) if re.match(r"\W*(positional arguments|(toy )?options)\W*$", line)
-    ]
-    heights = np.diff([*titles, len(said.splitlines())])
+    said = help_of(command.split(), capsys)
+    titles = [k for k, line in enumerate(said) if re.match(r"\W*(positional arguments|(toy )?options)\W*$", line)]
+    heights = np.diff([*titles, len(said)])
     assert len(titles) and heights.max() <= SCREEN, heights
-    (example,) = [line for line in said.splitlines() if line.startswith("Example: ")]
+    (example,) = [line for line in said if line.startswith("Example: ")]
     assert example.startswith(f"Example: softmode {command}")
     import tyro
 

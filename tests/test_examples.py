@@ -12,7 +12,13 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-NEEDS = {"behaviour_cloning": "torch", "train_ppo": "torch", "rerun_episode": "rerun", "usd_in_usd_out": "pxr"}
+NEEDS = {
+    "behaviour_cloning": "torch",
+    "train_ppo": "torch",
+    "train_own_toy": "torch",
+    "rerun_episode": "rerun",
+    "usd_in_usd_out": "pxr",
+}
 """Optional packages of examples; the others run with the extras demo, data and robots."""
 
 NEWTONS = {"newton_example": ("--viewer", "null", "--test", "--num-frames", "120")}

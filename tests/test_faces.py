@@ -20,6 +20,7 @@ ROOMS = (
     "splats",
     "robots",
     "mpm",
+    "radiance",
     "objects",
     "scenes",
     "envs",
@@ -28,6 +29,7 @@ ROOMS = (
     "demonstrations",
     "learning",
     "view",
+    "testing",
 )
 FACES = tuple(f"softmode.{room}" for room in ROOMS)
 """Packages that offer public names; what lies in their modules is not for users."""
@@ -128,11 +130,20 @@ def test_faces_load_nothing_before_they_are_asked() -> None:
     assert not {"warp", "newton", "torch", "pxr", "scipy", "trimesh"} & set(ast.literal_eval(run.stdout))
 
 
-def test_a_lazy_name_is_imported_once_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Relative and absolute homes are found, the package keeps what was imported, unknown names are refused."""
-    (tmp_path / "shop").mkdir()
-    (tmp_path / "shop" / "fruit.py").write_text("APPLE = 3\n")
-    (tmp_path / "shop" / "__init__.py").write_text(
+@pytest.mark.parametrize("rewritten", [False, True], ids=["plain", "rewritten"])
+def test_a_lazy_name_is_imported_once_and_kept(
+    rewritten: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Relative and absolute homes are found, the package keeps what was imported, unknown names are refused.
+
+    So too where pytest's own loader imports the package, as it does with the packages of installed plug-ins.
+    """
+    shop = "rewritten_shop" if rewritten else "shop"
+    if rewritten:
+        pytest.register_assert_rewrite(shop)
+    (tmp_path / shop).mkdir()
+    (tmp_path / shop / "fruit.py").write_text("APPLE = 3\n")
+    (tmp_path / shop / "__init__.py").write_text(
         "from typing import TYPE_CHECKING\n"
         "from softmode.lazy import lazy_names\n"
         "if TYPE_CHECKING:\n    from fractions import Fraction\n    from .fruit import APPLE\n"
@@ -140,10 +151,10 @@ def test_a_lazy_name_is_imported_once_and_kept(tmp_path: Path, monkeypatch: pyte
         "__getattr__, __dir__ = lazy_names(__name__)\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    package = import_module("shop")
+    package = import_module(shop)
     assert not {"APPLE", "Fraction"} & set(vars(package))
     assert dir(package) == sorted({*vars(package), "Fraction", "APPLE"})
     assert package.Fraction(1, 2) == 0.5 and package.APPLE == 3
     assert vars(package)["APPLE"] == 3
-    with pytest.raises(AttributeError, match=r"'shop' has no attribute 'Nothing'"):
+    with pytest.raises(AttributeError, match=rf"'{shop}' has no attribute 'Nothing'"):
         package.Nothing  # noqa: B018

@@ -15,11 +15,12 @@ FLOORS = (
     "files checks lazy quiet versions",
     "deformables stages",
     "splats robots mpm",
+    "radiance",
     "objects",
     "scenes",
     "envs usd viz",
     "demonstrations learning",
-    "view",
+    "view testing",
     "cli",
     "__main__",
 )

@@ -15,7 +15,7 @@ from softmode.learning.config_values import split_config
 class Bench:
     """Time a vector environment with random actions.
 
-    Example: softmode bench softmode/LiftSoft-v0 --num-envs 1 16 --stages
+    Example: softmode bench softmode/LiftSoft-v0 --num-envs 1 16
     """
 
     env: str

@@ -1,4 +1,4 @@
-"""The commands ``softmode body build``, ``softmode body show`` and ``softmode body check``."""
+"""The commands ``softmode body build``, ``body show``, ``body check`` and ``body cut``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from softmode.deformables.body.reduced_body import ReducedBody
     from softmode.deformables.body.regions import Region
     from softmode.deformables.build.report import BodyReport
-    from softmode.splats.splats import Splats
+    from softmode.objects.soft_object import SoftObject
 
 
 SHOWN = {"youngs_modulus": 1.0e5, "density": 300.0}
@@ -31,23 +31,26 @@ class _Asset:
 
     file: Annotated[Path | None, optional_argument()] = None
     """Splats (.ply, .splat, .spz, .sog, meta.json, .usd, ...), a mesh (.glb, .obj, .stl, .usd, ...) or a point cloud
-    (.npz with points, normals, colors; .ply); --splat and --object name one too."""
+    (.npz with points, normals, colors; .ply), or a preset's name; --splat and --object name one too."""
     functions: int | None = None
     """Scalar functions, chosen by elastic energy; 48 if omitted."""
     accuracy: float | None = None
     """Or as many as the first six frequencies take to be this near to those of the whole space, such as 0.02."""
     modes: int | None = None
     """FreeForm's functions instead: so many skinning eigenmodes beside the constant handle."""
-    handles: Literal["affine", "quadratic"] | None = None
-    """What each eigenmode carries: (X, Y, Z, 1), or all ten monomials up to degree two, for slender and flat bodies."""
+    handles: Literal["affine", "quadratic", "local"] | None = None
+    """What each eigenmode carries: (X, Y, Z, 1), or all ten monomials up to degree two, for slender and flat bodies; or
+    local handles in their place."""
+    local_count: int | None = None
+    """Number of local handles; 16 if omitted."""
     kernels: int | None = None
     """Reproducing kernels; 1000 if omitted, 400 with eigenmodes."""
     points: int = 384
     """Cubature points, at which a step evaluates stress."""
     surface: int = 400
     """Surface samples, which feel contact."""
-    splats: int = 2000
-    """Splats on a mesh; a splat file keeps its own."""
+    splats: int | None = None
+    """Splats on a mesh, 2000 if omitted, or on a preset, 6000; a splat file keeps its own."""
     rank_tolerance: float | None = None
     """Functions smaller than this are dropped as noise; 1e-5 if omitted, 1e-9 for slender and flat bodies."""
     poissons_ratio: tuple[float, ...] = (0.4,)
@@ -102,8 +105,9 @@ class BodyBuild(_Asset):
         out = self.target(self.out, ".npz")
         from softmode.objects.object_file import write_object
 
-        body, splats, report = _examined(self)
-        write_object(out, body, splats)
+        thing, report = _examined(self)
+        body, splats = thing.body, thing.visible_splats
+        write_object(out, body, splats, thing.radiance)
         _print_report(report, measures=False)
         print(
             f"wrote {body.name!r} to {out}: {body.function_count} functions, {body.point_count} cubature points, "
@@ -125,9 +129,13 @@ class BodyShow(_Asset):
     def run(self) -> int:
         """Draw, print, return 0."""
         out = self.target(self.out, ".png")
-        from softmode.viz.body_picture import mode_frequencies, rest_grasps, write_body_picture
+        from softmode.objects.rest_grasps import rest_grasps
+        from softmode.robots.arm import ArmDescription
+        from softmode.robots.jaws import ParallelJaw
+        from softmode.viz.body_picture import mode_frequencies, write_body_picture
 
-        body, splats, report = _examined(self)
+        thing, report = _examined(self)
+        body, splats = thing.body, thing.visible_splats
         material = _material(body)
         with quiet_warp():
             write_body_picture(out, body, splats, report, **material)
@@ -137,7 +145,7 @@ class BodyShow(_Asset):
         lowest = mode_frequencies(body, **material)[:8]
         print(f"{'frequencies [Hz]':34} {'  '.join(f'{value:.4g}' for value in lowest)}")
         try:
-            best = rest_grasps(body, **material)[0]
+            best = rest_grasps(body, ParallelJaw.of(ArmDescription()), **material)[0]
             width, height = 1e3 * best.width, 1e3 * (best.position[2] - body.bounds[0, 2])
             print(
                 f"{'grasp [mm, mm, deg]':34} {width:.0f} wide, {height:.0f} high, turned {math.degrees(best.yaw):.0f}"
@@ -160,7 +168,8 @@ class BodyCheck(_Asset):
         """Measure, print findings with remedies, return the exit code."""
         from softmode.viz.body_picture import mode_frequencies
 
-        body, _, report = _examined(self)
+        thing, report = _examined(self)
+        body = thing.body
         material = _material(body)
         print(f"{'made of, stored or given':44} {body.provenance.get('material', 'nothing said')}")
         print(f"{'first frequency [Hz]':44} {mode_frequencies(body, **material)[0]:.4g}")
@@ -169,8 +178,67 @@ class BodyCheck(_Asset):
         return report.severity
 
 
-def _examined(options: _Asset) -> tuple[ReducedBody, Splats, BodyReport]:
-    """Return a body with its splats and its report: read, or built from its asset."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BodyCut(_Asset):
+    """Cut a body by planes and save its parts with their splats; exit code 0, or 1 if nothing is cut.
+
+    Example: softmode body cut toy.npz --plane 0,0,0.04,0,0,1
+    """
+
+    plane: tuple[str, ...] = ()
+    """x,y,z,nx,ny,nz: a point [m] and the normal of a plane. Coordinates: z up, bounding box centred over the origin,
+    standing on z = 0. Several, after each other, cut one after the other."""
+    inside: tuple[float, float, float] | None = None
+    """Colour 0..1 of the faces that are opened; the mean of the splats if omitted."""
+    out: Annotated[Path | None, short_name("-o")] = None
+    """Body files to write: FILE-1.npz, FILE-2.npz, ... for FILE.npz, which stands beside the file if omitted."""
+
+    def run(self) -> int:
+        """Cut, write, say what happened."""
+        if not self.plane:
+            raise ConfigError("no plane is given", hint="give one like --plane 0,0,0.04,0,0,1")
+        planes = [_six_numbers("plane", text) for text in self.plane]
+        if self.out is not None and self.out.suffix.lower() != ".npz":
+            raise ConfigError(f"out {self.out} is no .npz file", hint="name it like toy.npz")
+        base = self.path.with_suffix(".npz") if self.out is None else self.out
+        check_place(base, "file", make_folders=False)
+        import numpy as np
+
+        from softmode.deformables.build.patch import Patch
+        from softmode.objects.cut import cut_object
+        from softmode.objects.object_file import write_object
+
+        thing, _ = _examined(self)
+        body = thing.body
+        low, high = body.bounds + body.offset
+        seat = np.array([*(0.5 * (low + high))[:2], low[2]])
+        parts = [thing]
+        for numbers in planes:
+            patch = Patch.plane(seat + numbers[:3], numbers[3:])
+            found = [cut_object(part, patch, inside=self.inside) for part in parts]
+            parts = [made for made_of, _ in found for made in made_of]
+            for note in [note for _, cut in found for note in cut.notes if len(found) == 1 or not cut.missed]:
+                print(note)
+        if len(parts) == 1 and parts[0].body is body:
+            return 1
+        for number, part in enumerate(parts, 1):
+            path = base.with_name(f"{base.stem}-{number}.npz")
+            write_object(path, part.body, part.splats)
+            count = 0 if part.splats is None else part.splats.count
+            print(
+                f"wrote {part.body.name!r} to {path}: {part.body.volume / body.volume:.1%} of the volume, "
+                f"{part.body.function_count} functions, {part.body.surface_count} surface samples, {count} splats"
+            )
+        return 0
+
+
+def _six_numbers(option: str, text: str) -> list[float]:
+    """Return six numbers separated by commas."""
+    return named_numbers(option, f"plane={text}", (6,))[1]
+
+
+def _examined(options: _Asset) -> tuple[SoftObject, BodyReport]:
+    """Return an object with its splats, and its body's report: read, or built from its asset."""
     from softmode.deformables.build.functions import RANK_TOLERANCE
     from softmode.deformables.build.options import BuildOptions
     from softmode.deformables.build.report import report_body
@@ -182,7 +250,7 @@ def _examined(options: _Asset) -> tuple[ReducedBody, Splats, BodyReport]:
     options.toy.check()
     path = options.path
     toy = options.toy if options.file is None else dataclasses.replace(options.toy, object=path)
-    if toy.splat is None and file_kind(path) == "body":
+    if toy.splat is None and toy.preset is None and file_kind(path) == "body":
         given = [f.name for f in dataclasses.fields(_Asset) if getattr(options, f.name) != f.default]
         given = [*(name.replace("_", "-") for name in given if name not in ("file", "toy")), *toy.shape]
         if given or isinstance(options, BodyBuild):
@@ -205,7 +273,7 @@ def _examined(options: _Asset) -> tuple[ReducedBody, Splats, BodyReport]:
     if made_of:
         body = dataclasses.replace(body, provenance={**body.provenance, "material": json.dumps(made_of)})
     report = report_body(body, quadrature=quadrature, splats=splats.means, size=found.size_asked)
-    return body, splats, report
+    return dataclasses.replace(found, body=body, splats=splats), report
 
 
 def _material(body: ReducedBody) -> dict[str, float]:

@@ -15,6 +15,7 @@ from softmode.errors import ConfigError
 if TYPE_CHECKING:
     from softmode.deformables.build.report import Finding
     from softmode.objects.soft_object import SoftObject
+    from softmode.robots.arm import ArmDescription
 
 
 def short_name(name: str) -> Any:
@@ -90,7 +91,7 @@ def finding_line(finding: Finding, stream: TextIO) -> str:
 
 
 def warn_of_object(env: Any) -> None:
-    """Print, on stderr, what the user should know about an environment's object that comes from a file.
+    """Print, on stderr, what the user should know about an environment's object that is a file or a preset.
 
     Args:
         env: A single or a vector environment; one that is not softmode's has no such object.
@@ -98,19 +99,23 @@ def warn_of_object(env: Any) -> None:
     from softmode.objects.loader import load
 
     base = env.unwrapped
-    if not hasattr(base, "task_class") or base.config.scene.object.file is None:
+    if not hasattr(base, "task_class"):
         return
     scene = base.config.scene
+    if scene.object.file is None and scene.object.preset is None:
+        return
     try:
         thing = base.task.scene.soft
     except ConfigError:  # The worlds live in other processes, which have put the body into the cache.
         thing = load(scene.object, material=scene.material)
-    warn_of(thing, scene.arm.gripper.stroke if base.task_class.grasps else None)
+    warn_of(thing, scene.arm if base.task_class.grasps else None)
 
 
-def warn_of(thing: SoftObject, opening: float | None = None) -> None:
-    """Print, on stderr, what the user should know about an object that a gripper of an opening [m], if any, takes."""
-    for finding in thing.findings(opening=opening):
+def warn_of(thing: SoftObject, arm: ArmDescription | None = None) -> None:
+    """Print, on stderr, what the user should know about an object that an arm, if any, is to take."""
+    from softmode.robots.jaws import ParallelJaw
+
+    for finding in thing.findings(jaw=None if arm is None else ParallelJaw.of(arm)):
         print(f"softmode: {finding_line(finding, sys.stderr)}", file=sys.stderr, flush=True)
 
 

@@ -25,7 +25,7 @@ class ListEnvs:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Robots:
-    """List the robots that load by name, or fetch some into the cache so that they load without a network.
+    """List the robots that load by name, or fetch some to the cache.
 
     Example: softmode robots fetch so101 ur5e
     """

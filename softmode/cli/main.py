@@ -1,4 +1,4 @@
-"""The command line: play, train, evaluate, export, record, view, bench, list-envs, robots, splat and body."""
+"""The command line: play, train, evaluate, check, record, view, morph, bench, splat, radiance, body, objects, ..."""
 
 from __future__ import annotations
 
@@ -9,9 +9,13 @@ from typing import Annotated, Any
 
 from softmode import __version__
 from softmode.cli.bench import Bench
-from softmode.cli.body import BodyBuild, BodyCheck, BodyShow
+from softmode.cli.body import BodyBuild, BodyCheck, BodyCut, BodyShow
+from softmode.cli.check import Check
 from softmode.cli.listing import ListEnvs, Robots
+from softmode.cli.morph import Morph
+from softmode.cli.objects import ObjectsExport, ObjectsList, ObjectsShow
 from softmode.cli.play import Play
+from softmode.cli.radiance import RadianceBake, RadianceInfo
 from softmode.cli.record import Record
 from softmode.cli.splat import SplatConvert, SplatFromMesh, SplatInfo, SplatShow
 from softmode.cli.train import Evaluate, Export, Train
@@ -21,6 +25,7 @@ from softmode.errors import SoftmodeError, needs_extra
 FIRST_STEPS = """softmode simulates soft objects made of splats or meshes, and robots that grasp them. To begin with:
 
   softmode play softmode/LiftSoft-v0 --video out/lift.mp4                    a robot lifts a toy; the film
+  softmode play softmode/LiftSoft-v0 --object mug --video out/mug.mp4        another object; softmode objects list
   softmode view                                                             pull a toy with the mouse, in a browser
   softmode body check toy.ply                                               what your own splats or mesh would become
   softmode play softmode/LiftSoft-v0 --splat toy.ply --video out/toy.mp4     the robot lifts your own
@@ -50,11 +55,18 @@ def main(arguments: list[str] | None = None) -> int:
             )
 
         kinds = one_of({"play": Play, "train": Train, "evaluate": Evaluate, "export": Export, "bench": Bench})
-        kinds |= one_of({"record": Record, "view": View, "list-envs": ListEnvs, "robots": Robots})
+        kinds |= one_of({"record": Record, "view": View, "morph": Morph})
+        kinds |= one_of({"check": Check, "list-envs": ListEnvs, "robots": Robots})
         splat = one_of({"show": SplatShow, "from-mesh": SplatFromMesh, "info": SplatInfo, "convert": SplatConvert})
         kinds |= Annotated[splat, subcommand("splat", description="Draw, make, inspect and convert splat files.")]
-        body = one_of({"build": BodyBuild, "show": BodyShow, "check": BodyCheck})
-        kinds |= Annotated[body, subcommand("body", description="Build, draw and check the bodies of soft objects.")]
+        radiance = one_of({"info": RadianceInfo, "bake": RadianceBake})
+        kinds |= Annotated[radiance, subcommand("radiance", description="Inspect fields, bake them to splats.")]
+        body = one_of({"build": BodyBuild, "show": BodyShow, "check": BodyCheck, "cut": BodyCut})
+        kinds |= Annotated[
+            body, subcommand("body", description="Build, draw, check and cut the bodies of soft objects.")
+        ]
+        objects = one_of({"list": ObjectsList, "show": ObjectsShow, "export": ObjectsExport})
+        kinds |= Annotated[objects, subcommand("objects", description="List, draw and write the preset objects.")]
         config = (tyro.conf.PositionalRequiredArgs, tyro.conf.DisallowNone)
         return tyro.cli(kinds, prog="softmode", args=arguments, config=config).run()
     except SoftmodeError as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from softmode.checks import require_number
 from softmode.errors import ConfigError, MaterialError
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from softmode.envs.task_config import TaskConfig
     from softmode.objects.config import ObjectConfig, StifferBox
 
+Config = TypeVar("Config", bound="TaskConfig")
 _MATERIAL = ("youngs_modulus", "density", "friction")
 _SPLAT_ONLY = ("crop", "part", "resolution")
 
@@ -24,9 +25,10 @@ class ObjectOptions:
     splat: Path | None = None
     """Splat file: .ply, .spz, .splat, .sog, a SOG folder or its meta.json, .usd; or a point cloud."""
     object: Path | None = None
-    """File of any kind: a mesh, a body of `softmode body build`, splats, an OpenUSD stage."""
+    """File of any kind: a mesh, a body of `softmode body build`, splats, a radiance field, an OpenUSD stage; or a
+    preset's name, see `softmode objects list`."""
     size: float | None = None
-    """Longest edge [m]; 0.08 if a file is given."""
+    """Longest edge [m]; 0.08 if a file is given, a preset has its own."""
     up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
     """Axis of the file that points up; -y for splats, +y for glTF, +z for the rest."""
     crop: tuple[float, float, float, float, float, float] | None = None
@@ -45,6 +47,8 @@ class ObjectOptions:
     """Coulomb's coefficient of the object."""
     stiffness: tuple[str, ...] = ()
     """NAME=x0,y0,z0,x1,y1,z1,FACTOR: a part FACTOR times as stiff, where the object stands [m]."""
+    stiffness_by_color: tuple[str, ...] = ()
+    """'#rrggbb:FACTOR': what has this colour is FACTOR times as stiff."""
 
     def check(self) -> None:
         """Refuse what cannot be, before any work is done.
@@ -64,8 +68,15 @@ class ObjectOptions:
 
     @property
     def file(self) -> Path | None:
-        """The file that is given."""
+        """The file that is given, or the name of a preset."""
         return self.object if self.splat is None else self.splat
+
+    @property
+    def preset(self) -> str | None:
+        """The preset that is named in place of a file."""
+        from softmode.objects.presets import PRESETS
+
+        return str(self.file) if str(self.object) in PRESETS else None
 
     @property
     def material(self) -> dict[str, float]:
@@ -77,7 +88,13 @@ class ObjectOptions:
         """The options that say how a file becomes an object, as fields of `ObjectConfig`."""
         names = ("size", "up", "crop", "part", "pose", "resolution")
         given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        return given | ({"stiffness": tuple(map(stiffer_box, self.stiffness))} if self.stiffness else {})
+        if self.stiffness:
+            given["stiffness"] = tuple(map(stiffer_box, self.stiffness))
+        if self.stiffness_by_color:
+            from softmode.objects.paint import StifferColor
+
+            given["stiffness_colors"] = tuple(map(StifferColor.parse, self.stiffness_by_color))
+        return given
 
     @property
     def is_given(self) -> bool:
@@ -96,19 +113,28 @@ class ObjectOptions:
 
         self.check()
         given: dict[str, Any] = self.shape
-        if self.file is not None:
+        if self.preset is not None:
+            base = ObjectConfig(surface_count=base.surface_count, build=base.build, preset=self.preset)
+        elif self.file is not None:
             found = "splat" if self.splat is not None else file_kind(self.file)
             kind = "splat" if found == "points" else found
             base = ObjectConfig(surface_count=base.surface_count, build=base.build).changed(**{kind: self.file})
         if base.body is not None:
             self._refuse(given, f"the body {base.body}", "give them to softmode body build")
         elif base.extents is not None:
-            self._refuse(set(given) - {"stiffness"}, f"a {base.shape} of {base.extents} m", "give a --splat file too")
-        elif base.mesh is not None:
-            self._refuse({*given} & {*_SPLAT_ONLY}, f"the mesh {base.mesh}", "they are for splats: leave them out")
+            self._refuse(
+                set(given) - {"stiffness", "stiffness_colors"},
+                f"a {base.shape} of {base.extents} m",
+                "give a --splat file too",
+            )
+        elif base.mesh is not None or base.preset is not None:
+            what = f"the mesh {base.mesh}" if base.preset is None else f"the preset {base.preset}"
+            self._refuse({*given} & {*_SPLAT_ONLY}, what, "they are for splats: leave them out")
+        elif base.radiance is not None:
+            self._refuse({*given} & {"part"}, f"the field {base.radiance}", "it is for splats: leave it out")
         return base.changed(**given) if given else base
 
-    def configured(self, config: TaskConfig) -> TaskConfig:
+    def configured(self, config: Config) -> Config:
         """Return the configuration of a task with this object and material, the same in all episodes.
 
         Raises:
@@ -116,9 +142,12 @@ class ObjectOptions:
             ConfigError: If an option says nothing about this object, or the task cannot have it.
         """
         from softmode.objects.object_file import read_object, stored_material
+        from softmode.objects.presets import find_preset
 
         thing = self.object_of(config.scene.object).pinned()
         stored = {} if thing.body is None else stored_material(read_object(thing.body).body)
+        if thing.preset is not None:
+            stored = find_preset(thing.preset).properties
         made = {**stored, **self.material}
         material = dataclasses.replace(config.scene.material, **made)
         scene = dataclasses.replace(config.scene, object=thing, material=material)

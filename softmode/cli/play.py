@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from softmode.checks import require_number, require_numbers
-from softmode.cli.common import BuildBar, bar_interval, own_object, quiet_warp, warn_of_object, warp_device
+from softmode.cli.common import BuildBar, bar_interval, own_object, quiet_warp, warn_of_object
 from softmode.cli.object_options import ObjectOptions
 from softmode.envs.catalogue import registered_id
 from softmode.errors import ConfigError
@@ -22,6 +22,7 @@ from softmode.viz.film import Film
 if TYPE_CHECKING:
     import gymnasium as gym
 
+    from softmode.envs.tasks.lift_soft.log import LiftLog
     from softmode.splats.splats import Splats
 
 
@@ -99,7 +100,7 @@ def _play(options: Play, film: Film | None) -> int:
     background = None if options.background is None else _background(options.background, options.background_pose)
     with quiet_warp():
         with BuildBar() as progress:
-            given |= {"config": config, "device": warp_device(options.device), "progress": progress}
+            given |= {"config": config, "device": options.device, "progress": progress}
             env = gym.make(options.env, render_mode="rgb_array" if film or options.rerun else None, **given)
         warn_of_object(env)
         try:
@@ -180,13 +181,21 @@ def _play_episode(
             if story is not None:
                 story.record(info)
             bar.update()
-    why = "" if story is None or info["is_success"] else f", {story.reason(info)}"
+    why = "" if info["is_success"] else _why(story, policy, info)
     modulus = info["parameters"]["youngs_modulus"]
     print(
         f"seed {seed}: E {modulus:.3g} Pa, {1e3 * seconds / max(steps - 1, 1):.1f} ms per control step, "
         f"return {total:.1f}, success: {info['is_success']}{why}"
     )
     return bool(info["is_success"])
+
+
+def _why(story: LiftLog | None, policy: Any, info: dict[str, Any]) -> str:
+    """Return why an episode failed, as the end of a line; empty where nothing is known."""
+    told = [] if story is None else [story.reason(info)]
+    if trouble := getattr(policy, "trouble", ""):
+        told.append(f"no grasp fits where it lies now: {trouble}")
+    return "".join(f", {reason}" for reason in told)
 
 
 def _background(path: Path, pose: tuple[float, ...]) -> Splats:

@@ -14,7 +14,6 @@ from softmode.cli.common import (
     quiet_warp,
     short_name,
     warn_of_object,
-    warp_device,
 )
 from softmode.cli.object_options import ObjectOptions
 from softmode.envs.catalogue import purpose, registered_id
@@ -86,7 +85,7 @@ class Record:
         given = self.toy.env_options(self.env, given)
         with quiet_warp():
             with BuildBar() as progress:
-                made = {**with_config(self.env, given), "device": warp_device(self.device), "progress": progress}
+                made = {**with_config(self.env, given), "device": self.device, "progress": progress}
                 env = gym.make(self.env, **made)
             warn_of_object(env)
         try:

@@ -41,7 +41,7 @@ class SplatFromMesh:
     def run(self) -> int:
         """Sample, fit, write; return the exit code."""
         out = self.out if self.out is not None else self.mesh.with_name(f"{self.mesh.stem}_splats.ply")
-        _check_target(out)
+        check_splat_target(out)
         if self.size is not None:
             require_number("size", self.size, above=0.0, hint="give it in metres, like 0.08")
         require_number("count", self.count, at_least=1, hint="give a number of splats like 10000")
@@ -117,7 +117,10 @@ class SplatInfo:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SplatShow:
-    """Draw a capture before it is built: four views, what would be cut, the section of the solid that fills it."""
+    """Draw a capture before it is built: four views, what would be cut, the section of the solid that fills it.
+
+    Example: softmode splat show toy.ply --up -y
+    """
 
     file: Path
     """The splat file."""
@@ -177,7 +180,7 @@ class SplatConvert:
         from softmode.splats.formats import CONVENTIONS, read_splats, write_splats
         from softmode.stages import tokens
 
-        _check_target(self.target)
+        check_splat_target(self.target)
         if self.convention is None and self.up is not None:
             raise ConfigError("--up says nothing without a convention", hint="give --convention too, like spz")
         splats = read_splats(self.source)
@@ -190,7 +193,7 @@ class SplatConvert:
         return 0
 
 
-def _check_target(path: Path) -> None:
+def check_splat_target(path: Path) -> None:
     """Refuse a file that cannot be written before any work is done."""
     from softmode.splats.formats import WRITABLE
 

@@ -20,9 +20,7 @@ from softmode.learning.players import require_torch
 class Train:
     """Train a policy with PPO.
 
-    Example: softmode train softmode/LiftSoft-v0 --splat toy.ply --time-limit 1800 --name toy
-
-    Several GPUs: torchrun --nproc-per-node 2 -m softmode.cli train ID --device cuda
+    Example: softmode train softmode/LiftSoft-v0 --splat toy.ply
     """
 
     env: str
@@ -106,9 +104,9 @@ class Train:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Evaluate:
-    """Play whole episodes with a trained policy and print how often it succeeds.
+    """Print how often a trained policy succeeds in whole episodes.
 
-    Example: softmode evaluate softmode/LiftSoft-v0 policies/lift_soft.npz --splat toy.ply --episodes 20
+    Example: softmode evaluate softmode/LiftSoft-v0 runs/toy/best.npz
     """
 
     env: str
@@ -155,9 +153,9 @@ class Evaluate:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write the policy of a run's checkpoint to a file of its own, without optimizer and critic.
+    """Write the policy of a checkpoint to a file of its own.
 
-    Example: softmode export runs/LiftSoft-v0/20261121-101500/best.npz policies/mine.npz
+    Example: softmode export runs/toy/best.npz toy.npz
     """
 
     checkpoint: Path

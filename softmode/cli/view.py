@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import sys
@@ -16,22 +17,26 @@ from softmode.cli.object_options import ObjectOptions
 from softmode.errors import AssetError, ConfigError
 from softmode.learning.config_values import split_config
 from softmode.learning.players import trained_policy
+from softmode.mpm.run import is_morph
 
 if TYPE_CHECKING:
     from softmode.view.app import ViewOptions
     from softmode.view.session import LiveSession
 
+_ELSEWHERE = ("target", "prepare", "toy", "splat", "object", "up", "crop")
+"""Options that the page which prepares a capture writes itself, or ends."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View:
-    """Show a soft object or an environment in the browser; pull and pin it with the mouse, tune it with sliders.
+    """Show an object or a task in the browser; pull, pin and tune it.
 
     Example: softmode view toy.ply --size 0.12 --scene drop
     """
 
     target: tuple[str, ...]
-    """An environment's id, or the file of a splat, a mesh, a saved body (.npz) or an OpenUSD stage; the built-in plush
-    if omitted."""
+    """An environment's id; the file of a splat, a mesh, a radiance field, a saved body (.npz) or an OpenUSD stage; a
+    preset's name; the run of `softmode morph` (.npz), which is played back; the built-in plush if omitted."""
     scene: Literal["hang", "drop"] = "hang"
     """An object hangs, held by one end, or drops on a table."""
     hold: Literal["top", "base"] = "top"
@@ -63,53 +68,87 @@ class View:
 
     def run(self) -> int:
         """Serve; return the exit code."""
-        from softmode.view.app import ViewApp, ViewOptions
+        from softmode.view.app import ViewOptions
 
         if self.duration is not None:
             require_number("duration", self.duration, above=0.0, hint="give seconds, like 60")
         served = ViewOptions(**same_fields(self, ViewOptions))
         served.check()  # a building that takes a minute need not come first
+        if len(self.target) == 1 and is_morph(self.target[0]):
+            return _played(self, served)
         with quiet_warp():
             shown = _prepared(self, served) if self.prepare else self
-            if shown is None:
-                return 0
-            session = _session(shown)
+            while shown is not None and _serve(shown, served):
+                shown = _prepared(shown, served)
+        return 0
+
+
+def _serve(options: View, served: ViewOptions) -> bool:
+    """Serve a session until it ends; return whether somebody asked to prepare its capture instead."""
+    from softmode.view.app import ViewApp
+
+    session = _session(options)
+    try:
+        with ViewApp(session, served, capture=_is_capture(_file(options))) as app:
+            print(f"softmode: open {app.url} in a browser; Ctrl-C ends it", flush=True)
+            if not served.is_local:
+                print(
+                    f"softmode: warning: listening at {options.host}: anyone who reaches port "
+                    f"{app.url.rpartition(':')[2]} of this machine can drive this session, without a password",
+                    file=sys.stderr,
+                )
+            if options.open:
+                _open(app.url)
             try:
-                with ViewApp(session, served) as app:
-                    print(f"softmode: open {app.url} in a browser; Ctrl-C ends it", flush=True)
-                    if not served.is_local:
-                        print(
-                            f"softmode: warning: listening at {self.host}: anyone who reaches port "
-                            f"{app.url.rpartition(':')[2]} of this machine can drive this session, without a password",
-                            file=sys.stderr,
-                        )
-                    if self.open:
-                        _open(app.url)
-                    try:
-                        app.run(self.duration)
-                    except KeyboardInterrupt:
-                        print("softmode: stopped", file=sys.stderr)
-                    if session.status().recording:
-                        print(f"softmode: wrote {session.stop_recording()}")
+                app.run(options.duration)
             except KeyboardInterrupt:
                 print("softmode: stopped", file=sys.stderr)
-            finally:
-                session.close()
-        return 0
+            if session.status().recording:
+                print(f"softmode: wrote {session.stop_recording()}")
+            return app.asked_to_prepare
+    except KeyboardInterrupt:
+        print("softmode: stopped", file=sys.stderr)
+        return False
+    finally:
+        session.close()
+
+
+def _file(options: View) -> Path | None:
+    """Return the file that is shown, if it is one."""
+    return options.toy.file if not options.target else Path(options.target[0])
+
+
+def _is_capture(file: Path | None) -> bool:
+    """Return whether a file holds splats."""
+    from softmode.objects.object_file import file_kind
+
+    return file is not None and file.exists() and file_kind(file) == "splat"
+
+
+def _played(options: View, served: ViewOptions) -> int:
+    """Play a morph back."""
+    from softmode.mpm import MorphRun
+    from softmode.view.morph_page import MorphPage
+
+    with MorphPage(MorphRun.load(options.target[0]), served) as page:
+        print(f"softmode: open {page.url} in a browser; Ctrl-C ends it", flush=True)
+        if options.open:
+            _open(page.url)
+        with contextlib.suppress(KeyboardInterrupt):
+            page.play(options.duration)
+    return 0
 
 
 def _prepared(options: View, served: ViewOptions) -> View | None:
     """Return the options with what a person made of a splat file on a page; None if they did not build it."""
-    from softmode.objects.object_file import file_kind
     from softmode.view.prepare import PreparePage
 
-    toy = options.toy
-    file = toy.file if not options.target else Path(options.target[0])
-    if file is None or not file.exists() or file_kind(file) != "splat":
+    toy, file = options.toy, _file(options)
+    if file is None or not _is_capture(file):
         raise AssetError(
             f"nothing to prepare in {file or 'the plush'}", hint="give a splat file, or leave out --prepare"
         )
-    with PreparePage(file, served, up=toy.up, crop=toy.crop) as page:
+    with PreparePage(file, served, up=toy.up, crop=toy.crop, rest=_words(options)) as page:
         print(f"softmode: open {page.url} in a browser; Ctrl-C ends it", flush=True)
         if options.open:
             _open(page.url)
@@ -123,12 +162,28 @@ def _prepared(options: View, served: ViewOptions) -> View | None:
         return dataclasses.replace(options, toy=dataclasses.replace(toy, up=page.up, crop=page.crop))
 
 
+def _words(options: View) -> list[str]:
+    """Return the words of the command line beside the file, and what is chosen on the page."""
+    words: list[str] = []
+    for group in (options, options.toy):
+        plain = View(target=()) if group is options else ObjectOptions()
+        for field in dataclasses.fields(group):
+            value = getattr(group, field.name)
+            if field.name in _ELSEWHERE or value == getattr(plain, field.name):
+                continue
+            option = field.name.replace("_", "-")
+            words += [f"--no-{option}"] if value is False else [f"--{option}"]
+            words += [] if value is False else map(str, value if isinstance(value, tuple) else (value,))
+    return words
+
+
 def _session(options: View) -> LiveSession:
     """Make the session that was asked for."""
     from gymnasium.envs.registration import registry
 
     from softmode.envs.catalogue import env_class, registered_id
     from softmode.objects.config import ObjectConfig
+    from softmode.objects.presets import PRESETS
     from softmode.view.session import LiveSession
 
     options.toy.check()
@@ -137,7 +192,7 @@ def _session(options: View) -> LiveSession:
         raise ConfigError(f"{len(options.target)} things to show: {', '.join(options.target)}", hint="name one")
     device, target = warp_device(options.device), next(iter(options.target), None)
     with BuildBar() as progress:
-        missing = target is not None and not Path(target).exists()
+        missing = target is not None and target not in PRESETS and not Path(target).exists()
         if target is not None and missing and (target.startswith("softmode/") or ":" in target or target in registry):
             registered_id(target)
             _refuse(options, ("scene", "hold"), "an environment")
@@ -147,18 +202,18 @@ def _session(options: View) -> LiveSession:
             session = LiveSession.from_env(
                 target, policy=options.policy, config=config, seed=options.seed, device=device, progress=progress
             )
-            if config.scene.object.file is not None:
+            if config.scene.object.file is not None or config.scene.object.preset is not None:
                 grasps = env_class(target).task_class.grasps
-                warn_of(session.object, config.scene.arm.gripper.stroke if grasps else None)
+                warn_of(session.object, config.scene.arm if grasps else None)
             return session
         if missing:
             raise AssetError(
                 f"{target} is neither a file nor an environment",
-                hint=f"give a splat, mesh or .npz file, or one of {', '.join(ENVIRONMENTS)}",
+                hint=f"give a splat, mesh or .npz file, or one of {', '.join([*ENVIRONMENTS, *PRESETS])}",
             )
         _refuse(options, ("policy", "seed"), "an object")
         source = target
-        if options.toy.shape or options.toy.file is not None:
+        if options.toy.shape or options.toy.file is not None or target in PRESETS:
             if target is not None and options.toy.file is not None:
                 raise ConfigError(f"{target} and {options.toy.file} are two objects", hint="name one")
             file = options.toy.object if target is None else Path(target)

@@ -21,8 +21,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from softmode.checks import require_number
+from softmode.deformables.build.patch import Patch
 from softmode.errors import ConfigError, SoftmodeError, needs_extra
-from softmode.view.live_types import Vector, finite_vector
+from softmode.view.live_types import Hit, Vector, finite_vector
 from softmode.view.panel import Command, MouseMode, Panel
 from softmode.view.stage import Stage
 
@@ -82,18 +83,22 @@ class ViewApp:
     Args:
         session: What to show.
         options: Where, and how often.
+        capture: Whether the page has a button that asks to turn and crop the capture which the session shows.
 
     Raises:
         ConfigError: If the address or the port cannot be used.
         MissingExtraError: If viser is not installed.
     """
 
-    def __init__(self, session: LiveSession, options: ViewOptions | None = None) -> None:
+    def __init__(self, session: LiveSession, options: ViewOptions | None = None, *, capture: bool = False) -> None:
         """Start the server and build the page."""
         self.session, self.options = session, options or ViewOptions()
+        self.asked_to_prepare = False
+        """Whether somebody pressed that button, which ends :meth:`run`."""
         self._commands: queue.SimpleQueue[Command] = queue.SimpleQueue()
         self._stop = threading.Event()
         self._drag: _Drag | None = None
+        self._touched: list[Hit] = []
         self._sent: deque[float] = deque(maxlen=60)
         self._told = -np.inf
         self._clients = 0
@@ -103,8 +108,10 @@ class ViewApp:
                 self._server, session, on_drag=self._on_drag, on_click=self._on_click, on_pin=self._on_pin
             )
             self._panel = Panel(
-                self._server, session, submit=self.submit, on_mode=self._on_mode, record_path=self._record_path
-            )
+                self._server, session, submit=self.submit, on_mode=self._on_mode, record_path=self._record_path,
+                on_prepare=self.prepare if capture else None,
+            )  # fmt: skip
+            aim(self._server)
         except BaseException:
             self.close()
             raise
@@ -146,6 +153,11 @@ class ViewApp:
     def stop(self) -> None:
         """Let :meth:`run` return; may be called from any thread."""
         self._stop.set()
+
+    def prepare(self) -> None:
+        """Ask to turn and crop the capture, as the button does; may be called from any thread."""
+        self.asked_to_prepare = True
+        self.stop()
 
     def close(self) -> None:
         """End the server; may be called twice."""
@@ -229,6 +241,13 @@ class ViewApp:
         self, session: LiveSession, client: int, phase: str, eye: Vector, forward: Vector, start: Vector, end: Vector
     ) -> None:
         """Begin, follow or end a drag; one at a time, the first one's."""
+        mode = self._panel.mouse_mode
+        if mode in ("cut", "slit") and self._drag is None:
+            self._draw_stroke(session, mode, phase, eye, start, end)
+            return
+        if mode == "paint" and self._drag is None:
+            self._draw_brush(session, phase, eye, end)
+            return
         if phase == "start":
             if self._drag is not None:
                 return
@@ -260,6 +279,29 @@ class ViewApp:
             self._drag = None
             if drag.pin is None:
                 session.end_drag()
+
+    def _draw_stroke(
+        self, session: LiveSession, mode: MouseMode, phase: str, eye: Vector, start: Vector, end: Vector
+    ) -> None:
+        """Show the stroke of a knife, and cut at its end: by the whole plane of the two rays, or between them alone."""
+        self._stage.stroke = None if phase == "end" else (start, end)
+        if phase == "end":
+            patch = Patch.stroke(eye, start, end)
+            session.cut(patch if mode == "slit" else Patch.plane(eye, np.cross(start - eye, end - eye)))
+
+    def _draw_brush(self, session: LiveSession, phase: str, eye: Vector, end: Vector) -> None:
+        """Gather where a stroke touches the object, and paint at its end."""
+        if phase == "start":
+            self._touched.clear()
+        hit = session.pick(eye, end - eye)
+        if hit is not None:
+            self._touched.append(hit)
+            self._stage.stroke = (self._touched[0].point, hit.point)
+        if phase == "end":
+            self._stage.stroke = None
+            factor, radius, depth = self._panel.brush
+            size = float(np.linalg.norm(np.ptp(session.object.body.bounds, axis=0)))
+            session.paint(self._touched, factor, radius=radius * size, depth=depth * size)
 
     def _record_path(self) -> Path:
         """Name the next recording."""
@@ -319,6 +361,18 @@ def start_server(options: ViewOptions) -> viser.ViserServer:
     # Any browser may ask viser for a tunnel to a public server, button or not.
     server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
     return server
+
+
+def aim(server: viser.ViserServer) -> None:
+    """Let pages of an earlier server at this address, which connect again, look where a new page does."""
+    first = server.initial_camera
+
+    async def look(client: viser.ClientHandle) -> None:  # async, so that it comes before what the page sends next
+        camera = client.camera
+        camera.fov, camera.near, camera.far = first.fov, first.near, first.far
+        camera.position, camera.look_at = first.position, first.look_at
+
+    server.on_client_connect(look)
 
 
 def _free_port(host: str, port: int) -> int:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
 
 from softmode.checks import require_number
+from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.tools.grips import Grip, Grips
 from softmode.errors import ConfigError
 from softmode.scenes.scene import Scene
 from softmode.view.live_types import DragView, Hit, LiveOptions, PinView, finite_vector
 
-KeptPin = tuple[Grip, NDArray[np.float64], NDArray[np.float64]]
-"""A pin with its position [m] and rotation, a quaternion xyzw."""
+KeptPin = tuple[int, Grip, NDArray[np.float64], NDArray[np.float64]]
+"""The object of a pin, the grip, its position [m] and rotation, a quaternion xyzw."""
 PIN_RADIUS = 0.1
 """How far a pinned region reaches if nothing is said, as a fraction of the object's size."""
 
@@ -61,17 +66,37 @@ class Hands:
         self._drag = None
 
     def kept(self) -> dict[int, KeptPin]:
-        """Return the pins of the first object with position and rotation, for `hold_again`."""
-        grips = self._scene.grips[0]
+        """Return the pins with object, position and rotation, for `hold_again`."""
         pins = self._pins.items()
-        return {number: (grips.held[grip], *grips.pose(grip)) for number, (index, grip) in pins if index == 0}
+        return {
+            number: (index, self._scene.grips[index].held[grip], *self._scene.grips[index].pose(grip))
+            for number, (index, grip) in pins
+        }
 
-    def hold_again(self, kept: dict[int, KeptPin]) -> None:
-        """Hold another build of the first object by the pins that it had, and by nothing else."""
+    def hold_again(self, kept: dict[int, KeptPin], before: Sequence[ReducedBody], came_from: Sequence[int]) -> None:
+        """Hold other builds of the objects, or parts of them, by the pins that they had, and by nothing else.
+
+        A pin whose points are in several parts keeps the part that has most of them.
+
+        Args:
+            kept: The pins.
+            before: The bodies that they held.
+            came_from: Of each object now, which of these it is or is a part of.
+        """
         self.let_go()
-        grips = self._scene.grips[0]
-        for number, (grip, position, rotation) in kept.items():
-            self._pins[number] = (0, grips.restore(grip, position, rotation.tolist()))
+        for number, (index, grip, position, rotation) in kept.items():
+            X = grip.rest_points + before[index].offset
+            owners = [k for k, origin in enumerate(came_from) if origin == index]
+            bodies = [self._scene.grips[k].body for k in owners]
+            places = [np.concatenate([body.surface_points, body.points]) + body.offset for body in bodies]
+            nearest = np.argmin([KDTree(place).query(X)[0] for place in places], axis=0)
+            most = int(np.bincount(nearest).argmax())
+            mine = nearest == most
+            moved = replace(grip, rest_points=X[mine] - bodies[most].offset, offsets=grip.offsets[mine])
+            self._pins[number] = (
+                owners[most],
+                self._scene.grips[owners[most]].restore(moved, position, rotation.tolist()),
+            )
 
     # -- the drag -----------------------------------------------------------------------------------------------------
 

@@ -48,10 +48,11 @@ def grips_strength(options: LiveOptions) -> GripOptions:
 
 
 class ObjectScene:
-    """One object, held by a part of it or above a table.
+    """One object, or the parts of one, held by a part of it or above a table.
 
     Args:
-        found: The object, at the scale that it has.
+        found: The whole object, at the scale that it has.
+        objects: What the scene holds instead: another build of the object, or the parts that it was cut into.
         scene: "hang" or "drop".
         hold: Which end a hanging object is held by.
         material: What it is made of.
@@ -65,6 +66,7 @@ class ObjectScene:
     def __init__(
         self,
         found: Placed,
+        objects: Sequence[SoftObject],
         scene: SceneName,
         hold: HoldName,
         material: Material,
@@ -88,10 +90,13 @@ class ObjectScene:
             below = (0.0, 0.0, -0.1 * half)
             table = [Fixture(label="table", size=(half, half, 0.1 * half), position=below, color=(0.42, 0.48, 0.54))]
         height = float(thing.body.bounds[1, 2] - thing.body.bounds[0, 2])
-        position = (0.0, 0.0, found.scale * (thing.height + 0.6 * height))
-        placed = replace(found, object=replace(thing, material=material), position=position)
+        position = np.array([0.0, 0.0, found.scale * (thing.height + 0.6 * height)])
+        placed = []
+        for part in objects or [replace(thing, material=material)]:
+            x, y, z = (position + found.scale * (part.body.offset - thing.body.offset)).tolist()
+            placed.append(replace(found, object=part, position=(x, y, z)))
         given = {"dt": options.substep, "steps_per_frame": BLOCK_STEPS, **grips_of(options)}
-        self.scene = SplatScene(table, [placed], device=device, **given)
+        self.scene = SplatScene(table, placed, device=device, **given)
         self.step()  # compiles
         self.reset()
 

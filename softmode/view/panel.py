@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -20,7 +20,11 @@ if TYPE_CHECKING:
     from softmode.view.session import LiveSession
 
 Command = Callable[["LiveSession"], None]
-MouseMode = Literal["drag", "pin"]
+MouseMode = Literal["drag", "pin", "cut", "slit", "paint"]
+MOUSE_HINT = (
+    "drag: pull the object. pin: hold the region that is clicked. cut: draw a stroke; the plane of stroke and camera"
+    " cuts. slit: only as far as the stroke goes. paint: draw over what shall be stiffer or softer"
+)
 FOLLOW_PAUSE = 1.0
 """How long a slider that was moved by hand is left alone [s]."""
 MODULUS_MARKS = ((3.0, "1 k"), (4.0, "10 k"), (5.0, "100 k"), (6.0, "1 M"), (7.0, "10 M"))
@@ -78,6 +82,7 @@ class Panel:
         submit: Takes what shall be done with the session.
         on_mode: Called with the mode of the mouse when it is chosen, in the thread that runs the session.
         record_path: Names the next recording.
+        on_prepare: Called when a person asks to turn and crop the capture; None has no button for it.
     """
 
     def __init__(
@@ -88,6 +93,7 @@ class Panel:
         submit: Callable[[Command], None],
         on_mode: Callable[[MouseMode], None],
         record_path: Callable[[], Path],
+        on_prepare: Callable[[], None] | None = None,
     ) -> None:
         """Build the controls."""
         self._gui, self._submit, self._on_mode, self._record_path = server.gui, submit, on_mode, record_path
@@ -96,10 +102,20 @@ class Panel:
         self._touched: dict[Slider, float] = {}
         self._plot_data: deque[tuple[float, float, float, float]] = deque(maxlen=PLOT_POINTS)
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+        if on_prepare is not None:
+            self._add_prepare(on_prepare)
         self._add_time()
         self._add_mouse()
         self._add_material(session)
         self._add_readouts()
+
+    def _add_prepare(self, on_prepare: Callable[[], None]) -> None:
+        """A button for captures that lie wrong or hold too much."""
+        button = self._gui.add_button("prepare", hint="turn the capture upright and crop it, then build it again")
+
+        @button.on_click
+        async def _(_: Any) -> None:
+            on_prepare()
 
     def _add_time(self) -> None:
         """Buttons that start, stop and record."""
@@ -135,12 +151,12 @@ class Panel:
     def _add_mouse(self) -> None:
         """What the mouse does on the object, and the way back."""
         gui = self._gui
-        hint = "drag: pull the object. pin: hold the region that is clicked"
-        mode = gui.add_dropdown("mouse", ("drag", "pin"), initial_value="drag", hint=hint)
+        modes: dict[str, MouseMode] = {name: name for name in get_args(MouseMode)}
+        mode = gui.add_dropdown("mouse", tuple(modes), initial_value="drag", hint=MOUSE_HINT)
 
         @mode.on_update
         async def _(_: Any) -> None:
-            chosen: MouseMode = "pin" if mode.value == "pin" else "drag"
+            chosen: MouseMode = modes.get(mode.value, "drag")
             self._submit(lambda session: self._set_mode(chosen))
 
         unpin = gui.add_button_group("unpin", ("last", "all"))
@@ -150,11 +166,35 @@ class Panel:
             only_last = unpin.value == "last"
             self._submit(lambda session: self._unpin(session, only_last))
 
+        with gui.add_folder("brush", expand_by_default=False):
+            size = (0.01, 0.5, 0.01)
+            self._radius = gui.add_slider("radius", *size, 0.1, hint="over the object's size")
+            self._depth = gui.add_slider("depth", *size, 0.2, hint="over the object's size")
+            self._factor = gui.add_slider("log10 factor", -3.0, 3.0, 0.1, -1.0, hint="times as stiff as now")
+            actions = gui.add_button_group("painted", ("undo", "save"), hint="save writes the body with its splats")
+
+        @actions.on_click
+        async def _(_: Any) -> None:
+            undo = actions.value == "undo"
+            self._submit(lambda session: session.undo_paint() if undo else self._save(session))
+
         build = gui.add_button("build for pins", hint="builds the object anew for the regions that are pinned")
 
         @build.on_click
         async def _(_: Any) -> None:
             self._submit(lambda session: session.build_for_pins())
+
+    def _save(self, session: LiveSession) -> None:
+        """Write the object beside the recordings."""
+        path = self._record_path().with_suffix(".npz")
+        session.save(path)
+        self.tell(f"wrote {path}")
+
+    @property
+    def brush(self) -> tuple[float, float, float]:
+        """Factor, radius and depth of the brush, lengths over the object's size."""
+        inside = [min(max(float(bar.value), 0.01), 0.5) for bar in (self._radius, self._depth)]  # a page may send more
+        return 10.0 ** min(max(float(self._factor.value), -3.0), 3.0), inside[0], inside[1]
 
     def _set_mode(self, mode: MouseMode) -> None:
         """Change what the mouse does."""
@@ -246,7 +286,7 @@ class Panel:
             ("energy", f"{energies.kinetic:.2e} kinetic, {energies.elastic:.2e} elastic J"),
         ]
         if status.notice:
-            rows += [("pins", status.notice)]
+            rows += [("notice", status.notice)]
         if status.reward_terms:
             rows += [("reward", ", ".join(f"{name} {value:.2f}" for name, value in status.reward_terms.items()))]
             rows += [("episode", f"{status.episode}{', solved' if status.success else ''}")]

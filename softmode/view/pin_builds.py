@@ -1,8 +1,8 @@
-"""Builds for pins: the body that a build told of the pinned regions gives, made in the background."""
+"""Builds in the background, such as of the body that a build told of the pinned regions gives."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
@@ -10,44 +10,54 @@ from scipy.spatial import KDTree
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
-from softmode.deformables.build.hold import hold
 from softmode.deformables.solver.attachments import UNTOLD_SHARE, untold_share
 from softmode.deformables.tools.grips import Grip, GripOptions
+from softmode.errors import ConfigError
+
+Finish = Callable[[], None]
+"""Takes up what was built, in the thread of the session."""
 
 
-class PinBuilds:
-    """One build at a time, of the body of a session with the regions that pins hold."""
+class Builds:
+    """One build at a time, in a thread of its own, while the session goes on; it returns what is left to be done."""
 
     def __init__(self) -> None:
         """Build nothing."""
         self._pool: ThreadPoolExecutor | None = None
-        self._future: Future[ReducedBody] | None = None
+        self._future: Future[Finish] | None = None
+        self.what = ""
+        """What is being built, in words; empty if nothing is."""
 
-    @property
-    def running(self) -> bool:
-        """Whether a build has been begun and not been taken."""
-        return self._future is not None
+    def begin(self, what: str, build: Callable[[], Finish]) -> None:
+        """Begin a build.
 
-    def begin(self, body: ReducedBody, regions: Iterable[Region]) -> None:
-        """Build a body with regions in a thread of its own."""
+        Raises:
+            ConfigError: If one is under way.
+        """
+        if self._future is not None:
+            raise ConfigError(f"a build is under way ({self.what})", hint="wait until it is done")
         if self._pool is None:
-            self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="pin-build")
-        self._future = self._pool.submit(hold, body, *regions, progress=False)
+            self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="build")
+        self.what, self._future = what, self._pool.submit(build)
 
-    def take(self) -> ReducedBody | None:
-        """Return the body that is built, once, or None.
+    def take(self) -> Finish | None:
+        """Return what takes up what is built, once, or None.
 
         Raises:
             SoftmodeError: If it could not be built.
         """
         if self._future is None or not self._future.done():
             return None
-        future, self._future = self._future, None
+        future, self._future, self.what = self._future, None, ""
         return future.result()
+
+    def forget(self) -> None:
+        """Leave alone what is being built."""
+        self._future, self.what = None, ""
 
     def close(self) -> None:
         """Wait for what is being built, and forget it."""
-        self._future = None
+        self.forget()
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
             self._pool = None

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import shlex
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -15,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from softmode.errors import ConfigError
 from softmode.splats.formats import read_splats
 from softmode.splats.splats import UpAxis, up_rotation
-from softmode.view.app import ViewOptions, page_url, start_server
+from softmode.view.app import ViewOptions, aim
+from softmode.view.page import Page
 
 Crop = tuple[float, float, float, float, float, float]
 """Lowest and highest corner of a box."""
@@ -23,6 +23,8 @@ SHOWN = 150_000
 """Most splats that are shown; of more, every k-th one is."""
 FAINT = 0.06
 """Factor on the opacity of splats outside the box."""
+ARC = 0.6
+"""Radius of the arcs over the object's diagonal, so that they lie outside of it; viser's is 0.65 of their scale."""
 HELP = (
     "**1.** Turn the toy upright with the arcs; it snaps to an axis of the file.  \n"
     "**2.** Pull the two corners of the box about it. What is outside is cut.  \n"
@@ -32,7 +34,7 @@ EDGES = ((0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4),
 """Edges of a box between its corners, which count in binary: x first."""
 
 
-class PreparePage:
+class PreparePage(Page):
     """A server whose page shows a capture with a box and arcs; a context manager.
 
     Args:
@@ -40,6 +42,7 @@ class PreparePage:
         options: Where the page is served.
         up: Axis of the file that points up; None for -y.
         crop: Lowest and highest corner of the box; None for a box about all.
+        rest: Other words of the command line that shows the same.
 
     Raises:
         AssetError: If the file cannot be read.
@@ -47,37 +50,27 @@ class PreparePage:
         MissingExtraError: If viser is not installed.
     """
 
-    def __init__(self, file: Path, options: ViewOptions, *, up: UpAxis | None = None, crop: Crop | None = None) -> None:
+    def __init__(
+        self,
+        file: Path,
+        options: ViewOptions,
+        *,
+        up: UpAxis | None = None,
+        crop: Crop | None = None,
+        rest: Sequence[str] = (),
+    ) -> None:
         """Start the server and build the page."""
-        self.file, self._options = file, options
+        self.file, self._rest = file, tuple(rest)
         self._splats = read_splats(file)
         self.up: UpAxis = up or "-y"
         """Axis of the file that points up."""
         self._lock, self._done = threading.Lock(), threading.Event()
-        self._server = start_server(options)
+        super().__init__(options)
         try:
             self._build_page(crop)
         except BaseException:
             self.close()
             raise
-
-    def __enter__(self) -> PreparePage:
-        """Return the page."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """End the server."""
-        self.close()
-
-    def close(self) -> None:
-        """End the server; may be called twice."""
-        with contextlib.redirect_stdout(io.StringIO()):
-            self._server.stop()
-
-    @property
-    def url(self) -> str:
-        """Where to point the browser."""
-        return page_url(self._options, self._server.get_port())
 
     def wait(self, duration: float | None = None) -> bool:
         """Wait until a person asks for the build; return whether one did, in `duration` seconds at most."""
@@ -102,7 +95,7 @@ class PreparePage:
         words = ["softmode", "view", str(self.file), f"--up={self.up}"]
         if self.crop is not None:
             words += ["--crop", *(f"{x:g}" for x in self.crop)]
-        return shlex.join(words)
+        return shlex.join([*words, *self._rest])
 
     # -- the page -----------------------------------------------------------------------------------------------------
 
@@ -112,7 +105,7 @@ class PreparePage:
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         scene.set_up_direction("+z")
         gui.add_markdown(HELP)
-        self._command = gui.add_text("repeat", "", hint="the command that builds the same, to copy")
+        self._command = gui.add_text("repeat", "", multiline=True, hint="the command that builds the same, to copy")
         self._told = gui.add_markdown("")
         build = gui.add_button("build")
 
@@ -120,8 +113,10 @@ class PreparePage:
         async def _(_: Any) -> None:
             self.press()
 
-        self._gizmos: list[Any] = []
+        self._gizmos: Any = None
+        self._turns = 0
         self.turn(np.eye(3), crop)
+        aim(self._server)
 
     def turn(self, rotation: np.ndarray, crop: Crop | None = None) -> None:
         """Turn what is shown, and take the axis of the file that points up then; the box is that of all, or `crop`.
@@ -165,36 +160,47 @@ class PreparePage:
     def _add_gizmos(self) -> None:
         """Add two corners and the arcs."""
         scene = self._server.scene
-        for gizmo in self._gizmos:
-            gizmo.remove()
+        if self._gizmos is not None:
+            self._gizmos.remove()
+        # A page keeps the pose of a gizmo that comes again under its name.
+        self._turns += 1
+        root = f"/gizmos {self._turns}"
+        self._gizmos = scene.add_frame(root, show_axes=False)
         size, centre = self._size, 0.5 * (self.low + self.high)
-        camera = self._server.initial_camera
-        camera.up, camera.look_at = (0.0, 0.0, 1.0), tuple(centre.tolist())
-        camera.position = tuple((centre + size * np.array([0.75, -1.0, 0.55])).tolist())
-        camera.near, camera.far = 0.01 * size, 100.0 * size
+        first = self._server.initial_camera
+        first.up = (0.0, 0.0, 1.0)
+        # Who is here already looks there too: what is turned about the file's origin goes elsewhere.
+        for camera in (first, *(client.camera for client in self._server.get_clients().values())):
+            camera.position = tuple((centre + size * np.array([0.75, -1.0, 0.55])).tolist())
+            camera.look_at = tuple(centre.tolist())
+            camera.near, camera.far = 0.01 * size, 100.0 * size
         corners = [
             scene.add_transform_controls(
-                f"/corner {k}", scale=0.22 * size, disable_rotations=True, depth_test=False, position=tuple(at.tolist())
+                f"{root}/corner {k}",
+                scale=0.22 * size,
+                disable_rotations=True,
+                depth_test=False,
+                position=tuple(at.tolist()),
             )
             for k, at in enumerate((self.low, self.high))
         ]
         arcs = scene.add_transform_controls(
-            "/turn", scale=0.45 * size, disable_axes=True, disable_sliders=True, depth_test=False, opacity=0.6,
-            position=tuple(centre.tolist()),
+            f"{root}/turn", scale=ARC / 0.65 * size, line_width=4.0, depth_test=False,
+            disable_axes=True, disable_sliders=True, position=tuple(centre.tolist()),
         )  # fmt: skip
-        labels = [
-            scene.add_label("/corner 0/label", "lowest corner"),
-            scene.add_label("/corner 1/label", "highest corner"),
-            scene.add_label("/turn/label", "turn upright", position=(0.0, 0.0, 0.3 * size)),
-        ]
-        self._gizmos = [*labels, *corners, arcs]
+        scene.add_label(f"{root}/corner 0/label", "lowest corner")
+        scene.add_label(f"{root}/corner 1/label", "highest corner")
+        scene.add_label(f"{root}/turn/label", "turn upright", position=(0.0, 0.0, ARC * size))
         for k, corner in enumerate(corners):
             corner.on_update(self._mover(k))
 
         async def turned(event: Any) -> None:
+            w, x, y, z = event.target.wxyz
+            rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
             if event.phase == "end":
-                w, x, y, z = event.target.wxyz
-                self.turn(Rotation.from_quat([x, y, z, w]).as_matrix())
+                self.turn(rotation)
+            else:  # the splats follow the hand
+                self._cloud.wxyz, self._cloud.position = event.target.wxyz, centre - rotation @ centre
 
         arcs.on_update(turned)
 
@@ -212,7 +218,8 @@ class PreparePage:
         scene = self._server.scene
         bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
         corners = np.where(bits, self.high, self.low)
-        scene.add_line_segments("/box", corners[np.array(EDGES)].astype(np.float32), colors=(255, 120, 30))
+        lines: dict[str, Any] = {"colors": (255, 120, 30), "thickness": 2.0, "thickness_units": "screen"}
+        scene.add_line_segments("/box", corners[np.array(EDGES)].astype(np.float32), **lines)
         means = self._upright.means
         inside = np.all((means >= self.low) & (means <= self.high), axis=1)
         if splats:
@@ -220,7 +227,7 @@ class PreparePage:
             shown = self._upright.subset(np.arange(self._upright.count)[part])
             opacity = np.where(inside[part], 1.0, FAINT) * shown.opacities
             unit = float(np.median(shown.scales.max(axis=1)))  # viser keeps covariances in half precision
-            scene.add_gaussian_splats(
+            self._cloud = scene.add_gaussian_splats(
                 "/splats", centers=shown.means / unit, scale=unit,
                 covariances=(shown.covariances() / unit**2).clip(-6e4, 6e4).astype(np.float32),
                 rgbs=shown.colors(), opacities=opacity[:, None].astype(np.float32),

@@ -5,8 +5,9 @@ All calls must come from one thread.
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
 
 from softmode.checks import require_number
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.build.hold import hold, paint
+from softmode.deformables.build.patch import Patch
+from softmode.deformables.build.sources import unpack_sources
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.namespaces import soft
 from softmode.deformables.model.status import status_reasons
@@ -23,12 +29,15 @@ from softmode.deformables.solver.energies import SoftEnergies
 from softmode.deformables.tools.grips import Grip
 from softmode.errors import ConfigError, SoftmodeError
 from softmode.objects.config import ObjectConfig
+from softmode.objects.cut import cut_object
+from softmode.objects.object_file import write_object
+from softmode.objects.paint import brushed, require_factor
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.host import host
 from softmode.scenes.meshes import SceneMesh, scene_meshes
+from softmode.scenes.motion import coordinates, motion_of, set_motion
 from softmode.splats.pinhole import PinholeCamera
 from softmode.view import live_parameters
-from softmode.view.coordinates import coordinates, set_motion
 from softmode.view.hands import Hands
 from softmode.view.live_recording import LiveRecording
 from softmode.view.live_scenes import EnvScene, LiveScene, ObjectScene, grips_strength
@@ -47,9 +56,12 @@ from softmode.view.live_types import (
 )
 from softmode.view.pace import Pace
 from softmode.view.picture import LivePicture
-from softmode.view.pin_builds import PinBuilds, held_untold, pin_regions
+from softmode.view.pin_builds import Builds, Finish, held_untold, pin_regions
 from softmode.view.recorders import RECORD_HZ, Recorder, live_camera, make_recorder
 from softmode.view.sources import load_source, with_functions
+
+Origin = ObjectConfig | tuple[SoftObject, ...]
+"""What a scene is made of: a configuration, or objects as they are; none of them for what was first given."""
 
 
 class LiveSession:
@@ -59,15 +71,18 @@ class LiveSession:
     `poses` are what to show, the rest is what a person does. All calls must come from one thread.
     """
 
-    def __init__(self, make: Callable[[ObjectConfig | SoftObject | None], LiveScene], options: LiveOptions) -> None:
+    def __init__(self, make: Callable[[Origin], LiveScene], options: LiveOptions) -> None:
         """Make the scene; use `from_object` or `from_env`."""
         self.options, self._make = options, make
         self._source: ObjectConfig | None = None
-        self._live = make(None)
+        self._live = make(())
         self._given: dict[str, Any] = {}
         self._playing = True
         self._recorder: Recorder | None = None
-        self._hands, self._builds, self._build_error = Hands(options), PinBuilds(), ""
+        self._hands, self._builds, self._message = Hands(options), Builds(), ""
+        self._whole: tuple[SoftObject, ...] = ()
+        self.generation = 0
+        """Counts how often the objects were exchanged for others: their splats and samples are others then."""
         self._share: tuple[tuple[int, tuple[int, ...]], float] = ((0, ()), 0.0)
         self._clock, self._record_from = 0.0, 0.0
         self._bind()
@@ -79,6 +94,8 @@ class LiveSession:
         self._energies, self._first_body = SoftEnergies(scene.solver), scene.objects[0].body
         self._solver = scene.solver
         self._meshes: tuple[SceneMesh, ...] | None = None
+        self.generation += 1
+        self._painted: list[tuple[int, ReducedBody]] = []
         self._pace = Pace(self._live.block_dt, self.options.budget)
         self._begin()
 
@@ -123,14 +140,11 @@ class LiveSession:
 
         first = load_source(source, size, progress)
 
-        def make(origin: ObjectConfig | SoftObject | None) -> LiveScene:
-            found = first
-            if isinstance(origin, ObjectConfig):
-                found = load_source(origin, None, progress)
-            elif origin is not None:
-                found = replace(first, object=origin)
+        def make(origin: Origin) -> LiveScene:
+            given = isinstance(origin, ObjectConfig)
+            found, objects = (load_source(origin, None, progress), ()) if given else (first, origin)
             made = material or found.object.material or Material(youngs_modulus=1.0e5, density=250.0)
-            return ObjectScene(found, scene, hold, made, chosen, device)
+            return ObjectScene(found, objects, scene, hold, made, chosen, device)
 
         return cls(make, chosen)
 
@@ -164,7 +178,7 @@ class LiveSession:
         """
         chosen = options or LiveOptions()
 
-        def make(origin: ObjectConfig | SoftObject | None) -> LiveScene:
+        def make(origin: Origin) -> LiveScene:
             source = origin if isinstance(origin, ObjectConfig) else None
             return EnvScene(name, policy, config, seed, chosen, device, progress, source)
 
@@ -210,10 +224,20 @@ class LiveSession:
     def reset(self) -> None:
         """Start over: drags and pins are let go, a hanging object is held again, an environment begins an episode.
 
-        Parameters stay as they are.
+        Parameters stay as they are. An object that was cut is whole again.
+
+        Raises:
+            ConfigError: If an object that was cut is being recorded.
         """
         self._hands.let_go()
-        self._live.reset()
+        self._builds.forget()
+        self._message = ""
+        if self._whole:
+            self._refuse_while_recording("the object is whole again")
+            whole, self._whole = self._whole, ()
+            self._remake(whole)
+        else:
+            self._live.reset()
         live_parameters.apply(self._scene, self._given)
         self._begin()
 
@@ -231,6 +255,11 @@ class LiveSession:
     def object(self) -> SoftObject:
         """The first soft object."""
         return self._object(0)
+
+    @property
+    def objects(self) -> tuple[SoftObject, ...]:
+        """The soft objects: more than one after a cut."""
+        return self._scene.objects
 
     @property
     def size(self) -> float:
@@ -417,13 +446,15 @@ class LiveSession:
         an environment a new episode begins.
 
         Raises:
-            ConfigError: If the count lies outside 10..120, or the object came as a saved body, which cannot be rebuilt.
+            ConfigError: If the count lies outside 10..120, the object came as a saved body, which cannot be rebuilt, or
+                it has been cut.
         """
-        if self._recorder is not None:
-            raise ConfigError("a recording is being made", hint="stop it before the functions change")
+        self._refuse_while_recording("the functions change")
+        if self._whole:
+            raise ConfigError("the object is cut", hint="reset first, which makes it whole")
         source = with_functions(self._source or self._live.source, count)
         if count != self._object(0).body.function_count:
-            self._exchange(source)
+            self._exchange(source, (0,))
             self._source = source
 
     def build_for_pins(self) -> None:
@@ -434,66 +465,207 @@ class LiveSession:
         over and pins keep their numbers. `status` says in `notice` how it stands.
 
         Raises:
-            ConfigError: With an environment, if nothing is pinned, if such a build is under way, or if the object came
-                as a body that does not keep what it was built from.
+            ConfigError: With an environment, if nothing is pinned, if a build is under way, or if the object came as a
+                body that does not keep what it was built from.
         """
         body, grips = self._object(0).body, self._pinned()
         if isinstance(self._live, EnvScene):
             raise ConfigError("an environment brings its object", hint="build its body with regions")
         if not grips:
             raise ConfigError("nothing is pinned", hint="pin a region first")
-        if self._builds.running:
-            raise ConfigError("a build for pins is under way", hint="wait until it is done")
-        if not self._first_body.sources:
+        first = self._first_body
+        if not first.sources:
             raise ConfigError(f"body {body.name!r} does not keep what it was built from", hint="build it anew")
-        self._build_error = ""
-        self._builds.begin(self._first_body, pin_regions(body, grips, grips_strength(self.options)))
+        regions = pin_regions(body, grips, grips_strength(self.options))
+
+        def build() -> Finish:
+            held = hold(first, *regions, progress=False)
+
+            def finish() -> None:
+                self._exchange_body(0, held)
+                self._first_body = first
+
+            return finish
+
+        self._begin_build("building for the pins", build)
+
+    def cut(self, patch: Patch) -> None:
+        """Cut all objects by a patch where they are now, in the background; time runs on.
+
+        The first `advance` after the build puts the parts in the place of what was cut, when nothing is dragged or
+        recorded: they go on from where it is then, touch each other, and pins keep their numbers. `status` says in
+        `notice` what happened. A reset makes the object whole again.
+
+        Args:
+            patch: What cuts, in the world [m].
+
+        Raises:
+            ConfigError: With an environment, or if a build is under way.
+        """
+        if isinstance(self._live, EnvScene):
+            raise ConfigError("an environment brings its object", hint="cut it in a session of its own")
+        objects, q = self._scene.objects, motion_of(self._scene).q
+
+        def build() -> Finish:
+            found = [cut_object(thing, patch, at, progress=False) for thing, at in zip(objects, q, strict=True)]
+
+            def finish() -> None:
+                owners = [k for k, (parts, _) in enumerate(found) for _ in parts]
+                if not all(cut.missed for _, cut in found):
+                    whole = self._whole or objects
+                    self._exchange(tuple(part for parts, _ in found for part in parts), owners)
+                    self._whole = whole
+                told = [cut for _, cut in found if not cut.missed] or [cut for _, cut in found]
+                self._message = "; ".join(note for cut in told for note in cut.notes)
+
+            return finish
+
+        self._begin_build("cutting", build)
+
+    def paint(self, hits: Sequence[Hit], factor: float, *, radius: float, depth: float) -> None:
+        """Make stiffer or softer what a brush has touched, in the background; time runs on.
+
+        The first `advance` after the build exchanges the body, as with :meth:`build_for_pins`. The field is the body's:
+        `save` keeps it.
+
+        Args:
+            hits: Where the brush touched, all on one object.
+            factor: Young's modulus there over what it is now, 0.001 to 1000.
+            radius: Radius of the brush [m], at rest and at the scale of the body.
+            depth: How deep it reaches into the object [m], likewise.
+
+        Raises:
+            ConfigError: With an environment, if a build is under way, if there is no hit or no point of the object
+                within reach, or radius or depth are no numbers > 0.
+            MaterialError: If the factor lies outside its range, or what has been painted would.
+        """
+        if isinstance(self._live, EnvScene):
+            raise ConfigError("an environment brings its object", hint="paint it in a session of its own")
+        require_factor("factor", factor)
+        if not hits:
+            raise ConfigError("the brush has touched nothing", hint="draw on the object")
+        index = hits[0].object_index
+        body = self._object(index).body
+        given = unpack_sources(body)
+        X = np.array([hit.rest_point for hit in hits if hit.object_index == index])
+        inward = -body.surface_normals[KDTree(body.surface_points).query(X)[1]]
+        reached = brushed(given.quadrature.points, X + body.offset, inward, radius, depth)
+        if not reached.any():
+            raise ConfigError("no point of the object is within the brush's reach", hint="enlarge radius or depth")
+        before = np.ones(len(reached)) if given.stiffness_scale is None else given.stiffness_scale
+        field = np.where(reached, factor, 1.0) * before
+        require_factor("stiffness", float(field[reached].max()))
+        require_factor("stiffness", float(field[reached].min()))
+
+        def build() -> Finish:
+            painted = paint(body, stiffness_scale=field, progress=False)
+
+            def finish() -> None:
+                self._exchange_body(index, painted)
+                self._painted.append((index, body))
+                self._message = f"{factor:g} times as stiff: {int(reached.sum())} of {len(reached)} points"
+
+            return finish
+
+        self._begin_build("painting", build)
+
+    def undo_paint(self) -> None:
+        """Give the object the body that it had before the last stroke of the brush.
+
+        Raises:
+            ConfigError: If nothing was painted since the last cut or reset, or something is recorded or built.
+        """
+        self._refuse_while_recording("it is undone")
+        if self._builds.what:
+            raise ConfigError(f"a build is under way ({self._builds.what})", hint="wait until it is done")
+        if not self._painted:
+            raise ConfigError("nothing is painted", hint="paint first")
+        index, body = self._painted.pop()
+        self._exchange_body(index, body)
+        self._message = ""
+
+    def save(self, path: str | Path, object_index: int = 0) -> None:
+        """Write an object as it is built now, with its splats, what was painted and what it is made of.
+
+        Args:
+            path: The .npz to write; `ReducedBody.load`, `load` and the commands read it.
+            object_index: Which object.
+
+        Raises:
+            ConfigError: If there is no such object.
+            StorageError: If it cannot be written.
+        """
+        thing, now = self._object(object_index), live_parameters.present(self._scene)
+        made = {name: getattr(now, name) for name in ("youngs_modulus", "poissons_ratio", "density", "friction")}
+        body = replace(thing.body, provenance={**thing.body.provenance, "material": json.dumps(made)})
+        write_object(path, body, thing.splats, thing.radiance)
+
+    def _begin_build(self, what: str, build: Callable[[], Finish]) -> None:
+        """Build in the background."""
+        self._builds.begin(what, build)
+        self._message = ""
+
+    def _refuse_while_recording(self, what: str) -> None:
+        if self._recorder is not None:
+            raise ConfigError("a recording is being made", hint=f"stop it before {what}")
 
     def _pinned(self) -> list[Grip]:
         """Return what holds the first object."""
         return [grip for grip in self._scene.grips[0].held.values() if not grip.pulls]
 
     def _take_build(self) -> None:
-        """Exchange the body for the one that was built for pins, if there is one and nobody is busy with the object."""
+        """Take up what was built, if there is anything and nobody is busy with the object."""
         if self._recorder is not None or self._hands.dragging:
             return
+        what = self._builds.what
         try:
-            body = self._builds.take()
+            finish = self._builds.take()
+            if finish is not None:
+                finish()
         except SoftmodeError as error:
-            self._build_error = f"the build for pins failed: {error}"
-            return
-        if body is not None:
-            first = self._first_body
-            self._exchange(replace(self._object(0), body=body))
-            self._first_body = first
+            self._message = f"{what} failed: {error}"
 
     def _notice(self) -> str:
-        """Return what a person should know of the pins."""
-        if self._builds.running:
-            return "building for the pins ..."
+        """Return what a person should know of pins, cuts and builds."""
+        if self._builds.what:
+            return f"{self._builds.what} ..."
         body, held = self._object(0).body, tuple(self._scene.grips[0].held)
         if self._share[0] != (id(body), held):
             self._share = ((id(body), held), held_untold(body, self._pinned()))
         share = self._share[1]
         hint = "build_for_pins() mends that" if body.sources and not isinstance(self._live, EnvScene) else ""
         stiff = f"pins hold {share:.0%} of {body.name!r}, which was not built for it and is too stiff; {hint}"
-        return self._build_error or (stiff.rstrip("; ") if share else "")
+        return self._message or (stiff.rstrip("; ") if share else "")
 
-    def _exchange(self, source: ObjectConfig | SoftObject) -> None:
-        """Make the scene anew with another build of its object, and go on from where it is."""
-        old = self._object(0).body
+    def _exchange_body(self, index: int, body: ReducedBody) -> None:
+        """Give an object another build of its body."""
+        objects, painted = list(self._scene.objects), self._painted
+        objects[index] = replace(objects[index], body=body)
+        self._exchange(tuple(objects), range(len(objects)))
+        self._painted = painted
+
+    def _exchange(self, origin: Origin, came_from: Sequence[int]) -> None:
+        """Make the scene anew with other builds of its objects, or parts of them, and go on from where it is.
+
+        Args:
+            origin: What the scene is made of.
+            came_from: Of each object, which one of the present ones it is or is a part of.
+        """
         self.end_drag()
-        motion = [coordinates(self._scene, name) for name in ("q", "qd")]
-        pins, elapsed = self._hands.kept(), self._time
-        made = self._make(source)  # a build that fails leaves all as it was
+        before, pins, elapsed = motion_of(self._scene), self._hands.kept(), self._time
+        self._remake(origin)  # a build that fails leaves all as it was
+        if not isinstance(self._live, EnvScene):
+            self._hands.hold_again(pins, before.bodies, came_from)
+            set_motion(self._scene, before, came_from)
+            self._time = elapsed
+        live_parameters.apply(self._scene, self._given)
+
+    def _remake(self, origin: Origin) -> None:
+        """Make the scene anew."""
+        made = self._make(origin)
         self._live.close()
         self._live = made
         self._bind()
-        if not isinstance(made, EnvScene):
-            self._hands.hold_again(pins)
-            set_motion(self._scene, old, *motion)
-            self._time = elapsed
-        live_parameters.apply(self._scene, self._given)
 
     # -- recording ----------------------------------------------------------------------------------------------------
 

@@ -48,21 +48,13 @@ class Stage:
     ) -> None:
         """Build the scene."""
         self._server, self._session, self._on_pin = server, session, on_pin
+        self._on_drag, self._on_click, self._clickable = on_drag, on_click, False
         self.size = session.size
         self._look()
         self._add_meshes()
-        picture = session.splats()
-        self._gaussians = GaussianBuffer(picture)
-        unit = self._gaussians.unit
-        self._splats = server.scene.add_gaussian_splats(
-            "/splats",
-            centers=picture.means / unit,
-            covariances=(picture.covariances / unit**2).clip(-6e4, 6e4),
-            rgbs=picture.colors.clip(0.0, 1.0),
-            opacities=picture.opacities.reshape(-1, 1).clip(0.0, 1.0),
-            scale=unit,
-        )
-        self._add_grips(picture, on_drag, on_click)
+        self._add_objects()
+        self.stroke: tuple[Vector, Vector] | None = None
+        """Ends of the stroke that somebody draws [m], or None."""
         nowhere = np.zeros((1, 2, 3), np.float32)
         self._line = server.scene.add_line_segments(
             "/drag", nowhere, colors=DRAG_COLOR, thickness=4.0, thickness_units="screen", visible=False
@@ -77,10 +69,14 @@ class Stage:
 
     def update(self) -> None:
         """Show the session as it is now."""
+        if self._generation != self._session.generation:
+            self._splats.remove()
+            self._grips.remove()
+            self._add_objects()
         picture = self._session.splats()
         words = self._gaussians.pack(picture.means, picture.covariances)
         poses = self._session.poses()
-        grips = self._session.surface()[self._grip_samples].astype(np.float32)
+        grips = self._surfaces()[self._grip_samples].astype(np.float32)
         drag = self._session.drag()
         with self._server.atomic():  # one message: splats never run ahead of the hand that holds them
             self._splats.buffer = words
@@ -128,13 +124,32 @@ class Stage:
                 "/grid", width=edge, height=edge, cell_size=0.1 * self._reach, section_size=self._reach, position=at
             )
 
-    def _add_grips(self, picture: SplatPicture, on_drag: Handler, on_click: Handler) -> None:
+    def _add_objects(self) -> None:
+        """Add the splats, and what receives the mouse."""
+        picture, self._generation = self._session.splats(), self._session.generation
+        self._gaussians = GaussianBuffer(picture)
+        unit = self._gaussians.unit
+        self._splats = self._server.scene.add_gaussian_splats(
+            "/splats",
+            centers=picture.means / unit,
+            covariances=(picture.covariances / unit**2).clip(-6e4, 6e4),
+            rgbs=picture.colors.clip(0.0, 1.0),
+            opacities=picture.opacities.reshape(-1, 1).clip(0.0, 1.0),
+            scale=unit,
+        )
+        self._add_grips(picture)
+
+    def _surfaces(self) -> Vector:
+        """Return the surface samples of all objects [m], shape (S, 3)."""
+        return np.concatenate([self._session.surface(k) for k in range(len(self._session.objects))])
+
+    def _add_grips(self, picture: SplatPicture) -> None:
         """Cover the object with invisible spheres that receive the mouse.
 
         Splats receive none. A mesh does, but viser's own materials write depth even where they are transparent, which
         would cut the splats behind; one of a GLB that blends does not.
         """
-        surface = self._session.surface()
+        surface = self._surfaces()
         keep = np.linspace(0, len(surface) - 1, min(len(surface), GRIP_MAX)).round().astype(int)
         self._grip_samples = np.unique(keep)
         samples = surface[self._grip_samples]
@@ -146,25 +161,28 @@ class Stage:
         self._grips = self._server.scene.add_batched_glb(
             "/grips", _invisible_sphere(radius), **places, lod="off", cast_shadow=False, receive_shadow=False
         )
-        self._grips.on_drag("left")(on_drag)
-        self._on_click = on_click
+        self._grips.on_drag("left")(self._on_drag)
+        if self._clickable:
+            self.set_clickable(True)
 
     def set_clickable(self, clickable: bool) -> None:
         """Let clicks on the object through, or not; where they are, the browser outlines what is under the mouse."""
+        self._clickable = clickable
         if clickable:
             self._grips.on_click(self._on_click)
         else:
             self._grips.remove_click_callback("all")
 
     def _show_drag(self, drag: DragView | None) -> None:
-        """Show a line from the gripped point to the cursor."""
-        if drag is not None:
+        """Show a line from the gripped point to the cursor, or a stroke."""
+        line = self.stroke if drag is None else (drag.point, drag.target)
+        if line is not None:
             if self._hint is not None:  # known now
                 self._hint.remove()
                 self._hint = None
-            self._line.points = np.array([[drag.point, drag.target]], np.float32)
-            self._grip.position = tuple(drag.point)
-        self._line.visible = self._grip.visible = drag is not None
+            self._line.points = np.array([line], np.float32)
+            self._grip.position = tuple(line[0])
+        self._line.visible = self._grip.visible = line is not None
 
     def _show_pins(self) -> None:
         """Add, move and remove the gizmos of pins."""

@@ -14,13 +14,12 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.body_modes import soft_modes, surface_modes
+from softmode.deformables.build.body_modes import soft_modes
 from softmode.deformables.build.report import BodyReport
-from softmode.deformables.materials.material import Material
 from softmode.errors import ConfigError, GraspError, needs_extra
 from softmode.files import whole_file
+from softmode.objects.rest_grasps import rest_grasps
 from softmode.robots.arm import ArmDescription
-from softmode.robots.grasp_planner import Grasp, plan_grasps
 from softmode.robots.jaws import ParallelJaw
 from softmode.splats.splats import SH_DC, Splats
 
@@ -51,33 +50,6 @@ def mode_frequencies(body: ReducedBody, *, youngs_modulus: float, density: float
     """
     value = soft_modes(body, 0)[0]
     return np.sqrt(youngs_modulus * value / (density * body.volume)) / (2.0 * np.pi)
-
-
-def rest_grasps(body: ReducedBody, *, youngs_modulus: float, density: float) -> tuple[Grasp, ...]:
-    """Return the best grasps of a body that stands as it is built, by the built-in arm, in the body frame.
-
-    Args:
-        body: The body.
-        youngs_modulus: Young's modulus [Pa].
-        density: Density [kg/m^3].
-
-    Raises:
-        GraspError: If none fits.
-    """
-    weight, friction = 9.81 * density * body.volume, Material().friction
-    return plan_grasps(
-        body.surface_points,
-        body.surface_normals,
-        body.surface_areas,
-        ParallelJaw.of(ArmDescription()),
-        friction=friction,
-        force=max(6.0, 2.5 * weight / friction),
-        weight=weight,
-        centre=np.zeros(3),
-        modes=surface_modes(body) / np.sqrt(youngs_modulus),
-        ground=float(body.surface_points[:, 2].min()),
-        count=3,
-    )
 
 
 def write_body_picture(
@@ -128,7 +100,7 @@ def write_body_picture(
     x, y, z = 1e2 * np.ptp(body.bounds, axis=0)
     facts = (
         f"{x:.3g} x {y:.3g} x {z:.3g} cm, {1e6 * body.volume:.4g} cm$^3$ · {body.function_count} functions · "
-        f"{body.mode_count} eigenmodes · {body.point_count} cubature points · {len(body.centres)} kernels"
+        f"{body.mode_count} handles · {body.point_count} cubature points · {len(body.centres)} kernels"
     )
     figure.text(0.02, 1.0 - 0.35 / height, body.name, fontsize=15, weight="bold")
     figure.text(0.985, 1.0 - 0.35 / height, facts, fontsize=10, ha="right", color="0.3")
@@ -177,7 +149,7 @@ def _weights(body: ReducedBody, splats: Splats) -> tuple[list[str], list[Array]]
     from matplotlib import colormaps
 
     x = splats.means.astype(np.float64)
-    weight = body.skinning_weights(x)[0]
+    weight = body.skinning_weights(x)[0] if body.skinned else np.ones((len(x), 1))
     title, color = _first(body, x)
     names, colors = [title], [color]
     ranks = _weight_names(body)
@@ -306,8 +278,9 @@ def _draw_grasps(axes: Any, body: ReducedBody, youngs_modulus: float, density: f
     from matplotlib.colors import to_rgb
     from matplotlib.patches import Polygon
 
+    jaw = ParallelJaw.of(ArmDescription())
     try:
-        found = rest_grasps(body, youngs_modulus=youngs_modulus, density=density)
+        found = rest_grasps(body, jaw, youngs_modulus=youngs_modulus, density=density)
     except GraspError as error:
         _plane(axes, body, "no grasp of the arm")
         words = "\n".join(textwrap.wrap(str(error), 34))
@@ -315,7 +288,7 @@ def _draw_grasps(axes: Any, body: ReducedBody, youngs_modulus: float, density: f
             0.5, -0.04, words, fontsize=7.5, color=_COLORS["warning"], transform=axes.transAxes, ha="center", va="top"
         )
         return
-    best, jaw = found[0], ParallelJaw.of(ArmDescription())
+    best = found[0]
     title = f"best grasps, {1e3 * best.width:.0f} mm wide"
     right, up = _plane(axes, body, title)
     view = np.stack([right, up], axis=1)
@@ -351,7 +324,7 @@ def _write_report(axes: Any, body: ReducedBody, report: BodyReport) -> None:
     half, y, step = -(-len(lines) // 2), 1.0, 0.06
     for column, part in enumerate((lines[:half], lines[half:])):
         for row, line in enumerate(part):
-            axes.text(0.5 * column, y - step * row, line, fontsize=7.5, transform=axes.transAxes, va="top")
+            axes.text(0.525 * column, y - step * row, line, fontsize=6.8, transform=axes.transAxes, va="top")
     y -= step * (half + 0.7)
     if not report.findings:
         axes.text(0.0, y, "no findings", fontsize=9, color="#1b7f3b", weight="bold", transform=axes.transAxes, va="top")
@@ -359,5 +332,5 @@ def _write_report(axes: Any, body: ReducedBody, report: BodyReport) -> None:
         for line in textwrap.wrap(f"{finding.severity}, {finding.name}: {finding.what}", 98):
             if y < -0.1:
                 return
-            axes.text(0.0, y, line, fontsize=7.5, color=_COLORS[finding.severity], transform=axes.transAxes, va="top")
+            axes.text(0.0, y, line, fontsize=6.8, color=_COLORS[finding.severity], transform=axes.transAxes, va="top")
             y -= step

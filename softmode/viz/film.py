@@ -67,7 +67,7 @@ class Film:
             from imageio_ffmpeg import write_frames
 
             how: dict[str, Any] = {"codec": "libx264", "quality": 8, "macro_block_size": 2}
-            how["output_params"] = ["-preset", "veryfast", "-threads", "1"]  # most of a small film's time otherwise
+            how["output_params"] = ["-preset", "superfast", "-threads", "1"]  # most of a small film's time otherwise
             if self.path.suffix.lower() == ".gif":
                 how = {"codec": "gif", "quality": None, "macro_block_size": 1, "pix_fmt_out": "pal8"}
                 how["output_params"] = ["-vf", GIF, "-loop", "0"]
@@ -95,7 +95,7 @@ class Film:
         done = np.append(0.0, np.cumsum(change + 0.2 * change.mean() + 1.0e-6)) if len(change) else np.zeros(1)
         chosen = np.abs(done - np.linspace(0.0, done[-1], self.SHEET_FRAMES)[:, None]).argmin(axis=1)
         rows = [np.concatenate([self._frames[i] for i in chosen[k : k + 3]], axis=1) for k in range(0, len(chosen), 3)]
-        Image.fromarray(np.concatenate(rows, axis=0)).save(self._sheet)
+        Image.fromarray(np.concatenate(rows, axis=0)).save(self._sheet, compress_level=2)
         os.replace(self._sheet, self.sheet_path)
         self._file.publish()
 

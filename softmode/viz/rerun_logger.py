@@ -260,7 +260,7 @@ class RerunLogger:
             if self._changed((w, o), frame):
                 fields["scales"], fields["quaternions"] = frame.axes(self._source.model.device)
             if self.frame_count == 0:
-                fields |= _colors(self._shown[o])
+                fields |= splat_colors(self._shown[o])
             self._stream.log(path, rr.GaussianSplats3D.from_fields(**fields))
         if not self.options.surface:
             return
@@ -279,7 +279,7 @@ class RerunLogger:
             return
         fields: dict[str, Any] = {"centers": marker.means}
         if w not in self._marks:
-            fields |= {"scales": marker.scales, "quaternions": marker.quats, **_colors(marker)}
+            fields |= {"scales": marker.scales, "quaternions": marker.quats, **splat_colors(marker)}
         self._marks[w] = marker.means
         self._stream.log(f"{self._prefix[w]}scene/marker", self._rr.GaussianSplats3D.from_fields(**fields))
 
@@ -329,7 +329,7 @@ class RerunLogger:
             self._stream.log(f"{path}/depth", encoded_depth(camera.images(view.name, "depth").numpy()[w]))
 
 
-def _colors(splats: Splats) -> dict[str, Any]:
+def splat_colors(splats: Splats) -> dict[str, Any]:
     """Return the fields of colour and opacity; higher degrees would have to turn with every splat."""
     rgba = np.concatenate([splats.colors(), splats.opacities[:, None]], axis=1)
     return {"colors": np.round(255.0 * np.clip(rgba, 0.0, 1.0)).astype(np.uint8), "spherical_harmonics_degree": 0}

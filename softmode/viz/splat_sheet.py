@@ -109,11 +109,11 @@ def write_splat_sheet(path: str | os.PathLike[str], survey: SplatSurvey, *, titl
     figure.text(0.015, 0.965, title, fontsize=15, weight="bold")
     grid = figure.add_gridspec(2, 4, left=0.03, right=0.985, top=0.915, bottom=0.05, wspace=0.2, hspace=0.2)
     for k, (name, (toward, right, up)) in enumerate(VIEWS.items()):
-        _draw_view(figure.add_subplot(grid[0, k]), name, splats, np.array(toward), right, up)
+        draw_view(figure.add_subplot(grid[0, k]), name, splats, np.array(toward), right, up)
     corner = np.array(VIEWS["from the corner"][0])
     cut = f"red is cut: {np.count_nonzero(~kept)} of {splats.count} splats"
-    _draw_view(figure.add_subplot(grid[1, 0]), cut, marked, corner, "", "")
-    _draw_view(figure.add_subplot(grid[1, 1]), "what is taken", thing, corner, "", "")
+    draw_view(figure.add_subplot(grid[1, 0]), cut, marked, corner, "", "")
+    draw_view(figure.add_subplot(grid[1, 1]), "what is taken", thing, corner, "", "")
     _draw_fill(figure.add_subplot(grid[1, 2]), survey, thing)
     words = figure.add_subplot(grid[1, 3])
     words.set_axis_off()
@@ -141,8 +141,20 @@ def _told(survey: SplatSurvey) -> list[str]:
     return [*lines, f"taken: {np.count_nonzero(survey.kept)} splats", f"   --crop {box}"]
 
 
-def _draw_view(axes: Any, title: str, splats: Splats, toward: Array, right: str, up: str) -> None:
-    """Draw splats from one side, with a bar and the axes."""
+def draw_view(
+    axes: Any, title: str, splats: Splats, toward: Array, right: str = "", up: str = "", *, unit: str | None = None
+) -> None:
+    """Draw splats from one side, with a bar and the axes.
+
+    Args:
+        axes: Axes of matplotlib.
+        title: Title of the picture.
+        splats: What is drawn.
+        toward: Direction to the camera, shape (3,).
+        right: Name of the axis to the right, empty in a view along none.
+        up: Name of the axis up.
+        unit: Unit of the bar, in a picture of a known scale, which then has no axes.
+    """
     toward = toward / np.linalg.norm(toward)
     above = np.array([0.0, 1.0, 0.0]) if abs(toward[2]) > 0.9 else np.array([0.0, 0.0, 1.0])
     across = np.cross(above, toward)
@@ -167,7 +179,7 @@ def _draw_view(axes: Any, title: str, splats: Splats, toward: Array, right: str,
     bar = _round_length(0.6 * reach)
     left, bottom = extent[0] + 0.06 * reach, extent[2] + 0.08 * reach
     axes.plot([left, left + bar], [bottom, bottom], color="black", lw=3, solid_capstyle="butt")
-    axes.text(left + 0.5 * bar, bottom + 0.03 * reach, f"{bar:g}", ha="center", va="bottom", fontsize=9)
+    axes.text(left + 0.5 * bar, bottom + 0.03 * reach, f"{bar:g} {unit or ''}", ha="center", va="bottom", fontsize=9)
     axes.tick_params(labelsize=8)
     if right:
         axes.set_xlabel(right, fontsize=10, labelpad=0)
@@ -175,6 +187,9 @@ def _draw_view(axes: Any, title: str, splats: Splats, toward: Array, right: str,
         return
     axes.set_xticks([])
     axes.set_yticks([])
+    if unit is not None:
+        axes.set_frame_on(False)
+        return
     root = np.array([extent[0] + 0.25 * reach, extent[3] - 0.45 * reach])
     for axis, name, color in zip(np.eye(3), "xyz", ("#c0392b", "#27964a", "#2a5bd7"), strict=True):
         tip = root + 0.28 * reach * np.array([axis @ across, axis @ upward])

@@ -141,7 +141,9 @@ def _own_splat(names: dict[str, Any], folder: Path) -> None:
     toy = names["toy"]
     assert np.ptp(toy.splats.means, axis=0).max() == abs(np.diff(toy.splats.bounds(), axis=0)).max()
     np.testing.assert_allclose(np.ptp(toy.splats.means, axis=0).max(), 0.08, rtol=0.05)
-    assert toy.body.provenance["quadrature_parts"] == 1 and toy.body.provenance["cubature_force_error"] < 0.02
+    assert toy.body.provenance["quadrature_parts"] == 1
+    error = toy.body.provenance["cubature_force_error"]
+    assert error < 0.03, error  # More than of a bar: functions of the larger space vary more.
     assert names["env"].unwrapped.scene.soft.body.name == toy.body.name
 
 

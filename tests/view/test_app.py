@@ -415,3 +415,29 @@ def test_the_command_refuses(arguments: list[str], words: str, capsys: pytest.Ca
     """Mistakes are one line and exit code 2."""
     assert main(["view", *arguments, "--port", "0", "--no-open"]) == 2
     assert words in capsys.readouterr().err.lower()
+
+
+def test_a_stroke_of_the_mouse_cuts(tmp_path: Path) -> None:
+    """In mode cut a drag across shows a line and cuts at its end; the page gets other splats; a reset heals."""
+    with served(record_folder=tmp_path) as view, PageClient(view.app.url) as client:
+        client.splats()
+        count = view.ask(lambda session: len(session.splats().means))
+        centre, size = view.ask(lambda session: session.centre()), view.ask(lambda session: session.size)
+        client.send(camera_message(centre - np.array([0.0, 6.0 * size, 0.0])))
+        view.ask(lambda session: view.app._panel._set_mode("cut"))
+        start, end = centre - np.array([0.2 * size, 0.2 * size, 0.0]), centre + np.array([0.3 * size, -0.2 * size, 0.0])
+        for phase, at in (("start", start), ("update", end)):
+            client.send(drag_message(phase, start, at))
+        assert view.wait(lambda session: view.app._stage.stroke is not None) and view.app._stage._line.visible
+        client.send(drag_message("end", start, end))
+        assert view.wait(lambda session: len(session.objects) == 2, 60.0)
+        assert view.app._stage.stroke is None
+        more = view.ask(lambda session: len(session.splats().means))
+        assert more > count
+        for _ in range(200):
+            if len(client.splats()[0]) == more:
+                break
+        else:
+            raise AssertionError("the page kept the splats before the cut")
+        view.ask(lambda session: session.reset())
+        assert view.ask(lambda session: len(session.splats().means)) == count

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
+import signal
+import socket
+import subprocess
+import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,6 +24,8 @@ from softmode.splats import make_plush, read_splats, write_splats
 from softmode.view.app import ViewOptions
 
 pytest.importorskip("viser", reason="the extra viz is not installed")
+from websockets.exceptions import WebSocketException
+
 from softmode.view.prepare import PreparePage
 from tests.view.page_client import PageClient
 
@@ -69,12 +77,13 @@ def test_a_browser_sees_the_page_and_the_button_ends_it(page: PreparePage) -> No
     """A client is sent splats, box and gizmos; without a press there is nothing to build, with one there is."""
     with PageClient(page.url) as client:
         names: set[str] = set()
+        shown = {"/splats", "/box", *(f"/gizmos 1/{name}" for name in ("corner 0", "corner 1", "turn"))}
         for _ in range(20):
             messages, _, _ = client.receive(10.0)
             names |= {str(one.get("name")) for one in messages}
-            if {"/splats", "/box", "/corner 0", "/corner 1", "/turn"} <= names:
+            if shown <= names:
                 break
-        assert {"/splats", "/box", "/corner 0", "/corner 1", "/turn"} <= names
+        assert shown <= names
     assert not page.wait(0.05)
     threading.Timer(0.1, page.press).start()
     assert page.wait(20.0)
@@ -84,3 +93,39 @@ def test_only_splat_files_are_prepared(tmp_path: Path, capsys: pytest.CaptureFix
     """Nothing to prepare is an error that says so."""
     assert main(["view", "--prepare", "--port", "0", "--no-open"]) == 2
     assert "Give a splat file" in capsys.readouterr().err
+
+
+def pressed(url: str, label: str) -> None:
+    """Press a button of the page that is, or soon will be, at an address; viser's own page connects again likewise."""
+    ends = time.monotonic() + 120.0
+    while time.monotonic() < ends:
+        with contextlib.suppress(OSError, WebSocketException, TimeoutError), PageClient(url) as client:
+            while time.monotonic() < ends:
+                for message in client.receive(10.0)[0]:
+                    if message["type"] == "GuiButtonMessage" and message["props"]["label"] == label:
+                        client.send({"type": "GuiUpdateMessage", "uuid": message["uuid"], "updates": {"value": True}})
+                        with contextlib.suppress(WebSocketException, TimeoutError):
+                            while True:  # until the server ends, as both buttons have it
+                                client.receive(20.0)
+                        return
+        time.sleep(0.2)
+    raise TimeoutError(f"no button {label!r} at {url}")
+
+
+def test_a_running_page_is_prepared_by_its_button(capture: Path) -> None:
+    """A page that shows a capture has a button for the gizmos, at the same address; theirs brings the object back."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    words = ["view", str(capture), "--size", "0.08", "--up=+x", "--port", str(port), "--no-open"]
+    with subprocess.Popen([sys.executable, "-m", "softmode", *words], stdout=subprocess.PIPE, text=True) as running:
+        try:
+            for label in ("prepare", "build", "prepare"):
+                pressed(f"http://127.0.0.1:{port}", label)
+        finally:
+            running.send_signal(signal.SIGINT)
+            said, _ = running.communicate(timeout=60.0)
+    assert running.returncode == 0
+    assert said.count(f"open http://127.0.0.1:{port}") >= 3  # the object, the gizmos, the object
+    assert f"to do this again: softmode view {shlex.quote(str(capture))} --up=+x --port {port} --no-open" in said
+    assert "--size 0.08" in said

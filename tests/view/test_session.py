@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.patch import Patch
 from softmode.deformables.materials.material import Material
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, lift_scene
-from softmode.errors import AssetError, ConfigError, StorageError
+from softmode.errors import AssetError, ConfigError, MaterialError, StorageError
 from softmode.objects import ObjectConfig, load
+from softmode.scenes.motion import coordinates
 from softmode.splats.formats import write_splats
-from softmode.view.coordinates import coordinates
 from softmode.view.live_recording import LiveRecording
 from softmode.view.live_types import LiveOptions
 from softmode.view.session import LiveSession
@@ -469,6 +470,108 @@ def test_pins_keep_their_numbers_when_handles_change():
     live.unpin(own)
     live.set_functions(24)
     assert len(live.pins()) == 1
+
+
+# -- cuts -------------------------------------------------------------------------------------------------------------
+
+
+def finish(live, seconds=60.0):
+    """Let time run until what is built in the background is done."""
+    ends = time.monotonic() + seconds
+    while live.status().notice.endswith("...") and time.monotonic() < ends:
+        live.advance(FRAME)
+    live.advance(1e-3)
+
+
+def test_a_cut_lets_the_lower_half_fall():
+    """Cut across while it hangs: two objects, the pin keeps its number and half, the other falls at g.
+
+    The session goes on meanwhile, momentum and energy do not jump, a reset makes the box whole again.
+    """
+    live = session()
+    settle(live)
+    centre, count = live.centre(), len(live.splats().means)
+    assert live.generation == 1
+    live.pause()
+    before = live.energies()
+    live.cut(Patch.plane(centre, (0.2, 0.0, 1.0)))
+    assert live.status().notice == "cutting ..."
+    with pytest.raises(ConfigError, match="under way"):
+        live.cut(Patch.plane(centre, (0.0, 0.0, 1.0)))
+    finish(live)
+    assert live.generation == 2 and "is cut into 2 parts" in live.status().notice
+    after = live.energies()
+    assert after.elastic <= before.elastic and after.kinetic <= before.kinetic * (1.0 + 1e-9)
+    assert after.gravitational == pytest.approx(before.gravitational, rel=1e-6)
+    assert len(live.splats().means) > count and list(live.pins()) == [1]
+    upper = int(live.centre(1)[2] > live.centre(0)[2])
+    assert live.pins()[1].object_index == upper
+    held, start, rate = live.centre(upper), live.centre(1 - upper)[2], coordinates(live._scene, "qd", 1 - upper)
+    speed = live.objects[1 - upper].body.mean_basis @ rate
+    for _ in range(12):
+        live.step()
+    t, dt = 12 / 120.0, 1.0 / 240.0
+    fall = speed[2] * t - 0.5 * 9.81 * t * (t + dt)
+    assert live.centre(1 - upper)[2] - start == pytest.approx(fall, rel=0.02)
+    assert np.linalg.norm(live.centre(upper) - held) < 0.2 * abs(fall)
+    with pytest.raises(ConfigError, match="cut"):
+        live.set_functions(16)
+    live.reset()
+    assert live.generation == 3 and len(live.splats().means) == count and len(live.pins()) == 1
+
+
+def test_a_slit_and_a_miss():
+    """A stroke that ends inside leaves one object with a slit; one beside it nothing, and says so."""
+    live = session("drop")
+    live.pause()
+    centre = live.centre()
+    live.cut(Patch.stroke(centre - np.array([0.0, 1.0, 0.0]), centre + np.array([0.0, 0.0, 0.2]), centre))
+    finish(live)
+    assert "has a slit" in live.status().notice and live.generation == 2
+    live.cut(Patch.plane(centre + 1.0, (0.0, 0.0, 1.0)))
+    finish(live)
+    assert "misses" in live.status().notice and live.generation == 2
+
+
+def test_an_environment_is_not_cut():
+    """Its object is its own; nor is a body cut that keeps no sources, which the notice says."""
+    live = LiveSession.from_object(replace(load(BOX), body=replace(load(BOX).body, sources=None)), options=PATIENT)
+    live.cut(Patch.plane(live.centre(), (0.0, 0.0, 1.0)))
+    finish(live)
+    assert "cutting failed" in live.status().notice and live.generation == 1
+
+
+def test_a_brush_makes_softer(tmp_path):
+    """What it touches gives way more; undone it does not; the file keeps the field and the material."""
+    live = session("drop")
+    live.pause()
+    hit = side(live)
+    stiff = live.objects[0].body
+    assert (stiff.stiffness_scale == 1.0).all()
+    live.paint([hit], 0.1, radius=0.3 * SIZE, depth=0.3 * SIZE)
+    finish(live)
+    body = live.objects[0].body
+    assert "0.1 times as stiff" in live.status().notice
+    near = np.linalg.norm(body.points - hit.rest_point, axis=1)
+    assert body.stiffness_scale[near.argmin()] == 0.1 and body.stiffness_scale[near.argmax()] == 1.0
+    live.save(tmp_path / "painted.npz")
+    again = load(tmp_path / "painted.npz")
+    assert np.array_equal(again.body.stiffness_scale, body.stiffness_scale)
+    assert again.material is not None and again.material.youngs_modulus == pytest.approx(SOFT.youngs_modulus)
+    live.paint([hit], 0.1, radius=0.3 * SIZE, depth=0.3 * SIZE)
+    finish(live)
+    assert live.objects[0].body.stiffness_scale.min() == pytest.approx(0.01)
+    with pytest.raises(MaterialError, match=r"0\.001"):
+        live.paint([hit], 0.05, radius=0.3 * SIZE, depth=0.3 * SIZE)
+    for _ in range(2):
+        live.undo_paint()
+    assert live.objects[0].body is stiff
+    with pytest.raises(ConfigError, match="nothing is painted"):
+        live.undo_paint()
+    with pytest.raises(MaterialError, match="factor"):
+        live.paint([hit], 1e-4, radius=0.1, depth=0.1)
+    with pytest.raises(ConfigError, match="touched nothing"):
+        live.paint([], 2.0, radius=0.1, depth=0.1)
 
 
 # -- recording --------------------------------------------------------------------------------------------------------
