@@ -118,13 +118,20 @@ def test_a_running_page_is_prepared_by_its_button(capture: Path) -> None:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     words = ["view", str(capture), "--size", "0.08", "--up=+x", "--port", str(port), "--no-open"]
-    with subprocess.Popen([sys.executable, "-m", "softmode", *words], stdout=subprocess.PIPE, text=True) as running:
+    command = [sys.executable, "-m", "softmode", *words]
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a job in the background ignores it
+    ) as running:
         try:
             for label in ("prepare", "build", "prepare"):
                 pressed(f"http://127.0.0.1:{port}", label)
-        finally:
             running.send_signal(signal.SIGINT)
             said, _ = running.communicate(timeout=60.0)
+        finally:
+            running.kill()  # a page that is still open would keep the test waiting for ever
     assert running.returncode == 0
     assert said.count(f"open http://127.0.0.1:{port}") >= 3  # the object, the gizmos, the object
     assert f"to do this again: softmode view {shlex.quote(str(capture))} --up=+x --port {port} --no-open" in said
