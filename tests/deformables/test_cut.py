@@ -276,7 +276,7 @@ def test_regions_go_with_their_part(bar: ReducedBody) -> None:
     qd = motion(held)[1]
     after = sum(part.volume * part.mean_basis @ carry_over(held, part, 0.0 * qd, qd)[1] for part in cut.bodies)
     before = held.volume * held.mean_basis @ qd
-    np.testing.assert_allclose(after, before, atol=1e-3 * np.linalg.norm(before))  # cells at the soft region differ
+    np.testing.assert_allclose(after, before, atol=5e-3 * np.linalg.norm(before))  # cells at the soft region differ
     clamped = hold(bar, end)
     qd = motion(clamped)[1]
     parts = cut_body(clamped, MIDDLE).bodies

@@ -98,7 +98,7 @@ def test_matrix_of_the_papers_warp():
     shifts = step * np.eye(3)
     bend = np.stack([(gradient(rest + s) - gradient(rest - s)) / (2.0 * step) for s in shifts], axis=-1)
     errors = []
-    for reach in (0.02, 0.01):
+    for reach in (0.01, 0.005):  # halved from 0.02 on the error falls by 5.6, 6.7 and 7.3
         away = reach * np.random.default_rng(1).uniform(-1.0, 1.0, rest.shape)
         there = rest + away
         apart = there + bar().evaluate(there)[0] @ q - moved
