@@ -6,15 +6,27 @@ import numpy as np
 import pytest
 import warp as wp
 
+from softmode.deformables.solver import minimise
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
+from softmode.deformables.solver.step_tables import StepTables
 from softmode.envs.presets import RL_BUILD, RL_SOLVER, rl_scene
 from softmode.scenes.table_scene import TableScene, TableSceneConfig
 
 CLOSE = np.array([0.0, 0.0, -1.0, 0.0, 1.0], np.float32)
 
 
-def grasp(device: str, *, one_launch: bool, shared: bool = False, worlds: int = 2) -> dict[str, np.ndarray]:
-    """Lower the open gripper over the object, close it until both fingers press, and return where everything is."""
+def grasp(
+    device: str, *, one_launch: bool, shared: bool = False, worlds: int = 2, eager: bool = False
+) -> dict[str, np.ndarray]:
+    """Lower the open gripper over the object, close it until both fingers press, and return where everything is.
+
+    Args:
+        device: Where.
+        one_launch: Whether all Newton iterations of a world are one launch.
+        shared: Whether that solves in shared memory.
+        worlds: How many.
+        eager: Whether one more step is taken without a graph at the end.
+    """
     scene = TableScene(rl_scene(), world_count=worlds, device=device)
     reduced = scene.solver.reduced
     reduced.tables = dataclasses.replace(reduced.tables, one_launch=one_launch, shared=shared)
@@ -23,6 +35,8 @@ def grasp(device: str, *, one_launch: bool, shared: bool = False, worlds: int = 
         down = np.clip((scene.soft.height - height) / 0.015, -1.0, 1.0)
         grip = 1.0 if step < 16 else max(1.0 - 0.08 * (step - 15), -0.3)
         scene.step(np.tile(np.array([0.0, 0.0, down, 0.0, grip], np.float32), (worlds, 1)))
+    if eager:
+        scene.control_step()
     assert (np.linalg.norm(scene.finger_force.numpy(), axis=2) > 0.5).all()
     assert not scene.status.any()
     arrays = {"q": scene.state.softmode.q, "joint_q": scene.state.joint_q, "force": scene.finger_force}
@@ -34,6 +48,23 @@ def test_one_launch_equals_launches_per_phase() -> None:
     apart, at_once = (grasp("cpu", one_launch=flag) for flag in (False, True))
     for name, value in apart.items():
         np.testing.assert_array_equal(at_once[name], value)
+
+
+def test_accepted_trial_serves_the_next_iteration(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the line search has found at an accepted trial is what an evaluation there finds: equal to the bit."""
+    kept = grasp("cpu", one_launch=False, worlds=1, eager=True)
+    again, seen = minimise.evaluate, []
+
+    def evaluate(tables: StepTables, dt: float, *, derivatives: bool) -> None:
+        if not tables.model.device.is_capturing:
+            seen.append(tables.newton.evaluated.numpy()[0])
+        tables.newton.evaluated.zero_()
+        again(tables, dt, derivatives=derivatives)
+
+    monkeypatch.setattr(minimise, "evaluate", evaluate)
+    for name, value in grasp("cpu", one_launch=False, worlds=1, eager=True).items():
+        np.testing.assert_array_equal(kept[name], value)
+    assert 0 < sum(seen) < len(seen)
 
 
 @pytest.mark.gpu

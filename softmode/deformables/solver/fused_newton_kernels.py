@@ -21,7 +21,7 @@ from softmode.deformables.solver.assembly_kernels import (
 )
 from softmode.deformables.solver.factor_kernels import factor_system, solve_system
 from softmode.deformables.solver.fused_system_kernels import shared_system, sum_forces_of
-from softmode.deformables.solver.iteration_kernels import NewtonStep
+from softmode.deformables.solver.iteration_kernels import ALL, NewtonStep
 from softmode.deformables.solver.rigid_row_kernels import evaluate_row
 from softmode.deformables.solver.search_kernels import accept_step, check_convergence, check_trial, start_line_search
 from softmode.deformables.solver.step_kernels import (
@@ -67,14 +67,14 @@ def minimise_worlds(
                 r[w, j] = step.rigid.r[w, j]
             barrier()
         # one copy of this code serves iterates and trials
-        slopes = 1 - trial
+        found = ALL + trial
         for i in range(begin, end):
             for p in range(member, step.instances.point_count[i], team):
-                evaluate_point(step, step.state.active, q, slopes, i, p)
+                evaluate_point(step, step.state.active, q, found, i, p)
             for e in range(member, step.constraints.count[i], team):
-                evaluate_constraint(step, step.state.active, q, r, slopes, i, e)
+                evaluate_constraint(step, step.state.active, q, r, 1 - trial, i, e)
         for k in range(member, step.rigid.row_count[w], team):
-            evaluate_row(step, step.state.active, r, slopes, w, k)
+            evaluate_row(step, step.state.active, r, found, w, k)
         barrier()
         if trial == 0:
             for i in range(begin, end):

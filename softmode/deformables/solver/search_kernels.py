@@ -137,6 +137,7 @@ def check_convergence(step: NewtonStep, team: int, w: int, member: int):
             done = 0
     if member != 0:
         return
+    step.state.evaluated[w] = 0
     step.state.potential[w] = potential
     if wp.isnan(potential):
         step.state.active[w] = 0
@@ -238,6 +239,7 @@ def check_trial(step: NewtonStep, team: int, w: int, member: int):
     """Accept a trial that lowers the potential enough (Armijo, up to rounding) or halve the step; give up if short.
 
     Where a full step has lowered it by more than a quadratic would have, take the better of that and twice the step.
+    What has been evaluated of an accepted trial serves the next iteration.
     """
     if step.state.searching[w] == 0:
         return
@@ -250,8 +252,10 @@ def check_trial(step: NewtonStep, team: int, w: int, member: int):
     alpha = step.state.step_length[w]
     if alpha > wp.float64(1.0):
         step.state.searching[w] = 0
+        step.state.evaluated[w] = 1
         if not (trial < step.state.reached[w]):
             step.state.step_length[w] = wp.float64(1.0)
+            step.state.evaluated[w] = 0
         return
     if alpha == wp.float64(1.0) and trial < potential + EXTENDED_DECREASE * step.state.slope[w] - rounding:
         step.state.reached[w] = trial
@@ -260,6 +264,7 @@ def check_trial(step: NewtonStep, team: int, w: int, member: int):
         return
     if trial <= potential + SUFFICIENT_DECREASE * alpha * step.state.slope[w] + rounding:
         step.state.searching[w] = 0
+        step.state.evaluated[w] = 1
         return
     alpha *= wp.float64(0.5)
     if alpha < step.options.step_length_min:
@@ -367,6 +372,7 @@ def accept_step(step: NewtonStep, team: int, w: int, member: int):
         step.state.status[w] = step.state.status[w] | WORLD_NO_DESCENT
     elif step.state.last[w] == 1 and step.state.in_contact[w] == 0:
         step.state.active[w] = 0
+        step.state.evaluated[w] = 0
     else:
         wp.atomic_max(step.state.any_active, 0, 1)
 
