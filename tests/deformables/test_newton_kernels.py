@@ -67,6 +67,22 @@ def test_accepted_trial_serves_the_next_iteration(monkeypatch: pytest.MonkeyPatc
     assert 0 < sum(seen) < len(seen)
 
 
+def test_list_of_acting_contacts() -> None:
+    """Sums go over the contacts with a force or a Hessian, in order; at rest most samples of the underside are near."""
+    scene = TableScene(rl_scene())
+    for _ in range(2):
+        scene.step(np.zeros(5, np.float32))
+    tables = scene.solver.reduced.tables
+    tables.newton.active.fill_(1)
+    minimise.evaluate(tables, scene.dt, derivatives=True)
+    constraints = tables.constraints
+    count, listed = (int(array.numpy()[0]) for array in (constraints.count, constraints.acting_count))
+    force, hessian = (array.numpy()[0, :count] for array in (constraints.force, constraints.hessian))
+    acts = force.any(axis=1) | hessian.any(axis=(1, 2))
+    assert 0 < acts.sum() < count
+    np.testing.assert_array_equal(constraints.acting.numpy()[0, :listed], np.flatnonzero(acts))
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a GPU")
 @pytest.mark.parametrize("shared", [False, True])

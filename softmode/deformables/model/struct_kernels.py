@@ -125,6 +125,8 @@ class PointConstraints:
     energy: wp.array2d[wp.float64]  # [J]
     force: wp.array2d[wp.vec3d]  # on the soft body [N]
     hessian: wp.array2d[wp.mat33]  # [N/m]
+    acting: wp.array2d[int]  # all pins, then the contacts that act, in order: those with a force or a Hessian
+    acting_count: wp.array[int]  # (instance_count,)
     dof_begin: wp.array2d[int]  # the rigid unknowns that move the shape; an empty range where none does
     dof_end: wp.array2d[int]
     jacobian: wp.array3d[wp.vec3]  # (instance_count, constraint_max, rigid_max), motion of the shape per such unknown

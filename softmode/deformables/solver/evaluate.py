@@ -22,6 +22,8 @@ def evaluate(tables: StepTables, dt: float, *, derivatives: bool) -> None:
     t = tables
     found = ALL if derivatives else ENERGIES
     _evaluate(t, dt, t.newton.active, t.arrays.q, t.rigid.table.r, found=int(found), forces=derivatives)
+    if derivatives:
+        t.launch_teams(kernels.list_constraints, t.layout.instance_count, t.step, t.team)
 
 
 def evaluate_trial(tables: StepTables, dt: float) -> None:

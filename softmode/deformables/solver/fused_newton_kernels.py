@@ -28,6 +28,7 @@ from softmode.deformables.solver.step_kernels import (
     evaluate_constraint,
     evaluate_point,
     gradient_block,
+    list_acting,
     sum_force_block,
 )
 
@@ -77,6 +78,9 @@ def minimise_worlds(
             evaluate_row(step, step.state.active, r, found, w, k)
         barrier()
         if trial == 0:
+            for i in range(begin, end):
+                list_acting(step, team, i, member)
+            barrier()
             for i in range(begin, end):
                 if step.options.shared != 0:
                     sum_forces_of(step, i, member, team)

@@ -61,7 +61,8 @@ def _sized(snippet: str) -> str:
         }
         __syncthreads();
         const int blocks = N / 24;
-        const int constraint_count = step.constraints.count.data[i];
+        const int acting_count = step.constraints.acting_count.data[i];
+        const int* acting = (const int*)step.constraints.acting.data + (size_t)i * step.constraints.acting.shape[1];
         const int* rows = (const int*)step.constraints.row.data + (size_t)i * step.constraints.row.shape[1];
         const int room = step.constraints.hessian.shape[1];
         const float* H = (const float*)step.constraints.hessian.data + (size_t)i * room * 9;
@@ -72,7 +73,7 @@ def _sized(snippet: str) -> str:
             const int d = (t / (2 * blocks * blocks)) % 3;
             const int k = (t / blocks) % (2 * blocks);
             const int m = t % blocks;
-            if (c > d || (c == d && m < k / 2) || constraint_count == 0) continue;
+            if (c > d || (c == d && m < k / 2) || acting_count == 0) continue;
             float sum[4][8];
             #pragma unroll
             for (int a = 0; a < 4; ++a) {
@@ -80,7 +81,8 @@ def _sized(snippet: str) -> str:
                 for (int b = 0; b < 8; ++b) sum[a][b] = 0.0f;
             }
             #pragma unroll 4
-            for (int e = 0; e < constraint_count; ++e) {
+            for (int s = 0; s < acting_count; ++s) {
+                const int e = acting[s];
                 const float* r = values + (size_t)rows[e] * 8 * blocks;
                 const float h = H[9 * e + 3 * c + d];
                 const float4 u = *(const float4*)&r[4 * k];
@@ -218,7 +220,8 @@ def shared_system(
     const int n = 8 * blocks;
     const int first_point = step.instances.point_start.data[i];
     const int point_count = step.instances.point_count.data[i];
-    const int constraint_count = step.constraints.count.data[i];
+    const int acting_count = step.constraints.acting_count.data[i];
+    const int* acting = (const int*)step.constraints.acting.data + (size_t)i * step.constraints.acting.shape[1];
     const double* P = (const double*)step.points.stress.data + (size_t)i * step.points.stress.shape[1] * 9;
     const double* F = (const double*)step.constraints.force.data + (size_t)i * step.constraints.force.shape[1] * 3;
     const int* rows = (const int*)step.constraints.row.data + (size_t)i * step.constraints.row.shape[1];
@@ -237,7 +240,10 @@ def shared_system(
             value += P[9 * p + 3 * axis + 2] * (double)G[3 * n * p + 2 * n];
         }
         #pragma unroll 8
-        for (int e = 0; e < constraint_count; ++e) value -= F[3 * e + axis] * (double)values[(size_t)rows[e] * n + k];
+        for (int s = 0; s < acting_count; ++s) {
+            const int e = acting[s];
+            value -= F[3 * e + axis] * (double)values[(size_t)rows[e] * n + k];
+        }
         out[t] = value;
     }
 #endif

@@ -80,7 +80,8 @@ def rigid_excess(step: NewtonStep, w: int, member: int, team: int):
         for k in range(step.rigid.count[w]):
             residual += step.rigid.inertia[w, j, k] * (step.rigid.r[w, k] - step.rigid.predicted[w, k])
         for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
-            for e in range(first_coupled(step.instances, i), step.constraints.count[i]):
+            for k in range(first_coupled(step.instances, i), step.constraints.acting_count[i]):
+                e = step.constraints.acting[i, k]
                 if j >= step.constraints.dof_begin[i, e] and j < step.constraints.dof_end[i, e]:
                     force = wp.dot(wp.vec3d(step.constraints.jacobian[i, e, j]), step.constraints.force[i, e])
                     residual += force
@@ -123,8 +124,8 @@ def check_convergence(step: NewtonStep, team: int, w: int, member: int):
             for e in range(member, q.shape[1], team):
                 residual += wp.dot(gradient[i, e], gradient[i, e])
                 external += wp.dot(step.motion.force[i, e], step.motion.force[i, e])
-            for e in range(member, step.constraints.count[i], team):
-                scale += wp.length(step.constraints.force[i, e])
+            for k in range(member, step.constraints.acting_count[i], team):
+                scale += wp.length(step.constraints.force[i, step.constraints.acting[i, k]])
             residual = team_sum(residual)
             scale = wp.sqrt(team_sum(external)) + team_sum(scale)
             floor = wp.float64(1.0e-5) * step.instances.mass[i] * wp.float64(step.instances.tolerance[i]) / (dt * dt)

@@ -30,7 +30,7 @@ from softmode.deformables.materials.material_kernels import (
 )
 from softmode.deformables.model.declare import kernel_over
 from softmode.deformables.model.deformation_kernels import elastic_gradient
-from softmode.deformables.model.lane_kernels import LANES, team_sum, vec8d
+from softmode.deformables.model.lane_kernels import LANES, team_rank, team_sum, vec8d
 from softmode.deformables.model.status import (
     PARAMETER_BITS,
     WORLD_COLLAPSED,
@@ -40,6 +40,7 @@ from softmode.deformables.model.status import (
 from softmode.deformables.model.struct_kernels import (
     Basis,
     Instances,
+    PointConstraints,
     blocks_of,
     has_contacts,
     in_mask,
@@ -393,6 +394,44 @@ evaluate_constraints = kernel_over(evaluate_constraint, "evaluate_constraints", 
 
 
 @wp.func
+def acts(constraints: PointConstraints, i: int, e: int):
+    """Return whether a constraint has a force or a Hessian; what is no number does."""
+    total = wp.float64(0.0)
+    for a in range(3):
+        total += wp.abs(constraints.force[i, e][a])
+        for b in range(3):
+            total += wp.float64(wp.abs(constraints.hessian[i, e][a, b]))
+    return not (total == wp.float64(0.0))
+
+
+@wp.func
+def list_acting(step: NewtonStep, team: int, i: int, member: int):
+    """List the constraints of an instance that act at the iterate: more than half of the contacts are only near."""
+    if step.state.active[step.instances.world[i]] == 0:
+        return
+    pins = step.instances.pin_count[i]
+    count = step.constraints.count[i]
+    for e in range(member, pins, team):
+        step.constraints.acting[i, e] = e
+    found = int(pins)
+    for first in range(pins, count, team):
+        e = first + member
+        flag = int(0)
+        if e < count:
+            if acts(step.constraints, i, e):
+                flag = 1
+        rank = team_rank(flag)
+        if flag != 0:
+            step.constraints.acting[i, found + rank % 65536] = e
+        found += rank / 65536
+    if member == 0:
+        step.constraints.acting_count[i] = found
+
+
+list_constraints = kernel_over(list_acting, "list_constraints", "i", "member")
+
+
+@wp.func
 def sum_force_block(step: NewtonStep, active: wp.array[int], i: int, chunk: int, b: int):
     """Sum V P grad b_k over one chunk of the points, less b_k f over one chunk of the constraints."""
     if active[step.instances.world[i]] == 0 or LANES * b >= step.instances.function_count[i]:
@@ -406,8 +445,9 @@ def sum_force_block(step: NewtonStep, active: wp.array[int], i: int, chunk: int,
         P = wp.transpose(step.points.stress[i, p])
         for k in range(3):
             total = add_outer_3d(total, P[k], vec8d(step.basis.gradient_across[b, first + p, k]))
-    count = step.constraints.count[i]
-    for e in range(chunk * count / chunk_count, (chunk + 1) * count / chunk_count):
+    count = step.constraints.acting_count[i]
+    for k in range(chunk * count / chunk_count, (chunk + 1) * count / chunk_count):
+        e = step.constraints.acting[i, k]
         total = add_outer_3d(total, -step.constraints.force[i, e], vec8d(step.basis.row[step.constraints.row[i, e], b]))
     for axis in range(3):
         step.arrays.gradient_chunk[i, chunk, axis * stride + b] = total[axis]
