@@ -1,6 +1,9 @@
 """Newton's iteration in one launch does what the launches per phase do; a carried stiffness only saves time."""
 
 import dataclasses
+import re
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -93,6 +96,17 @@ def test_one_launch_on_cuda(shared: bool) -> None:
     for name in ("q", "joint_q"):
         np.testing.assert_allclose(at_once[name], apart[name], atol=1.0e-5)
     np.testing.assert_allclose(at_once["force"], apart["force"], atol=1.0e-3 * np.abs(apart["force"]).max())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs the CUDA compiler of Warp's wheel")
+def test_no_thread_copies_the_tables(tmp_path: Path) -> None:
+    """Compiled for CUDA, no kernel of the line search has the 8 kB of the step's struct in its threads' own memory."""
+    module = "softmode.deformables.solver.search_kernels"
+    wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
+    (code,) = tmp_path.glob("*.ptx")
+    text = code.read_text(errors="replace")
+    assert ".entry check_iterates" in text
+    assert max([int(size) for size in re.findall(r"__local_depot\d+\[(\d+)\];", text)], default=0) < 1000
 
 
 def test_carried_stiffness_agrees_within_tolerance() -> None:

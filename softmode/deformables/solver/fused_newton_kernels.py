@@ -83,7 +83,9 @@ def minimise_worlds(
             barrier()
             for i in range(begin, end):
                 if step.options.shared != 0:
-                    sum_forces_of(step, i, member, team)
+                    sum_forces_of(
+                        step.instances, step.basis, step.points, step.constraints, step.arrays, i, member, team
+                    )
                 else:
                     for t in range(member, chunks * blocks, team):
                         sum_force_block(step, step.state.active, i, t / blocks, t % blocks)
@@ -118,7 +120,19 @@ def minimise_worlds(
                     inertia = float(
                         step.instances.mass[begin] * rate * (rate + wp.float64(step.instances.mass_damping[begin]))
                     )
-                    shared_system(0, inertia, step, begin, w, member, team)
+                    shared_system(
+                        0,
+                        inertia,
+                        rigid_max,
+                        step.basis,
+                        step.constraints,
+                        step.rigid,
+                        step.arrays,
+                        begin,
+                        w,
+                        member,
+                        team,
+                    )
                 for s in range(step.arrays.system_start[w], step.arrays.system_start[w + 1 - step.options.shared]):
                     factor_system(
                         step.state.active, team, step.options.factor_width, unit, step.arrays.systems, s, member
@@ -131,7 +145,19 @@ def minimise_worlds(
                     solve_rigid_team(step.state.active, team, step.rigid, w, member)
                     barrier()
                 if step.options.shared != 0:
-                    shared_system(1, inertia, step, begin, w, member, team)
+                    shared_system(
+                        1,
+                        inertia,
+                        rigid_max,
+                        step.basis,
+                        step.constraints,
+                        step.rigid,
+                        step.arrays,
+                        begin,
+                        w,
+                        member,
+                        team,
+                    )
                 for s in range(step.arrays.system_start[w], step.arrays.system_start[w + 1 - step.options.shared]):
                     solve_system(
                         step.state.active,
