@@ -1,20 +1,35 @@
 """Newton's iteration in one launch does what the launches per phase do; a carried stiffness only saves time."""
 
 import dataclasses
+import re
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import warp as wp
 
+from softmode.deformables.solver import minimise
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
+from softmode.deformables.solver.step_tables import StepTables
 from softmode.envs.presets import RL_BUILD, RL_SOLVER, rl_scene
 from softmode.scenes.table_scene import TableScene, TableSceneConfig
 
 CLOSE = np.array([0.0, 0.0, -1.0, 0.0, 1.0], np.float32)
 
 
-def grasp(device: str, *, one_launch: bool, shared: bool = False, worlds: int = 2) -> dict[str, np.ndarray]:
-    """Lower the open gripper over the object, close it until both fingers press, and return where everything is."""
+def grasp(
+    device: str, *, one_launch: bool, shared: bool = False, worlds: int = 2, eager: bool = False
+) -> dict[str, np.ndarray]:
+    """Lower the open gripper over the object, close it until both fingers press, and return where everything is.
+
+    Args:
+        device: Where.
+        one_launch: Whether all Newton iterations of a world are one launch.
+        shared: Whether that solves in shared memory.
+        worlds: How many.
+        eager: Whether one more step is taken without a graph at the end.
+    """
     scene = TableScene(rl_scene(), world_count=worlds, device=device)
     reduced = scene.solver.reduced
     reduced.tables = dataclasses.replace(reduced.tables, one_launch=one_launch, shared=shared)
@@ -23,6 +38,8 @@ def grasp(device: str, *, one_launch: bool, shared: bool = False, worlds: int = 
         down = np.clip((scene.soft.height - height) / 0.015, -1.0, 1.0)
         grip = 1.0 if step < 16 else max(1.0 - 0.08 * (step - 15), -0.3)
         scene.step(np.tile(np.array([0.0, 0.0, down, 0.0, grip], np.float32), (worlds, 1)))
+    if eager:
+        scene.control_step()
     assert (np.linalg.norm(scene.finger_force.numpy(), axis=2) > 0.5).all()
     assert not scene.status.any()
     arrays = {"q": scene.state.softmode.q, "joint_q": scene.state.joint_q, "force": scene.finger_force}
@@ -36,6 +53,39 @@ def test_one_launch_equals_launches_per_phase() -> None:
         np.testing.assert_array_equal(at_once[name], value)
 
 
+def test_accepted_trial_serves_the_next_iteration(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the line search has found at an accepted trial is what an evaluation there finds: equal to the bit."""
+    kept = grasp("cpu", one_launch=False, worlds=1, eager=True)
+    again, seen = minimise.evaluate, []
+
+    def evaluate(tables: StepTables, dt: float, *, derivatives: bool) -> None:
+        if not tables.model.device.is_capturing:
+            seen.append(tables.newton.evaluated.numpy()[0])
+        tables.newton.evaluated.zero_()
+        again(tables, dt, derivatives=derivatives)
+
+    monkeypatch.setattr(minimise, "evaluate", evaluate)
+    for name, value in grasp("cpu", one_launch=False, worlds=1, eager=True).items():
+        np.testing.assert_array_equal(kept[name], value)
+    assert 0 < sum(seen) < len(seen)
+
+
+def test_list_of_acting_contacts() -> None:
+    """Sums go over the contacts with a force or a Hessian, in order; at rest most samples of the underside are near."""
+    scene = TableScene(rl_scene())
+    for _ in range(2):
+        scene.step(np.zeros(5, np.float32))
+    tables = scene.solver.reduced.tables
+    tables.newton.active.fill_(1)
+    minimise.evaluate(tables, scene.dt, derivatives=True)
+    constraints = tables.constraints
+    count, listed = (int(array.numpy()[0]) for array in (constraints.count, constraints.acting_count))
+    force, hessian = (array.numpy()[0, :count] for array in (constraints.force, constraints.hessian))
+    acts = force.any(axis=1) | hessian.any(axis=(1, 2))
+    assert 0 < acts.sum() < count
+    np.testing.assert_array_equal(constraints.acting.numpy()[0, :listed], np.flatnonzero(acts))
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a GPU")
 @pytest.mark.parametrize("shared", [False, True])
@@ -46,6 +96,17 @@ def test_one_launch_on_cuda(shared: bool) -> None:
     for name in ("q", "joint_q"):
         np.testing.assert_allclose(at_once[name], apart[name], atol=1.0e-5)
     np.testing.assert_allclose(at_once["force"], apart["force"], atol=1.0e-3 * np.abs(apart["force"]).max())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs the CUDA compiler of Warp's wheel")
+def test_no_thread_copies_the_tables(tmp_path: Path) -> None:
+    """Compiled for CUDA, no kernel of the line search has the 8 kB of the step's struct in its threads' own memory."""
+    module = "softmode.deformables.solver.search_kernels"
+    wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
+    (code,) = tmp_path.glob("*.ptx")
+    text = code.read_text(errors="replace")
+    assert ".entry check_iterates" in text
+    assert max([int(size) for size in re.findall(r"__local_depot\d+\[(\d+)\];", text)], default=0) < 1000
 
 
 def test_carried_stiffness_agrees_within_tolerance() -> None:

@@ -195,7 +195,9 @@ class AdjointReduced:
         self._step = allocate(kernels.Linearised, axes, self._sizes, self.device)
         points, constraints = Points(), PointConstraints()
         points.stress, constraints.force = self._step.point, self._step.constraint
-        constraints.count, constraints.row = t.constraints.count, t.constraints.row
+        constraints.row, constraints.acting_count = t.constraints.row, t.constraints.count  # all of them act
+        every = np.tile(np.arange(t.constraints.row.shape[1], dtype=np.int32), (self.instances, 1))
+        constraints.acting = wp.array(every, dtype=int, device=self.device)
         given = {"instances": t.instances, "basis": t.basis, "arrays": t.arrays}
         given |= {"points": points, "constraints": constraints}
         self._sums = allocate(NewtonStep, "", {}, self.device, given=given)

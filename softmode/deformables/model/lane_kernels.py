@@ -92,6 +92,32 @@ def team_sum(value: wp.float64) -> wp.float64:  # pyright: ignore[reportReturnTy
     ...
 
 
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    __shared__ int counts[32];
+    const unsigned mask = __ballot_sync(0xffffffff, flag != 0);
+    const int lane = threadIdx.x % 32;
+    if (lane == 0) counts[threadIdx.x / 32] = __popc(mask);
+    __syncthreads();
+    int before = __popc(mask & ((1u << lane) - 1u));
+    int total = 0;
+    for (int k = 0; k < blockDim.x / 32; ++k) {
+        if (k < threadIdx.x / 32) before += counts[k];
+        total += counts[k];
+    }
+    __syncthreads();
+    return before | (total << 16);
+#else
+    return flag << 16;
+#endif
+"""
+)
+def team_rank(flag: int) -> int:  # pyright: ignore[reportReturnType]
+    """Return how many threads before this one have the flag 1, plus 2^16 times how many of all; every thread calls."""
+    ...
+
+
 def to_blocks(q: np.ndarray, block_count: int) -> np.ndarray:
     """Return coordinates (..., n, 3) in the layout of the kernels, (..., 3 block_count, 8), padded with zeros."""
     n = q.shape[-2]

@@ -119,11 +119,14 @@ class PointConstraints:
     friction: wp.array2d[wp.float64]
     stick: wp.array2d[wp.float64]  # tangential stiffness of a contact with memory [N/m]; 0: smoothed Coulomb friction
     anchor: wp.array2d[wp.vec3d]  # where the sample stuck at the start of the step, in the shape's frame [m]
+    displacement: wp.array2d[wp.vec3d]  # of the last evaluation, relative to the other side [m]
     slip: wp.array2d[wp.vec3d]  # tangential displacement, that of the memory included [m]
     normal_force: wp.array2d[wp.float64]  # of the last iterates, for friction [N]
     energy: wp.array2d[wp.float64]  # [J]
     force: wp.array2d[wp.vec3d]  # on the soft body [N]
     hessian: wp.array2d[wp.mat33]  # [N/m]
+    acting: wp.array2d[int]  # all pins, then the contacts that act, in order: those with a force or a Hessian
+    acting_count: wp.array[int]  # (instance_count,)
     dof_begin: wp.array2d[int]  # the rigid unknowns that move the shape; an empty range where none does
     dof_end: wp.array2d[int]
     jacobian: wp.array3d[wp.vec3]  # (instance_count, constraint_max, rigid_max), motion of the shape per such unknown
@@ -171,6 +174,7 @@ class NewtonState:
     instance_start: wp.array[int]  # (world_count + 1,)
     active: wp.array[int]
     searching: wp.array[int]
+    evaluated: wp.array[int]  # whether the iterate is the last trial: what does not depend on friction is evaluated
     last: wp.array[int]  # whether every body moves less than its tolerance in this iteration
     in_contact: wp.array[int]  # whether a body of the world is near a shape
     refresh: wp.array[int]  # whether the elastic Hessian is to be evaluated

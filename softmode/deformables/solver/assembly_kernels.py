@@ -13,7 +13,6 @@ from softmode.deformables.model.struct_kernels import (
     NewtonState,
     Rigid,
     first_coupled,
-    has_contacts,
 )
 from softmode.deformables.solver.iteration_kernels import NewtonStep, add_outer
 
@@ -140,14 +139,17 @@ assemble_matrix = kernel_over(matrix_row, "assemble_matrix", "i", "row", "member
 @wp.func
 def contact_block(step: NewtonStep, i: int, task: int):
     """Add the contacts, sum_e b^T H b, to 8x8 blocks; driven unknowns stay put."""
-    if step.state.active[step.instances.world[i]] == 0 or not has_contacts(step.instances, step.constraints, i):
+    pins = step.instances.pin_count[i]
+    count = step.constraints.acting_count[i]
+    if step.state.active[step.instances.world[i]] == 0 or count == pins:
         return
     block_count = step.basis.row.shape[1]
     pair, rows, columns = block_task(task, block_count)
     c, d = block_pair(pair)
     driven = step.instances.driven_count[i]
     block = mat88()
-    for e in range(step.instances.pin_count[i], step.constraints.count[i]):
+    for k in range(pins, count):
+        e = step.constraints.acting[i, k]
         r = step.constraints.row[i, e]
         b = free_part(step.basis.row[r, rows], driven - LANES * rows)
         v = step.constraints.hessian[i, e][c, d] * free_part(step.basis.row[r, columns], driven - LANES * columns)
@@ -176,7 +178,8 @@ def column_block(step: NewtonStep, i: int, rows: int, j: int):
     if j == step.options.rigid_max:
         value = vec8(-step.arrays.gradient[i, rows])
     elif j < step.rigid.count[step.instances.world[i]]:
-        for e in range(first_coupled(step.instances, i), step.constraints.count[i]):
+        for k in range(first_coupled(step.instances, i), step.constraints.acting_count[i]):
+            e = step.constraints.acting[i, k]
             if j < step.constraints.dof_begin[i, e] or j >= step.constraints.dof_end[i, e]:
                 continue
             value = value - step.constraints.coupling[i, e, j][c] * step.basis.row[step.constraints.row[i, e], b]
@@ -198,7 +201,8 @@ def rigid_entry(step: NewtonStep, w: int, j: int, l: int):
     end = step.state.instance_start[w + 1]
     h = step.rigid.inertia[w, j, l]
     for i in range(first, end):
-        for e in range(first_coupled(step.instances, i), step.constraints.count[i]):
+        for m in range(first_coupled(step.instances, i), step.constraints.acting_count[i]):
+            e = step.constraints.acting[i, m]
             if l >= step.constraints.dof_begin[i, e] and j < step.constraints.dof_end[i, e]:
                 h += wp.float64(wp.dot(step.constraints.jacobian[i, e, j], step.constraints.coupling[i, e, l]))
     for k in range(step.rigid.row_count[w]):
@@ -210,7 +214,8 @@ def rigid_entry(step: NewtonStep, w: int, j: int, l: int):
         for k in range(step.rigid.count[w]):
             g += step.rigid.inertia[w, j, k] * (step.rigid.r[w, k] - step.rigid.predicted[w, k])
         for i in range(first, end):
-            for e in range(first_coupled(step.instances, i), step.constraints.count[i]):
+            for m in range(first_coupled(step.instances, i), step.constraints.acting_count[i]):
+                e = step.constraints.acting[i, m]
                 if j >= step.constraints.dof_begin[i, e] and j < step.constraints.dof_end[i, e]:
                     g += wp.dot(wp.vec3d(step.constraints.jacobian[i, e, j]), step.constraints.force[i, e])
         for k in range(step.rigid.row_count[w]):

@@ -1,29 +1,46 @@
 """Potential, gradient and Hessian of a step: the launches of one Newton iteration up to its linear system."""
 
+import warp as wp
+
 from softmode.deformables.solver import assembly_kernels as assembly
 from softmode.deformables.solver import step_kernels as kernels
+from softmode.deformables.solver.iteration_kernels import ALL, ENERGIES, TRIAL
 from softmode.deformables.solver.rigid_row_kernels import evaluate_rows
 from softmode.deformables.solver.step_tables import StepTables
 
 
-def evaluate(tables: StepTables, dt: float, *, derivatives: bool, trial: bool = False) -> None:
+def evaluate(tables: StepTables, dt: float, *, derivatives: bool) -> None:
     """Evaluate cubature points, point constraints and constraint rows at the iterate of every active world.
+
+    What the trial that became the iterate has found already is not evaluated again.
 
     Args:
         tables: Tables of the step.
         dt: Step [s].
         derivatives: Whether forces and Hessians are evaluated beside energies.
-        trial: Whether it is done at the trial of every world in a line search instead.
     """
-    t, rigid, step, asked = tables, tables.rigid, tables.newton_step(dt), int(derivatives)
-    at = (t.newton.active, t.arrays.q)
-    if trial:
-        at = (t.newton.searching, t.arrays.q_trial)
-    selected, r = at[0], rigid.table.trial if trial else rigid.table.r
-    t.launch(kernels.evaluate_points, t.points.energy.shape, step, *at, asked)
-    t.launch(kernels.evaluate_constraints, t.constraints.row.shape, step, *at, r, asked)
-    if rigid.row_max:
-        t.launch(evaluate_rows, (t.layout.world_count, rigid.row_max), step, selected, r, asked)
+    t = tables
+    found = ALL if derivatives else ENERGIES
+    _evaluate(t, dt, t.newton.active, t.arrays.q, t.rigid.table.r, found=int(found), forces=derivatives)
+    if derivatives:
+        t.launch_teams(kernels.list_constraints, t.layout.instance_count, t.step, t.team)
+
+
+def evaluate_trial(tables: StepTables, dt: float) -> None:
+    """Evaluate the trial of every world in a line search: the energies, and the stress for the case that it serves."""
+    t = tables
+    _evaluate(t, dt, t.newton.searching, t.arrays.q_trial, t.rigid.table.trial, found=int(TRIAL), forces=False)
+
+
+def _evaluate(
+    t: StepTables, dt: float, selected: wp.array, q: wp.array, r: wp.array, *, found: int, forces: bool
+) -> None:
+    """Evaluate the selected worlds at (q, r): of points and rows what ``found`` says, of contacts forces or not."""
+    step = t.newton_step(dt)
+    t.launch(kernels.evaluate_points, t.points.energy.shape, step, selected, q, found)
+    t.launch(kernels.evaluate_constraints, t.constraints.row.shape, step, selected, q, r, int(forces))
+    if t.rigid.row_max:
+        t.launch(evaluate_rows, (t.layout.world_count, t.rigid.row_max), step, selected, r, found)
 
 
 def gather_gradient(tables: StepTables, dt: float) -> None:

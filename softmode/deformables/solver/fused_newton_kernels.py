@@ -21,13 +21,14 @@ from softmode.deformables.solver.assembly_kernels import (
 )
 from softmode.deformables.solver.factor_kernels import factor_system, solve_system
 from softmode.deformables.solver.fused_system_kernels import shared_system, sum_forces_of
-from softmode.deformables.solver.iteration_kernels import NewtonStep
+from softmode.deformables.solver.iteration_kernels import ALL, NewtonStep
 from softmode.deformables.solver.rigid_row_kernels import evaluate_row
 from softmode.deformables.solver.search_kernels import accept_step, check_convergence, check_trial, start_line_search
 from softmode.deformables.solver.step_kernels import (
     evaluate_constraint,
     evaluate_point,
     gradient_block,
+    list_acting,
     sum_force_block,
 )
 
@@ -67,19 +68,24 @@ def minimise_worlds(
                 r[w, j] = step.rigid.r[w, j]
             barrier()
         # one copy of this code serves iterates and trials
-        slopes = 1 - trial
+        found = ALL + trial
         for i in range(begin, end):
             for p in range(member, step.instances.point_count[i], team):
-                evaluate_point(step, step.state.active, q, slopes, i, p)
+                evaluate_point(step, step.state.active, q, found, i, p)
             for e in range(member, step.constraints.count[i], team):
-                evaluate_constraint(step, step.state.active, q, r, slopes, i, e)
+                evaluate_constraint(step, step.state.active, q, r, 1 - trial, i, e)
         for k in range(member, step.rigid.row_count[w], team):
-            evaluate_row(step, step.state.active, r, slopes, w, k)
+            evaluate_row(step, step.state.active, r, found, w, k)
         barrier()
         if trial == 0:
             for i in range(begin, end):
+                list_acting(step, team, i, member)
+            barrier()
+            for i in range(begin, end):
                 if step.options.shared != 0:
-                    sum_forces_of(step, i, member, team)
+                    sum_forces_of(
+                        step.instances, step.basis, step.points, step.constraints, step.arrays, i, member, team
+                    )
                 else:
                     for t in range(member, chunks * blocks, team):
                         sum_force_block(step, step.state.active, i, t / blocks, t % blocks)
@@ -114,7 +120,19 @@ def minimise_worlds(
                     inertia = float(
                         step.instances.mass[begin] * rate * (rate + wp.float64(step.instances.mass_damping[begin]))
                     )
-                    shared_system(0, inertia, step, begin, w, member, team)
+                    shared_system(
+                        0,
+                        inertia,
+                        rigid_max,
+                        step.basis,
+                        step.constraints,
+                        step.rigid,
+                        step.arrays,
+                        begin,
+                        w,
+                        member,
+                        team,
+                    )
                 for s in range(step.arrays.system_start[w], step.arrays.system_start[w + 1 - step.options.shared]):
                     factor_system(
                         step.state.active, team, step.options.factor_width, unit, step.arrays.systems, s, member
@@ -127,7 +145,19 @@ def minimise_worlds(
                     solve_rigid_team(step.state.active, team, step.rigid, w, member)
                     barrier()
                 if step.options.shared != 0:
-                    shared_system(1, inertia, step, begin, w, member, team)
+                    shared_system(
+                        1,
+                        inertia,
+                        rigid_max,
+                        step.basis,
+                        step.constraints,
+                        step.rigid,
+                        step.arrays,
+                        begin,
+                        w,
+                        member,
+                        team,
+                    )
                 for s in range(step.arrays.system_start[w], step.arrays.system_start[w + 1 - step.options.shared]):
                     solve_system(
                         step.state.active,

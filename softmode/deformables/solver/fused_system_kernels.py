@@ -7,7 +7,8 @@ hide it. The system stays in shared memory from its assembly to its solution; lo
 
 import warp as wp
 
-from softmode.deformables.solver.iteration_kernels import NewtonStep
+from softmode.deformables.model.struct_kernels import Basis, Instances, PointConstraints, Points, Rigid
+from softmode.deformables.solver.iteration_kernels import NewtonArrays
 
 SHARED_SIZE = 72
 """Most unknowns of a system in shared memory, and"""
@@ -28,12 +29,12 @@ def _sized(snippet: str) -> str:
     __shared__ __align__(16) float D[SHARED_SIZE * 8];
     __shared__ float right[SHARED_SIZE];
     const int stride = SHARED_WIDTH;
-    const int N = step.arrays.systems.scalars.shape[1];
-    const int W = step.arrays.systems.scalars.shape[2];
-    float* g = (float*)step.arrays.systems.scalars.data + (size_t)i * N * W;
+    const int N = arrays.systems.scalars.shape[1];
+    const int W = arrays.systems.scalars.shape[2];
+    float* g = (float*)arrays.systems.scalars.data + (size_t)i * N * W;
     if (mode == 0) {
-        const int chunks = step.arrays.stiffness.shape[1];
-        const float* K = (const float*)step.arrays.stiffness.data + (size_t)i * chunks * N * N;
+        const int chunks = arrays.stiffness.shape[1];
+        const float* K = (const float*)arrays.stiffness.data + (size_t)i * chunks * N * N;
         const int quads = N / 4;
         #pragma unroll 4
         for (int t = member; t < N * quads; t += team) {
@@ -61,18 +62,19 @@ def _sized(snippet: str) -> str:
         }
         __syncthreads();
         const int blocks = N / 24;
-        const int constraint_count = step.constraints.count.data[i];
-        const int* rows = (const int*)step.constraints.row.data + (size_t)i * step.constraints.row.shape[1];
-        const int room = step.constraints.hessian.shape[1];
-        const float* H = (const float*)step.constraints.hessian.data + (size_t)i * room * 9;
-        const float* values = (const float*)step.basis.row.data;
+        const int acting_count = constraints.acting_count.data[i];
+        const int* acting = (const int*)constraints.acting.data + (size_t)i * constraints.acting.shape[1];
+        const int* rows = (const int*)constraints.row.data + (size_t)i * constraints.row.shape[1];
+        const int room = constraints.hessian.shape[1];
+        const float* H = (const float*)constraints.hessian.data + (size_t)i * room * 9;
+        const float* values = (const float*)basis.row.data;
         // half blocks, 4 x 8: of the components (c, d), rows 4 k of the functions, columns 8 m
         for (int t = member; t < 9 * 2 * blocks * blocks; t += team) {
             const int c = t / (6 * blocks * blocks);
             const int d = (t / (2 * blocks * blocks)) % 3;
             const int k = (t / blocks) % (2 * blocks);
             const int m = t % blocks;
-            if (c > d || (c == d && m < k / 2) || constraint_count == 0) continue;
+            if (c > d || (c == d && m < k / 2) || acting_count == 0) continue;
             float sum[4][8];
             #pragma unroll
             for (int a = 0; a < 4; ++a) {
@@ -80,7 +82,8 @@ def _sized(snippet: str) -> str:
                 for (int b = 0; b < 8; ++b) sum[a][b] = 0.0f;
             }
             #pragma unroll 4
-            for (int e = 0; e < constraint_count; ++e) {
+            for (int s = 0; s < acting_count; ++s) {
+                const int e = acting[s];
                 const float* r = values + (size_t)rows[e] * 8 * blocks;
                 const float h = H[9 * e + 3 * c + d];
                 const float4 u = *(const float4*)&r[4 * k];
@@ -162,18 +165,18 @@ def _sized(snippet: str) -> str:
             }
             __syncthreads();
         }
-        if (member == 0) step.arrays.systems.indefinite.data[i] = bad;
+        if (member == 0) arrays.systems.indefinite.data[i] = bad;
         return;
     }
-    const int tail_count = step.rigid.count.data[world];
-    const double* t = (const double*)step.rigid.direction.data + (size_t)world * step.rigid.direction.shape[1];
+    const int tail_count = rigid.count.data[world];
+    const double* t = (const double*)rigid.direction.data + (size_t)world * rigid.direction.shape[1];
     for (int row = member; row < N; row += team) {
-        float value = A[row * stride + N + step.options.rigid_max];
+        float value = A[row * stride + N + rigid_max];
         for (int j = 0; j < tail_count; ++j) value -= A[row * stride + N + j] * (float)t[j];
         right[row] = value;
     }
     __syncthreads();
-    float* out = (float*)step.arrays.direction.data + (size_t)i * N;
+    float* out = (float*)arrays.direction.data + (size_t)i * N;
     for (int first = N - 8; first >= 0; first -= 8) {
         float x[8];
         #pragma unroll
@@ -201,7 +204,11 @@ def _sized(snippet: str) -> str:
 def shared_system(
     mode: int,
     inertia: float,
-    step: NewtonStep,  # the matrices hold from column N on B, and after mode 0 U^-T B
+    rigid_max: int,
+    basis: Basis,
+    constraints: PointConstraints,
+    rigid: Rigid,
+    arrays: NewtonArrays,  # the matrices hold from column N on B, and after mode 0 U^-T B
     i: int,
     world: int,
     member: int,
@@ -214,21 +221,22 @@ def shared_system(
 @wp.func_native(
     snippet="""
 #if defined(__CUDA_ARCH__)
-    const int blocks = step.basis.row.shape[1];
+    const int blocks = basis.row.shape[1];
     const int n = 8 * blocks;
-    const int first_point = step.instances.point_start.data[i];
-    const int point_count = step.instances.point_count.data[i];
-    const int constraint_count = step.constraints.count.data[i];
-    const double* P = (const double*)step.points.stress.data + (size_t)i * step.points.stress.shape[1] * 9;
-    const double* F = (const double*)step.constraints.force.data + (size_t)i * step.constraints.force.shape[1] * 3;
-    const int* rows = (const int*)step.constraints.row.data + (size_t)i * step.constraints.row.shape[1];
-    const float* values = (const float*)step.basis.row.data;
-    double* out = (double*)step.arrays.gradient_chunk.data + (size_t)i * step.arrays.gradient_chunk.shape[1] * 3 * n;
+    const int first_point = instances.point_start.data[i];
+    const int point_count = instances.point_count.data[i];
+    const int acting_count = constraints.acting_count.data[i];
+    const int* acting = (const int*)constraints.acting.data + (size_t)i * constraints.acting.shape[1];
+    const double* P = (const double*)points.stress.data + (size_t)i * points.stress.shape[1] * 9;
+    const double* F = (const double*)constraints.force.data + (size_t)i * constraints.force.shape[1] * 3;
+    const int* rows = (const int*)constraints.row.data + (size_t)i * constraints.row.shape[1];
+    const float* values = (const float*)basis.row.data;
+    double* out = (double*)arrays.gradient_chunk.data + (size_t)i * arrays.gradient_chunk.shape[1] * 3 * n;
     for (int t = member; t < 3 * n; t += team) {
         const int axis = t / n;
         const int k = t - axis * n;
         // points in memory one after another, three rows of n functions each
-        const float* G = (const float*)step.basis.gradient_across.data + (size_t)first_point * 3 * n + k;
+        const float* G = (const float*)basis.gradient_across.data + (size_t)first_point * 3 * n + k;
         double value = 0.0;
         #pragma unroll 8
         for (int p = 0; p < point_count; ++p) {
@@ -237,14 +245,21 @@ def shared_system(
             value += P[9 * p + 3 * axis + 2] * (double)G[3 * n * p + 2 * n];
         }
         #pragma unroll 8
-        for (int e = 0; e < constraint_count; ++e) value -= F[3 * e + axis] * (double)values[(size_t)rows[e] * n + k];
+        for (int s = 0; s < acting_count; ++s) {
+            const int e = acting[s];
+            value -= F[3 * e + axis] * (double)values[(size_t)rows[e] * n + k];
+        }
         out[t] = value;
     }
 #endif
 """
 )
 def sum_forces_of(
-    step: NewtonStep,
+    instances: Instances,
+    basis: Basis,
+    points: Points,
+    constraints: PointConstraints,
+    arrays: NewtonArrays,
     i: int,
     member: int,
     team: int,

@@ -19,6 +19,14 @@ from softmode.deformables.solver.factor_kernels import Systems
 
 wp.set_module_options({"enable_backward": False})
 
+ENERGIES = wp.constant(0)
+"""What an evaluation at points and rows finds: energies alone;"""
+ALL = wp.constant(1)
+"""those with stress and Hessian, less what the trial that became the iterate has found already;"""
+TRIAL = wp.constant(2)
+"""those of a trial step with the stress, which serve if it is accepted. Contacts have their energies alone then: their
+forces wait for the normal force that friction goes by next."""
+
 mat38d: Any = wp.types.matrix(shape=(3, LANES), dtype=wp.float64)
 
 
@@ -57,7 +65,11 @@ class NewtonArrays:
 
 @struct
 class NewtonStep:
-    """All that Newton's iteration reads and writes in a step."""
+    """All that Newton's iteration reads and writes in a step.
+
+    It is larger than 8 kB: hand its members, not all of it, to a function that a function of a kernel calls and to native
+    code. The CUDA compiler copies a struct of that size there for every thread.
+    """
 
     instances: Instances
     basis: Basis

@@ -5,7 +5,7 @@ import warp as wp
 from softmode.deformables.solver import fused_newton_kernels as fused
 from softmode.deformables.solver import search_kernels as search
 from softmode.deformables.solver import step_kernels as kernels
-from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient, solve
+from softmode.deformables.solver.evaluate import assemble, evaluate, evaluate_trial, gather_gradient, solve
 from softmode.deformables.solver.step_tables import StepTables
 
 
@@ -53,7 +53,7 @@ def _try_step(tables: StepTables, dt: float) -> None:
     t.launch(search.trial_functions, t.unknowns, step)
     if t.rigid.count_max:
         t.launch(search.trial_rigid, (t.layout.world_count, t.rigid.count_max), step)
-    evaluate(t, dt, derivatives=False, trial=True)
+    evaluate_trial(t, dt)
     t.newton.any_searching.zero_()
     t.launch_teams(search.check_trials, t.layout.world_count, step, t.team)
 

@@ -14,7 +14,7 @@ import warp as wp
 
 from softmode.deformables.model.declare import kernel_over, struct
 from softmode.deformables.model.struct_kernels import Rigid
-from softmode.deformables.solver.iteration_kernels import NewtonStep
+from softmode.deformables.solver.iteration_kernels import ALL, NewtonStep
 
 wp.set_module_options({"enable_backward": False})
 
@@ -283,9 +283,11 @@ def evaluate_cone(rigid: Rigid, w: int, head: int, r: wp.array2d[wp.float64], dt
 def evaluate_row(
     step: NewtonStep, selected: wp.array[int], r: wp.array2d[wp.float64], derivatives: int, w: int, k: int
 ):
-    """Evaluate the rows at r: energy, force and s'' J."""
+    """Evaluate the rows at r: energy, force and, where asked, s'' J; ``derivatives`` as for the points."""
     dt = step.options.dt
     if selected[w] == 0 or k >= step.rigid.row_count[w]:
+        return
+    if derivatives == ALL and step.state.evaluated[w] != 0:
         return
     kind = step.rigid.row_kind[w, k]
     if kind == ELLIPTIC:

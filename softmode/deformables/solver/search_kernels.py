@@ -7,6 +7,10 @@ from softmode.deformables.model.lane_kernels import barrier, team_sum, vec8d
 from softmode.deformables.model.status import WORLD_ITERATION_LIMIT, WORLD_NO_DESCENT, WORLD_NOT_FINITE
 from softmode.deformables.model.struct_kernels import (
     Instances,
+    Motion,
+    PointConstraints,
+    Points,
+    Rigid,
     first_coupled,
     has_contacts,
     hessian_key,
@@ -36,60 +40,78 @@ Newton's steps halve the penetration, and double ones end it."""
 
 
 @wp.func
-def potential_share(step: NewtonStep, q: wp.array2d[vec8d], r: wp.array2d[wp.float64], w: int, member: int, team: int):
+def potential_share(
+    instances: Instances,
+    motion: Motion,
+    points: Points,
+    constraints: PointConstraints,
+    rigid: Rigid,
+    instance_start: wp.array[int],
+    dt: wp.float64,
+    q: wp.array2d[vec8d],
+    r: wp.array2d[wp.float64],
+    w: int,
+    member: int,
+    team: int,
+):
     """Return one thread's share of the incremental potential of a world [J], in a fixed order."""
-    dt = step.options.dt
     half = wp.float64(0.5)
     total = wp.float64(0.0)
-    for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
-        c = step.motion.rate[i]
-        inertial = half * step.instances.mass[i] * c * c / (dt * dt)
-        damping = half * step.instances.mass[i] * wp.float64(step.instances.mass_damping[i]) * c / dt
+    for i in range(instance_start[w], instance_start[w + 1]):
+        c = motion.rate[i]
+        inertial = half * instances.mass[i] * c * c / (dt * dt)
+        damping = half * instances.mass[i] * wp.float64(instances.mass_damping[i]) * c / dt
         for e in range(member, q.shape[1], team):
             x = q[i, e]
-            away = x - step.motion.q_inertial[i, e]
-            moved = x - step.motion.q_rate[i, e]
-            ahead = x - step.motion.q_start[i, e]
+            away = x - motion.q_inertial[i, e]
+            moved = x - motion.q_rate[i, e]
+            ahead = x - motion.q_start[i, e]
+            total += inertial * wp.dot(away, away) + damping * wp.dot(moved, moved) - wp.dot(motion.force[i, e], ahead)
+        for p in range(member, instances.point_count[i], team):
+            total += points.energy[i, p]
+        for e in range(member, constraints.count[i], team):
+            total += constraints.energy[i, e]
+    for j in range(member, rigid.count[w], team):
+        for l in range(rigid.count[w]):
             total += (
-                inertial * wp.dot(away, away) + damping * wp.dot(moved, moved) - wp.dot(step.motion.force[i, e], ahead)
+                half * (r[w, j] - rigid.predicted[w, j]) * rigid.inertia[w, j, l] * (r[w, l] - rigid.predicted[w, l])
             )
-        for p in range(member, step.instances.point_count[i], team):
-            total += step.points.energy[i, p]
-        for e in range(member, step.constraints.count[i], team):
-            total += step.constraints.energy[i, e]
-    for j in range(member, step.rigid.count[w], team):
-        for l in range(step.rigid.count[w]):
-            total += (
-                half
-                * (r[w, j] - step.rigid.predicted[w, j])
-                * step.rigid.inertia[w, j, l]
-                * (r[w, l] - step.rigid.predicted[w, l])
-            )
-    for k in range(member, step.rigid.row_count[w], team):
-        total += step.rigid.row_energy[w, k]
+    for k in range(member, rigid.row_count[w], team):
+        total += rigid.row_energy[w, k]
     return total
 
 
 @wp.func
-def rigid_excess(step: NewtonStep, w: int, member: int, team: int):
+def rigid_excess(
+    instances: Instances,
+    constraints: PointConstraints,
+    rigid: Rigid,
+    instance_start: wp.array[int],
+    force_tolerance: wp.float64,
+    rigid_tolerance: wp.array[float],
+    w: int,
+    member: int,
+    team: int,
+):
     """Return how many of one thread's joint dofs have a residual above the tolerance of the forces on them."""
     excess = wp.float64(0.0)
-    for j in range(member, step.rigid.count[w], team):
+    for j in range(member, rigid.count[w], team):
         residual = wp.float64(0.0)
-        scale = step.rigid.inertia[w, j, j] * wp.float64(step.arrays.rigid_tolerance[w])
-        for k in range(step.rigid.count[w]):
-            residual += step.rigid.inertia[w, j, k] * (step.rigid.r[w, k] - step.rigid.predicted[w, k])
-        for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
-            for e in range(first_coupled(step.instances, i), step.constraints.count[i]):
-                if j >= step.constraints.dof_begin[i, e] and j < step.constraints.dof_end[i, e]:
-                    force = wp.dot(wp.vec3d(step.constraints.jacobian[i, e, j]), step.constraints.force[i, e])
+        scale = rigid.inertia[w, j, j] * wp.float64(rigid_tolerance[w])
+        for k in range(rigid.count[w]):
+            residual += rigid.inertia[w, j, k] * (rigid.r[w, k] - rigid.predicted[w, k])
+        for i in range(instance_start[w], instance_start[w + 1]):
+            for k in range(first_coupled(instances, i), constraints.acting_count[i]):
+                e = constraints.acting[i, k]
+                if j >= constraints.dof_begin[i, e] and j < constraints.dof_end[i, e]:
+                    force = wp.dot(wp.vec3d(constraints.jacobian[i, e, j]), constraints.force[i, e])
                     residual += force
                     scale += wp.abs(force)
-        for k in range(step.rigid.row_count[w]):
-            force = wp.float64(step.rigid.row_jacobian[w, k, j]) * step.rigid.row_force[w, k]
+        for k in range(rigid.row_count[w]):
+            force = wp.float64(rigid.row_jacobian[w, k, j]) * rigid.row_force[w, k]
             residual += force
             scale += wp.abs(force)
-        if not (wp.abs(residual) <= step.options.force_tolerance * scale):
+        if not (wp.abs(residual) <= force_tolerance * scale):
             excess += wp.float64(1.0)
     return excess
 
@@ -108,7 +130,20 @@ def check_convergence(step: NewtonStep, team: int, w: int, member: int):
     q = step.arrays.q
     gradient = step.arrays.gradient
     dt = step.options.dt
-    share = potential_share(step, step.arrays.q, step.rigid.r, w, member, team)
+    share = potential_share(
+        step.instances,
+        step.motion,
+        step.points,
+        step.constraints,
+        step.rigid,
+        step.state.instance_start,
+        step.options.dt,
+        step.arrays.q,
+        step.rigid.r,
+        w,
+        member,
+        team,
+    )
     potential = team_sum(share)
     done = int(1)
     if step.state.iteration[w] == 0:
@@ -123,20 +158,31 @@ def check_convergence(step: NewtonStep, team: int, w: int, member: int):
             for e in range(member, q.shape[1], team):
                 residual += wp.dot(gradient[i, e], gradient[i, e])
                 external += wp.dot(step.motion.force[i, e], step.motion.force[i, e])
-            for e in range(member, step.constraints.count[i], team):
-                scale += wp.length(step.constraints.force[i, e])
+            for k in range(member, step.constraints.acting_count[i], team):
+                scale += wp.length(step.constraints.force[i, step.constraints.acting[i, k]])
             residual = team_sum(residual)
             scale = wp.sqrt(team_sum(external)) + team_sum(scale)
             floor = wp.float64(1.0e-5) * step.instances.mass[i] * wp.float64(step.instances.tolerance[i]) / (dt * dt)
             if not (wp.sqrt(residual) <= step.options.force_tolerance * scale + floor):
                 done = 0
     if done == 1 and step.rigid.count[w] > 0:
-        excess = rigid_excess(step, w, member, team)
+        excess = rigid_excess(
+            step.instances,
+            step.constraints,
+            step.rigid,
+            step.state.instance_start,
+            step.options.force_tolerance,
+            step.arrays.rigid_tolerance,
+            w,
+            member,
+            team,
+        )
         excess = team_sum(excess)
         if excess > wp.float64(0.0):
             done = 0
     if member != 0:
         return
+    step.state.evaluated[w] = 0
     step.state.potential[w] = potential
     if wp.isnan(potential):
         step.state.active[w] = 0
@@ -238,10 +284,24 @@ def check_trial(step: NewtonStep, team: int, w: int, member: int):
     """Accept a trial that lowers the potential enough (Armijo, up to rounding) or halve the step; give up if short.
 
     Where a full step has lowered it by more than a quadratic would have, take the better of that and twice the step.
+    What has been evaluated of an accepted trial serves the next iteration.
     """
     if step.state.searching[w] == 0:
         return
-    share = potential_share(step, step.arrays.q_trial, step.rigid.trial, w, member, team)
+    share = potential_share(
+        step.instances,
+        step.motion,
+        step.points,
+        step.constraints,
+        step.rigid,
+        step.state.instance_start,
+        step.options.dt,
+        step.arrays.q_trial,
+        step.rigid.trial,
+        w,
+        member,
+        team,
+    )
     trial = team_sum(share)
     if member != 0:
         return
@@ -250,8 +310,10 @@ def check_trial(step: NewtonStep, team: int, w: int, member: int):
     alpha = step.state.step_length[w]
     if alpha > wp.float64(1.0):
         step.state.searching[w] = 0
+        step.state.evaluated[w] = 1
         if not (trial < step.state.reached[w]):
             step.state.step_length[w] = wp.float64(1.0)
+            step.state.evaluated[w] = 0
         return
     if alpha == wp.float64(1.0) and trial < potential + EXTENDED_DECREASE * step.state.slope[w] - rounding:
         step.state.reached[w] = trial
@@ -260,6 +322,7 @@ def check_trial(step: NewtonStep, team: int, w: int, member: int):
         return
     if trial <= potential + SUFFICIENT_DECREASE * alpha * step.state.slope[w] + rounding:
         step.state.searching[w] = 0
+        step.state.evaluated[w] = 1
         return
     alpha *= wp.float64(0.5)
     if alpha < step.options.step_length_min:
@@ -367,6 +430,7 @@ def accept_step(step: NewtonStep, team: int, w: int, member: int):
         step.state.status[w] = step.state.status[w] | WORLD_NO_DESCENT
     elif step.state.last[w] == 1 and step.state.in_contact[w] == 0:
         step.state.active[w] = 0
+        step.state.evaluated[w] = 0
     else:
         wp.atomic_max(step.state.any_active, 0, 1)
 

@@ -30,7 +30,7 @@ from softmode.deformables.materials.material_kernels import (
 )
 from softmode.deformables.model.declare import kernel_over
 from softmode.deformables.model.deformation_kernels import elastic_gradient
-from softmode.deformables.model.lane_kernels import LANES, team_sum, vec8d
+from softmode.deformables.model.lane_kernels import LANES, team_rank, team_sum, vec8d
 from softmode.deformables.model.status import (
     PARAMETER_BITS,
     WORLD_COLLAPSED,
@@ -40,13 +40,14 @@ from softmode.deformables.model.status import (
 from softmode.deformables.model.struct_kernels import (
     Basis,
     Instances,
+    PointConstraints,
     blocks_of,
     has_contacts,
     in_mask,
     interpolate_change,
     pushes,
 )
-from softmode.deformables.solver.iteration_kernels import NewtonStep, add_outer_3d, mat38d
+from softmode.deformables.solver.iteration_kernels import ALL, ENERGIES, NewtonStep, add_outer_3d, mat38d
 
 wp.set_module_options({"enable_backward": False})
 
@@ -218,6 +219,7 @@ def begin_newton(step: NewtonStep):
             in_contact = 1
     step.state.in_contact[w] = in_contact
     step.state.active[w] = 1
+    step.state.evaluated[w] = 0
     step.state.refresh[w] = 1
     step.state.project[w] = 0
     step.state.failures[w] = 0
@@ -272,10 +274,14 @@ def evaluate_point(
 ):
     """Evaluate V_p Psi(F_p) and, where asked, its derivatives by F_p at every cubature point.
 
-    A body of scale s has V_p s^3 and the elastic F_p / s: each derivative takes one s off.
+    A body of scale s has V_p s^3 and the elastic F_p / s: each derivative takes one s off. ``derivatives`` is one of
+    ENERGIES, ALL and TRIAL.
     """
     dt = step.options.dt
-    if selected[step.instances.world[i]] == 0 or p >= step.instances.point_count[i]:
+    w = step.instances.world[i]
+    if selected[w] == 0 or p >= step.instances.point_count[i]:
+        return
+    if derivatives == ALL and step.state.evaluated[w] != 0 and step.state.refresh[w] == 0:
         return
     point = step.instances.point_start[i] + p
     parameters = material_of(step.instances, step.basis, i, point)
@@ -289,11 +295,11 @@ def evaluate_point(
             step.basis.gradient, step.motion.q_start, i, point, step.instances.function_count[i], s
         )
     step.points.energy[i, p] = s * s * weight * energy(parameters, G, G_start, dt)
-    if derivatives != 0:
+    if derivatives != ENERGIES:
         step.points.stress[i, p] = s * weight * stress(parameters, G, G_start, dt)
         step.points.volume_ratio[i, p] = float(wp.float64(1.0) + determinant_minus_one(G))
-    if derivatives != 0 and step.state.refresh[step.instances.world[i]] != 0:
-        C = float(weight) * hessian(parameters, G, G_start, dt, step.state.project[step.instances.world[i]])
+    if derivatives == ALL and step.state.refresh[w] != 0:
+        C = float(weight) * hessian(parameters, G, G_start, dt, step.state.project[w])
         for pair in range(6):
             r = 3 * pair
             step.points.hessian[i, pair, p] = wp.mat33(
@@ -323,18 +329,25 @@ def evaluate_constraint(
     if selected[w] == 0 or e >= step.constraints.count[i]:
         return
     row = step.constraints.row[i, e]
-    d = interpolate_change(step.basis.row, row, q, step.motion.q_start, i, step.instances.function_count[i])
+    known = derivatives != 0 and step.state.evaluated[w] != 0
+    d = step.constraints.displacement[i, e]
+    if not known:
+        d = interpolate_change(step.basis.row, row, q, step.motion.q_start, i, step.instances.function_count[i])
     smoothing = step.instances.smoothing[i]
     share = wp.float64(1.0)
     if e >= step.constraints.count[i] - step.constraints.pair_count[i]:
         j = step.constraints.partner[i, e]
         if j >= 0:
-            row = step.constraints.partner_row[i, e]
-            d -= interpolate_change(step.basis.row, row, q, step.motion.q_start, j, step.instances.function_count[j])
+            if not known:
+                row = step.constraints.partner_row[i, e]
+                count = step.instances.function_count[j]
+                d -= interpolate_change(step.basis.row, row, q, step.motion.q_start, j, count)
             smoothing = wp.min(smoothing, step.instances.smoothing[j])
             share = wp.float64(0.5)
-    for k in range(step.constraints.dof_begin[i, e], step.constraints.dof_end[i, e]):
-        d -= r[w, k] * wp.vec3d(step.constraints.jacobian[i, e, k])
+    if not known:
+        for k in range(step.constraints.dof_begin[i, e], step.constraints.dof_end[i, e]):
+            d -= r[w, k] * wp.vec3d(step.constraints.jacobian[i, e, k])
+        step.constraints.displacement[i, e] = d
     stiffness = step.constraints.stiffness[i, e]
     identity = wp.identity(n=3, dtype=wp.float64)
     H = stiffness * identity
@@ -381,6 +394,44 @@ evaluate_constraints = kernel_over(evaluate_constraint, "evaluate_constraints", 
 
 
 @wp.func
+def acts(constraints: PointConstraints, i: int, e: int):
+    """Return whether a constraint has a force or a Hessian; what is no number does."""
+    total = wp.float64(0.0)
+    for a in range(3):
+        total += wp.abs(constraints.force[i, e][a])
+        for b in range(3):
+            total += wp.float64(wp.abs(constraints.hessian[i, e][a, b]))
+    return not (total == wp.float64(0.0))
+
+
+@wp.func
+def list_acting(step: NewtonStep, team: int, i: int, member: int):
+    """List the constraints of an instance that act at the iterate: more than half of the contacts are only near."""
+    if step.state.active[step.instances.world[i]] == 0:
+        return
+    pins = step.instances.pin_count[i]
+    count = step.constraints.count[i]
+    for e in range(member, pins, team):
+        step.constraints.acting[i, e] = e
+    found = int(pins)
+    for first in range(pins, count, team):
+        e = first + member
+        flag = int(0)
+        if e < count:
+            if acts(step.constraints, i, e):
+                flag = 1
+        rank = team_rank(flag)
+        if flag != 0:
+            step.constraints.acting[i, found + rank % 65536] = e
+        found += rank / 65536
+    if member == 0:
+        step.constraints.acting_count[i] = found
+
+
+list_constraints = kernel_over(list_acting, "list_constraints", "i", "member")
+
+
+@wp.func
 def sum_force_block(step: NewtonStep, active: wp.array[int], i: int, chunk: int, b: int):
     """Sum V P grad b_k over one chunk of the points, less b_k f over one chunk of the constraints."""
     if active[step.instances.world[i]] == 0 or LANES * b >= step.instances.function_count[i]:
@@ -394,8 +445,9 @@ def sum_force_block(step: NewtonStep, active: wp.array[int], i: int, chunk: int,
         P = wp.transpose(step.points.stress[i, p])
         for k in range(3):
             total = add_outer_3d(total, P[k], vec8d(step.basis.gradient_across[b, first + p, k]))
-    count = step.constraints.count[i]
-    for e in range(chunk * count / chunk_count, (chunk + 1) * count / chunk_count):
+    count = step.constraints.acting_count[i]
+    for k in range(chunk * count / chunk_count, (chunk + 1) * count / chunk_count):
+        e = step.constraints.acting[i, k]
         total = add_outer_3d(total, -step.constraints.force[i, e], vec8d(step.basis.row[step.constraints.row[i, e], b]))
     for axis in range(3):
         step.arrays.gradient_chunk[i, chunk, axis * stride + b] = total[axis]

@@ -54,7 +54,7 @@ _SAMPLES = {
 }
 _CONSTRAINTS = {
     "": "instance constraint",
-    "count pair_count": "instance",
+    "count pair_count acting_count": "instance",
     "jacobian coupling": "instance constraint rigid",
 }
 _NEWTON = {"": "world", "cached_q": "instance unknown", "cached_key": "instance", "any_active any_searching": "1"}
