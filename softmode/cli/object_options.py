@@ -49,6 +49,12 @@ class ObjectOptions:
     """NAME=x0,y0,z0,x1,y1,z1,FACTOR: a part FACTOR times as stiff, where the object stands [m]."""
     stiffness_by_color: tuple[str, ...] = ()
     """'#rrggbb:FACTOR': what has this colour is FACTOR times as stiff."""
+    stiffness_file: Path | None = None
+    """.npz of points [m] where the object stands, and factors of stiffness."""
+    density_by_color: tuple[str, ...] = ()
+    """'#rrggbb:FACTOR': what has this colour is FACTOR times as dense as the rest; the mass stays."""
+    density_file: Path | None = None
+    """.npz of points [m] where the object stands, and factors of density."""
 
     def check(self) -> None:
         """Refuse what cannot be, before any work is done.
@@ -86,14 +92,15 @@ class ObjectOptions:
     @property
     def shape(self) -> dict[str, Any]:
         """The options that say how a file becomes an object, as fields of `ObjectConfig`."""
-        names = ("size", "up", "crop", "part", "pose", "resolution")
+        names = ("size", "up", "crop", "part", "pose", "resolution", "stiffness_file", "density_file")
         given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         if self.stiffness:
             given["stiffness"] = tuple(map(stiffer_box, self.stiffness))
-        if self.stiffness_by_color:
-            from softmode.objects.paint import StifferColor
+        for what in ("stiffness", "density"):
+            if colors := getattr(self, f"{what}_by_color"):
+                from softmode.objects.paint import StifferColor
 
-            given["stiffness_colors"] = tuple(map(StifferColor.parse, self.stiffness_by_color))
+                given[f"{what}_colors"] = tuple(map(StifferColor.parse, colors))
         return given
 
     @property
@@ -108,7 +115,7 @@ class ObjectOptions:
             AssetError: If the file is missing or cannot be read.
             ConfigError: If an option says nothing about this object.
         """
-        from softmode.objects.config import ObjectConfig
+        from softmode.objects.config import PAINTED, ObjectConfig
         from softmode.objects.object_file import file_kind
 
         self.check()
@@ -123,7 +130,7 @@ class ObjectOptions:
             self._refuse(given, f"the body {base.body}", "give them to softmode body build")
         elif base.extents is not None:
             self._refuse(
-                set(given) - {"stiffness", "stiffness_colors"},
+                set(given) - {*PAINTED},
                 f"a {base.shape} of {base.extents} m",
                 "give a --splat file too",
             )

@@ -26,6 +26,8 @@ Shape = Literal["plush", "box", "cylinder", "capsule", "sphere"]
 Pose = Literal["stable", "captured"]
 SIZE = 0.08
 """Longest edge of what has no size of its own and is given none [m]."""
+PAINTED = ("stiffness", "stiffness_colors", "stiffness_file", "density_colors", "density_file")
+"""Options that say where stiffness and density vary."""
 FILES = ("splat", "mesh", "radiance", "body")
 """Options that name a file."""
 
@@ -104,6 +106,13 @@ class ObjectConfig:
     """Parts of another stiffness; where they overlap, the last one counts."""
     stiffness_colors: tuple[StifferColor, ...] = ()
     """Parts of another stiffness by the colour of the nearest splat; times what `stiffness` says."""
+    stiffness_file: str | Path | None = None
+    """File of points and factors, as `read_field` takes, where the object stands: times what the others say."""
+    density_colors: tuple[StifferColor, ...] = ()
+    """Parts of another density by the colour of the nearest splat, factors relative to each other: the mass stays that
+    of the material's density."""
+    density_file: str | Path | None = None
+    """File of points and factors of density, likewise; times what `density_colors` says."""
     clamped_height: float = 0.0
     """Height of the foot that is fixed to the table [m], 0 for an object that stands free. A clamped object keeps its
     scale."""
@@ -117,6 +126,7 @@ class ObjectConfig:
         """Check the ranges."""
         object.__setattr__(self, "stiffness", tuple(self.stiffness))
         object.__setattr__(self, "stiffness_colors", tuple(self.stiffness_colors))
+        object.__setattr__(self, "density_colors", tuple(self.density_colors))
         if self.size is not None:
             hint = "give the longest edge in metres"
             require_number("size", self.size, at_least=0.005, at_most=1.0, unit="m", hint=hint)
@@ -143,8 +153,11 @@ class ObjectConfig:
         if self.body is not None and self.clamped_height > 0.0:
             hint = "build it with a region for its foot: softmode body build FILE --region foot=..."
             raise ConfigError(f"clamped_height is {self.clamped_height} m for a body that is built", hint=hint)
-        if self.body is not None and (self.stiffness or self.stiffness_colors):
-            raise ConfigError(f"stiffness given for the body {self.body}", hint="give it when the body is built")
+        painted = [name for name in PAINTED if getattr(self, name)]
+        if self.body is not None and painted:
+            raise ConfigError(
+                f"{', '.join(painted)} given for the body {self.body}", hint="give it when the body is built"
+            )
         self._check_extents()
         if self.colors is not None:
             if self.shape == "plush" and self.mesh is None and self.preset is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections.abc import Callable
@@ -16,10 +17,12 @@ from softmode.deformables.body.regions import Region
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.cache import cached_body
 from softmode.deformables.materials.material import Material
+from softmode.errors import AssetError
 from softmode.objects.config import ObjectConfig
 from softmode.objects.object_file import file_kind, read_object, surface_cover
 from softmode.objects.soft_object import SoftObject
 from softmode.objects.source import (
+    density_scale,
     field_of_body,
     may_turn,
     object_source,
@@ -94,13 +97,21 @@ def load(
             top = float(quadrature.bounds[0, 2]) + config.clamped_height
             regions = (Region(name="foot", box=((-wide,) * 3, (wide, wide, top))),)
         scale = stiffness_scale(config, quadrature, parts, turn)
-        body = build_body(quadrature, made, name=parts.name, regions=regions, stiffness_scale=scale, progress=progress)
+        fields = {"stiffness_scale": scale, "density_scale": density_scale(config, quadrature, parts, turn)}
+        body = build_body(quadrature, made, name=parts.name, regions=regions, **fields, progress=progress)
         return replace(body, provenance={**body.provenance, "turn": json.dumps(turn.tolist())})
 
     clamp = (config.clamped_height,) if config.clamped_height > 0.0 else ()
     key = (RECIPE, *parts.key, may_turn(config), config.surface_count, made, *clamp, *config.stiffness)
-    if config.stiffness_colors:  # A mesh's key does not hold its colours.
+    if config.stiffness_colors or config.density_colors:  # A mesh's key does not hold its colours.
         key = (*key, *config.stiffness_colors, parts.splats.means, parts.splats.sh)
+    if config.density_colors:
+        key = (*key, "density", *config.density_colors)
+    for name in ("stiffness_file", "density_file"):
+        if (file := getattr(config, name)) is not None:
+            if not Path(file).is_file():
+                raise AssetError(f"{name} {file}: no such file", hint="check the path")
+            key = (*key, name, hashlib.sha256(Path(file).read_bytes()).hexdigest())
     body = cached_body(key, build)
     turn = np.array(json.loads(str(body.provenance["turn"])))
     splats = splats_of_body(parts.splats, body, turn)

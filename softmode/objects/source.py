@@ -21,7 +21,7 @@ from softmode.errors import AssetError, ConfigError
 from softmode.files import read_archive, write_archive
 from softmode.objects.config import FILES, ObjectConfig
 from softmode.objects.mesh_file import read_mesh
-from softmode.objects.paint import color_field
+from softmode.objects.paint import color_field, read_field
 from softmode.objects.parts import choose_part
 from softmode.objects.pose import stable_rotation
 from softmode.objects.presets import find_preset, preset_mesh
@@ -154,7 +154,7 @@ def stiffness_scale(
     Raises:
         ConfigError: If a part of another stiffness holds no point, or no splat has the colour of one.
     """
-    if not config.stiffness and not config.stiffness_colors:
+    if not config.stiffness and not config.stiffness_colors and config.stiffness_file is None:
         return None
     low, high = quadrature.bounds
     points = quadrature.points - [*(0.5 * (low + high))[:2], low[2]]
@@ -169,6 +169,34 @@ def stiffness_scale(
         found[inside] = part.factor
     if config.stiffness_colors:
         found *= color_field(_laid_down(source.splats, turn), config.stiffness_colors)(quadrature.points)
+    if config.stiffness_file is not None:
+        found *= read_field(config.stiffness_file)(points)
+    return found
+
+
+def density_scale(
+    config: ObjectConfig, quadrature: Quadrature, source: ObjectSource, turn: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """Return the relative density per quadrature point of a standing object (P,), None if it is the same everywhere.
+
+    Args:
+        config: Which object.
+        quadrature: Its solid.
+        source: What it is made of.
+        turn: As for :func:`stiffness_scale`.
+
+    Raises:
+        ConfigError: If no splat has the colour of a part.
+        AssetError: If a file cannot be read.
+    """
+    if not config.density_colors and config.density_file is None:
+        return None
+    low, high = quadrature.bounds
+    found = np.ones(len(quadrature.points))
+    if config.density_colors:
+        found *= color_field(_laid_down(source.splats, turn), config.density_colors)(quadrature.points)
+    if config.density_file is not None:
+        found *= read_field(config.density_file)(quadrature.points - [*(0.5 * (low + high))[:2], low[2]])
     return found
 
 

@@ -13,7 +13,7 @@ import newton
 import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.coupling.rigid_solver import mujoco_warnings
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
@@ -196,6 +196,23 @@ class SplatScene:
                 for grips in self.grips:
                     grips.apply(first, self.control, self.dt)
                 self.solver.step(first, second, self.control, None, self.dt)
+
+    def push(self, index: int, force: ArrayLike) -> None:
+        """Let forces act on the surface samples of an object, such as those of wind, until others are given.
+
+        Args:
+            index: Which object.
+            force: One for each sample [N], shape (surface_count, 3), or one for all.
+
+        Raises:
+            ConfigError: If they are not finite or of another shape.
+        """
+        count, given = self.objects[index].body.surface_count, np.asarray(force, dtype=np.float32)
+        if given.shape not in ((3,), (count, 3)) or not np.isfinite(given).all():
+            raise ConfigError(f"force: expected finite values, shape ({count}, 3) or (3,), got {given.shape}")
+        start = int(self.model.softmode.particle_start.numpy()[index])
+        for state in (self.state, self._scratch):
+            state.particle_f[start : start + count].assign(np.broadcast_to(given, (count, 3)))
 
     def reset(self) -> None:
         """Put everything back where it was placed, at rest."""

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.rkpm import BasisRKPM, make_basis
@@ -60,6 +62,28 @@ def test_a_kernel_acts_within_its_support_on_what_is_connected_there() -> None:
     assert find_visibility(material, points[:1], np.array([2.3])) is None
     two = dataclasses.replace(material, part=np.array([0, 0, 0, 0, 1]))
     assert find_visibility(two, points[:1], np.array([2.05])) is None
+
+
+def test_functions_go_on_into_a_gap() -> None:
+    """Between two leaves, where a point is within reach of a kernel that does not act there, evaluation goes on.
+
+    Values are finite, and affine motions come back exactly.
+    """
+    leaves = [trimesh.creation.box((0.08, 0.03, 0.003)) for _ in range(2)]
+    for leaf, angle in zip(leaves, (-0.25, 0.25), strict=True):
+        leaf.apply_translation((0.036, 0.0, 0.0))
+        leaf.apply_transform(trimesh.transformations.rotation_matrix(angle, (0.0, 1.0, 0.0)))
+    mesh: Any = trimesh.util.concatenate(leaves)
+    quadrature = quadrature_from_mesh(mesh.vertices, mesh.faces, point_count=1500, surface_count=200)
+    found = build_body(quadrature, BuildOptions(function_count=24, cubature_count=96), progress=False)
+    low, high = found.bounds
+    x = np.random.default_rng(0).uniform(1.2 * low - 0.2 * high, 1.2 * high - 0.2 * low, (3000, 3))
+    ratio, centre = found.raw.reach(x)
+    clamped = centre + (x - centre) / np.maximum(ratio, 1.0)[:, None]
+    assert not found.raw.covered(clamped).all()
+    stretch = np.diag([1.1, 1.2, 0.9])
+    back = found.evaluate(x)[0] @ found.affine(stretch)
+    np.testing.assert_allclose(back, x @ (stretch - np.eye(3)), atol=1e-10)
 
 
 def test_fingers_share_no_kernel_and_linear_functions_are_reproduced() -> None:

@@ -33,7 +33,7 @@ def gradient_of(s: MpmSimulation, loss: MassLoss) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("model", list(MaterialModel), ids=lambda m: m.name)
 @pytest.mark.parametrize(("control", "smoothing"), [("additive", 0.955), ("material", 0.0)])
 def test_gradient_against_differences(model: MaterialModel, control: str, smoothing: float) -> None:
-    """Along a random direction of every input, central differences agree to 1e-5 in float64."""
+    """Along a random direction of every input, central differences agree to 2e-5 in float64."""
     material = Material(youngs_modulus=1.4e5, poissons_ratio=0.2, density=75.0, model=model)
     options = MpmOptions(
         precision="float64", control=control, smoothing=smoothing, damping=0.5, gravity=(0.0, 0.0, -2.0)

@@ -96,6 +96,31 @@ def test_an_object_by_its_colours() -> None:
     assert load(base).body.fingerprint != thing.body.fingerprint
 
 
+def test_an_object_by_files_and_density(tmp_path) -> None:
+    """Fields from files say where the object stands; densities are relative, so that the mass stays."""
+    shape = {"shape": "box", "extents": SIZE, "splat_count": 800, "surface_count": 80, "build": OPTIONS}
+    base = ObjectConfig(**shape, colors=(RED, BLUE))
+    points = np.array([[0.0, 0.0, 0.25 * SIZE[2]], [0.0, 0.0, 0.75 * SIZE[2]]])
+    for name, factors in (("stiff.npz", [1.0, 5.0]), ("dense.npz", [4.0, 1.0])):
+        np.savez(tmp_path / name, points=points, factors=np.array(factors))
+    files = {"stiffness_file": tmp_path / "stiff.npz", "density_file": tmp_path / "dense.npz"}
+    thing = load(ObjectOptions(**files).object_of(base))
+    given = unpack_sources(thing.body)
+    assert given.stiffness_scale is not None and given.density_scale is not None
+    upper = given.quadrature.points[:, 2] > given.quadrature.bounds[:, 2].mean()
+    np.testing.assert_array_equal(given.stiffness_scale, np.where(upper, 5.0, 1.0))
+    np.testing.assert_allclose(given.density_scale * given.density_scale[upper][0] ** -1, np.where(upper, 1.0, 4.0))
+    assert thing.body.volume == pytest.approx(np.prod(SIZE))
+    assert thing.body.offset[2] < 0.45 * SIZE[2]  # the centre of mass, which the lower half draws down
+    colored = load(ObjectOptions(density_by_color=("#cc1a1a:3",)).object_of(base))
+    density = unpack_sources(colored.body).density_scale
+    assert density is not None and density.max() / density.min() == pytest.approx(3.0)
+    with pytest.raises(AssetError, match="no such file"):
+        load(base.changed(density_file=tmp_path / "none.npz"))
+    with pytest.raises(ConfigError, match="density_file"):
+        ObjectConfig(body="body.npz", density_file=tmp_path / "dense.npz")
+
+
 def test_the_reach_of_a_brush() -> None:
     """A cylinder along the normal, of radius and depth; strokes are unions."""
     points = np.random.default_rng(1).uniform(-1.0, 1.0, (500, 3))

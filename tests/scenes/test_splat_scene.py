@@ -57,6 +57,23 @@ def test_kinetic_energy_of_free_fall_is_the_work_of_gravity(cube: SoftObject) ->
     np.testing.assert_allclose(moved, (0.0, 0.0, -GRAVITY * DT**2 * 8 * 9 / 2), atol=1e-6)
 
 
+def test_pushed_samples_carry_the_weight(cube: SoftObject) -> None:
+    """Forces on the surface that sum to the weight keep a cube at rest where it hangs; without them it falls."""
+    scene = make_scene(cube, (0.0, 0.0, 1.0), steps_per_frame=4)
+    share = cube.body.surface_areas / cube.body.surface_areas.sum()
+    push = np.outer(share, (0.0, 0.0, MASS * GRAVITY))
+    scene.push(0, push)
+    for _ in range(3):
+        scene.step()
+    momentum = MASS * cube.body.mean_basis @ scene.state.softmode.qd.numpy()
+    assert abs(momentum[2]) < 1e-6 * MASS * GRAVITY * 12 * DT  # of float32 forces
+    scene.push(0, (0.0, 0.0, 0.0))
+    scene.step()
+    assert (MASS * cube.body.mean_basis @ scene.state.softmode.qd.numpy())[2] < -0.99 * MASS * GRAVITY * 4 * DT
+    with pytest.raises(ConfigError, match="force"):
+        scene.push(0, np.zeros((3, 3)))
+
+
 def test_stack_comes_to_rest_and_the_film_tells(cube: SoftObject, tmp_path) -> None:
     """One cube falls on another: the record has the energy of the fall, no status, and overlaps far below the size."""
     drop = 0.04

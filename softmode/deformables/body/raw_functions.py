@@ -23,6 +23,10 @@ class RawFunctions(Protocol):
         """Return how far points lie from the nearest centre that acts there, over its reach (N,), and it (N, 3) [m]."""
         ...
 
+    def covered(self, points: Array) -> NDArray[np.bool_]:
+        """Return at which of points (N, 3) within reach the functions can be evaluated, shape (N,)."""
+        ...
+
     def evaluate(self, points: Array) -> tuple[Array, Array]:
         """Return values (N, R) and gradients [1/m] (N, R, 3) at points within reach."""
         ...
@@ -46,6 +50,10 @@ class SkinningFunctions:
         distance, nearest = self.kernels.nearest(points)
         return distance / (REACH * self.kernels.support[nearest]), self.kernels.centres[nearest]
 
+    def covered(self, points: Array) -> NDArray[np.bool_]:
+        """Return at which of points (N, 3) within reach there are enough kernels: not in the gap between two leaves."""
+        return self.kernels.covered(points)
+
     def weights(self, points: Array) -> tuple[Array, Array]:
         """Return the skinning weights (N, J) and their gradients [1/m] (N, J, 3) at points within reach."""
         return self.skin.evaluate(*enveloped(self.kernels.evaluate(points), self.envelope))
@@ -67,6 +75,10 @@ class QuadraticFunctions:
     def reach(self, points: Array) -> tuple[Array, Array]:
         """Return how far points lie from the centre that covers each best, over its reach (N,), and it (N, 3) [m]."""
         return self.kernels.reach(points)
+
+    def covered(self, points: Array) -> NDArray[np.bool_]:
+        """Return that there are enough kernels at all points (N, 3) within reach: one will do."""
+        return np.ones(len(points), dtype=bool)
 
     def evaluate(self, points: Array) -> tuple[Array, Array]:
         """Return values (N, 10 + 10 n) and gradients [1/m] (N, 10 + 10 n, 3) at points within reach."""

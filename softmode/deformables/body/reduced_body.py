@@ -285,6 +285,12 @@ class ReducedBody:
         ratio, centre = self.raw.reach(x)
         far = ratio > 1.0
         inner = np.where(far[:, None], centre + (x - centre) / np.maximum(ratio, 1.0)[:, None], x)
+        # Between two leaves what is within reach of a kernel may be nearest to material that it does not act on.
+        bare = np.arange(len(x)) if self._divided else np.flatnonzero(far)
+        for nearer in (0.5, 0.5, 0.5, 0.0):
+            bare = bare[~self.raw.covered(inner[bare])]
+            inner[bare] = centre[bare] + nearer * (inner[bare] - centre[bare])
+            far[bare] = True
         return x, inner, far
 
     def _evaluate_inside(self, x: Array) -> tuple[Array, Array]:

@@ -186,6 +186,18 @@ class BasisRKPM:
                 distance[rows] = away.min(axis=1)
         return distance, nearest
 
+    def covered(self, points: Array) -> NDArray[np.bool_]:
+        """Return at which of points (N, 3) `evaluate` finds enough kernels, shape (N,)."""
+        found = np.zeros(len(points), dtype=bool)
+        for some in np.array_split(np.arange(len(points)), 1 + len(points) * self.kernel_count // _PAIRS_PER_CHUNK):
+            row, column, count = self._pairs(points[some])
+            offset = points[some[row]] - self.centres[column]
+            poly = np.column_stack([np.ones(len(row)), offset / float(self.support.mean())])
+            moment = np.zeros((len(some), 4, 4))
+            np.add.at(moment, row, self._bell(offset, column)[0][:, None, None] * poly[:, :, None] * poly[:, None])
+            found[some] = (count >= 4) & ~_inverted(moment)[1]
+        return found
+
     @cached_property
     def _tree(self) -> KDTree:
         return KDTree(self.centres)
@@ -260,19 +272,10 @@ class BasisRKPM:
 
     def _invert(self, moment: Array, x: Array, first: int) -> Array:
         """Invert the moment matrices (N, 4, 4), refusing ill-conditioned ones."""
-        # Scaling by the zeroth moment keeps the determinant away from underflow at points seen only by kernel rims.
-        scale = moment[:, 0, 0].copy()
-        lost = ~(scale > 1e-14)
-        scaled = moment / np.where(lost, 1.0, scale)[:, None, None]
-        scaled[lost] = np.eye(4)
-        lost |= np.abs(np.linalg.det(scaled)) < 1e-30
-        scaled[lost] = np.eye(4)
-        inverse = np.linalg.inv(scaled)
-        condition = np.abs(scaled).sum(axis=1).max(axis=1) * np.abs(inverse).sum(axis=1).max(axis=1)
-        lost |= ~(condition < CONDITION_LIMIT)
+        inverse, lost = _inverted(moment)
         if lost.any():
             self._raise_uncovered(np.flatnonzero(lost) + first, x[lost])
-        return inverse / scale[:, None, None]
+        return inverse
 
     def _raise_uncovered(self, index: NDArray[np.intp], x: Array) -> None:
         raise BasisError(
@@ -280,6 +283,21 @@ class BasisRKPM:
             " enough reproducing kernels",
             hint="Use more or wider kernels, or evaluate only points within the object.",
         )
+
+
+def _inverted(moment: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the inverses of moment matrices (N, 4, 4), and which are too ill-conditioned to have one (N,)."""
+    # Scaling by the zeroth moment keeps the determinant away from underflow at points seen only by kernel rims.
+    scale = moment[:, 0, 0].copy()
+    lost = ~(scale > 1e-14)
+    scaled = moment / np.where(lost, 1.0, scale)[:, None, None]
+    scaled[lost] = np.eye(4)
+    lost |= np.abs(np.linalg.det(scaled)) < 1e-30
+    scaled[lost] = np.eye(4)
+    inverse = np.linalg.inv(scaled)
+    condition = np.abs(scaled).sum(axis=1).max(axis=1) * np.abs(inverse).sum(axis=1).max(axis=1)
+    lost |= ~(condition < CONDITION_LIMIT)
+    return inverse / np.where(lost, 1.0, scale)[:, None, None], lost
 
 
 def sample_farthest(points: ArrayLike, count: int, *, seed: int = 0, first: int | None = None) -> NDArray[np.intp]:
