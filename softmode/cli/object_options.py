@@ -38,7 +38,7 @@ class ObjectOptions:
     pose: Literal["stable", "captured"] | None = None
     """Lay what cannot stand on its stable side (stable), or leave it as it is."""
     resolution: int | None = None
-    """Voxels along the longest edge when a splat file is filled; 64."""
+    """Voxels along the longest edge when a splat file is filled; 64 to 384, as its thin parts need."""
     youngs_modulus: float | None = None
     """Young's modulus [Pa]; many tasks draw it."""
     density: float | None = None

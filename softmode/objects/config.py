@@ -95,7 +95,8 @@ class ObjectConfig:
     the ground it was captured on, wide but thin, nor loose small parts win; the one with the greatest height; the one
     with most splats; or whatever there is."""
     resolution: int | None = None
-    """Voxels along the longest edge of the grid in which a splat file is filled; 64 if None."""
+    """Voxels along the longest edge of the grid in which a splat file is filled; None takes 64 to 384,
+    as its thin parts need."""
     pose: Pose = "stable"
     """"stable" lays an object from a file that cannot stand as it is there (on a pointed foot, say) on the side that
     needs the least turn; "captured" lets it topple."""

@@ -1,9 +1,9 @@
 """Quadrature: an object as interior points with weights [m^3] and surface samples with areas [m^2].
 
-Every source ends on the same uniform grid over the bounding box (a grid integrates two to four times better than
-random points). Each cell carries the volume of the object inside it and sits at the centroid of that part, so linear
-functions are integrated as well at the boundary as inside. Meshes are integrated column by column, exactly along z;
-implicit functions by sub-sampling with a linear boundary layer.
+Every source ends on a grid over the bounding box (a grid integrates two to four times better than random points). Each
+cell becomes eight points with the volume, the centroid and the second moments of what lies inside it, so quadratic
+functions are integrated as well at the boundary as inside. Meshes are integrated column by column, exactly along z, and
+moved until the moments of the whole match; implicit functions by sub-sampling with a linear boundary layer.
 """
 
 from __future__ import annotations
