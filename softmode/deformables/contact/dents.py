@@ -7,8 +7,8 @@ their motion is, per pressure,
 
 a bed of springs (Winkler) of the scale that is missing, in series with the penalty of contact. It was fitted to pairs
 of opposite discs on cubes, beams, pads and spheres of 28 to 68 functions against 2,000 kernels: radii of 12 to 18 mm on
-bodies of 100 mm then give 0.88 to 1.1 of the fine compliance, where the functions alone give 0.3 to 0.7. A wall of
-thickness t is no softer than itself: h is bounded by 3/4 of t.
+bodies of 100 mm then give 0.88 to 1.1 of the fine compliance, where the functions alone give 0.3 to 0.7. A wall is no
+softer than itself: h is bounded by a share of its thickness.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 DENT_FACTOR = 0.30
 """Dent over the size of what the functions resolve, under the pressure E / (1 - nu^2)."""
-WALL_SHARE = 0.75
+WALL_SHARE = 0.6
 """Bound of that size as a share of the thickness below a sample."""
 
 
@@ -37,5 +37,4 @@ def resolved_size(body: ReducedBody) -> float:
 
 def dent_lengths(body: ReducedBody) -> Array:
     """Return w E / (1 - nu^2) at the surface samples of a body, shape (surface_count,) [m]."""
-    h, wall = resolved_size(body), WALL_SHARE * thickness(body)
-    return DENT_FACTOR * h / (1.0 + (h / wall) ** 4) ** 0.25
+    return DENT_FACTOR * np.minimum(resolved_size(body), WALL_SHARE * thickness(body))

@@ -486,9 +486,7 @@ def gather_contacts(
             samples.constraint[i, s, slot] = -1
             if shape < 0:
                 continue
-            row = instances.row_start[i] + s
-            depth = dent_depth(instances, i, dent_length[row])
-            deepest = -wp.float64(OVERLAP * instances.size[i] + depth)
+            deepest = -wp.float64(OVERLAP * instances.size[i])
             if samples.gap[i, s, slot] < deepest:
                 wp.atomic_or(status, instances.world[i], WORLD_PENETRATION)
             gap = wp.max(samples.gap[i, s, slot], deepest)
@@ -514,6 +512,7 @@ def gather_contacts(
                 if prescribed != 0:
                     twist = shapes.body_qd[body]
                     drift = dt * wp.spatial_top(twist) + turn(dt * wp.spatial_bottom(twist), arm)
+            row = instances.row_start[i] + s
             constraints.row[i, e] = row
             constraints.dof_begin[i, e] = 0
             constraints.dof_end[i, e] = 0
@@ -527,9 +526,9 @@ def gather_contacts(
             kappa = stiffness_per_area(
                 instances, i, relative_stiffness[row], partner_mass, shape_area(shapes, shape), dt
             )
-            area = sample_area(instances.scale[i], basis.row_area[row])
+            area = wp.max(sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
             stiffness = wp.float64(kappa * area)
-            compliance = dent_compliance(instances, i, relative_stiffness[row], dent_length[row]) / wp.max(area, 1.0e-30)
+            compliance = dent_compliance(instances, i, relative_stiffness[row], dent_length[row]) / area
             slip, anchor = remembered_slip(
                 shapes,
                 shape,
@@ -547,7 +546,7 @@ def gather_contacts(
             constraints.stick[i, e] = stick_stiffness(stick_ratio, stiffness, sheared)
             constraints.stiffness[i, e] = stiffness
             constraints.dent_compliance[i, e] = wp.float64(compliance)
-            constraints.dent_depth[i, e] = wp.float64(depth)
+            constraints.dent_depth[i, e] = wp.float64(dent_depth(instances, i, dent_length[row]))
             constraints.friction[i, e] = wp.float64(wp.sqrt(instances.friction[i] * shapes.friction[shape]))
 
 

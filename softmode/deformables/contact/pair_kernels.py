@@ -517,10 +517,12 @@ def write_pairs(
     wj = dent_compliance(instances, j, relative_stiffness[at], dent_length[at]) / half_area
     compliance = wp.float64(wi + wj)
     sheared = wp.float64(shear_ratio(instances.poissons_ratio[i]) * wi + shear_ratio(instances.poissons_ratio[j]) * wj)
+    thick = wp.max(instances.scale[i] * pairs.thickness[own], instances.scale[j] * pairs.thickness[at])
     depth = dent_depth(instances, i, dent_length[own]) + dent_depth(instances, j, dent_length[at])
+    depth = wp.min(depth, 0.5 * DEPTH * thick)
     friction = wp.float64(wp.sqrt(instances.friction[i] * instances.friction[j]))
     n = pairs.normal[i, s, slot]
-    deepest = -wp.float64(OVERLAP * wp.min(instances.size[i], instances.size[j]) + depth)
+    deepest = -wp.float64(OVERLAP * wp.min(instances.size[i], instances.size[j]))
     if pairs.gap[i, s, slot] < deepest:
         wp.atomic_or(state.status, instances.world[i], WORLD_PENETRATION)
     offset = wp.max(pairs.gap[i, s, slot], deepest) * n

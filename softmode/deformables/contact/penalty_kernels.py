@@ -19,6 +19,7 @@ doi:10.1145/3386569.3392425, eq. 13), mu f_n f0(|d_t|), which creeps.
 import warp as wp
 
 from softmode.deformables.model.struct_kernels import (
+    OVERLAP,
     Instances,
     NewtonState,
     PointConstraints,
@@ -194,23 +195,24 @@ def stiffness_exponents(instances: Instances, i: int, relative: float, partner_a
 
 @wp.func
 def dent_depth(instances: Instances, i: int, length: float):
-    """Return the dent [m] that a body takes under the pressure E / (1 - nu^2), E that where it is touched.
+    """Return the dent [m] beyond which the contact of a body hardens.
 
-    Zero where ``contact_stiffness`` is given: the penalty is then the whole law of the contact.
+    It is what the pressure E / (2 - 2 nu^2) dents, E that where it is touched, and half of the overlap that a step may
+    start from at the most. Zero where ``contact_stiffness`` is given: the penalty is then the whole law of the contact.
 
     Args:
         instances: The bodies.
         i: The body.
-        length: That depth at scale 1 [m], see ``dents``.
+        length: Dent at scale 1 under the pressure E / (1 - nu^2) [m], see ``dents``.
     """
     if instances.contact_stiffness[i] > 0.0:
         return float(0.0)
-    return instances.scale[i] * length
+    return 0.5 * wp.min(instances.scale[i] * length, OVERLAP * instances.size[i])
 
 
 @wp.func
 def dent_compliance(instances: Instances, i: int, relative: float, length: float):
-    """Return the dent per pressure w [m/Pa] of a body, from the parameters as they are now.
+    """Return the dent per pressure w [m/Pa] of a body, from the parameters as they are now; 0 as ``dent_depth``.
 
     Args:
         instances: The bodies.
@@ -218,8 +220,10 @@ def dent_compliance(instances: Instances, i: int, relative: float, length: float
         relative: Young's modulus where they touch relative to the body's.
         length: Dent at scale 1 under the pressure E / (1 - nu^2) [m].
     """
+    if instances.contact_stiffness[i] > 0.0:
+        return float(0.0)
     nu = instances.poissons_ratio[i]
-    return dent_depth(instances, i, length) * (1.0 - nu * nu) / (relative * instances.youngs_modulus[i])
+    return instances.scale[i] * length * (1.0 - nu * nu) / (relative * instances.youngs_modulus[i])
 
 
 @wp.func

@@ -190,7 +190,9 @@ class AdjointReduced:
             "pin": self.pin_total,
             "unknown": 3 * layout.block_count,
         }
-        of_constraints = "constraint_slip constraint_normal constraint_gain constraint_hessian constraint memory memory_start"
+        of_constraints = (
+            "constraint_slip constraint_normal constraint_gain constraint_hessian constraint memory memory_start"
+        )
         axes = {"": "instance point", of_constraints: "instance constraint"}
         self._step = allocate(kernels.Linearised, axes, self._sizes, self.device)
         points, constraints = Points(), PointConstraints()

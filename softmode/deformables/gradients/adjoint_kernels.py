@@ -44,7 +44,7 @@ class Linearised:
     point: wp.array2d[wp.mat33d]  # V times what is summed over the points next [N m]
     constraint_slip: wp.array2d[wp.vec3d]  # pins: x - target [m]; contacts: -d force / d friction coefficient [N]
     constraint_normal: wp.array2d[wp.vec3d]  # contacts: d force / d normal force
-    constraint_gain: wp.array2d[wp.vec3d]  # contacts: d normal force / d ln of stiffness, of dent compliance, of lengths
+    constraint_gain: wp.array2d[wp.vec3d]  # contacts: d normal force / d ln of stiffness, dent compliance, lengths [N]
     constraint_hessian: wp.array2d[wp.mat33d]  # -d force / d displacement [N/m]; not symmetric where a contact slips
     constraint: wp.array2d[wp.vec3d]  # what is summed over the constraints next [N]
     memory: wp.array2d[wp.vec3d]  # what the next step feels of a contact's memory, over the stick stiffness
@@ -311,9 +311,8 @@ def measure_residual(
     for e in range(constraints.count[i]):
         scale += wp.length(constraints.force[i, e])
         if e >= instances.pin_count[i]:
-            bound = wp.float64(OVERLAP * instances.size[i]) + constraints.dent_depth[i, e]
-            deepest = wp.max(deepest, -wp.dot(constraints.normal[i, e], constraints.offset[i, e]) / bound)
-    overlap_out[i] = deepest
+            deepest = wp.max(deepest, -wp.dot(constraints.normal[i, e], constraints.offset[i, e]))
+    overlap_out[i] = deepest / wp.float64(OVERLAP * instances.size[i])
     ratio_out[i] = wp.sqrt(total) / (scale + weight * resolution[i])
 
 
