@@ -149,7 +149,7 @@ def stiffness_per_area(scene, instance=0):
 
 
 def test_stiffness_and_size_of_the_penalty():
-    """At rest under a pressure P = m g / A samples sink x + w P with kappa (x - eps / 2) = P, or kappa x^2 / (2 eps)."""
+    """At rest under a pressure P = m g / A they sink x + w P with kappa (x - eps / 2) = P, or kappa x^2 / (2 eps)."""
     material = Material(youngs_modulus=1.0e7, mass_damping=5.0)
     scene = on_shape(lambda w: w.add_ground_plane(), height=0.0, material=material)
     settle(scene, 400)
@@ -252,7 +252,7 @@ def test_fast_impact_stays_shallow(youngs_modulus, density):
 
 @pytest.mark.parametrize("ratio", [0.001, 1000.0])
 def test_fast_impact_of_light_and_heavy_boxes(ratio):
-    """A free box of 0.001 and 1000 times the mass hits a soft cube with 5 m/s: 1 % of the edge deep besides the dent."""
+    """A free box of 0.001 and 1000 times the mass hits a soft cube at 5 m/s: 1 % of the edge deep besides the dent."""
     scene, twin = impact(ratio, speed=5.0, dt=0.001)
     momentum, _, energy = totals(scene, twin)
     depth = []
