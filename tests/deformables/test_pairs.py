@@ -444,14 +444,14 @@ def overlap(scene):
 @pytest.mark.parametrize("dt", [0.004, 0.01])
 @pytest.mark.parametrize("speed", [2.0, 5.0, 10.0])
 def test_fast_impacts_do_not_tunnel(speed, dt, offset):
-    """However far a body flies in a step, it does not enter the other by more than a tenth of its size."""
+    """However far a body flies in a step, besides the dent it does not enter the other by more than 1 % of its size."""
     materials = (Material(youngs_modulus=1.0e6), Material(youngs_modulus=1.0e6))
     scene = two(cube(), cube(), (*offset, 1.5 * EDGE), materials=materials, velocity=(0, 0, -speed), dt=dt)
     depth = 0.0
     for _ in range(round((0.05 + EDGE) / speed / dt) + 3):
         scene.step()
         depth = max(depth, overlap(scene))
-    assert depth < 0.01 * EDGE
+    assert depth < 0.01 * EDGE + scene.reduced.view.constraints.dent_depth.numpy().max()
     assert np.abs(scene.momentum(0)[0][2]) > 0.3 * scene.mass() * speed
     assert not scene.reduced.status.numpy().any()
 
@@ -484,7 +484,7 @@ def test_stack_carries_its_weight():
     """Three soft cubes at rest: the net force on each is its weight to 1e-4, whichever it stands on."""
     scene = stack()
     replay = scene.capture()
-    for _ in range(200):
+    for _ in range(300):  # on their dents they sway for longer than their material damps
         replay()
     force, weight = scene.reduced.instance_force.numpy(), scene.mass() * GRAVITY
     np.testing.assert_allclose(force[:, 2], weight, rtol=1e-4)
