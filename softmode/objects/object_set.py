@@ -133,6 +133,14 @@ class ObjectSet:
         """
         return replace(self, objects=tuple(self._config(one, like) for one in self.objects))
 
+    def pinned(self) -> Self:
+        """Return the set, of configurations, with whole paths and fingerprints of the files, see `ObjectConfig.pinned`.
+
+        Raises:
+            AssetError: If a file cannot be read.
+        """
+        return replace(self, objects=tuple(self.config(k).pinned() for k in range(self.count)))
+
     def for_varied_ratio(self) -> Self:
         """Return the set, of configurations, with bodies for a Poisson's ratio that varies."""
         kinds = [one.for_varied_ratio() if isinstance(one, ObjectConfig) else one for one in self.objects]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -24,8 +26,10 @@ from softmode.envs import (
     scripted_policy,
 )
 from softmode.errors import ConfigError, GraspError
+from softmode.learning.config_values import config_of, pinned_options, values_of
 from softmode.objects import ObjectConfig, ObjectSet
 from softmode.scenes import BoundSplats
+from softmode.splats import make_plush, write_splats
 
 STEPS = 26
 CUBE = ObjectConfig(
@@ -150,6 +154,19 @@ def test_processes_deal_out_the_same_objects() -> None:
     assert info["object"] == chosen[3]
     assert info["object_name"] == config.objects.names[chosen[3]] if config.objects else False
     np.testing.assert_array_equal(observation, first[3])
+
+
+def test_runs_keep_the_set(tmp_path: Path) -> None:
+    """What a checkpoint or a dataset keeps of a configuration, as JSON, makes the same set again, its files pinned."""
+    config = lift(objects=replace(SET, objects=("mug", *KINDS[1:]), size=0.07))
+    kept = json.loads(json.dumps(values_of(config)))
+    assert config_of(LiftSoftConfig, kept) == config
+    file = tmp_path / "toy.ply"
+    write_splats(file, make_plush(300))
+    options = {"config": values_of(LiftSoftConfig(objects=ObjectSet(["mug", file])))}
+    pinned = pinned_options("softmode/LiftSoft-v0", options)
+    found = config_of(LiftSoftConfig, json.loads(json.dumps(pinned["config"]))).object_set
+    assert found is not None and found.config(1).fingerprint == ObjectConfig(splat=file).pinned().fingerprint
 
 
 def test_scripted_policies_take_each_object() -> None:
