@@ -101,6 +101,8 @@ def warn_of_object(env: Any) -> None:
     base = env.unwrapped
     if not hasattr(base, "task_class"):
         return
+    if base.config.object_set is not None:  # the task has checked them
+        return
     scene = base.config.scene
     if scene.object.file is None and scene.object.preset is None:
         return

@@ -63,6 +63,10 @@ def checked_config(wanted: type[TaskConfig], config: TaskConfig | None, given: S
     scene = config.scene
     if given.control_mode is not None:
         scene = replace(scene, control=replace(scene.control, mode=given.control_mode))  # type: ignore[arg-type]
+    if config.object_set is not None and (given.splat is not None or given.size is not None):
+        what = "splat" if given.splat is not None else "size"
+        hint = "leave it out, or give the set a size: ObjectSet([...], size=0.07)"
+        raise ConfigError(f"{what} is given beside a set of objects", hint=hint)
     if given.splat is not None or given.size is not None:
         scene = replace(scene, object=_with_splat(scene.object, given))
     return replace(config, scene=scene)

@@ -133,10 +133,13 @@ def worlds_state(task: Task) -> tuple[dict[str, str], dict[str, NDArray[Any]]]:
     """Return whose the state of a task is, and its arrays, each of shape (world_count, size).
 
     Raises:
-        ConfigError: If the scene has grips, which are not part of a state.
+        ConfigError: If the scene has grips, which are not part of a state, or worlds differ in their objects.
     """
     if task.scene.grips:
         raise ConfigError("the scene has grips, which are not part of a state", hint="set scene.grip_slots to 0")
+    if len(task.scene.members) > 1:
+        hint = "take the states of environments with one object each: config.from_world(i)"
+        raise ConfigError("the worlds have different objects, whose states differ in size", hint=hint)
     arrays = {name: _rows(array, parts, task.world_count).copy() for name, array, parts in _parts(task)}
     arrays[_SHAPES] = _shifted(task, arrays[_SHAPES], -1)
     return owner_of(task), arrays

@@ -59,6 +59,15 @@ def object_part(point_count: int) -> tuple[Segment, ...]:
     )
 
 
+def one_hot_part(object_count: int) -> tuple[Segment, ...]:
+    """Return the segment that says which object of a set is there.
+
+    Args:
+        object_count: Number of objects of the set.
+    """
+    return (Segment("object_one_hot", object_count, 0.0, 1.0),)
+
+
 class ObservationLayout:
     """Where every segment stands in the observation vector, and its bounds.
 

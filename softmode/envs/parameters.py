@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.model.structs import StructType, filled
 from softmode.errors import ConfigError
@@ -53,25 +53,43 @@ class ParameterTable:
         parameters: What is drawn; a later parameter replaces an earlier one of the same name.
         world_count: Number of worlds.
         device: Warp device.
+        kinds: Of every kind of worlds the numbers that are not drawn there, by the name of a parameter.
+        kind: Which kind each world is, shape (world_count,).
 
     Attributes:
         values: The drawn numbers, float32, shape (world_count, columns).
+        low: Least of each column, shape (kinds, columns).
+        high: Largest of each column, likewise.
     """
 
-    def __init__(self, parameters: Sequence[Parameter], world_count: int, device: wp.DeviceLike = None) -> None:
+    def __init__(
+        self,
+        parameters: Sequence[Parameter],
+        world_count: int,
+        device: wp.DeviceLike = None,
+        *,
+        kinds: Sequence[Mapping[str, float]] = ({},),
+        kind: ArrayLike | None = None,
+    ) -> None:
         """Lay out the columns and upload their ranges."""
         self.parameters = {parameter.name: parameter for parameter in parameters}
         self.world_count = world_count
         ends = np.cumsum([parameter.size for parameter in self.parameters.values()]).tolist()
         self._column = dict(zip(self.parameters, [0, *ends], strict=False))
 
-        def upload(rows: list[np.ndarray], dtype: type) -> wp.array:
-            return wp.array(np.concatenate(rows), dtype=dtype, device=device)
-
         chosen = self.parameters.values()
-        self.low = upload([np.array(p.low, np.float32) for p in chosen], float)
-        self.high = upload([np.array(p.high, np.float32) for p in chosen], float)
-        self.log = upload([np.full(p.size, p.log) for p in chosen], wp.bool)
+
+        def upload(bound: str) -> wp.array:
+            rows = [
+                [np.array((kept[p.name],) if p.name in kept else getattr(p, bound), np.float32) for p in chosen]
+                for kept in kinds
+            ]
+            return wp.array(np.stack([np.concatenate(row) for row in rows]), dtype=float, device=device)
+
+        self.low, self.high = upload("low"), upload("high")
+        logs = np.concatenate([np.full(p.size, p.log) for p in chosen])
+        self.log = wp.array(logs, dtype=wp.bool, device=device)
+        self.kind = wp.array(np.zeros(world_count) if kind is None else kind, dtype=int, device=device)
         self.values = wp.zeros((world_count, ends[-1]), dtype=float, device=device)
 
     def column(self, name: str) -> int:

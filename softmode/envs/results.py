@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -30,7 +31,9 @@ def observation_arrays(task: Task, *, final: bool = False) -> Tree:
 def info_arrays(task: Task, *, final: bool = False) -> dict[str, Tree]:
     """Return the infos of all worlds; with `final`, those of the episodes that ended in this step."""
     success, metrics, parameters, vector, status = (task.final_outcome if final else task.outcome).values()
+    which = {} if task.object_set is None else {"object": task.object_index}
     return {
+        **which,
         "is_success": success,
         "reward_terms": {name: columns_of(task.terms, k) for k, name in enumerate(task.term_names)},
         **{name: columns_of(metrics, k) for k, name in enumerate(task.metric_names)},
@@ -51,6 +54,12 @@ def named_reasons(infos: dict[str, Any]) -> None:
     for world, bits in enumerate(status):
         names[world] = status_reasons(int(bits))
     infos["solver_reasons"], infos["_solver_reasons"] = names, infos["_solver_status"].copy()
+
+
+def add_object_names(infos: dict[str, Any], names: Sequence[str]) -> None:
+    """Add the name of the object of every world to infos in NumPy, with their mask."""
+    infos["object_name"] = np.array(names, dtype=object)[infos["object"]]
+    infos["_object_name"] = infos["_object"].copy()
 
 
 def columns_of(array: wp.array, columns: int | slice) -> wp.array:

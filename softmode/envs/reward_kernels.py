@@ -21,7 +21,7 @@ class WorldState:
     q: wp.array[wp.vec3d]  # reduced coordinates [m]
     particle_start: wp.array[int]
     particle_q: wp.array[wp.vec3]  # surface samples [m]
-    points: wp.array[int]  # those of object 0 that are observed
+    points: wp.array2d[int]  # those of object 0 that are observed, (world_count, points)
     stride: int  # soft objects per world
 
 
@@ -54,7 +54,7 @@ def tool_position(state: WorldState, world: int):
 @wp.func
 def surface_point(state: WorldState, world: int, point: int):
     """Return where an observed surface point of object 0 is [m]."""
-    return state.particle_q[state.particle_start[world * state.stride] + state.points[point]]
+    return state.particle_q[state.particle_start[world * state.stride] + state.points[world, point]]
 
 
 @wp.func

@@ -13,6 +13,7 @@ from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.task import Task
 from softmode.errors import ConfigError
+from softmode.objects.soft_object import SoftObject
 
 Vector = NDArray[np.float64]
 Environment = gym.Env | gym.vector.VectorEnv
@@ -69,6 +70,11 @@ class ScriptedPolicy:
         return float(self.scene.controller.target_yaw.numpy()[self.world])
 
     @property
+    def soft(self) -> SoftObject:
+        """Object 0 of the world."""
+        return self.scene.objects_of(self.world)[0]
+
+    @property
     def centre(self) -> Vector:
         """Centre of mass of object 0 [m]."""
         return self.scene.object_position.numpy()[self.world, 0].astype(float)
@@ -93,7 +99,7 @@ class ScriptedPolicy:
 
     def surfaces(self) -> list[Vector]:
         """Return the surface samples of every object [m], each of shape (N, 3)."""
-        counts = [thing.body.surface_count for thing in self.scene.objects]
+        counts = [thing.body.surface_count for thing in self.scene.objects_of(self.world)]
         state = self.task.state
         start = int(state.particle_start.numpy()[self.world * state.stride])
         points = self.scene.state.particle_q.numpy()[start : start + sum(counts)].astype(float)

@@ -18,9 +18,9 @@ from softmode.robots.grasp_planner import Grasp, plan_grasps
 from softmode.robots.jaws import ParallelJaw
 
 
-@functools.lru_cache(maxsize=4)
+@functools.lru_cache(maxsize=64)
 def _modes(thing: SoftObject) -> Vector:
-    """Return the elastic modes at an object's surface samples, the same for all worlds."""
+    """Return the elastic modes at an object's surface samples, the same for all worlds that have it."""
     return surface_modes(thing.body)
 
 
@@ -154,13 +154,13 @@ class ScriptedGrasp(ScriptedPolicy):
 
     def _plan(self) -> Grasp | None:
         """Choose a grasp where the object is, another one after every failed attempt; None if none fits any more."""
-        body, scale = self.scene.soft.body, float(self.drawn("scale")[0])
+        body, scale = self.soft.body, float(self.drawn("scale")[0])
         points = self.surfaces()
         turn = Rotation.align_vectors(points[0] - points[0].mean(0), body.surface_points - body.surface_points.mean(0))[
             0
         ]
         stiffness = float(self.drawn("youngs_modulus")[0]) * scale
-        modes = np.einsum("ab,sbm->sam", turn.as_matrix(), _modes(self.scene.soft)) / np.sqrt(stiffness)
+        modes = np.einsum("ab,sbm->sam", turn.as_matrix(), _modes(self.soft)) / np.sqrt(stiffness)
         try:
             found = plan_grasps(
                 points[0],
@@ -186,7 +186,7 @@ class ScriptedGrasp(ScriptedPolicy):
 
     def _weight(self) -> float:
         """Return the weight of the object [N]."""
-        volume = self.scene.soft.body.volume * float(self.drawn("scale")[0]) ** 3
+        volume = self.soft.body.volume * float(self.drawn("scale")[0]) ** 3
         return float(self.drawn("density")[0]) * volume * 9.81
 
     def _friction(self) -> float:

@@ -60,7 +60,8 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
 
     The reward is the sum of ``info["reward_terms"]``. ``info`` also holds ``is_success``, the task's figures,
     ``finger_force`` [N], ``parameters`` (what was drawn at reset), ``solver_status`` (the solver's flags),
-    ``solver_reasons`` (their names, such as "contact_overflow") and ``end_reason`` (:class:`EndReason`). An episode
+    ``solver_reasons`` (their names, such as "contact_overflow") and ``end_reason`` (:class:`EndReason`); with a set of
+    objects (``TaskConfig.objects``) ``object``, which one is there, and ``object_name``. An episode
     terminates only by failure, named by ``failure``, such as "dropped" or "diverged".
 
     ``reset`` takes as ``options`` any of the parameters, such as ``position`` (x, y) [m], ``yaw`` [rad],
@@ -120,6 +121,7 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
             progress=progress,
         )
         self.scene, self.device = self.task.scene, self.task.device
+        self._object_names = () if self.config.object_set is None else self.config.object_set.names
         self.action_space = self.task.action_space
         self.observation_space = self.task.observation_space()
 
@@ -213,4 +215,6 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         """Return the info of the present state."""
         info = take(info_arrays(self.task), 0, scalars=True)
         info["solver_reasons"] = status_reasons(info["solver_status"])
+        if self._object_names:
+            info["object_name"] = self._object_names[info["object"]]
         return info

@@ -31,7 +31,7 @@ from softmode.envs.arguments import (
 )
 from softmode.envs.env_state import EnvState, checked_state, generator_of, generator_state
 from softmode.envs.parameters import check_options
-from softmode.envs.results import named_reasons
+from softmode.envs.results import add_object_names, named_reasons
 from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.envs.tensors import Tensor, host_array, map_tree
@@ -141,7 +141,6 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         edges = np.linspace(0, self.num_envs, shards + 1).astype(int)
         self._slices = [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
         common = {
-            "config": config,
             "obs_type": obs_type,
             "limit": int(max_episode_steps or 0),
             "autoreset_mode": mode,
@@ -149,7 +148,10 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             "device": str(self.device),
             "progress": progress,
         }
-        arguments = [{**common, "world_count": part.stop - part.start} for part in self._slices]
+        arguments = [
+            {**common, "config": config.from_world(part.start), "world_count": part.stop - part.start}
+            for part in self._slices
+        ]
         self._worlds: list[Any] = []
         try:
             for part in arguments:
@@ -159,6 +161,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         except BaseException:
             self.close_extras()
             raise
+        self._object_names = () if config.object_set is None else config.object_set.names
         self._random: list[np.random.Generator] | None = None
         self._streams: dict[int, Any] = {}
         self._results: list[dict[str, Any]] = []
@@ -442,6 +445,8 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         infos = self._masked(tree, mask)
         if self.output == "numpy":
             named_reasons(infos)
+            if self._object_names:
+                add_object_names(infos, self._object_names)
         return infos
 
     def _masked(self, tree: dict[str, Any], mask: Any) -> dict[str, Any]:

@@ -15,16 +15,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.build.build_body import Progress
+from softmode.deformables.materials.material import Material
 from softmode.deformables.model import status as bits
 from softmode.deformables.model.structs import filled
 from softmode.deformables.solver.parameters import set_parameters
 from softmode.envs import task_kernels as kernels
 from softmode.envs.cameras import FollowCamera, overview, square_camera, wrist_camera
 from softmode.envs.end_reason import EndReason
-from softmode.envs.observation import PROPRIOCEPTION, ObservationLayout, Segment, object_part
+from softmode.envs.observation import PROPRIOCEPTION, ObservationLayout, Segment, object_part, one_hot_part
 from softmode.envs.parameters import Parameter, ParameterTable
 from softmode.envs.reward_kernels import StepResult, WorldState
 from softmode.envs.task_config import ObservationType, TaskConfig
+from softmode.errors import ConfigError, GraspError
+from softmode.objects.rest_grasps import rest_grasps
+from softmode.robots.jaws import ParallelJaw
 from softmode.scenes.capture import capture_graph
 from softmode.scenes.table_scene import GAP, TableScene, TableSceneConfig
 from softmode.splats.camera import CameraOptions
@@ -84,6 +88,9 @@ class Task:
     """Surface points of the object in the observation."""
     grasps: ClassVar[bool] = False
     """Whether the gripper is to take object 0."""
+    takes_sets: ClassVar[bool] = False
+    """Whether object 0 may be another one in every world (`TaskConfig.objects`): what the task reads of it comes from
+    `WorldState`, or is one per world, never of `scene.soft`."""
     kernels: ClassVar[Any] = None
     """Device side that `observe` and `evaluate` launch, a module with kernels of these names and a struct `Plan`: first
     columns of parameters (`drawn`) and segments (`columns`), and what has the name of an attribute of the task, its
@@ -103,6 +110,14 @@ class Task:
     ) -> None:
         """Build the scene and allocate what a step writes."""
         self.config, self.obs_type, self.world_count = config, obs_type, world_count
+        self.object_set = config.object_set
+        """The objects of which every world gets one; None where all have the same."""
+        if self.object_set is not None and not self.takes_sets:
+            raise ConfigError(
+                f"{type(self).__name__} cannot have another object in every world, objects is a set of"
+                f" {self.object_set.count}",
+                hint="give config.scene.object one object; a task of yours may set takes_sets",
+            )
         self.limit, self.autoreset_mode = limit, autoreset_mode
         cameras = []
         if obs_type != "state":
@@ -124,13 +139,22 @@ class Task:
         )
         self._follow = FollowCamera(self.render_cameras()[0], world_count)
         self.device = self.scene.device
-        self.table = ParameterTable(self.parameters(), world_count, self.device)
-        soft = self.scene.soft
-        self.points = sample_farthest(soft.body.surface_points, self.point_count, first=0)
-        """Surface samples of object 0 in the observation."""
+        self._check_objects()
+        kept = [self._kept(material) for material in self.scene.materials]
+        self.table = ParameterTable(self.parameters(), world_count, self.device, kinds=kept, kind=self.scene.member)
+        members = self.scene.members
+        points = [sample_farthest(thing.body.surface_points, self.point_count, first=0) for thing in members]
+        self.points_of_worlds: NDArray[np.intp] = np.stack(points)[self.scene.member]
+        """Surface samples of object 0 in the observation, shape (world_count, point_count)."""
+        self.points = self.points_of_worlds[0]
+        """Those of world 0, and of all worlds that have the same object."""
+        self.rest_height = wp.array(self.scene.heights[:, 0], dtype=float, device=self.device)
+        """Height of the centre of every unscaled object 0 over the table at rest [m], shape (world_count,)."""
+        given = self.object_set
+        code = one_hot_part(given.count) if given is not None and config.objects_one_hot else ()
         proprioception_and_goal = (*PROPRIOCEPTION, *self.goal_segments())
         self.layout = ObservationLayout(
-            (*proprioception_and_goal, *object_part(self.point_count), *self.object_segments())
+            (*proprioception_and_goal, *object_part(self.point_count), *self.object_segments(), *code)
         )
         self.segments = self.layout.segments
         """Columns of each segment: proprioception, goal, object, and what a task adds about it."""
@@ -144,7 +168,7 @@ class Task:
                 "drawn": self.table.columns_in(self.kernels.Drawn),
                 "columns": self.layout.columns_in(self.kernels.Columns),
             }
-            self.plan = filled(self.kernels.Plan, self, config, config.scene.control, soft, **columns)
+            self.plan = filled(self.kernels.Plan, self, config, config.scene.control, self.scene.soft, **columns)
             """What the task's own kernels know beside the state."""
         self.reset()
         self.graph = capture_graph(self._step, self.device)
@@ -190,6 +214,10 @@ class Task:
         columns = [self.table.column(name) for name in MATERIAL]
         self._material_columns = wp.array(columns, dtype=int, device=device)
         self._solver_mask = wp.zeros(worlds + 1, dtype=wp.bool, device=device)
+        self._heights = wp.array(scene.heights, dtype=float, device=device)
+        self._lowest = wp.array(scene.heights[:, 0] - FALL, dtype=float, device=device)
+        self.object_index = wp.array(scene.chosen, dtype=int, device=device)
+        """Which object of the set each world has, shape (world_count,); zeros without a set."""
         self._low = wp.array(self.low, dtype=float, device=device)
         self._high = wp.array(self.high, dtype=float, device=device)
         self.state = filled(
@@ -199,7 +227,7 @@ class Task:
             scene.model.softmode,
             scene.state,
             parameters=self.table.values,
-            points=wp.array(self.points, dtype=int, device=device),
+            points=wp.array(self.points_of_worlds, dtype=int, device=device),
             q=scene.state.softmode.q,
             stride=len(scene.objects),
         )
@@ -227,11 +255,37 @@ class Task:
 
         Where Poisson's ratio is drawn, the functions of every object are made for several.
         """
-        scene = self.config.scene
+        scene, given = self.config.scene, self.config.object_set
+        if given is not None:
+            scene = replace(scene, objects=given.resolved(scene.object))
         if self.config.poissons_ratio_range is None:
             return scene
+        if given is not None:
+            scene = replace(scene, objects=given.resolved(scene.object).for_varied_ratio())
         first, *others = (thing.for_varied_ratio() for thing in (scene.object, *scene.others))
         return replace(scene, object=first, others=tuple(others))
+
+    def _check_objects(self) -> None:
+        """Refuse objects of a set that the gripper is to take and cannot.
+
+        Raises:
+            GraspError: If there is one; it names the object.
+        """
+        if self.object_set is None or not self.grasps:
+            return
+        scene, jaw, names = self.scene, ParallelJaw.of(self.config.scene.arm), self.object_set.names
+        for k, thing, material in zip(np.unique(scene.chosen), scene.members, scene.materials, strict=True):
+            friction = max(math.sqrt(material.friction * jaw.friction), 1.0e-3)
+            try:
+                rest_grasps(thing.body, jaw, friction=friction)
+            except GraspError as error:
+                hint = "give it another size, or leave it out of the set"
+                raise GraspError(f"objects: {names[k]} does not fit the gripper: {error.message}", hint=hint) from error
+
+    def _kept(self, material: Material) -> dict[str, float]:
+        """Return the properties of a material that are not drawn."""
+        names = MATERIAL[: MATERIAL.index("scale")] if self.object_set is not None else ()
+        return {name: getattr(material, name) for name in names if getattr(self.config, f"{name}_range") is None}
 
     def build(self) -> None:
         """Allocate what the subclass needs; called once, when the scene stands."""
@@ -295,8 +349,11 @@ class Task:
         written = ("finite", "observation", "reward", "terms", "metrics")
         return {"parameters": self.table.values, **{name: getattr(self, name) for name in (*names, *written)}}
 
-    def marker(self) -> Splats | None:
-        """Return the splats that mark the goal in pictures; `observe` writes `scene.marker_place`."""
+    def marker(self) -> Splats | Sequence[Splats] | None:
+        """Return the splats that mark the goal in pictures, a list for worlds that differ.
+
+        `observe` writes `scene.marker_place`.
+        """
         return None
 
     def front_camera(self, name: str, edge: int) -> PinholeCamera:
@@ -349,7 +406,7 @@ class Task:
         scene, names = self.scene, {"position": position, "yaw": yaw, "scale": "scale"}
         columns = {field: self.table.column(name) for field, name in names.items()}
         given = {"turn": turn, "shift": shift, "gap": GAP + ground, "object_index": index}
-        place = filled(kernels.Placement, scene.objects[index], **columns, **given)
+        place = filled(kernels.Placement, **columns, **given, height=self._heights)
         outputs = [scene.place_position, scene.place_yaw]
         self.launch(kernels.place_object, [scene.world_mask, self.state, place], outputs)
 
@@ -404,7 +461,7 @@ class Task:
     def _draw(self) -> None:
         """Draw the parameters of the worlds in `scene.world_mask`."""
         table = self.table
-        inputs = [self.scene.world_mask, self.seed, table.low, table.high, table.log]
+        inputs = [self.scene.world_mask, self.seed, table.kind, table.low, table.high, table.log]
         self.launch(kernels.draw_parameters, inputs, [self.episode, table.values])
 
     def _start(self) -> None:
@@ -430,6 +487,9 @@ class Task:
         """Write the observation and the metrics of all worlds."""
         columns = self.layout.columns_in(kernels.Columns)
         self.launch(kernels.observe, [self.state, self._arm, columns], [self.observation])
+        if self.object_set is not None and self.config.objects_one_hot:
+            dim, column = (self.world_count, self.object_set.count), self.column("object_one_hot")
+            self.launch(kernels.observe_kind, [self.object_index, column], [self.observation], dim)
         self.observe()
         self.launch(kernels.bound_observation, [self._low, self._high], [self.observation, self.finite])
 
@@ -460,7 +520,8 @@ class Task:
         """
         scene = self.scene
         scale = self.table.values.numpy()[:, self.table.column("scale")]
-        radius = float(np.linalg.norm(scene.soft.body.surface_points, axis=1).max()) * scale
+        members = [float(np.linalg.norm(thing.body.surface_points, axis=1).max()) for thing in scene.members]
+        radius = np.array(members)[scene.member] * scale
         balls = [(scene.object_position.numpy()[:, 0], radius), (scene.controller.tool_pose.numpy()[:, :3], HAND)]
         if scene.marker is not None:
             balls.append((scene.marker_place.numpy()[:, :3], MARKER))
@@ -508,7 +569,7 @@ class Task:
         self.failure.zero_()
         self.any_done.zero_()
         self.evaluate()
-        status, lowest = scene.solver.status, scene.soft.height - FALL
+        status, lowest = scene.solver.status, self._lowest
         not_finite = bits.WORLD_NOT_FINITE | bits.WORLD_RIGID_NOT_FINITE
         inputs = [fresh, self.limit, not_finite, status, self.finite, self.state, lowest]
         self.launch(kernels.finish_step, inputs, [self.result, self._episode])

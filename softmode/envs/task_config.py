@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, Self, get_args
 
 from softmode.checks import require_choice, require_number, require_numbers, require_range
 from softmode.errors import ConfigError
+from softmode.objects.object_set import ObjectSet
 from softmode.scenes.table_scene import TableSceneConfig
 from softmode.splats.camera_randomization import CameraRandomization
 
@@ -32,6 +33,11 @@ class TaskConfig:
 
     scene: TableSceneConfig = field(default_factory=TableSceneConfig)
     """Objects, robot and physics."""
+    objects: ObjectSet | None = None
+    """Objects of which every world gets one and keeps it, in place of `scene.object`; material properties without a
+    range are those of the object, the range of another property holds for all."""
+    objects_one_hot: bool = False
+    """Whether observations end with a number per object of the set: 1 for the one that is there, 0 for others."""
     position_range: tuple[float, float] = (0.05, 0.08)
     """Half-width of the object's random position in x and y [m]."""
     yaw_range: float = math.pi
@@ -61,6 +67,12 @@ class TaskConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
+        if self.objects is not None and not isinstance(self.objects, ObjectSet):
+            raise ConfigError(f"objects is a {type(self.objects).__name__}", hint="give an ObjectSet([...])")
+        if self.objects is not None and self.scene.objects is not None and self.objects != self.scene.objects:
+            raise ConfigError("objects and scene.objects are two sets", hint="give one of them")
+        if self.objects_one_hot and self.object_set is None:
+            raise ConfigError("objects_one_hot without objects", hint="give objects=ObjectSet([...])")
         require_numbers("position_range", self.position_range, 2, at_least=0.0, unit="m")
         require_number("yaw_range", self.yaw_range, at_least=0.0, unit="rad")
         for name, limits in _RANGES.items():
@@ -72,6 +84,23 @@ class TaskConfig:
         require_number("image_size", self.image_size, at_least=36, at_most=640, unit="px")
         require_number("render_size", self.render_size, at_least=64, at_most=1024, unit="px")
         require_choice("mesh_samples", self.mesh_samples, (1, 4))
+
+    @property
+    def object_set(self) -> ObjectSet | None:
+        """The objects of which every world gets one; None where all have the same."""
+        return self.scene.objects if self.objects is None else self.objects
+
+    def from_world(self, first: int) -> Self:
+        """Return this for worlds from some world on: those of one process, or that world alone.
+
+        Args:
+            first: How many worlds come before.
+        """
+        given = self.object_set
+        if given is None or not first:
+            return self
+        moved = replace(given, first_world=given.first_world + first)
+        return replace(self, objects=moved, scene=replace(self.scene, objects=None))
 
     @classmethod
     def preset(cls, name: str) -> Self:

@@ -53,7 +53,7 @@ class Placement:
     scale: int
     turn: float  # what is added to the yaw [rad]
     shift: float  # from the unscaled object's centre to what lies at the position, along the yaw [m]
-    height: float  # of the unscaled object's centre [m]
+    height: wp.array2d[float]  # of the unscaled object's centre [m], (world_count, objects)
     gap: float  # [m]
     object_index: int
 
@@ -75,8 +75,9 @@ class Episode:
 def draw_parameters(
     world_mask: wp.array[wp.bool],
     seed: wp.array[int],
-    low: wp.array[float],
-    high: wp.array[float],
+    kind: wp.array[int],  # row of the bounds
+    low: wp.array2d[float],
+    high: wp.array2d[float],
     logarithmic: wp.array[wp.bool],
     # In, out:
     episode: wp.array[int],
@@ -92,8 +93,8 @@ def draw_parameters(
     for p in range(columns):
         random = wp.rand_init(seed[w], episode[w] * columns + p)
         u = wp.randf(random)
-        a = low[p]
-        b = high[p]
+        a = low[kind[w], p]
+        b = high[kind[w], p]
         value = a + u * (b - a)
         if logarithmic[p]:
             value = a * wp.exp(u * wp.log(b / a))
@@ -117,7 +118,7 @@ def place_object(
     yaw = place.turn + state.parameters[w, place.yaw]
     x = state.parameters[w, place.position] - scale * place.shift * wp.cos(yaw)
     y = state.parameters[w, place.position + 1] - scale * place.shift * wp.sin(yaw)
-    z = place.height * scale + place.gap
+    z = place.height[w, place.object_index] * scale + place.gap
     i = w * state.stride + place.object_index
     position_out[i] = wp.vec3d(wp.float64(x), wp.float64(y), wp.float64(z))
     yaw_out[i] = wp.float64(yaw)
@@ -171,8 +172,20 @@ def observe(
     write(observation, w, column.object_position, x)
     write(observation, w, column.object_velocity, state.object_velocity[w, 0])
     write(observation, w, column.object_offset, x - p)
-    for i in range(state.points.shape[0]):
+    for i in range(state.points.shape[1]):
         write(observation, w, column.object_points + 3 * i, surface_point(state, w, i) - x)
+
+
+@wp.kernel
+def observe_kind(
+    kind: wp.array[int],  # object of the set that each world has
+    column: int,
+    # Out:
+    observation: wp.array2d[float],
+):
+    """Write 1 for the object of the set that is there, and 0 for the others."""
+    w, k = wp.tid()
+    observation[w, column + k] = wp.where(kind[w] == k, 1.0, 0.0)
 
 
 @wp.kernel
@@ -234,7 +247,7 @@ def finish_step(
     status: wp.array[int],
     finite: wp.array[wp.bool],
     state: WorldState,
-    lowest: float,  # height under which object 0 is lost [m]
+    lowest: wp.array[float],  # height under which object 0 is lost [m]
     # In, out:
     result: StepResult,
     episode: Episode,
@@ -243,7 +256,7 @@ def finish_step(
     w = wp.tid()
     played = not fresh[w]
     why = result.failure[w]
-    if not (state.object_position[w, 0][2] >= lowest):
+    if not (state.object_position[w, 0][2] >= lowest[w]):
         why = EndReason.DROPPED
     if (status[w] & not_finite) != 0 or not finite[w]:
         why = EndReason.DIVERGED

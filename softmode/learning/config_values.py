@@ -109,10 +109,13 @@ def pinned_options(env: str, options: dict[str, Any]) -> dict[str, Any]:
         return options
     config, rest = split_config(env, options)
     first, *others = (thing.pinned() for thing in (config.scene.object, *config.scene.others))
-    if all(thing.file is None for thing in (first, *others)):
+    given = config.object_set
+    several = None if given is None else given.resolved(first).pinned()
+    every = (first, *others, *(() if several is None else map(several.config, range(several.count))))
+    if all(thing.file is None for thing in every):
         return options
-    scene = dataclasses.replace(config.scene, object=first, others=tuple(others))
-    return joined_config(env, dataclasses.replace(config, scene=scene), rest)
+    scene = dataclasses.replace(config.scene, object=first, others=tuple(others), objects=None)
+    return joined_config(env, dataclasses.replace(config, scene=scene, objects=several), rest)
 
 
 def located_options(options: Any, folder: Path) -> Any:
@@ -145,7 +148,8 @@ def _field_of(value: Any, hint: Any, before: Any) -> Any:
             return config_of(kinds[0], value, before)  # type: ignore[arg-type]
     if isinstance(value, list):
         inner = next((a for a in arguments if typing.get_origin(a) is tuple), hint)
-        kinds = [kind for kind in typing.get_args(inner) if dataclasses.is_dataclass(kind)]
+        parts = [part for one in typing.get_args(inner) for part in (one, *typing.get_args(one))]  # of unions too
+        kinds = [kind for kind in parts if dataclasses.is_dataclass(kind)]
         return tuple(_field_of(part, kinds[0] if kinds else None, None) for part in value)
     return value
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from softmode.objects.mesh_fit import FitOptions, MeshFit, splats_from_mesh
     from softmode.objects.object_build import build_object
     from softmode.objects.object_file import surface_cover, write_object
+    from softmode.objects.object_set import ObjectSet
     from softmode.objects.paint import StifferColor, color_field, nearest_field, read_field
     from softmode.objects.placed import Placed
     from softmode.objects.presets import PRESETS, Preset
@@ -46,6 +47,7 @@ __all__ = [
     "FitOptions",
     "MeshFit",
     "ObjectConfig",
+    "ObjectSet",
     "Placed",
     "Preset",
     "SoftObject",

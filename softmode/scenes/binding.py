@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
+from softmode.deformables.model.authoring import body_key
 from softmode.deformables.model.namespaces import soft
 from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.deformables.skinning.skinning_kernels import vec6
@@ -42,15 +43,30 @@ class SplatFrame:
         return host(scales), host(quats)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Skin:
+    """The splats of one body in the worlds that have it."""
+
+    skin: SkinSplats
+    """The splats."""
+    start: wp.array
+    """Where q of the body begins in each of these worlds."""
+    rows: wp.array | None
+    """The rows of these worlds in the arrays; None for all."""
+    first: int
+    """Column where they begin."""
+
+
 class BoundSplats:
     """Splats that follow the soft bodies of a model: the mean of x(X) and F Sigma F^T over each splat.
 
     Args:
         model: A model with soft bodies, the same in every world; None for states of a single body on their own.
         objects: The soft bodies of a world in the order in which they were added, at least one; None for a body that is
-            not shown.
+            not shown; a list with one body per world of the model where worlds differ.
         worlds: Which worlds; all of them if None. Without a model: which states, the first if None.
-        others: Splats behind those of the objects, which `update` leaves where they are: a marker, rigid toys.
+        others: Splats behind those of the objects, which `update` leaves where they are: a marker, rigid toys; a list
+            with one per world of the model where worlds differ.
         sh_degree: Highest degree of the colours, 0 to 3; None for that of the splats.
         device: Warp device where there is no model.
 
@@ -61,34 +77,50 @@ class BoundSplats:
     def __init__(
         self,
         model: newton.Model | None,
-        objects: Sequence[SoftObject | None],
+        objects: Sequence[SoftObject | Sequence[SoftObject] | None],
         *,
         worlds: Sequence[int] | None = None,
-        others: Sequence[Splats] = (),
+        others: Sequence[Splats | Sequence[Splats]] = (),
         sh_degree: int | None = None,
         device: wp.DeviceLike = None,
     ) -> None:
         """Upload the splats at rest."""
         device = device if model is None else model.device
-        shown = [thing for thing in objects if thing is not None and thing.splats is not None]
+        each = [[thing] if thing is None or isinstance(thing, SoftObject) else list(thing) for thing in objects]
+        self.indices = tuple(o for o, things in enumerate(each) if _has_splats(things))
+        """Which objects have splats."""
         if model is not None:
-            starts = _function_starts(model, len(objects), worlds)
-        elif len(shown) == len(objects) == 1:
-            starts = np.array([0] if worlds is None else worlds)[:, None] * shown[0].body.function_count
+            starts = _function_starts(model, each, worlds)
+        elif len(self.indices) == len(each) == len(each[0]) == 1 and each[0][0] is not None:
+            starts = np.array([0] if worlds is None else worlds)[:, None] * each[0][0].body.function_count
         else:
             raise ConfigError(f"there are {len(objects)} objects and no model", hint="give one object that has splats")
-        parts = [*(thing.visible_splats for thing in shown), *others]
+        chosen = range(len(starts)) if worlds is None else worlds
+        parts: list[Splats | list[Splats]] = []
+        for things in [each[o] for o in self.indices]:
+            splats = [thing.visible_splats for thing in things if thing is not None]
+            parts.append(splats[0] if len(things) == 1 else [splats[w] for w in chosen])
+        parts += [part if isinstance(part, Splats) else [part[w] for w in chosen] for part in others]
         self.arrays = SplatArrays.from_splats(parts, world_count=len(starts), sh_degree=sh_degree, device=device)
         """The splats as they are, for cameras and rasterisers."""
-        ends = np.cumsum([splats.count for splats in parts]).tolist()
-        self.columns = tuple(slice(end - splats.count, end) for end, splats in zip(ends, parts, strict=True))
-        """Where the splats of each object that has some are in `arrays`, then those of `others`."""
-        self.indices = tuple(o for o, thing in enumerate(objects) if thing is not None and thing.splats is not None)
-        """Which objects have splats."""
-        self._skins = []
-        for o, thing, rest in zip(self.indices, shown, parts, strict=False):
-            skin = SkinSplats(rest.means, rest.covariances(), thing.basis, thing.grad_basis, device=device)
-            self._skins.append((skin, wp.array(np.ascontiguousarray(starts[:, o]), dtype=int, device=device)))
+        self._counts = [[part.count] if isinstance(part, Splats) else [one.count for one in part] for part in parts]
+        ends = np.cumsum([max(counts) for counts in self._counts]).tolist()
+        self.columns = tuple(slice(end - max(counts), end) for end, counts in zip(ends, self._counts, strict=True))
+        """Where the splats of each object that has some are in `arrays`, then those of `others`; where worlds differ,
+        the last columns of a world may be empty."""
+        self._skins: list[_Skin] = []
+        for o, columns in zip(self.indices, self.columns, strict=False):
+            things = each[o]
+            for thing in {id(thing): thing for thing in things}.values():
+                assert thing is not None  # of those that have splats
+                rest = thing.visible_splats
+                skin = SkinSplats(rest.means, rest.covariances(), thing.basis, thing.grad_basis, device=device)
+                mine = [k for k, w in enumerate(chosen) if things[w % len(things)] is thing]
+                if not mine:
+                    continue
+                start = wp.array(np.ascontiguousarray(starts[mine, o]), dtype=int, device=device)
+                rows = None if len(things) == 1 else wp.array(mine, dtype=int, device=device)
+                self._skins.append(_Skin(skin=skin, start=start, rows=rows, first=columns.start))
 
     def update(self, state: newton.State) -> None:
         """Move the splats to where a state of the model has them; capturable after a first time."""
@@ -97,18 +129,19 @@ class BoundSplats:
     def move(self, q: wp.array) -> None:
         """Move the splats by the coordinates q of all instances [m], flat vec3d; capturable after a first time."""
         arrays = self.arrays
-        for (skin, start), columns in zip(self._skins, self.columns, strict=False):
-            moved = (arrays.means, arrays.covariances)
-            skin.launch(q, start, *moved, rotations=arrays.rotations, first_splat=columns.start)
+        moved, turns = (arrays.means, arrays.covariances), arrays.rotations
+        for one in self._skins:
+            one.skin.launch(q, one.start, *moved, rotations=turns, first_splat=one.first, rows=one.rows)
 
     def frames(self) -> dict[tuple[int, int], SplatFrame]:
         """Return the splats as they are by place of the world in `worlds` and object; reads from the device."""
         means, covariances = host(self.arrays.means), host(self.arrays.covariances)
-        return {
-            (w, o): SplatFrame(means=means[w, columns].copy(), covariances=covariances[w, columns].copy())
-            for o, columns in zip(self.indices, self.columns, strict=False)
-            for w in range(len(means))
-        }
+        frames: dict[tuple[int, int], SplatFrame] = {}
+        for o, columns, counts in zip(self.indices, self.columns, self._counts, strict=False):
+            for w in range(len(means)):
+                mine = slice(columns.start, columns.start + counts[w % len(counts)])
+                frames[w, o] = SplatFrame(means=means[w, mine].copy(), covariances=covariances[w, mine].copy())
+        return frames
 
 
 def splats_of_states(thing: SoftObject, states: ArrayLike) -> Iterator[Splats]:
@@ -130,16 +163,34 @@ def splats_of_states(thing: SoftObject, states: ArrayLike) -> Iterator[Splats]:
             yield rest.with_covariances(frame.means, frame.covariances, turns[k] if rest.sh_degree else np.eye(3))
 
 
-def _function_starts(model: newton.Model, count: int, worlds: Sequence[int] | None) -> NDArray[np.int32]:
-    """Return where q of each of the soft bodies of a world begins, shape (worlds, count).
+def _has_splats(things: Sequence[SoftObject | None]) -> bool:
+    """Return whether a body has splats; where worlds differ, all of them have, or it is shown in none."""
+    return all(thing is not None and thing.splats is not None for thing in things)
+
+
+def _function_starts(
+    model: newton.Model, each: Sequence[Sequence[SoftObject | None]], worlds: Sequence[int] | None
+) -> NDArray[np.int32]:
+    """Return where q of each of the soft bodies of a world begins, shape (worlds, bodies).
 
     Raises:
-        ConfigError: If the worlds do not hold that many.
+        ConfigError: If the worlds do not hold that many, or one of them holds another body.
     """
-    data = soft(model)
+    data, count = soft(model), len(each)
     owner, every = data.instance_world.numpy(), max(int(model.world_count), 1)
     if len(owner) != every * count or (every > 1 and not np.array_equal(owner, np.repeat(np.arange(every), count))):
         hint = "give one object, or None, per soft body of a world, in the order in which they were added"
         raise ConfigError(f"objects names {count} soft bodies, the model has {len(owner)} in {every} worlds", hint=hint)
     starts = np.asarray(data.function_start.numpy(), dtype=np.int32).reshape(every, count)
-    return starts if worlds is None else starts[list(worlds)]
+    keys, chosen = data.body_key.numpy().reshape(every, count), range(every) if worlds is None else worlds
+    for o, things in enumerate(each):
+        if len(things) not in (1, every):
+            hint = "give one body, or one per world"
+            raise ConfigError(f"objects[{o}] has {len(things)} bodies for {every} worlds", hint=hint)
+        wanted = [-1 if thing is None else body_key(thing.body) for thing in things]
+        for w in chosen:
+            wants = wanted[w % len(things)]
+            if wants not in (-1, int(keys[w, o])):
+                hint = "give the body of every world where worlds differ: TableScene.objects_of(world)"
+                raise ConfigError(f"objects[{o}] is not the body that world {w} holds", hint=hint)
+    return starts[list(chosen)]

@@ -119,7 +119,7 @@ def columns_of(arrays: SplatArrays, columns: slice) -> SplatArrays:
     """Return some of the splats; shares memory."""
     turns = arrays.rotations if arrays.rotations.shape[1] == 1 else arrays.rotations[:, columns]
     named = {name: getattr(arrays, name)[:, columns] for name in ("means", "covariances", "opacities", "sh")}
-    return replace(arrays, **named, object_index=arrays.object_index[columns], rotations=turns)
+    return replace(arrays, **named, object_index=arrays.object_index[columns], rotations=turns, spanning=None)
 
 
 def _triangles(

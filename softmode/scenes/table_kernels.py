@@ -5,14 +5,21 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 
+@wp.struct
+class ObjectBases:
+    """What places and centres follow from, one row per body, padded to the largest."""
+
+    body: wp.array[int]  # (instance_count,) row of each soft object
+    function_start: wp.array[int]  # (instance_count,)
+    function_count: wp.array[int]  # (body_count,)
+    linear: wp.array3d[wp.float64]  # (body_count, function_max, 4)
+    mean: wp.array2d[wp.float64]  # (body_count, function_max)
+    stride: int  # soft objects per world
+
+
 @wp.kernel
 def place_objects(
-    # Instances:
-    function_start: wp.array[int],
-    stride: int,  # soft objects per world
-    object_index: int,
-    # Asset:
-    linear_coordinates: wp.array2d[wp.float64],  # (function_count, 4)
+    bases: ObjectBases,
     # Reset:
     world_mask: wp.array[wp.bool],
     position: wp.array[wp.vec3d],  # (instance_count,) [m]
@@ -23,30 +30,27 @@ def place_objects(
     qd_out: wp.array[wp.vec3d],
     q_driven_out: wp.array[wp.vec3d],
 ):
-    """Set q of one object of each world to the placement x = scale R(yaw) X + position, at rest; clamps hold it so."""
-    w, k = wp.tid()
-    if not world_mask[w]:
+    """Set q of every object to the placement x = scale R(yaw) X + position, at rest; clamps hold it so."""
+    i, k = wp.tid()
+    b = bases.body[i]
+    if not world_mask[i / bases.stride] or k >= bases.function_count[b]:
         return
-    i = w * stride + object_index
     size = wp.float64(scale[i])
     c = size * wp.cos(yaw[i]) - wp.float64(1.0)
     s = size * wp.sin(yaw[i])
-    x = linear_coordinates[k, 0]
-    y = linear_coordinates[k, 1]
-    z = (size - wp.float64(1.0)) * linear_coordinates[k, 2]
-    q = wp.vec3d(c * x - s * y, s * x + c * y, z) + linear_coordinates[k, 3] * position[i]
-    q_out[function_start[i] + k] = q
-    q_driven_out[function_start[i] + k] = q
-    qd_out[function_start[i] + k] = wp.vec3d()
+    x = bases.linear[b, k, 0]
+    y = bases.linear[b, k, 1]
+    z = (size - wp.float64(1.0)) * bases.linear[b, k, 2]
+    q = wp.vec3d(c * x - s * y, s * x + c * y, z) + bases.linear[b, k, 3] * position[i]
+    at = bases.function_start[i] + k
+    q_out[at] = q
+    q_driven_out[at] = q
+    qd_out[at] = wp.vec3d()
 
 
 @wp.kernel
 def observe_objects(
-    # Instances:
-    function_start: wp.array[int],
-    stride: int,  # soft objects per world
-    object_index: int,
-    mean_basis: wp.array[wp.float64],
+    bases: ObjectBases,
     # State in:
     q: wp.array[wp.vec3d],
     qd: wp.array[wp.vec3d],
@@ -55,15 +59,17 @@ def observe_objects(
     velocity_out: wp.array2d[wp.vec3],
 ):
     """Compute position and velocity of the centre of mass: sum_k mean(b_k) q_k."""
-    w = wp.tid()
-    start = function_start[w * stride + object_index]
+    i = wp.tid()
+    b = bases.body[i]
+    start = bases.function_start[i]
     x = wp.vec3d()
     v = wp.vec3d()
-    for k in range(mean_basis.shape[0]):
-        x += mean_basis[k] * q[start + k]
-        v += mean_basis[k] * qd[start + k]
-    position_out[w, object_index] = wp.vec3(x)
-    velocity_out[w, object_index] = wp.vec3(v)
+    for k in range(bases.function_count[b]):
+        x += bases.mean[b, k] * q[start + k]
+        v += bases.mean[b, k] * qd[start + k]
+    w = i / bases.stride
+    position_out[w, i - w * bases.stride] = wp.vec3(x)
+    velocity_out[w, i - w * bases.stride] = wp.vec3(v)
 
 
 @wp.kernel

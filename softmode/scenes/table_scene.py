@@ -8,6 +8,7 @@ import newton
 import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
+from numpy.typing import NDArray
 
 from softmode.checks import require_number
 from softmode.deformables.coupling.rigid_solver import mujoco_warnings
@@ -21,6 +22,7 @@ from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
 from softmode.objects.loader import Progress, load
+from softmode.objects.object_set import ObjectSet
 from softmode.objects.placed import Placed
 from softmode.objects.soft_object import SoftObject
 from softmode.robots.arm import ArmDescription, add_arm
@@ -46,12 +48,14 @@ class TableSceneConfig:
 
     object: ObjectConfig = field(default_factory=ObjectConfig)
     """The soft object."""
+    objects: ObjectSet | None = None
+    """Objects of which each world gets one in place of `object`; those that are named get its build."""
     others: tuple[ObjectConfig, ...] = ()
     """More soft objects, of the same material."""
     fixtures: tuple[Fixture, ...] = ()
     """Rigid shapes on the table."""
     material: Material = field(default_factory=lambda: Material(youngs_modulus=2.0e5, density=250.0))
-    """Its material; Young's modulus may be changed per world at reset."""
+    """Its material; Young's modulus may be changed per world at reset. In a set, that of objects that say none."""
     arm: ArmDescription = field(default_factory=ArmDescription)
     """The robot."""
     control: ArmControlOptions = field(default_factory=ArmControlOptions)
@@ -81,6 +85,8 @@ class TableSceneConfig:
         require_number("control_hz", self.control_hz, at_least=1.0, at_most=1000.0)
         require_number("table_friction", self.table_friction, at_least=0.0)
         require_number("grip_slots", self.grip_slots, at_least=0, at_most=4096)
+        if self.objects is not None and not isinstance(self.objects, ObjectSet):
+            raise ConfigError(f"objects is a {type(self.objects).__name__}", hint="give an ObjectSet([...])")
 
 
 class TableScene:
@@ -93,7 +99,8 @@ class TableScene:
         film: Cameras of one image size whose pictures people look at; see :meth:`draw_film`.
         camera_options: Light and background.
         camera_randomization: What `randomize` of the cameras draws.
-        marker: Splats around the origin that mark a place, such as a goal, in pictures; they touch nothing.
+        marker: Splats around the origin that mark a place, such as a goal, in pictures; they touch nothing. A list of
+            them has those of each world.
         device: Warp device; the default one if None.
         progress: Reports the build of the object, see :func:`softmode.deformables.build.build_body.build_body`.
     """
@@ -107,7 +114,7 @@ class TableScene:
         film: Sequence[PinholeCamera] = (),
         camera_options: CameraOptions | None = None,
         camera_randomization: CameraRandomization | None = None,
-        marker: Splats | None = None,
+        marker: Splats | Sequence[Splats] | None = None,
         device: wp.DeviceLike = None,
         progress: Progress = None,
     ) -> None:
@@ -117,10 +124,7 @@ class TableScene:
         self.world_count = world_count
         self.device = wp.get_device(device)
         self.dt = 1.0 / (config.control_hz * config.substeps)
-        kinds = (config.object, *config.others)
-        loaded = {kind: load(kind, material=config.material, progress=progress) for kind in dict.fromkeys(kinds)}
-        self.objects: tuple[SoftObject, ...] = tuple(loaded[kind] for kind in kinds)
-        """The soft objects of a world; their instances follow each other, world by world."""
+        self._load(progress)
         self._build_model()
         self._build_solver()
         self.marker_place = wp.zeros(world_count, dtype=wp.transform, device=self.device)
@@ -135,9 +139,14 @@ class TableScene:
         self.film: FilmCamera | None = None
         """The cameras that people look through; None without any."""
         if cameras or film:
-            self.splats = BoundSplats(self.model, self.objects, others=() if marker is None else (marker,))
+            first = self.objects[0] if len(self.members) == 1 else [self.members[m] for m in self.member]
+            things = (first, *self.objects[1:])
+            self.splats = BoundSplats(self.model, things, others=() if marker is None else (marker,))
             if marker is not None:
-                self.marker_points = wp.array(marker.means[None], dtype=wp.vec3, device=self.device)
+                rest = self.splats.arrays.means.numpy()[:, self.splats.columns[-1]]
+                self.marker_points = wp.array(
+                    rest[:1] if isinstance(marker, Splats) else rest, dtype=wp.vec3, device=self.device
+                )
                 """Centres of the marker's splats from `marker_place` [m], shape (1 or world_count, splats); a task may
                 put an array of its own here before the first picture, to change the marker's shape."""
         if cameras and self.splats is not None:
@@ -155,13 +164,67 @@ class TableScene:
 
     @property
     def soft(self) -> SoftObject:
-        """The first soft object."""
+        """The first soft object, of world 0 where worlds differ."""
         return self.objects[0]
+
+    def objects_of(self, world: int) -> tuple[SoftObject, ...]:
+        """Return the soft objects of a world."""
+        return (self.members[self.member[world]], *self.objects[1:])
+
+    def marker_of(self, world: int) -> Splats | None:
+        """Return the splats that mark a place in a world, as they were given; None without any."""
+        return self.marker if self.marker is None or isinstance(self.marker, Splats) else self.marker[world]
 
     # -- construction -------------------------------------------------------------------------------------------------
 
+    def _load(self, progress: Progress) -> None:
+        """Load what the worlds hold, each object once."""
+        config = self.config
+        loaded: dict[tuple[ObjectConfig, Material | None], SoftObject] = {}
+
+        def loaded_once(kind: ObjectConfig, material: Material | None) -> SoftObject:
+            if (kind, material) not in loaded:
+                loaded[kind, material] = load(kind, material=material, progress=progress)
+            return loaded[kind, material]
+
+        self.chosen: NDArray[np.intp] = np.zeros(self.world_count, dtype=np.intp)
+        """Which object of the set each world has, shape (world_count,); zeros without a set."""
+        if config.objects is None:
+            self.members: tuple[SoftObject, ...] = (loaded_once(config.object, config.material),)
+            """What object 0 of the worlds is: one soft object, or those of the set that some world has."""
+            self.materials: tuple[Material, ...] = (config.material,)
+            """What each of them is made of."""
+            self.member = self.chosen
+            """Which of them each world has, shape (world_count,)."""
+        else:
+            given = config.objects.resolved(config.object)
+            self.chosen = given.chosen(self.world_count)
+            held, self.member = np.unique(self.chosen, return_inverse=True)
+            kinds = [(given.config(k), given.material(k, config.material)) for k in held]
+            self.members = tuple(loaded_once(kind, own) for kind, own in kinds)
+            self.materials = tuple(
+                own or thing.material or config.material for thing, (_, own) in zip(self.members, kinds, strict=True)
+            )
+        others = tuple(loaded_once(kind, config.material) for kind in config.others)
+        self.objects: tuple[SoftObject, ...] = (self.members[self.member[0]], *others)
+        """The soft objects of a world, of world 0 where worlds differ (see `objects_of`); their instances follow each
+        other, world by world."""
+
     def _build_model(self) -> None:
-        """Add arm, table, fixtures and objects to a world and replicate it."""
+        """Make a world for each object that object 0 may be, and a model of as many copies of each as are wanted."""
+        worlds = [self._world(thing, made_of) for thing, made_of in zip(self.members, self.materials, strict=True)]
+        builder = newton.ModelBuilder()
+        register_custom_attributes(builder)
+        SolverMuJoCo.register_custom_attributes(builder)
+        if len(worlds) == 1:
+            builder.replicate(worlds[0], self.world_count)
+        else:
+            for m in self.member:
+                builder.add_world(worlds[m])
+        self.model: Any = builder.finalize(device=self.device)  # Any: it carries the attributes of soft bodies
+
+    def _world(self, first: SoftObject, material: Material) -> newton.ModelBuilder:
+        """Return a world with arm, table, fixtures and objects; the first of these and its material are given."""
         config = self.config
         world = newton.ModelBuilder()
         self.arm = add_arm(world, config.arm)
@@ -170,23 +233,19 @@ class TableScene:
         table = Fixture(label="table", position=place, size=size, color=slate, friction=config.table_friction)
         for fixture in (table, *config.fixtures):
             add_fixture(world, fixture)
-        for thing in self.objects:
+        for thing in (first, *self.objects[1:]):
             placed = Placed(object=thing, position=(*config.object_position, thing.height))
-            instance = placed.add_to(world, material=config.material)
+            instance = placed.add_to(world, material=material if thing is first else config.material)
             if config.grip_slots:
                 add_grip_slots(world, instance, config.grip_slots)
-        builder = newton.ModelBuilder()
-        register_custom_attributes(builder)
-        SolverMuJoCo.register_custom_attributes(builder)
-        builder.replicate(world, self.world_count)
-        self.model: Any = builder.finalize(device=self.device)  # Any: it carries the attributes of soft bodies
+        return world
 
     def _build_solver(self) -> None:
         """Make the coupled solver, the controller and the buffers of a control step."""
         config, model, worlds = self.config, self.model, self.world_count
         with mujoco_warnings():
             rigid = SolverMuJoCo(model, njmax=config.constraint_max, nconmax=config.rigid_contact_max)
-        distinct = list({id(thing.body): thing.body for thing in self.objects}.values())
+        distinct = list({id(thing.body): thing.body for thing in (*self.members, *self.objects)}.values())
         self.solver = SolverCoupledReduced(model, distinct, options=config.solver, rigid=rigid)
         self.state: Any = model.state()
         self._scratch: Any = model.state()
@@ -200,7 +259,7 @@ class TableScene:
             for i in range(instances if slots else 0)
         )
         """Grips of each instance, world by world, that pull and hold it while the scene runs; none without slots."""
-        device, bodies = self.device, [thing.body for thing in self.objects]
+        device = self.device
         self.actions = wp.zeros((worlds, config.control.action_size), dtype=float, device=device)
         self.object_position = wp.zeros((worlds, len(self.objects)), dtype=wp.vec3, device=device)
         """Centre of mass of each soft object [m], shape (world_count, objects)."""
@@ -210,8 +269,7 @@ class TableScene:
         starts = model.body_world_start.numpy()[:worlds]
         fingers = starts[:, None] + np.asarray(self.arm.finger_bodies)[None]
         self._finger_body = wp.array(fingers, dtype=int, device=device)
-        self._linear = [wp.array(body.linear_coordinates, dtype=wp.float64, device=device) for body in bodies]
-        self._mean_basis = [wp.array(body.mean_basis, dtype=wp.float64, device=device) for body in bodies]
+        self._bases = self._object_bases()
         self.world_mask = wp.ones(worlds, dtype=wp.bool, device=device)
         """Which worlds `reset_worlds` resets, shape (world_count,)."""
         self._solver_mask = wp.zeros(worlds + 1, dtype=wp.bool, device=device)
@@ -219,6 +277,29 @@ class TableScene:
         """Where `reset_worlds` puts the centre of mass of each object [m], shape (world_count * objects,)."""
         self.place_yaw = wp.zeros(instances, dtype=wp.float64, device=device)
         """Its rotation about the vertical [rad]."""
+
+    def _object_bases(self) -> Any:
+        """Return what places and centres of the objects follow from, on the device."""
+        device, bodies, rows = self.device, [], {}
+        for thing in (*self.members, *self.objects):
+            if rows.setdefault(id(thing.body), len(bodies)) == len(bodies):
+                bodies.append(thing.body)
+        most = max(body.function_count for body in bodies)
+        linear, mean = np.zeros((len(bodies), most, 4)), np.zeros((len(bodies), most))
+        for b, body in enumerate(bodies):
+            linear[b, : body.function_count], mean[b, : body.function_count] = body.linear_coordinates, body.mean_basis
+        first = np.array([rows[id(thing.body)] for thing in self.members])[self.member]
+        others = np.array([rows[id(thing.body)] for thing in self.objects[1:]], int)
+        body = np.column_stack([first, np.tile(others, (self.world_count, 1))]).reshape(-1)
+        bases = kernels.ObjectBases()
+        bases.body = wp.array(body, dtype=int, device=device)
+        bases.function_start = self.model.softmode.function_start
+        counts = [body.function_count for body in bodies]
+        bases.function_count = wp.array(counts, dtype=int, device=device)
+        bases.linear = wp.array(linear, dtype=wp.float64, device=device)
+        bases.mean = wp.array(mean, dtype=wp.float64, device=device)
+        bases.stride = len(self.objects)
+        return bases
 
     # -- time ---------------------------------------------------------------------------------------------------------
 
@@ -242,7 +323,7 @@ class TableScene:
         mask = np.ones(worlds, bool) if world_mask is None else np.asarray(world_mask, bool)
         place = np.empty((worlds, count, 3))
         place[:, :, :2] = self.config.object_position
-        place[:, :, 2] = [thing.height + GAP for thing in self.objects]
+        place[:, :, 2] = self.heights + GAP
         turn = np.zeros((worlds, count))
         if position is not None:
             place[:, 0, :2] = position
@@ -261,10 +342,9 @@ class TableScene:
         wp.copy(self._solver_mask, self.world_mask, count=worlds)
         self.solver.reset(state, self._solver_mask)
         place = (self.world_mask, self.place_position, self.place_yaw, data.scale)
-        for o, linear in enumerate(self._linear):
-            instances = (data.function_start, len(self.objects), o, linear)
-            outputs = (state.softmode.q, state.softmode.qd, self.control.softmode.q_driven)
-            launch(self.device, kernels.place_objects, (worlds, linear.shape[0]), *instances, *place, *outputs)
+        outputs = (state.softmode.q, state.softmode.qd, self.control.softmode.q_driven)
+        dim = (worlds * len(self.objects), self._bases.mean.shape[1])
+        launch(self.device, kernels.place_objects, dim, self._bases, *place, *outputs)
         self.solver.update_particles(state)
         self.controller.reset(state, self.world_mask)
         self.controller.write_targets(self.control)
@@ -307,12 +387,10 @@ class TableScene:
 
     def observe(self) -> None:
         """Refresh what observations are made of; capturable."""
-        data, state, worlds = self.model.softmode, self.state, self.world_count
+        state, worlds = self.state, self.world_count
         self.controller.measure(state)
-        for o, mean_basis in enumerate(self._mean_basis):
-            instances = (data.function_start, len(self.objects), o, mean_basis)
-            arrays = (state.softmode.q, state.softmode.qd, self.object_position, self.object_velocity)
-            launch(self.device, kernels.observe_objects, worlds, *instances, *arrays)
+        arrays = (state.softmode.q, state.softmode.qd, self.object_position, self.object_velocity)
+        launch(self.device, kernels.observe_objects, worlds * len(self.objects), self._bases, *arrays)
         fingers = (self._finger_body, self.solver.body_wrench, self.finger_force)
         launch(self.device, kernels.observe_fingers, (worlds, 2), *fingers)
 
@@ -345,11 +423,18 @@ class TableScene:
         if self.splats is not None:
             self.splats.update(self.state)
             if self.marker is not None:
-                dim, first = (self.world_count, self.marker.count), self.splats.columns[-1].start
+                dim, first = (self.world_count, self.marker_points.shape[1]), self.splats.columns[-1].start
                 arrays = (self.marker_points, self.marker_place, first, self.splats.arrays.means)
                 launch(self.device, kernels.place_marker, dim, *arrays)
 
     # -- reading ------------------------------------------------------------------------------------------------------
+
+    @property
+    def heights(self) -> NDArray[np.float64]:
+        """Height of the centre of every unscaled object over the table at rest [m], shape (world_count, objects)."""
+        first = np.array([thing.height for thing in self.members])[self.member]
+        others = np.array([thing.height for thing in self.objects[1:]])
+        return np.column_stack([first, np.tile(others, (self.world_count, 1))])
 
     @property
     def status(self) -> np.ndarray:

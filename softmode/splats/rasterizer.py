@@ -75,20 +75,26 @@ class SplatArrays:
     rotations: wp.array
     """Rotation of each splat's colours, rest frame to world, quat, shape (1 or world_count, N); (1, 1) and not read if
     K = 1, where colours are the same from everywhere."""
+    spanning: wp.array | None = None
+    """Columns of the splats that the map of a shadow spans, int32, shape (world_count, M), where worlds differ in
+    them; None where every so many splats do."""
 
     @classmethod
     def from_splats(
         cls,
-        objects: list[Splats] | tuple[Splats, ...],
+        objects: Sequence[Splats | Sequence[Splats]],
         *,
         world_count: int = 1,
         sh_degree: int | None = None,
         device: str | wp.Device | None = None,
     ) -> "SplatArrays":
-        """Upload the objects in their rest state, every world alike; means, covariances and rotations are per world.
+        """Upload the objects in their rest state; means, covariances and rotations are per world.
+
+        Opacities and colours are shared by all worlds where these are alike, else per world too.
 
         Args:
-            objects: Splats of each object, in the order of their columns.
+            objects: Splats of each object, in the order of their columns. A list of them, one per world, stands for an
+                object that differs; it has the columns of the largest, and those that a world leaves are invisible.
             world_count: Number of worlds.
             sh_degree: Degree kept, 0 to 3; None for the highest of the objects. Lower ones are padded with zeros.
             device: Warp device.
@@ -102,24 +108,78 @@ class SplatArrays:
         if sh_degree is not None:
             hint = "Pass None for that of the objects"
             require_number("sh_degree", sh_degree, at_least=0, at_most=3, hint=hint)
-        sh = padded_sh(objects, None if sh_degree is None else (sh_degree + 1) ** 2)
-        s = np.concatenate([splats.covariances() for splats in objects])
-        six = np.stack([s[:, 0, 0], s[:, 0, 1], s[:, 0, 2], s[:, 1, 1], s[:, 1, 2], s[:, 2, 2]], axis=1)
-        means = np.concatenate([splats.means for splats in objects])
-        index = np.repeat(np.arange(len(objects), dtype=np.int32), [splats.count for splats in objects])
-        turns = (world_count, len(means)) if sh.shape[1] > 1 else (1, 1)
-
-        def worlds(array: np.ndarray) -> np.ndarray:
-            return np.repeat(array.astype(np.float32)[None], world_count, axis=0)
-
+        shown = [[thing] if isinstance(thing, Splats) else list(thing) for thing in objects]
+        sizes = {len(thing) for thing in shown if len(thing) != 1}
+        if not all(shown) or sizes > {world_count}:
+            hint = "Give one Splats, or one for each world"
+            raise ConfigError(f"objects of {sorted(sizes)} worlds, expected {world_count}", hint=hint)
+        widths = [max(splats.count for splats in thing) for thing in shown]
+        every = [splats for thing in shown for splats in thing]
+        degree = max(splats.sh.shape[1] for splats in every) if sh_degree is None else (sh_degree + 1) ** 2
+        # Worlds that show the same share a row until it is copied.
+        rows: dict[tuple[int, ...], int] = {}
+        parts: list[list[Splats]] = []
+        row = np.zeros(world_count, dtype=int)
+        for world in range(world_count if sizes else 1):
+            mine = [thing[world % len(thing)] for thing in shown]
+            row[world] = rows.setdefault(tuple(map(id, mine)), len(rows))
+            if row[world] == len(parts):
+                parts.append(mine)
+        means, six, opacities, sh = (
+            np.stack(arrays) for arrays in zip(*(_padded_columns(mine, widths, degree) for mine in parts), strict=True)
+        )
+        index = np.repeat(np.arange(len(shown), dtype=np.int32), widths)
+        turns = (world_count, sum(widths)) if degree > 1 else (1, 1)
+        kept = row if len(parts) > 1 else row[:1]
+        spanning = None
+        if len(parts) > 1:
+            filled = [_filled_columns(mine, widths) for mine in parts]
+            spanning = wp.array(_spanning_columns(filled)[row], dtype=wp.int32, device=device)
         return cls(
-            means=wp.array(worlds(means), dtype=wp.vec3, device=device),
-            covariances=wp.array(worlds(six), dtype=kernels.vec6, device=device),
-            opacities=wp.array(np.concatenate([o.opacities for o in objects])[None], dtype=wp.float32, device=device),
-            sh=wp.array(sh[None], dtype=wp.vec3, device=device),
+            means=wp.array(means.astype(np.float32)[row], dtype=wp.vec3, device=device),
+            covariances=wp.array(six.astype(np.float32)[row], dtype=kernels.vec6, device=device),
+            opacities=wp.array(opacities[kept], dtype=wp.float32, device=device),
+            sh=wp.array(sh[kept], dtype=wp.vec3, device=device),
             object_index=wp.array(index, dtype=wp.int32, device=device),
             rotations=wp.full(turns, wp.quat_identity(), dtype=wp.quat, device=device),
+            spanning=spanning,
         )
+
+
+def spanning_columns(count: int) -> np.ndarray:
+    """Return which of so many splats the map of a shadow spans, some of them."""
+    return np.arange(0, count, max(1, count // 128))
+
+
+def _spanning_columns(filled: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the columns that the maps of several worlds span, the last of each repeated to the longest row."""
+    rows = [columns[spanning_columns(len(columns))] for columns in filled]
+    longest = max(map(len, rows))
+    return np.stack([np.pad(row, (0, longest - len(row)), mode="edge") for row in rows])
+
+
+def _filled_columns(objects: Sequence[Splats], widths: Sequence[int]) -> np.ndarray:
+    """Return the columns of a world that hold a splat."""
+    starts = np.cumsum([0, *widths])
+    return np.concatenate([start + np.arange(splats.count) for start, splats in zip(starts, objects, strict=False)])
+
+
+def _padded_columns(
+    objects: Sequence[Splats], widths: Sequence[int], coefficient_count: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return means, covariances, opacities and colours of a world; what is missing to a width is not opaque."""
+    s = np.concatenate([splats.covariances() for splats in objects])
+    six = np.stack([s[:, 0, 0], s[:, 0, 1], s[:, 0, 2], s[:, 1, 1], s[:, 1, 2], s[:, 2, 2]], axis=1)
+    means = np.concatenate([splats.means for splats in objects])
+    opacities = np.concatenate([splats.opacities for splats in objects])
+    given = (means, six, opacities, padded_sh(objects, coefficient_count))
+    ends = np.cumsum([splats.count for splats in objects])
+    missing = [width - splats.count for width, splats in zip(widths, objects, strict=True)]
+    if not any(missing):
+        return given
+    places = np.repeat(ends, missing)
+    means, six, opacities, sh = (np.insert(array, places, 0.0, axis=0) for array in given)
+    return means, six, opacities, sh
 
 
 @dataclass(frozen=True, kw_only=True)

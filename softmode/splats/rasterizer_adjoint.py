@@ -34,6 +34,10 @@ def exp_twist(twist: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(expm(generator), dtype=np.float64)
 
 
+UNTOUCHED = ("object_index", "spanning")
+"""Arrays of `SplatArrays` that have no gradient."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RasterizerGradients:
     """Derivatives of the loss, on the rasteriser's device; each is summed over the views that share its array."""
@@ -139,7 +143,7 @@ class AdjointRasterizer:
             ("loss_depth", loss_depth, None if loss_depth is None else images),
             ("mesh_rgb", mesh_rgb, meshes),
             ("mesh_depth", mesh_depth, meshes),
-            *((f"splats.{k}", v, getattr(out, k).shape) for k, v in vars(splats).items() if k != "object_index"),
+            *((f"splats.{k}", v, getattr(out, k).shape) for k, v in vars(splats).items() if k not in UNTOUCHED),
             ("views.world_to_camera", views.world_to_camera, (r.view_count,)),
             ("views.background", views.background, out.background.shape),
         )

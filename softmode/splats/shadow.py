@@ -7,7 +7,7 @@ from softmode.deformables.model.declare import launch
 from softmode.splats import shadow_kernels as kernels
 from softmode.splats.camera_meshes import MeshImages
 from softmode.splats.camera_options import CameraOptions, ShadowOptions
-from softmode.splats.rasterizer import SplatArrays, ViewArrays
+from softmode.splats.rasterizer import SplatArrays, ViewArrays, spanning_columns
 
 
 class SplatShadow:
@@ -38,6 +38,7 @@ class SplatShadow:
         self._bounds = wp.zeros(world_count, dtype=wp.vec4, device=self.device)
         shape = (world_count, self.options.cells, self.options.cells)
         self._map = wp.zeros(shape, dtype=wp.float32, device=self.device)
+        self._spanning: dict[int, wp.array] = {}  # by the number of splats; kept, as graphs may hold them
 
     def cast(
         self, splats: SplatArrays, views: ViewArrays, sensor_pose: wp.array, meshes: MeshImages, mesh_rgb: wp.array
@@ -54,8 +55,12 @@ class SplatShadow:
         count, cast = splats.means.shape[1], (splats.means, splats.opacities)
         options, device, place = self.options, self.device, (self._bounds, self._frame, self.options.margin)
         self._map.fill_(1.0e30)
-        stride = max(1, count // 128)
-        launch(device, kernels.bound_map, self.world_count, *cast, self._frame, stride, self._bounds)
+        spanning = splats.spanning
+        if spanning is None:
+            if count not in self._spanning:
+                self._spanning[count] = wp.array(spanning_columns(count)[None], dtype=wp.int32, device=device)
+            spanning = self._spanning[count]
+        launch(device, kernels.bound_map, self.world_count, *cast, self._frame, spanning, self._bounds)
         launch(device, kernels.fill_map, (self.world_count, count), *cast, *place, self._map)
         seen = (views.world, views.intrinsics, sensor_pose)
         shown = (meshes.depth, meshes.packed, meshes.albedo, meshes.normal)

@@ -29,14 +29,15 @@ def bound_map(
     mean: wp.array2d[wp.vec3],  # (1|world_count, splat_count) [m]
     opacity: wp.array2d[float],
     frame: wp.mat33,  # rows: two axes across the light, the light's direction
-    stride: int,
+    spanning: wp.array2d[int],  # (1|world_count, M) columns of some of the splats
     # Out:
     bounds_out: wp.array[wp.vec4],  # (world_count,) lowest and highest along both axes [m]
 ):
     """Find how far some of the splats reach across the light; the margin of the map takes care of the others."""
     world = wp.tid()
     bounds = wp.vec4(1.0e30, -1.0e30, 1.0e30, -1.0e30)
-    for i in range(0, mean.shape[1], stride):
+    for k in range(spanning.shape[1]):
+        i = spanning[world % spanning.shape[0], k]
         p = frame * mean[world % mean.shape[0], i]
         if opacity[world % opacity.shape[0], i] >= SOLID and wp.length(p) < 1.0e6:
             bounds = wp.vec4(

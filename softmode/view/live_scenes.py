@@ -185,7 +185,7 @@ class EnvScene:
         self.scene: TableScene = task.scene
         self.block_steps = self.scene.config.substeps
         self.block_dt = 1.0 / self.scene.config.control_hz
-        self.marker: Splats | None = task.marker()
+        self.marker: Splats | None = self.scene.marker_of(0)
         self.viewpoints: Sequence[PinholeCamera] = task.render_cameras()
         self.config = base
         self._factory = policy_factory(policy, self._env, trained)

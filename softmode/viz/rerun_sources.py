@@ -141,7 +141,7 @@ class TaskSource:
         """Keep the task; ``world`` is the one whose steps count."""
         scene = task.scene
         self.name, self.model, self.solver = name, scene.model, scene.solver
-        self.objects: Sequence[SoftObject | None] = scene.objects
+        self.objects: Sequence[SoftObject | None] = scene.objects_of(world)
         self.control: newton.Control | None = scene.control
         self.task, self._world, self._step, self._elapsed = task, world, -1, 0
         self._drawn = False
@@ -165,11 +165,12 @@ class TaskSource:
     def marker(self, world: int) -> Splats | None:
         """Return the task's marker where the last picture has it."""
         scene = self.task.scene
-        if not self._drawn or scene.marker is None:
+        marker = scene.marker_of(world)
+        if not self._drawn or marker is None:
             return None
         assert scene.splats is not None  # it has just drawn them
         means = scene.splats.arrays.means.numpy()[world, scene.splats.columns[-1]]
-        return replace(scene.marker, means=means.copy())
+        return replace(marker, means=means[: marker.count].copy())
 
     def scalars(self, world: int) -> Numbers:
         """Return reward, its terms, metrics, observation, action, success, solver; no reward before the first step."""

@@ -119,6 +119,7 @@ class SkinSplats:
         *,
         rotations: wp.array | None = None,
         first_splat: int = 0,
+        rows: wp.array | None = None,
     ) -> None:
         """Write the deformed means and covariances of all worlds; capturable after one launch for as many worlds.
 
@@ -130,6 +131,8 @@ class SkinSplats:
             rotations: Output rotations of F, rest frame to world, quat, like `means`; None, or shape (1, 1) as in
                 `SplatArrays` of degree 0, for colours that are the same from everywhere.
             first_splat: Column where this object's splats begin.
+            rows: Row of each of the worlds in the outputs, int32, shape (world_count,), where other worlds show other
+                objects; None for outputs with one row per world, in their order.
 
         Raises:
             BasisError: If an output has not a row per world or too few columns, `rotations` has another shape than
@@ -140,7 +143,10 @@ class SkinSplats:
                 raise BasisError(f"rotations has shape {rotations.shape}, means {means.shape}; one per splat is needed")
             rotations = None
         worlds = function_start.shape[0]
-        shape, columns = (worlds, means.shape[-1]), first_splat + self.count
+        if rows is not None and rows.shape != (worlds,):
+            raise BasisError(f"rows has shape {rows.shape} for {worlds} worlds", hint="Give the row of each world")
+        shape = (worlds if rows is None else means.shape[0], means.shape[-1])
+        columns = first_splat + self.count
         if means.shape != shape or covariances.shape != shape or not 0 <= first_splat <= columns <= shape[1]:
             raise BasisError(
                 f"means {means.shape} and covariances {covariances.shape} do not hold columns {first_splat} to "
@@ -164,7 +170,7 @@ class SkinSplats:
         skin = kernels.Skin()
         skin.rest_mean, skin.rest_covariance, skin.basis = self.rest_means, self.rest_covariances, self.basis
         skin.stretch_limit, skin.first_splat, skin.offset, skin.q = self.stretch_limit, first_splat, offset, moved
-        skin.mean, skin.covariance, skin.rotation = means, covariances, rotations
+        skin.mean, skin.covariance, skin.rotation, skin.row = means, covariances, rotations, rows
         if self.device.is_cpu and self.count >= cpu_kernels.BLOCK:
             blocks = -(-self.count // cpu_kernels.BLOCK)
             wp.launch(cpu_kernels.skin_blocks, (blocks, worlds), [skin], device=self.device)

@@ -145,8 +145,9 @@ class Skin:
     offset: wp.array[wp.vec3d]  # (world_count,) [m]
     q: wp.array2d[wp.vec4]  # (world_count, function_count) [m]
     first_splat: int
+    row: wp.array[int]  # (world_count,) row of each world in the outputs, or of size zero: that of the world
     # Out:
-    mean: wp.array2d[wp.vec3]  # (world_count, >= first_splat + splat_count) [m]
+    mean: wp.array2d[wp.vec3]  # (rows, >= first_splat + splat_count) [m]
     covariance: wp.array2d[vec6]  # like mean [m^2]
     rotation: wp.array2d[wp.quat]  # like mean, or of size zero: not wanted
 
@@ -158,14 +159,17 @@ def write_splat(skin: Skin, row0: wp.vec4, row1: wp.vec4, row2: wp.vec4, world: 
         1.0 + row0[0], row0[1], row0[2], row1[0], 1.0 + row1[1], row1[2], row2[0], row2[1], 1.0 + row2[2]
     )  # fmt: skip
     column = skin.first_splat + i
+    row = world
+    if skin.row.shape[0] > 0:
+        row = skin.row[world]
     if skin.rotation.shape[0] > 0:
-        skin.rotation[world, column] = polar_rotation(gradient)
+        skin.rotation[row, column] = polar_rotation(gradient)
     f = limited_stretch(gradient, skin.stretch_limit)
     s = f * symmetric_matrix(skin.rest_covariance[i]) * wp.transpose(f)
     x = skin.offset[world] + wp.vec3d(skin.rest_mean[i])
     x = x + wp.vec3d(wp.float64(row0[3]), wp.float64(row1[3]), wp.float64(row2[3]))
-    skin.mean[world, column] = wp.vec3(x)
-    skin.covariance[world, column] = vec6(s[0, 0], s[0, 1], s[0, 2], s[1, 1], s[1, 2], s[2, 2])
+    skin.mean[row, column] = wp.vec3(x)
+    skin.covariance[row, column] = vec6(s[0, 0], s[0, 1], s[0, 2], s[1, 1], s[1, 2], s[2, 2])
 
 
 @wp.func

@@ -67,8 +67,8 @@ class NewtonArrays:
 class NewtonStep:
     """All that Newton's iteration reads and writes in a step.
 
-    It is larger than 8 kB: hand its members, not all of it, to a function that a function of a kernel calls and to native
-    code. The CUDA compiler copies a struct of that size there for every thread.
+    It is larger than 8 kB: hand its members, not all of it, to a function that a function of a kernel calls and to
+    native code. The CUDA compiler copies a struct of that size there for every thread.
     """
 
     instances: Instances

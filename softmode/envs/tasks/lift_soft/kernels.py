@@ -33,7 +33,7 @@ class Plan:
 
     drawn: Drawn
     columns: Columns
-    height: float  # of the unscaled object's centre at rest [m]
+    rest_height: wp.array[float]  # of the unscaled object's centre [m]
     goal_tolerance: float  # [m]
     hold_steps: int
 
@@ -42,7 +42,7 @@ class Plan:
 def observe(state: WorldState, plan: Plan, result: StepResult):
     """Write the goal, relative to the object and as a position, the rise and the distance."""
     w = wp.tid()
-    rest_height = plan.height * state.parameters[w, plan.drawn.scale]
+    rest_height = plan.rest_height[w] * state.parameters[w, plan.drawn.scale]
     goal = wp.vec3(
         state.parameters[w, plan.drawn.goal],
         state.parameters[w, plan.drawn.goal + 1],

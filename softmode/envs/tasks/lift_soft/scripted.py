@@ -60,5 +60,5 @@ class ScriptedLift(ScriptedPolicy):
         offset = centre - self.tool
         self._hang = offset if self._hang is None else self._hang + self.AVERAGED * (offset - self._hang)
         way = self.segment("goal") - self.tool - self._hang
-        way[:2] *= float(centre[2] - self.scene.soft.height > 0.02)
+        way[:2] *= float(centre[2] - self.soft.height > 0.02)
         return bounded(way, 0.008)

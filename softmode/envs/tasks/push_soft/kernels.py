@@ -41,9 +41,9 @@ class Plan:
 
     drawn: Drawn
     columns: Columns
-    rest: wp.array[wp.vec3]  # of the observed points, relative to the centre of mass [m]
+    rest: wp.array2d[wp.vec3]  # of the observed points, relative to the centre of mass [m], (world_count, points)
     before: wp.array[float]  # distance one step earlier [m], negative in the first step
-    push_distance: float  # from the unscaled object's centre to the tool behind it [m]
+    push_distances: wp.array[float]  # from the unscaled object's centre to the tool behind it [m]
     push_height: float  # [m]
     goal_tolerance: float  # [m]
     yaw_tolerance: float  # [rad], negative where yaw does not matter
@@ -69,8 +69,9 @@ def observe(state: WorldState, plan: Plan, result: StepResult):
     # the rotation about z from the goal's heading to the object's: least squares over the points
     along = float(0.0)
     across = float(0.0)
-    for i in range(plan.rest.shape[0]):
-        a = wp.vec2(c * plan.rest[i][0] - s * plan.rest[i][1], s * plan.rest[i][0] + c * plan.rest[i][1])
+    for i in range(plan.rest.shape[1]):
+        r = plan.rest[w, i]
+        a = wp.vec2(c * r[0] - s * r[1], s * r[0] + c * r[1])
         b = surface_point(state, w, i) - x
         along += a[0] * b[0] + a[1] * b[1]
         across += a[0] * b[1] - a[1] * b[0]
@@ -79,7 +80,7 @@ def observe(state: WorldState, plan: Plan, result: StepResult):
     way = goal - wp.vec2(x[0], x[1])
     distance = wp.length(way)
     towards = way / wp.max(distance, 1.0e-6)
-    back = plan.push_distance * state.parameters[w, plan.drawn.scale]
+    back = plan.push_distances[w] * state.parameters[w, plan.drawn.scale]
     push = wp.vec3(x[0] - back * towards[0], x[1] - back * towards[1], plan.push_height)
     write(result.observation, w, plan.columns.goal, goal)
     write(result.observation, w, plan.columns.goal_heading, wp.vec2(c, s))

@@ -53,7 +53,7 @@ class ScriptedPush(ScriptedPolicy):
         distance = float(np.linalg.norm(way))
         towards = way / max(distance, 1.0e-6)
         size = float(self.drawn("scale")[0])
-        back, low = self.task.push_distance * size, self.task.push_height
+        back, low = self.task.push_distance[self.world] * size, self.task.push_height
         offset = tool[:2] - centre[:2]
         along, across = float(offset @ towards), float(towards[0] * offset[1] - towards[1] * offset[0])
         step = self._speed
@@ -82,7 +82,7 @@ class ScriptedPush(ScriptedPolicy):
 
     def _way_behind(self, tool: Vector, goal: Vector, is_behind: bool, size: float) -> Vector:
         """Return the move to the place behind the object: straight if it is free, else up, across and down."""
-        above = 2.0 * self.scene.soft.height * size + 0.5 * self.arm.gripper.pad_size[2] + 0.012
+        above = 2.0 * self.soft.height * size + 0.5 * self.arm.gripper.pad_size[2] + 0.012
         move = goal - tool
         low = tool[2] < above - 0.005
         if (is_behind and low) or np.linalg.norm(move[:2]) < 0.006:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from softmode.checks import require_fields, require_number, require_range
@@ -23,6 +25,7 @@ from softmode.envs.task_kernels import forget
 from softmode.envs.tasks.push_soft import kernels
 from softmode.objects.config import ObjectConfig
 from softmode.objects.loader import load
+from softmode.objects.soft_object import SoftObject
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
 from softmode.scenes.table_scene import TableSceneConfig
@@ -103,18 +106,23 @@ class PushSoft(Task):
     config: PushSoftConfig
     config_class = PushSoftConfig
     kernels = kernels
+    takes_sets = True
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
 
     def build(self) -> None:
         """Allocate what the reward remembers."""
         self.before = wp.zeros(self.world_count, dtype=float, device=self.device)
-        body = self.scene.soft.body
-        self.rest = wp.array(body.surface_points[self.points], dtype=wp.vec3, device=self.device)
+        surfaces, member = [thing.body.surface_points for thing in self.scene.members], self.scene.member
+        rest = [surfaces[m][points] for m, points in zip(member, self.points_of_worlds, strict=True)]
+        self.rest = wp.array(np.stack(rest), dtype=wp.vec3, device=self.device)
         self.yaw_tolerance = -1.0 if self.config.yaw_tolerance is None else self.config.yaw_tolerance
         pad = self.config.scene.arm.gripper.pad_size
-        self.push_distance = float(np.linalg.norm(body.surface_points[:, :2], axis=1).max() + 0.5 * pad[0])
-        """From the centre of the unscaled object to the tool that pushes it [m]."""
+        radii = [float(np.linalg.norm(points[:, :2], axis=1).max() + 0.5 * pad[0]) for points in surfaces]
+        self.push_distance: NDArray[np.float64] = np.array(radii)[member]
+        """From the centre of each unscaled object to the tool that pushes it [m], shape (world_count,)."""
+        self.push_distances = wp.array(self.push_distance, dtype=float, device=self.device)
+        """The same on the device."""
         self.push_height = self.config.scene.control.workspace_lower[2] + 0.006
         """Height of the tool that pushes [m]."""
 
@@ -154,18 +162,30 @@ class PushSoft(Task):
         """Add how far the object was from its goal a step ago."""
         return {**super().state_arrays(), "before": self.before}
 
-    def marker(self) -> Splats:
-        """Return the outline of the object, to be drawn on the table."""
-        soft = load(self.scene_config().object, material=self.config.scene.material)
-        points = soft.body.surface_points[:, :2]
-        corners = points[ConvexHull(points).vertices]
-        edges = np.roll(corners, -1, axis=0) - corners
-        length = np.linalg.norm(edges, axis=1)
-        along = np.arange(0.0, length.sum(), 0.003)
-        start = np.concatenate([[0.0], np.cumsum(length)])
-        k = np.searchsorted(start, along, side="right") - 1
-        outline = corners[k] + edges[k] * ((along - start[k]) / length[k])[:, None]
-        return dots(np.column_stack([outline, np.full(len(outline), 0.001)]), 0.0018, opacity=0.8)
+    def marker(self) -> Splats | Sequence[Splats]:
+        """Return the outline of the object, to be drawn on the table; a list where the worlds differ."""
+        scene = self.scene_config()
+        if scene.objects is None:
+            return _outline(load(scene.object, material=scene.material))
+        chosen = scene.objects.chosen(self.world_count)
+        drawn = {
+            k: _outline(load(scene.objects.config(k), material=scene.objects.material(k, scene.material)))
+            for k in np.unique(chosen).tolist()
+        }
+        return drawn[chosen[0]] if len(drawn) == 1 else [drawn[k] for k in chosen.tolist()]
+
+
+def _outline(thing: SoftObject) -> Splats:
+    """Return dots along the outline of an object, seen from above."""
+    points = thing.body.surface_points[:, :2]
+    corners = points[ConvexHull(points).vertices]
+    edges = np.roll(corners, -1, axis=0) - corners
+    length = np.linalg.norm(edges, axis=1)
+    along = np.arange(0.0, length.sum(), 0.003)
+    start = np.concatenate([[0.0], np.cumsum(length)])
+    k = np.searchsorted(start, along, side="right") - 1
+    outline = corners[k] + edges[k] * ((along - start[k]) / length[k])[:, None]
+    return dots(np.column_stack([outline, np.full(len(outline), 0.001)]), 0.0018, opacity=0.8)
 
 
 class PushSoftEnv(SoftEnv):

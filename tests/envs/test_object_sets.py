@@ -1,0 +1,201 @@
+"""Another object in every world: each world is the single environment with its object, bit for bit."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import softmode  # noqa: F401  (registers the environments)
+from softmode.deformables import BuildOptions, Material
+from softmode.envs import (
+    LiftSoftConfig,
+    LiftSoftEnv,
+    LiftSoftVectorEnv,
+    PlaceInBinConfig,
+    PlaceInBinEnv,
+    PushSoftConfig,
+    PushSoftEnv,
+    PushSoftVectorEnv,
+    scripted_policy,
+)
+from softmode.errors import ConfigError, GraspError
+from softmode.learning.config_values import config_of, pinned_options, values_of
+from softmode.objects import ObjectConfig, ObjectSet
+from softmode.scenes import BoundSplats
+from softmode.splats import make_plush, write_splats
+
+STEPS = 26
+CUBE = ObjectConfig(
+    shape="box",
+    extents=(0.05, 0.05, 0.05),
+    surface_count=90,
+    splat_count=400,
+    build=BuildOptions(mode_count=2, kernel_count=120, cubature_count=64),
+)
+BALL = ObjectConfig(
+    shape="sphere",
+    extents=(0.06, 0.06, 0.06),
+    surface_count=150,
+    splat_count=700,
+    build=BuildOptions(mode_count=4, kernel_count=150, cubature_count=96),
+)
+ROD = ObjectConfig(
+    shape="cylinder",
+    extents=(0.04, 0.04, 0.06),
+    surface_count=110,
+    splat_count=550,
+    build=BuildOptions(mode_count=3, kernel_count=120, cubature_count=80),
+)
+KINDS = (CUBE, BALL, ROD)
+MATERIALS = (
+    Material(youngs_modulus=8.0e4, density=300.0),
+    Material(youngs_modulus=4.0e4, density=120.0, friction=1.0),
+    Material(youngs_modulus=3.0e5, density=500.0, poissons_ratio=0.4),
+)
+SET = ObjectSet(KINDS, materials=MATERIALS, order="in_turn")
+PLACE = {"position": (0.45, 0.0)}
+
+
+def lift(**changes: Any) -> LiftSoftConfig:
+    """Return LiftSoft with the set, every object of its own material."""
+    return LiftSoftConfig(**{"objects": SET, "youngs_modulus_range": None, "image_size": 48, **changes})
+
+
+def alone(config: Any, k: int) -> Any:
+    """Return the configuration of the single environment with object k."""
+    scene = replace(config.scene, object=KINDS[k], material=MATERIALS[k])
+    return replace(config, objects=None, objects_one_hot=False, scene=scene)
+
+
+def actions(world_count: int, step: int) -> np.ndarray:
+    """Return actions that go down, close and rise, and differ from world to world."""
+    down = np.array([0.0, 0.0, -1.0 if step < 14 else 0.6, 0.0, 1.0 if step < 12 else -1.0], np.float32)
+    return down + np.random.default_rng(step).uniform(-0.3, 0.3, (world_count, 5)).astype(np.float32)
+
+
+def test_each_world_lifts_as_alone() -> None:
+    """Observation, reward, ends, info and picture of world i have the bits of the single environment, with contact."""
+    count, seed = len(KINDS), 3
+    config = lift(objects_one_hot=True, image_outputs=("segmentation",))
+    many = LiftSoftVectorEnv(count, config=config, obs_type="pixels", device="cpu")
+    pictures, infos = many.reset(seed=seed, options=PLACE)
+    assert infos["object"].tolist() == [0, 1, 2]
+    assert infos["object_name"].tolist() == ["box", "sphere", "cylinder"]
+    seen, frames, results = [many.state_observation], [pictures], []
+    for step in range(STEPS):
+        picture, *result, infos = many.step(actions(count, step))
+        seen.append(many.state_observation)
+        frames.append(picture)
+        results.append((*result, infos["object_height"], infos["solver_status"], infos["finger_force"]))
+    code = many.task_columns("object_one_hot")
+    np.testing.assert_array_equal(seen[-1][:, code], np.eye(count))
+    assert all(max(result[5][k].max() for result in results) > 0.1 for k in range(count))  # fingers touch
+    for k in range(count):
+        single = LiftSoftEnv(config=alone(many.config, k), obs_type="pixels", device="cpu")
+        picture, info = single.reset(seed=seed + k, options=PLACE)
+        assert info["parameters"]["density"] == np.float32(MATERIALS[k].density)
+        for step in range(STEPS + 1):
+            np.testing.assert_array_equal(single.task.observation.numpy()[0], np.delete(seen[step][k], code))
+            for name, image in picture.items():
+                np.testing.assert_array_equal(image, frames[step][name][k])
+            if step < STEPS:
+                picture, reward, terminated, truncated, info = single.step(actions(count, step)[k])
+                mine = (reward, terminated, truncated, info["object_height"], info["solver_status"])
+                assert mine == tuple(part[k] for part in results[step][:5])
+
+
+def test_each_world_is_pushed_as_alone() -> None:
+    """The same for PushSoft, whose reward knows the shape; the film has the outline of each object as its goal."""
+    count = len(KINDS)
+    config = PushSoftConfig(objects=SET, youngs_modulus_range=None, yaw_tolerance=0.2, render_size=64)
+    many = PushSoftVectorEnv(count, config=config, render_mode="rgb_array", device="cpu")
+    observation, _ = many.reset(seed=9)
+    seen, rewards = [observation], []
+    ahead = np.array([1.0, 0.0, 0.0, 0.0, 0.0], np.float32)
+    for step in range(12):
+        observation, reward, *_ = many.step(np.tile(ahead, (count, 1)) + 0.2 * actions(count, step))
+        seen.append(observation)
+        rewards.append(reward)
+    film = many.render()
+    assert film is not None
+    for k in range(count):
+        single = PushSoftEnv(config=alone(config, k), render_mode="rgb_array", device="cpu")
+        observation, _ = single.reset(seed=9 + k)
+        for step in range(12):
+            np.testing.assert_array_equal(observation, seen[step][k])
+            observation, reward, *_ = single.step(ahead + 0.2 * actions(count, step)[k])
+            assert reward == rewards[step][k]
+        picture = single.render()
+        assert picture is not None
+        np.testing.assert_array_equal(picture, film[k])
+
+
+def test_processes_deal_out_the_same_objects() -> None:
+    """Two processes hold the objects that one holds; a single environment made for a world has that world's."""
+    given = ObjectSet(["ball", "sponge"], seed=2, size=0.06)
+    config = LiftSoftConfig(objects=ObjectSet(KINDS, seed=4))
+    chosen = ObjectSet(KINDS, seed=4).chosen(4)
+    assert pickle.loads(pickle.dumps(given)) == given
+    env = gym.make_vec("softmode/LiftSoft-v0", num_envs=4, config=config, processes=2, device="cpu")
+    try:
+        first, infos = env.reset(seed=1)
+        np.testing.assert_array_equal(infos["object"], chosen)
+    finally:
+        env.close()
+    single = LiftSoftEnv(config=config.from_world(3), device="cpu")
+    observation, info = single.reset(seed=4)
+    assert info["object"] == chosen[3]
+    assert info["object_name"] == config.objects.names[chosen[3]] if config.objects else False
+    np.testing.assert_array_equal(observation, first[3])
+
+
+def test_runs_keep_the_set(tmp_path: Path) -> None:
+    """What a checkpoint or a dataset keeps of a configuration, as JSON, makes the same set again, its files pinned."""
+    config = lift(objects=replace(SET, objects=("mug", *KINDS[1:]), size=0.07))
+    kept = json.loads(json.dumps(values_of(config)))
+    assert config_of(LiftSoftConfig, kept) == config
+    file = tmp_path / "toy.ply"
+    write_splats(file, make_plush(300))
+    options = {"config": values_of(LiftSoftConfig(objects=ObjectSet(["mug", file])))}
+    pinned = pinned_options("softmode/LiftSoft-v0", options)
+    found = config_of(LiftSoftConfig, json.loads(json.dumps(pinned["config"]))).object_set
+    assert found is not None and found.config(1).fingerprint == ObjectConfig(splat=file).pinned().fingerprint
+
+
+def test_scripted_policies_take_each_object() -> None:
+    """The scripted policy lifts every object of the set in a vector environment."""
+    env = LiftSoftVectorEnv(len(KINDS), config=lift(), device="cpu", autoreset_mode="Disabled")
+    env.reset(seed=0, options=PLACE)
+    policy, solved = scripted_policy(env), np.zeros(len(KINDS), bool)
+    for _ in range(200):
+        *_, infos = env.step(policy(None))
+        solved |= infos["is_success"]
+        if solved.all():
+            break
+    assert solved.all()
+
+
+def test_what_cannot_take_a_set_says_so() -> None:
+    """A task that knows one body, an object too wide for the gripper, a state, one body for all splats, a shortcut."""
+    with pytest.raises(ConfigError, match="PlaceInBin cannot have another object"):
+        PlaceInBinEnv(config=PlaceInBinConfig(objects=SET), device="cpu")
+    wide = replace(CUBE, extents=(0.16, 0.16, 0.16))
+    with pytest.raises(GraspError, match="box#2 does not fit the gripper"):
+        LiftSoftVectorEnv(2, config=lift(objects=ObjectSet([CUBE, wide], order="in_turn")), device="cpu")
+    with pytest.raises(ConfigError, match="objects_one_hot"):
+        LiftSoftConfig(objects_one_hot=True)
+    with pytest.raises(ConfigError, match="size is given beside a set"):
+        LiftSoftEnv(config=lift(), size=0.05)
+    env = LiftSoftVectorEnv(2, config=lift(), device="cpu")
+    env.reset(seed=0)
+    with pytest.raises(ConfigError, match="worlds have different objects"):
+        env.get_state()
+    with pytest.raises(ConfigError, match="not the body that world 1 holds"):
+        BoundSplats(env.task.scene.model, env.task.scene.objects)
