@@ -41,7 +41,6 @@ class NewtonOptions:
     refresh_interval: int
     refresh_distance: float  # in sizes
     rigid_max: int  # joint dofs that there is room for
-    shared: int  # 1 where every world has one system, which fits in shared memory
     factor_width: int  # columns that a thread of the factorisation takes at a time
     dt: wp.float64
 
@@ -67,8 +66,8 @@ class NewtonArrays:
 class NewtonStep:
     """All that Newton's iteration reads and writes in a step.
 
-    It is larger than 8 kB: hand its members, not all of it, to a function that a function of a kernel calls and to native
-    code. The CUDA compiler copies a struct of that size there for every thread.
+    It is larger than 8 kB: hand its members, not all of it, to a function that a function of a kernel calls and to
+    native code. The CUDA compiler copies a struct of that size there for every thread.
     """
 
     instances: Instances
