@@ -5,10 +5,12 @@ another with barriers between. A launch per phase waits for the world that needs
 for its own slowest world; here a world that is done makes room for the next one.
 """
 
+from functools import cache
 from typing import Any
 
 import warp as wp
 
+from softmode.deformables.model.declare import Kernel
 from softmode.deformables.model.lane_kernels import LANES, barrier, vec8d
 from softmode.deformables.solver.assembly_kernels import (
     column_block,
@@ -20,7 +22,7 @@ from softmode.deformables.solver.assembly_kernels import (
     stiffness_block,
 )
 from softmode.deformables.solver.factor_kernels import factor_system, solve_system
-from softmode.deformables.solver.fused_system_kernels import shared_system, sum_forces_of
+from softmode.deformables.solver.fused_system_kernels import dynamic_floats, shared_system_of, sum_forces_of
 from softmode.deformables.solver.iteration_kernels import ALL, NewtonStep
 from softmode.deformables.solver.rigid_row_kernels import evaluate_row
 from softmode.deformables.solver.search_kernels import accept_step, check_convergence, check_trial, start_line_search
@@ -38,152 +40,170 @@ TEAM = 96
 """Threads that share a world on CUDA."""
 
 
-@wp.kernel(launch_bounds=(TEAM, 4))
-def minimise_worlds(
-    step: NewtonStep,
-    unit: wp.array3d[Any],  # the systems in units of ``factor_width`` columns
-    team: int,
-):
-    """Minimise the incremental potential of every world by Newton with a line search."""
-    w, member = wp.tid()
-    dt = step.options.dt
-    begin = step.state.instance_start[w]
-    end = step.state.instance_start[w + 1]
-    blocks = step.basis.row.shape[1]
-    n = step.rigid.count[w]
-    tasks = 3 * blocks * blocks + 3 * (blocks * blocks + blocks) / 2
-    chunks = step.arrays.gradient_chunk.shape[1]
-    stiffness_chunks = step.arrays.stiffness.shape[1]
-    rigid_max = step.options.rigid_max
-    columns = rigid_max + 1
-    q = step.arrays.q_trial
-    r = step.rigid.trial
-    trial = int(0)
-    while step.state.active[w] != 0:
-        if trial == 0:
-            for i in range(begin, end):
-                for e in range(member, 3 * blocks, team):
-                    q[i, e] = step.arrays.q[i, e]
-            for j in range(member, n, team):
-                r[w, j] = step.rigid.r[w, j]
-            barrier()
-        # one copy of this code serves iterates and trials
-        found = ALL + trial
-        for i in range(begin, end):
-            for p in range(member, step.instances.point_count[i], team):
-                evaluate_point(step, step.state.active, q, found, i, p)
-            for e in range(member, step.constraints.count[i], team):
-                evaluate_constraint(step, step.state.active, q, r, 1 - trial, i, e)
-        for k in range(member, step.rigid.row_count[w], team):
-            evaluate_row(step, step.state.active, r, found, w, k)
-        barrier()
-        if trial == 0:
-            for i in range(begin, end):
-                list_acting(step, team, i, member)
-            barrier()
-            for i in range(begin, end):
-                if step.options.shared != 0:
-                    sum_forces_of(
-                        step.instances, step.basis, step.points, step.constraints, step.arrays, i, member, team
-                    )
-                else:
-                    for t in range(member, chunks * blocks, team):
-                        sum_force_block(step, step.state.active, i, t / blocks, t % blocks)
-                barrier()
-                for e in range(member, 3 * blocks, team):
-                    gradient_block(step, i, e)
-            barrier()
-            check_convergence(step, team, w, member)
-            barrier()
-            if step.state.active[w] != 0:
-                for i in range(begin, end):
-                    if step.state.refresh[w] != 0:
-                        for t in range(member, stiffness_chunks * tasks, team):
-                            stiffness_block(step, i, t / tasks, t % tasks)
-                        barrier()
-                    if step.options.shared == 0:
-                        width = 3 * blocks
-                        for t in range(member, LANES * width * width, team):
-                            matrix_row(step, width, i, t / width, t % width)
-                        barrier()
-                        for t in range(member, tasks, team):
-                            contact_block(step, i, t)
-                    for t in range(member, 3 * blocks * columns, team):
-                        column_block(step, i, t / columns, t % columns)
-                for t in range(member, n * n, team):
-                    rigid_entry(step, w, t / n, t % n)
-                barrier()
-                inertia = float(0.0)
-                if step.options.shared != 0:
-                    # the padding behind the functions carries inertia alone
-                    rate = step.motion.rate[begin] / dt
-                    inertia = float(
-                        step.instances.mass[begin] * rate * (rate + wp.float64(step.instances.mass_damping[begin]))
-                    )
-                    shared_system(
-                        0,
-                        inertia,
-                        rigid_max,
-                        step.basis,
-                        step.constraints,
-                        step.rigid,
-                        step.arrays,
-                        begin,
-                        w,
-                        member,
-                        team,
-                    )
-                for s in range(step.arrays.system_start[w], step.arrays.system_start[w + 1 - step.options.shared]):
-                    factor_system(
-                        step.state.active, team, step.options.factor_width, unit, step.arrays.systems, s, member
-                    )
-                barrier()
-                if n > 0:
-                    for t in range(member, n * (n + 1), team):
-                        condensed_entry(step, w, t / (n + 1), t % (n + 1))
-                    barrier()
-                    solve_rigid_team(step.state.active, team, step.rigid, w, member)
-                    barrier()
-                if step.options.shared != 0:
-                    shared_system(
-                        1,
-                        inertia,
-                        rigid_max,
-                        step.basis,
-                        step.constraints,
-                        step.rigid,
-                        step.arrays,
-                        begin,
-                        w,
-                        member,
-                        team,
-                    )
-                for s in range(step.arrays.system_start[w], step.arrays.system_start[w + 1 - step.options.shared]):
-                    solve_system(
-                        step.state.active,
-                        rigid_max,
-                        team,
-                        step.rigid.direction,
-                        rigid_max,
-                        step.arrays.systems,
-                        s,
-                        member,
-                    )
-                barrier()
-                start_line_search(step, team, w, member)
-        else:
-            check_trial(step, team, w, member)
-        barrier()
-        if step.state.active[w] != 0:
-            trial = step.state.searching[w]
-            if trial != 0:
-                alpha = step.state.step_length[w]
+@cache
+def newton_kernel(unit_type: Any, size: int = 0, width: int = 0) -> Kernel:
+    """Return the kernel that minimises the incremental potential of every world by Newton with a line search.
+
+    Args:
+        unit_type: What the factorisation takes at a time, ``float`` or ``vec8``.
+        size: Unknowns of the systems that are solved in shared memory, one per world; 0 for any in global memory.
+        width: Columns of those systems.
+    """
+    shared, dynamic = size > 0, dynamic_floats(size, width)
+    shared_system = shared_system_of(size or 24, width or 32)  # called where ``shared`` says so
+
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(TEAM, 4))
+    def minimise_worlds(
+        step: NewtonStep,
+        unit: wp.array3d[unit_type],  # the systems in units of ``factor_width`` columns
+        team: int,
+    ):
+        """Minimise the incremental potential of every world by Newton with a line search."""
+        w, member = wp.tid()
+        if wp.static(dynamic > 0):
+            _room = wp.tile_empty(shape=wp.static(dynamic), dtype=float, storage="shared")
+        dt = step.options.dt
+        begin = step.state.instance_start[w]
+        end = step.state.instance_start[w + 1]
+        blocks = step.basis.row.shape[1]
+        n = step.rigid.count[w]
+        tasks = 3 * blocks * blocks + 3 * (blocks * blocks + blocks) / 2
+        chunks = step.arrays.gradient_chunk.shape[1]
+        stiffness_chunks = step.arrays.stiffness.shape[1]
+        rigid_max = step.options.rigid_max
+        columns = rigid_max + 1
+        q = step.arrays.q_trial
+        r = step.rigid.trial
+        trial = int(0)
+        while step.state.active[w] != 0:
+            if trial == 0:
                 for i in range(begin, end):
                     for e in range(member, 3 * blocks, team):
-                        q[i, e] = step.arrays.q[i, e] + alpha * vec8d(step.arrays.direction[i, e])
+                        q[i, e] = step.arrays.q[i, e]
                 for j in range(member, n, team):
-                    r[w, j] = step.rigid.r[w, j] + alpha * step.rigid.direction[w, j]
+                    r[w, j] = step.rigid.r[w, j]
                 barrier()
+            # one copy of this code serves iterates and trials
+            found = ALL + trial
+            for i in range(begin, end):
+                for p in range(member, step.instances.point_count[i], team):
+                    evaluate_point(step, step.state.active, q, found, i, p)
+                for e in range(member, step.constraints.count[i], team):
+                    evaluate_constraint(step, step.state.active, q, r, 1 - trial, i, e)
+            for k in range(member, step.rigid.row_count[w], team):
+                evaluate_row(step, step.state.active, r, found, w, k)
+            barrier()
+            if trial == 0:
+                for i in range(begin, end):
+                    list_acting(step, team, i, member)
+                barrier()
+                for i in range(begin, end):
+                    if wp.static(shared):
+                        sum_forces_of(
+                            step.instances, step.basis, step.points, step.constraints, step.arrays, i, member, team
+                        )
+                    else:
+                        for t in range(member, chunks * blocks, team):
+                            sum_force_block(step, step.state.active, i, t / blocks, t % blocks)
+                    barrier()
+                    for e in range(member, 3 * blocks, team):
+                        gradient_block(step, i, e)
+                barrier()
+                check_convergence(step, team, w, member)
+                barrier()
+                if step.state.active[w] != 0:
+                    for i in range(begin, end):
+                        if step.state.refresh[w] != 0:
+                            for t in range(member, stiffness_chunks * tasks, team):
+                                stiffness_block(step, i, t / tasks, t % tasks)
+                            barrier()
+                        if wp.static(not shared):
+                            width = 3 * blocks
+                            for t in range(member, LANES * width * width, team):
+                                matrix_row(step, width, i, t / width, t % width)
+                            barrier()
+                            for t in range(member, tasks, team):
+                                contact_block(step, i, t)
+                        for t in range(member, 3 * blocks * columns, team):
+                            column_block(step, i, t / columns, t % columns)
+                    for t in range(member, n * n, team):
+                        rigid_entry(step, w, t / n, t % n)
+                    barrier()
+                    inertia = float(0.0)
+                    if wp.static(shared):
+                        # the padding behind the functions carries inertia alone
+                        rate = step.motion.rate[begin] / dt
+                        inertia = float(
+                            step.instances.mass[begin] * rate * (rate + wp.float64(step.instances.mass_damping[begin]))
+                        )
+                        shared_system(
+                            0,
+                            inertia,
+                            rigid_max,
+                            step.basis,
+                            step.constraints,
+                            step.rigid,
+                            step.arrays,
+                            begin,
+                            w,
+                            member,
+                            team,
+                        )
+                    if wp.static(not shared):
+                        for s in range(step.arrays.system_start[w], step.arrays.system_start[w + 1]):
+                            factor_system(
+                                step.state.active, team, step.options.factor_width, unit, step.arrays.systems, s, member
+                            )
+                    barrier()
+                    if n > 0:
+                        for t in range(member, n * (n + 1), team):
+                            condensed_entry(step, w, t / (n + 1), t % (n + 1))
+                        barrier()
+                        solve_rigid_team(step.state.active, team, step.rigid, w, member)
+                        barrier()
+                    if wp.static(shared):
+                        shared_system(
+                            1,
+                            inertia,
+                            rigid_max,
+                            step.basis,
+                            step.constraints,
+                            step.rigid,
+                            step.arrays,
+                            begin,
+                            w,
+                            member,
+                            team,
+                        )
+                    if wp.static(not shared):
+                        for s in range(step.arrays.system_start[w], step.arrays.system_start[w + 1]):
+                            solve_system(
+                                step.state.active,
+                                rigid_max,
+                                team,
+                                step.rigid.direction,
+                                rigid_max,
+                                step.arrays.systems,
+                                s,
+                                member,
+                            )
+                    barrier()
+                    start_line_search(step, team, w, member)
             else:
-                accept_step(step, team, w, member)
-                barrier()
+                check_trial(step, team, w, member)
+            barrier()
+            if step.state.active[w] != 0:
+                trial = step.state.searching[w]
+                if trial != 0:
+                    alpha = step.state.step_length[w]
+                    for i in range(begin, end):
+                        for e in range(member, 3 * blocks, team):
+                            q[i, e] = step.arrays.q[i, e] + alpha * vec8d(step.arrays.direction[i, e])
+                    for j in range(member, n, team):
+                        r[w, j] = step.rigid.r[w, j] + alpha * step.rigid.direction[w, j]
+                    barrier()
+                else:
+                    accept_step(step, team, w, member)
+                    barrier()
+
+    return minimise_worlds

@@ -3,47 +3,91 @@
 The algorithms of ``assembly_kernels`` and ``factor``, for a kernel in which a block takes a world through everything:
 there every number that another thread has written is a round trip to L2, and the threads of one world are too few to
 hide it. The system stays in shared memory from its assembly to its solution; loops keep several loads in flight.
+
+Only the upper triangle is kept: row block b, eight rows, from its diagonal block to the last right-hand column, W - 8 b
+numbers a row. Diagonal blocks hold U with inverse pivots once they are factored. The sizes are constants of the code,
+so that indices cost no division; each size is compiled when it is first used. Compiled for a CPU the same code runs
+with one thread, for tests.
 """
+
+from functools import cache
+from typing import Any
 
 import warp as wp
 
 from softmode.deformables.model.struct_kernels import Basis, Instances, PointConstraints, Points, Rigid
 from softmode.deformables.solver.iteration_kernels import NewtonArrays
 
-SHARED_SIZE = 72
-"""Most unknowns of a system in shared memory, and"""
-SHARED_WIDTH = 88
-"""most columns, the right-hand ones included: static shared memory ends at 48 kB."""
+STATIC_BYTES = 44 * 1024
+"""Shared memory that a kernel may have without asking: 48 kB, less the scratch of sums over a team."""
 
 
-def _sized(snippet: str) -> str:
-    """Return CUDA source with the sizes of the shared system in the places of their names."""
-    return snippet.replace("SHARED_SIZE", str(SHARED_SIZE)).replace("SHARED_WIDTH", str(SHARED_WIDTH))
+def shared_floats(size: int, width: int) -> int:
+    """Return how many numbers a system takes of N = ``size`` unknowns and W = ``width`` columns, multiples of eight."""
+    blocks = size // 8
+    return 8 * blocks * width - 32 * blocks * (blocks - 1)
 
 
-@wp.func_native(
-    snippet=_sized("""
+def dynamic_floats(size: int, width: int) -> int:
+    """Return how many of those numbers a kernel has to ask for when it is launched: all or none."""
+    needed = shared_bytes(size, width)
+    return 0 if needed <= STATIC_BYTES else needed // 4
+
+
+def shared_bytes(size: int, width: int) -> int:
+    """Return how much shared memory a block needs for such a system and its right-hand side."""
+    return 4 * (shared_floats(size, width) + size)
+
+
+_BEGIN = """
 #if defined(__CUDA_ARCH__)
+#define SOFTMODE_SHARED __shared__ __align__(16)
+#define SOFTMODE_BARRIER __syncthreads()
+#else
+#define SOFTMODE_SHARED alignas(16) static
+#define SOFTMODE_BARRIER
+#endif
+    struct alignas(16) Quad { float x, y, z, w; };
+"""
+_END = """
+#undef SOFTMODE_SHARED
+#undef SOFTMODE_BARRIER
+"""
+_STATIC = """
+    SOFTMODE_SHARED float room[FLOATS + SIZE];
+"""
+_DYNAMIC = """
+#if defined(__CUDA_ARCH__)
+    extern __shared__ char dynamic_smem_base[];  // of Warp's tiles: the kernel has one of this size and no other
+    float* room = (float*)dynamic_smem_base;
+#else
+    alignas(16) static float room[FLOATS + SIZE];
+#endif
+"""
+_SYSTEM = """
     // mode 0: assemble A, load B, factor, write U^-T B back; mode 1: solve with the factor that is there
-    __shared__ __align__(16) float A[SHARED_SIZE * SHARED_WIDTH];
-    __shared__ __align__(16) float D[SHARED_SIZE * 8];
-    __shared__ float right[SHARED_SIZE];
-    const int stride = SHARED_WIDTH;
-    const int N = arrays.systems.scalars.shape[1];
-    const int W = arrays.systems.scalars.shape[2];
+    float* A = room;
+    float* right = room + FLOATS;
+    constexpr int N = SIZE;
+    constexpr int W = WIDTH;
+    // column 0 of row r, were it there
+    const auto row_of = [](int r) {
+        const int b = r / 8;
+        return 8 * b * W - 32 * b * (b - 1) + (r - 8 * b) * (W - 8 * b) - 8 * b;
+    };
     float* g = (float*)arrays.systems.scalars.data + (size_t)i * N * W;
     if (mode == 0) {
         const int chunks = arrays.stiffness.shape[1];
         const float* K = (const float*)arrays.stiffness.data + (size_t)i * chunks * N * N;
-        const int quads = N / 4;
+        constexpr int quads = N / 4;
         #pragma unroll 4
         for (int t = member; t < N * quads; t += team) {
             const int row = t / quads;
             const int first = 4 * (t - row * quads);
             if (first >= (row & ~7)) {
-                float4 value = *(const float4*)&K[row * N + first];
+                Quad value = *(const Quad*)&K[row * N + first];
                 for (int chunk = 1; chunk < chunks; ++chunk) {
-                    const float4 more = *(const float4*)&K[(size_t)chunk * N * N + row * N + first];
+                    const Quad more = *(const Quad*)&K[(size_t)chunk * N * N + row * N + first];
                     value.x += more.x; value.y += more.y; value.z += more.z; value.w += more.w;
                 }
                 const int at = row - first;
@@ -51,22 +95,22 @@ def _sized(snippet: str) -> str:
                 if (at == 1) value.y += inertia;
                 if (at == 2) value.z += inertia;
                 if (at == 3) value.w += inertia;
-                *(float4*)&A[row * stride + first] = value;
+                *(Quad*)&A[row_of(row) + first] = value;
             }
         }
         #pragma unroll 4
         for (int t = member; t < N * (W - N); t += team) {
             const int row = t / (W - N);
             const int at = N + t - row * (W - N);
-            A[row * stride + at] = g[row * W + at];
+            A[row_of(row) + at] = g[row * W + at];
         }
-        __syncthreads();
-        const int blocks = N / 24;
+        SOFTMODE_BARRIER;
+        constexpr int blocks = N / 24;
         const int acting_count = constraints.acting_count.data[i];
         const int* acting = (const int*)constraints.acting.data + (size_t)i * constraints.acting.shape[1];
         const int* rows = (const int*)constraints.row.data + (size_t)i * constraints.row.shape[1];
-        const int room = constraints.hessian.shape[1];
-        const float* H = (const float*)constraints.hessian.data + (size_t)i * room * 9;
+        const int capacity = constraints.hessian.shape[1];
+        const float* H = (const float*)constraints.hessian.data + (size_t)i * capacity * 9;
         const float* values = (const float*)basis.row.data;
         // half blocks, 4 x 8: of the components (c, d), rows 4 k of the functions, columns 8 m
         for (int t = member; t < 9 * 2 * blocks * blocks; t += team) {
@@ -86,9 +130,9 @@ def _sized(snippet: str) -> str:
                 const int e = acting[s];
                 const float* r = values + (size_t)rows[e] * 8 * blocks;
                 const float h = H[9 * e + 3 * c + d];
-                const float4 u = *(const float4*)&r[4 * k];
-                const float4 v = *(const float4*)&r[8 * m];
-                const float4 w = *(const float4*)&r[8 * m + 4];
+                const Quad u = *(const Quad*)&r[4 * k];
+                const Quad v = *(const Quad*)&r[8 * m];
+                const Quad w = *(const Quad*)&r[8 * m + 4];
                 const float left[4] = {u.x * h, u.y * h, u.z * h, u.w * h};
                 #pragma unroll
                 for (int a = 0; a < 4; ++a) {
@@ -102,127 +146,150 @@ def _sized(snippet: str) -> str:
             for (int a = 0; a < 4; ++a) {
                 #pragma unroll
                 for (int b = 0; b < 8; ++b) {
-                    A[(c * 8 * blocks + 4 * k + a) * stride + d * 8 * blocks + 8 * m + b] += sum[a][b];
+                    A[row_of(c * 8 * blocks + 4 * k + a) + d * 8 * blocks + 8 * m + b] += sum[a][b];
                 }
             }
         }
-        __syncthreads();
+        SOFTMODE_BARRIER;
         int bad = 0;
         for (int first = 0; first < N; first += 8) {
+            float* here = A + row_of(first);
+            const int stride = W - first;
             for (int l = first + member; l < W; l += team) {
                 float r[8];
                 #pragma unroll
-                for (int a = 0; a < 8; ++a) r[a] = A[(first + a) * stride + l];
-                #pragma unroll 8
-                for (int s = 0; s < first; ++s) {
-                    const float4 u = *(const float4*)&A[s * stride + first];
-                    const float4 v = *(const float4*)&A[s * stride + first + 4];
-                    const float x = A[s * stride + l];
-                    r[0] -= u.x * x; r[1] -= u.y * x; r[2] -= u.z * x; r[3] -= u.w * x;
-                    r[4] -= v.x * x; r[5] -= v.y * x; r[6] -= v.z * x; r[7] -= v.w * x;
+                for (int a = 0; a < 8; ++a) r[a] = here[a * stride + l];
+                for (int above = 0; above < first; above += 8) {
+                    const float* rows_above = A + row_of(above);
+                    #pragma unroll
+                    for (int s = 0; s < 8; ++s) {
+                        const float* row = rows_above + s * (W - above);
+                        const Quad u = *(const Quad*)&row[first];
+                        const Quad v = *(const Quad*)&row[first + 4];
+                        const float x = row[l];
+                        r[0] -= u.x * x; r[1] -= u.y * x; r[2] -= u.z * x; r[3] -= u.w * x;
+                        r[4] -= v.x * x; r[5] -= v.y * x; r[6] -= v.z * x; r[7] -= v.w * x;
+                    }
                 }
                 #pragma unroll
-                for (int a = 0; a < 8; ++a) A[(first + a) * stride + l] = r[a];
+                for (int a = 0; a < 8; ++a) here[a * stride + l] = r[a];
             }
-            __syncthreads();
+            SOFTMODE_BARRIER;
             // every thread factors its own copy of the diagonal block (inverse pivots): cheaper than waiting for one
             float U[8][8];
             #pragma unroll
             for (int a = 0; a < 8; ++a) {
                 float row[8];
                 #pragma unroll
-                for (int b = 0; b < 8; ++b) row[b] = b >= a ? A[(first + a) * stride + first + b] : 0.0f;
-                const float floor = fmaxf(1.0e-6f * fabsf(row[a]), 1.0e-30f);
+                for (int b = 0; b < 8; ++b) row[b] = b >= a ? here[a * stride + first + b] : 0.0f;
+                const float size = row[a] < 0.0f ? -row[a] : row[a];
+                const float floor = 1.0e-6f * size > 1.0e-30f ? 1.0e-6f * size : 1.0e-30f;
                 #pragma unroll
                 for (int s = 0; s < a; ++s) {
                     #pragma unroll
                     for (int b = a; b < 8; ++b) row[b] -= U[s][a] * U[s][b];
                 }
                 if (row[a] < floor) bad = 1;
-                const float inverse = 1.0f / sqrtf(fmaxf(row[a], floor));
+                const float inverse = 1.0f / wp::sqrt(row[a] > floor ? row[a] : floor);
                 #pragma unroll
                 for (int b = a; b < 8; ++b) U[a][b] = inverse * row[b];
                 U[a][a] = inverse;
-            }
-            if (member == 0) {
-                #pragma unroll
-                for (int a = 0; a < 8; ++a) {
-                    #pragma unroll
-                    for (int b = a; b < 8; ++b) D[(first + a) * 8 + b] = U[a][b];
-                }
             }
             for (int l = first + 8 + member; l < W; l += team) {
                 float x[8];
                 #pragma unroll
                 for (int a = 0; a < 8; ++a) {
-                    float value = A[(first + a) * stride + l];
+                    float value = here[a * stride + l];
                     #pragma unroll
                     for (int s = 0; s < a; ++s) value -= U[s][a] * x[s];
                     x[a] = U[a][a] * value;
-                    A[(first + a) * stride + l] = x[a];
+                    here[a * stride + l] = x[a];
                     if (l >= N) g[(first + a) * W + l] = x[a];
                 }
             }
-            __syncthreads();
+            SOFTMODE_BARRIER;
+            // nobody reads the diagonal block again before the solution
+            if (member == 0) {
+                #pragma unroll
+                for (int a = 0; a < 8; ++a) {
+                    #pragma unroll
+                    for (int b = a; b < 8; ++b) here[a * stride + first + b] = U[a][b];
+                }
+            }
         }
+        SOFTMODE_BARRIER;
         if (member == 0) arrays.systems.indefinite.data[i] = bad;
-        return;
-    }
-    const int tail_count = rigid.count.data[world];
-    const double* t = (const double*)rigid.direction.data + (size_t)world * rigid.direction.shape[1];
-    for (int row = member; row < N; row += team) {
-        float value = A[row * stride + N + rigid_max];
-        for (int j = 0; j < tail_count; ++j) value -= A[row * stride + N + j] * (float)t[j];
-        right[row] = value;
-    }
-    __syncthreads();
-    float* out = (float*)arrays.direction.data + (size_t)i * N;
-    for (int first = N - 8; first >= 0; first -= 8) {
-        float x[8];
-        #pragma unroll
-        for (int a = 7; a >= 0; --a) {
-            float value = right[first + a];
-            #pragma unroll
-            for (int b = a + 1; b < 8; ++b) value -= D[(first + a) * 8 + b] * x[b];
-            x[a] = value * D[(first + a) * 8 + a];
-        }
-        if (member == 0) {
-            #pragma unroll
-            for (int a = 0; a < 8; ++a) out[first + a] = x[a];
-        }
-        for (int row = member; row < first; row += team) {
-            float value = right[row];
-            #pragma unroll
-            for (int b = 0; b < 8; ++b) value -= A[row * stride + first + b] * x[b];
+    } else {
+        const int tail_count = rigid.count.data[world];
+        const double* t = (const double*)rigid.direction.data + (size_t)world * rigid.direction.shape[1];
+        for (int row = member; row < N; row += team) {
+            float value = A[row_of(row) + N + rigid_max];
+            for (int j = 0; j < tail_count; ++j) value -= A[row_of(row) + N + j] * (float)t[j];
             right[row] = value;
         }
-        __syncthreads();
+        SOFTMODE_BARRIER;
+        float* out = (float*)arrays.direction.data + (size_t)i * N;
+        for (int first = N - 8; first >= 0; first -= 8) {
+            const float* here = A + row_of(first);
+            float x[8];
+            #pragma unroll
+            for (int a = 7; a >= 0; --a) {
+                float value = right[first + a];
+                #pragma unroll
+                for (int b = a + 1; b < 8; ++b) value -= here[a * (W - first) + first + b] * x[b];
+                x[a] = value * here[a * (W - first) + first + a];
+            }
+            if (member == 0) {
+                #pragma unroll
+                for (int a = 0; a < 8; ++a) out[first + a] = x[a];
+            }
+            for (int row = member; row < first; row += team) {
+                float value = right[row];
+                #pragma unroll
+                for (int b = 0; b < 8; ++b) value -= A[row_of(row) + first + b] * x[b];
+                right[row] = value;
+            }
+            SOFTMODE_BARRIER;
+        }
     }
-#endif
-""")
-)
-def shared_system(
-    mode: int,
-    inertia: float,
-    rigid_max: int,
-    basis: Basis,
-    constraints: PointConstraints,
-    rigid: Rigid,
-    arrays: NewtonArrays,  # the matrices hold from column N on B, and after mode 0 U^-T B
-    i: int,
-    world: int,
-    member: int,
-    team: int,
-) -> None:
-    """Assemble and factor system ``i`` (mode 0), later solve it (mode 1). CUDA only, one body per world, no pins."""
-    ...
+"""
+
+
+@cache
+def shared_system_of(size: int, width: int) -> Any:
+    """Return the device function for systems of N = ``size`` unknowns and W = ``width`` columns."""
+    room = _DYNAMIC if dynamic_floats(size, width) else _STATIC
+    snippet = _BEGIN + room + _SYSTEM + _END
+    for name, value in {"FLOATS": shared_floats(size, width), "SIZE": size, "WIDTH": width}.items():
+        snippet = snippet.replace(name, str(value))
+
+    @wp.func_native(snippet=snippet)
+    def shared_system(
+        mode: int,
+        inertia: float,
+        rigid_max: int,
+        basis: Basis,
+        constraints: PointConstraints,
+        rigid: Rigid,
+        arrays: NewtonArrays,  # the matrices hold from column N on B, and after mode 0 U^-T B
+        i: int,
+        world: int,
+        member: int,
+        team: int,
+    ) -> None:
+        """Assemble and factor system ``i`` (mode 0), later solve it (mode 1). One body per world, no pins."""
+        ...
+
+    return shared_system
 
 
 @wp.func_native(
     snippet="""
-#if defined(__CUDA_ARCH__)
     const int blocks = basis.row.shape[1];
     const int n = 8 * blocks;
+    const size_t by_block = basis.gradient_across.strides[0];
+    const size_t by_point = basis.gradient_across.strides[1];
+    const size_t by_axis = basis.gradient_across.strides[2];
     const int first_point = instances.point_start.data[i];
     const int point_count = instances.point_count.data[i];
     const int acting_count = constraints.acting_count.data[i];
@@ -235,14 +302,15 @@ def shared_system(
     for (int t = member; t < 3 * n; t += team) {
         const int axis = t / n;
         const int k = t - axis * n;
-        // points in memory one after another, three rows of n functions each
-        const float* G = (const float*)basis.gradient_across.data + (size_t)first_point * 3 * n + k;
+        const char* G = (const char*)basis.gradient_across.data + (k / 8) * by_block + (size_t)first_point * by_point;
+        G += (k % 8) * sizeof(float);
         double value = 0.0;
         #pragma unroll 8
         for (int p = 0; p < point_count; ++p) {
-            value += P[9 * p + 3 * axis] * (double)G[3 * n * p];
-            value += P[9 * p + 3 * axis + 1] * (double)G[3 * n * p + n];
-            value += P[9 * p + 3 * axis + 2] * (double)G[3 * n * p + 2 * n];
+            const char* at = G + (size_t)p * by_point;
+            value += P[9 * p + 3 * axis] * (double)*(const float*)at;
+            value += P[9 * p + 3 * axis + 1] * (double)*(const float*)(at + by_axis);
+            value += P[9 * p + 3 * axis + 2] * (double)*(const float*)(at + 2 * by_axis);
         }
         #pragma unroll 8
         for (int s = 0; s < acting_count; ++s) {
@@ -251,7 +319,6 @@ def shared_system(
         }
         out[t] = value;
     }
-#endif
 """
 )
 def sum_forces_of(
@@ -264,5 +331,5 @@ def sum_forces_of(
     member: int,
     team: int,
 ) -> None:
-    """Sum V P grad b_k over the points, less b_k f over the constraints, a thread per unknown. CUDA only."""
+    """Sum V P grad b_k over the points, less b_k f over the constraints, a thread per unknown."""
     ...

@@ -41,7 +41,6 @@ class NewtonOptions:
     refresh_interval: int
     refresh_distance: float  # in sizes
     rigid_max: int  # joint dofs that there is room for
-    shared: int  # 1 where every world has one system, which fits in shared memory
     factor_width: int  # columns that a thread of the factorisation takes at a time
     dt: wp.float64
 

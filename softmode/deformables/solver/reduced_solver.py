@@ -58,6 +58,11 @@ class ReducedSolver(SolverBase):
         return self.tables.options
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """What keeps Newton's iteration from its fast path on a GPU, a sentence each; none on a CPU."""
+        return self.tables.notes
+
+    @property
     def bodies(self) -> tuple[ReducedBody, ...]:
         """The distinct bodies."""
         return self.tables.layout.bodies

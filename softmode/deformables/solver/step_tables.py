@@ -16,7 +16,7 @@ from softmode.deformables.contact.detection_kernels import Shapes
 from softmode.deformables.contact.pairs import SoftPairs
 from softmode.deformables.contact.shape_tables import candidate_shapes, shape_table
 from softmode.deformables.model.declare import WRENCH, Kernel, launch, launch_teams
-from softmode.deformables.model.lane_kernels import team_size
+from softmode.deformables.model.lane_kernels import LANES, team_size
 from softmode.deformables.model.layout import Layout, lay_out, lay_out_bases, lay_out_instances, surface_stiffness
 from softmode.deformables.model.namespaces import SoftModel, soft
 from softmode.deformables.model.rigid_dofs import RigidDofs
@@ -34,15 +34,17 @@ from softmode.deformables.model.struct_kernels import (
 from softmode.deformables.model.tables import allocate
 from softmode.deformables.solver import fused_newton_kernels as fused
 from softmode.deformables.solver.factor import BlockCholesky
-from softmode.deformables.solver.fused_system_kernels import SHARED_SIZE, SHARED_WIDTH
+from softmode.deformables.solver.fused_system_kernels import shared_bytes
 from softmode.deformables.solver.iteration_kernels import NewtonArrays, NewtonOptions, NewtonStep
 from softmode.deformables.solver.options import SolverReducedOptions
 from softmode.deformables.solver.systems import join_systems
 
 CUDA_THREADS = 2**16
 """Threads that keep a GPU busy: sums over points are split until there are about so many."""
-ONE_LAUNCH_BLOCKS = 5
+ONE_LAUNCH_BLOCKS = 7
 """Blocks of eight functions up to which a body is small enough for a team of threads on CUDA."""
+RESERVED_BYTES = 2048
+"""Shared memory that the one launch needs besides its system, with what CUDA keeps for itself."""
 
 _POINTS = {"": "instance point", "hessian": "instance 6 point"}
 _MOTION = {"": "instance unknown", "rate": "instance"}
@@ -138,6 +140,13 @@ class StepTables:
         return soft(self.model)
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """What keeps Newton's iteration from its fast path on a GPU, a sentence each; none on a CPU."""
+        if not self.model.device.is_cuda:
+            return ()
+        return newton_notes(self.system.size, one_launch=self.one_launch, shared=self.shared)
+
+    @property
     def unknowns(self) -> tuple[int, int]:
         """Shape of an array over the unknowns in blocks of eight."""
         return self.layout.instance_count, 3 * self.layout.block_count
@@ -200,7 +209,8 @@ def allocate_tables(
     one_launch = device.is_cuda and layout.part_count == 1 and blocks <= ONE_LAUNCH_BLOCKS
     one_each = count == layout.world_count and layout.pin_max == 0
     driven = any(body.driven_count for body in layout.bodies)
-    small = one_launch and one_each and not driven and 3 * layout.stride <= SHARED_SIZE
+    size = (3 * layout.stride, system.scalars.shape[2])
+    shared = one_launch and one_each and not driven and fits_in_shared_memory(device.max_shared_memory_per_block, *size)
 
     def chunks(threads: int, tasks: int) -> int:
         """Return into how many parts sums over points are split where a kernel has so many threads, a body tasks."""
@@ -219,7 +229,7 @@ def allocate_tables(
         "team": team_size(device),
         "constraint": options.contact_max + layout.pin_max,
         "rigid": rigid.count_max,
-        "gradient_chunk": 1 if small else chunks(count * blocks, blocks),
+        "gradient_chunk": 1 if shared else chunks(count * blocks, blocks),
         "stiffness_chunk": chunks(count * square, square + (square + 3 * blocks) // 2),
         "pin_instance": count if layout.pin_max else 1,
         "pin_row": layout.stride if layout.pin_max else 1,
@@ -238,8 +248,7 @@ def allocate_tables(
         "arrays": allocate(NewtonArrays, _ARRAYS, sizes, device, given=of_system),
     }
     state = allocate(NewtonState, _NEWTON, sizes, device, given=given)
-    shared = small and system.scalars.shape[2] <= SHARED_WIDTH
-    constant = _newton_options(options, rigid, system, shared)
+    constant = _newton_options(options, rigid, system)
     step = allocate(
         NewtonStep, "", {}, device, given={**structs, "rigid": rigid.table, "state": state, "options": constant}
     )
@@ -267,18 +276,37 @@ def allocate_tables(
         every_world=wp.full(layout.world_count + 1, True, dtype=bool, device=device),
         team=sizes["team"],
         one_launch=one_launch,
-        fused_kernel=wp.overload(fused.minimise_worlds, {"unit": system.unit}),
+        fused_kernel=fused.newton_kernel(system.unit.dtype, *(size if shared else ())),
         shared=shared,
     )
 
 
-def _newton_options(
-    options: SolverReducedOptions, rigid: RigidDofs, system: BlockCholesky, shared: bool
-) -> NewtonOptions:
+def newton_notes(size: int, *, one_launch: bool, shared: bool) -> tuple[str, ...]:
+    """Return why systems of ``size`` unknowns are not solved in shared memory, all iterations in one launch."""
+    if not one_launch:
+        most = LANES * ONE_LAUNCH_BLOCKS
+        return (
+            f"systems of {size} unknowns take a launch per phase of each Newton iteration: "
+            f"one launch takes worlds whose bodies do not touch each other and have at most {most} functions",
+        )
+    if not shared:
+        return (
+            f"systems of {size} unknowns are solved in global memory: shared memory takes one body per world, "
+            "without pins and driven regions",
+        )
+    return ()
+
+
+def fits_in_shared_memory(room: int, size: int, width: int) -> bool:
+    """Return whether a block with ``room`` bytes can hold a system of ``size`` unknowns and ``width`` columns."""
+    return shared_bytes(size, width) + RESERVED_BYTES <= room
+
+
+def _newton_options(options: SolverReducedOptions, rigid: RigidDofs, system: BlockCholesky) -> NewtonOptions:
     """Return the options of Newton's iteration that do not depend on the length of a step."""
     given = NewtonOptions()
     for name in ("iteration_max", "force_tolerance", "step_length_min"):
         setattr(given, name, getattr(options, name))
     given.refresh_interval, given.refresh_distance = options.stiffness_renewal, options.renewal_distance
-    given.rigid_max, given.factor_width, given.shared = rigid.count_max, system.width, int(shared)
+    given.rigid_max, given.factor_width = rigid.count_max, system.width
     return given
