@@ -34,7 +34,7 @@ def main() -> None:
             options = BuildOptions(handles="local", cubature_count=384 if "384" in name else 6 * MOST)
         start = time.process_time()
         bodies[name] = build_body(quadrature, options, name=name, progress=False)
-        cubature = float(bodies[name].provenance["seconds_cubature"])
+        cubature = float(str(bodies[name].provenance["seconds_cubature"]))
         print(
             f"build of {name}: {time.process_time() - start:.2f} s of processor time, of {bodies[name].function_count} "
             f"functions at {bodies[name].point_count} points; wall clock of the cubature {cubature:.2f} s"

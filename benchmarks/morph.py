@@ -47,13 +47,17 @@ def main() -> None:
     parser.add_argument(
         "--coarse", type=float, default=MorphOptions().coarse, help="0 compares masses on one grid alone"
     )
+    parser.add_argument("--loss", choices=("log", "squared"), default="log", help="distance of masses on the grid")
+    parser.add_argument("--accuracy", type=float, help="leave off when so much of the loss is gone, such as 0.95")
     parser.add_argument("--pairs", nargs="*", help=f"all ordered pairs of these; {' '.join(PAIRS)} if none is named")
     parser.add_argument("--sources", nargs="+", help="only pairs that begin with these")
     parser.add_argument("--bodies", type=Path, help="particles of the pairs (.npz): read if it is there, else written")
     parser.add_argument("--json", type=Path, help="where to write the table")
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
-    chosen = MorphOptions(frame_count=options.frames, coarse=options.coarse)
+    chosen = MorphOptions(
+        frame_count=options.frames, coarse=options.coarse, loss=options.loss, target_accuracy=options.accuracy
+    )
     if options.pairs is not None:
         bodies = pair_bodies(options.pairs or PAIRS, options.spacing, options.bodies)
         rows = []
@@ -61,7 +65,8 @@ def main() -> None:
             made = replace(chosen, mpm=replace(chosen.mpm, damping=damping))
             for target in bodies:
                 sources = [name for name in options.sources or bodies if name != target]
-                rows += morph_pairs(bodies, sources, target, made, options.device)
+                if sources:
+                    rows += morph_pairs(bodies, sources, target, made, options.device)
                 if options.json is not None:
                     options.json.write_text(json.dumps(rows, indent=1))
             if rows:

@@ -90,7 +90,8 @@ def recorded(run: Callable[[], None], device: Any) -> float:
     run()
     with wp.ScopedCapture(device=device) as capture:
         run()
-    return float(np.median([timed(lambda: wp.capture_launch(capture.graph)) for _ in range(9)]))
+    graph: Any = capture.graph
+    return float(np.median([timed(lambda: wp.capture_launch(graph)) for _ in range(9)]))
 
 
 def timed(run: Callable[[], object]) -> float:

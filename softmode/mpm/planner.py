@@ -16,17 +16,17 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast
+from typing import cast, get_args
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from softmode.checks import require_number
+from softmode.checks import require_choice, require_number
 from softmode.deformables import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.errors import AssetError, ConfigError, SolverDiverged
-from softmode.mpm.losses import CoarseMassLoss, MassLoss
+from softmode.mpm.losses import CoarseMassLoss, MassLoss, MassLossKind
 from softmode.mpm.options import MpmOptions
 from softmode.mpm.particles import ParticleBody
 from softmode.mpm.planner_kernels import (
@@ -76,6 +76,9 @@ class MorphOptions:
     """Halvings of a step before a pass is left."""
     gradient_tolerance: float = 1.0e-4
     """A pass ends when the gradient is smaller than this part of the pass's first."""
+    loss: MassLossKind = "log"
+    """Distance of masses on the grid: that of logarithms, or "squared" for comparison, which throws particles out. It
+    is compared on the fine grid alone."""
     mass_scale: float = 1.0
     """Mass scale of the logarithmic loss [kg]."""
     target_accuracy: float | None = None
@@ -97,6 +100,7 @@ class MorphOptions:
             require_number(name, getattr(self, name), at_least=1)
         require_number("step_length", self.step_length, above=0.0)
         require_number("gradient_tolerance", self.gradient_tolerance, at_least=0.0, below=1.0)
+        require_choice("loss", self.loss, get_args(MassLossKind))
         require_number("mass_scale", self.mass_scale, above=0.0, unit="kg")
         require_number("coarse", self.coarse, at_least=0.0, at_most=1.0)
         require_number("settling", self.settling, at_least=0.0, at_most=1.0)
@@ -169,8 +173,10 @@ class MorphPlanner:
         real, _, mat = TYPES[mpm.precision]
         for goal in self.targets:
             mpm.grid.require(goal.positions, "target")
-        self.loss = MassLoss(mpm.grid, self.targets[0], mass_scale=o.mass_scale, dtype=real, device=s.device)
-        factors = COARSE if o.coarse else ()
+        self.loss = MassLoss(
+            mpm.grid, self.targets[0], kind=o.loss, mass_scale=o.mass_scale, dtype=real, device=s.device
+        )
+        factors = COARSE if o.coarse and o.loss == "log" else ()
         self._coarse = [CoarseMassLoss(self.loss, s, self.targets[0], factor=factor) for factor in factors]
         self.notes = tuple(
             f"world {world}: masses differ by {100.0 * abs(ratio - 1.0):.0f} % ({body.mass:.4g} and {goal.mass:.4g} "
