@@ -21,7 +21,7 @@ DEPTHS = (0.01, 0.02, 0.04, 0.08, 0.11)
 """Over the radius."""
 RIGID = 400.0
 """Contact stiffness over P-wave modulus per size of the rows without the dent, as in the rule."""
-BOXES = {"cube": (0.1, 0.1, 0.1), "beam": (0.24, 0.05, 0.05), "pad": (0.1, 0.1, 0.02)}
+BOXES = {"cube": (0.1, 0.1, 0.1), "beam": (0.24, 0.05, 0.05), "pad": (0.1, 0.1, 0.02), "sheet": (0.1, 0.1, 0.004)}
 
 
 def main() -> None:
@@ -36,7 +36,8 @@ def main() -> None:
                 press = Press(body, RADIUS, youngs_modulus=modulus, stiffness=stiffness)
                 row = [press.force(share * RADIUS) / hertz(share * RADIUS, modulus) for share in DEPTHS]
                 print(f"{body.function_count} functions, {samples} samples, E {modulus:g}, {name}:", *shown(row))
-    print("two punches, force over that of half spaces, radii of 6, 12 and 18 mm, 1 mm deep")
+    print("two punches, force over that of half spaces, radii of 6, 12 and 18 mm, 1 mm deep (0.4 mm into the pad)")
+    print("whole face: plates that squeeze by 4 %, force over E A strain")
     for name, edges in BOXES.items():
         quadrature = quadrature_from_box(edges, point_count=2000, surface_count=1500)
         options = BuildOptions(mode_count=8, kernel_count=250, cubature_count=300)
@@ -47,7 +48,9 @@ def main() -> None:
                 press = Press(body, 0.5 * edges[2], punch=a, stiffness=stiffness)
                 depth = 0.02 * edges[2] if edges[2] < 0.05 else 0.001
                 row.append(press.force(depth) * compliance(a, edges[2]) / depth)
-            print(f"{name}, {body.function_count} functions, {kind}:", *shown(row))
+            press, depth = Press(body, 0.5 * edges[2], stiffness=stiffness), 0.02 * edges[2]
+            whole = press.force(depth) * edges[2] / (1.0e6 * edges[0] * edges[1] * 2.0 * depth)
+            print(f"{name}, {body.function_count} functions, {kind}:", *shown(row), "whole face", *shown([whole]))
 
 
 def rigid(body: ReducedBody, youngs_modulus: float) -> float:

@@ -109,12 +109,12 @@ class Press:
 
 @pytest.mark.parametrize("youngs_modulus", [1.0e5, 1.0e6])
 def test_hertz(youngs_modulus: float) -> None:
-    """A sphere between plates presses as Hertz's, made finite: within 15 % from 4 to 11 % of its radius.
+    """A sphere between plates presses as Hertz's, made finite: within 15 % from 2 to 11 % of its radius.
 
     32 functions alone press 1.6 to 3.6 times as hard there.
     """
     press = Press(ball(), RADIUS, youngs_modulus=youngs_modulus)
-    for share in (0.04, 0.08, 0.11):
+    for share in (0.02, 0.04, 0.08, 0.11):
         depth = share * RADIUS
         assert press.force(depth) == pytest.approx(hertz(depth, youngs_modulus), rel=0.15), share
 

@@ -162,7 +162,7 @@ def test_dynamic_rows_reproduce_the_touched_point():
     A, b = rng.normal(size=(3, 3)), rng.normal(size=3)
     constant = scene.body().mean_basis  # basis is orthonormal to mass: these are the coordinates of 1
     mine = {s: (gap, n) for i, s, _, gap, n, _ in rows if i == 1}
-    assert len(mine) > 20
+    assert len(mine) > 12
     x = surface(scene, 1).points
     for k in range(table.count.numpy()[1]):
         s = samples[1, k] // 2
@@ -191,7 +191,7 @@ def test_gap_of_spheres_is_of_second_order():
         body = ball(0.03, count)
         scene = two(body, body, (0.0, 0.0, 0.06), rotation=rotation((1, 2, 0), 0.7))
         rows = [row for row in found(scene) if abs(row[3]) < 2e-3]
-        assert len(rows) > 3
+        assert len(rows) > 2
         centres = [scene.centre(i) for i in range(2)]
         surfaces = [surface(scene, i) for i in range(2)]
         radius = np.linalg.norm(body.surface_points, axis=1).mean()

@@ -197,8 +197,9 @@ def stiffness_exponents(instances: Instances, i: int, relative: float, partner_a
 def dent_depth(instances: Instances, i: int, length: float):
     """Return the dent [m] beyond which the contact of a body hardens.
 
-    It is what the pressure E / (2 - 2 nu^2) dents, E that where it is touched, and half of the overlap that a step may
-    start from at the most. Zero where ``contact_stiffness`` is given: the penalty is then the whole law of the contact.
+    It is what the pressure E / (2 - 2 nu^2) dents, E that where it is touched, and a quarter of the overlap that a step
+    may start from at the most: deeper, samples at an edge of what presses would take one face for the other in turns.
+    Zero where ``contact_stiffness`` is given: the penalty is then the whole law of the contact.
 
     Args:
         instances: The bodies.
@@ -207,7 +208,7 @@ def dent_depth(instances: Instances, i: int, length: float):
     """
     if instances.contact_stiffness[i] > 0.0:
         return float(0.0)
-    return 0.5 * wp.min(instances.scale[i] * length, OVERLAP * instances.size[i])
+    return wp.min(0.5 * instances.scale[i] * length, 0.25 * OVERLAP * instances.size[i])
 
 
 @wp.func
