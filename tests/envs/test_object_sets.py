@@ -138,7 +138,7 @@ def test_each_world_is_pushed_as_alone() -> None:
 
 
 def test_states_of_different_objects_go_on_as_they_did() -> None:
-    """After a state, in bytes, all goes on with the same bits; one world of three takes another one's with its object."""
+    """After a state, in bytes, all goes on with the same bits; a world takes another one's that has its object."""
     config = lift(objects=replace(SET, objects=(CUBE, BALL), materials=None), youngs_modulus_range=(2.0e4, 2.0e6))
     env = LiftSoftVectorEnv(3, config=config, device="cpu")
     env.reset(seed=4, options=PLACE)
@@ -220,5 +220,7 @@ def test_what_cannot_take_a_set_says_so() -> None:
     env.reset(seed=0)
     with pytest.raises(StateError, match="world 1 has object 1 of the set, the state object 0"):
         env.set_state(env.get_state().worlds([0]))
+    with pytest.raises(ConfigError, match="a world keeps its object"):
+        env.reset(options={"object": 1})
     with pytest.raises(ConfigError, match="not the body that world 1 holds"):
         BoundSplats(env.task.scene.model, env.task.scene.objects)
