@@ -122,9 +122,7 @@ def check_options(
     unknown = sorted(set(options) - set(parameters))
     if unknown:
         if "object" in unknown:
-            hint = (
-                "choose it when the environment is made: ObjectSet([...], order='in_turn'), or another seed of the set"
-            )
+            hint = "choose it when the environment is made, by order or seed of the ObjectSet"
             raise ConfigError("'object' is no reset option: a world keeps its object", hint=hint)
         raise ConfigError(f"unknown reset options {unknown}", hint=f"use {', '.join(parameters)}")
     return {name: _checked(parameters[name], value, world_count) for name, value in options.items()}

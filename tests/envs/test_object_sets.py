@@ -20,6 +20,9 @@ from softmode.envs import (
     LiftSoftVectorEnv,
     PlaceInBinConfig,
     PlaceInBinEnv,
+    PressSoftConfig,
+    PressSoftEnv,
+    PressSoftVectorEnv,
     PushSoftConfig,
     PushSoftEnv,
     PushSoftVectorEnv,
@@ -135,6 +138,26 @@ def test_each_world_is_pushed_as_alone() -> None:
         picture = single.render()
         assert picture is not None
         np.testing.assert_array_equal(picture, film[k])
+
+
+def test_each_world_is_pressed_as_alone() -> None:
+    """The same for PressSoft, whose gauge knows how high a pad is."""
+    pads, foam = (CUBE, replace(ROD, extents=(0.06, 0.06, 0.03))), Material(youngs_modulus=1.0e5, poissons_ratio=0.4)
+    config = PressSoftConfig(objects=ObjectSet(pads, order="in_turn"))
+    config = replace(config, scene=replace(config.scene, material=foam))
+    many = PressSoftVectorEnv(2, config=config, device="cpu")
+    first, _ = many.reset(seed=5)
+    down = np.array([0.0, 0.0, -1.0, 0.0, 0.0], np.float32)
+    seen = [many.step(np.tile(down, (2, 1)))[:2] for _ in range(10)]
+    for k, pad in enumerate(pads):
+        own = replace(config, objects=None, scene=replace(config.scene, object=pad))
+        single = PressSoftEnv(config=own, device="cpu")
+        observation, _ = single.reset(seed=5 + k)
+        np.testing.assert_array_equal(observation, first[k])
+        for observation, reward in seen:
+            mine, own_reward, *_ = single.step(down)
+            np.testing.assert_array_equal(mine, observation[k])
+            assert own_reward == reward[k]
 
 
 def test_states_of_different_objects_go_on_as_they_did() -> None:
