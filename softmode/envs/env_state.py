@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -21,6 +22,10 @@ VERSION = 1
 _KIND = "softmode-env-state"
 _OPTIONAL = ("hessian.", "camera.")
 """Parts that an environment may lack, by the first letters of their names."""
+_OBJECT = "task.object"
+"""Which object of the set each world has; where all have the same, the owner says it."""
+Parts = int | NDArray[Any]
+"""How the worlds lie in an array, see `_parts`."""
 _SHAPES = "state.softmode.stick_shape"
 """Indices of the shapes that surfaces stick to, which a state counts within the world."""
 
@@ -31,7 +36,8 @@ class EnvState:
 
     On CPU an environment that was given a state goes on with the same bits as the one that the state was taken from, if
     their configurations are equal. Objects, robot and task must be the same; ranges and solver options may differ.
-    What was drawn for cameras comes along for those that both environments have.
+    What was drawn for cameras comes along for those that both environments have. Of environments whose worlds have
+    different objects both hold the same ones, and a world takes the state of a world with its object.
     """
 
     owner: dict[str, str]
@@ -54,7 +60,14 @@ class EnvState:
 
     @classmethod
     def joined(cls, states: Sequence[Self]) -> Self:
-        """Return the states of several worlds of one task as one."""
+        """Return the states of several worlds of one task as one.
+
+        Raises:
+            ConfigError: If they have different objects, as those of several processes.
+        """
+        if any(state.owner != states[0].owner for state in states):
+            hint = "make the environment with processes=1"
+            raise ConfigError("the processes hold different objects of the set, whose states differ in size", hint=hint)
         arrays = {name: np.concatenate([s.arrays[name] for s in states]) for name in states[0].arrays}
         return cls(owner=states[0].owner, arrays=arrays, random=tuple(one for s in states for one in s.random))
 
@@ -133,13 +146,10 @@ def worlds_state(task: Task) -> tuple[dict[str, str], dict[str, NDArray[Any]]]:
     """Return whose the state of a task is, and its arrays, each of shape (world_count, size).
 
     Raises:
-        ConfigError: If the scene has grips, which are not part of a state, or worlds differ in their objects.
+        ConfigError: If the scene has grips, which are not part of a state.
     """
     if task.scene.grips:
         raise ConfigError("the scene has grips, which are not part of a state", hint="set scene.grip_slots to 0")
-    if len(task.scene.members) > 1:
-        hint = "take the states of environments with one object each: config.from_world(i)"
-        raise ConfigError("the worlds have different objects, whose states differ in size", hint=hint)
     arrays = {name: _rows(array, parts, task.world_count).copy() for name, array, parts in _parts(task)}
     arrays[_SHAPES] = _shifted(task, arrays[_SHAPES], -1)
     return owner_of(task), arrays
@@ -163,6 +173,14 @@ def set_worlds_state(
     now = worlds_state(task)
     _check(owner, arrays, *now)
     before = now[1]
+    if _OBJECT in before:
+        other = np.flatnonzero(mask & (arrays[_OBJECT] != before[_OBJECT])[:, 0])
+        if len(other):
+            found = [int(of[_OBJECT][other[0], 0]) for of in (arrays, before)]
+            hint = "give a world a state of a world with the same object, see info['object']"
+            raise StateError(
+                f"world {other[0]} has object {found[1]} of the set, the state object {found[0]}", hint=hint
+            )
     values = {name: np.where(mask[:, None], arrays.get(name, rows), rows) for name, rows in before.items()}
     if "hessian.cached" in before and "hessian.cached" not in arrays:
         values["hessian.cached"][mask] = 0  # the next step evaluates its own
@@ -184,7 +202,8 @@ def set_worlds_state(
 
 def owner_of(task: Task) -> dict[str, str]:
     """Return what a state is bound to: task, robot and objects."""
-    bodies = ", ".join(thing.body.fingerprint[:16] for thing in task.scene.objects)
+    things = (*task.scene.members, *task.scene.objects[1:])
+    bodies = ", ".join(thing.body.fingerprint[:16] for thing in things)
     robot = hashlib.sha256(repr(task.config.scene.arm).encode()).hexdigest()[:16]
     return {"task": type(task).__name__, "robot": robot, "objects": bodies}
 
@@ -211,14 +230,22 @@ def _check(
             raise StateError(f"{name} is {found[0]} in the state and {found[1]} in the environment", hint=hint)
 
 
-def _parts(task: Task) -> Iterator[tuple[str, Any, int]]:
+def _parts(task: Task) -> Iterator[tuple[str, Any, Parts]]:
     """Yield name and array of all that a step reads and a step before may have written.
 
-    The third entry says in how many equal parts an array has the worlds one after another: 1, or the number of cameras.
+    The third entry says in how many equal parts an array has the worlds one after another: 1, or the number of cameras;
+    or where each world begins, and the end, where worlds with different objects have different sizes.
     """
     scene, controller = task.scene, task.scene.controller
+    differ = len(scene.members) > 1
+    functions, particles = _starts(task) if differ else (1, 1)
     for owner, name in ((scene.state, "state"), (scene.control, "control")):
-        yield from _fields(owner, name)
+        for field_name, array in _fields(owner, name):
+            of_body = ".softmode.q" in field_name
+            of_surface = ".particle_" in field_name or ".softmode.stick_" in field_name
+            yield field_name, array, functions if of_body else particles if of_surface else 1
+    if differ:
+        yield _OBJECT, task.object_index, 1
     tables, data = scene.solver.tables, scene.solver.rigid.mjw_data
     for name in ("commanded_q", "previous_q", "target_position", "target_yaw"):
         yield f"controller.{name}", getattr(controller, name), 1
@@ -246,23 +273,44 @@ def _shifted(task: Task, shapes: NDArray[Any], sign: int) -> NDArray[Any]:
     return np.where(shapes < 0, shapes, shapes + sign * first)
 
 
-def _fields(owner: object, name: str) -> Iterator[tuple[str, wp.array, int]]:
+def _starts(task: Task) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return where the functions and the surface samples of each world begin, and their ends, (world_count + 1,)."""
+    scene = task.scene
+    bodies = [[thing.body for thing in scene.objects_of(world)] for world in range(task.world_count)]
+    functions = [sum(body.function_count for body in world) for world in bodies]
+    samples = [sum(body.surface_count for body in world) for world in bodies]
+    return np.cumsum([0, *functions]), np.cumsum([0, *samples])
+
+
+def _fields(owner: object, name: str) -> Iterator[tuple[str, wp.array]]:
     """Yield the arrays of a state or a control of Newton, and of the namespaces in it."""
     for key, value in sorted(vars(owner).items()):
         if isinstance(value, wp.array):
             if value.size:
-                yield f"{name}.{key}", value, 1
+                yield f"{name}.{key}", value
         elif type(value).__name__ == "AttributeNamespace":
             yield from _fields(value, f"{name}.{key}")
 
 
-def _rows(array: wp.array, parts: int, world_count: int) -> NDArray[Any]:
-    """Return an array by world, shape (world_count, size)."""
+def _rows(array: wp.array, parts: Parts, world_count: int) -> NDArray[Any]:
+    """Return an array by world, shape (world_count, size); zeros behind the numbers of a smaller world."""
     values = array.numpy()
+    if not isinstance(parts, int):
+        each = [values[a:b].reshape(-1) for a, b in itertools.pairwise(parts)]
+        rows = np.zeros((world_count, max(map(len, each))), values.dtype)
+        for row, numbers in zip(rows, each, strict=True):
+            row[: len(numbers)] = numbers
+        return rows
     return values.reshape(parts, world_count, -1).swapaxes(0, 1).reshape(world_count, -1)
 
 
-def _write(array: wp.array, parts: int, rows: NDArray[Any]) -> None:
+def _write(array: wp.array, parts: Parts, rows: NDArray[Any]) -> None:
     """Write what `_rows` returned."""
     like = array.numpy()
+    if not isinstance(parts, int):
+        size = like[:1].size
+        sizes = size * np.diff(parts)
+        rows = np.concatenate([row[:n] for row, n in zip(rows, sizes, strict=True)])
+        array.assign(rows.reshape(like.shape).astype(like.dtype))
+        return
     array.assign(rows.reshape(len(rows), parts, -1).swapaxes(0, 1).reshape(like.shape).astype(like.dtype))

@@ -89,7 +89,8 @@ class ParameterTable:
         self.low, self.high = upload("low"), upload("high")
         logs = np.concatenate([np.full(p.size, p.log) for p in chosen])
         self.log = wp.array(logs, dtype=wp.bool, device=device)
-        self.kind = wp.array(np.zeros(world_count) if kind is None else kind, dtype=int, device=device)
+        rows = np.zeros(world_count, np.int32) if kind is None else np.asarray(kind, np.int32)
+        self.kind = wp.array(rows, dtype=int, device=device)
         self.values = wp.zeros((world_count, ends[-1]), dtype=float, device=device)
 
     def column(self, name: str) -> int:
@@ -120,6 +121,9 @@ def check_options(
     """
     unknown = sorted(set(options) - set(parameters))
     if unknown:
+        if "object" in unknown:
+            hint = "choose it when the environment is made, by order or seed of the ObjectSet"
+            raise ConfigError("'object' is no reset option: a world keeps its object", hint=hint)
         raise ConfigError(f"unknown reset options {unknown}", hint=f"use {', '.join(parameters)}")
     return {name: _checked(parameters[name], value, world_count) for name, value in options.items()}
 

@@ -96,6 +96,10 @@ class BoundSplats:
         else:
             raise ConfigError(f"there are {len(objects)} objects and no model", hint="give one object that has splats")
         chosen = range(len(starts)) if worlds is None else worlds
+        for part in others:
+            if not isinstance(part, Splats) and len(part) <= max(chosen):
+                hint = "give one Splats, or one for each world of the model"
+                raise ConfigError(f"others has {len(part)} splats for world {max(chosen)}", hint=hint)
         parts: list[Splats | list[Splats]] = []
         for things in [each[o] for o in self.indices]:
             splats = [thing.visible_splats for thing in things if thing is not None]

@@ -110,7 +110,7 @@ class SplatArrays:
             require_number("sh_degree", sh_degree, at_least=0, at_most=3, hint=hint)
         shown = [[thing] if isinstance(thing, Splats) else list(thing) for thing in objects]
         sizes = {len(thing) for thing in shown if len(thing) != 1}
-        if not all(shown) or sizes > {world_count}:
+        if not all(shown) or not sizes <= {world_count}:
             hint = "Give one Splats, or one for each world"
             raise ConfigError(f"objects of {sorted(sizes)} worlds, expected {world_count}", hint=hint)
         widths = [max(splats.count for splats in thing) for thing in shown]

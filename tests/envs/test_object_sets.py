@@ -20,12 +20,15 @@ from softmode.envs import (
     LiftSoftVectorEnv,
     PlaceInBinConfig,
     PlaceInBinEnv,
+    PressSoftConfig,
+    PressSoftEnv,
+    PressSoftVectorEnv,
     PushSoftConfig,
     PushSoftEnv,
     PushSoftVectorEnv,
     scripted_policy,
 )
-from softmode.errors import ConfigError, GraspError
+from softmode.errors import ConfigError, GraspError, StateError
 from softmode.learning.config_values import config_of, pinned_options, values_of
 from softmode.objects import ObjectConfig, ObjectSet
 from softmode.scenes import BoundSplats
@@ -137,6 +140,49 @@ def test_each_world_is_pushed_as_alone() -> None:
         np.testing.assert_array_equal(picture, film[k])
 
 
+def test_each_world_is_pressed_as_alone() -> None:
+    """The same for PressSoft, whose gauge knows how high a pad is."""
+    pads, foam = (CUBE, replace(ROD, extents=(0.06, 0.06, 0.03))), Material(youngs_modulus=1.0e5, poissons_ratio=0.4)
+    config = PressSoftConfig(objects=ObjectSet(pads, order="in_turn"))
+    config = replace(config, scene=replace(config.scene, material=foam))
+    many = PressSoftVectorEnv(2, config=config, device="cpu")
+    first, _ = many.reset(seed=5)
+    down = np.array([0.0, 0.0, -1.0, 0.0, 0.0], np.float32)
+    seen = [many.step(np.tile(down, (2, 1)))[:2] for _ in range(10)]
+    for k, pad in enumerate(pads):
+        own = replace(config, objects=None, scene=replace(config.scene, object=pad))
+        single = PressSoftEnv(config=own, device="cpu")
+        observation, _ = single.reset(seed=5 + k)
+        np.testing.assert_array_equal(observation, first[k])
+        for observation, reward in seen:
+            mine, own_reward, *_ = single.step(down)
+            np.testing.assert_array_equal(mine, observation[k])
+            assert own_reward == reward[k]
+
+
+def test_states_of_different_objects_go_on_as_they_did() -> None:
+    """After a state, in bytes, all goes on with the same bits; a world takes another one's that has its object."""
+    config = lift(objects=replace(SET, objects=(CUBE, BALL), materials=None), youngs_modulus_range=(2.0e4, 2.0e6))
+    env = LiftSoftVectorEnv(3, config=config, device="cpu")
+    env.reset(seed=4, options=PLACE)
+
+    def play(first: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        return [env.step(actions(3, step))[:2] for step in range(first, first + 6)]
+
+    play(10)
+    kept = env.get_state().to_bytes()
+    after = play(16)
+    env.set_state(kept)
+    for mine, theirs in zip(play(16), after, strict=True):
+        np.testing.assert_array_equal(mine[0], theirs[0])
+        np.testing.assert_array_equal(mine[1], theirs[1])
+    env.set_state(env.get_state().worlds([2, 1, 2]), mask=np.array([True, False, False]))  # worlds 0 and 2: cubes
+    same = np.tile(actions(1, 30), (3, 1))
+    observation = env.step(same)[0]
+    np.testing.assert_array_equal(observation[0], observation[2])
+    assert not np.array_equal(observation[0], observation[1])
+
+
 def test_processes_deal_out_the_same_objects() -> None:
     """Two processes hold the objects that one holds; a single environment made for a world has that world's."""
     given = ObjectSet(["ball", "sponge"], seed=2, size=0.06)
@@ -183,7 +229,7 @@ def test_scripted_policies_take_each_object() -> None:
 
 
 def test_what_cannot_take_a_set_says_so() -> None:
-    """A task that knows one body, an object too wide for the gripper, a state, one body for all splats, a shortcut."""
+    """A task that knows one body, an object too wide for the gripper, another's state, one body for all, a shortcut."""
     with pytest.raises(ConfigError, match="PlaceInBin cannot have another object"):
         PlaceInBinEnv(config=PlaceInBinConfig(objects=SET), device="cpu")
     wide = replace(CUBE, extents=(0.16, 0.16, 0.16))
@@ -195,7 +241,9 @@ def test_what_cannot_take_a_set_says_so() -> None:
         LiftSoftEnv(config=lift(), size=0.05)
     env = LiftSoftVectorEnv(2, config=lift(), device="cpu")
     env.reset(seed=0)
-    with pytest.raises(ConfigError, match="worlds have different objects"):
-        env.get_state()
+    with pytest.raises(StateError, match="world 1 has object 1 of the set, the state object 0"):
+        env.set_state(env.get_state().worlds([0]))
+    with pytest.raises(ConfigError, match="a world keeps its object"):
+        env.reset(options={"object": 1})
     with pytest.raises(ConfigError, match="not the body that world 1 holds"):
         BoundSplats(env.task.scene.model, env.task.scene.objects)

@@ -37,7 +37,7 @@ class Plan:
 
     drawn: Drawn
     columns: Columns
-    top: float  # height of the unscaled pad [m]
+    top: wp.array[float]  # height of every unscaled pad [m]
     tip_length: float  # from the tool point down to the finger tips [m]
     force_tolerance: float  # as a share of the goal
     least_tolerance: float  # [N]
@@ -50,7 +50,7 @@ def observe(state: WorldState, plan: Plan, result: StepResult):
     """Write goal force, contact force and their difference; the metrics; and the marker over the plan."""
     w = wp.tid()
     goal = state.parameters[w, plan.drawn.goal_force]
-    surface = plan.top * state.parameters[w, plan.drawn.scale]
+    surface = plan.top[w] * state.parameters[w, plan.drawn.scale]
     p = tool_position(state, w)
     x = state.object_position[w, 0]
     # vertical: what the fingers squeeze each other with adds nothing

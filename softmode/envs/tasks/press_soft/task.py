@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import warp as wp
+from numpy.typing import NDArray
 
 from softmode.checks import require_fields, require_range
 from softmode.deformables.build.options import BuildOptions
@@ -118,13 +120,20 @@ class PressSoft(Task):
     config: PressSoftConfig
     config_class = PressSoftConfig
     kernels = kernels
+    takes_sets = True
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
 
+    def build(self) -> None:
+        """Upload how high the pads are."""
+        self.top = wp.array(self.tops, dtype=float, device=self.device)
+        """Height of every unscaled pad [m], shape (world_count,), on the device."""
+
     @property
-    def top(self) -> float:
-        """Height of the unscaled pad [m]."""
-        return float(np.ptp(self.scene.soft.body.surface_points[:, 2]))
+    def tops(self) -> NDArray[np.float64]:
+        """Height of every unscaled pad [m], shape (world_count,)."""
+        heights = [float(np.ptp(thing.body.surface_points[:, 2])) for thing in self.scene.members]
+        return np.array(heights)[self.scene.member]
 
     @property
     def tip_length(self) -> float:
@@ -140,11 +149,12 @@ class PressSoft(Task):
         """
         config = self.config
         room = config.scene.arm.home_position[2] - self.tip_length - CLEARANCE
-        most = min(2.0, room / self.top)
+        top = float(self.tops.max())
+        most = min(2.0, room / top)
         largest = 1.0 if config.scale_range is None else config.scale_range[1]
         if largest > most:
             raise ConfigError(
-                f"a pad of height {self.top:.3f} m, scaled by up to {largest}, reaches the finger tips at the start",
+                f"a pad of height {top:.3f} m, scaled by up to {largest}, reaches the finger tips at the start",
                 hint=f"keep the scale below {most:.2f}, or raise scene.arm.home_position",
             )
         (low, high), least = config.force_range, config.least_tolerance
