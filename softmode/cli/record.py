@@ -33,7 +33,7 @@ ROBOT = "softmode_arm"
 class Record:
     """Record episodes of an environment as a LeRobot v3.0 dataset.
 
-    Example: softmode record softmode/LiftSoft-v0 --splat toy.ply -o out/toy --episodes 50
+    Example: softmode record softmode/LiftSoft-v0 -o out/toy
     """
 
     env: str
