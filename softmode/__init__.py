@@ -20,6 +20,8 @@ ENVIRONMENTS = {
     "softmode/PlaceInBin-v0": "Put a soft toy into a bin with other soft objects in it.",
     "softmode/RopeRoute-v0": "Lead a soft rope around pegs, each on its side, to a goal.",
     "softmode/ShapeSoft-v0": "Bend a soft post into a given shape and hold it there.",
+    "softmode/PushSoftGoal-v0": "PushSoft, goal-conditioned: for hindsight experience replay.",
+    "softmode/LiftSoftGoal-v0": "LiftSoft, goal-conditioned: for hindsight experience replay.",
 }
 """Ids of the registered environments and what their task is."""
 _EPISODE_STEPS = {
@@ -29,6 +31,8 @@ _EPISODE_STEPS = {
     "PlaceInBin": 180,
     "RopeRoute": 160,
     "ShapeSoft": 100,
+    "PushSoftGoal": 120,
+    "LiftSoftGoal": 150,
 }
 """Control steps of an episode."""
 

@@ -299,6 +299,7 @@ COMMANDS = (
     "record",
     "view",
     "morph",
+    "new",
     "check",
     "list-envs",
     "robots",

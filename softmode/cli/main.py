@@ -1,4 +1,4 @@
-"""The command line: play, train, evaluate, check, record, view, morph, bench, splat, radiance, body, objects, ..."""
+"""The command line: play, train, evaluate, new, check, record, view, morph, bench, splat, radiance, body, ..."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from softmode.cli.body import BodyBuild, BodyCheck, BodyCut, BodyShow
 from softmode.cli.check import Check
 from softmode.cli.listing import ListEnvs, Robots
 from softmode.cli.morph import Morph
+from softmode.cli.new import New
 from softmode.cli.objects import ObjectsExport, ObjectsList, ObjectsShow
 from softmode.cli.play import Play
 from softmode.cli.radiance import RadianceBake, RadianceInfo
@@ -56,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
 
         kinds = one_of({"play": Play, "train": Train, "evaluate": Evaluate, "export": Export, "bench": Bench})
         kinds |= one_of({"record": Record, "view": View, "morph": Morph})
-        kinds |= one_of({"check": Check, "list-envs": ListEnvs, "robots": Robots})
+        kinds |= one_of({"new": New, "check": Check, "list-envs": ListEnvs, "robots": Robots})
         splat = one_of({"show": SplatShow, "from-mesh": SplatFromMesh, "info": SplatInfo, "convert": SplatConvert})
         kinds |= Annotated[splat, subcommand("splat", description="Draw, make, inspect and convert splat files.")]
         radiance = one_of({"info": RadianceInfo, "bake": RadianceBake})

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 class Play:
     """Play episodes of an environment and film them.
 
-    Example: softmode play softmode/LiftSoft-v0 --splat toy.ply --video out/toy.mp4
+    Example: softmode play softmode/LiftSoft-v0 --splat toy.ply
     """
 
     env: str

@@ -33,7 +33,7 @@ ROBOT = "softmode_arm"
 class Record:
     """Record episodes of an environment as a LeRobot v3.0 dataset.
 
-    Example: softmode record softmode/LiftSoft-v0 --splat toy.ply -o out/toy --episodes 50
+    Example: softmode record softmode/LiftSoft-v0 -o out/toy
     """
 
     env: str
@@ -56,6 +56,8 @@ class Record:
     noise: float = 0.0
     """Standard deviation of random pushes that are added to the actions played, not to those recorded; 0.3 makes
     demonstrations that show how to come back from errors."""
+    states: bool = False
+    """Record the state in which each episode begins, to begin episodes with."""
     append: bool = False
     """Add to the dataset in the folder, if there is one."""
     device: str | None = None
@@ -107,7 +109,9 @@ class Record:
                     bar.update(recorded - bar.n)
 
                 try:
-                    how = {name: getattr(self, name) for name in ("episodes", "seed", "noise", "only_successes")}
+                    how = {
+                        name: getattr(self, name) for name in ("episodes", "seed", "noise", "only_successes", "states")
+                    }
                     result = record_episodes(env, policy, writer, task=purpose(self.env), progress=tell, **how)
                 except KeyboardInterrupt:
                     bar.close()

@@ -106,7 +106,7 @@ class Train:
 class Evaluate:
     """Print how often a trained policy succeeds in whole episodes.
 
-    Example: softmode evaluate softmode/LiftSoft-v0 runs/toy/best.npz
+    Example: softmode evaluate softmode/LiftSoft-v0 toy.npz
     """
 
     env: str

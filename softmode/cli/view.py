@@ -29,7 +29,7 @@ _ELSEWHERE = ("target", "prepare", "toy", "splat", "object", "up", "crop")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View:
-    """Show an object or a task in the browser; pull, pin and tune it.
+    """Show an object or task in the browser; pull, pin, tune it.
 
     Example: softmode view toy.ply --size 0.12 --scene drop
     """

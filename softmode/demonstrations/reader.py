@@ -8,7 +8,7 @@ import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,9 @@ from softmode.demonstrations.pictures import decode_png, read_film
 from softmode.demonstrations.schema import INDEX_FEATURES, Feature
 from softmode.demonstrations.statistics import Statistics
 from softmode.errors import AssetError, ConfigError
+
+if TYPE_CHECKING:
+    from softmode.envs.env_state import EnvState
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +46,8 @@ class Dataset:
     """Statistics of every feature over all frames."""
     origins: tuple[dict[str, Any], ...] = ()
     """Where the episodes come from, each from its ``first_episode`` on: environment and options; empty if not said."""
+    folder: Path | None = None
+    """Where it lies."""
 
     @property
     def episode_count(self) -> int:
@@ -60,6 +65,21 @@ class Dataset:
             raise ConfigError(f"episode {number} is not in 0..{self.episode_count - 1}")
         part = slice(self.episode_start[number], self.episode_stop[number])
         return {name: column[part] for name, column in self.columns.items()}
+
+    def state(self, number: int) -> EnvState:
+        """Return the state in which an episode began, for ``reset(options={"state": state})``.
+
+        Raises:
+            ConfigError: If there is no such episode, or it was recorded without its state.
+            StateError: If the state is damaged or of another version.
+        """
+        from softmode.envs.env_state import EnvState
+
+        self.episode(number)
+        path = None if self.folder is None else self.folder / schema.STATE_PATH.format(number=number)
+        if path is None or not path.exists():
+            raise ConfigError(f"episode {number} has no state", hint="record with --states, or states=True")
+        return EnvState.load(path)
 
 
 def read_dataset(
@@ -105,6 +125,7 @@ def read_dataset(
         episode_start=starts,
         episode_stop=stops,
         statistics=found.combined(),
+        folder=found.folder,
     )
 
 

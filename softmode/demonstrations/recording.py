@@ -131,6 +131,7 @@ def record_episodes(
     seed: int = 0,
     noise: float = 0.0,
     only_successes: bool = False,
+    states: bool = False,
     progress: Callable[[int, bool, int], None] | None = None,
 ) -> Recorded:
     """Play episodes and record them.
@@ -149,6 +150,8 @@ def record_episodes(
         seed: Seed of the first episode.
         noise: Standard deviation of a push, in the unit of the actions.
         only_successes: Record only episodes that end in success.
+        states: Record the state in which each episode begins as well, of an environment of softmode's; see
+            `Dataset.state`.
         progress: Told after every episode played its seed, whether it succeeded, and how many are recorded.
 
     Raises:
@@ -156,6 +159,9 @@ def record_episodes(
         StorageError: If the dataset cannot be written; the episodes before stay.
     """
     check_recording(episodes, seed, noise)
+    base: Any = env.unwrapped
+    if states and not hasattr(base, "get_state"):
+        raise ConfigError(f"{base} has no get_state", hint="record without states")
     recorded = successes = attempts = 0
     while recorded < episodes:
         if attempts >= ATTEMPTS * episodes:
@@ -163,10 +169,13 @@ def record_episodes(
                 f"only {recorded} of {attempts} episodes succeeded, {episodes} were asked for; they are recorded",
                 hint="use a better policy, or record failures too",
             )
-        success = _play(env, policy, writer, seed + attempts, noise)
+        writer.discard_episode()
+        observation, _ = env.reset(seed=seed + attempts)
+        state = base.get_state().to_bytes() if states else None
+        success = _play(env, policy, writer, observation, seed + attempts, noise)
         attempts += 1
         if success or not only_successes:
-            writer.save_episode(task)
+            writer.save_episode(task, state=state)
             recorded, successes = recorded + 1, successes + success
         else:
             writer.discard_episode()
@@ -176,11 +185,14 @@ def record_episodes(
 
 
 def _play(
-    env: gym.Env, policy: Callable[[int], Callable[[Any], Any]], writer: DatasetWriter, seed: int, noise: float
+    env: gym.Env,
+    policy: Callable[[int], Callable[[Any], Any]],
+    writer: DatasetWriter,
+    observation: Any,
+    seed: int,
+    noise: float,
 ) -> bool:
-    """Play an episode into the writer; return whether it ended in success."""
-    writer.discard_episode()
-    observation, _ = env.reset(seed=seed)
+    """Play an episode, which has just begun with an observation, into the writer; return whether it succeeded."""
     act, random = policy(seed), np.random.default_rng((seed, 0xDA27))
     done, info, push, left = False, {}, np.float32(0.0), 0
     while not done:

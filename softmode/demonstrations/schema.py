@@ -38,6 +38,7 @@ EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.par
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 INFO_PATH, STATISTICS_PATH, TASKS_PATH = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"
 ORIGINS_PATH = "meta/softmode.json"
+STATE_PATH = "meta/states/episode-{number:06d}.npz"
 IMAGE_NAMES = ("height", "width", "channels")
 
 

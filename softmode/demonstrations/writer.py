@@ -200,11 +200,12 @@ class DatasetWriter:
 
     # -- episodes -----------------------------------------------------------------------------------------------------
 
-    def save_episode(self, task: str) -> int:
+    def save_episode(self, task: str, *, state: bytes | None = None) -> int:
         """Add the frames since the last saved episode to the dataset.
 
         Args:
             task: What was to be done, as a sentence.
+            state: The state in which the episode began, ``env.unwrapped.get_state().to_bytes()``; see `Dataset.state`.
 
         Returns:
             The number of the episode.
@@ -221,14 +222,14 @@ class DatasetWriter:
         what = f"another episode of dataset {self.folder}, whose {self.episode_count} are complete,"
         try:
             with storage_errors(what, hint="free some space and append"):
-                self._save(task)
+                self._save(task, state)
         except BaseException:
             self.discard_episode()
             raise
         self._begin()
         return self.episode_count - 1
 
-    def _save(self, task: str) -> None:
+    def _save(self, task: str, state: bytes | None) -> None:
         """Stage the files of the dataset with the present episode, then put them in place."""
         episode, number, start = self._episode, self.episode_count, self.frame_count
         count = episode.length
@@ -262,6 +263,11 @@ class DatasetWriter:
         if self._origin is not None and self._origin != last:
             origins = [*origins, {**self._origin, "first_episode": number}]
             moves[schema.ORIGINS_PATH] = write_json(stage / "softmode.json", {"origins": origins})
+        if state is not None:
+            moves[schema.STATE_PATH.format(number=number)] = stage / "state.npz"
+            (stage / "state.npz").write_bytes(state)
+        else:  # one that a killed recording may have left behind
+            (self._root / schema.STATE_PATH.format(number=number)).unlink(missing_ok=True)
         moves[schema.INFO_PATH] = write_json(stage / "info.json", self._info(number + 1, start + count, tasks))
         for source in moves.values():
             sync(source)

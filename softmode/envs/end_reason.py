@@ -17,3 +17,5 @@ class EndReason(IntEnum):
     """The object fell off the table."""
     SPILLED = 4
     """Another object left the container that it belongs in."""
+    FAILED = 5
+    """A rule of the task itself, of a `TerminationTerm`."""

@@ -43,9 +43,24 @@ def scripted_policy(env: Environment) -> Callable[[Any], Any]:
         if parent.__name__ in _POLICIES:
             module, _, name = _POLICIES[parent.__name__].partition(":")
             policy = getattr(importlib.import_module(f"softmode.envs.tasks.{module}"), name)
-            return ScriptedWorlds(base, policy) if isinstance(base, SoftVectorEnv) else policy(env)
+            return scripted_worlds(policy)(env)
     hint = f"there is one for {', '.join(_POLICIES)}; a task of yours may set scripted_policy"
     raise ConfigError(f"there is no scripted policy for {env}", hint=hint)
+
+
+def scripted_worlds(policy: type[ScriptedPolicy]) -> Callable[[Any], Callable[[Any], Any]]:
+    """Return what `Task.scripted_policy` of a task of your own is: the policy of an environment, single or vector.
+
+    Args:
+        policy: Class of the policy of one world.
+    """
+
+    def make(env: Environment) -> Callable[[Any], Any]:
+        """Return the policy of an environment."""
+        base = env.unwrapped
+        return ScriptedWorlds(base, policy) if isinstance(base, SoftVectorEnv) else policy(env)
+
+    return make
 
 
 class ScriptedWorlds:

@@ -330,6 +330,9 @@ class Task:
         """Reset `held`, and counters of the subclass, in the worlds of `scene.world_mask`."""
         self.launch(kernels.forget, [self.scene.world_mask, 0], [self.held])
 
+    def before_step(self) -> None:
+        """Change the worlds before each control step; part of the captured step."""
+
     def observe(self) -> None:
         """Write the goal segments of `observation` and the `metrics`, functions of the state alone."""
         if self.kernels is not None:
@@ -536,6 +539,7 @@ class Task:
     def _step(self) -> None:
         """Simulate, judge, start the episodes that are due, observe."""
         scene = self.scene
+        self.before_step()
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
             wp.copy(self._fresh, self.done)
             scene.control_step()

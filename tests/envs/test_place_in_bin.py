@@ -17,6 +17,8 @@ from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.place_in_bin.scripted import ScriptedPlace
 from softmode.envs.tasks.place_in_bin.task import Bin, PlaceInBinConfig, PlaceInBinEnv, bin_scene
 from softmode.errors import ConfigError
+from softmode.testing import assert_success
+from tests.envs.conftest import Episodes, MakeEnv
 
 ENV_ID = "softmode/PlaceInBin-v0"
 IDLE = np.array([0.0, 0.0, 0.0, 0.0, 1.0], np.float32)
@@ -217,20 +219,19 @@ def test_script_grasps_again_what_it_lost(env: PlaceInBinEnv) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.episodes(20)
 @pytest.mark.parametrize("modulus", [None, 2.0e4, 2.0e6])
-def test_script_succeeds_on_twenty_of_twenty_seeds(env: PlaceInBinEnv, modulus: float | None) -> None:
+def test_script_succeeds_on_twenty_of_twenty_seeds(soft_env: MakeEnv, episode: Episodes, modulus: float | None) -> None:
     """20 of 20 seeds with random stiffness, and at either end."""
     options = {} if modulus is None else {"youngs_modulus": modulus}
-    won = [play(env, seed, **options)[1][-1] for seed in range(20)]
-    assert sum(won) == 20, won
+    assert_success(episode(soft_env("softmode/PlaceInBin-v0"), options=options))
 
 
 @pytest.mark.slow
-def test_script_places_plush_toys() -> None:
+@pytest.mark.episodes(10)
+def test_script_places_plush_toys(soft_env: MakeEnv, episode: Episodes) -> None:
     """10 of 10 seeds among plush toys."""
-    env = PlaceInBinEnv(preset="plush")
-    won = [play(env, seed)[1][-1] for seed in range(10)]
-    assert sum(won) == 10, won
+    assert_success(episode(soft_env("softmode/PlaceInBin-v0", preset="plush")))
 
 
 @pytest.mark.slow

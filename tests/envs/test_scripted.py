@@ -19,6 +19,8 @@ from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv, lift
 from softmode.errors import ConfigError, GraspError
 from softmode.objects.config import ObjectConfig
 from softmode.splats.colored_mesh import ColoredMesh
+from softmode.testing import assert_success
+from tests.envs.conftest import Episodes, MakeEnv
 from tests.shapes import SHAPES
 
 
@@ -52,12 +54,12 @@ def test_lifts_soft_and_stiff_objects(lift: LiftSoftEnv, seed: int, modulus: flo
 
 
 @pytest.mark.slow
+@pytest.mark.episodes(20)
 @pytest.mark.parametrize("modulus", [None, 2.0e4, 2.0e6])
-def test_succeeds_on_twenty_of_twenty_seeds(lift: LiftSoftEnv, modulus: float | None) -> None:
+def test_succeeds_on_twenty_of_twenty_seeds(soft_env: MakeEnv, episode: Episodes, modulus: float | None) -> None:
     """20 of 20 seeds with random stiffness in 2e4..2e6 Pa, and at either end."""
     options = {} if modulus is None else {"youngs_modulus": modulus}
-    results = [play(lift, seed, **options)[0]["is_success"] for seed in range(20)]
-    assert sum(results) == 20, [seed for seed, won in enumerate(results) if not won]
+    assert_success(episode(soft_env("softmode/LiftSoft-v0"), options=options))
 
 
 def test_tries_again_after_a_loss(lift: LiftSoftEnv) -> None:

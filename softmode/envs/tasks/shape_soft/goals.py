@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Mapping, Sequence
-from types import MethodType
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from softmode.deformables.model.structs import filled
-from softmode.envs.end_reason import EndReason
+from softmode.envs.goals import GoalMethods
 from softmode.envs.tasks.shape_soft import kernels
 from softmode.envs.tasks.shape_soft.config import ShapeSoftConfig
-from softmode.envs.tensors import Tensor
-from softmode.errors import ConfigError
 
-Goals = np.ndarray | Tensor
-Infos = Mapping[str, Any] | Sequence[Mapping[str, Any]] | np.ndarray | None
 POINTS = 12
 """Points of a goal."""
 
@@ -33,90 +25,13 @@ def reward_rules(config: ShapeSoftConfig) -> Any:
     return rules
 
 
-class _GoalMethod:
-    """A method that environments have only where their observations hold the goals, which is how learners tell them."""
-
-    def __init__(self, method: Callable[..., Any]) -> None:
-        self.method, self.__doc__ = method, method.__doc__
-
-    def __get__(self, env: Any, kind: type | None = None) -> Callable[..., Any]:
-        if env is None:
-            return self.method
-        if env.obs_type != "state":
-            raise AttributeError(f"{self.method.__name__} needs the goals that obs_type='state' observes")
-        return MethodType(self.method, env)
-
-
-class GoalMethods:
-    """Reward and ends of episodes as functions of the goals; only with state observations, which hold them."""
+class ShapeGoals(GoalMethods):
+    """Rewards of shapes, by their points relative to the middle of the foot, or by their masses."""
 
     config: ShapeSoftConfig
+    goal_size = 3 * POINTS
 
-    device: wp.Device
-    """Device on which rewards of numpy arrays are computed: that of the task."""
-
-    @_GoalMethod
-    def compute_reward(self, achieved_goal: Goals, desired_goal: Goals, info: Infos = None) -> Any:
-        """Return the reward of a step that led to `achieved_goal`, bit for bit that of the step on the same device.
-
-        Args:
-            achieved_goal: Points of the shape [m], shape (..., 36), a numpy array or a tensor.
-            desired_goal: Those of the target.
-            info: Not used.
-
-        Returns:
-            Rewards, float32, shape (...): a number, an array, or a tensor on the device of the goals.
-
-        Raises:
-            ConfigError: If the shapes do not fit.
-        """
-        size = 3 * POINTS
-        pair: tuple[Any, ...] = (achieved_goal, desired_goal)
-        if not all(isinstance(goal, Tensor) for goal in pair):
-            pair = tuple(np.asarray(goal, np.float32) for goal in pair)
-        leading = tuple(pair[0].shape[:-1])
-        if any(tuple(goal.shape) != (*leading, size) for goal in pair):
-            hint = f"give both the same shape (..., {size})"
-            raise ConfigError(f"goals have shapes {tuple(pair[0].shape)} and {tuple(pair[1].shape)}", hint=hint)
-        if not isinstance(pair[0], Tensor):
-            goals = [wp.array(goal.reshape(-1, size), dtype=float, device=self.device) for goal in pair]
-            return self._launch(goals).numpy().reshape(leading)[()]
-        with _torch_stream(pair[0]):
-            goals = [wp.from_torch(goal.detach().float().reshape(-1, size).contiguous()) for goal in pair]
-            return wp.to_torch(self._launch(goals)).reshape(leading)
-
-    def _launch(self, goals: list[wp.array]) -> wp.array:
-        """Compute the reward of each row."""
-        device = goals[0].device
-        reward = wp.zeros(goals[0].shape[0], dtype=float, device=device)
-        inputs = [*goals, reward_rules(self.config)]
-        wp.launch(kernels.compute_reward, dim=reward.shape[0], inputs=inputs, outputs=[reward], device=device)
-        return reward
-
-    @_GoalMethod
-    def compute_terminated(self, achieved_goal: Goals, desired_goal: Goals, info: Infos = None) -> Any:
-        """Return whether the episode ended by a failure, which `info` (one or a sequence) knows; goals end none."""
-        if isinstance(info, Mapping):
-            return _failed(info)
-        if info is None or len(info) == 0:
-            return np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
-        return np.array([_failed(one) for one in info])
-
-    @_GoalMethod
-    def compute_truncated(self, achieved_goal: Goals, desired_goal: Goals, info: Infos = None) -> Any:
-        """Return False: the time limit is not the task's."""
-        return np.zeros(np.shape(achieved_goal)[:-1], bool)[()]
-
-
-def _failed(info: Mapping[str, Any]) -> bool:
-    """Return whether an info is that of a failure."""
-    return bool(info.get("end_reason", EndReason.RUNNING) > EndReason.TIME_LIMIT)
-
-
-def _torch_stream(tensor: Any) -> contextlib.AbstractContextManager[object]:
-    """Return the context in which kernels wait for what torch does on the device of a tensor."""
-    if not tensor.is_cuda:
-        return contextlib.nullcontext()
-    import torch
-
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device)))
+    def launch_reward(self, achieved: wp.array, desired: wp.array, reward: wp.array) -> None:
+        """Compute the rewards of pairs of shapes."""
+        inputs = [achieved, desired, reward_rules(self.config)]
+        wp.launch(kernels.compute_reward, reward.shape[0], inputs=inputs, outputs=[reward], device=reward.device)

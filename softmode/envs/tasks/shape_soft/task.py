@@ -17,7 +17,7 @@ from softmode.envs.soft_vector_env import SoftVectorEnv
 from softmode.envs.task import Task
 from softmode.envs.tasks.shape_soft import kernels
 from softmode.envs.tasks.shape_soft.config import ShapeSoftConfig
-from softmode.envs.tasks.shape_soft.goals import POINTS, GoalMethods, reward_rules
+from softmode.envs.tasks.shape_soft.goals import POINTS, ShapeGoals, reward_rules
 from softmode.envs.tasks.shape_soft.targets import ShapeTargets, record_press
 from softmode.objects.loader import load
 from softmode.scenes.table_scene import TableScene
@@ -108,7 +108,7 @@ class ShapeSoft(Task):
         )
 
 
-class ShapeSoftEnv(GoalMethods, SoftEnv):
+class ShapeSoftEnv(ShapeGoals, SoftEnv):
     """One arm, one soft post, one target shape; see :class:`ShapeSoft` and :class:`SoftEnv`."""
 
     config: ShapeSoftConfig
@@ -116,7 +116,7 @@ class ShapeSoftEnv(GoalMethods, SoftEnv):
     task_class = ShapeSoft
 
 
-class ShapeSoftVectorEnv(GoalMethods, SoftVectorEnv):
+class ShapeSoftVectorEnv(ShapeGoals, SoftVectorEnv):
     """Many worlds of it; see :class:`ShapeSoft` and :class:`SoftVectorEnv`."""
 
     config: ShapeSoftConfig

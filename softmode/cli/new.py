@@ -1,0 +1,111 @@
+"""The command ``softmode new``: a package with a task of one's own, from templates."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import keyword
+import re
+import shutil
+import string
+import tempfile
+from pathlib import Path
+from typing import Literal
+
+from softmode import __version__
+from softmode.errors import ConfigError
+from softmode.files import storage_errors
+
+TEMPLATES = Path(__file__).parent / "templates" / "task"
+"""Files of a package, ``package`` in their names for its name."""
+_LONGEST = 60
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class New:
+    """Write a package with a task of your own.
+
+    Example: softmode new task slide_disc
+    """
+
+    what: Literal["task"]
+    """What to write."""
+    name: str
+    """Name of the task, for example slide_disc."""
+    out: Path = Path()
+    """Folder in which the package's folder is made."""
+
+    def run(self) -> int:
+        """Write the package and say what to do next."""
+        folder = write_task(self.name, self.out)
+        package, name = package_name(self.name), env_id(self.name)
+        print(f"{folder} is a package with the task {name}. Next:\n")
+        print(f"  cd {folder}\n  pip install -e '.[dev]'\n  python -m pytest")
+        print(f"  softmode play {package}:{name} --video out/{package}.mp4")
+        return 0
+
+
+def package_name(name: str) -> str:
+    """Return the name of the package of a task: slide_disc for SlideDisc, slide-disc and slide_disc.
+
+    Raises:
+        ConfigError: If the name is no such name, or the package would hide another one.
+    """
+    package = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).replace("-", "_").lower()
+    if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", package) or len(package) > _LONGEST:
+        raise ConfigError(f"name is {name!r}", hint="use letters, digits and single underscores, like slide_disc")
+    if keyword.iskeyword(package) or importlib.util.find_spec(package) is not None:
+        raise ConfigError(f"name is {name!r}: Python has {package} already", hint="choose another, like slide_disc")
+    return package
+
+
+def class_name(package: str) -> str:
+    """Return the name of a package's task: SlideDisc."""
+    return "".join(part.capitalize() for part in package.split("_"))
+
+
+def env_id(name: str) -> str:
+    """Return the id of a task's environment: slide_disc/SlideDisc-v0."""
+    package = package_name(name)
+    return f"{package}/{class_name(package)}-v0"
+
+
+def write_task(name: str, parent: Path) -> Path:
+    """Write the package of a task, whole or not at all.
+
+    Args:
+        name: Name of the task.
+        parent: Folder in which its folder is made.
+
+    Returns:
+        The folder of the package, which has its name.
+
+    Raises:
+        ConfigError: If the name cannot be used, or there is such a folder.
+        StorageError: If it cannot be written.
+    """
+    package = package_name(name)
+    folder = parent / package
+    if folder.exists():
+        raise ConfigError(f"{folder} exists", hint="choose another name, or another folder with --out")
+    words = {
+        "package": package,
+        "project": package.replace("_", "-"),
+        "Task": class_name(package),
+        "id": env_id(name),
+        "version": __version__,
+    }
+    with storage_errors(folder):
+        parent.mkdir(parents=True, exist_ok=True)
+        pending = Path(tempfile.mkdtemp(prefix=f".{package}.", dir=parent))
+        try:
+            for template in sorted(TEMPLATES.rglob("*.txt")):
+                place = template.relative_to(TEMPLATES).with_suffix("").as_posix().replace("package", package)
+                path = pending / place
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(string.Template(template.read_text("utf-8")).substitute(words), "utf-8")
+            pending.chmod(0o755)
+            pending.rename(folder)
+        finally:
+            shutil.rmtree(pending, ignore_errors=True)
+    return folder

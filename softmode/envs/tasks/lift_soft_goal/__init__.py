@@ -1,0 +1,1 @@
+"""LiftSoftGoal: LiftSoft, goal-conditioned."""

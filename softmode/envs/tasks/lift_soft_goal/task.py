@@ -1,0 +1,51 @@
+"""LiftSoftGoal: lift a soft object to a place in the air, goal-conditioned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from softmode.envs.position_goals import GoalReward, PositionGoalMethods, PositionGoals, check_goal_reward
+from softmode.envs.soft_env import SoftEnv
+from softmode.envs.soft_vector_env import SoftVectorEnv
+from softmode.envs.tasks.lift_soft.task import LiftSoft, LiftSoftConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiftSoftGoalConfig(LiftSoftConfig):
+    """Goal and reward of LiftSoftGoal."""
+
+    reward: GoalReward = "sparse"
+    """"sparse": 0 at the goal and -1 elsewhere; "distance": minus the distance [m]."""
+
+    def __post_init__(self) -> None:
+        """Check the reward."""
+        super().__post_init__()
+        check_goal_reward(self.reward)
+
+
+class LiftSoftGoal(PositionGoals, LiftSoft):
+    """lift a soft object to a place in the air, goal-conditioned.
+
+    See `PositionGoals` for observation, reward and success; scene, draws and scripted policy are those of `LiftSoft`.
+    """
+
+    config: LiftSoftGoalConfig
+    config_class = LiftSoftGoalConfig
+    goal_size = 3
+
+
+class LiftSoftGoalEnv(PositionGoalMethods, SoftEnv):
+    """The environment of one world; see :class:`LiftSoftGoal` and :class:`SoftEnv`."""
+
+    config: LiftSoftGoalConfig
+    task: LiftSoftGoal
+    task_class = LiftSoftGoal
+    goal_size = 3
+
+
+class LiftSoftGoalVectorEnv(PositionGoalMethods, SoftVectorEnv):
+    """Many worlds of it; see :class:`LiftSoftGoal` and :class:`SoftVectorEnv`."""
+
+    config: LiftSoftGoalConfig
+    task_class = LiftSoftGoal
+    goal_size = 3

@@ -1,0 +1,1 @@
+"""PushSoftGoal: PushSoft, goal-conditioned."""

@@ -1,0 +1,56 @@
+"""PushSoftGoal: push a soft object to a place on the table, goal-conditioned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from softmode.envs.position_goals import GoalReward, PositionGoalMethods, PositionGoals, check_goal_reward
+from softmode.envs.soft_env import SoftEnv
+from softmode.envs.soft_vector_env import SoftVectorEnv
+from softmode.envs.tasks.push_soft.task import PushSoft, PushSoftConfig
+from softmode.errors import ConfigError
+
+
+@dataclass(frozen=True, kw_only=True)
+class PushSoftGoalConfig(PushSoftConfig):
+    """Goal and reward of PushSoftGoal."""
+
+    reward: GoalReward = "sparse"
+    """"sparse": 0 at the goal and -1 elsewhere; "distance": minus the distance [m]."""
+
+    def __post_init__(self) -> None:
+        """Check the reward."""
+        super().__post_init__()
+        check_goal_reward(self.reward)
+        if self.yaw_tolerance is not None:
+            raise ConfigError(
+                f"yaw_tolerance is {self.yaw_tolerance}, the goals of PushSoftGoal are places", hint="leave it None"
+            )
+
+
+class PushSoftGoal(PositionGoals, PushSoft):
+    """push a soft object to a place on the table, goal-conditioned.
+
+    See `PositionGoals` for observation, reward and success; scene, draws and scripted policy are those of `PushSoft`.
+    """
+
+    config: PushSoftGoalConfig
+    config_class = PushSoftGoalConfig
+    goal_size = 2
+
+
+class PushSoftGoalEnv(PositionGoalMethods, SoftEnv):
+    """The environment of one world; see :class:`PushSoftGoal` and :class:`SoftEnv`."""
+
+    config: PushSoftGoalConfig
+    task: PushSoftGoal
+    task_class = PushSoftGoal
+    goal_size = 2
+
+
+class PushSoftGoalVectorEnv(PositionGoalMethods, SoftVectorEnv):
+    """Many worlds of it; see :class:`PushSoftGoal` and :class:`SoftVectorEnv`."""
+
+    config: PushSoftGoalConfig
+    task_class = PushSoftGoal
+    goal_size = 2
