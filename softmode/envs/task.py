@@ -21,7 +21,7 @@ from softmode.deformables.solver.parameters import set_parameters
 from softmode.envs import task_kernels as kernels
 from softmode.envs.cameras import FollowCamera, overview, square_camera, wrist_camera
 from softmode.envs.end_reason import EndReason
-from softmode.envs.observation import PROPRIOCEPTION, ObservationLayout, Segment, object_part
+from softmode.envs.observation import ObservationLayout, Segment, object_part, proprioception
 from softmode.envs.parameters import Parameter, ParameterTable
 from softmode.envs.reward_kernels import StepResult, WorldState
 from softmode.envs.task_config import ObservationType, TaskConfig
@@ -84,6 +84,8 @@ class Task:
     """Surface points of the object in the observation."""
     grasps: ClassVar[bool] = False
     """Whether the gripper is to take object 0."""
+    any_robot: ClassVar[bool] = False
+    """Whether the task has been tried with robots from files, which `robot` names."""
     kernels: ClassVar[Any] = None
     """Device side that `observe` and `evaluate` launch, a module with kernels of these names and a struct `Plan`: first
     columns of parameters (`drawn`) and segments (`columns`), and what has the name of an attribute of the task, its
@@ -128,7 +130,7 @@ class Task:
         soft = self.scene.soft
         self.points = sample_farthest(soft.body.surface_points, self.point_count, first=0)
         """Surface samples of object 0 in the observation."""
-        proprioception_and_goal = (*PROPRIOCEPTION, *self.goal_segments())
+        proprioception_and_goal = (*proprioception(self.scene.controller.joint_count), *self.goal_segments())
         self.layout = ObservationLayout(
             (*proprioception_and_goal, *object_part(self.point_count), *self.object_segments())
         )
@@ -305,8 +307,10 @@ class Task:
 
     def observation_camera(self) -> PinholeCamera:
         """Return the camera of pixel observations, named "pixels"."""
-        camera = self.front_camera if self.config.camera == "front" else wrist_camera
-        return camera("pixels", self.config.image_size)
+        edge = self.config.image_size
+        if self.config.camera == "front":
+            return self.front_camera("pixels", edge)
+        return wrist_camera("pixels", edge, self.config.scene.arm)
 
     def render_cameras(self) -> list[PinholeCamera]:
         """Return the cameras whose pictures stand side by side in a rendered frame."""
@@ -524,7 +528,7 @@ class Task:
     @property
     def action_space(self) -> gym.spaces.Box:
         """Actions of one world, in [-1, 1]."""
-        return gym.spaces.Box(-1.0, 1.0, (self.config.scene.control.action_size,), np.float32)
+        return gym.spaces.Box(-1.0, 1.0, (self.scene.controller.action_size,), np.float32)
 
     def state_keys(self) -> dict[str, slice]:
         """Return the columns of each key of a state observation that is a dict; empty for one that is a vector."""

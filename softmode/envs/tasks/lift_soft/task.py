@@ -82,6 +82,7 @@ class LiftSoft(Task):
     config_class = LiftSoftConfig
     kernels = kernels
     grasps = True
+    any_robot = True
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
 
