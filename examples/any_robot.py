@@ -5,7 +5,7 @@ five to eight joints with two driven fingers will do: a name, an MJCF or a URDF 
 the built-in arm; the table shows for soft and stiff plushes whether they were lifted, how hard the fingers pressed, and
 how far the plush moved in the hand.
 
-Run: ``python examples/any_robot.py [--robot panda] [--short]``
+Run: ``python examples/any_robot.py [--robot panda] [--episodes 20] [--short]``
 """
 
 import argparse
@@ -50,7 +50,8 @@ def main() -> None:
     """Print one row per episode."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--robot", default="aloha_arm", help="a name, or the path of an MJCF or URDF file")
-    parser.add_argument("--short", action="store_true", help="2 episodes instead of 8")
+    parser.add_argument("--episodes", type=int, default=8, help="how many, from soft to stiff")
+    parser.add_argument("--short", action="store_true", help="2 episodes")
     given = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
     env = LiftSoftEnv(robot=given.robot)
@@ -59,9 +60,10 @@ def main() -> None:
     print(f"{given.robot} stands at {np.round(arm.base, 3)}, its fingers open by {1e3 * arm.gripper.stroke:.0f} mm")
     print("   E [Pa]  lifted  steps  force [N]  moved in the hand [mm]")
     rows = []
-    for seed, modulus in enumerate(np.geomspace(2.0e4, 2.0e6, 2 if given.short else 8)):
+    for seed, modulus in enumerate(np.geomspace(2.0e4, 2.0e6, 2 if given.short else given.episodes)):
         rows.append(lift(env, seed, float(modulus)))
         print("{E:9.0f}{success!s:>8}{steps:7}{force:11.1f}{slip:14.1f}".format(**rows[-1]))
+    print(f"lifted {sum(row['success'] for row in rows)} of {len(rows)}")
     test_final(rows)
 
 

@@ -40,6 +40,7 @@ def with_robot(config: Config, robot: str | Path | RobotDescription | TableRobot
     if isinstance(robot, RobotDescription):
         arm = scene.arm if isinstance(scene.arm, ArmDescription) else ArmDescription()
         (dx, dy), goal = config.position_range, getattr(config, "goal_range", (0.0, 0.0, 0.0))
+        goal = (*(max(side, getattr(config, "goal_distance", (0.0, 0.0))[1]) for side in goal[:2]), *goal[2:])
         rise = getattr(config, "goal_height", arm.home_position[2] - 0.08) + goal[-1]
         robot = place_robot(
             robot,
