@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from softmode.deformables.build.report import Finding
     from softmode.objects.soft_object import SoftObject
     from softmode.robots.arm import ArmDescription
+    from softmode.robots.table_robot import TableRobot
 
 
 def short_name(name: str) -> Any:
@@ -113,7 +114,7 @@ def warn_of_object(env: Any) -> None:
     warn_of(thing, scene.arm if base.task_class.grasps else None)
 
 
-def warn_of(thing: SoftObject, arm: ArmDescription | None = None) -> None:
+def warn_of(thing: SoftObject, arm: ArmDescription | TableRobot | None = None) -> None:
     """Print, on stderr, what the user should know about an object that an arm, if any, is to take."""
     from softmode.robots.jaws import ParallelJaw
 

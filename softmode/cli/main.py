@@ -11,13 +11,14 @@ from softmode import __version__
 from softmode.cli.bench import Bench
 from softmode.cli.body import BodyBuild, BodyCheck, BodyCut, BodyShow
 from softmode.cli.check import Check
-from softmode.cli.listing import ListEnvs, Robots
+from softmode.cli.listing import ListEnvs
 from softmode.cli.morph import Morph
 from softmode.cli.new import New
 from softmode.cli.objects import ObjectsExport, ObjectsList, ObjectsShow
 from softmode.cli.play import Play
 from softmode.cli.radiance import RadianceBake, RadianceInfo
 from softmode.cli.record import Record
+from softmode.cli.robots import Robots
 from softmode.cli.splat import SplatConvert, SplatFromMesh, SplatInfo, SplatShow
 from softmode.cli.train import Evaluate, Export, Train
 from softmode.cli.view import View

@@ -13,9 +13,12 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softmode.checks import require_choice
+from softmode.envs.robots import with_robot
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
+from softmode.robots.description import RobotDescription
+from softmode.robots.table_robot import TableRobot
 
 CONTROL_MODES = ("pose_delta", "joint_delta")
 RENDER_MODES = ("rgb_array",)
@@ -37,15 +40,20 @@ class Shortcuts:
     """Longest edge of the object [m]."""
     preset: str | None = None
     """Named variant of the task, instead of a configuration."""
+    robot: str | Path | RobotDescription | TableRobot | None = None
+    """Robot instead of the built-in arm: a name, a file, or a loaded one."""
 
 
-def checked_config(wanted: type[TaskConfig], config: TaskConfig | None, given: Shortcuts) -> TaskConfig:
+def checked_config(
+    wanted: type[TaskConfig], config: TaskConfig | None, given: Shortcuts, any_robot: bool = True
+) -> TaskConfig:
     """Return the configuration with the constructor's shortcuts applied.
 
     Args:
         wanted: Class of the configuration.
         config: The configuration, or None for the preset or the default.
         given: The shortcuts.
+        any_robot: Whether the task plays with robots from files.
 
     Raises:
         ConfigError: If an option is unknown, or the configuration of another task.
@@ -69,7 +77,15 @@ def checked_config(wanted: type[TaskConfig], config: TaskConfig | None, given: S
         raise ConfigError(f"{what} is given beside a set of objects", hint=hint)
     if given.splat is not None or given.size is not None:
         scene = replace(scene, object=_with_splat(scene.object, given))
-    return replace(config, scene=scene)
+    config = replace(config, scene=scene)
+    if given.robot is None:
+        return config
+    if not any_robot:
+        raise ConfigError(
+            f"robot given for a task of {wanted.__name__}, which plays with the built-in arm only",
+            hint="LiftSoft takes any robot; docs/howto/own_robot.md has a scene of your own",
+        )
+    return with_robot(config, given.robot)
 
 
 def _with_splat(thing: ObjectConfig, given: Shortcuts) -> ObjectConfig:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from softmode.robots.arm import ArmDescription
+from softmode.robots.table_robot import TableRobot
 from softmode.splats.pinhole import PinholeCamera
 
 Point = tuple[float, float, float]
@@ -28,8 +31,24 @@ def overview(name: str, edge: int) -> PinholeCamera:
     return square_camera(name, edge, (1.42, -1.20, 0.86), (0.34, 0.03, 0.35), 0.60)
 
 
-def wrist_camera(name: str, edge: int) -> PinholeCamera:
+def wrist_camera(name: str, edge: int, arm: ArmDescription | TableRobot | None = None) -> PinholeCamera:
     """Return the camera on the hand that looks between the fingers, with pictures of `edge` x `edge` pixels."""
+    if isinstance(arm, TableRobot):
+        # As far from the tool as that of the built-in arm.
+        mount = Rotation.from_quat(arm.robot.tool[3:])
+        place = mount.apply(arm.jaw.frame[:3]) + arm.robot.tool[:3]
+        turn = mount * Rotation.from_quat(arm.jaw.frame[3:])
+        eye, target, up = (tuple(v.tolist()) for v in turn.apply([[0.12, 0, -0.12], [0, 0, 0], [-1, 0, 0]]))
+        return PinholeCamera.look_at(
+            name,
+            position=tuple((np.array(eye) + place).tolist()),
+            target=tuple((np.array(target) + place).tolist()),
+            up=up,
+            width=edge,
+            height=edge,
+            fov_y=1.1,
+            body=arm.robot.end_effector,
+        )
     return PinholeCamera.look_at(
         name,
         position=(0.12, 0.0, 0.02),

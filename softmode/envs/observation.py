@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium as gym
@@ -42,7 +42,16 @@ PROPRIOCEPTION = (
     Segment("command_turn", 1, -1.0, 1.0),
     Segment("command_opening", 1, -0.5, 0.5),
 )
-"""What every observation begins with."""
+"""What every observation begins with; robots from files have `joint_angles` of their own number."""
+
+
+def proprioception(joint_count: int) -> tuple[Segment, ...]:
+    """Return the segments of the robot.
+
+    Args:
+        joint_count: Joints between base and tool.
+    """
+    return tuple(replace(s, size=joint_count) if s.name == "joint_angles" else s for s in PROPRIOCEPTION)
 
 
 def object_part(point_count: int) -> tuple[Segment, ...]:

@@ -37,6 +37,8 @@ from softmode.envs.results import info_arrays, observation_arrays, take
 from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.errors import ConfigError
+from softmode.robots.description import RobotDescription
+from softmode.robots.table_robot import TableRobot
 
 
 class SoftEnv(gym.Env, gym.utils.EzPickle):
@@ -77,6 +79,8 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         splat: Splat file of the object; None for the built-in one.
         size: Longest edge of the object [m].
         preset: Named variant of the task, instead of `config`.
+        robot: Robot instead of the built-in arm: a name of `softmode.robots.available`, a file, a `RobotDescription`,
+            or a `TableRobot` that `softmode.robots.place_robot` put at the table.
         config: Everything else.
         device: Warp device.
         progress: Reports the build of the object: a callable (stage, fraction), or True or False for a bar or none.
@@ -99,18 +103,25 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         splat: str | Path | None = None,
         size: float | None = None,
         preset: str | None = None,
+        robot: str | Path | RobotDescription | TableRobot | None = None,
         config: TaskConfig | None = None,
         device: wp.DeviceLike = None,
         progress: bool | Progress | None = None,
     ) -> None:
         """Build the scene and the spaces."""
         given = Shortcuts(
-            obs_type=obs_type, render_mode=render_mode, control_mode=control_mode, splat=splat, size=size, preset=preset
+            obs_type=obs_type,
+            render_mode=render_mode,
+            control_mode=control_mode,
+            splat=splat,
+            size=size,
+            preset=preset,
+            robot=robot,
         )
         # What a copy is made from when the environment is pickled; a callback cannot travel.
         place = None if device is None else str(device)
         gym.utils.EzPickle.__init__(self, **vars(given), config=config, device=place)
-        self.config = checked_config(self.task_class.config_class, config, given)
+        self.config = checked_config(self.task_class.config_class, config, given, self.task_class.any_robot)
         self.obs_type, self.render_mode = obs_type, render_mode
         self.metadata = {**self.metadata, "render_fps": round(self.config.scene.control_hz)}
         self.task = self.task_class(

@@ -37,6 +37,8 @@ from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.envs.tensors import Tensor, host_array, map_tree
 from softmode.envs.worlds import LocalWorlds, RemoteWorlds
 from softmode.errors import ConfigError, MissingExtraError
+from softmode.robots.description import RobotDescription
+from softmode.robots.table_robot import TableRobot
 
 Output = Literal["numpy", "torch"]
 
@@ -59,6 +61,8 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         splat: Splat file of the object; None for the built-in one.
         size: Longest edge of the object [m].
         preset: Named variant of the task, instead of `config`.
+        robot: Robot instead of the built-in arm: a name of `softmode.robots.available`, a file, a `RobotDescription`,
+            or a `TableRobot` that `softmode.robots.place_robot` put at the table.
         config: Everything else.
         max_episode_steps: Control steps after which an episode is truncated; None for never.
         autoreset_mode: When the next episode of a world begins.
@@ -87,6 +91,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
         splat: str | Path | None = None,
         size: float | None = None,
         preset: str | None = None,
+        robot: str | Path | RobotDescription | TableRobot | None = None,
         config: TaskConfig | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
@@ -104,6 +109,7 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             "splat": splat,
             "size": size,
             "preset": preset,
+            "robot": robot,
             "config": config,
             "max_episode_steps": max_episode_steps,
             "autoreset_mode": autoreset_mode,
@@ -122,9 +128,15 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             known = ", ".join(f"AutoresetMode.{choice.name}" for choice in AutoresetMode)
             raise ConfigError(f"autoreset_mode is {autoreset_mode!r}", hint=f"use one of {known}") from error
         given = Shortcuts(
-            obs_type=obs_type, render_mode=render_mode, control_mode=control_mode, splat=splat, size=size, preset=preset
+            obs_type=obs_type,
+            render_mode=render_mode,
+            control_mode=control_mode,
+            splat=splat,
+            size=size,
+            preset=preset,
+            robot=robot,
         )
-        config = checked_config(self.task_class.config_class, config, given)
+        config = checked_config(self.task_class.config_class, config, given, self.task_class.any_robot)
         if output == "torch":
             try:
                 import torch  # noqa: F401

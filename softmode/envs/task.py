@@ -22,7 +22,7 @@ from softmode.deformables.solver.parameters import set_parameters
 from softmode.envs import task_kernels as kernels
 from softmode.envs.cameras import FollowCamera, overview, square_camera, wrist_camera
 from softmode.envs.end_reason import EndReason
-from softmode.envs.observation import PROPRIOCEPTION, ObservationLayout, Segment, object_part, one_hot_part
+from softmode.envs.observation import ObservationLayout, Segment, object_part, one_hot_part, proprioception
 from softmode.envs.parameters import Parameter, ParameterTable
 from softmode.envs.reward_kernels import StepResult, WorldState
 from softmode.envs.task_config import ObservationType, TaskConfig
@@ -91,6 +91,8 @@ class Task:
     takes_sets: ClassVar[bool] = False
     """Whether object 0 may be another one in every world (`TaskConfig.objects`): what the task reads of it comes from
     `WorldState`, or is one per world, never of `scene.soft`."""
+    any_robot: ClassVar[bool] = False
+    """Whether the task has been tried with robots from files, which `robot` names."""
     kernels: ClassVar[Any] = None
     """Device side that `observe` and `evaluate` launch, a module with kernels of these names and a struct `Plan`: first
     columns of parameters (`drawn`) and segments (`columns`), and what has the name of an attribute of the task, its
@@ -152,7 +154,7 @@ class Task:
         """Height of the centre of every unscaled object 0 over the table at rest [m], shape (world_count,)."""
         given = self.object_set
         code = one_hot_part(given.count) if given is not None and config.objects_one_hot else ()
-        proprioception_and_goal = (*PROPRIOCEPTION, *self.goal_segments())
+        proprioception_and_goal = (*proprioception(self.scene.controller.joint_count), *self.goal_segments())
         self.layout = ObservationLayout(
             (*proprioception_and_goal, *object_part(self.point_count), *self.object_segments(), *code)
         )
@@ -365,8 +367,10 @@ class Task:
 
     def observation_camera(self) -> PinholeCamera:
         """Return the camera of pixel observations, named "pixels"."""
-        camera = self.front_camera if self.config.camera == "front" else wrist_camera
-        return camera("pixels", self.config.image_size)
+        edge = self.config.image_size
+        if self.config.camera == "front":
+            return self.front_camera("pixels", edge)
+        return wrist_camera("pixels", edge, self.config.scene.arm)
 
     def render_cameras(self) -> list[PinholeCamera]:
         """Return the cameras whose pictures stand side by side in a rendered frame."""
@@ -589,7 +593,7 @@ class Task:
     @property
     def action_space(self) -> gym.spaces.Box:
         """Actions of one world, in [-1, 1]."""
-        return gym.spaces.Box(-1.0, 1.0, (self.config.scene.control.action_size,), np.float32)
+        return gym.spaces.Box(-1.0, 1.0, (self.scene.controller.action_size,), np.float32)
 
     def state_keys(self) -> dict[str, slice]:
         """Return the columns of each key of a state observation that is a dict; empty for one that is a vector."""

@@ -6,19 +6,16 @@ import warp as wp
 
 from softmode.envs.end_reason import EndReason
 from softmode.envs.reward_kernels import StepResult, WorldState, surface_point, tool_position, write
-from softmode.robots.arm import ARM_JOINT_COUNT
 
 wp.set_module_options({"enable_backward": False})
-
-_LEFT = wp.constant(ARM_JOINT_COUNT)
-_RIGHT = wp.constant(ARM_JOINT_COUNT + 1)
 
 
 @wp.struct
 class ArmState:
-    """Joints and command of the arm in every world."""
+    """Joints and command of the arm in every world; two entries behind the joints' command the opening."""
 
     coord_start: wp.array[int]
+    joint_columns: wp.array[int]
     joint_q: wp.array[float]
     opening: wp.array[float]
     target_position: wp.array[wp.vec3]
@@ -162,12 +159,13 @@ def observe(
     for f in range(2):
         observation[w, column.finger_force + f] = wp.length(state.finger_force[w, f])
     start = arm.coord_start[w]
-    for j in range(ARM_JOINT_COUNT):
-        observation[w, column.joint_angles + j] = arm.joint_q[start + j]
+    count = arm.joint_columns.shape[0]
+    for j in range(count):
+        observation[w, column.joint_angles + j] = arm.joint_q[start + arm.joint_columns[j]]
     write(observation, w, column.command_lead, arm.target_position[w] - p)
     # sine of the angle from the measured heading to the commanded one
     observation[w, column.command_turn] = c * wp.sin(arm.target_yaw[w]) - s * wp.cos(arm.target_yaw[w])
-    observation[w, column.command_opening] = arm.commanded_q[w, _LEFT] + arm.commanded_q[w, _RIGHT]
+    observation[w, column.command_opening] = arm.commanded_q[w, count] + arm.commanded_q[w, count + 1]
     x = state.object_position[w, 0]
     write(observation, w, column.object_position, x)
     write(observation, w, column.object_velocity, state.object_velocity[w, 0])

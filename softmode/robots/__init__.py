@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from softmode.robots.grasp_planner import Grasp, plan_grasps
     from softmode.robots.jaws import ParallelJaw
     from softmode.robots.loading import load
+    from softmode.robots.robot_control import RobotController
     from softmode.robots.soft_fingertips import SoftFingertips, add_soft_fingertips
+    from softmode.robots.table_robot import TableRobot, place_robot
 
 __all__ = [
     "ArmControlOptions",
@@ -29,15 +31,18 @@ __all__ = [
     "GripperDescription",
     "JointDrive",
     "ParallelJaw",
+    "RobotController",
     "RobotDescription",
     "RobotGripper",
     "RobotIndices",
     "SoftFingertips",
+    "TableRobot",
     "add_arm",
     "add_soft_fingertips",
     "available",
     "fetch",
     "load",
+    "place_robot",
     "plan_grasps",
 ]
 

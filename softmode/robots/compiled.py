@@ -23,14 +23,7 @@ from softmode.deformables.coupling.rigid_solver import mujoco_warnings
 from softmode.errors import AssetError, ConfigError
 from softmode.robots.assets import RobotAsset
 from softmode.robots.description import JointDrive, RobotGripper, ToolPose
-
-_TOOL_NAMES = (
-    "pinch pinch_site grasp_site gripperframe link_tcp tcp tool tool0 end_effector ee gripper attachment_site hand "
-    "Fixed_Jaw"
-).split()
-"""Names of sites, then of bodies, that are taken for the tool when none is given; the first one present."""
-_DRIVE_FREQUENCY = 8.0
-"""Natural frequency of the drives of a file that has no actuators [Hz]."""
+from softmode.robots.hand import find_end_effector, find_gripper
 
 
 @dataclass
@@ -40,6 +33,8 @@ class CompiledRobot:
     model: Any
     asset: RobotAsset
     at_home: dict[str, float]
+    bandwidth: float = 8.0
+    """Natural frequency of the drives of joints without a servo [Hz]."""
 
     def __post_init__(self) -> None:
         """Check that every link has at most one hinge or slide."""
@@ -66,6 +61,12 @@ class CompiledRobot:
         self.lower = np.where(limited, model.jnt_range[:, 0] - reference, -math.inf)
         self.upper = np.where(limited, model.jnt_range[:, 1] - reference, math.inf)
         self.dropped: set[str] = set()
+        self.notes: list[str] = []
+        """What was chosen where the file does not say."""
+        self.ties = self._ties()
+        """Per joint its leader, and ratio and offset of q_joint = offset + ratio q_leader."""
+        self.passive: list[int] = []
+        """Joints without a drive, known after `drives`."""
 
     def link(self, body: int) -> str:
         """Return the name of a link."""
@@ -98,19 +99,22 @@ class CompiledRobot:
             self.mujoco.mj_forward(self.model, data)
         return data
 
-    def tool(self, name: str | None, offset: np.ndarray) -> tuple[int, ToolPose]:
+    def tool(
+        self, name: str | None, offset: np.ndarray, drives: Sequence[JointDrive | None] = ()
+    ) -> tuple[int, ToolPose]:
         """Return the link that carries the tool, and the tool's pose in it."""
         model = self.model
         sites = {model.site(s).name: s for s in range(model.nsite)}
         bodies = {self.link(b): b for b in range(1, model.nbody)}
         if name is None:
-            name = next((n for group in (sites, bodies) for n in _TOOL_NAMES if n in group), None)
-        if name is None or (name not in sites and name not in bodies):
+            name, how = find_end_effector(self, drives)
+            self.notes.append(f"end effector {name!r}: {how}")
+        if name not in sites and name not in bodies:
             leaves = [n for n, b in bodies.items() if b not in model.body_parentid]
-            what = "names no end effector" if name is None else f"has no site or body {name!r} for end_effector"
             known = ", ".join(repr(n) for n in [*filter(None, sites), *leaves][:12])
             raise ConfigError(
-                f"robot {self.asset.name!r} {what}", hint=f"pass end_effector= a site or body, like {known}"
+                f"robot {self.asset.name!r} has no site or body {name!r} for end_effector",
+                hint=f"pass end_effector= a site or body, like {known}",
             )
         if name in sites:
             s = sites[name]
@@ -127,7 +131,7 @@ class CompiledRobot:
     def drives(self) -> tuple[JointDrive | None, ...]:
         """Turn actuators into joint drives."""
         model = self.model
-        owner, ratio, shift = self._ties()
+        owner, ratio, shift = self.ties
         count = model.njnt
         drives: list[JointDrive | None] = [None] * count
         torque_limit: dict[int, float] = {} if model.nu else dict.fromkeys(range(count), math.inf)
@@ -168,6 +172,7 @@ class CompiledRobot:
         for j, drive in enumerate(drives):
             if drive is None and owner[j] in torque_limit:
                 drives[j] = self._default_drive(j, min(torque_limit[owner[j]], self._joint_limit(j)))
+        self.passive = [j for j in range(count) if drives[j] is None]
         # A tie between driven joints is what their drives replace; one between passive joints stays.
         for e in range(model.neq):
             if self._tie(e) is not None and drives[int(model.eq_obj1id[e])] is not None:
@@ -187,11 +192,18 @@ class CompiledRobot:
         """Return per joint its leader, and ratio and offset of q_joint = offset + ratio q_leader."""
         count = self.model.njnt
         owner, ratio, shift = list(range(count)), [1.0] * count, [0.0] * count
+        ties: list[tuple[int, int, float, float]] = []
         for e in range(self.model.neq):
             tie = self._tie(e)
-            if tie is None or owner[tie[0]] == owner[tie[1]]:
+            if tie is not None:
+                ties.append(tie)
+        # A servo on a tendon over joints that nothing ties moves them alike, each by the sign of its coefficient.
+        for a in range(self.model.nu):
+            first, *others = [(j, c) for j, c in self._transmission(a).items() if c] or [(0, 1.0)]
+            ties += [(j, first[0], 0.0, math.copysign(1.0, c * first[1])) for j, c in others]
+        for joint, leader, offset, slope in ties:
+            if owner[joint] == owner[leader]:
                 continue
-            joint, leader, offset, slope = tie
             # q_joint = offset + slope q_leader, in terms of the leader's own leader; then all that followed the joint.
             top, slope, offset = owner[leader], slope * ratio[leader], offset + slope * shift[leader]
             old, old_ratio, old_shift = owner[joint], ratio[joint], shift[joint]
@@ -225,7 +237,7 @@ class CompiledRobot:
         mass = np.zeros((model.nv, model.nv))
         data = self.data(self.home(None))
         self.mujoco.mj_fullM(model, data, mass)
-        omega = 2.0 * math.pi * _DRIVE_FREQUENCY
+        omega = 2.0 * math.pi * self.bandwidth
         return JointDrive(
             stiffness=float(mass[j, j] * omega**2),
             damping=float(max(2.0 * mass[j, j] * omega - model.dof_damping[j], 0.0)),
@@ -242,19 +254,14 @@ class CompiledRobot:
         drives: tuple[JointDrive | None, ...],
         start: np.ndarray,
         link: int,
-        tool: ToolPose,
-        hand: list[int],
-    ) -> RobotGripper | None:
-        """Return the gripper as given, or as found behind the end effector."""
+    ) -> tuple[RobotGripper | None, int]:
+        """Return the gripper as given, or as found behind the end effector, and the link from which the hand begins."""
+        palm = link
         if given is None:
-            fingers = [j for j, b in enumerate(self.model.jnt_bodyid) if b in hand and b != link]
-            given = {}
-            for j in fingers:
-                drive = drives[j]
-                if drive is None or not (math.isfinite(drive.lower) and math.isfinite(drive.upper)):
-                    continue
-                ends = sorted((drive.lower, drive.upper), key=lambda q: self._distance(j, q, start, link, tool))
-                given[self.joint_names[j]] = (ends[0], ends[1])
+            given, palm, notes = find_gripper(self, drives, start, link)
+            self.notes += notes
+            if given:
+                self.notes.append(f"gripper {', '.join(map(repr, given))}: found by closing it")
         unknown = [name for name in given if name not in self.joint_names]
         if unknown:
             raise ConfigError(
@@ -262,14 +269,6 @@ class CompiledRobot:
                 hint=f"its joints are {', '.join(self.joint_names)}",
             )
         if not given:
-            return None
+            return None, link
         closed, wide = ([float(pair[k]) for pair in given.values()] for k in (0, 1))
-        return RobotGripper(joints=tuple(given), closed=tuple(closed), open=tuple(wide))
-
-    def _distance(self, j: int, q: float, start: np.ndarray, link: int, tool: ToolPose) -> float:
-        """Return the distance of a finger's centre of mass from the tool point with its joint at a coordinate [m]."""
-        joint_q = start.copy()
-        joint_q[j] = q
-        data = self.data(joint_q)
-        point = data.xpos[link] + data.xmat[link].reshape(3, 3) @ np.array(tool[:3])
-        return float(np.linalg.norm(data.xipos[self.model.jnt_bodyid[j]] - point))
+        return RobotGripper(joints=tuple(given), closed=tuple(closed), open=tuple(wide)), palm

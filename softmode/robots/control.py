@@ -107,10 +107,11 @@ class ArmController:
         if not isinstance(arm, ArmIndices):
             raise ConfigError(
                 f"arm is a {type(arm).__name__}; the controller knows the kinematics of the built-in arm only",
-                hint="write control.joint_target_q for a loaded robot, see RobotDescription.with_opening",
+                hint="a loaded robot has RobotController, or write control.joint_target_q yourself",
             )
         self.options = options if options is not None else ArmControlOptions()
         self.arm = arm
+        self.joint_count, self.action_size = ARM_JOINT_COUNT, self.options.action_size
         self.world_count = max(model.world_count, 1)
         device = model.device
         w = self.world_count
@@ -123,6 +124,8 @@ class ArmController:
             return wp.array(offset + first, dtype=wp.int32, device=device)
 
         self.coord_start = starts(model.joint_coord_world_start, arm.coord_start)
+        self.joint_columns = wp.array(np.arange(ARM_JOINT_COUNT), dtype=wp.int32, device=device)
+        """Coordinates of the joints between base and tool in the arm, (joint_count,)."""
         description, gripper = arm.description, arm.description.gripper
         self._chain = filled(
             kernels.Chain,

@@ -56,7 +56,7 @@ class RobotDescription:
 
     name: str
     """Name of the robot."""
-    path: Path
+    path: Path = field(repr=False)
     """The file it was read from."""
     mjcf: str = field(repr=False)
     """The robot alone as canonical MJCF with absolute asset paths, without actuators."""
@@ -82,6 +82,8 @@ class RobotDescription:
     """Names of the end effector's link and of all links behind it."""
     gripper: RobotGripper | None = None
     """The gripper, or None."""
+    notes: tuple[str, ...] = ()
+    """What was chosen where the file does not say it, a line each."""
     gravity_compensation: bool = True
     """Whether the robot carries its own weight apart from the drives, as the controllers of real arms do."""
     collision: Literal["hull", "mesh"] = "hull"
@@ -116,6 +118,22 @@ class RobotDescription:
     def passive_joints(self) -> tuple[str, ...]:
         """Names of the joints without a drive."""
         return tuple(name for name, drive in zip(self.joint_names, self.drives, strict=True) if drive is None)
+
+    def joint_inertias(self) -> np.ndarray:
+        """Return what each joint accelerates in the home pose, the others held [kg or kg m^2], shape (joint_count,)."""
+        mujoco = importlib.import_module("mujoco")
+        model = mujoco.MjModel.from_xml_string(self.mjcf)
+        data = mujoco.MjData(model)
+        data.qpos[:] = model.qpos0 + self.home_joint_q
+        mujoco.mj_forward(model, data)
+        mass = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, mass)
+        return np.diag(mass).copy()
+
+    def drive_frequencies(self) -> np.ndarray:
+        """Return sqrt(stiffness / inertia) / (2 pi) of every drive in the home pose [Hz], NaN where there is none."""
+        stiffness = np.array([math.nan if drive is None else drive.stiffness for drive in self.drives])
+        return np.sqrt(stiffness / self.joint_inertias()) / (2.0 * math.pi)
 
     def with_opening(self, opening: float, joint_q: Sequence[float] | None = None) -> np.ndarray:
         """Return joint coordinates with the gripper at an opening; they may serve as drive targets.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from softmode.errors import ConfigError
 from softmode.robots.arm import ArmDescription
 from softmode.robots.arm_shapes import finger_parts, hand_parts
 from softmode.robots.description import RobotDescription, ToolPose
+from softmode.robots.hand import colliding, settled, side_of, surface_corners
 
 Array = NDArray[np.float64]
 
@@ -55,14 +56,19 @@ class ParallelJaw:
         require_fields(self, ("friction",), above=0.0)
 
     @classmethod
-    def of(cls, robot: ArmDescription | RobotDescription) -> ParallelJaw:
+    def of(cls, robot: Any) -> ParallelJaw:
         """Return the jaw of a robot; that of a robot from a file is measured from its collision shapes.
+
+        Args:
+            robot: An `ArmDescription`, a `RobotDescription`, or a `TableRobot`, whose jaw has the frame of its tool.
 
         Raises:
             ConfigError: If the robot has no two fingers, each with joints of its own, that close on each other.
         """
         if isinstance(robot, RobotDescription):
             return _measured(robot)
+        if not isinstance(robot, ArmDescription):
+            return replace(robot.jaw, frame=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
         gripper = robot.gripper
         parts = [part for part in finger_parts(gripper.pad_size, gripper.finger_length, 1.0) if part.touch]
         palm = hand_parts(robot.hand_length, gripper.stroke)[-1].size
@@ -79,6 +85,23 @@ class ParallelJaw:
         )
 
 
+def gap_of(robot: RobotDescription, jaw: ParallelJaw, opening: float) -> float:
+    """Return the distance between the faces of the fingers along the closing axis at an opening of the gripper [m].
+
+    Args:
+        robot: The robot that the jaw was measured on.
+        jaw: Its fingers.
+        opening: 0 is closed, 1 is open.
+    """
+    model: Any = importlib.import_module("mujoco").MjModel.from_xml_string(robot.mjcf)
+    data = _kinematics(robot, model, opening)
+    mount = data.xmat[model.body(robot.end_effector).id].reshape(3, 3)
+    y = mount @ (Rotation.from_quat(robot.tool[3:]) * Rotation.from_quat(jaw.frame[3:])).as_matrix()[:, 1]
+    left, right = (surface_corners(model, data, side) @ y for side in _fingers(robot, model))
+    # The closing axis may point from either finger to the other.
+    return float(max(left.min() - right.max(), right.min() - left.max()))
+
+
 def _measured(robot: RobotDescription) -> ParallelJaw:
     """Measure the jaw of a robot from a file."""
     model: Any = importlib.import_module("mujoco").MjModel.from_xml_string(robot.mjcf)
@@ -86,12 +109,14 @@ def _measured(robot: RobotDescription) -> ParallelJaw:
     hand = [model.body(name).id for name in robot.hand_links]
     hand = [link for link in hand if link not in sides[0] + sides[1]]
     closed, wide = (_kinematics(robot, model, opening) for opening in (0.0, 1.0))
-    moved = [_points(model, wide, side).mean(0) - _points(model, closed, side).mean(0) for side in sides]
+    moved = [
+        surface_corners(model, wide, side).mean(0) - surface_corners(model, closed, side).mean(0) for side in sides
+    ]
     axis = moved[0] - moved[1]
     y = axis / max(float(np.linalg.norm(axis)), 1e-12)
     mount = wide.xmat[model.body(robot.end_effector).id].reshape(3, 3)
-    fingers = [_points(model, wide, side) for side in sides]
-    base = _points(model, wide, hand) if hand else np.empty((0, 3))
+    fingers = [surface_corners(model, wide, side) for side in sides]
+    base = surface_corners(model, wide, hand) if hand else np.empty((0, 3))
     if not len(base):
         base = wide.xpos[[model.body_parentid[sides[0][0]]]]
     out = np.concatenate(fingers).mean(0) - base.mean(0)
@@ -116,7 +141,7 @@ def _measured(robot: RobotDescription) -> ParallelJaw:
     tool = Rotation.from_matrix(mount) * Rotation.from_quat(robot.tool[3:])
     origin = wide.xpos[model.body(robot.end_effector).id] + mount @ np.array(robot.tool[:3])
     place = tool.inv().apply(turn @ middle - origin)
-    faces = [geom for side in sides for geom in _geoms(model, side)]
+    faces = [geom for side in sides for geom in colliding(model, side)]
     pad_width, pad_length = (max(float(high[j] - low[j]), _FACE) for j in (0, 2))
     return ParallelJaw(
         opening=opening,
@@ -142,8 +167,25 @@ def _fingers(robot: RobotDescription, model: Any) -> tuple[list[int], list[int]]
     roots = [link for link in sorted(driven) if not _above(model, link) & driven]
     if len(roots) != 2:
         raise ConfigError(f"robot {robot.name!r} has {len(roots)} driven fingers, not two", hint=_HINT)
-    first, second = ([b for b in range(1, model.nbody) if root in {b, *_above(model, b)}] for root in roots)
+    sides = []
+    for root in roots:
+        palm = int(model.body_parentid[root])
+        own = [b for b in range(1, model.nbody) if root in {b, *_above(model, b)}]
+        # A link that a loop ties to the driven one belongs to the finger: the pads of linkages hang there.
+        sides.append(sorted({*own, *side_of(model, palm, root)}))
+    first, second = sides
     return first, second
+
+
+def finger_names(robot: RobotDescription) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the names of the links of both fingers.
+
+    Raises:
+        ConfigError: If the robot has no two driven fingers.
+    """
+    model: Any = importlib.import_module("mujoco").MjModel.from_xml_string(robot.mjcf)
+    first, second = _fingers(robot, model)
+    return tuple(model.body(b).name for b in first), tuple(model.body(b).name for b in second)
 
 
 def _above(model: Any, link: int) -> set[int]:
@@ -156,29 +198,5 @@ def _above(model: Any, link: int) -> set[int]:
 
 def _kinematics(robot: RobotDescription, model: Any, opening: float) -> Any:
     """Return where everything is with the gripper at an opening."""
-    mujoco = importlib.import_module("mujoco")
-    data = mujoco.MjData(model)
-    data.qpos[:] = model.qpos0 + robot.with_opening(opening)
-    mujoco.mj_kinematics(model, data)
-    return data
-
-
-def _geoms(model: Any, links: list[int]) -> list[int]:
-    """Return the shapes of links that collide; all of them if none does."""
-    own = [geom for geom in range(model.ngeom) if int(model.geom_bodyid[geom]) in links]
-    return [geom for geom in own if model.geom_contype[geom] | model.geom_conaffinity[geom]] or own
-
-
-def _points(model: Any, data: Any, links: list[int]) -> Array:
-    """Return corners of the shapes of links in the world, (N, 3) [m]: a mesh's vertices, else of the bounding box."""
-    found = []
-    for geom in _geoms(model, links):
-        mesh = int(model.geom_dataid[geom])
-        if mesh >= 0:
-            start = model.mesh_vertadr[mesh]
-            local = np.asarray(model.mesh_vert[start : start + model.mesh_vertnum[mesh]], float)
-        else:
-            signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
-            local = model.geom_aabb[geom, :3] + signs * model.geom_aabb[geom, 3:]
-        found.append(data.geom_xpos[geom] + local @ data.geom_xmat[geom].reshape(3, 3).T)
-    return np.concatenate(found) if found else np.empty((0, 3))
+    passive = [robot.joint_names.index(name) for name in robot.passive_joints]
+    return settled(model, model.qpos0 + robot.with_opening(opening), passive)

@@ -16,6 +16,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from softmode.checks import require_number
 from softmode.errors import AssetError, ConfigError
 from softmode.robots.assets import RobotAsset, find
 from softmode.robots.compiled import CompiledRobot
@@ -32,24 +33,28 @@ def load(
     home: Sequence[float] | None = None,
     root: str | None = None,
     asset_root: str | Path | None = None,
+    drive_bandwidth: float = 8.0,
     download: bool = True,
 ) -> RobotDescription:
     """Load a robot by name, or from an MJCF or URDF file.
 
-    A URDF, and an MJCF file without any actuator, gets critically damped drives of 8 Hz on every joint, scaled by the
-    joint's inertia in the home pose and limited by its effort limit. A torque motor becomes such a drive as well.
+    A URDF, and an MJCF file without any actuator, gets critically damped drives on every joint, scaled by the joint's
+    inertia in the home pose and limited by its effort limit. A torque motor becomes such a drive as well.
+    ``RobotDescription.notes`` says what was chosen where the file does not say it.
 
     Args:
         source: A name of :func:`available`, or the path of a file (a `Path`, or a string that ends in .xml, .mjcf or
             .urdf).
-        end_effector: Site or body that carries the tool; found by its usual names if omitted.
+        end_effector: Site or body that carries the tool. If omitted, it is found by its usual names, else as the link
+            in which two fingers meet, else as the last link of the longest chain.
         tool_offset: Tool point in the frame of that site or body [m], shape (3,).
-        gripper: Coordinates (closed, open) of each gripper joint [m or rad]. If omitted, the driven joints behind the
-            end effector with limits, open where the finger's centre of mass is farther from the tool point.
+        gripper: Coordinates (closed, open) of each gripper joint [m or rad]. If omitted, the driven joints with limits
+            behind the end effector that move a finger towards the other one.
         home: Joint coordinates of the home pose [m or rad]; by default the key frame "home", else the first one, else
             zero, brought into the joint limits.
         root: Body whose subtree is the robot, moved to the origin; needed if the file holds several robots.
         asset_root: Folder outside which the file may refer to nothing; its own folder if omitted.
+        drive_bandwidth: Natural frequency of the drives of joints without a servo [Hz].
         download: Whether a model that is not in the cache may be downloaded.
 
     Returns:
@@ -58,7 +63,7 @@ def load(
     Raises:
         AssetError: If the model cannot be fetched, or the file is missing, broken, refers outside the asset root, or
             holds what is not supported: a free or ball joint, several joints in one link.
-        ConfigError: If a name is unknown, or the end effector is neither named nor found.
+        ConfigError: If a name is unknown, or a number out of range.
         MissingExtraError: If the name needs the extra ``[robots]`` and it is not installed.
     """
     asset = _locate(source, asset_root, download)
@@ -66,18 +71,22 @@ def load(
     offset = asset.tool_offset if tool_offset is None else tuple(float(value) for value in tool_offset)
     if len(offset) != 3 or not all(math.isfinite(value) for value in offset):
         raise ConfigError(f"tool_offset = {offset} is not a point", hint="give three coordinates in metres")
+    require_number("drive_bandwidth", drive_bandwidth, at_least=0.1, at_most=100.0, unit="Hz")
     spec = _read(asset)
     full = _compile(spec, asset)
     keys = {full.key(k).name: full.key_qpos[k] for k in range(full.nkey)}
     key = keys.get("home", next(iter(keys.values()), full.qpos0))
     at_home = {full.joint(j).name: float(key[full.jnt_qposadr[j]]) for j in range(full.njnt)}
     _keep_robot(spec, asset.root if root is None else root, asset)
-    robot = CompiledRobot(_compile(spec, asset), asset, at_home)
+    robot = CompiledRobot(_compile(spec, asset), asset, at_home, drive_bandwidth)
     drives = robot.drives()
     start = robot.home(home)
-    link, tool = robot.tool(end_effector, np.array(offset))
-    hand = robot.behind(link)
-    jaws = robot.gripper(gripper, drives, start, link, tool, hand)
+    if home is None:
+        found = "home" if "home" in keys else next(iter(keys), None)
+        robot.notes.append("home: zero, no key frame" if found is None else f"home: key frame {found!r}")
+    link, tool = robot.tool(end_effector, np.array(offset), drives)
+    jaws, palm = robot.gripper(gripper, drives, start, link)
+    hand = sorted({*robot.behind(palm), *robot.behind(link)})
     for equality in list(spec.equalities):
         if equality.name in robot.dropped:
             spec.delete(equality)
@@ -87,7 +96,7 @@ def load(
     return RobotDescription(
         name=asset.name,
         path=asset.path,
-        mjcf=spec.to_xml(),
+        mjcf=_balanced(spec.to_xml()),
         link_names=tuple(robot.link(b) for b in range(1, robot.model.nbody)),
         joint_names=robot.joint_names,
         joint_links=tuple(robot.link(b) for b in robot.model.jnt_bodyid),
@@ -99,6 +108,7 @@ def load(
         tool=tool,
         hand_links=tuple(robot.link(b) for b in hand),
         gripper=jaws,
+        notes=tuple(robot.notes),
     )
 
 
@@ -155,11 +165,11 @@ def _prepare_urdf(tree: ElementTree.Element, asset: RobotAsset) -> str:
                 link.remove(visual)
         for mesh in link.iter("mesh"):
             value = mesh.get("filename", "")
-            bases = [asset.path.parent]
+            values, bases = [value], [asset.path.parent]
             if value.startswith("package://"):
-                package, _, value = value.removeprefix("package://").partition("/")
-                bases = [asset.asset_root / package, asset.asset_root]
-            file = resolve_inside([value], bases, asset.asset_root, asset.path, "<mesh>")
+                whole = value.removeprefix("package://")
+                values, bases = [whole, whole.partition("/")[2]], [asset.asset_root]
+            file = resolve_inside(values, bases, asset.asset_root, asset.path, "<mesh>")
             mesh.set("filename", str(file))
     for texture in tree.iter("texture"):
         texture.attrib.pop("filename", None)
@@ -171,7 +181,23 @@ def _compile(spec: Any, asset: RobotAsset) -> Any:
     try:
         return spec.compile()
     except (ValueError, RuntimeError) as error:
-        raise AssetError(f"robot file {asset.path}: {_one_line(error)}", hint="mend the file") from error
+        text = _one_line(error)
+        hint = "convert that mesh to .stl or .obj" if "no decoder found" in text else "mend the file"
+        raise AssetError(f"robot file {asset.path}: {text}", hint=hint) from error
+
+
+def _balanced(text: str) -> str:
+    """Keep the triangle inequality of principal inertias, which the digits of a written file may break."""
+    tree, changed = ElementTree.fromstring(text), False
+    for element in tree.iter("inertial"):
+        inertia = [float(value) for value in element.get("diaginertia", "0 0 0").split()]
+        k = max(range(3), key=lambda i: inertia[i])
+        others = sum(inertia) - inertia[k]
+        if inertia[k] > others * (1.0 - 1.0e-7) > 0.0:
+            inertia[k] = others * (1.0 - 1.0e-5)
+            element.set("diaginertia", " ".join(f"{value:.9g}" for value in inertia))
+            changed = True
+    return ElementTree.tostring(tree, encoding="unicode") if changed else text
 
 
 def _one_line(error: Exception) -> str:

@@ -6,6 +6,7 @@ links wherever they lead, so every reference is resolved here first and refused 
 
 from __future__ import annotations
 
+import os
 from pathlib import Path, PurePosixPath
 from xml.etree import ElementTree
 
@@ -105,11 +106,21 @@ def resolve_inside(values: list[str], bases: list[Path], root: Path, file: Path,
     existing = [candidate for candidate in candidates if candidate.exists()]
     outside = [candidate for candidate in existing or candidates if not candidate.is_relative_to(inside)]
     if outside:
-        hint = "copy the file into the folder, or pass asset_root= the folder that holds the whole robot"
+        hint = (
+            f"copy the file into the folder, or pass asset_root={_common(file, outside) or 'the folder of the robot'}"
+        )
         raise AssetError(f"{file}: {tag} refers to {asked!r}, which lies outside the asset root {root}", hint=hint)
     if not existing:
-        raise AssetError(f"{file}: {tag} refers to {asked!r}, which does not exist", hint="put the file in its place")
+        found = next((up for up in list(file.resolve().parents)[:6] for value in values if (up / value).exists()), None)
+        hint = f"pass asset_root={found}" if found else "put the file in its place, or pass asset_root= its folder"
+        raise AssetError(f"{file}: {tag} refers to {asked!r}, which does not exist in {root}", hint=hint)
     return existing[0]
+
+
+def _common(file: Path, outside: list[Path]) -> Path | None:
+    """Return the folder that holds the robot file and what it refers to, unless that is all of the disk."""
+    shared = Path(os.path.commonpath([file.resolve().parent, *outside]))
+    return shared if len(shared.parts) > 2 else None
 
 
 def _collect(

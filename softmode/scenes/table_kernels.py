@@ -74,14 +74,18 @@ def observe_objects(
 
 @wp.kernel
 def observe_fingers(
-    finger_body: wp.array2d[int],  # (world_count, 2)
+    finger_body: wp.array3d[int],  # (world_count, 2, links of a finger), -1 for none
     body_wrench: wp.array[wp.spatial_vector],
     # Out:
     force_out: wp.array2d[wp.vec3],  # (world_count, 2) [N]
 ):
-    """Read the force of the soft object on each finger."""
+    """Read the force of the soft object on each finger, the sum over its links."""
     w, f = wp.tid()
-    force_out[w, f] = wp.spatial_top(body_wrench[finger_body[w, f]])
+    force = wp.spatial_top(body_wrench[finger_body[w, f, 0]])
+    for k in range(1, finger_body.shape[2]):
+        if finger_body[w, f, k] >= 0:
+            force += wp.spatial_top(body_wrench[finger_body[w, f, k]])
+    force_out[w, f] = force
 
 
 @wp.kernel

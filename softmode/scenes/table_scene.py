@@ -25,8 +25,10 @@ from softmode.objects.loader import Progress, load
 from softmode.objects.object_set import ObjectSet
 from softmode.objects.placed import Placed
 from softmode.objects.soft_object import SoftObject
-from softmode.robots.arm import ArmDescription, add_arm
-from softmode.robots.control import ArmController, ArmControlOptions
+from softmode.robots.arm import ArmDescription
+from softmode.robots.control import ArmControlOptions
+from softmode.robots.robot_control import controller_of
+from softmode.robots.table_robot import TableRobot, finger_links
 from softmode.scenes import table_kernels as kernels
 from softmode.scenes.binding import BoundSplats
 from softmode.scenes.capture import capture_graph, capture_step, require_even
@@ -56,8 +58,8 @@ class TableSceneConfig:
     """Rigid shapes on the table."""
     material: Material = field(default_factory=lambda: Material(youngs_modulus=2.0e5, density=250.0))
     """Its material; Young's modulus may be changed per world at reset. In a set, that of objects that say none."""
-    arm: ArmDescription = field(default_factory=ArmDescription)
-    """The robot."""
+    arm: ArmDescription | TableRobot = field(default_factory=ArmDescription)
+    """The robot: the built-in arm, or a loaded one that :func:`softmode.robots.place_robot` put at the table."""
     control: ArmControlOptions = field(default_factory=ArmControlOptions)
     """What actions mean."""
     solver: SolverReducedOptions = field(default_factory=SolverReducedOptions)
@@ -227,7 +229,7 @@ class TableScene:
         """Return a world with arm, table, fixtures and objects; the first of these and its material are given."""
         config = self.config
         world = newton.ModelBuilder()
-        self.arm = add_arm(world, config.arm)
+        self.arm = config.arm.add_to(world)
         place, size = (0.35, 0.0, -0.03), (0.5, 0.6, 0.03)
         slate = (0.42, 0.48, 0.54)
         table = Fixture(label="table", position=place, size=size, color=slate, friction=config.table_friction)
@@ -252,7 +254,7 @@ class TableScene:
         self.control: Any = model.control()
         for state in (self.state, self._scratch):
             newton.eval_fk(model, model.joint_q, model.joint_qd, state)
-        self.controller = ArmController(model, self.arm, config.control)
+        self.controller = controller_of(model, config.arm, self.arm, config.control)
         slots, instances = config.grip_slots, worlds * len(self.objects)
         self.grips = tuple(
             Grips(self.solver, i, slot_count=slots, options=config.grip_options)
@@ -260,14 +262,14 @@ class TableScene:
         )
         """Grips of each instance, world by world, that pull and hold it while the scene runs; none without slots."""
         device = self.device
-        self.actions = wp.zeros((worlds, config.control.action_size), dtype=float, device=device)
+        self.actions = wp.zeros((worlds, self.controller.action_size), dtype=float, device=device)
         self.object_position = wp.zeros((worlds, len(self.objects)), dtype=wp.vec3, device=device)
         """Centre of mass of each soft object [m], shape (world_count, objects)."""
         self.object_velocity = wp.zeros_like(self.object_position)
         """Its velocity [m/s]."""
         self.finger_force = wp.zeros((worlds, 2), dtype=wp.vec3, device=device)
-        starts = model.body_world_start.numpy()[:worlds]
-        fingers = starts[:, None] + np.asarray(self.arm.finger_bodies)[None]
+        starts, fingers = model.body_world_start.numpy()[:worlds], finger_links(config.arm, self.arm)
+        fingers = np.where(fingers < 0, -1, starts[:, None, None] + fingers)
         self._finger_body = wp.array(fingers, dtype=int, device=device)
         self._bases = self._object_bases()
         self.world_mask = wp.ones(worlds, dtype=wp.bool, device=device)

@@ -110,3 +110,61 @@ def write_wedge(path: Path) -> None:
     mesh: Any = trimesh.util.concatenate(parts)
     mesh.update_faces([k > 1 for k in range(len(mesh.faces))])
     mesh.export(path)
+
+
+ARM5 = """<mujoco model="arm5">
+  <compiler angle="radian"/>
+  <default>
+    <joint damping="2" armature="0.3"/>
+    <position kp="4000" kv="200" forcerange="-90 90"/>
+  </default>
+  <worldbody>
+    <body name="base">
+      <geom type="cylinder" size="0.06 0.05" pos="0 0 0.05" mass="2"/>
+      <body name="turn" pos="0 0 0.1">
+        <joint name="turn" axis="0 0 1" range="-3 3"/>
+        <geom type="cylinder" size="0.05 0.05" pos="0 0 0.05" mass="1.5"/>
+        <body name="upper" pos="0 0 0.15">
+          <joint name="shoulder" axis="0 1 0" range="-2 2"/>
+          <geom type="capsule" fromto="0 0 0 0 0 0.35" size="0.035" mass="1.5"/>
+          <body name="fore" pos="0 0 0.35">
+            <joint name="elbow" axis="0 1 0" range="-2.7 2.7"/>
+            <geom type="capsule" fromto="0 0 0 0 0 0.35" size="0.03" mass="1.2"/>
+            <body name="wrist" pos="0 0 0.35">
+              <joint name="wrist" axis="0 1 0" range="-2.4 2.4"/>
+              <geom type="capsule" fromto="0 0 0 0 0 0.06" size="0.025" mass="0.6"/>
+              <body name="roll" pos="0 0 0.09">
+                <joint name="roll" axis="0 0 1" range="-2.9 2.9"/>
+                <geom type="box" size="0.03 0.06 0.012" mass="0.4"/>
+                <body name="jaw_a" pos="0 0 0.012">
+                  <joint name="jaw_a" type="slide" axis="0 1 0" range="0 0.045" armature="0.1"/>
+                  <geom type="box" size="0.012 0.006 0.035" pos="0 0.006 0.035" mass="0.05"/>
+                </body>
+                <body name="jaw_b" pos="0 0 0.012">
+                  <joint name="jaw_b" type="slide" axis="0 -1 0" range="0 0.045" armature="0.1"/>
+                  <geom type="box" size="0.012 0.006 0.035" pos="0 -0.006 0.035" mass="0.05"/>
+                </body>
+              </body>
+            </body>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <tendon><fixed name="both"><joint joint="jaw_a" coef="0.5"/><joint joint="jaw_b" coef="0.5"/></fixed></tendon>
+  <actuator>
+    <position joint="turn"/><position joint="shoulder"/><position joint="elbow"/><position joint="wrist"/>
+    <position joint="roll"/>
+    <position tendon="both" kp="100" kv="10" ctrlrange="0 0.045" forcerange="-80 80"/>
+  </actuator>
+  <keyframe><key name="home" qpos="0 0.2 1.6 1.34 0 0.045 0.045"/></keyframe>
+</mujoco>
+"""
+"""An arm of five joints whose gripper hangs on one soft servo; no link has a usual name, no equality ties the jaws."""
+
+
+def write_arm5(folder: Path, text: str = ARM5) -> Path:
+    """Write the arm of five joints; return its path."""
+    path = folder / "arm5.xml"
+    path.write_text(text)
+    return path

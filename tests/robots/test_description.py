@@ -282,7 +282,7 @@ NO_TOOL = MJCF.replace('name="pinch"', 'name="spot"')
 @pytest.mark.parametrize(
     ("text", "options", "error", "words"),
     [
-        (NO_TOOL, {}, ConfigError, ["names no end effector", "'spot'", "'jaw_left'"]),
+        (NO_TOOL, {"end_effector": "pinch"}, ConfigError, ["'pinch'", "'spot'", "'jaw_left'"]),
         (MJCF, {"end_effector": "finger"}, ConfigError, ["'finger'", "end_effector", "'pinch'"]),
         (MJCF, {"tool_offset": (0.0, 1.0)}, ConfigError, ["tool_offset"]),
         (MJCF, {"home": (0.0, 0.0)}, ConfigError, ["home", "shoulder, elbow, left, right"]),
@@ -331,8 +331,17 @@ def test_robot_without_gripper(tmp_path):
 def test_urdf_mesh_that_is_missing(tmp_path):
     """The error names file and mesh."""
     path = write_urdf(tmp_path, URDF.replace("wedge.stl", "spoon.stl"))
-    with pytest.raises(AssetError, match=r"spoon\.stl.*does not exist"):
+    with pytest.raises(AssetError, match=r"spoon\.stl.*does not exist.*asset_root"):
         robots.load(path, asset_root=tmp_path)
+
+
+def test_urdf_whose_meshes_lie_elsewhere_names_the_folder(tmp_path):
+    """What stands behind asset_root= in the error loads the file."""
+    path = write_urdf(tmp_path)
+    with pytest.raises(AssetError, match=r"asset_root=") as caught:
+        robots.load(path)
+    folder = str(caught.value).split("asset_root=")[1].split()[0]
+    assert robots.load(path, asset_root=folder).gripper is not None
 
 
 SINGULAR = """<mujoco><worldbody>

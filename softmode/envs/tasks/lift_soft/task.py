@@ -83,6 +83,7 @@ class LiftSoft(Task):
     kernels = kernels
     grasps = True
     takes_sets = True
+    any_robot = True
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
 

@@ -25,6 +25,7 @@ from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
+from softmode.robots.table_robot import TableRobot
 from softmode.scenes.table_scene import TableSceneConfig
 from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
@@ -139,6 +140,8 @@ class PressSoft(Task):
     def tip_length(self) -> float:
         """Distance from the tool point down to the finger tips [m]."""
         arm = self.config.scene.arm
+        if isinstance(arm, TableRobot):
+            return arm.jaw.tip
         return arm.hand_length + arm.gripper.finger_length - arm.tool_length
 
     def parameters(self) -> tuple[Parameter, ...]:

@@ -1,0 +1,72 @@
+"""Tasks with a robot from a file: where it stands, and the ranges of what is random within its reach."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from softmode.envs.task_config import TaskConfig
+from softmode.errors import ConfigError
+from softmode.robots.arm import ArmDescription
+from softmode.robots.description import RobotDescription
+from softmode.robots.loading import load
+from softmode.robots.table_robot import TableRobot, place_robot
+
+Config = TypeVar("Config", bound=TaskConfig)
+
+_RANGES = ("position_range", "goal_range", "goal_height")
+"""Fields of configurations that shrink with the share of the places that a robot reaches."""
+
+
+def with_robot(config: Config, robot: str | Path | RobotDescription | TableRobot) -> Config:
+    """Return a task's configuration with another robot.
+
+    A robot that is not at the table yet is placed so that its tool reaches, pointing down, the home position of the
+    configured arm and the random places and goals of the task. Where that cannot be, the ranges shrink about their
+    middle, and so does the height of goals.
+
+    Args:
+        config: The configuration.
+        robot: A name, a file, a loaded robot, or one at the table.
+
+    Raises:
+        ConfigError: If the robot has no gripper of two fingers, or cannot reach the table.
+        AssetError: If it cannot be loaded.
+    """
+    scene = config.scene
+    if isinstance(robot, (str, Path)):
+        robot = load(robot)
+    if isinstance(robot, RobotDescription):
+        arm = scene.arm if isinstance(scene.arm, ArmDescription) else ArmDescription()
+        (dx, dy), goal = config.position_range, getattr(config, "goal_range", (0.0, 0.0, 0.0))
+        goal = (*(max(side, getattr(config, "goal_distance", (0.0, 0.0))[1]) for side in goal[:2]), *goal[2:])
+        rise = getattr(config, "goal_height", arm.home_position[2] - 0.08) + goal[-1]
+        robot = place_robot(
+            robot,
+            home_position=arm.home_position,
+            home_opening=arm.home_opening,
+            over=scene.object_position,
+            ranges=(max(dx, goal[0]) + 0.03, max(dy, goal[1]) + 0.03),
+            height=max(rise + 0.06, arm.home_position[2]),
+        )
+    if not isinstance(robot, TableRobot):
+        hint = "give a name of softmode.robots.available(), a file, a RobotDescription, or a TableRobot"
+        raise ConfigError(f"robot is a {type(robot).__name__}", hint=hint)
+    # Loops and joint limits of a gripper take rows of their own.
+    more = len(robot.robot.joint_names) + 6 * robot.robot.mjcf.count("<connect")
+    scene = replace(
+        scene,
+        arm=robot,
+        constraint_max=max(scene.constraint_max, 64) + 2 * more,
+        rigid_contact_max=max(scene.rigid_contact_max, 64),
+    )
+    changes: dict[str, Any] = {"scene": scene}
+    if robot.share < 1.0:
+        names = {field.name for field in fields(config)}
+        for name in _RANGES:
+            if name in names:
+                value = getattr(config, name)
+                shrunk = tuple(robot.share * v for v in value) if isinstance(value, tuple) else robot.share * value
+                changes[name] = shrunk
+    return replace(config, **changes)

@@ -1,0 +1,182 @@
+"""The serial chain from a robot's base to its tool on the host: kinematics, Jacobian, inverse, reach.
+
+A pose is a product of exponentials (Lynch and Park, *Modern Robotics*, 2017, eq. 4.14): every joint turns about, or
+slides along, an axis that is known in the base frame at zero coordinates.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from softmode.errors import ConfigError
+from softmode.robots.description import RobotDescription, ToolPose
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SerialChain:
+    """The joints between base and tool, in the base frame at zero coordinates; poses are made for many rows at once."""
+
+    joints: tuple[int, ...]
+    """Which joint coordinates of the robot these are."""
+    axis: Array
+    """Directions of the joints, shape (n, 3)."""
+    anchor: Array
+    """Points on the axes of hinges [m], shape (n, 3)."""
+    slide: NDArray[np.bool_]
+    """Which joints slide, shape (n,)."""
+    lower: Array
+    """Lower limits [rad or m], shape (n,)."""
+    upper: Array
+    """Upper limits, shape (n,)."""
+    home: Array
+    """Coordinates of the home pose, shape (n,)."""
+    tool_position: Array
+    """Tool at zero coordinates [m], shape (3,)."""
+    tool_rotation: Array
+    """Its rotation matrix."""
+
+    @property
+    def span(self) -> tuple[Array, Array]:
+        """Finite limits: a joint without one turns by half a turn to either side."""
+        return np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)
+
+    def forward(self, q: Array) -> tuple[Array, Array]:
+        """Return positions (B, 3) [m] and rotations (B, 3, 3) of the tool at coordinates of shape (B, n)."""
+        position, rotation, _, _ = self._sweep(q)
+        return position, rotation
+
+    def jacobian(self, q: Array) -> Array:
+        """Return d(position, rotation)/dq in the base frame, shape (B, 6, n)."""
+        position, _, axes, anchors = self._sweep(q)
+        lever = np.cross(axes, position[:, None] - anchors)
+        linear = np.where(self.slide[:, None], axes, lever)
+        angular = np.where(self.slide[:, None], 0.0, axes)
+        return np.concatenate([linear, angular], axis=2).transpose(0, 2, 1)
+
+    def _sweep(self, q: Array) -> tuple[Array, Array, Array, Array]:
+        """Return the tool, and axes and anchors of all joints."""
+        count = len(q)
+        rotation, position = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
+        axes, anchors = np.empty((count, len(self.axis), 3)), np.empty((count, len(self.axis), 3))
+        for k, (axis, anchor) in enumerate(zip(self.axis, self.anchor, strict=True)):
+            axes[:, k] = rotation @ axis
+            anchors[:, k] = rotation @ anchor + position
+            if self.slide[k]:
+                position = position + axes[:, k] * q[:, k, None]
+            else:
+                turn = Rotation.from_rotvec(q[:, k, None] * axis).as_matrix()
+                position = position + np.einsum("bij,bj->bi", rotation, anchor - turn @ anchor)
+                rotation = rotation @ turn
+        return rotation @ self.tool_position + position, rotation @ self.tool_rotation, axes, anchors
+
+    def inverse(
+        self, position: Array, rotation: Array, start: Array, *, iterations: int = 150, length: float = 0.3
+    ) -> tuple[Array, Array]:
+        """Return coordinates that bring the tool to poses, by damped least squares within the limits.
+
+        Args:
+            position: Wanted positions [m], shape (B, 3).
+            rotation: Wanted rotation matrices, shape (B, 3, 3).
+            start: Where the iteration begins, shape (n,).
+            iterations: How many steps.
+            length: By how much a rotation error counts [m/rad].
+
+        Returns:
+            The coordinates, shape (B, n), and the error that is left [m], shape (B,).
+        """
+        low, high = self.span
+        q = np.tile(np.clip(start, low, high), (len(position), 1))
+        weight = np.array([1.0] * 3 + [length] * 3)[:, None]
+        for _ in range(iterations):
+            error = self._error(q, position, rotation, length)
+            jacobian = weight * self.jacobian(q)
+            size = np.linalg.norm(error, axis=1)
+            damping = (0.05 * np.minimum(1.0, size / 0.05) + 1.0e-4) ** 2
+            normal = jacobian @ jacobian.transpose(0, 2, 1) + damping[:, None, None] * np.eye(6)
+            step = np.einsum("bij,bi->bj", jacobian, np.linalg.solve(normal, error[..., None])[..., 0])
+            q = np.clip(q + np.clip(step, -0.4, 0.4), low, high)
+        return q, np.linalg.norm(self._error(q, position, rotation, length), axis=1)
+
+    def _error(self, q: Array, position: Array, rotation: Array, length: float) -> Array:
+        at, turned = self.forward(q)
+        turn = Rotation.from_matrix(rotation @ turned.transpose(0, 2, 1)).as_rotvec()
+        return np.concatenate([position - at, length * turn], axis=1)
+
+    @functools.cached_property
+    def reach(self) -> float:
+        """Largest distance of the tool from the first joint within the limits [m], by a search from random poses."""
+        low, high = self.span
+        first = self.anchor[0]
+
+        def distance(q: Array) -> Array:
+            return np.linalg.norm(self.forward(q)[0] - first, axis=1)
+
+        random = np.random.default_rng(0)
+        q = low + (high - low) * random.random((4000, len(low)))
+        q = np.concatenate([q[np.argsort(distance(q))[-15:]], self.home[None]])
+        best, step = distance(q), 0.4
+        while step > 1.0e-4:
+            improved = False
+            for k in range(len(low)):
+                for sign in (step, -step):
+                    trial = q.copy()
+                    trial[:, k] = np.clip(trial[:, k] + sign, low[k], high[k])
+                    far = distance(trial)
+                    better = far > best + 1.0e-9
+                    q[better], best = trial[better], np.maximum(best, far)
+                    improved |= bool(better.any())
+            step = step if improved else 0.5 * step
+        return float(best.max())
+
+
+def serial_chain(robot: RobotDescription, frame: ToolPose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)) -> SerialChain:
+    """Return the chain from the base of a robot to its tool.
+
+    Args:
+        robot: The robot.
+        frame: Pose of the point that is to be moved in the tool's frame.
+
+    Raises:
+        ConfigError: If no joint moves the tool.
+    """
+    mujoco: Any = importlib.import_module("mujoco")
+    model = mujoco.MjModel.from_xml_string(robot.mjcf)
+    data = mujoco.MjData(model)
+    data.qpos[:] = model.qpos0
+    mujoco.mj_kinematics(model, data)
+    link = end = model.body(robot.end_effector).id
+    path: list[int] = []
+    while link > 0:
+        first = int(model.body_jntadr[link])
+        path += range(first + int(model.body_jntnum[link]) - 1, first - 1, -1) if first >= 0 else []
+        link = int(model.body_parentid[link])
+    joints = path[::-1]
+    if not joints:
+        raise ConfigError(
+            f"no joint moves the end effector {robot.end_effector!r} of robot {robot.name!r}",
+            hint="name a link or site at the end of an arm: end_effector=",
+        )
+    mount = data.xmat[end].reshape(3, 3)
+    inside = Rotation.from_quat(robot.tool[3:])
+    place = np.array(robot.tool[:3]) + inside.apply(frame[:3])
+    turn = (inside * Rotation.from_quat(frame[3:])).as_matrix()
+    return SerialChain(
+        joints=tuple(joints),
+        axis=data.xaxis[joints].copy(),
+        anchor=data.xanchor[joints].copy(),
+        slide=model.jnt_type[joints] == int(mujoco.mjtJoint.mjJNT_SLIDE),
+        lower=np.array(robot.joint_lower)[joints],
+        upper=np.array(robot.joint_upper)[joints],
+        home=np.array(robot.home)[joints],
+        tool_position=data.xpos[end] + mount @ place,
+        tool_rotation=mount @ turn,
+    )

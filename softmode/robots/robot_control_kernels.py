@@ -1,0 +1,302 @@
+"""Device side of the controller of loaded robots: a chain of up to eight joints, and a gripper with a measured gap."""
+
+import warp as wp
+
+from softmode.robots.control_kernels import (
+    Command,
+    Settings,
+    _clamp_into,
+    _clean,
+    _rotation_between,
+    _solve_spd,
+    _tool_yaw,
+    mat66,
+    vec6,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+JOINT_MAX = 8
+
+vec8 = wp.types.vector(length=JOINT_MAX, dtype=wp.float32)
+"""One number per joint; those beyond the robot's are zero."""
+mat68 = wp.types.matrix(shape=(6, JOINT_MAX), dtype=wp.float32)
+"""A tool Jacobian: three rows of translation, three of rotation."""
+
+
+@wp.struct
+class RobotChain:
+    """The joints between base and tool as a product of exponentials in the world frame, and the gripper."""
+
+    count: int
+    axis: wp.array[wp.vec3]  # (count,) directions at zero coordinates
+    anchor: wp.array[wp.vec3]  # (count,) points on the axes [m]
+    slide: wp.array[int]  # (count,) 1 where a joint slides
+    lower: wp.array[float]
+    upper: wp.array[float]
+    home: vec8
+    tool: wp.transform  # at zero coordinates
+    coord_start: wp.array[int]  # (world_count,)
+    joint: wp.array[int]  # (count,) coordinate in the robot
+    finger: wp.array[int]  # coordinates of the gripper's joints
+    closed: wp.array[float]
+    open: wp.array[float]
+    gap: wp.array[float]  # between the fingers at evenly spaced openings 0..1 [m]
+
+
+@wp.func
+def _forward(chain: RobotChain, q: vec8):
+    """Return the tool's pose in the world at joint coordinates q."""
+    pose = wp.transform_identity()
+    for k in range(chain.count):
+        axis = chain.axis[k]
+        if chain.slide[k] == 1:
+            pose = pose * wp.transform(axis * q[k], wp.quat_identity())
+        else:
+            turn = wp.quat_from_axis_angle(axis, q[k])
+            anchor = chain.anchor[k]
+            pose = pose * wp.transform(anchor - wp.quat_rotate(turn, anchor), turn)
+    return pose * chain.tool
+
+
+@wp.func
+def _jacobian(chain: RobotChain, q: vec8, rotation_weight: float):
+    """Return d(tool position, rotation_weight * rotation)/dq in the world frame; columns of no joint are zero."""
+    tool = wp.transform_get_translation(_forward(chain, q))
+    jacobian = mat68()
+    pose = wp.transform_identity()
+    for k in range(chain.count):
+        axis = wp.transform_vector(pose, chain.axis[k])
+        anchor = chain.anchor[k]
+        if chain.slide[k] == 1:
+            for i in range(3):
+                jacobian[i, k] = axis[i]
+            pose = pose * wp.transform(chain.axis[k] * q[k], wp.quat_identity())
+        else:
+            lever = wp.cross(axis, tool - wp.transform_point(pose, anchor))
+            for i in range(3):
+                jacobian[i, k] = lever[i]
+                jacobian[3 + i, k] = rotation_weight * axis[i]
+            turn = wp.quat_from_axis_angle(chain.axis[k], q[k])
+            pose = pose * wp.transform(anchor - wp.quat_rotate(turn, anchor), turn)
+    return jacobian
+
+
+@wp.func
+def _inverse(
+    chain: RobotChain, settings: Settings, position: wp.vec3, rotation: wp.quat, q_start: vec8, low: vec8, high: vec8
+):
+    """Iterate damped least squares towards a tool pose, within joint limits, pulled home in the null space.
+
+    One iteration: dq = J^T (J J^T + lambda^2 I)^-1 (e - J z) + z with z = gain * (q_home - q). An arm of five joints
+    has no null space: the pull is left out, it would only bend the pose.
+    """
+    q = q_start
+    gain = wp.where(chain.count > 6, settings.posture_gain, 0.0)
+    for _iteration in range(settings.iterations):
+        pose = _forward(chain, q)
+        e_position = position - wp.transform_get_translation(pose)
+        e_rotation = settings.rotation_weight * _rotation_between(rotation, wp.transform_get_rotation(pose))
+        jacobian = _jacobian(chain, q, settings.rotation_weight)
+        pull = gain * (chain.home - q)
+        right = vec6()
+        for i in range(3):
+            right[i] = e_position[i]
+            right[3 + i] = e_rotation[i]
+        right = right - jacobian * pull
+        scale = settings.damping * wp.min(1.0, wp.length(right) / settings.damping) + 1.0e-3
+        normal = mat66(jacobian * wp.transpose(jacobian))
+        for i in range(6):
+            normal[i, i] = normal[i, i] + scale * scale
+        q = q + pull + wp.transpose(jacobian) * _solve_spd(normal, right)
+        for k in range(chain.count):
+            q[k] = wp.clamp(q[k], low[k], high[k])
+    return q
+
+
+@wp.func
+def _outside(chain: RobotChain, settings: Settings, q: vec8):
+    """Return the distance of the tool from the workspace box [m]."""
+    position = wp.transform_get_translation(_forward(chain, q))
+    return wp.length(position - _clamp_into(position, settings.workspace_lower, settings.workspace_upper))
+
+
+@wp.func
+def _read_arm(chain: RobotChain, world: int, joint_q: wp.array[float]):
+    q = vec8()
+    for k in range(chain.count):
+        q[k] = joint_q[chain.coord_start[world] + chain.joint[k]]
+    return q
+
+
+@wp.func
+def _gap_at(chain: RobotChain, opening: float):
+    """Return the distance between the fingers at an opening [m]; beyond the ends its slope goes on."""
+    last = chain.gap.shape[0] - 1
+    x = opening * float(last)
+    i = wp.clamp(int(wp.floor(x)), 0, last - 1)
+    return chain.gap[i] + (x - float(i)) * (chain.gap[i + 1] - chain.gap[i])
+
+
+@wp.func
+def _opening_at(chain: RobotChain, gap: float):
+    """Return the opening at a distance between the fingers, the inverse of `_gap_at`."""
+    last = chain.gap.shape[0] - 1
+    i = int(0)
+    while i < last - 1 and gap > chain.gap[i + 1]:
+        i += 1
+    return (float(i) + (gap - chain.gap[i]) / (chain.gap[i + 1] - chain.gap[i])) / float(last)
+
+
+@wp.func
+def _read_opening(chain: RobotChain, world: int, joint_q: wp.array[float]):
+    """Return the measured distance between the fingers [m]."""
+    total = float(0.0)
+    for f in range(chain.finger.shape[0]):
+        q = joint_q[chain.coord_start[world] + chain.finger[f]]
+        total += (q - chain.closed[f]) / (chain.open[f] - chain.closed[f])
+    return _gap_at(chain, total / float(chain.finger.shape[0]))
+
+
+@wp.kernel
+def reset_command(
+    chain: RobotChain,
+    joint_q_in: wp.array[float],
+    world_mask: wp.array[wp.bool],
+    # Out:
+    command: Command,
+):
+    """Set the command of the masked worlds to the measured configuration."""
+    world = wp.tid()
+    if not world_mask[world]:
+        return
+    q = _read_arm(chain, world, joint_q_in)
+    pose = _forward(chain, q)
+    opening = _read_opening(chain, world, joint_q_in)
+    for k in range(chain.count + 2):
+        value = 0.5 * opening
+        if k < chain.count:
+            value = q[k]
+        command.commanded_q[world, k] = value
+        command.previous_q[world, k] = value
+    command.target_position[world] = wp.transform_get_translation(pose)
+    command.target_yaw[world] = _tool_yaw(wp.transform_get_rotation(pose))
+    command.tool_pose[world] = pose
+    command.opening[world] = opening
+
+
+@wp.kernel
+def move_command(
+    chain: RobotChain,
+    settings: Settings,
+    action: wp.array2d[float],
+    joint_q_in: wp.array[float],
+    # In, out:
+    command: Command,
+):
+    """Apply one action to the command: move, clamp to workspace and lead, solve for the joints, move the gripper."""
+    world = wp.tid()
+    measured = _read_arm(chain, world, joint_q_in)
+    measured_pose = _forward(chain, measured)
+    command.tool_pose[world] = measured_pose
+    measured_position = wp.transform_get_translation(measured_pose)
+    q = vec8()
+    low = vec8()
+    high = vec8()
+    for k in range(chain.count + 2):
+        command.previous_q[world, k] = command.commanded_q[world, k]
+    for k in range(chain.count):
+        q[k] = command.commanded_q[world, k]
+        low[k] = chain.lower[k]
+        high[k] = chain.upper[k]
+    q_before = vec8(q)
+    if settings.joint_mode == 1:
+        lead = settings.max_lead_angle
+        for k in range(chain.count):
+            moved = q[k] + settings.joint_scale * _clean(action[world, k])
+            q[k] = wp.clamp(wp.clamp(moved, measured[k] - lead, measured[k] + lead), low[k], high[k])
+        pose = _forward(chain, q)
+        position = wp.transform_get_translation(pose)
+        inside = _clamp_into(position, settings.workspace_lower, settings.workspace_upper)
+        if wp.length(inside - position) > 0.0:
+            q = _inverse(chain, settings, inside, wp.transform_get_rotation(pose), q, low, high)
+            if _outside(chain, settings, q) > wp.max(_outside(chain, settings, q_before), 1.0e-3):
+                q = q_before
+            pose = _forward(chain, q)
+            position = wp.transform_get_translation(pose)
+        command.target_position[world] = position
+        command.target_yaw[world] = _tool_yaw(wp.transform_get_rotation(pose))
+    else:
+        move = wp.vec3(_clean(action[world, 0]), _clean(action[world, 1]), _clean(action[world, 2]))
+        position = command.target_position[world] + settings.translation_scale * move
+        ahead = position - measured_position
+        distance = wp.length(ahead)
+        if distance > settings.max_lead:
+            position = measured_position + ahead * (settings.max_lead / distance)
+        position = _clamp_into(position, settings.workspace_lower, settings.workspace_upper)
+        yaw = command.target_yaw[world] + settings.rotation_scale * _clean(action[world, 3])
+        measured_yaw = _tool_yaw(wp.transform_get_rotation(measured_pose))
+        turn = yaw - measured_yaw
+        turn = turn - 2.0 * wp.pi * wp.round(turn / (2.0 * wp.pi))
+        yaw = measured_yaw + wp.clamp(turn, -settings.max_lead_angle, settings.max_lead_angle)
+        rotation = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw) * wp.quat(0.0, 1.0, 0.0, 0.0)
+        q = _inverse(chain, settings, position, rotation, q, low, high)
+        # Where limits or reach hold the joints back, the target waits at what they attain.
+        pose = _forward(chain, q)
+        attained = wp.transform_get_translation(pose)
+        if wp.length(attained - position) > 0.002:
+            position = attained
+        attained_yaw = _tool_yaw(wp.transform_get_rotation(pose))
+        missing = yaw - attained_yaw
+        missing = missing - 2.0 * wp.pi * wp.round(missing / (2.0 * wp.pi))
+        if wp.abs(missing) > 0.01:
+            yaw = attained_yaw
+        command.target_position[world] = position
+        command.target_yaw[world] = yaw
+
+    for k in range(chain.count):
+        command.commanded_q[world, k] = q[k]
+    measured_opening = _read_opening(chain, world, joint_q_in)
+    command.opening[world] = measured_opening
+    lead = settings.opening_lead
+    wanted = wp.lerp(-lead, settings.stroke, 0.5 * (1.0 + _clean(action[world, action.shape[1] - 1])))
+    opening = command.commanded_q[world, chain.count] + command.commanded_q[world, chain.count + 1]
+    opening = opening + wp.clamp(wanted - opening, -settings.opening_rate, settings.opening_rate)
+    opening = wp.clamp(opening, measured_opening - lead, measured_opening + lead)
+    command.commanded_q[world, chain.count] = 0.5 * opening
+    command.commanded_q[world, chain.count + 1] = 0.5 * opening
+
+
+@wp.kernel
+def write_targets(
+    chain: RobotChain,
+    command: Command,
+    fraction: float,
+    # Out:
+    joint_target_q_out: wp.array[float],
+):
+    """Interpolate the position targets between two commands; the gripper's joints share one opening."""
+    world = wp.tid()
+    start = chain.coord_start[world]
+    n = chain.count
+    for k in range(n):
+        target = wp.lerp(command.previous_q[world, k], command.commanded_q[world, k], fraction)
+        joint_target_q_out[start + chain.joint[k]] = target
+    before = command.previous_q[world, n] + command.previous_q[world, n + 1]
+    now = command.commanded_q[world, n] + command.commanded_q[world, n + 1]
+    opening = _opening_at(chain, wp.lerp(before, now, fraction))
+    for f in range(chain.finger.shape[0]):
+        joint_target_q_out[start + chain.finger[f]] = wp.lerp(chain.closed[f], chain.open[f], opening)
+
+
+@wp.kernel
+def measure(
+    chain: RobotChain,
+    joint_q_in: wp.array[float],
+    # Out:
+    command: Command,
+):
+    """Compute the tool's pose and the distance between the fingers."""
+    world = wp.tid()
+    command.tool_pose[world] = _forward(chain, _read_arm(chain, world, joint_q_in))
+    command.opening[world] = _read_opening(chain, world, joint_q_in)

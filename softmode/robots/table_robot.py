@@ -1,0 +1,350 @@
+"""A robot from a file as the tasks have it: standing at the table, with a tool between its fingers and a home pose."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import newton
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from softmode.checks import require_fields, require_number
+from softmode.errors import ConfigError
+from softmode.robots.arm import ArmDescription, ArmIndices, GripperDescription
+from softmode.robots.chain import SerialChain, serial_chain
+from softmode.robots.description import RobotDescription, RobotIndices
+from softmode.robots.hand import settled
+from softmode.robots.jaws import ParallelJaw, finger_names, gap_of
+
+Array = NDArray[np.float64]
+
+JOINT_MAX = 8
+"""Most joints between base and tool."""
+_OPENINGS = 17
+"""At how many openings the gap between the fingers is measured."""
+_DOWN = np.diag([-1.0, 1.0, -1.0])
+"""Orientation of a tool that points down with yaw 0: z down, fingers close along y."""
+_YAW = 1.4
+"""How far the tool must turn about the vertical to either side over the home position [rad]."""
+_NEAR = 2.0e-3
+"""Error of the inverse kinematics that counts as reached [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableRobot:
+    """A loaded robot at the table; made by :func:`place_robot`, and what ``TableSceneConfig.arm`` takes."""
+
+    robot: RobotDescription
+    """The robot; its home pose is the one at the table."""
+    base: tuple[float, float, float, float]
+    """Where its base stands: x, y, z [m] and the rotation about the vertical [rad]."""
+    jaw: ParallelJaw
+    """Its fingers, with the frame of tasks between the pads: x across the fingers, y along the closing axis, z out."""
+    home_position: tuple[float, float, float]
+    """Tool position of the home pose in the world [m]; the tool points down."""
+    home_opening: float
+    """Distance between the pads there [m]."""
+    gaps: tuple[float, ...] = field(repr=False)
+    """Distance between the fingers [m] at openings from 0 to 1 of the gripper, evenly spaced and ascending."""
+    grip_force: float
+    """Largest force of a finger [N]."""
+    grip_stiffness: float
+    """Stiffness of a finger along the closing axis [N/m]."""
+    share: float
+    """Share of a task's ranges of places that it reaches, 1 for all."""
+
+    def __post_init__(self) -> None:
+        """Check what a caller may replace."""
+        require_fields(self, ("base",), count=4)
+        require_fields(self, ("home_position",), count=3)
+        require_number("home_opening", self.home_opening, at_least=0.0, at_most=self.jaw.opening + 1e-9, unit="m")
+
+    @property
+    def gripper(self) -> GripperDescription:
+        """What tasks and scripted policies ask of a gripper: sizes, and the drive of one finger."""
+        return GripperDescription(
+            stroke=self.jaw.opening,
+            finger_length=max(self.jaw.reach, self.jaw.pad_length),
+            pad_size=(self.jaw.pad_width, self.jaw.thickness, self.jaw.pad_length),
+            force_limit=self.grip_force,
+            drive_stiffness=self.grip_stiffness,
+            friction=self.jaw.friction,
+        )
+
+    @property
+    def chain(self) -> SerialChain:
+        """The chain to the frame of tasks, in the base frame."""
+        return serial_chain(self.robot, self.jaw.frame)
+
+    @property
+    def joint_count(self) -> int:
+        """Joints between base and tool."""
+        return len(self.chain.joints)
+
+    def opening_at(self, gap: float) -> float:
+        """Return the opening, 0 to 1, at which the fingers are so far apart [m]."""
+        return float(np.interp(gap, self.gaps, np.linspace(0.0, 1.0, len(self.gaps))))
+
+    def joint_q_over(self, position: Sequence[float], yaw: float = 0.0) -> Array:
+        """Return the joint coordinates that hold the tool at a point of the world, pointing down.
+
+        Args:
+            position: Tool position in the world [m], shape (3,).
+            yaw: Rotation about the vertical [rad].
+
+        Returns:
+            Coordinates of the joints between base and tool, shape (joint_count,).
+
+        Raises:
+            ConfigError: If the point is out of reach.
+        """
+        chain = self.chain
+        start = np.array(self.robot.home)[list(chain.joints)]
+        q, error = _reach(chain, np.array([self.base]), np.array([position], float), np.array([yaw]), start)
+        if error[0] > _NEAR:
+            raise ConfigError(
+                f"robot {self.robot.name!r} cannot hold its tool at {tuple(position)} m pointing down with yaw {yaw}",
+                hint="choose a point nearer to its base, or place it anew: softmode.robots.place_robot(robot, ...)",
+            )
+        return q[0]
+
+    def add_to(
+        self, builder: newton.ModelBuilder, *, xform: Sequence[float] | None = None, label: str = "arm"
+    ) -> RobotIndices:
+        """Add the robot in its home pose to a builder; `xform` places its base elsewhere."""
+        newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
+        return self.robot.add_to(builder, xform=base_pose(self.base) if xform is None else xform, label=label)
+
+
+def finger_links(description: ArmDescription | TableRobot, arm: ArmIndices | RobotIndices) -> NDArray[np.int64]:
+    """Return the bodies of both fingers in the builder, shape (2, links of a finger), -1 for none."""
+    if not isinstance(description, TableRobot) or isinstance(arm, ArmIndices):
+        return np.asarray(arm.finger_bodies)[:, None]
+    sides = finger_names(description.robot)
+    bodies = dict(zip(description.robot.link_names, arm.link_bodies, strict=True))
+    table = np.full((2, max(map(len, sides))), -1)
+    for f, side in enumerate(sides):
+        table[f, : len(side)] = [bodies[name] for name in side]
+    return table
+
+
+def base_pose(base: Sequence[float]) -> tuple[float, ...]:
+    """Return position and quaternion (xyzw) of a base at x, y, z [m], turned about the vertical [rad]."""
+    return (*base[:3], 0.0, 0.0, math.sin(0.5 * base[3]), math.cos(0.5 * base[3]))
+
+
+def place_robot(
+    robot: RobotDescription,
+    *,
+    home_position: Sequence[float] = (0.45, 0.0, 0.25),
+    home_opening: float = 0.08,
+    over: Sequence[float] = (0.45, 0.0),
+    ranges: Sequence[float] = (0.09, 0.16),
+    height: float = 0.24,
+    base: Sequence[float] | None = None,
+    grip_force: float = 40.0,
+    grip_way: float | None = 0.01,
+) -> TableRobot:
+    """Place a loaded robot at the table, so that it reaches what a task needs with the tool pointing down.
+
+    Distance and direction of the base are searched: the most places first, then the middle of what serves.
+    Where not all is in reach, the ranges shrink about their middle; `TableRobot.share` says by how much.
+
+    Args:
+        robot: The robot, with a gripper of two fingers.
+        home_position: Tool position of the home pose [m], shape (3,).
+        home_opening: Distance between the pads in the home pose [m]; the widest one if it is less.
+        over: Middle of the places on the table [m], shape (2,).
+        ranges: Half-widths of the places in x and y [m].
+        height: Highest place over the table [m].
+        base: Where the base stands, x, y, z [m] and rotation [rad]; searched if omitted.
+        grip_force: Largest force of a finger [N]; that of the file if it is less.
+        grip_way: How far past the object a finger's drive aims for that force [m], by which softer drives of the file
+            are stiffened: models of grippers often have a servo so soft that it cannot press, where the device
+            controls the force. None keeps the file's drives.
+
+    Returns:
+        The robot at the table.
+
+    Raises:
+        ConfigError: If it has no gripper of two fingers, too few or too many joints, or cannot reach the table.
+    """
+    if robot.gripper is None:
+        raise ConfigError(
+            f"robot {robot.name!r} has no gripper, which this task needs",
+            hint="name its joints: load(..., gripper={'joint': (closed, open)}), or use a robot that has one",
+        )
+    jaw = ParallelJaw.of(robot)
+    chain = serial_chain(robot, jaw.frame)
+    if not 5 <= len(chain.joints) <= JOINT_MAX:
+        raise ConfigError(
+            f"robot {robot.name!r} has {len(chain.joints)} joints between base and tool, expected 5 to {JOINT_MAX}",
+            hint="write control.joint_target_q yourself, see RobotDescription.with_opening",
+        )
+    box = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [0.02, height], indexing="ij"), axis=-1).reshape(-1, 3)
+    given = None if base is None else [tuple(float(value) for value in base)]
+    # The fingers may change sides: half a turn about the tool, which may free the last joint's range.
+    half = Rotation.from_quat(jaw.frame[3:]) * Rotation.from_rotvec([0.0, 0.0, np.pi])
+    other = (*jaw.frame[:3], *half.as_quat().tolist())
+    jaws = [jaw, replace(jaw, frame=other)]
+    best: tuple[float, ParallelJaw, Any, Array] | None = None
+    for share in (1.0, 0.75, 0.5, 0.3):
+        places = box * [share * ranges[0], share * ranges[1], 1.0] + [*over, 0.0]
+        points = np.concatenate([np.array([home_position] * 3, float), places])
+        yaw = np.array([0.0, _YAW, -_YAW] + [0.0] * len(box))
+        found = [_placed(robot, one, given, over, points, yaw) for one in jaws]
+        found = [one for one in found if one is not None]
+        if found:
+            _, chosen, placed, q = min(found, key=lambda one: one[0])
+            best = share, chosen, placed, q
+            break
+    if best is None:
+        raise ConfigError(
+            f"robot {robot.name!r}, whose tool reaches {chain.reach:.2f} m, finds no place from which it points down "
+            f"at {tuple(home_position)} m and around {tuple(over)} m",
+            hint="use a larger robot, a lower home_position, or name its tool: load(..., end_effector=, tool_offset=)",
+        )
+    share, jaw, placed, q = best
+    gaps = np.maximum.accumulate([gap_of(robot, jaw, s) for s in np.linspace(0.0, 1.0, _OPENINGS)])
+    gaps = np.maximum(gaps, 0.0) + 1.0e-7 * np.arange(_OPENINGS)  # ascending
+    jaw = replace(jaw, opening=float(gaps[-1]))
+    opening = min(home_opening, jaw.opening)
+    fraction = float(np.interp(opening, gaps, np.linspace(0.0, 1.0, _OPENINGS)))
+    home = robot.home_joint_q
+    home[list(chain.joints)] = q
+    home = _closed_loops(robot, robot.with_opening(fraction, home.tolist()))
+    robot = replace(robot, home=tuple(home.tolist()))
+    robot, force, stiffness = _with_grip(robot, 0.5 * float(gaps[-1] - gaps[0]), grip_force, grip_way)
+    return TableRobot(
+        robot=robot,
+        base=placed,
+        jaw=jaw,
+        home_position=(float(home_position[0]), float(home_position[1]), float(home_position[2])),
+        home_opening=opening,
+        gaps=tuple(gaps.tolist()),
+        grip_force=force,
+        grip_stiffness=stiffness,
+        share=share,
+    )
+
+
+def _with_grip(
+    robot: RobotDescription, travel: float, most: float, way: float | None
+) -> tuple[RobotDescription, float, float]:
+    """Return the robot with drives of the fingers that press, the force [N] and the stiffness [N/m] of one finger.
+
+    A joint that moves by R while its finger travels by T acts on it with the lever r = T / R: a force f = torque / r,
+    a stiffness k / r^2.
+    """
+    fingers = robot.gripper
+    assert fingers is not None
+    index = [robot.joint_names.index(name) for name in fingers.joints]
+    drives = [drive for drive in (robot.drives[j] for j in index) if drive is not None]
+    if len(drives) < len(index):
+        raise ConfigError(
+            f"a gripper joint of robot {robot.name!r} has no drive", hint="name driven joints: load(..., gripper=)"
+        )
+    lever = travel / np.maximum(np.abs(np.array(fingers.open) - np.array(fingers.closed)), 1.0e-9)
+    shared = 0.5 * len(index)  # joints of a finger
+    limit = np.array([drive.effort_limit for drive in drives]) / lever * shared
+    force = float(min(most, limit.min()))
+    stiffness = np.array([drive.stiffness for drive in drives])
+    damping = np.array([drive.damping for drive in drives])
+    if way is not None:
+        wanted = force / way * lever**2 / shared
+        inertia = robot.joint_inertias()[index]
+        critical = 2.0 * np.sqrt(np.maximum(wanted, stiffness) * inertia)
+        damping = np.where(wanted > stiffness, np.maximum(damping, critical), damping)
+        stiffness = np.maximum(stiffness, wanted)
+    changed = list(robot.drives)
+    for k, j in enumerate(index):
+        bounded = force * lever[k] / shared
+        new = {"stiffness": float(stiffness[k]), "damping": float(damping[k]), "effort_limit": float(bounded)}
+        changed[j] = replace(drives[k], **new)
+    along = float((stiffness / lever**2).sum() / 2.0)
+    return replace(robot, drives=tuple(changed)), force, along
+
+
+def _placed(
+    robot: RobotDescription, jaw: ParallelJaw, given: list[Any] | None, over: Sequence[float], points: Array, yaw: Array
+) -> tuple[float, ParallelJaw, Any, Array] | None:
+    """Return how far from home, the jaw, the base, and the coordinates over the first point; None if none reaches all.
+
+    The middle of the distances that serve is taken, in the direction that asks for the least change of the home pose
+    and leaves the last joint room to turn the tool.
+    """
+    chain = serial_chain(robot, jaw.frame)
+    bases = _bases(chain, over) if given is None else given
+    count = len(points)
+    rows, turns = np.tile(points, (len(bases), 1)), np.tile(yaw, len(bases))
+    q, error = _reach(chain, np.repeat(np.array(bases), count, axis=0), rows, turns, chain.home)
+    reached = (error.reshape(-1, count) <= _NEAR).all(axis=1)
+    at_home = q.reshape(-1, count, q.shape[1])[:, 0]
+    middles = []
+    for turn in dict.fromkeys(one[3] for one in bases):
+        chosen = [k for k in np.flatnonzero(reached) if bases[k][3] == turn]
+        middles += [chosen[len(chosen) // 2]] if chosen else []
+    if not middles:
+        return None
+    low, high = chain.span
+    room = np.minimum(at_home - low, high - at_home)[:, -1]  # of the joint that turns the tool
+    change = {k: float(np.abs(at_home[k] - chain.home).sum() + 3.0 * max(0.0, _YAW - room[k])) for k in middles}
+    k = min(middles, key=lambda k: change[k])
+    return change[k], jaw, bases[k], at_home[k]
+
+
+def _bases(chain: SerialChain, over: Sequence[float]) -> list[Any]:
+    """Return places of the base: on the near side of the table, at several distances, turned by quarter turns."""
+    return [
+        (float(over[0] - share * chain.reach), float(over[1]), 0.0, turn)
+        for turn in (0.0, 0.5 * math.pi, -0.5 * math.pi, math.pi)
+        for share in np.linspace(0.25, 0.95, 15)
+    ]
+
+
+def _reach(chain: SerialChain, base: Array, points: Array, yaw: Array, start: Array) -> tuple[Array, Array]:
+    """Return coordinates that hold the tool at points of the world, pointing down, and what is missing [m].
+
+    The iteration begins in the home pose, then in two other ones for what was not reached.
+
+    Args:
+        chain: The chain in the base frame.
+        base: Where the base stands for each point, x, y, z [m] and rotation [rad], shape (N or 1, 4).
+        points: The points, shape (N, 3).
+        yaw: Rotation of the tool about the vertical there [rad], shape (N,).
+        start: The home pose.
+    """
+    base = np.broadcast_to(base, (len(points), 4))
+    local = _about_z(-base[:, 3]).apply(points - base[:, :3])
+    turns = _about_z(yaw - base[:, 3]).as_matrix() @ _DOWN
+    low, high = chain.span
+    starts = [start, np.clip(0.5 * (low + high), low, high)]
+    bent = starts[1].copy()
+    bent[1::2] += 0.25 * (high - low)[1::2]
+    q, error = chain.inverse(local, turns, starts[0], iterations=80)
+    for other in (starts[1], bent):
+        left = np.flatnonzero(error > _NEAR)
+        if not len(left):
+            break
+        again, missing = chain.inverse(local[left], turns[left], other, iterations=80)
+        better = missing < error[left]
+        q[left[better]], error[left[better]] = again[better], missing[better]
+    return q, error
+
+
+def _about_z(angle: Array) -> Rotation:
+    """Return rotations about the vertical [rad], shape (N,)."""
+    return Rotation.from_rotvec(np.outer(angle, [0.0, 0.0, 1.0]))
+
+
+def _closed_loops(robot: RobotDescription, joint_q: Array) -> Array:
+    """Return joint coordinates with the loops closed by the passive joints, within the limits."""
+    model = importlib.import_module("mujoco").MjModel.from_xml_string(robot.mjcf)
+    passive = [robot.joint_names.index(name) for name in robot.passive_joints]
+    data = settled(model, model.qpos0 + joint_q, passive)
+    return np.clip(np.asarray(data.qpos) - model.qpos0, robot.joint_lower, robot.joint_upper)

@@ -1,0 +1,112 @@
+"""LiftSoft with robots from files: observation, worlds, the scripted lift."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softmode import robots
+from softmode.envs.tasks.lift_soft.scripted import ScriptedLift
+from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv, LiftSoftVectorEnv
+from softmode.envs.tasks.push_soft.task import PushSoftEnv
+from softmode.errors import ConfigError
+from softmode.robots.table_robot import TableRobot
+from tests.robots.files import MJCF, write_arm5, write_mjcf
+
+
+@pytest.fixture(scope="module")
+def arm5(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of the arm of five joints."""
+    return write_arm5(tmp_path_factory.mktemp("robot"))
+
+
+@pytest.fixture(scope="module")
+def env(arm5: Path) -> LiftSoftEnv:
+    """LiftSoft with it, by the path of its file."""
+    return LiftSoftEnv(robot=arm5, device="cpu")
+
+
+def lift(env: LiftSoftEnv, seed: int, **options: Any) -> bool:
+    """Play the scripted policy; return whether the object was lifted to the goal and held."""
+    env.reset(seed=seed, options=options)
+    policy = ScriptedLift(env)
+    for _ in range(250):
+        _, _, terminated, _, info = env.step(policy())
+        if info["is_success"] or terminated:
+            return bool(info["is_success"])
+    return False
+
+
+def test_observation_of_five_joints(env: LiftSoftEnv) -> None:
+    """The joints' segment has five angles, those of the state; the tool is where the controller measures it."""
+    seen, _ = env.reset(seed=3)
+    task = env.task
+    arm = task.config.scene.arm
+    assert isinstance(arm, TableRobot)
+    columns, segment = task.segments["joint_angles"]
+    assert segment.size == 5 and env.action_space.shape == (5,)
+    np.testing.assert_array_equal(seen[columns], env.scene.state.joint_q.numpy()[:5])
+    np.testing.assert_allclose(seen[task.segments["tool_position"][0]], arm.home_position, atol=2e-3)
+    assert seen[task.segments["opening"][0]][0] == pytest.approx(arm.home_opening, abs=1e-4)
+    assert env.observation_space.contains(seen)
+
+
+@pytest.mark.parametrize("modulus", [2e4, 2e6])
+def test_scripted_lift(env: LiftSoftEnv, modulus: float) -> None:
+    """The arm lifts a soft and a stiff object to the goal and holds it with both fingers."""
+    assert lift(env, 1, youngs_modulus=np.array([modulus]))
+
+
+def test_world_equals_the_single_environment(env: LiftSoftEnv, arm5: Path) -> None:
+    """World 1 of 2 gives the observations of the single environment, bit for bit, with the same draws."""
+    worlds = LiftSoftVectorEnv(2, robot=arm5, device="cpu")
+    many, _ = worlds.reset(seed=[8, 9])
+    one, _ = env.reset(seed=9)
+    np.testing.assert_array_equal(many[1], one)
+    action = np.float32([0.4, -0.3, -1.0, 0.5, -0.2])
+    for _ in range(6):
+        many = worlds.step(np.tile(action, (2, 1)))[0]
+        one = env.step(action)[0]
+    np.testing.assert_array_equal(many[1], one)
+    worlds.close()
+
+
+def test_state_of_a_loaded_robot(env: LiftSoftEnv) -> None:
+    """A state goes on with the same bits."""
+    env.reset(seed=4)
+    state = env.get_state()
+    action = np.float32([0.2, 0.1, -1.0, 0.3, -1.0])
+    first = [env.step(action)[0] for _ in range(4)]
+    env.set_state(state)
+    second = [env.step(action)[0] for _ in range(4)]
+    np.testing.assert_array_equal(first, second)
+
+
+def test_wrist_camera(arm5: Path) -> None:
+    """The camera hangs on the hand of the robot and sees something."""
+    config = LiftSoftConfig(camera="wrist")
+    env = LiftSoftEnv(robot=arm5, obs_type="pixels", config=config, device="cpu")
+    picture, _ = env.reset(seed=0)
+    assert picture.std() > 5.0
+
+
+def test_robots_and_tasks_that_do_not_fit(tmp_path: Path, arm5: Path) -> None:
+    """A robot without gripper, what is no robot, and a task with the built-in arm only: typed errors."""
+    bare = robots.load(write_mjcf(tmp_path, MJCF), end_effector="jaw_left")
+    with pytest.raises(ConfigError, match="no gripper, which this task needs"):
+        LiftSoftEnv(robot=bare)
+    with pytest.raises(ConfigError, match="robot is a int"):
+        LiftSoftEnv(robot=3)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="built-in arm only"):
+        PushSoftEnv(robot=arm5)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("aloha_arm" not in robots.available(), reason="this mujoco-warp ships no ALOHA arm")
+def test_scripted_lift_of_the_aloha_arm() -> None:
+    """An arm of six joints that ships with mujoco-warp lifts the plush."""
+    env = LiftSoftEnv(robot="aloha_arm", device="cpu")
+    assert lift(env, 2, youngs_modulus=np.array([2e5]))
