@@ -1,19 +1,24 @@
 """Fill of captures: shells of known volume, and twelve captures of known objects.
 
-Run with `python -m benchmarks.captures [--scenes]`. Volumes and extents are relative to the truth, times are of one
-core (processor time).
+Run with `python -m benchmarks.captures [--scenes | --loads]`. Volumes and extents are relative to the truth, times are
+of one core (processor time). With `--loads`: the whole of `load`, from a file to a body that has never been built.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+import tempfile
 import time
+from pathlib import Path
+from unittest import mock
 
 import numpy as np
 
 from softmode.deformables.build.quadrature import quadrature_from_points, quadrature_from_splats
-from softmode.objects import ObjectConfig
+from softmode.objects import ObjectConfig, load
 from softmode.objects.source import object_source, standing_quadrature
+from softmode.splats.formats import write_splats
 from tests.captures import CAPTURES, SHELLS, render_shell
 
 BARE = 4e-4
@@ -26,8 +31,11 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=20_000, help="splats of a shell")
     parser.add_argument("--sigmas", type=float, nargs="+", default=[0.05e-3, 0.4e-3, 1e-3], help="their thickness [m]")
     parser.add_argument("--scenes", action="store_true", help="the twelve captures instead")
+    parser.add_argument("--loads", type=int, nargs="*", help="load files of so many splats; 100,000 and 500,000")
     options = parser.parse_args()
-    if options.scenes:
+    if options.loads is not None:
+        print_loads(options.loads or [100_000, 500_000])
+    elif options.scenes:
         print_scenes()
     else:
         print_shells(options.count, options.sigmas)
@@ -57,6 +65,21 @@ def print_shells(count: int, sigmas: list[float]) -> None:
                 f"{found.report['resolution']:8d}{seconds:7.1f}",
                 flush=True,
             )
+
+
+def print_loads(counts: list[int]) -> None:
+    """Time `load` of files with shells of some captures, without any cache."""
+    print(f"{'capture':12}{'splats':>9}{'voxels':>8}{'functions':>11}{'load, s':>9}")
+    for name in ("dense", "thin neck", "mug"):
+        for count in counts:
+            with tempfile.TemporaryDirectory() as folder, mock.patch.dict(os.environ, SOFTMODE_CACHE=folder):
+                file = Path(folder) / "capture.ply"
+                write_splats(file, render_shell(CAPTURES[name].solid(), count))
+                start = time.process_time()
+                body = load(ObjectConfig(splat=file, up="+z")).body
+                seconds = time.process_time() - start
+            voxels = body.provenance["quadrature_resolution"]
+            print(f"{name:12}{count:9d}{voxels:8d}{body.function_count:11d}{seconds:9.1f}", flush=True)
 
 
 def print_scenes() -> None:

@@ -31,6 +31,7 @@ from tests.test_cli_body import QUICK, merged
 
 ID = "softmode/LiftSoft-v0"
 UP = ["--up", "+z"]
+POLICY = Path(__file__).parents[1] / "policies" / "lift_soft.npz"
 
 
 @pytest.fixture(scope="module")
@@ -69,11 +70,13 @@ def commands(folder: Path) -> dict[str, list[str]]:
             "state",
         ],
         "train": ["train", ID, *train, str(folder / "run"), "--set", "rollout_steps=4", "hidden=[8]", "epochs=1"],
+        "evaluate": ["evaluate", ID, str(POLICY), "--episodes", "1", "--num-envs", "1", "--device", "cpu"],
         "bench": ["bench", ID, "--num-envs", "1", "--steps", "1", "--warmup", "0", "--device", "cpu"],
         "view": ["view", ID, "--policy", "zero", "--duration", "0.2", "--port", "0", "--no-open"],
         "view object": ["view", "--duration", "0.2", "--port", "0", "--no-open"],
         "body check": ["body", "check", *QUICK],
         "body build": ["body", "build", *QUICK, "-o", str(folder / "toy.npz")],
+        "body show": ["body", "show", *QUICK, "-o", str(folder / "toy.png")],
     }
 
 
@@ -95,7 +98,8 @@ def test_every_command_takes_an_object_and_says_what_matters(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """The same options name the object in each, and its defect is told once, with the remedy."""
-    pytest.importorskip({"train": "torch", "record": "pyarrow"}.get(command.split()[0], "numpy"))
+    extras = {"train": "torch", "evaluate": "torch", "record": "pyarrow", "body show": "matplotlib"}
+    pytest.importorskip(extras.get(command, "numpy"))
     monkeypatch.chdir(assets)
     options, finding = GIVEN[given]
     assert main([*commands(tmp_path)[command], *options]) == (1 if command == "body check" else 0)
