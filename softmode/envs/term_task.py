@@ -23,7 +23,7 @@ class TermTask(Task):
     it keeps that task's observation and figures, and replaces its reward and success.
     """
 
-    config: TermConfig
+    config: Any
     config_class = TermConfig
 
     def __init__(self, config: Any, **options: Any) -> None:

@@ -72,7 +72,7 @@ def test_rewards_are_computed_again(pair: tuple[Any, Any]) -> None:
 
 def test_the_script_reaches_the_goal_and_the_sparse_reward_says_so() -> None:
     """-1 until the disc is within the tolerance, 0 there; ten steps there are a success. The script is PushSoft's."""
-    env = gym.make("softmode/PushSoftGoal-v0").unwrapped
+    env: Any = gym.make("softmode/PushSoftGoal-v0").unwrapped
     seen, info = env.reset(seed=0)
     policy, rewards, apart = scripted_policy(env), [], []
     while not info["is_success"] and len(rewards) < 120:

@@ -29,7 +29,6 @@ class LiftSoftGoal(PositionGoals, LiftSoft):
     See `PositionGoals` for observation, reward and success; scene, draws and scripted policy are those of `LiftSoft`.
     """
 
-    config: LiftSoftGoalConfig
     config_class = LiftSoftGoalConfig
     goal_size = 3
 

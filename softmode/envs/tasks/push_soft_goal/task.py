@@ -34,7 +34,6 @@ class PushSoftGoal(PositionGoals, PushSoft):
     See `PositionGoals` for observation, reward and success; scene, draws and scripted policy are those of `PushSoft`.
     """
 
-    config: PushSoftGoalConfig
     config_class = PushSoftGoalConfig
     goal_size = 2
 
