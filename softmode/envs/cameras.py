@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -38,12 +40,15 @@ def wrist_camera(name: str, edge: int, arm: ArmDescription | TableRobot | None =
         mount = Rotation.from_quat(arm.robot.tool[3:])
         place = mount.apply(arm.jaw.frame[:3]) + arm.robot.tool[:3]
         turn = mount * Rotation.from_quat(arm.jaw.frame[3:])
-        eye, target, up = (tuple(v.tolist()) for v in turn.apply([[0.12, 0, -0.12], [0, 0, 0], [-1, 0, 0]]))
+        eye, middle, up = turn.apply([[0.12, 0.0, -0.12], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+        position: Any = tuple((eye + place).tolist())
+        target: Any = tuple((middle + place).tolist())
+        upward: Any = tuple(up.tolist())
         return PinholeCamera.look_at(
             name,
-            position=tuple((np.array(eye) + place).tolist()),
-            target=tuple((np.array(target) + place).tolist()),
-            up=up,
+            position=position,
+            target=target,
+            up=upward,
             width=edge,
             height=edge,
             fov_y=1.1,
