@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 if TYPE_CHECKING:
     from softmode.robots.description import JointDrive
@@ -278,5 +278,5 @@ def _mean_gap(robot: Compiled, joint_q: Array, sides: Sequence[Sequence[int]]) -
         if not len(points):
             points = data.xipos[list(side)]
         clouds.append(points[:: max(1, len(points) // _POINTS)])
-    both = (cKDTree(clouds[1]).query(clouds[0])[0], cKDTree(clouds[0]).query(clouds[1])[0])
+    both = (KDTree(clouds[1]).query(clouds[0])[0], KDTree(clouds[0]).query(clouds[1])[0])
     return float(np.mean([distances.mean() for distances in both]))

@@ -88,7 +88,7 @@ def _draw(axes: Any, robot: RobotDescription, model: Any, joint_q: Array, links:
     if triangles:
         seen, paint = np.concatenate(triangles), np.concatenate(colors)
         order = np.argsort(seen[:, :, 2].mean(axis=1))
-        axes.add_collection(PolyCollection(seen[order][:, :, :2], facecolors=paint[order], linewidths=0.0))
+        axes.add_collection(PolyCollection(list(seen[order][:, :, :2]), facecolors=paint[order], linewidths=0.0))
     mount = data.xmat[model.body(robot.end_effector).id].reshape(3, 3)
     tool = data.xpos[model.body(robot.end_effector).id] + mount @ np.array(robot.tool[:3])
     turn = mount @ Rotation.from_quat(robot.tool[3:]).as_matrix()

@@ -118,7 +118,7 @@ def test_steps_of_the_tool(placed: TableRobot) -> None:
     pose = rig.controller.tool_pose.numpy()
     np.testing.assert_allclose(pose[0, :3] - before[0, :3], 4 * 0.015 * np.array([1.0, -1.0, -1.0]), atol=1e-3)
     assert rig.controller.target_yaw.numpy()[0] == pytest.approx(4 * 0.08, abs=1e-2)
-    down = wp.quat_rotate(wp.quat(*pose[0, 3:]), wp.vec3(0.0, 0.0, 1.0))
+    down = np.array(wp.quat_rotate(wp.quat(*pose[0, 3:]), wp.vec3(0.0, 0.0, 1.0)))
     assert down[2] < -0.9999
     np.testing.assert_array_equal(pose[0], pose[1])
 
