@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Robots:
-    """List the robots that load by name, fetch some to the cache, or check what a file holds and draw it.
+    """List robots that load by name, fetch some, or check and draw a file.
 
     Example: softmode robots check arm.urdf -o arm.png
     """

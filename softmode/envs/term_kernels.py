@@ -49,8 +49,9 @@ def advance_level(
     next_level: wp.array[float],
     column: int,  # of the parameter
     size: int,
-    low: wp.array[float],
-    high: wp.array[float],
+    low: wp.array2d[float],  # (kinds, columns)
+    high: wp.array2d[float],
+    kind: wp.array[int],  # of worlds
     easy_low: wp.array[float],
     easy_high: wp.array[float],
     # In, out:
@@ -66,8 +67,8 @@ def advance_level(
         now = 0.0
     level[w] = now
     for k in range(size):
-        a = low[column + k]
-        b = high[column + k]
+        a = low[kind[w], column + k]
+        b = high[kind[w], column + k]
         share = float(0.0)
         if b > a:
             share = (parameters[w, column + k] - a) / (b - a)

@@ -165,7 +165,7 @@ class TermTask(Task):
         for name, term in self.made_of.curricula.items():
             table, parameter = self.table, self.table.parameters[term.parameter]
             inputs = [self.scene.world_mask, self.episode, self._next_levels[name], table.column(term.parameter)]
-            inputs += [parameter.size, table.low, table.high, *self._easy[name]]
+            inputs += [parameter.size, table.low, table.high, table.kind, *self._easy[name]]
             self.launch(kernels.advance_level, inputs, [self._levels[name], table.values])
         self._run("reset")
 

@@ -132,7 +132,7 @@ def test_a_running_page_is_prepared_by_its_button(capture: Path) -> None:
             said, _ = running.communicate(timeout=60.0)
         finally:
             running.kill()  # a page that is still open would keep the test waiting for ever
-    assert running.returncode == 0
+    assert running.returncode in (0, 130)  # interrupted on the last page, or before it was up
     assert said.count(f"open http://127.0.0.1:{port}") >= 3  # the object, the gizmos, the object
     assert f"to do this again: softmode view {shlex.quote(str(capture))} --up=+x --port {port} --no-open" in said
     assert "--size 0.08" in said
