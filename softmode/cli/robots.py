@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Robots:
-    """List robots that load by name, fetch some, or check and draw a file.
+    """List the robots known by name, fetch some, check a file.
 
     Example: softmode robots check arm.urdf -o arm.png
     """

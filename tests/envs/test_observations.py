@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.tasks.push_soft.task import PushSoftConfig
+from softmode.robots import ArmDescription
 
 Vector = NDArray[np.float64]
 Numbers = dict[str, Vector]
@@ -35,7 +36,9 @@ class HostState:
     def __init__(self, env: SoftEnv) -> None:
         """Read the state."""
         scene = env.task.scene
-        self.env, self.scene, self.arm = env, scene, scene.arm.description
+        arm = scene.arm.description
+        assert isinstance(arm, ArmDescription)
+        self.env, self.scene, self.arm = env, scene, arm
         model, state = scene.model, scene.state
         fresh = model.state()
         newton.eval_fk(model, state.joint_q, state.joint_qd, fresh)

@@ -13,6 +13,7 @@ from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.press_soft.scripted import ScriptedPress
 from softmode.envs.tasks.press_soft.task import START_HEIGHT, THICKNESS, PressSoftConfig, PressSoftEnv
 from softmode.errors import ConfigError
+from softmode.robots import ArmDescription
 from softmode.testing import assert_success
 from tests.envs.conftest import Episodes, MakeEnv
 
@@ -65,13 +66,14 @@ def test_contact_force_is_what_the_drives_push_with(press: PressSoftEnv, modulus
     J by differences of the forward kinematics in float32: (1e-7 m) / (1e-3 rad), so some 1e-3 of f.
     """
     info, infos = play(press, 0, youngs_modulus=modulus, goal_force=goal)
-    scene = press.scene
+    scene, arm = press.scene, press.scene.config.arm
+    assert isinstance(arm, ArmDescription)
     assert abs(infos[-20]["contact_force"] - info["contact_force"]) < 0.01 * goal  # at rest
     start, count = scene.arm.coord_start, 7
     q, target = (
         a.numpy()[start : start + count].astype(float) for a in (scene.state.joint_q, scene.control.joint_target_q)
     )
-    torque = np.array(scene.config.arm.drive_stiffnesses) * (target - q)
+    torque = np.array(arm.drive_stiffnesses) * (target - q)
     moved, jacobian = scene.model.state(), np.zeros((3, count))
     for j in range(count):
         ends = []
