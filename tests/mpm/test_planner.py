@@ -62,6 +62,7 @@ def test_the_logarithm_leaves_no_particle_behind() -> None:
         MorphOptions(loss="cubic")  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_morph_that_has_settled_stays() -> None:
     """Sixty steps without control change the loss by at most 5 %; without settling stress bends the body back."""
     source, target = ball(6.93, 1.0), torus(7.0, 3.2, 1.0)

@@ -42,9 +42,7 @@ def test_finite_elements_of_a_beam() -> None:
     np.testing.assert_allclose(np.sqrt(value), 4.7300407449**2 * np.sqrt(inertia), rtol=2e-3)
 
 
-@pytest.mark.parametrize(
-    ("name", "poissons_ratio"), [("bar 10:1", 0.3), ("plate 20:1", 0.49), ("fork", 0.3), ("round tube", 0.3)]
-)
+@pytest.mark.parametrize(("name", "poissons_ratio"), [("bar 10:1", 0.49), ("fork", 0.3), ("round tube", 0.3)])
 def test_default_frequencies(name: str, poissons_ratio: float) -> None:
     """The first six frequencies of the default body are those of finite elements."""
     low, high = errors(name, poissons_ratio)
