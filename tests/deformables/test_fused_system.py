@@ -12,8 +12,8 @@ from softmode.deformables.solver.fused_system_kernels import (
     STATIC_BYTES,
     dynamic_floats,
     shared_bytes,
-    shared_floats,
     shared_direction_of,
+    shared_floats,
 )
 from softmode.deformables.solver.iteration_kernels import NewtonArrays
 from softmode.deformables.solver.step_tables import ONE_LAUNCH_BLOCKS, fits_in_shared_memory, newton_notes

@@ -279,8 +279,8 @@ _SYSTEM = """
                 #pragma unroll 4
                 for (int s = 0; s < acting_count; ++s) {
                     const int e = acting[s];
-                    const float* jacobian = &J[(e * dofs + j) * 3];
-                    const double force = jacobian[0] * F[3 * e] + jacobian[1] * F[3 * e + 1] + jacobian[2] * F[3 * e + 2];
+                    const float* u = &J[(e * dofs + j) * 3];
+                    const double force = u[0] * F[3 * e] + u[1] * F[3 * e + 1] + u[2] * F[3 * e + 2];
                     value += j >= begins[e] && j < ends[e] ? force : 0.0;
                 }
                 for (int k = 0; k < row_count; ++k) value += (double)row_jacobian[k * dofs + j] * row_force[k];
@@ -296,7 +296,9 @@ _SYSTEM = """
                     const float h = u[0] * v[0] + u[1] * v[1] + u[2] * v[2];
                     value += l >= begins[e] && j < ends[e] ? (double)h : 0.0;
                 }
-                for (int k = 0; k < row_count; ++k) value += (double)row_jacobian[k * dofs + j] * row_coupling[k * dofs + l];
+                for (int k = 0; k < row_count; ++k) {
+                    value += (double)row_jacobian[k * dofs + j] * row_coupling[k * dofs + l];
+                }
                 if (l == j) least[j] = lowest[j] > CONDENSED * value ? lowest[j] : CONDENSED * value;
             }
             double part[4] = {0.0, 0.0, 0.0, 0.0};
