@@ -7,14 +7,13 @@ import warp as wp
 
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.model.struct_kernels import Basis, PointConstraints, Rigid
-from softmode.deformables.solver import assembly_kernels as assembly
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient, solve
 from softmode.deformables.solver.fused_system_kernels import (
     STATIC_BYTES,
     dynamic_floats,
     shared_bytes,
+    shared_direction_of,
     shared_floats,
-    shared_system_of,
 )
 from softmode.deformables.solver.iteration_kernels import NewtonArrays
 from softmode.deformables.solver.step_tables import ONE_LAUNCH_BLOCKS, fits_in_shared_memory, newton_notes
@@ -40,10 +39,10 @@ def loaded(mode_count: int) -> Scene:
 
 @pytest.mark.parametrize("mode_count, size", [(1, 24), (2, 48), (4, 72), (6, 96), (8, 120), (11, 144), (13, 168)])
 def test_packed_system_equals_launches(mode_count: int, size: int) -> None:
-    """Directions of body and box agree within single precision times the condition of the system."""
+    """Directions of body and box, and the gradient of the box, agree within single precision times the condition."""
     scene = loaded(mode_count)
     t, dt = scene.reduced.tables, scene.dt
-    count, world = t.rigid.count_max, (t.layout.world_count, t.rigid.count_max)
+    count = t.rigid.count_max
     assert (3 * t.layout.stride, t.rigid.table.count.numpy()[0]) == (size, 6)
     t.newton.active.fill_(1)
     t.newton.refresh.fill_(1)
@@ -59,14 +58,14 @@ def test_packed_system_equals_launches(mode_count: int, size: int) -> None:
             rate = float(t.motion.rate.numpy()[0]) / dt
             inertia = float(t.instances.mass.numpy()[0]) * rate * (rate + float(t.instances.mass_damping.numpy()[0]))
             given = (inertia, count, t.basis, t.constraints, t.rigid.table, t.arrays)
-            wp.launch(kernel, dim=1, inputs=[0, *given], device="cpu")
-            t.launch(assembly.condense, (*world, count + 1), t.step)
-            t.launch_teams(assembly.solve_rigid, 1, t.newton.active, t.team, t.rigid.table)
-            wp.launch(kernel, dim=1, inputs=[1, *given], device="cpu")
+            for array in (t.rigid.table.matrix, t.rigid.table.gradient, t.rigid.table.direction):
+                array.zero_()
+            wp.launch(kernel, dim=1, inputs=[*given], device="cpu")
         else:
             solve(t)
         assert t.system.indefinite.numpy()[0] == 0
-        found.append((t.arrays.direction.numpy().copy(), t.rigid.table.direction.numpy().copy()))
+        rigid = t.rigid.table
+        found.append([array.numpy().copy() for array in (t.arrays.direction, rigid.direction, rigid.gradient)])
         t.arrays.direction.zero_()
     for apart, at_once in zip(*found, strict=True):
         assert np.abs(apart).max() > 0.0
@@ -75,11 +74,10 @@ def test_packed_system_equals_launches(mode_count: int, size: int) -> None:
 
 def packed_kernel(size: int, width: int):
     """Return a kernel that calls the system's device function for one world."""
-    shared_system = shared_system_of(size, width)
+    shared_direction = shared_direction_of(size, width)
 
     @wp.kernel(module="unique", enable_backward=False)
     def packed(
-        mode: int,
         inertia: float,
         rigid_max: int,
         basis: Basis,
@@ -87,7 +85,7 @@ def packed_kernel(size: int, width: int):
         rigid: Rigid,
         arrays: NewtonArrays,
     ):
-        shared_system(mode, inertia, rigid_max, basis, constraints, rigid, arrays, 0, 0, 0, 1)
+        shared_direction(inertia, rigid_max, basis, constraints, rigid, arrays, 0, 0, 0, 1)
 
     return packed
 

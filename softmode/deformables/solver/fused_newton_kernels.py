@@ -22,7 +22,7 @@ from softmode.deformables.solver.assembly_kernels import (
     stiffness_block,
 )
 from softmode.deformables.solver.factor_kernels import factor_system, solve_system
-from softmode.deformables.solver.fused_system_kernels import dynamic_floats, shared_system_of, sum_forces_of
+from softmode.deformables.solver.fused_system_kernels import dynamic_floats, shared_direction_of, sum_forces_of
 from softmode.deformables.solver.iteration_kernels import ALL, NewtonStep
 from softmode.deformables.solver.rigid_row_kernels import evaluate_row
 from softmode.deformables.solver.search_kernels import accept_step, check_convergence, check_trial, start_line_search
@@ -50,7 +50,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0) -> Kernel:
         width: Columns of those systems.
     """
     shared, dynamic = size > 0, dynamic_floats(size, width)
-    shared_system = shared_system_of(size or 24, width or 32)  # called where ``shared`` says so
+    shared_direction = shared_direction_of(size or 24, width or 32)  # called where ``shared`` says so
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=(TEAM, 4))
     def minimise_worlds(
@@ -124,20 +124,14 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0) -> Kernel:
                             barrier()
                             for t in range(member, tasks, team):
                                 contact_block(step, i, t)
-                        for t in range(member, 3 * blocks * columns, team):
-                            column_block(step, i, t / columns, t % columns)
-                    for t in range(member, n * n, team):
-                        rigid_entry(step, w, t / n, t % n)
-                    barrier()
-                    inertia = float(0.0)
+                            for t in range(member, 3 * blocks * columns, team):
+                                column_block(step, i, t / columns, t % columns)
                     if wp.static(shared):
                         # the padding behind the functions carries inertia alone
                         rate = step.motion.rate[begin] / dt
-                        inertia = float(
-                            step.instances.mass[begin] * rate * (rate + wp.float64(step.instances.mass_damping[begin]))
-                        )
-                        shared_system(
-                            0,
+                        damping = wp.float64(step.instances.mass_damping[begin])
+                        inertia = float(step.instances.mass[begin] * rate * (rate + damping))
+                        shared_direction(
                             inertia,
                             rigid_max,
                             step.basis,
@@ -150,32 +144,20 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0) -> Kernel:
                             team,
                         )
                     if wp.static(not shared):
+                        for t in range(member, n * n, team):
+                            rigid_entry(step, w, t / n, t % n)
+                        barrier()
                         for s in range(step.arrays.system_start[w], step.arrays.system_start[w + 1]):
                             factor_system(
                                 step.state.active, team, step.options.factor_width, unit, step.arrays.systems, s, member
                             )
-                    barrier()
-                    if n > 0:
-                        for t in range(member, n * (n + 1), team):
-                            condensed_entry(step, w, t / (n + 1), t % (n + 1))
                         barrier()
-                        solve_rigid_team(step.state.active, team, step.rigid, w, member)
-                        barrier()
-                    if wp.static(shared):
-                        shared_system(
-                            1,
-                            inertia,
-                            rigid_max,
-                            step.basis,
-                            step.constraints,
-                            step.rigid,
-                            step.arrays,
-                            begin,
-                            w,
-                            member,
-                            team,
-                        )
-                    if wp.static(not shared):
+                        if n > 0:
+                            for t in range(member, n * (n + 1), team):
+                                condensed_entry(step, w, t / (n + 1), t % (n + 1))
+                            barrier()
+                            solve_rigid_team(step.state.active, team, step.rigid, w, member)
+                            barrier()
                         for s in range(step.arrays.system_start[w], step.arrays.system_start[w + 1]):
                             solve_system(
                                 step.state.active,

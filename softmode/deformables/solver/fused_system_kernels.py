@@ -16,6 +16,7 @@ from typing import Any
 import warp as wp
 
 from softmode.deformables.model.struct_kernels import Basis, Instances, PointConstraints, Points, Rigid
+from softmode.deformables.solver.assembly_kernels import CONDENSED_ROUNDING
 from softmode.deformables.solver.iteration_kernels import NewtonArrays
 
 STATIC_BYTES = 44 * 1024
@@ -35,8 +36,13 @@ def dynamic_floats(size: int, width: int) -> int:
 
 
 def shared_bytes(size: int, width: int) -> int:
-    """Return how much shared memory a block needs for such a system and its right-hand side."""
-    return 4 * (shared_floats(size, width) + size)
+    """Return how much shared memory a block needs for such a system, its right-hand side and the rigid unknowns."""
+    return 4 * (shared_floats(size, width) + size) + 8 * _rigid_doubles(width - size)
+
+
+def _rigid_doubles(columns: int) -> int:
+    """Return how many numbers the rigid unknowns take: their matrix, its least pivots, ratios, right-hand side."""
+    return columns * columns + 3 * columns
 
 
 _BEGIN = """
@@ -54,29 +60,45 @@ _END = """
 #undef SOFTMODE_BARRIER
 """
 _STATIC = """
-    SOFTMODE_SHARED float room[FLOATS + SIZE];
+    SOFTMODE_SHARED float room[BYTES / 4];
 """
 _DYNAMIC = """
 #if defined(__CUDA_ARCH__)
     extern __shared__ char dynamic_smem_base[];  // of Warp's tiles: the kernel has one of this size and no other
     float* room = (float*)dynamic_smem_base;
 #else
-    alignas(16) static float room[FLOATS + SIZE];
+    alignas(16) static float room[BYTES / 4];
 #endif
 """
 _SYSTEM = """
-    // mode 0: assemble A, load B, factor, write U^-T B back; mode 1: solve with the factor that is there
     float* A = room;
     float* right = room + FLOATS;
     constexpr int N = SIZE;
     constexpr int W = WIDTH;
+    constexpr int R = W - N;
+    double* S = (double*)(right + N);  // (R, R): the rigid unknowns' matrix, then its factor with inverse pivots
+    double* least = S + R * R;
+    double* ratio = least + R;
+    double* move = ratio + R;
     // column 0 of row r, were it there
     const auto row_of = [](int r) {
         const int b = r / 8;
         return 8 * b * W - 32 * b * (b - 1) + (r - 8 * b) * (W - 8 * b) - 8 * b;
     };
-    float* g = (float*)arrays.systems.scalars.data + (size_t)i * N * W;
-    if (mode == 0) {
+    constexpr int blocks = N / 24;
+    const int tail = rigid.count.data[world];
+    const int acting_count = constraints.acting_count.data[i];
+    const int* acting = (const int*)constraints.acting.data + (size_t)i * constraints.acting.shape[1];
+    const int* rows = (const int*)constraints.row.data + (size_t)i * constraints.row.shape[1];
+    const int* begins = (const int*)constraints.dof_begin.data + (size_t)i * constraints.dof_begin.shape[1];
+    const int* ends = (const int*)constraints.dof_end.data + (size_t)i * constraints.dof_end.shape[1];
+    const int capacity = constraints.hessian.shape[1];
+    const float* H = (const float*)constraints.hessian.data + (size_t)i * capacity * 9;
+    const int dofs = constraints.jacobian.shape[2];  // room for rigid unknowns
+    const float* J = (const float*)constraints.jacobian.data + (size_t)i * capacity * dofs * 3;
+    const float* HJ = (const float*)constraints.coupling.data + (size_t)i * capacity * dofs * 3;
+    const float* values = (const float*)basis.row.data;
+    {
         const int chunks = arrays.stiffness.shape[1];
         const float* K = (const float*)arrays.stiffness.data + (size_t)i * chunks * N * N;
         constexpr int quads = N / 4;
@@ -98,20 +120,36 @@ _SYSTEM = """
                 *(Quad*)&A[row_of(row) + first] = value;
             }
         }
-        #pragma unroll 4
-        for (int t = member; t < N * (W - N); t += team) {
-            const int row = t / (W - N);
-            const int at = N + t - row * (W - N);
-            A[row_of(row) + at] = g[row * W + at];
+        // right of K: -sum_e b_k H_e J_e, and -g in column rigid_max
+        const double* g = (const double*)arrays.gradient.data + (size_t)i * N;
+        for (int t = member; t < 3 * blocks * R; t += team) {
+            const int j = t / (3 * blocks);
+            const int first = 8 * (t - j * 3 * blocks);
+            const int c = first / (8 * blocks);
+            const int k = first - c * 8 * blocks;
+            float sum[8];
+            #pragma unroll
+            for (int a = 0; a < 8; ++a) sum[a] = 0.0f;
+            if (j == rigid_max) {
+                #pragma unroll
+                for (int a = 0; a < 8; ++a) sum[a] = (float)-g[first + a];
+            } else if (j < tail) {
+                #pragma unroll 4
+                for (int s = 0; s < acting_count; ++s) {
+                    const int e = acting[s];
+                    const float given = HJ[(e * dofs + j) * 3 + c];
+                    const float h = j >= begins[e] && j < ends[e] ? given : 0.0f;
+                    const float* r = values + (size_t)rows[e] * 8 * blocks + k;
+                    const Quad u = *(const Quad*)&r[0];
+                    const Quad v = *(const Quad*)&r[4];
+                    sum[0] -= h * u.x; sum[1] -= h * u.y; sum[2] -= h * u.z; sum[3] -= h * u.w;
+                    sum[4] -= h * v.x; sum[5] -= h * v.y; sum[6] -= h * v.z; sum[7] -= h * v.w;
+                }
+            }
+            #pragma unroll
+            for (int a = 0; a < 8; ++a) A[row_of(first + a) + N + j] = sum[a];
         }
         SOFTMODE_BARRIER;
-        constexpr int blocks = N / 24;
-        const int acting_count = constraints.acting_count.data[i];
-        const int* acting = (const int*)constraints.acting.data + (size_t)i * constraints.acting.shape[1];
-        const int* rows = (const int*)constraints.row.data + (size_t)i * constraints.row.shape[1];
-        const int capacity = constraints.hessian.shape[1];
-        const float* H = (const float*)constraints.hessian.data + (size_t)i * capacity * 9;
-        const float* values = (const float*)basis.row.data;
         // half blocks, 4 x 8: of the components (c, d), rows 4 k of the functions, columns 8 m
         for (int t = member; t < 9 * 2 * blocks * blocks; t += team) {
             const int c = t / (6 * blocks * blocks);
@@ -204,7 +242,6 @@ _SYSTEM = """
                     for (int s = 0; s < a; ++s) value -= U[s][a] * x[s];
                     x[a] = U[a][a] * value;
                     here[a * stride + l] = x[a];
-                    if (l >= N) g[(first + a) * W + l] = x[a];
                 }
             }
             SOFTMODE_BARRIER;
@@ -219,12 +256,101 @@ _SYSTEM = """
         }
         SOFTMODE_BARRIER;
         if (member == 0) arrays.systems.indefinite.data[i] = bad;
-    } else {
-        const int tail_count = rigid.count.data[world];
-        const double* t = (const double*)rigid.direction.data + (size_t)world * rigid.direction.shape[1];
+        // the rigid unknowns, less the body: R - Y^T Y and -g_r - Y^T y
+        const double* M = (const double*)rigid.inertia.data + (size_t)world * dofs * dofs;
+        const double* r = (const double*)rigid.r.data + (size_t)world * dofs;
+        const double* predicted = (const double*)rigid.predicted.data + (size_t)world * dofs;
+        const double* lowest = (const double*)rigid.pivot_floor.data + (size_t)world * dofs;
+        const double* F = (const double*)constraints.force.data + (size_t)i * capacity * 3;
+        const int row_count = rigid.row_count.data[world];
+        const size_t first_row = (size_t)world * rigid.row_force.shape[1];
+        const float* row_jacobian = (const float*)rigid.row_jacobian.data + first_row * dofs;
+        const double* row_coupling = (const double*)rigid.row_coupling.data + first_row * dofs;
+        const double* row_force = (const double*)rigid.row_force.data + first_row;
+        for (int t = member; t < tail * (tail + 1); t += team) {
+            const int j = t / (tail + 1);
+            const int l = t - j * (tail + 1);
+            if (l > j && l < tail) continue;
+            double value = 0.0;
+            int other = N + l;
+            if (l == tail) {
+                other = N + rigid_max;
+                for (int k = 0; k < tail; ++k) value += M[j * dofs + k] * (r[k] - predicted[k]);
+                #pragma unroll 4
+                for (int s = 0; s < acting_count; ++s) {
+                    const int e = acting[s];
+                    const float* u = &J[(e * dofs + j) * 3];
+                    const double force = u[0] * F[3 * e] + u[1] * F[3 * e + 1] + u[2] * F[3 * e + 2];
+                    value += j >= begins[e] && j < ends[e] ? force : 0.0;
+                }
+                for (int k = 0; k < row_count; ++k) value += (double)row_jacobian[k * dofs + j] * row_force[k];
+                ((double*)rigid.gradient.data)[(size_t)world * dofs + j] = value;
+                value = -value;
+            } else {
+                value = M[j * dofs + l];
+                #pragma unroll 4
+                for (int s = 0; s < acting_count; ++s) {
+                    const int e = acting[s];
+                    const float* u = &J[(e * dofs + j) * 3];
+                    const float* v = &HJ[(e * dofs + l) * 3];
+                    const float h = u[0] * v[0] + u[1] * v[1] + u[2] * v[2];
+                    value += l >= begins[e] && j < ends[e] ? (double)h : 0.0;
+                }
+                for (int k = 0; k < row_count; ++k) {
+                    value += (double)row_jacobian[k * dofs + j] * row_coupling[k * dofs + l];
+                }
+                if (l == j) least[j] = lowest[j] > CONDENSED * value ? lowest[j] : CONDENSED * value;
+            }
+            double part[4] = {0.0, 0.0, 0.0, 0.0};
+            for (int first = 0; first < N; first += 8) {
+                const float* here = A + row_of(first);
+                #pragma unroll
+                for (int a = 0; a < 8; ++a) {
+                    part[a % 4] += (double)here[a * (W - first) + N + j] * (double)here[a * (W - first) + other];
+                }
+            }
+            value -= (part[0] + part[1]) + (part[2] + part[3]);
+            if (l == tail) move[j] = value;
+            else S[j * R + l] = value;
+        }
+        SOFTMODE_BARRIER;
+        // as ``assembly_kernels.factor_rigid``
+        for (int a = 0; a < tail; ++a) {
+            double pivot = S[a * R + a];
+            for (int s = 0; s < a; ++s) pivot -= S[a * R + s] * S[a * R + s];
+            for (int b = a + 1 + member; b < tail; b += team) {
+                double value = S[b * R + a];
+                for (int s = 0; s < a; ++s) value -= S[b * R + s] * S[a * R + s];
+                S[b * R + a] = value;
+                const double diagonal = S[b * R + b] > least[b] ? S[b * R + b] : least[b];
+                ratio[b] = value * value / diagonal;
+            }
+            SOFTMODE_BARRIER;
+            pivot = pivot > least[a] ? pivot : least[a];
+            for (int b = a + 1; b < tail; ++b) pivot = pivot > ratio[b] ? pivot : ratio[b];
+            const double inverse = 1.0 / wp::sqrt(pivot);
+            if (member == 0) S[a * R + a] = inverse;
+            for (int b = a + 1 + member; b < tail; b += team) S[b * R + a] *= inverse;
+            SOFTMODE_BARRIER;
+        }
+        if (member == 0) {
+            for (int a = 0; a < tail; ++a) {
+                double value = move[a];
+                for (int s = 0; s < a; ++s) value -= S[a * R + s] * move[s];
+                move[a] = value * S[a * R + a];
+            }
+            double* out = (double*)rigid.direction.data + (size_t)world * dofs;
+            for (int a = tail - 1; a >= 0; --a) {
+                double value = move[a];
+                for (int s = a + 1; s < tail; ++s) value -= S[s * R + a] * move[s];
+                move[a] = value * S[a * R + a];
+                out[a] = move[a];
+            }
+        }
+        SOFTMODE_BARRIER;
         for (int row = member; row < N; row += team) {
             float value = A[row_of(row) + N + rigid_max];
-            for (int j = 0; j < tail_count; ++j) value -= A[row_of(row) + N + j] * (float)t[j];
+            for (int j = 0; j < tail; ++j) value -= A[row_of(row) + N + j] * (float)move[j];
             right[row] = value;
         }
         SOFTMODE_BARRIER;
@@ -256,31 +382,37 @@ _SYSTEM = """
 
 
 @cache
-def shared_system_of(size: int, width: int) -> Any:
+def shared_direction_of(size: int, width: int) -> Any:
     """Return the device function for systems of N = ``size`` unknowns and W = ``width`` columns."""
     room = _DYNAMIC if dynamic_floats(size, width) else _STATIC
     snippet = _BEGIN + room + _SYSTEM + _END
-    for name, value in {"FLOATS": shared_floats(size, width), "SIZE": size, "WIDTH": width}.items():
+    given = {
+        "FLOATS": shared_floats(size, width),
+        "BYTES": shared_bytes(size, width),
+        "SIZE": size,
+        "WIDTH": width,
+        "CONDENSED": float(CONDENSED_ROUNDING),
+    }
+    for name, value in given.items():
         snippet = snippet.replace(name, str(value))
 
     @wp.func_native(snippet=snippet)
-    def shared_system(
-        mode: int,
+    def shared_direction(
         inertia: float,
         rigid_max: int,
         basis: Basis,
         constraints: PointConstraints,
         rigid: Rigid,
-        arrays: NewtonArrays,  # the matrices hold from column N on B, and after mode 0 U^-T B
+        arrays: NewtonArrays,
         i: int,
         world: int,
         member: int,
         team: int,
     ) -> None:
-        """Assemble and factor system ``i`` (mode 0), later solve it (mode 1). One body per world, no pins."""
+        """Compute Newton's direction of body ``i`` and of the rigid unknowns. One body per world, no pins."""
         ...
 
-    return shared_system
+    return shared_direction
 
 
 @wp.func_native(
@@ -290,7 +422,6 @@ def shared_system_of(size: int, width: int) -> Any:
     const size_t by_block = basis.gradient_across.strides[0];
     const size_t by_point = basis.gradient_across.strides[1];
     const size_t by_axis = basis.gradient_across.strides[2];
-    const int first_point = instances.point_start.data[i];
     const int point_count = instances.point_count.data[i];
     const int acting_count = constraints.acting_count.data[i];
     const int* acting = (const int*)constraints.acting.data + (size_t)i * constraints.acting.shape[1];
@@ -298,26 +429,38 @@ def shared_system_of(size: int, width: int) -> Any:
     const double* F = (const double*)constraints.force.data + (size_t)i * constraints.force.shape[1] * 3;
     const int* rows = (const int*)constraints.row.data + (size_t)i * constraints.row.shape[1];
     const float* values = (const float*)basis.row.data;
-    double* out = (double*)arrays.gradient_chunk.data + (size_t)i * arrays.gradient_chunk.shape[1] * 3 * n;
-    for (int t = member; t < 3 * n; t += team) {
-        const int axis = t / n;
-        const int k = t - axis * n;
-        const char* G = (const char*)basis.gradient_across.data + (k / 8) * by_block + (size_t)first_point * by_point;
-        G += (k % 8) * sizeof(float);
-        double value = 0.0;
-        #pragma unroll 8
-        for (int p = 0; p < point_count; ++p) {
+    // a group of threads per part, a thread per function
+    const int parts = arrays.gradient_chunk.shape[1];
+    const int lanes = team / parts;
+    const int part = member / lanes;
+    const char* start = (const char*)basis.gradient_across.data;
+    start += (size_t)instances.point_start.data[i] * by_point;
+    double* out = (double*)arrays.gradient_chunk.data + ((size_t)i * parts + part) * 3 * n;
+    for (int k = member - part * lanes; k < n; k += lanes) {
+        const char* G = start + (k / 8) * by_block + (k % 8) * sizeof(float);
+        double x = 0.0, y = 0.0, z = 0.0;
+        #pragma unroll 4
+        for (int p = part * point_count / parts; p < (part + 1) * point_count / parts; ++p) {
             const char* at = G + (size_t)p * by_point;
-            value += P[9 * p + 3 * axis] * (double)*(const float*)at;
-            value += P[9 * p + 3 * axis + 1] * (double)*(const float*)(at + by_axis);
-            value += P[9 * p + 3 * axis + 2] * (double)*(const float*)(at + 2 * by_axis);
+            const double* stress = P + 9 * p;
+            const double a = *(const float*)at;
+            const double b = *(const float*)(at + by_axis);
+            const double c = *(const float*)(at + 2 * by_axis);
+            x += stress[0] * a; x += stress[1] * b; x += stress[2] * c;
+            y += stress[3] * a; y += stress[4] * b; y += stress[5] * c;
+            z += stress[6] * a; z += stress[7] * b; z += stress[8] * c;
         }
-        #pragma unroll 8
-        for (int s = 0; s < acting_count; ++s) {
+        #pragma unroll 4
+        for (int s = part * acting_count / parts; s < (part + 1) * acting_count / parts; ++s) {
             const int e = acting[s];
-            value -= F[3 * e + axis] * (double)values[(size_t)rows[e] * n + k];
+            const double b = values[(size_t)rows[e] * n + k];
+            x -= F[3 * e] * b;
+            y -= F[3 * e + 1] * b;
+            z -= F[3 * e + 2] * b;
         }
-        out[t] = value;
+        out[k] = x;
+        out[n + k] = y;
+        out[2 * n + k] = z;
     }
 """
 )
@@ -331,5 +474,5 @@ def sum_forces_of(
     member: int,
     team: int,
 ) -> None:
-    """Sum V P grad b_k over the points, less b_k f over the constraints, a thread per unknown."""
+    """Sum V P grad b_k over the points, less b_k f over the constraints, each chunk by a part of the team."""
     ...

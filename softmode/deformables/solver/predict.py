@@ -23,3 +23,4 @@ def predict(tables: StepTables, state: newton.State, control: SoftControl, dt: f
     bdf2 = int(tables.options.integrator == "bdf2")
     given = (control.q_driven, tables.parameters.density, tables.parameters.scale, bdf2)
     tables.launch(kernels.begin_step, (count, blocks), step, tables.model.gravity, *before, *given)
+    tables.launch(kernels.start_points, tables.points.energy.shape, step)

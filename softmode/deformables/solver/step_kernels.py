@@ -250,6 +250,18 @@ def extrapolate(step: NewtonStep):
         step.arrays.q[i, e] = step.arrays.q[i, e] + step.motion.change[i, e]
 
 
+@wp.kernel
+def start_points(step: NewtonStep):
+    """Evaluate the deformation at the start of the step, which viscosity goes by, once for all iterations."""
+    i, p = wp.tid()
+    if p >= step.instances.point_count[i] or step.instances.viscosity[i] <= 0.0:
+        return
+    point = step.instances.point_start[i] + p
+    s = wp.float64(step.instances.scale[i])
+    count = step.instances.function_count[i]
+    step.points.start[i, p] = elastic_gradient(step.basis.gradient, step.motion.q_start, i, point, count, s)
+
+
 @wp.func
 def material_of(instances: Instances, basis: Basis, i: int, point: int):
     """Return the material of an instance at a cubature point."""
@@ -291,9 +303,7 @@ def evaluate_point(
     G = elastic_gradient(step.basis.gradient, q, i, point, step.instances.function_count[i], s)
     G_start = G
     if step.instances.viscosity[i] > 0.0:
-        G_start = elastic_gradient(
-            step.basis.gradient, step.motion.q_start, i, point, step.instances.function_count[i], s
-        )
+        G_start = step.points.start[i, p]
     step.points.energy[i, p] = s * s * weight * energy(parameters, G, G_start, dt)
     if derivatives != ENERGIES:
         step.points.stress[i, p] = s * weight * stress(parameters, G, G_start, dt)

@@ -224,7 +224,7 @@ def allocate_tables(
         "team": team_size(device),
         "constraint": options.contact_max + layout.pin_max,
         "rigid": rigid.count_max,
-        "gradient_chunk": 1 if shared else chunks(count * blocks, blocks),
+        "gradient_chunk": fused.TEAM // 32 if shared and device.is_cuda else chunks(count * blocks, blocks),
         "stiffness_chunk": chunks(count * square, square + (square + 3 * blocks) // 2),
         "pin_instance": count if layout.pin_max else 1,
         "pin_row": layout.stride if layout.pin_max else 1,
