@@ -31,6 +31,8 @@ FAILURES = wp.constant(2)
 """Indefinite Hessians after which a step keeps to the projected one."""
 PROJECTED_ITERATIONS = wp.constant(8)
 """Iterations before which a small step with the projected Hessian does not count as convergence."""
+ENERGY_ROUNDING = wp.constant(wp.float64(1.0e-15))
+"""What rounding leaves of the elastic energy of a body that has turned, over E V."""
 SUFFICIENT_DECREASE = wp.constant(wp.float64(0.25))
 """Least decrease of the potential over that of its tangent. A quadratic has 0.5; with little less than that asked for,
 friction between sticking and slipping is crossed back and forth for many iterations."""
@@ -280,6 +282,16 @@ def trial_rigid(step: NewtonStep):
 
 
 @wp.func
+def rounding_of(instances: Instances, instance_start: wp.array[int], potential: wp.float64, w: int):
+    """Return what rounding leaves of the potential of a world [J]."""
+    total = wp.float64(1.0e-12) * wp.abs(potential)
+    for i in range(instance_start[w], instance_start[w + 1]):
+        volume = instances.mass[i] * wp.float64(instances.size[i] * instances.size[i] / instances.inertia[i])
+        total += ENERGY_ROUNDING * wp.float64(instances.youngs_modulus[i]) * volume
+    return total
+
+
+@wp.func
 def check_trial(step: NewtonStep, team: int, w: int, member: int):
     """Accept a trial that lowers the potential enough (Armijo, up to rounding) or halve the step; give up if short.
 
@@ -306,7 +318,7 @@ def check_trial(step: NewtonStep, team: int, w: int, member: int):
     if member != 0:
         return
     potential = step.state.potential[w]
-    rounding = wp.float64(1.0e-12) * wp.abs(potential)
+    rounding = rounding_of(step.instances, step.state.instance_start, potential, w)
     alpha = step.state.step_length[w]
     if alpha > wp.float64(1.0):
         step.state.searching[w] = 0

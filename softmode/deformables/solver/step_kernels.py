@@ -47,6 +47,7 @@ from softmode.deformables.model.struct_kernels import (
     has_contacts,
     in_mask,
     interpolate_change,
+    p_wave_modulus,
     pushes,
 )
 from softmode.deformables.solver.iteration_kernels import ALL, ENERGIES, NewtonStep, add_outer_3d, mat38d
@@ -66,6 +67,9 @@ EXTRAPOLATION_INERTIA = wp.constant(wp.float64(0.01))
 """Least rho L^2 / (E dt^2) of a body whose acceleration is carried on."""
 NEEDS_FEASIBLE_START = wp.constant(int(MaterialModel.NEO_HOOKEAN))
 """The material that forbids inversion: a step starts where the last one ended."""
+PIVOT_ROUNDING = wp.constant(1.0e-4)
+"""What rounding may take of a pivot of the Hessian, over the stiffness P V / L^2 of a body: its rotations have no more
+than their inertia left when all else is eliminated."""
 COLLAPSED_RATIO = wp.constant(0.01)
 """Points whose volume is below this fraction of their rest volume count as collapsed, and"""
 COLLAPSED_SHARE = wp.constant(0.1)
@@ -254,6 +258,15 @@ def begin_newton(step: NewtonStep):
     w = wp.tid()
     in_contact = int(0)
     for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
+        rate = step.motion.rate[i] / step.options.dt
+        mass = float(step.instances.mass[i])
+        least = mass * float(rate * (rate + wp.float64(step.instances.mass_damping[i])))
+        modulus = p_wave_modulus(step.instances.youngs_modulus[i], step.instances.poissons_ratio[i])
+        slack = PIVOT_ROUNDING * modulus * mass / step.instances.inertia[i]
+        for k in range(3 * step.basis.row.shape[1]):
+            step.arrays.systems.bounds[step.instances.system[i], step.instances.system_block[i] + k] = wp.vec2(
+                least, slack
+            )
         if pushes(step.instances, step.constraints, i):
             in_contact = 1
     step.state.in_contact[w] = in_contact
