@@ -50,7 +50,8 @@ def start_line_search(tables: StepTables, dt: float) -> None:
 def _try_step(tables: StepTables, dt: float) -> None:
     """Evaluate one trial step in every searching world and accept or halve it."""
     t, step = tables, tables.newton_step(dt)
-    t.launch(search.trial_functions, t.unknowns, step)
+    threads = t.layout.block_count if t.model.device.is_cuda else 1
+    t.launch(search.trial_functions, (t.layout.instance_count, threads), step, threads)
     if t.rigid.count_max:
         t.launch(search.trial_rigid, (t.layout.world_count, t.rigid.count_max), step)
     evaluate_trial(t, dt)

@@ -66,6 +66,7 @@ _ARRAYS = {
     "gradient_chunk": "instance gradient_chunk unknown",
     "stiffness": "instance stiffness_chunk row unknown",
     "pins": "pin_instance pin_row pin_block",
+    "turn turn_centre turn_shift": "instance",
 }
 
 
