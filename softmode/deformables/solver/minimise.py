@@ -3,6 +3,7 @@
 import warp as wp
 
 from softmode.deformables.solver import fused_newton_kernels as fused
+from softmode.deformables.solver import rigid_start_kernels
 from softmode.deformables.solver import search_kernels as search
 from softmode.deformables.solver import step_kernels as kernels
 from softmode.deformables.solver.evaluate import assemble, evaluate, evaluate_trial, gather_gradient, solve
@@ -14,6 +15,8 @@ def minimise(tables: StepTables, dt: float) -> None:
     t, worlds, step = tables, tables.layout.world_count, tables.newton_step(dt)
     t.launch(kernels.begin_newton, worlds, step)
     t.launch(kernels.extrapolate, t.unknowns, step)
+    if t.model.shape_count:
+        t.launch_teams(rigid_start_kernels.start_rigidly, t.layout.instance_count, step, t.samples, t.team)
     if t.options.carry_stiffness:
         t.launch_teams(search.reuse_hessians, worlds, step, t.team)
     if t.one_launch:
