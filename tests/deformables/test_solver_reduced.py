@@ -1,8 +1,8 @@
 """The reduced step of bodies without contact: identities, order, closed forms, a dense reference, batching, errors."""
 
-import newton
 import dataclasses
 
+import newton
 import numpy as np
 import pytest
 import warp as wp

@@ -36,8 +36,8 @@ from softmode.deformables.model.tables import allocate
 from softmode.deformables.solver.detect import adapt
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient
 from softmode.deformables.solver.iteration_kernels import NewtonStep
-from softmode.deformables.solver.spin_kernels import end_spin
 from softmode.deformables.solver.solver_reduced import SolverReduced
+from softmode.deformables.solver.spin_kernels import end_spin
 from softmode.deformables.solver.step_kernels import sum_forces
 from softmode.errors import ConfigError, SolverDiverged
 

@@ -8,7 +8,7 @@ S and U then give the loss by the moments.
 import warp as wp
 
 from softmode.deformables.model.declare import struct
-from softmode.deformables.model.lane_kernels import LANES, vec8d
+from softmode.deformables.model.lane_kernels import vec8d
 from softmode.deformables.model.struct_kernels import Basis, Instances, Motion, blocks_of
 from softmode.deformables.solver.iteration_kernels import mat38d
 from softmode.deformables.solver.spin_kernels import (
@@ -68,14 +68,14 @@ def pull_velocity(
     # Out:
     loss: SpinLoss,
 ):
-    """Pass dL/dv_t through the rotation eta x r' to q_t and to what the target made of the start."""
+    """Pass dL/dv_t through the rotation chi x r' to q_t and to what the target made of the start."""
     i = wp.tid()
     loss.momentum[i] = wp.vec3d()
     if not turns(spin, motion, i):
         return
     a = instances.asset[i]
     blocks = blocks_of(instances.function_count[i])
-    eta = spin.correction[i]
+    chi = spin.correction[i]
     inverse = wp.inverse(tensor_of_inertia(spin.moment_end[i], instances.size[i]))
     moment = wp.mat33d()
     for b in range(blocks):
@@ -84,9 +84,11 @@ def pull_velocity(
         moment += r * wp.transpose(unknown_block(qd_bar, i, b))
     zeta = inverse * axial(moment)
     loss.momentum[i] = zeta
-    # by r': of eta x r', of sum r' x b and of the inertia
-    by_r = wp.outer(zeta, eta) + wp.outer(eta, zeta) - wp.float64(2.0) * wp.dot(zeta, eta) * wp.identity(
-        n=3, dtype=wp.float64
+    # by r': of chi x r', of sum r' x b and of the inertia
+    by_r = (
+        wp.outer(zeta, chi)
+        + wp.outer(chi, zeta)
+        - wp.float64(2.0) * wp.dot(zeta, chi) * wp.identity(n=3, dtype=wp.float64)
     )
     total = wp.vec3d()
     for b in range(blocks):
@@ -118,7 +120,7 @@ def velocity_loss(
     start = unknown_block(motion.q_start, i, b) + rest - wp.outer(spin.centre[i], one)
     u = unknown_block(motion.qd_start, i, b) - wp.outer(spin.velocity[i], one)
     away = wp.transpose(spin.rotation[i]) * u + spin.outward[i] * start
-    # d (eta x r') . v_bar = r' . (v_bar x eta), -zeta . (r' x b) = r' . (zeta x b)
+    # d (chi x r') . v_bar = r' . (v_bar x chi), -zeta . (r' x b) = r' . (zeta x b)
     return wp.skew(zeta) * away - wp.skew(spin.correction[i]) * unknown_block(qd_bar, i, b) + by_r * r
 
 

@@ -1,4 +1,4 @@
-"""Device side of Newton's start in an impact: the body is moved rigidly to where inertia and contact have their minimum.
+"""Device side of Newton's start in an impact: the body moves rigidly to the minimum of inertia and contact.
 
 A body that flies on through what it hits starts Newton far too deep. Newton's first iterations then do little else than
 push it out and turn it, which a rigid body does in six unknowns: over the motions y -> X + t + R r of the iterate,
@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from softmode.deformables.contact.penalty_kernels import normal_potential, slip_potential
-from softmode.deformables.model.lane_kernels import vec8d
+from softmode.deformables.model.lane_kernels import team_sum, vec8d
 from softmode.deformables.model.struct_kernels import (
     Samples,
     blocks_of,
@@ -29,7 +29,6 @@ from softmode.deformables.solver.spin_kernels import (
     team_sum33,
     unknown_block,
 )
-from softmode.deformables.model.lane_kernels import team_sum
 
 wp.set_module_options({"enable_backward": False})
 
@@ -93,9 +92,7 @@ def contact_at(step: NewtonStep, total: wp.vec3d, i: int, e: int, follow: int):
         step.constraints.normal_force[i, e] = k * slope
     limit = step.constraints.friction[i, e] * step.constraints.normal_force[i, e]
     t = total - wp.dot(n, total) * n
-    f0, secant, _tangent = slip_potential(
-        wp.length(t), limit, step.constraints.stick[i, e], step.options.stick_range
-    )
+    f0, secant, _tangent = slip_potential(wp.length(t), limit, step.constraints.stick[i, e], step.options.stick_range)
     N = wp.outer(n, n)
     H = k * curvature * N + secant * (wp.identity(n=3, dtype=wp.float64) - N)
     return k * psi + f0, k * slope * n - secant * t, H

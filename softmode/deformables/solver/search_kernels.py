@@ -262,9 +262,7 @@ def find_turn(instances: Instances, basis: Basis, arrays: NewtonArrays, i: int, 
 
 
 @wp.func
-def moved_block(
-    instances: Instances, basis: Basis, arrays: NewtonArrays, i: int, b: int, alpha: wp.float64
-):
+def moved_block(instances: Instances, basis: Basis, arrays: NewtonArrays, i: int, b: int, alpha: wp.float64):
     """Return eight coordinates of the iterate moved by alpha times the direction, its rotation a finite one."""
     rest, one = rest_block(basis, instances.asset[i], b)
     shift = arrays.turn_shift[i]

@@ -13,7 +13,7 @@ doi:10.1002/nme.1620310103) with the exponential map. In b, R^T w is w as Coriol
 the second term is the centrifugal force, which the elastic forces must balance. After the step, which leaves x with the
 centre of mass X', the rest is r' = x - X' and the velocity is
 
-    v' = V' + (r' - R r)/dt + eta x r',    eta = I'^-1 (L - sum r' x b),
+    v' = V' + (r' - R r)/dt + chi x r',    chi = I'^-1 (L - sum r' x b),
 
 so that the angular momentum has changed by dt times the moment of all forces about the centre of mass, at their new
 places, and by nothing else.
@@ -25,7 +25,7 @@ import warp as wp
 
 from softmode.deformables.model.declare import struct
 from softmode.deformables.model.lane_kernels import LANES, team_sum, vec8d
-from softmode.deformables.model.struct_kernels import Basis, Instances, Motion, blocks_of
+from softmode.deformables.model.struct_kernels import Basis, Motion, blocks_of
 from softmode.deformables.solver.iteration_kernels import NewtonStep, mat38d
 
 wp.set_module_options({"enable_backward": False})
@@ -59,7 +59,7 @@ class Spin:
     centrifugal: wp.array[wp.mat33d]  # dt^2 times the centrifugal force is this times r
     centre_end: wp.array[wp.vec3d]  # X' [m]
     moment_end: wp.array[wp.mat33d]  # sum r' r'^T [m^2]
-    correction: wp.array[wp.vec3d]  # eta [rad/s]
+    correction: wp.array[wp.vec3d]  # chi [rad/s]
 
 
 @wp.func
@@ -287,9 +287,7 @@ def turned_block(spin: Spin, i: int, q: mat38d, rest: mat38d, one: vec8d):
 
 
 @wp.func
-def target_block(
-    spin: Spin, i: int, turned: mat38d, r: mat38d, qd: mat38d, one: vec8d, dt: wp.float64
-):
+def target_block(spin: Spin, i: int, turned: mat38d, r: mat38d, qd: mat38d, one: vec8d, dt: wp.float64):
     """Return eight coordinates of the target x*."""
     u = qd - wp.outer(spin.velocity[i], one)
     b = wp.transpose(spin.rotation[i]) * u + spin.outward[i] * r
