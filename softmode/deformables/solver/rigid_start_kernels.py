@@ -15,6 +15,10 @@ import warp as wp
 from softmode.deformables.contact.penalty_kernels import normal_potential, slip_potential
 from softmode.deformables.model.lane_kernels import team_sum, vec8d
 from softmode.deformables.model.struct_kernels import (
+    Basis,
+    Instances,
+    PointConstraints,
+    Rigid,
     Samples,
     blocks_of,
     has_contacts,
@@ -71,28 +75,46 @@ def solve_six(H: mat66d, g: vec6d):
 
 
 @wp.func
-def contact_place(step: NewtonStep, samples: Samples, i: int, e: int):
+def contact_place(
+    instances: Instances,
+    basis: Basis,
+    q_start: wp.array2d[vec8d],
+    constraints: PointConstraints,
+    rigid: Rigid,
+    samples: Samples,
+    q: wp.array2d[vec8d],
+    i: int,
+    e: int,
+):
     """Return offset + d of a contact at the iterate, and where its sample is."""
-    row = step.constraints.row[i, e]
-    d = interpolate_change(step.basis.row, row, step.arrays.q, step.motion.q_start, i, step.instances.function_count[i])
-    place = samples.position[i, row - step.instances.row_start[i]] + d
-    w = step.instances.world[i]
-    for k in range(step.constraints.dof_begin[i, e], step.constraints.dof_end[i, e]):
-        d -= step.rigid.r[w, k] * wp.vec3d(step.constraints.jacobian[i, e, k])
-    return step.constraints.offset[i, e] + d, place
+    row = constraints.row[i, e]
+    d = interpolate_change(basis.row, row, q, q_start, i, instances.function_count[i])
+    place = samples.position[i, row - instances.row_start[i]] + d
+    w = instances.world[i]
+    for k in range(constraints.dof_begin[i, e], constraints.dof_end[i, e]):
+        d -= rigid.r[w, k] * wp.vec3d(constraints.jacobian[i, e, k])
+    return constraints.offset[i, e] + d, place
 
 
 @wp.func
-def contact_at(step: NewtonStep, total: wp.vec3d, i: int, e: int, follow: int):
+def contact_at(
+    constraints: PointConstraints,
+    smoothing: float,
+    stick_range: wp.float64,
+    total: wp.vec3d,
+    i: int,
+    e: int,
+    follow: int,
+):
     """Return energy, force and Hessian of a contact at offset + d; ``follow``: its friction takes this normal force."""
-    n = step.constraints.normal[i, e]
-    k = step.constraints.stiffness[i, e]
-    psi, slope, curvature = normal_potential(-wp.dot(n, total), wp.float64(step.instances.smoothing[i]))
+    n = constraints.normal[i, e]
+    k = constraints.stiffness[i, e]
+    psi, slope, curvature = normal_potential(-wp.dot(n, total), wp.float64(smoothing))
     if follow != 0:
-        step.constraints.normal_force[i, e] = k * slope
-    limit = step.constraints.friction[i, e] * step.constraints.normal_force[i, e]
+        constraints.normal_force[i, e] = k * slope
+    limit = constraints.friction[i, e] * constraints.normal_force[i, e]
     t = total - wp.dot(n, total) * n
-    f0, secant, _tangent = slip_potential(wp.length(t), limit, step.constraints.stick[i, e], step.options.stick_range)
+    f0, secant, _tangent = slip_potential(wp.length(t), limit, constraints.stick[i, e], stick_range)
     N = wp.outer(n, n)
     H = k * curvature * N + secant * (wp.identity(n=3, dtype=wp.float64) - N)
     return k * psi + f0, k * slope * n - secant * t, H
@@ -114,9 +136,21 @@ def rigid_potential(
     """Return the potential of the motion by t and R [J], with away = X - X* and C = sum (m/dt^2 r* + f) r^T."""
     share = wp.float64(0.0)
     for e in range(member, step.constraints.count[i] - step.constraints.pair_count[i], team):
-        total, place = contact_place(step, samples, i, e)
+        total, place = contact_place(
+            step.instances,
+            step.basis,
+            step.motion.q_start,
+            step.constraints,
+            step.rigid,
+            samples,
+            step.arrays.q,
+            i,
+            e,
+        )
         r = place - X
-        value, _f, _H = contact_at(step, total + t + R * r - r, i, e, 0)
+        value, _f, _H = contact_at(
+            step.constraints, step.instances.smoothing[i], step.options.stick_range, total + t + R * r - r, i, e, 0
+        )
         share += value
     weight = step.instances.mass[i] / (step.options.dt * step.options.dt)
     rigid = wp.float64(0.5) * weight * wp.dot(t, t + wp.float64(2.0) * away) - wp.ddot(
@@ -147,7 +181,17 @@ def start_rigidly(step: NewtonStep, samples: Samples, team: int):
         return
     stored = wp.float64(0.0)
     for e in range(member, count, team):
-        total, _place = contact_place(step, samples, i, e)
+        total, _place = contact_place(
+            step.instances,
+            step.basis,
+            step.motion.q_start,
+            step.constraints,
+            step.rigid,
+            samples,
+            step.arrays.q,
+            i,
+            e,
+        )
         penetration = -wp.dot(step.constraints.normal[i, e], total)
         psi, _slope, _curvature = normal_potential(penetration, wp.float64(step.instances.smoothing[i]))
         stored += step.constraints.stiffness[i, e] * psi
@@ -187,10 +231,22 @@ def start_rigidly(step: NewtonStep, samples: Samples, team: int):
         H_tr = wp.mat33d()
         H_rr = wp.mat33d()
         for e in range(member, count, team):
-            total, place = contact_place(step, samples, i, e)
+            total, place = contact_place(
+                step.instances,
+                step.basis,
+                step.motion.q_start,
+                step.constraints,
+                step.rigid,
+                samples,
+                step.arrays.q,
+                i,
+                e,
+            )
             r = place - X
             arm = R * r
-            value, f, K = contact_at(step, total + t + arm - r, i, e, 1)
+            value, f, K = contact_at(
+                step.constraints, step.instances.smoothing[i], step.options.stick_range, total + t + arm - r, i, e, 1
+            )
             lever = wp.skew(arm)
             share += value
             push += f
