@@ -89,7 +89,7 @@ def suite_kappa() -> Work:
 
 def suite_cubature() -> Work:
     """All quadrature points instead of the default cubature, and Newton to a tighter tolerance."""
-    tight = SolverReducedOptions(contact_max=1, tolerance=1e-7)
+    tight = SolverReducedOptions(contact_max=1, tolerance=1e-7, keep_spin=False)
     for scene, m in (("bend", 6), ("bend", 16), ("twist_360", 16), ("spin", 16)):
         references = [scene] if scene == "spin" else [scene, soft(scene, KAPPA)]
         yield Row(label="all points", scene=scene, options=affine(m, cubature_count=None)), references

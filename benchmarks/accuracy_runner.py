@@ -60,7 +60,9 @@ class Row:
     """Quadrature points of the build."""
     pin_counts: tuple[int, int, int] = (3, 5, 5)
     """Gauss points per axis of a soft clamp."""
-    solver: SolverReducedOptions = dataclasses.field(default_factory=lambda: SolverReducedOptions(contact_max=1))
+    solver: SolverReducedOptions = dataclasses.field(
+        default_factory=lambda: SolverReducedOptions(contact_max=1, keep_spin=False)
+    )
     """How a step is solved."""
     steps: int | None = None
     """Number of steps; the scene's own when None."""

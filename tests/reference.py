@@ -474,9 +474,10 @@ class FreeBody:
         return still.solve(np.zeros_like(self.body.linear_coordinates[:, :3]), np.zeros((self.body.function_count, 3)))
 
     def step(self, q_start: np.ndarray, qd_start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (q, qd) after one step of implicit Euler, solved to rounding by Newton."""
-        q = self.solve(q_start, qd_start)
-        return q, (q - q_start) / self.dt
+        """Return (q, qd) after one step of implicit Euler that follows the rotation, solved to rounding by Newton."""
+        spin = Spin(self.body, q_start, qd_start, self.dt)
+        q = self.solve(q_start, (spin.target - q_start) / self.dt)
+        return q, spin.velocity(q)
 
     def solve(self, q_start: np.ndarray, qd_start: np.ndarray) -> np.ndarray:
         """Return the minimum of the potential, by full Newton steps from where the body rests or drifts to."""
@@ -526,3 +527,59 @@ def contact_readings(entries, body, body_q, body_com):
         weight @ x / weight.sum(),
         mean / np.linalg.norm(mean),
     )
+
+
+def exponential(turn: np.ndarray) -> np.ndarray:
+    """Return the rotation exp([turn])."""
+    angle = np.linalg.norm(turn)
+    T = np.cross(turn, I3).T
+    return I3 + np.sinc(angle / np.pi) * T + 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2 * T @ T
+
+
+class Spin:
+    """Where a free body goes in a step without forces, and its velocity after it: see ``spin_kernels``.
+
+    Args:
+        body: The body.
+        q: Coordinates at the start (n, 3) [m].
+        qd: Velocities (n, 3) [m/s].
+        dt: Step [s].
+    """
+
+    def __init__(self, body: ReducedBody, q: np.ndarray, qd: np.ndarray, dt: float) -> None:
+        """Find the rotation of the step and the target."""
+        self.body, self.dt = body, dt
+        one = body.linear_coordinates[:, 3]
+        r, X = self.about_centre(q)
+        V = body.mean_basis @ qd
+        u = qd - np.outer(one, V)
+        inertia = self.inertia(r)
+        self.momentum = np.cross(r, u).sum(axis=0)
+        omega = mean = np.linalg.solve(inertia, self.momentum)
+        for _ in range(200):  # L and L . omega are kept; Newton is not needed for bodies that are no needles
+            mean = 0.5 * np.linalg.solve(inertia, self.momentum + exponential(-dt * mean) @ self.momentum)
+        R = exponential(dt * mean)
+        turned = r @ R.T
+        omega_end = R @ (2.0 * mean - omega)
+        b = (u - np.cross(omega, r)) @ R - dt * np.cross(omega_end, np.cross(omega_end, turned))
+        b -= np.cross(np.linalg.solve(self.inertia(turned), np.cross(turned, b).sum(axis=0)), turned)
+        self.outward = b
+        self.turned = turned + np.outer(one, X) - body.linear_coordinates[:, :3]
+        self.target = self.turned + dt * (np.outer(one, V) + b)
+
+    def about_centre(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the coordinates of the place from the centre of mass (n, 3), and that centre (3,)."""
+        y = q + self.body.linear_coordinates[:, :3]
+        X = self.body.mean_basis @ y
+        return y - np.outer(self.body.linear_coordinates[:, 3], X), X
+
+    @staticmethod
+    def inertia(r: np.ndarray) -> np.ndarray:
+        """Return the tensor of inertia per unit mass."""
+        return (r**2).sum() * I3 - r.T @ r
+
+    def velocity(self, q: np.ndarray) -> np.ndarray:
+        """Return the velocity at the end of the step, (n, 3)."""
+        r, _X = self.about_centre(q)
+        eta = np.linalg.solve(self.inertia(r), self.momentum - np.cross(r, self.outward).sum(axis=0))
+        return (q - self.turned) / self.dt + np.cross(eta, r)

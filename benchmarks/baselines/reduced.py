@@ -191,7 +191,9 @@ def _run(
         add_pins(builder, instance, held - body.offset, stiffness=STIFFNESS * volume, targets=held)
     model: Any = builder.finalize(device="cpu")
     model.set_gravity(SCENE.gravity)
-    solver = SolverReduced(model, [body], options=SolverReducedOptions(contact_max=1, integrator=integrator))
+    solver = SolverReduced(
+        model, [body], options=SolverReducedOptions(contact_max=1, integrator=integrator, keep_spin=False)
+    )
     states, control = [model.state(), model.state()], model.control()
     graphs = []
     for a, b in ((0, 1), (1, 0)):

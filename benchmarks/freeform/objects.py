@@ -235,7 +235,7 @@ def reduced_motion(thing: Thing, grip: Grip, body: ReducedBody, points: Array, s
         instance = add_reduced_body(builder, body, material=material, position=body.offset.tolist())
         add_pins(builder, instance, grip.points - body.offset, stiffness=grip.stiffness, targets=grip.points)
 
-    options = SolverReducedOptions(contact_max=1)
+    options = SolverReducedOptions(contact_max=1, keep_spin=False)
     scene = Scene(place, [body], gravity=(grip.gravity * thing.down).tolist(), options=options, dt=DT)
     basis, rest = body.evaluate(points - body.offset)[0], scene.q()
     frames, clock = [], []

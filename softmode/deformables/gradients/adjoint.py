@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from softmode.checks import require_fields, require_number
 from softmode.deformables.gradients import adjoint_kernels as kernels
+from softmode.deformables.gradients import spin_adjoint_kernels as spin_kernels
 from softmode.deformables.gradients.krylov import Gmres
 from softmode.deformables.gradients.turning_kernels import find_turning
 from softmode.deformables.model.declare import WRENCH
@@ -36,6 +37,7 @@ from softmode.deformables.solver.detect import adapt
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient
 from softmode.deformables.solver.iteration_kernels import NewtonStep
 from softmode.deformables.solver.solver_reduced import SolverReduced
+from softmode.deformables.solver.spin_kernels import end_spin
 from softmode.deformables.solver.step_kernels import sum_forces
 from softmode.errors import ConfigError, SolverDiverged
 
@@ -201,6 +203,7 @@ class AdjointReduced:
         given = {"instances": t.instances, "basis": t.basis, "arrays": t.arrays}
         given |= {"points": points, "constraints": constraints}
         self._sums = allocate(NewtonStep, "", {}, self.device, given=given)
+        self._spin = allocate(spin_kernels.SpinLoss, "instance", self._sizes, self.device)
         self._gmres = Gmres(solver, cycle_length=self.options.cycle_length, cycle_max=self.options.cycle_max)
         self._driven = self._zeros(t.unknowns, vec8d)
         self._state = solver.model.state()
@@ -338,6 +341,8 @@ class AdjointReduced:
             self._restore(k)
             self._measure(k, residual[k], overlap[k])
             t.launch(kernels.add_velocity, t.unknowns, t.motion, qd_bar[k + 2], dt, q_bar[k + 2])
+            velocity = (t.motion, t.spin, t.arrays.q, qd_bar[k + 2], q_bar[k + 2], self._spin)
+            t.launch(spin_kernels.pull_velocity, self.instances, *bodies, *velocity)
             if self.solver.model.shape_count and k + 1 < steps:
                 self._pull_memory(k, q_bar[k + 2])
             self._solve(k, q_bar[k + 2], costate)
@@ -348,8 +353,10 @@ class AdjointReduced:
                 found = (sums, pin_target[k], self._step)
                 t.launch(kernels.accumulate_constraints, constraints, *bodies, *contacts, *found)
             self._sum_points(t.newton.active)
-            given = (t.motion, t.arrays, t.model.gravity, costate, self._driven, dt, k)
+            given = (t.motion, t.arrays, t.model.gravity, costate, self._driven, t.spin, dt, k)
             t.launch(kernels.propagate, t.unknowns, *bodies, *given, q_bar, qd_bar, sums)
+            start = (t.motion, self._spin, t.spin, t.arrays.q, costate, dt, k)
+            t.launch(spin_kernels.propagate_spin, self.instances, *bodies, *start, q_bar, qd_bar)
 
         self._check(residual.numpy(), error.numpy(), overlap.numpy())
         density = self.solver.parameters.density
@@ -418,6 +425,7 @@ class AdjointReduced:
             wp.copy(values, stored)
         t.shapes.body_q, t.shapes.body_qd = self._pose[k], self._twist[k]
         adapt(t, dt)
+        t.launch_teams(end_spin, self.instances, t.newton_step(dt), t.team, t.spin)
         progress = t.newton
         for flag in (progress.active, progress.refresh, progress.exact):
             flag.fill_(1)

@@ -28,6 +28,7 @@ from softmode.deformables.model.struct_kernels import (
     interpolate_change,
 )
 from softmode.deformables.solver.iteration_kernels import NewtonArrays
+from softmode.deformables.solver.spin_kernels import Spin, turns
 from softmode.deformables.solver.step_kernels import material_of
 
 wp.set_module_options({"enable_backward": False})
@@ -517,6 +518,7 @@ def propagate(
     gravity: wp.array[wp.vec3],
     costate: wp.array2d[vec8d],
     driven: wp.array2d[vec8d],  # H^T lambda at the driven functions
+    spin: Spin,
     dt: wp.float64,
     t: int,
     # In and out, (T + 2, ...): row t + 2 is dL/dq_t, which becomes dL/d(q_driven); before it those of the steps before
@@ -524,7 +526,10 @@ def propagate(
     qd_bar: wp.array3d[vec8d],
     sums: Sums,
 ):
-    """Subtract lambda^T dr/d(q_(t-1), v_(t-1), q_(t-2), v_(t-2), m, alpha, g)."""
+    """Subtract lambda^T dr/d(q_(t-1), v_(t-1), q_(t-2), v_(t-2), m, alpha, g).
+
+    Of a target that turns, ``spin_adjoint_kernels`` has the part by the start of the step.
+    """
     i, e = wp.tid()
     stride = basis.row.shape[1]
     b = e % stride
@@ -539,6 +544,9 @@ def propagate(
             start = start - arrays.gradient_chunk[i, k, e]
     q_rate = m * rate * (rate + alpha) * L - rate * qd_bar[t + 2, i, e]
     qd_rate = m * rate * L
+    if turns(spin, motion, i):
+        q_rate = m * rate * alpha * L
+        qd_rate = vec8d()
     third = wp.float64(0.0)
     if motion.rate[i] > wp.float64(1.0):
         third = wp.float64(1.0) / wp.float64(3.0)

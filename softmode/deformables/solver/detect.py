@@ -46,7 +46,8 @@ def detect(tables: StepTables, state: newton.State, control: SoftControl, dt: fl
 def adapt(tables: StepTables, dt: float) -> None:
     """Let bodies in contact or attached to a rigid body take an Euler step, whatever the integrator."""
     if tables.options.integrator == "bdf2":
-        tables.launch(fall_back_to_euler, tables.unknowns, tables.newton_step(dt))
+        blocks = (tables.layout.instance_count, tables.layout.block_count)
+        tables.launch(fall_back_to_euler, blocks, tables.newton_step(dt), tables.spin)
 
 
 def differentiate_constraints(tables: StepTables) -> None:

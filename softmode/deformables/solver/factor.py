@@ -42,7 +42,7 @@ class BlockCholesky:
         self._factor = wp.overload(kernels.factor, {"unit": self.unit})
         given = {"world": system_world, "matrix": self.matrix, "scalars": self.scalars, "pattern": self.pattern}
         sizes = {"system": self.system_count, "row": size, "block": size // LANES}
-        axes = {"indefinite": "system", "diagonal right": "system row", "solution": "system block"}
+        axes = {"indefinite": "system", "diagonal right": "system row", "solution bounds": "system block"}
         self.table = allocate(kernels.Systems, axes, sizes, device, given=given)
         """All of it, for kernels."""
         self.indefinite = self.table.indefinite
@@ -54,7 +54,7 @@ class BlockCholesky:
     def factor(self, active: wp.array) -> None:
         """Replace [A | B] by [U | U^-T B] in the active worlds; only the upper triangle of A is read.
 
-        Sets ``indefinite`` where a pivot had to be raised.
+        Sets ``indefinite`` where a pivot had to be raised by more than rounding.
         """
         self._launch(self._factor, active, self.team, self.width, self.unit, self.table)
 

@@ -34,7 +34,8 @@ class Systems:
     scalars: wp.array3d[float]  # (system_count, N, N + M), the same memory number by number
     pattern: wp.array3d[int]  # (system_count, part_count, part_count), which parts are related, upper triangle
     diagonal: wp.array2d[vec8]  # (system_count, N): diagonal blocks of U with inverse pivots
-    indefinite: wp.array[int]  # (system_count,), 1 where a pivot had to be raised
+    bounds: wp.array2d[wp.vec2]  # (system_count, N / 8): least pivots of eight rows, and what rounding may take of them
+    indefinite: wp.array[int]  # (system_count,), 1 where a pivot had to be raised by more than rounding
     right: wp.array2d[float]  # (system_count, N), scratch of the solution
     solution: wp.array2d[vec8]  # (system_count, N / 8)
 
@@ -106,14 +107,17 @@ def factor_system(
         barrier()
         # every thread factors its own copy of the diagonal block (inverse pivots): cheaper than waiting for one
         U = mat88()
+        bounds = systems.bounds[i, block]
         for a in range(8):
             row = matrix[i, first + a, block]
             floor = wp.max(1.0e-6 * wp.abs(row[a]), 1.0e-30)
+            least = wp.where(bounds[1] > 0.0, -bounds[1], floor)
+            floor = wp.max(floor, bounds[0])
             for s in range(a):
                 factor = U[s, a]
                 for b in range(8):
                     row[b] -= factor * U[s, b]
-            if row[a] < floor:
+            if not (row[a] >= least):
                 indefinite = 1
             inverse = 1.0 / wp.sqrt(wp.max(row[a], floor))
             for b in range(8):

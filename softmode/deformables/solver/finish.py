@@ -6,7 +6,7 @@ import warp as wp
 from softmode.deformables.contact import friction_memory_kernels as memory_kernels
 from softmode.deformables.contact import penalty_kernels
 from softmode.deformables.model.namespaces import soft
-from softmode.deformables.solver import attachment_kernels
+from softmode.deformables.solver import attachment_kernels, spin_kernels
 from softmode.deformables.solver import step_kernels as kernels
 from softmode.deformables.solver.step_tables import StepTables
 
@@ -22,8 +22,9 @@ def finish(tables: StepTables, state: newton.State, dt: float, *, prescribed: bo
     """
     t, out, worlds, step = tables, soft(state), tables.layout.world_count, tables.newton_step(dt)
     t.launch_teams(kernels.check_state, worlds, step, t.team)
-    every = (t.layout.instance_count, t.layout.stride)
-    t.launch(kernels.end_step, every, step, out.q, out.qd, out.q_before, out.qd_before, out.dt_before)
+    t.launch_teams(spin_kernels.end_spin, t.layout.instance_count, step, t.team, t.spin)
+    every = (t.layout.instance_count, t.layout.block_count)
+    t.launch(kernels.end_step, every, step, t.spin, out.q, out.qd, out.q_before, out.qd_before, out.dt_before)
     if t.model.shape_count:
         sticking = (t.instances, t.shapes, t.samples, t.constraints, int(prescribed))
         t.launch(memory_kernels.remember_slip, t.samples.position.shape, *sticking, out.stick_shape, out.stick_point)

@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from softmode.deformables.model.declare import Kernel
-from softmode.deformables.model.lane_kernels import LANES, barrier, vec8d
+from softmode.deformables.model.lane_kernels import LANES, barrier
 from softmode.deformables.solver.assembly_kernels import (
     column_block,
     condensed_entry,
@@ -25,7 +25,13 @@ from softmode.deformables.solver.factor_kernels import factor_system, solve_syst
 from softmode.deformables.solver.fused_system_kernels import dynamic_floats, shared_direction_of, sum_forces_of
 from softmode.deformables.solver.iteration_kernels import ALL, NewtonStep
 from softmode.deformables.solver.rigid_row_kernels import evaluate_row
-from softmode.deformables.solver.search_kernels import accept_step, check_convergence, check_trial, start_line_search
+from softmode.deformables.solver.search_kernels import (
+    accept_step,
+    check_convergence,
+    check_trial,
+    move_functions,
+    start_line_search,
+)
 from softmode.deformables.solver.step_kernels import (
     evaluate_constraint,
     evaluate_point,
@@ -179,8 +185,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0) -> Kernel:
                 if trial != 0:
                     alpha = step.state.step_length[w]
                     for i in range(begin, end):
-                        for e in range(member, 3 * blocks, team):
-                            q[i, e] = step.arrays.q[i, e] + alpha * vec8d(step.arrays.direction[i, e])
+                        move_functions(step.instances, step.basis, step.arrays, alpha, i, member, team, q)
                     for j in range(member, n, team):
                         r[w, j] = step.rigid.r[w, j] + alpha * step.rigid.direction[w, j]
                     barrier()

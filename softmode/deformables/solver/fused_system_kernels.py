@@ -215,19 +215,22 @@ _SYSTEM = """
             SOFTMODE_BARRIER;
             // every thread factors its own copy of the diagonal block (inverse pivots): cheaper than waiting for one
             float U[8][8];
+            const float* bounds = (const float*)arrays.systems.bounds.data + 2 * ((size_t)i * (N / 8) + first / 8);
             #pragma unroll
             for (int a = 0; a < 8; ++a) {
                 float row[8];
                 #pragma unroll
                 for (int b = 0; b < 8; ++b) row[b] = b >= a ? here[a * stride + first + b] : 0.0f;
                 const float size = row[a] < 0.0f ? -row[a] : row[a];
-                const float floor = 1.0e-6f * size > 1.0e-30f ? 1.0e-6f * size : 1.0e-30f;
+                float floor = 1.0e-6f * size > 1.0e-30f ? 1.0e-6f * size : 1.0e-30f;
+                const float least = bounds[1] > 0.0f ? -bounds[1] : floor;
+                floor = bounds[0] > floor ? bounds[0] : floor;
                 #pragma unroll
                 for (int s = 0; s < a; ++s) {
                     #pragma unroll
                     for (int b = a; b < 8; ++b) row[b] -= U[s][a] * U[s][b];
                 }
-                if (row[a] < floor) bad = 1;
+                if (!(row[a] >= least)) bad = 1;
                 const float inverse = 1.0f / wp::sqrt(row[a] > floor ? row[a] : floor);
                 #pragma unroll
                 for (int b = a; b < 8; ++b) U[a][b] = inverse * row[b];

@@ -60,6 +60,9 @@ class NewtonArrays:
     system_start: wp.array[int]  # (world_count + 1,)
     systems: Systems
     direction: wp.array2d[vec8]
+    turn: wp.array[wp.vec3d]  # (instance_count,), rotation that is in the direction [rad], 0 where it is small
+    turn_centre: wp.array[wp.vec3d]  # (instance_count,), centre of mass of the iterate [m]
+    turn_shift: wp.array[wp.vec3d]  # (instance_count,), its motion in the direction [m]
 
 
 @struct

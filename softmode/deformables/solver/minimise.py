@@ -3,6 +3,7 @@
 import warp as wp
 
 from softmode.deformables.solver import fused_newton_kernels as fused
+from softmode.deformables.solver import rigid_start_kernels
 from softmode.deformables.solver import search_kernels as search
 from softmode.deformables.solver import step_kernels as kernels
 from softmode.deformables.solver.evaluate import assemble, evaluate, evaluate_trial, gather_gradient, solve
@@ -14,6 +15,8 @@ def minimise(tables: StepTables, dt: float) -> None:
     t, worlds, step = tables, tables.layout.world_count, tables.newton_step(dt)
     t.launch(kernels.begin_newton, worlds, step)
     t.launch(kernels.extrapolate, t.unknowns, step)
+    if t.model.shape_count:
+        t.launch_teams(rigid_start_kernels.start_rigidly, t.layout.instance_count, step, t.samples, t.team)
     if t.options.carry_stiffness:
         t.launch_teams(search.reuse_hessians, worlds, step, t.team)
     if t.one_launch:
@@ -50,7 +53,8 @@ def start_line_search(tables: StepTables, dt: float) -> None:
 def _try_step(tables: StepTables, dt: float) -> None:
     """Evaluate one trial step in every searching world and accept or halve it."""
     t, step = tables, tables.newton_step(dt)
-    t.launch(search.trial_functions, t.unknowns, step)
+    threads = t.layout.block_count if t.model.device.is_cuda else 1
+    t.launch(search.trial_functions, (t.layout.instance_count, threads), step, threads)
     if t.rigid.count_max:
         t.launch(search.trial_rigid, (t.layout.world_count, t.rigid.count_max), step)
     evaluate_trial(t, dt)

@@ -14,11 +14,15 @@ class SolverReducedOptions:
     """How a step is solved."""
 
     integrator: Integrator = "euler"
-    """"euler": implicit Euler, first order, damps what a step cannot resolve (half of a 10 rad/s spin in a second at
-    60 Hz). "bdf2": keeps 97 % of it; without viscosity (whose stress is differenced backwards) its order was measured
-    as 1.7 to 1.9 in bending and 0.8 to 1.3 in a free motion. It needs equal steps, and takes an Euler step where there
-    is none before, as after a reset, and where a body has contacts or is attached to a rigid body. Who writes q or qd
-    must set ``state.softmode.dt_before`` of the instance to 0."""
+    """"euler": implicit Euler, first order, damps what a step cannot resolve. "bdf2": damps less; without viscosity
+    (whose stress is differenced backwards) its order was measured as 1.7 to 1.9 in bending and 0.8 to 1.3 in a free
+    motion. It needs equal steps, and takes an Euler step where there is none before, as after a reset, and where a body
+    has contacts or is attached to a rigid body. Who writes q or qd must set ``state.softmode.dt_before`` of the
+    instance to 0."""
+    keep_spin: bool = True
+    """Whether Euler steps follow the rotation of a body, so that a free one keeps its spin. Bodies with exact regions,
+    and those that turn by more than 1 rad in a step or so fast that they fly apart, take the plain step, which costs
+    half of a 10 rad/s spin in a second at 60 Hz, as all do without this."""
     iteration_max: int = 40
     """Newton iterations at most."""
     stiffness_renewal: int = 5

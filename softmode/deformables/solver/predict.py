@@ -3,6 +3,7 @@
 import newton
 
 from softmode.deformables.model.namespaces import SoftControl, soft
+from softmode.deformables.solver import spin_kernels
 from softmode.deformables.solver import step_kernels as kernels
 from softmode.deformables.solver.step_tables import StepTables
 
@@ -18,9 +19,11 @@ def predict(tables: StepTables, state: newton.State, control: SoftControl, dt: f
     """
     data, step, blocks = soft(state), tables.newton_step(dt), tables.layout.block_count
     count, chunks = tables.layout.instance_count, tables.arrays.gradient_chunk.shape[1]
+    turning = (tables.team, data.q, data.qd, data.qd_before, int(tables.options.keep_spin), tables.spin)
+    tables.launch_teams(spin_kernels.find_spin, count, step, *turning)
     tables.launch(kernels.sum_external, (count, chunks, blocks), step, state.particle_f)
     before = (data.q, data.qd, data.q_before, data.qd_before, data.dt_before)
     bdf2 = int(tables.options.integrator == "bdf2")
-    given = (control.q_driven, tables.parameters.density, tables.parameters.scale, bdf2)
+    given = (control.q_driven, tables.parameters.density, tables.parameters.scale, tables.spin, bdf2)
     tables.launch(kernels.begin_step, (count, blocks), step, tables.model.gravity, *before, *given)
     tables.launch(kernels.start_points, tables.points.energy.shape, step)

@@ -6,17 +6,28 @@ from softmode.deformables.model.declare import kernel_over
 from softmode.deformables.model.lane_kernels import barrier, team_sum, vec8d
 from softmode.deformables.model.status import WORLD_ITERATION_LIMIT, WORLD_NO_DESCENT, WORLD_NOT_FINITE
 from softmode.deformables.model.struct_kernels import (
+    Basis,
     Instances,
     Motion,
     PointConstraints,
     Points,
     Rigid,
+    blocks_of,
     first_coupled,
     has_contacts,
     hessian_key,
     pushes,
 )
-from softmode.deformables.solver.iteration_kernels import NewtonOptions, NewtonStep
+from softmode.deformables.solver.iteration_kernels import NewtonArrays, NewtonOptions, NewtonStep, mat38d
+from softmode.deformables.solver.spin_kernels import (
+    axial,
+    rest_block,
+    rotation_of,
+    team_sum3,
+    team_sum33,
+    tensor_of_inertia,
+    unknown_block,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,9 +39,19 @@ PROJECTED_DISTANCE = wp.constant(0.01)
 """A projected Hessian is kept while steps are larger than this fraction of the size: far from the minimum Newton's own
 is likely to be indefinite again."""
 FAILURES = wp.constant(2)
-"""Indefinite Hessians after which a step keeps to the projected one."""
+"""Indefinite Hessians after which a step keeps to the projected one until it is near the minimum:"""
+NEAR_DISTANCE = wp.constant(1.0e-3)
+"""its steps are smaller than this fraction of the size. There the projected one converges linearly only."""
+NEAR_FAILURES = wp.constant(5)
+"""Indefinite Hessians after which it keeps to the projected one even there."""
+TURN_LEAST = wp.constant(wp.float64(1.0e-4))
+"""Size of a Newton step, over that of the body (rms), from which on its rotation is a finite one: below, the strain of
+a linear one is far less than the tolerance."""
 PROJECTED_ITERATIONS = wp.constant(8)
 """Iterations before which a small step with the projected Hessian does not count as convergence."""
+ENERGY_ROUNDING = wp.constant(wp.float64(2.0e-17))
+"""What rounding leaves of the elastic energy of a body that has turned, over E V: a tenth of float64's unit, since the
+errors of its points differ in sign."""
 SUFFICIENT_DECREASE = wp.constant(wp.float64(0.25))
 """Least decrease of the potential over that of its tangent. A quadratic has 0.5; with little less than that asked for,
 friction between sticking and slipping is crossed back and forth for many iterations."""
@@ -201,6 +222,83 @@ check_iterates = kernel_over(check_convergence, "check_iterates", "w", "member")
 
 
 @wp.func
+def direction_block(arrays: NewtonArrays, i: int, b: int):
+    """Return eight coordinates of the direction."""
+    stride = arrays.direction.shape[1] / 3
+    block = mat38d()
+    for axis in range(3):
+        block[axis] = vec8d(arrays.direction[i, axis * stride + b])
+    return block
+
+
+@wp.func
+def find_turn(instances: Instances, basis: Basis, arrays: NewtonArrays, i: int, member: int, team: int):
+    """Find the rigid part of the direction: motion of the centre of mass, and the rotation with its angular momentum.
+
+    Along a straight line a rotation stretches, which a stiff body resists long before the rotation is done.
+    """
+    a = instances.asset[i]
+    X = wp.vec3d()
+    shift = wp.vec3d()
+    for b in range(member, blocks_of(instances.function_count[i]), team):
+        rest, _one = rest_block(basis, a, b)
+        X += (unknown_block(arrays.q, i, b) + rest) * basis.mean[a, b]
+        shift += direction_block(arrays, i, b) * basis.mean[a, b]
+    X = team_sum3(X)
+    shift = team_sum3(shift)
+    S = wp.mat33d()
+    U = wp.mat33d()
+    for b in range(member, blocks_of(instances.function_count[i]), team):
+        rest, one = rest_block(basis, a, b)
+        r = unknown_block(arrays.q, i, b) + rest - wp.outer(X, one)
+        S += r * wp.transpose(r)
+        U += r * wp.transpose(direction_block(arrays, i, b))
+    S = team_sum33(S)
+    U = team_sum33(U)
+    if member == 0:
+        arrays.turn_centre[i] = X
+        arrays.turn_shift[i] = shift
+        arrays.turn[i] = wp.inverse(tensor_of_inertia(S, instances.size[i])) * axial(U)
+
+
+@wp.func
+def moved_block(instances: Instances, basis: Basis, arrays: NewtonArrays, i: int, b: int, alpha: wp.float64):
+    """Return eight coordinates of the iterate moved by alpha times the direction, its rotation a finite one."""
+    rest, one = rest_block(basis, instances.asset[i], b)
+    shift = arrays.turn_shift[i]
+    turn = arrays.turn[i]
+    r = unknown_block(arrays.q, i, b) + rest - wp.outer(arrays.turn_centre[i], one)
+    bent = direction_block(arrays, i, b) - wp.outer(shift, one) - wp.skew(turn) * r
+    centre = arrays.turn_centre[i] + alpha * shift
+    return rotation_of(alpha * turn) * (r + alpha * bent) + wp.outer(centre, one) - rest
+
+
+@wp.func
+def move_functions(
+    instances: Instances,
+    basis: Basis,
+    arrays: NewtonArrays,
+    alpha: wp.float64,
+    i: int,
+    member: int,
+    team: int,
+    # Out; it may be ``arrays.q``:
+    q_out: wp.array2d[vec8d],
+):
+    """Move the coordinates of an instance by alpha times the direction."""
+    stride = q_out.shape[1] / 3
+    turn = arrays.turn[i]
+    if wp.dot(turn, turn) == wp.float64(0.0):
+        for e in range(member, q_out.shape[1], team):
+            q_out[i, e] = arrays.q[i, e] + alpha * vec8d(arrays.direction[i, e])
+        return
+    for b in range(member, stride, team):
+        block = moved_block(instances, basis, arrays, i, b, alpha)
+        for axis in range(3):
+            q_out[i, axis * stride + b] = block[axis]
+
+
+@wp.func
 def start_line_search(step: NewtonStep, team: int, w: int, member: int):
     """Compute the slope g . d of each active world and start its line search at alpha = 1.
 
@@ -231,6 +329,10 @@ def start_line_search(step: NewtonStep, team: int, w: int, member: int):
             limit = wp.min(limit, wp.float64(0.1) * step.options.stick_range)
         if not (wp.sqrt(moved) <= limit):
             last = 0
+        if wp.sqrt(moved) > TURN_LEAST * wp.float64(step.instances.size[i]) and step.instances.driven_count[i] == 0:
+            find_turn(step.instances, step.basis, step.arrays, i, member, team)
+        elif member == 0:
+            step.arrays.turn[i] = wp.vec3d()
     slope = team_sum(slope)
     if member != 0:
         return
@@ -261,13 +363,14 @@ start_line_searches = kernel_over(start_line_search, "start_line_searches", "w",
 
 
 @wp.kernel
-def trial_functions(step: NewtonStep):
-    """Set q_trial = q + alpha dq."""
-    i, e = wp.tid()
+def trial_functions(step: NewtonStep, team: int):
+    """Move q_trial to q + alpha dq."""
+    i, member = wp.tid()
     w = step.instances.world[i]
     if step.state.searching[w] == 0:
         return
-    step.arrays.q_trial[i, e] = step.arrays.q[i, e] + step.state.step_length[w] * vec8d(step.arrays.direction[i, e])
+    alpha = step.state.step_length[w]
+    move_functions(step.instances, step.basis, step.arrays, alpha, i, member, team, step.arrays.q_trial)
 
 
 @wp.kernel
@@ -277,6 +380,16 @@ def trial_rigid(step: NewtonStep):
     if step.state.searching[w] == 0 or j >= step.rigid.count[w]:
         return
     step.rigid.trial[w, j] = step.rigid.r[w, j] + step.state.step_length[w] * step.rigid.direction[w, j]
+
+
+@wp.func
+def rounding_of(instances: Instances, instance_start: wp.array[int], potential: wp.float64, w: int):
+    """Return what rounding leaves of the potential of a world [J]."""
+    total = wp.float64(1.0e-12) * wp.abs(potential)
+    for i in range(instance_start[w], instance_start[w + 1]):
+        volume = instances.mass[i] * wp.float64(instances.size[i] * instances.size[i] / instances.inertia[i])
+        total += ENERGY_ROUNDING * wp.float64(instances.youngs_modulus[i]) * volume
+    return total
 
 
 @wp.func
@@ -306,7 +419,7 @@ def check_trial(step: NewtonStep, team: int, w: int, member: int):
     if member != 0:
         return
     potential = step.state.potential[w]
-    rounding = wp.float64(1.0e-12) * wp.abs(potential)
+    rounding = rounding_of(step.instances, step.state.instance_start, potential, w)
     alpha = step.state.step_length[w]
     if alpha > wp.float64(1.0):
         step.state.searching[w] = 0
@@ -387,6 +500,7 @@ def accept_step(step: NewtonStep, team: int, w: int, member: int):
     refreshed = step.state.refresh[w]
     far = int(0)
     away = int(0)
+    allowed = int(NEAR_FAILURES)
     for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
         moved = wp.float64(0.0)
         for e in range(member, q.shape[1], team):
@@ -394,15 +508,17 @@ def accept_step(step: NewtonStep, team: int, w: int, member: int):
             moved += wp.dot(d, d)
             if refreshed != 0:
                 step.state.cached_q[i, e] = q[i, e]
-            if alpha > wp.float64(0.0):
-                q[i, e] = q[i, e] + alpha * d
         moved = team_sum(moved)
+        if alpha > wp.float64(0.0):
+            move_functions(step.instances, step.basis, step.arrays, alpha, i, member, team, q)
         if alpha * wp.sqrt(moved) > refresh_limit(step.instances, i, step.options):
             far = 1
         if refreshed != 0 and member == 0:
             step.state.cached_key[i] = hessian_key(step.instances, i, float(step.options.dt))
         if alpha * wp.sqrt(moved) > wp.float64(PROJECTED_DISTANCE * step.instances.size[i]):
             away = 1
+        if alpha * wp.sqrt(moved) > wp.float64(NEAR_DISTANCE * step.instances.size[i]):
+            allowed = FAILURES
     for j in range(member, step.rigid.count[w], team):
         if alpha > wp.float64(0.0):
             step.rigid.r[w, j] = step.rigid.r[w, j] + alpha * step.rigid.direction[w, j]
@@ -419,7 +535,7 @@ def accept_step(step: NewtonStep, team: int, w: int, member: int):
         step.state.refresh[w] = 1
     if alpha == wp.float64(0.0) or (slow and away == 1):
         step.state.project[w] = 1
-    elif step.state.project[w] != 0 and away == 0 and step.state.failures[w] < FAILURES:
+    elif step.state.project[w] != 0 and away == 0 and step.state.failures[w] < allowed:
         step.state.project[w] = 0
         step.state.refresh[w] = 1
     step.state.exact[w] = 0

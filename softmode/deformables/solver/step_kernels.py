@@ -13,6 +13,8 @@ c (v - v_rate)/dt, q_inertial = q_rate + dt/c v_rate:
     implicit Euler  c = 1,    q_rate = q_n,                      v_rate = v_n
     BDF2            c = 3/2,  q_rate = (4 q_n - q_(n-1))/3,      v_rate = (4 v_n - v_(n-1))/3
 
+In a step of implicit Euler q_inertial and the velocity at the end turn with the body, see ``spin_kernels``.
+
 Precision: basis data float32; q, energy and residual float64; the Newton direction float32.
 """
 
@@ -45,9 +47,19 @@ from softmode.deformables.model.struct_kernels import (
     has_contacts,
     in_mask,
     interpolate_change,
+    p_wave_modulus,
     pushes,
 )
 from softmode.deformables.solver.iteration_kernels import ALL, ENERGIES, NewtonStep, add_outer_3d, mat38d
+from softmode.deformables.solver.spin_kernels import (
+    Spin,
+    rest_block,
+    target_block,
+    turned_block,
+    turns,
+    unknown_block,
+    velocity_block,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -55,6 +67,9 @@ EXTRAPOLATION_INERTIA = wp.constant(wp.float64(0.01))
 """Least rho L^2 / (E dt^2) of a body whose acceleration is carried on."""
 NEEDS_FEASIBLE_START = wp.constant(int(MaterialModel.NEO_HOOKEAN))
 """The material that forbids inversion: a step starts where the last one ended."""
+PIVOT_ROUNDING = wp.constant(1.0e-4)
+"""What rounding may take of a pivot of the Hessian, over the stiffness P V / L^2 of a body: its rotations have no more
+than their inertia left when all else is eliminated."""
 COLLAPSED_RATIO = wp.constant(0.01)
 """Points whose volume is below this fraction of their rest volume count as collapsed, and"""
 COLLAPSED_SHARE = wp.constant(0.1)
@@ -128,6 +143,7 @@ def begin_step(
     q_driven: wp.array[wp.vec3d],  # (function_total,), where the driven functions are to be at the end of the step
     density: wp.array[float],  # (instance_count,) [kg/m^3], as the model has them, which may not be in use yet
     scale: wp.array[float],
+    spin: Spin,
     bdf2: int,
 ):
     """Read the state, predict where the body goes, and add gravity to the external forces; flag bad parameters."""
@@ -184,6 +200,22 @@ def begin_step(
         step.motion.change[i, e] = change
         step.arrays.q[i, e] = start
     step.motion.rate[i] = c
+    if c == wp.float64(1.0) and spin.turns[i] != 0:
+        rest, one = rest_block(step.basis, step.instances.asset[i], b)
+        turned, r = turned_block(spin, i, unknown_block(step.motion.q_start, i, b), rest, one)
+        target = target_block(spin, i, turned, r, unknown_block(step.motion.qd_start, i, b), one, dt)
+        # the acceleration that is carried on balances the centrifugal one
+        outward = ahead * (spin.centrifugal[i] * r)
+        begin = turned + ahead * (target - turned) - outward
+        onward = mat38d()
+        if again:
+            gain = wp.outer(ahead * dt * spin.gain[i], one)
+            onward = gain + spin.onward[i] * (unknown_block(step.motion.change, i, b) - gain) + outward
+        for axis in range(3):
+            e = axis * stride + b
+            step.motion.q_inertial[i, e] = target[axis]
+            step.motion.change[i, e] = onward[axis]
+            step.arrays.q[i, e] = begin[axis]
     weight = step.instances.mass[i] * vec8d(step.basis.mean[step.instances.asset[i], b])
     if bits != 0:
         wp.atomic_or(step.state.status, step.instances.world[i], bits)
@@ -195,18 +227,29 @@ def begin_step(
 
 
 @wp.kernel
-def fall_back_to_euler(step: NewtonStep):
+def fall_back_to_euler(step: NewtonStep, spin: Spin):
     """Let a body near a shape, or fixed to a rigid body, take an Euler step.
 
     BDF2 would carry its velocity across the jump of an impact; and the rigid body takes Euler steps, in which the same
     force changes its momentum by another amount.
     """
-    i, e = wp.tid()
+    i, b = wp.tid()
     if not pushes(step.instances, step.constraints, i):
         return
+    dt = step.options.dt
+    stride = step.basis.row.shape[1]
+    q = unknown_block(step.motion.q_start, i, b)
+    qd = unknown_block(step.motion.qd_start, i, b)
+    target = q + dt * qd
+    if spin.turns[i] != 0:
+        rest, one = rest_block(step.basis, step.instances.asset[i], b)
+        turned, r = turned_block(spin, i, q, rest, one)
+        target = target_block(spin, i, turned, r, qd, one, dt)
     step.motion.rate[i] = wp.float64(1.0)
-    step.motion.q_rate[i, e] = step.motion.q_start[i, e]
-    step.motion.q_inertial[i, e] = step.motion.q_start[i, e] + step.options.dt * step.motion.qd_start[i, e]
+    for axis in range(3):
+        e = axis * stride + b
+        step.motion.q_rate[i, e] = step.motion.q_start[i, e]
+        step.motion.q_inertial[i, e] = target[axis]
 
 
 @wp.kernel
@@ -215,6 +258,15 @@ def begin_newton(step: NewtonStep):
     w = wp.tid()
     in_contact = int(0)
     for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
+        rate = step.motion.rate[i] / step.options.dt
+        mass = float(step.instances.mass[i])
+        least = mass * float(rate * (rate + wp.float64(step.instances.mass_damping[i])))
+        modulus = p_wave_modulus(step.instances.youngs_modulus[i], step.instances.poissons_ratio[i])
+        slack = PIVOT_ROUNDING * modulus * mass / step.instances.inertia[i]
+        for k in range(3 * step.basis.row.shape[1]):
+            step.arrays.systems.bounds[step.instances.system[i], step.instances.system_block[i] + k] = wp.vec2(
+                least, slack
+            )
         if pushes(step.instances, step.constraints, i):
             in_contact = 1
     step.state.in_contact[w] = in_contact
@@ -497,6 +549,7 @@ sum_gradient = kernel_over(gradient_block, "sum_gradient", "i", "e")
 @wp.kernel
 def end_step(
     step: NewtonStep,
+    spin: Spin,
     # Out:
     q_out: wp.array[wp.vec3d],
     qd_out: wp.array[wp.vec3d],
@@ -504,37 +557,35 @@ def end_step(
     qd_before_out: wp.array[wp.vec3d],
     dt_before_out: wp.array[wp.float64],
 ):
-    """Write the state: v = c (q - q_rate) / dt; a world that is not finite stays where it was, at rest.
+    """Write the state: v = c (q - q_rate) / dt, or as ``spin_kernels`` has it where the target turns.
 
-    After a step near a shape there is no step before: the next one starts over with implicit Euler.
+    A world that is not finite stays where it was, at rest. After a step near a shape there is no step before: the next
+    one starts over with implicit Euler.
     """
     dt = step.options.dt
-    i, k = wp.tid()
-    if k >= step.instances.function_count[i]:
+    i, b = wp.tid()
+    n = step.instances.function_count[i]
+    if LANES * b >= n:
         return
-    b = k / LANES
-    lane = k % LANES
-    stride = step.basis.row.shape[1]
     failed = (step.state.status[step.instances.world[i]] & WORLD_NOT_FINITE) != 0
-    before = wp.vec3d()
-    qd_before = wp.vec3d()
-    now = wp.vec3d()
-    qd = wp.vec3d()
-    for axis in range(3):
-        e = axis * stride + b
-        before[axis] = step.motion.q_start[i, e][lane]
-        qd_before[axis] = step.motion.qd_start[i, e][lane]
-        now[axis] = step.arrays.q[i, e][lane]
-        qd[axis] = step.motion.rate[i] / dt * (now[axis] - step.motion.q_rate[i, e][lane])
+    before = unknown_block(step.motion.q_start, i, b)
+    qd_before = unknown_block(step.motion.qd_start, i, b)
+    now = unknown_block(step.arrays.q, i, b)
+    qd = step.motion.rate[i] / dt * (now - unknown_block(step.motion.q_rate, i, b))
+    if turns(spin, step.motion, i):
+        qd = velocity_block(step, spin, i, b)
     if failed:
         now = before
-        qd = wp.vec3d()
-    out = step.instances.function_start[i] + k
-    q_out[out] = now
-    qd_out[out] = qd
-    q_before_out[out] = before
-    qd_before_out[out] = qd_before
-    if k == 0:
+        qd = mat38d()
+    first = step.instances.function_start[i] + LANES * b
+    for lane in range(LANES):
+        if LANES * b + lane < n:
+            out = first + lane
+            q_out[out] = wp.vec3d(now[0, lane], now[1, lane], now[2, lane])
+            qd_out[out] = wp.vec3d(qd[0, lane], qd[1, lane], qd[2, lane])
+            q_before_out[out] = wp.vec3d(before[0, lane], before[1, lane], before[2, lane])
+            qd_before_out[out] = wp.vec3d(qd_before[0, lane], qd_before[1, lane], qd_before[2, lane])
+    if b == 0:
         fresh = failed or has_contacts(step.instances, step.constraints, i)
         dt_before_out[i] = wp.where(fresh, wp.float64(0.0), dt)
 

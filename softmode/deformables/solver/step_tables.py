@@ -36,6 +36,7 @@ from softmode.deformables.solver.factor import BlockCholesky
 from softmode.deformables.solver.fused_system_kernels import shared_bytes
 from softmode.deformables.solver.iteration_kernels import NewtonArrays, NewtonOptions, NewtonStep
 from softmode.deformables.solver.options import SolverReducedOptions
+from softmode.deformables.solver.spin_kernels import Spin
 from softmode.deformables.solver.systems import join_systems
 
 CUDA_THREADS = 2**16
@@ -65,6 +66,7 @@ _ARRAYS = {
     "gradient_chunk": "instance gradient_chunk unknown",
     "stiffness": "instance stiffness_chunk row unknown",
     "pins": "pin_instance pin_row pin_block",
+    "turn turn_centre turn_shift": "instance",
 }
 
 
@@ -86,6 +88,8 @@ class StepTables:
     """What follows from density and scale."""
     motion: Motion
     """The motion of the step per unknown."""
+    spin: Spin
+    """How each instance turns in the step."""
     points: Points
     """Results at the cubature points."""
     samples: Samples
@@ -254,6 +258,7 @@ def allocate_tables(
         scaled=scaled,
         samples=allocate(Samples, _SAMPLES, sizes, device, fill={"constraint": -1}),
         **structs,
+        spin=allocate(Spin, "instance", sizes, device),
         newton=state,
         step=step,
         rigid=rigid,
