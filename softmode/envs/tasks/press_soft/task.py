@@ -25,7 +25,7 @@ from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
-from softmode.robots.table_robot import TableRobot
+from softmode.robots.table_robot import TableRobot, tip_length
 from softmode.scenes.table_scene import TableSceneConfig
 from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
@@ -36,6 +36,8 @@ START_HEIGHT = 0.02
 """Height of the finger tips over the pad at the start of an episode [m]."""
 COMPLIANCE = 6.0
 """Factor by which the arm's drives are more compliant than usual; their damping ratio stays."""
+TOOL_STIFFNESS = 3.0e3
+"""What its vertical stiffness at the tool then is [N/m]."""
 CLEARANCE = 0.005
 """What has to remain of it over a pad that is scaled up [m]."""
 MOST_FORCE = 100.0
@@ -82,6 +84,8 @@ def press_scene() -> TableSceneConfig:
 class PressSoftConfig(TaskConfig):
     """Goal and success of PressSoft."""
 
+    heights_of_tips = True
+    tool_stiffness = TOOL_STIFFNESS
     scene: TableSceneConfig = field(default_factory=press_scene)
     """Objects, robot and physics."""
     position_range: tuple[float, float] = (0.02, 0.02)
@@ -122,6 +126,7 @@ class PressSoft(Task):
     config_class = PressSoftConfig
     kernels = kernels
     takes_sets = True
+    any_robot = True
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
 
@@ -139,10 +144,13 @@ class PressSoft(Task):
     @property
     def tip_length(self) -> float:
         """Distance from the tool point down to the finger tips [m]."""
+        return tip_length(self.config.scene.arm)
+
+    @property
+    def arm_stiffness(self) -> float:
+        """Vertical stiffness of arm and drives at the tool [N/m]."""
         arm = self.config.scene.arm
-        if isinstance(arm, TableRobot):
-            return arm.jaw.tip
-        return arm.hand_length + arm.gripper.finger_length - arm.tool_length
+        return arm.tool_stiffness if isinstance(arm, TableRobot) else TOOL_STIFFNESS
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the goal force [N]; a pad must not reach up to the fingers.

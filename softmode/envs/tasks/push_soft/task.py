@@ -28,6 +28,7 @@ from softmode.objects.loader import load
 from softmode.objects.soft_object import SoftObject
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
+from softmode.robots.table_robot import TableRobot
 from softmode.scenes.table_scene import TableSceneConfig
 from softmode.splats.splats import Splats
 
@@ -60,6 +61,7 @@ def push_scene() -> TableSceneConfig:
 class PushSoftConfig(TaskConfig):
     """Goal and success of PushSoft."""
 
+    heights_of_tips = True
     scene: TableSceneConfig = field(default_factory=push_scene)
     """Objects, robot and physics."""
     position_range: tuple[float, float] = (0.03, 0.06)
@@ -107,6 +109,7 @@ class PushSoft(Task):
     config_class = PushSoftConfig
     kernels = kernels
     takes_sets = True
+    any_robot = True
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
 
@@ -117,8 +120,9 @@ class PushSoft(Task):
         rest = [surfaces[m][points] for m, points in zip(member, self.points_of_worlds, strict=True)]
         self.rest = wp.array(np.stack(rest), dtype=wp.vec3, device=self.device)
         self.yaw_tolerance = -1.0 if self.config.yaw_tolerance is None else self.config.yaw_tolerance
-        pad = self.config.scene.arm.gripper.pad_size
-        radii = [float(np.linalg.norm(points[:, :2], axis=1).max() + 0.5 * pad[0]) for points in surfaces]
+        arm = self.config.scene.arm
+        width = arm.jaw.finger_width if isinstance(arm, TableRobot) else arm.gripper.pad_size[0]
+        radii = [float(np.linalg.norm(points[:, :2], axis=1).max() + 0.5 * width) for points in surfaces]
         self.push_distance: NDArray[np.float64] = np.array(radii)[member]
         """From the centre of each unscaled object to the tool that pushes it [m], shape (world_count,)."""
         self.push_distances = wp.array(self.push_distance, dtype=float, device=self.device)
