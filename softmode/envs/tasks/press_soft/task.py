@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 
 from softmode.checks import require_fields, require_range
@@ -132,14 +131,18 @@ class PressSoft(Task):
 
     def build(self) -> None:
         """Upload how high the pads are."""
-        self.top = wp.array(self.tops, dtype=float, device=self.device)
+        self.top = self.per_object(self._tops)
         """Height of every unscaled pad [m], shape (world_count,), on the device."""
+
+    @property
+    def _tops(self) -> NDArray[np.float64]:
+        """Height of every unscaled pad that a world may have [m], shape (members,)."""
+        return np.array([float(np.ptp(thing.body.surface_points[:, 2])) for thing in self.scene.members])
 
     @property
     def tops(self) -> NDArray[np.float64]:
         """Height of every unscaled pad [m], shape (world_count,)."""
-        heights = [float(np.ptp(thing.body.surface_points[:, 2])) for thing in self.scene.members]
-        return np.array(heights)[self.scene.member]
+        return self._tops[self.scene.member]
 
     @property
     def tip_length(self) -> float:
@@ -160,7 +163,7 @@ class PressSoft(Task):
         """
         config = self.config
         room = config.scene.arm.home_position[2] - self.tip_length - CLEARANCE
-        top = float(self.tops.max())
+        top = float(self._tops.max())
         most = min(2.0, room / top)
         largest = 1.0 if config.scale_range is None else config.scale_range[1]
         if largest > most:

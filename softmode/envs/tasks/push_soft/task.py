@@ -116,19 +116,23 @@ class PushSoft(Task):
     def build(self) -> None:
         """Allocate what the reward remembers."""
         self.before = wp.zeros(self.world_count, dtype=float, device=self.device)
-        surfaces, member = [thing.body.surface_points for thing in self.scene.members], self.scene.member
-        rest = [surfaces[m][points] for m, points in zip(member, self.points_of_worlds, strict=True)]
-        self.rest = wp.array(np.stack(rest), dtype=wp.vec3, device=self.device)
+        surfaces = [thing.body.surface_points for thing in self.scene.members]
+        rest = [surface[points] for surface, points in zip(surfaces, self._points, strict=True)]
+        self.rest = self.per_object(np.stack(rest), wp.vec3)
         self.yaw_tolerance = -1.0 if self.config.yaw_tolerance is None else self.config.yaw_tolerance
         arm = self.config.scene.arm
         width = arm.jaw.finger_width if isinstance(arm, TableRobot) else arm.gripper.pad_size[0]
         radii = [float(np.linalg.norm(points[:, :2], axis=1).max() + 0.5 * width) for points in surfaces]
-        self.push_distance: NDArray[np.float64] = np.array(radii)[member]
+        self._push_distances = np.array(radii)
+        self.push_distances = self.per_object(self._push_distances)
         """From the centre of each unscaled object to the tool that pushes it [m], shape (world_count,)."""
-        self.push_distances = wp.array(self.push_distance, dtype=float, device=self.device)
-        """The same on the device."""
         self.push_height = self.config.scene.control.workspace_lower[2] + 0.006
         """Height of the tool that pushes [m]."""
+
+    @property
+    def push_distance(self) -> NDArray[np.float64]:
+        """The same on the host."""
+        return self._push_distances[self.scene.member]
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the goal: distance [m] and direction [rad] from the object, and the angle to turn [rad]."""
