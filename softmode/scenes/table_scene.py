@@ -104,7 +104,7 @@ class TableScene:
         camera_options: Light and background.
         camera_randomization: What `randomize` of the cameras draws.
         marker: Splats around the origin that mark a place, such as a goal, in pictures; they touch nothing. A list of
-            them has those of each world.
+            them has those of each world, or of each object of the set where a reset may change the object.
         device: Warp device; the default one if None.
         progress: Reports the build of the object, see :func:`softmode.deformables.build.build_body.build_body`.
     """
@@ -136,19 +136,22 @@ class TableScene:
         self.marker_place.fill_(wp.transform_identity())
         self.marker = marker
         """Splats that mark a place in pictures, as they were given; the last ones of `splats`."""
+        self._marker_rows: wp.array | None = None
         self.splats: BoundSplats | None = None
         """The splats of the objects, then those of the marker, as cameras see them; None without cameras."""
         self.cameras: dict[tuple[int, int], SplatCamera] = {}
         """The cameras by the width and height of their pictures [px]."""
         self.film: FilmCamera | None = None
         """The cameras that people look through; None without any."""
-        if (cameras or film) and self.resampled:
-            hint = "observe the state and do not render, or leave resample out"
-            raise ConfigError("objects.resample has no pictures yet", hint=hint)
         if cameras or film:
-            first = self.objects[0] if len(self.members) == 1 else [self.members[m] for m in self.member]
+            first = (
+                self.objects[0]
+                if len(self.members) == 1 and not self.resampled
+                else [self.members[m] for m in self.member]
+            )
             things = (first, *self.objects[1:])
-            self.splats = BoundSplats(self.model, things, others=() if marker is None else (marker,))
+            resident = {"resident": self.members, "choice": self.object_index} if self.resampled else {}
+            self.splats = BoundSplats(self.model, things, others=() if marker is None else (marker,), **resident)
             if marker is not None:
                 rest = self.splats.arrays.means.numpy()[:, self.splats.columns[-1]]
                 self.marker_points = wp.array(
@@ -156,6 +159,9 @@ class TableScene:
                 )
                 """Centres of the marker's splats from `marker_place` [m], shape (1 or world_count, splats); a task may
                 put an array of its own here before the first picture, to change the marker's shape."""
+                if self.resampled and not isinstance(marker, Splats):
+                    table = self.splats.per_object[0][0].numpy()[:, self.splats.columns[-1]]
+                    self._marker_rows = wp.array(table, dtype=wp.vec3, device=self.device)
         if cameras and self.splats is not None:
             self.cameras = cameras_by_size(
                 self.model, self.splats, cameras, options=camera_options, randomization=camera_randomization
@@ -190,7 +196,9 @@ class TableScene:
 
     def marker_of(self, world: int) -> Splats | None:
         """Return the splats that mark a place in a world, as they were given; None without any."""
-        return self.marker if self.marker is None or isinstance(self.marker, Splats) else self.marker[world]
+        if self.marker is None or isinstance(self.marker, Splats):
+            return self.marker
+        return self.marker[self.member[world] if self.resampled else world]
 
     # -- construction -------------------------------------------------------------------------------------------------
 
@@ -396,6 +404,10 @@ class TableScene:
             raise ConfigError("the worlds keep their objects", hint="give objects=ObjectSet([...], resample=True)")
         self._choice.set(self.object_index, self.world_mask)
         self.copy_rows(self._base_rows, self._bases.body)
+        if self.splats is not None:
+            self.splats.choose(self.world_mask)
+        if self._marker_rows is not None:
+            self.copy_rows(self._marker_rows, self.marker_points)
 
     def copy_rows(self, table: wp.array, out: wp.array) -> None:
         """Copy from a table with a row per object that of its object to each world of `world_mask`; capturable."""

@@ -32,20 +32,24 @@ def lift(**changes: Any) -> LiftSoftConfig:
 
 def test_each_reset_lifts_as_alone() -> None:
     """After resets from small to large and back, with contact before each: the bits of the single environment."""
-    env = LiftSoftEnv(config=lift(), device="cpu")
-    singles = [LiftSoftEnv(config=alone(env.config, k), device="cpu") for k in range(len(KINDS))]
+    config = lift(image_outputs=("segmentation",))
+    env = LiftSoftEnv(config=config, obs_type="pixels", device="cpu")
+    singles = [LiftSoftEnv(config=alone(config, k), obs_type="pixels", device="cpu") for k in range(len(KINDS))]
     graph = env.task.graph
     for seed, k in enumerate((0, 1, 2, 1, 0)):
-        observation, info = env.reset(seed=seed, options={**PLACE, "object": k})
-        mine, own = singles[k].reset(seed=seed, options=PLACE)
+        pictures, info = env.reset(seed=seed, options={**PLACE, "object": k})
+        others, own = singles[k].reset(seed=seed, options=PLACE)
         assert info["object"] == k and info["object_name"] == env.config.objects.names[k]
         assert str(info["parameters"]) == str(own["parameters"])
         touched = 0.0
         for step in range(STEPS):
-            np.testing.assert_array_equal(observation, mine)
+            seen = [one.task.observation.numpy() for one in (env, singles[k])]
+            np.testing.assert_array_equal(*seen)
+            for name, image in pictures.items():
+                np.testing.assert_array_equal(image, others[name])
             action = actions(1, step)[0]
-            observation, reward, *_, info = env.step(action)
-            mine, own_reward, *_, own = singles[k].step(action)
+            pictures, reward, *_, info = env.step(action)
+            others, own_reward, *_, own = singles[k].step(action)
             assert reward == own_reward and info["object_height"] == own["object_height"]
             touched = max(touched, info["finger_force"].max())
         assert touched > 0.1
@@ -56,11 +60,10 @@ def test_each_reset_lifts_as_alone() -> None:
 def test_each_reset_is_pushed_and_pressed_as_alone(kind: Any, config: Any) -> None:
     """The same for PushSoft, whose reward knows the shape, and PressSoft, whose gauge knows the height."""
     pads = (CUBE, replace(ROD, extents=(0.06, 0.06, 0.03)))
-    made = config(objects=ObjectSet(pads, resample=True), youngs_modulus_range=None)
-    env = kind(config=made, device="cpu")
-    singles = [
-        kind(config=replace(made, objects=None, scene=replace(made.scene, object=pad)), device="cpu") for pad in pads
-    ]
+    made = config(objects=ObjectSet(pads, resample=True), youngs_modulus_range=None, render_size=64)
+    film = {"render_mode": "rgb_array", "device": "cpu"}
+    env = kind(config=made, **film)
+    singles = [kind(config=replace(made, objects=None, scene=replace(made.scene, object=pad)), **film) for pad in pads]
     move = np.array([0.6 if kind is PushSoftEnv else 0.0, 0.0, 0.0 if kind is PushSoftEnv else -1.0, 0.0, 0.0])
     for seed, k in enumerate((0, 1, 0)):
         observation, _ = env.reset(seed=seed, options={"object": k})
@@ -70,6 +73,9 @@ def test_each_reset_is_pushed_and_pressed_as_alone(kind: Any, config: Any) -> No
             observation, reward, *_ = env.step(move)
             mine, own_reward, *_ = singles[k].step(move)
             assert reward == own_reward
+        for one in (env, singles[k]):
+            one.task.forget_film(np.ones(1, bool))  # the camera follows from where it was
+        np.testing.assert_array_equal(env.render(), singles[k].render())
 
 
 def test_worlds_draw_as_the_single_environment() -> None:

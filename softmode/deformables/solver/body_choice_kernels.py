@@ -92,3 +92,15 @@ def clear_rows(
     w, k = wp.tid()
     if world_mask[w]:
         out[w, k] = wp.uint32(0)
+
+
+@wp.kernel
+def rows_that_chose(
+    choice: wp.array[int],  # (world_count,)
+    wanted: int,
+    # Out:
+    row_out: wp.array[int],  # (world_count,)
+):
+    """Write the worlds that chose something, -1 for the others."""
+    w = wp.tid()
+    row_out[w] = wp.where(choice[w] == wanted, w, -1)

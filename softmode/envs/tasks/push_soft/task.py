@@ -175,12 +175,13 @@ class PushSoft(Task):
         scene = self.scene_config()
         if scene.objects is None:
             return _outline(load(scene.object, material=scene.material))
-        chosen = scene.objects.chosen(self.world_count)
+        given = scene.objects
+        chosen = np.arange(given.count) if given.resample else given.chosen(self.world_count)
         drawn = {
             k: _outline(load(scene.objects.config(k), material=scene.objects.material(k, scene.material)))
             for k in np.unique(chosen).tolist()
         }
-        return drawn[chosen[0]] if len(drawn) == 1 else [drawn[k] for k in chosen.tolist()]
+        return drawn[chosen[0]] if len(drawn) == 1 and not given.resample else [drawn[k] for k in chosen.tolist()]
 
 
 def _outline(thing: SoftObject) -> Splats:
