@@ -178,11 +178,10 @@ def _prepare_urdf(tree: ElementTree.Element, asset: RobotAsset) -> tuple[str, li
     )
     notes = use_meshes(tree, asset)
     for link in tree.iter("link"):
-        first, *more = link.findall("inertial") or [None]
-        for second in more:
+        for second in link.findall("inertial")[1:]:
             link.remove(second)
             notes.append(f"link {link.get('name')!r} has its first <inertial>, of several")
-        inertia = None if first is None else first.find("inertia")
+        inertia = link.find("inertial/inertia")
         if inertia is not None and _mended(inertia):
             notes.append(f"link {link.get('name')!r} had an inertia that is none, only its diagonal is kept")
     for texture in tree.iter("texture"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import newton
 import numpy as np
@@ -95,7 +96,8 @@ class BoundSplats:
         device: wp.DeviceLike = None,
     ) -> None:
         """Upload the splats at rest."""
-        self._choice, self._resident = choice, tuple(resident)
+        self._choice: Any = choice
+        self._resident = tuple(resident)
         device = device if model is None else model.device
         each = [[thing] if thing is None or isinstance(thing, SoftObject) else list(thing) for thing in objects]
         self.indices = tuple(o for o, things in enumerate(each) if _has_splats(things))
@@ -123,7 +125,7 @@ class BoundSplats:
         count = len(self._resident) or len(starts)
         arrays = SplatArrays.from_splats(parts, world_count=count, sh_degree=sh_degree, device=device)
         self._table = arrays
-        self.arrays = arrays if choice is None else _rows_of(arrays, choice.numpy())
+        self.arrays = arrays if choice is None else _rows_of(arrays, np.asarray(choice.numpy(), np.int32))
         """The splats as they are, for cameras and rasterisers."""
         self._counts = [[part.count] if isinstance(part, Splats) else [one.count for one in part] for part in parts]
         ends = np.cumsum([max(counts) for counts in self._counts]).tolist()
@@ -214,8 +216,8 @@ def splats_of_states(thing: SoftObject, states: ArrayLike) -> Iterator[Splats]:
 def _rows_of(table: SplatArrays, rows: NDArray[np.int32]) -> SplatArrays:
     """Return arrays with some of the rows of others; those that all rows share stay as they are."""
 
-    def chosen(name: str) -> wp.array:
-        array = getattr(table, name)
+    def chosen(name: str) -> Any:
+        array: Any = getattr(table, name)
         shared = array is None or array.shape == (1, 1) or (array.shape[0] == 1 and table.means.shape[0] > 1)
         return array if shared else wp.array(array.numpy()[rows], dtype=array.dtype, device=array.device)
 

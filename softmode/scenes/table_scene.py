@@ -230,7 +230,7 @@ class TableScene:
                     what = "others" if config.others else "grip_slots"
                     raise ConfigError(f"objects.resample and {what} exclude each other", hint=f"leave {what} out")
                 held, self._member = np.arange(given.count), chosen
-            kinds = [(given.config(k), given.material(k, config.material)) for k in held]
+            kinds = [(given.config(int(k)), given.material(int(k), config.material)) for k in held]
             self.members = tuple(loaded_once(kind, own) for kind, own in kinds)
             self.materials = tuple(
                 own or thing.material or config.material for thing, (_, own) in zip(self.members, kinds, strict=True)

@@ -1,12 +1,16 @@
 """Links with several joints and floating bases become links of one joint each, and move as MuJoCo moves them."""
 
-import mujoco
+import importlib
+from typing import Any
+
 import newton
 import numpy as np
 import pytest
 
 from softmode import robots
 from tests.robots.files import MJCF, write_mjcf
+
+mujoco: Any = importlib.import_module("mujoco")
 
 SIX = """<mujoco><compiler angle="radian"/><worldbody><body name="wrist" pos="0.1 0.2 0.3" euler="0.3 0.1 0">
   <joint name="a" axis="1 0 0" pos="0.01 0 0"/><joint name="b" axis="0 1 0" pos="0 0.02 0" armature="0.1"/>

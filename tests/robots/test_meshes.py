@@ -1,9 +1,10 @@
 """Meshes of a URDF: packages are found, other formats are converted, what is only seen may be missing."""
 
+import importlib
 import os
 from pathlib import Path
+from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 import trimesh
@@ -12,6 +13,8 @@ from scipy.spatial.distance import pdist
 from softmode import robots
 from softmode.errors import AssetError, MissingExtraError
 from tests.robots.files import URDF, write_urdf
+
+mujoco: Any = importlib.import_module("mujoco")
 
 WEDGE = "package://lifter/meshes/wedge.stl"
 ARM = "package://lifter/meshes/arm.dae"
@@ -57,7 +60,7 @@ def test_other_formats_collide(suffix, tmp_path) -> None:
     path = write_urdf(tmp_path, URDF.replace(WEDGE, f"package://lifter/meshes/finger{suffix}"))
     box = trimesh.creation.box((0.04, 0.01, 0.02))
     if suffix == ".stl":
-        write(tmp_path, "finger.stl", text=trimesh.exchange.stl.export_stl_ascii(box))
+        write(tmp_path, "finger.stl", text=str(box.export(file_type="stl_ascii")))
     else:
         write(tmp_path, f"finger{suffix}", box)
     robot = robots.load(path)
