@@ -218,8 +218,9 @@ def _rows_of(table: SplatArrays, rows: NDArray[np.int32]) -> SplatArrays:
 
     def chosen(name: str) -> Any:
         array: Any = getattr(table, name)
-        shared = array is None or array.shape == (1, 1) or (array.shape[0] == 1 and table.means.shape[0] > 1)
-        return array if shared else wp.array(array.numpy()[rows], dtype=array.dtype, device=array.device)
+        if array is None or array.shape == (1, 1) or (array.shape[0] == 1 and table.means.shape[0] > 1):
+            return array
+        return wp.array(array.numpy()[rows], dtype=array.dtype, device=array.device)
 
     return replace(table, **{name: chosen(name) for name in _ARRAYS})
 
