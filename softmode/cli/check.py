@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Annotated
 
-from softmode.cli.common import quiet_warp
+from softmode.cli.common import own_object, quiet_warp, robot_options
+from softmode.cli.object_options import ObjectOptions
+from softmode.envs.catalogue import registered_id
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -18,13 +21,22 @@ class Check:
     """Id of the environment, for example softmode/LiftSoft-v0, or module:id of your own."""
     episodes: int = 5
     """Episodes of the scripted policy."""
+    robot: str | None = None
+    """Robot in place of the built-in arm: a name of `softmode robots list`, or an MJCF or URDF file."""
+    toy: Annotated[ObjectOptions, own_object()] = dataclasses.field(default_factory=ObjectOptions)
+    """Your own object; what is left out is as the task has it."""
 
     def run(self) -> int:
         """Print a line per check; return 1 if one fails."""
+        from softmode.learning.config_values import with_config
         from softmode.testing import check_task
 
+        registered_id(self.env)
+
         with quiet_warp():
-            found = check_task(self.env, episodes=self.episodes)
+            given = self.toy.env_options(self.env, {}) | robot_options(self.robot)
+            options = with_config(self.env, given) if given else {}
+            found = check_task(self.env, episodes=self.episodes, **options)
         words = {True: "ok", False: "FAILED", None: "skipped"}
         for check in found:
             print(f"{check.name:28}{words[check.passed]:9}{check.note}")

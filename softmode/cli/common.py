@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Iterator
 from dataclasses import fields
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from softmode.errors import ConfigError
@@ -73,6 +74,14 @@ def own_object() -> Any:
     import tyro
 
     return tyro.conf.OmitArgPrefixes
+
+
+def robot_options(robot: str | None) -> dict[str, str]:
+    """Return the keyword argument of environments that names a robot, a file by its whole path; none if omitted."""
+    if robot is None:
+        return {}
+    is_file = "/" in robot or robot.lower().endswith((".xml", ".mjcf", ".urdf"))
+    return {"robot": str(Path(robot).resolve()) if is_file else robot}
 
 
 def optional_argument() -> Any:

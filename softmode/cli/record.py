@@ -12,6 +12,7 @@ from softmode.cli.common import (
     bar_interval,
     own_object,
     quiet_warp,
+    robot_options,
     short_name,
     warn_of_object,
 )
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 
 ROBOT = "softmode_arm"
-"""Name of the robot in the dataset."""
+"""Name of the built-in arm in the dataset; another robot has its own."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -60,6 +61,8 @@ class Record:
     """Record the state in which each episode begins, to begin episodes with."""
     append: bool = False
     """Add to the dataset in the folder, if there is one."""
+    robot: str | None = None
+    """Robot in place of the built-in arm: a name of `softmode robots list`, or an MJCF or URDF file."""
     device: str | None = None
     """Warp device, for example cpu or cuda:0."""
     toy: Annotated[ObjectOptions, own_object()] = dataclasses.field(default_factory=ObjectOptions)
@@ -84,7 +87,7 @@ class Record:
         given: dict[str, Any] = {"obs_type": "pixels_agent_pos"} if trained is None else dict(trained.env_options)
         if self.obs_type is not None:
             given["obs_type"] = self.obs_type
-        given = self.toy.env_options(self.env, given)
+        given = self.toy.env_options(self.env, given) | robot_options(self.robot)
         with quiet_warp():
             with BuildBar() as progress:
                 made = {**with_config(self.env, given), "device": self.device, "progress": progress}
@@ -95,8 +98,9 @@ class Record:
             features = environment_features(env, pictures=self.pictures)
             origin = {"env": self.env, "env_options": given}
             fps = int(env.metadata["render_fps"])
+            robot = ROBOT if self.robot is None else Path(self.robot).stem
             with (
-                DatasetWriter(out, features, fps=fps, robot_type=ROBOT, append=self.append, origin=origin) as writer,
+                DatasetWriter(out, features, fps=fps, robot_type=robot, append=self.append, origin=origin) as writer,
                 tqdm(total=self.episodes, desc="recording", unit="episode", mininterval=bar_interval()) as bar,
             ):
                 before = writer.episode_count

@@ -83,7 +83,7 @@ def checked_config(
     if not any_robot:
         raise ConfigError(
             f"robot given for a task of {wanted.__name__}, which plays with the built-in arm only",
-            hint="LiftSoft takes any robot; docs/howto/own_robot.md has a scene of your own",
+            hint="LiftSoft, PushSoft and PressSoft take any robot; docs/howto/own_robot.md has a scene of your own",
         )
     return with_robot(config, given.robot)
 

@@ -173,7 +173,7 @@ def set_worlds_state(
     now = worlds_state(task)
     _check(owner, arrays, *now)
     before = now[1]
-    if _OBJECT in before:
+    if _OBJECT in before and not task.scene.resampled:
         other = np.flatnonzero(mask & (arrays[_OBJECT] != before[_OBJECT])[:, 0])
         if len(other):
             found = [int(of[_OBJECT][other[0], 0]) for of in (arrays, before)]
@@ -189,6 +189,9 @@ def set_worlds_state(
     chosen = {name: (array, count) for name, array, count in parts}
     _write(*chosen["task.parameters"], values["task.parameters"])
     task.scene.world_mask.assign(mask)
+    if task.scene.resampled:
+        _write(*chosen[_OBJECT], values[_OBJECT])
+        task.use_objects()
     task.apply_materials()
     for name, array, count in parts:
         _write(array, count, values[name])
@@ -238,14 +241,14 @@ def _parts(task: Task) -> Iterator[tuple[str, Any, Parts]]:
     """
     scene, controller = task.scene, task.scene.controller
     differ = len(scene.members) > 1
-    functions, particles = _starts(task) if differ else (1, 1)
+    functions, particles = _starts(task) if differ and not scene.resampled else (1, 1)
     for owner, name in ((scene.state, "state"), (scene.control, "control")):
         for field_name, array in _fields(owner, name):
             of_body = ".softmode.q" in field_name
             of_surface = ".particle_" in field_name or ".softmode.stick_" in field_name
             yield field_name, array, functions if of_body else particles if of_surface else 1
     if differ:
-        yield _OBJECT, task.object_index, 1
+        yield _OBJECT, scene.object_index, 1
     tables, data = scene.solver.tables, scene.solver.rigid.mjw_data
     for name in ("commanded_q", "previous_q", "target_position", "target_yaw"):
         yield f"controller.{name}", getattr(controller, name), 1

@@ -30,8 +30,8 @@ def observation_arrays(task: Task, *, final: bool = False) -> Tree:
 
 def info_arrays(task: Task, *, final: bool = False) -> dict[str, Tree]:
     """Return the infos of all worlds; with `final`, those of the episodes that ended in this step."""
-    success, metrics, parameters, vector, status = (task.final_outcome if final else task.outcome).values()
-    which = {} if task.object_set is None else {"object": task.object_index}
+    success, metrics, parameters, vector, status, index = (task.final_outcome if final else task.outcome).values()
+    which = {} if task.object_set is None else {"object": index}
     return {
         **which,
         "is_success": success,

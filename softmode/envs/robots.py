@@ -6,15 +6,20 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from softmode.envs.task_config import TaskConfig
 from softmode.errors import ConfigError
 from softmode.robots.arm import ArmDescription
 from softmode.robots.description import RobotDescription
+from softmode.robots.jaws import ParallelJaw
 from softmode.robots.loading import load
-from softmode.robots.table_robot import TableRobot, place_robot
+from softmode.robots.table_robot import TableRobot, place_robot, tip_length
 
 Config = TypeVar("Config", bound=TaskConfig)
 
+_TOP = 0.17
+"""Height that every tool is to reach where the workspace allows it: over what stands on the table [m]."""
 _RANGES = ("position_range", "goal_range", "goal_height")
 """Fields of configurations that shrink with the share of the places that a robot reaches."""
 
@@ -35,29 +40,40 @@ def with_robot(config: Config, robot: str | Path | RobotDescription | TableRobot
         AssetError: If it cannot be loaded.
     """
     scene = config.scene
+    arm = scene.arm if isinstance(scene.arm, ArmDescription) else ArmDescription()
     if isinstance(robot, (str, Path)):
         robot = load(robot)
     if isinstance(robot, RobotDescription):
-        arm = scene.arm if isinstance(scene.arm, ArmDescription) else ArmDescription()
         (dx, dy), goal = config.position_range, getattr(config, "goal_range", (0.0, 0.0, 0.0))
         goal = (*(max(side, getattr(config, "goal_distance", (0.0, 0.0))[1]) for side in goal[:2]), *goal[2:])
         rise = getattr(config, "goal_height", arm.home_position[2] - 0.08) + goal[-1]
+        x, y, z = arm.home_position
+        if config.heights_of_tips and robot.gripper is not None:
+            z += ParallelJaw.of(robot).tip - tip_length(arm)
         robot = place_robot(
             robot,
-            home_position=arm.home_position,
+            home_position=(x, y, z),
             home_opening=arm.home_opening,
             over=scene.object_position,
             ranges=(max(dx, goal[0]) + 0.03, max(dy, goal[1]) + 0.03),
-            height=max(rise + 0.06, arm.home_position[2]),
+            height=max(rise + 0.06, z, min(scene.control.workspace_upper[2], _TOP)),
         )
+        if config.tool_stiffness is not None:
+            robot = robot.with_tool_stiffness(config.tool_stiffness)
     if not isinstance(robot, TableRobot):
         hint = "give a name of softmode.robots.available(), a file, a RobotDescription, or a TableRobot"
         raise ConfigError(f"robot is a {type(robot).__name__}", hint=hint)
+    control = scene.control
+    if config.heights_of_tips:
+        up = np.array([0.0, 0.0, tip_length(robot) - tip_length(arm)])
+        lower, upper = (tuple((corner + up).tolist()) for corner in (control.workspace_lower, control.workspace_upper))
+        control = replace(control, workspace_lower=lower, workspace_upper=upper)
     # Loops and joint limits of a gripper take rows of their own.
     more = len(robot.robot.joint_names) + 6 * robot.robot.mjcf.count("<connect")
     scene = replace(
         scene,
         arm=robot,
+        control=control,
         constraint_max=max(scene.constraint_max, 64) + 2 * more,
         rigid_contact_max=max(scene.rigid_contact_max, 64),
     )

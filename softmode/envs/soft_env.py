@@ -147,7 +147,7 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
             self.set_state(checked_state(given["state"]))
             self.task.begin()
             return self._observe(), self._info()
-        given = check_options(self.task.table.parameters, given, 1)
+        given = check_options(self.task.reset_options, given, 1)
         fresh = seed is not None or self._np_random is None
         super().reset(seed=seed)
         seeds = np.array([world_seed(self.np_random)]) if fresh else None

@@ -144,13 +144,14 @@ class Task:
         self._check_objects()
         kept = [self._kept(material) for material in self.scene.materials]
         self.table = ParameterTable(self.parameters(), world_count, self.device, kinds=kept, kind=self.scene.member)
+        self._rows: list[tuple[wp.array, wp.array]] = []
         members = self.scene.members
         points = [sample_farthest(thing.body.surface_points, self.point_count, first=0) for thing in members]
-        self.points_of_worlds: NDArray[np.intp] = np.stack(points)[self.scene.member]
-        """Surface samples of object 0 in the observation, shape (world_count, point_count)."""
+        self._points: NDArray[np.intp] = np.stack(points)
         self.points = self.points_of_worlds[0]
         """Those of world 0, and of all worlds that have the same object."""
-        self.rest_height = wp.array(self.scene.heights[:, 0], dtype=float, device=self.device)
+        heights = np.array([thing.height for thing in members])
+        self.rest_height = self.per_object(heights)
         """Height of the centre of every unscaled object 0 over the table at rest [m], shape (world_count,)."""
         given = self.object_set
         code = one_hot_part(given.count) if given is not None and config.objects_one_hot else ()
@@ -175,6 +176,32 @@ class Task:
         self.reset()
         self.graph = capture_graph(self._step, self.device)
         """The step as a captured graph."""
+
+    @property
+    def points_of_worlds(self) -> NDArray[np.intp]:
+        """Surface samples of object 0 in the observation, shape (world_count, point_count)."""
+        return self._points[self.scene.member]
+
+    @property
+    def reset_options(self) -> dict[str, Parameter]:
+        """What a reset option may set, by name: the parameters, and with `ObjectSet.resample` the object."""
+        given = self.object_set
+        if given is None or not given.resample:
+            return self.table.parameters
+        return {**self.table.parameters, "object": Parameter(name="object", low=(0.0,), high=(given.count - 1.0,))}
+
+    def per_object(self, values: ArrayLike, dtype: type = float) -> wp.array:
+        """Return an array with a row per world: that of its object, which follows it where a reset may change it.
+
+        Args:
+            values: A row per member of the scene, see `TableScene.members`.
+            dtype: Type of the array, of a multiple of 32 bits.
+        """
+        table = np.asarray(values)
+        array = wp.array(table[self.scene.member], dtype=dtype, device=self.device)
+        if self.scene.resampled:
+            self._rows.append((wp.array(table, dtype=dtype, device=self.device), array))
+        return array
 
     def column(self, segment: str) -> int:
         """Return the first column of a segment of the observation."""
@@ -201,6 +228,7 @@ class Task:
             "parameters": self.table.values,
             "observation": self.observation,
             "status": self.scene.solver.status,
+            "object": self.scene.object_index,
         }
         """What a step came to."""
         self.final_outcome = {name: wp.zeros_like(array) for name, array in self.outcome.items()}
@@ -216,9 +244,14 @@ class Task:
         columns = [self.table.column(name) for name in MATERIAL]
         self._material_columns = wp.array(columns, dtype=int, device=device)
         self._solver_mask = wp.zeros(worlds + 1, dtype=wp.bool, device=device)
-        self._heights = wp.array(scene.heights, dtype=float, device=device)
-        self._lowest = wp.array(scene.heights[:, 0] - FALL, dtype=float, device=device)
-        self.object_index = wp.array(scene.chosen, dtype=int, device=device)
+        others = [thing.height for thing in scene.objects[1:]]
+        heights = np.array([[thing.height, *others] for thing in scene.members])
+        self._heights = self.per_object(heights)
+        self._lowest = self.per_object(heights[:, 0] - FALL)
+        given = self.object_set
+        self._ends = wp.array([1.0] if given is None else given.ends, dtype=float, device=device)
+        self._wanted = wp.full(worlds, -1, dtype=int, device=device)
+        self.object_index = scene.object_index
         """Which object of the set each world has, shape (world_count,); zeros without a set."""
         self._low = wp.array(self.low, dtype=float, device=device)
         self._high = wp.array(self.high, dtype=float, device=device)
@@ -229,7 +262,7 @@ class Task:
             scene.model.softmode,
             scene.state,
             parameters=self.table.values,
-            points=wp.array(self.points_of_worlds, dtype=int, device=device),
+            points=self.per_object(self._points, int),
             q=scene.state.softmode.q,
             stride=len(scene.objects),
         )
@@ -276,7 +309,8 @@ class Task:
         if self.object_set is None or not self.grasps:
             return
         scene, jaw, names = self.scene, ParallelJaw.of(self.config.scene.arm), self.object_set.names
-        for k, thing, material in zip(np.unique(scene.chosen), scene.members, scene.materials, strict=True):
+        held = range(len(scene.members)) if scene.resampled else np.unique(scene.chosen)
+        for k, thing, material in zip(held, scene.members, scene.materials, strict=True):
             friction = max(math.sqrt(material.friction * jaw.friction), 1.0e-3)
             try:
                 rest_grasps(thing.body, jaw, friction=friction)
@@ -443,7 +477,12 @@ class Task:
             for camera in self.scene.cameras.values():
                 camera.variation.seed(chosen, mask)
         self.scene.world_mask.assign(mask)
+        options = dict(options or {})
+        wanted = options.pop("object", None)
+        if wanted is not None:
+            self._wanted.assign(np.where(mask, np.rint(wanted[:, 0]), -1).astype(np.int32))
         self._draw()
+        self._wanted.fill_(-1)
         if options:
             values = self.table.values.numpy().copy()
             for name, numbers in options.items():
@@ -468,6 +507,9 @@ class Task:
     def _draw(self) -> None:
         """Draw the parameters of the worlds in `scene.world_mask`."""
         table = self.table
+        if self.scene.resampled:
+            inputs = [self.scene.world_mask, self.seed, self.episode, self._ends, self._wanted]
+            self.launch(kernels.draw_objects, inputs, [self.object_index, table.kind])
         inputs = [self.scene.world_mask, self.seed, table.kind, table.low, table.high, table.log]
         self.launch(kernels.draw_parameters, inputs, [self.episode, table.values])
 
@@ -475,6 +517,8 @@ class Task:
         """Set those worlds up from their parameters."""
         scene = self.scene
         mask = scene.world_mask
+        if scene.resampled:
+            self.use_objects()
         self.apply_materials()
         self.place()
         scene.reset_worlds()
@@ -482,6 +526,12 @@ class Task:
             camera.randomize(mask)
         self.launch(kernels.clear_worlds, [mask], [self._episode, self.result])
         self.clear()
+
+    def use_objects(self) -> None:
+        """Let the worlds in `scene.world_mask` have the objects that `object_index` says, with what is theirs."""
+        self.scene.use_objects()
+        for table, array in self._rows:
+            self.scene.copy_rows(table, array)
 
     def apply_materials(self) -> None:
         """Give the bodies of the worlds in `scene.world_mask` the materials and sizes of their parameters."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal, Self, get_args
+from typing import ClassVar, Literal, Self, get_args
 
 from softmode.checks import require_choice, require_number, require_numbers, require_range
 from softmode.errors import ConfigError
@@ -30,6 +30,13 @@ _RANGES: dict[str, dict[str, float]] = {
 @dataclass(frozen=True, kw_only=True)
 class TaskConfig:
     """Scene, randomisation and pictures, common to all tasks."""
+
+    heights_of_tips: ClassVar[bool] = False
+    """Whether heights of home pose and workspace are meant for the tips of the fingers; those of another robot are then
+    raised by how much longer its fingers are."""
+    tool_stiffness: ClassVar[float | None] = None
+    """Vertical stiffness that the drives of another robot are to have at its tool in the home pose [N/m]; None keeps
+    them."""
 
     scene: TableSceneConfig = field(default_factory=TableSceneConfig)
     """Objects, robot and physics."""

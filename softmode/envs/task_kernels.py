@@ -99,6 +99,31 @@ def draw_parameters(
 
 
 @wp.kernel
+def draw_objects(
+    world_mask: wp.array[wp.bool],
+    seed: wp.array[int],
+    episode: wp.array[int],  # before it is counted
+    ends: wp.array[float],  # (objects,) where the share of each ends in [0, 1]
+    wanted: wp.array[int],  # the object that was asked for, -1 to draw one
+    # Out:
+    object_out: wp.array[int],
+    kind_out: wp.array[int],
+):
+    """Draw the object of an episode by the weights; parameters, whose offsets are not negative, draw from others."""
+    w = wp.tid()
+    if not world_mask[w]:
+        return
+    chosen = wanted[w]
+    if chosen < 0:
+        u = wp.randf(wp.rand_init(seed[w], -2 - episode[w]))
+        chosen = int(0)
+        while chosen < ends.shape[0] - 1 and u >= ends[chosen]:
+            chosen += 1
+    object_out[w] = chosen
+    kind_out[w] = chosen
+
+
+@wp.kernel
 def place_object(
     world_mask: wp.array[wp.bool],
     state: WorldState,

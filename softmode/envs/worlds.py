@@ -36,7 +36,7 @@ class LocalWorlds:
     def __init__(self, task_class: type[Task], arguments: dict[str, Any]) -> None:
         """Build the task."""
         self.task = task_class(**arguments)
-        self.parameters = self.task.table.parameters
+        self.parameters = self.task.reset_options
         self.segments = {name: columns for name, (columns, _) in self.task.segments.items()}
         self.action_space = self.task.action_space
         self.observation_space = self.task.observation_space()

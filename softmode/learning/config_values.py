@@ -113,7 +113,7 @@ def pinned_options(env: str, options: dict[str, Any]) -> dict[str, Any]:
     given = config.object_set
     several = None if given is None else given.resolved(first).pinned()
     every = (first, *others, *(() if several is None else map(several.config, range(several.count))))
-    if all(thing.file is None for thing in every):
+    if not any(thing.files for thing in every):
         return options
     scene = dataclasses.replace(config.scene, object=first, others=tuple(others), objects=None)
     return joined_config(env, dataclasses.replace(config, scene=scene, objects=several), rest)
@@ -125,11 +125,11 @@ def located_options(options: Any, folder: Path) -> Any:
         return [located_options(part, folder) for part in options]
     if not isinstance(options, dict):
         return options
-    from softmode.objects.config import FILES
+    from softmode.objects.config import FIELD_FILES, FILES
 
     found = {name: located_options(value, folder) for name, value in options.items()}
-    fingerprint = found.get("fingerprint")
-    for kind in FILES:
+    for kind, its in (*((kind, "fingerprint") for kind in FILES), *FIELD_FILES.items()):
+        fingerprint = found.get(its)
         if isinstance(fingerprint, str) and isinstance(path := found.get(kind), str):
             found[kind] = str(find_file(Path(path), fingerprint, folder) or path)
     return found

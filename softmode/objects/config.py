@@ -30,6 +30,8 @@ PAINTED = ("stiffness", "stiffness_colors", "stiffness_file", "density_colors", 
 """Options that say where stiffness and density vary."""
 FILES = ("splat", "mesh", "radiance", "body")
 """Options that name a file."""
+FIELD_FILES = {"stiffness_file": "stiffness_fingerprint", "density_file": "density_fingerprint"}
+"""Options that name a file of factors, and those that hold its fingerprint."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,6 +124,10 @@ class ObjectConfig:
     fingerprint: str | None = None
     """`file_fingerprint` of the file that is meant, see `pinned`; None takes whatever lies at the path. The file is
     looked for at its path and by its name in the working folder; another content is refused when it is loaded."""
+    stiffness_fingerprint: str | None = None
+    """The same for `stiffness_file`."""
+    density_fingerprint: str | None = None
+    """The same for `density_file`."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -196,36 +202,52 @@ class ObjectConfig:
         """Return this with other options; another file comes without the fingerprint of the one before."""
         if any(options.get(kind) is not None for kind in FILES):
             options = {"fingerprint": None, **options}
+        for name, its in FIELD_FILES.items():
+            if options.get(name) is not None:
+                options = {its: None, **options}
         return replace(self, **options)
 
+    @property
+    def files(self) -> dict[str, tuple[Path, str]]:
+        """The files that are named, by the option that names one: the path, and the option of its fingerprint."""
+        found = {} if self.file is None else {self.file[0]: (self.file[1], "fingerprint")}
+        given = {name: getattr(self, name) for name in FIELD_FILES}
+        return found | {name: (Path(path), FIELD_FILES[name]) for name, path in given.items() if path is not None}
+
     def pinned(self) -> ObjectConfig:
-        """Return this with the whole path and the fingerprint of its file, so that it is found again from elsewhere.
+        """Return this with the whole paths and the fingerprints of its files, so that they are found from elsewhere.
 
         Raises:
-            AssetError: If the file cannot be read.
+            AssetError: If a file cannot be read.
         """
-        if self.file is None or self.fingerprint is not None:
-            return self
-        kind, path = self.file
-        return replace(self, **{kind: str(path.resolve())}, fingerprint=file_fingerprint(path))  # type: ignore[arg-type]
+        changes: dict[str, Any] = {}
+        for name, (path, its) in self.files.items():
+            if getattr(self, its) is None:
+                changes |= {name: str(path.resolve()), its: file_fingerprint(path)}
+        return replace(self, **changes) if changes else self
 
     def located(self) -> ObjectConfig:
-        """Return this with its file where it was found.
+        """Return this with its files where they were found.
 
         Raises:
-            AssetError: If it has a fingerprint, and no file of that content is there.
+            AssetError: If one has a fingerprint, and no file of that content is there.
         """
-        if self.file is None or self.fingerprint is None:
-            return self
-        kind, path = self.file
-        found = find_file(path, self.fingerprint, Path.cwd())
-        if found is None:
-            what = "the content has changed since it was recorded" if path.exists() else "no such file any more"
-            raise AssetError(
-                f"object file {path}: {what}, and none of that name and content in the working folder",
-                hint="put it back, or name another object (--splat or --object)",
-            )
-        return replace(self, **{kind: str(found)})  # type: ignore[arg-type]
+        changes: dict[str, Any] = {}
+        for name, (path, its) in self.files.items():
+            fingerprint = getattr(self, its)
+            if fingerprint is None:
+                continue
+            found = find_file(path, fingerprint, Path.cwd())
+            if found is None:
+                what = "the content has changed since it was recorded" if path.exists() else "no such file any more"
+                kind = name if name in FIELD_FILES else "object file"
+                option = f"--{name.replace('_', '-')}" if name in FIELD_FILES else "--splat or --object"
+                raise AssetError(
+                    f"{kind} {path}: {what}, and none of that name and content in the working folder",
+                    hint=f"put it back, or name another {'field' if name in FIELD_FILES else 'object'} ({option})",
+                )
+            changes[name] = str(found)
+        return replace(self, **changes) if changes else self
 
     def for_varied_ratio(self) -> ObjectConfig:
         """Return this with a body for a Poisson's ratio that varies; a clamped or a built one stays as it is."""

@@ -52,6 +52,9 @@ class ObjectSet:
     """What draws depend on."""
     first_world: int = field(default=0, kw_only=True)
     """Which world of the draws is the first here: with 5, a single environment has the object of world 5 of many."""
+    resample: bool = field(default=False, kw_only=True)
+    """Whether a world gets another object at every reset, drawn by the weights and the seed of `reset`, or named by its
+    option `object`; all objects of the set are then resident, and each world has room for the largest."""
 
     def __post_init__(self) -> None:
         """Check the objects and what belongs to each."""
@@ -80,6 +83,8 @@ class ObjectSet:
                 raise ConfigError(f"materials[{k}] is a {type(one).__name__}", hint="give a Material or None")
         require_choice("order", self.order, get_args(Order))
         require_number("seed", self.seed, at_least=0, at_most=SEED_MAX)
+        if self.resample and self.order != "drawn":
+            raise ConfigError("resample draws objects, and order deals them out in turn", hint="leave order out")
         require_number("first_world", self.first_world, at_least=0)
         if self.weights is not None:
             for k, weight in enumerate(self.weights):
@@ -151,11 +156,16 @@ class ObjectSet:
         worlds = self.first_world + np.arange(world_count)
         if self.order == "in_turn":
             return worlds % self.count
+        draws = np.random.default_rng(self.seed).random(self.first_world + world_count)
+        return np.searchsorted(self.ends, draws[self.first_world :], side="right")
+
+    @property
+    def ends(self) -> NDArray[np.float64]:
+        """Where the share of each object ends in [0, 1], shape (count,), for uniform draws."""
         weights = np.ones(self.count) if self.weights is None else np.array(self.weights, float)
         ends = np.cumsum(weights / weights.sum())
         ends[np.flatnonzero(weights)[-1] :] = 1.0  # rounding must not let a draw beyond the last that may be drawn
-        draws = np.random.default_rng(self.seed).random(self.first_world + world_count)
-        return np.searchsorted(ends, draws[self.first_world :], side="right")
+        return ends
 
     def material(self, index: int, default: Material) -> Material | None:
         """Return what an object is made of; None for a body file, which says it itself, or does not.

@@ -60,6 +60,8 @@ class RobotAsset:
     """Tool point in the frame of the end effector [m]."""
     asset_root: Path
     """Folder outside which the file may refer to nothing."""
+    root_given: bool = True
+    """Whether that was said; otherwise a URDF may also refer to the packages it names."""
 
 
 def available() -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,6 +35,8 @@ class CompiledRobot:
     at_home: dict[str, float]
     bandwidth: float = 8.0
     """Natural frequency of the drives of joints without a servo [Hz]."""
+    undriven: Collection[str] = ()
+    """Joints that get no drive by default: those of a base that floats."""
 
     def __post_init__(self) -> None:
         """Check that every link has at most one hinge or slide."""
@@ -134,7 +136,8 @@ class CompiledRobot:
         owner, ratio, shift = self.ties
         count = model.njnt
         drives: list[JointDrive | None] = [None] * count
-        torque_limit: dict[int, float] = {} if model.nu else dict.fromkeys(range(count), math.inf)
+        driven = [j for j in range(count) if self.joint_names[j] not in self.undriven]
+        torque_limit: dict[int, float] = {} if model.nu else dict.fromkeys(driven, math.inf)
         for a in range(model.nu):
             arms = self._transmission(a)
             if not arms or len({owner[j] for j in arms}) != 1:

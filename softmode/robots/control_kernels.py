@@ -206,6 +206,66 @@ def _clean(value: float):
 
 
 @wp.func
+def held_target(
+    settings: Settings, position: wp.vec3, yaw: float, measured: wp.transform, move: wp.vec3, turn_entry: float
+):
+    """Return position and yaw of the target after an action: moved, held back by lead and workspace.
+
+    Args:
+        settings: What actions mean.
+        position: Commanded position of the tool [m].
+        yaw: Its yaw [rad].
+        measured: Measured pose of the tool.
+        move: The action's entries for the position, -1..1.
+        turn_entry: That for the yaw.
+    """
+    measured_position = wp.transform_get_translation(measured)
+    moved = position + settings.translation_scale * move
+    ahead = moved - measured_position
+    distance = wp.length(ahead)
+    if distance > settings.max_lead:
+        moved = measured_position + ahead * (settings.max_lead / distance)
+    moved = _clamp_into(moved, settings.workspace_lower, settings.workspace_upper)
+    wanted = yaw + settings.rotation_scale * turn_entry
+    measured_yaw = _tool_yaw(wp.transform_get_rotation(measured))
+    turn = wanted - measured_yaw
+    turn = turn - 2.0 * wp.pi * wp.round(turn / (2.0 * wp.pi))
+    return moved, measured_yaw + wp.clamp(turn, -settings.max_lead_angle, settings.max_lead_angle)
+
+
+@wp.func
+def down_at(yaw: float):
+    """Return the rotation of a tool that points down: half a turn about y, then the yaw about the vertical."""
+    return wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw) * wp.quat(0.0, 1.0, 0.0, 0.0)
+
+
+@wp.func
+def attained_target(position: wp.vec3, yaw: float, pose: wp.transform):
+    """Return the target, or what the joints attain of it where limits or reach hold them back: it waits there."""
+    attained = wp.transform_get_translation(pose)
+    at = position
+    if wp.length(attained - position) > 0.002:
+        at = attained
+    attained_yaw = _tool_yaw(wp.transform_get_rotation(pose))
+    missing = yaw - attained_yaw
+    missing = missing - 2.0 * wp.pi * wp.round(missing / (2.0 * wp.pi))
+    return at, wp.where(wp.abs(missing) > 0.01, attained_yaw, yaw)
+
+
+@wp.func
+def moved_opening(settings: Settings, opening: float, measured: float, entry: float):
+    """Return the commanded opening after an action's entry for the gripper, -1..1.
+
+    The range of commands starts below zero, so that the drives reach their limit on thin objects too. The lead is taken
+    from both fingers together: with equal targets an off-centre grasp is pushed back to the middle.
+    """
+    lead = settings.opening_lead
+    wanted = wp.lerp(-lead, settings.stroke, 0.5 * (1.0 + entry))
+    moved = opening + wp.clamp(wanted - opening, -settings.opening_rate, settings.opening_rate)
+    return wp.clamp(moved, measured - lead, measured + lead)
+
+
+@wp.func
 def _read_arm(chain: Chain, world: int, joint_q: wp.array[float]):
     q = vec7()
     for k in range(_N):
@@ -261,7 +321,6 @@ def move_command(
     measured = _read_arm(chain, world, joint_q_in)
     measured_pose = _forward(chain, world, measured)
     command.tool_pose[world] = measured_pose
-    measured_position = wp.transform_get_translation(measured_pose)
     q = vec7()
     low = vec7()
     high = vec7()
@@ -292,30 +351,11 @@ def move_command(
         command.target_yaw[world] = _tool_yaw(wp.transform_get_rotation(pose))
     else:
         move = wp.vec3(_clean(action[world, 0]), _clean(action[world, 1]), _clean(action[world, 2]))
-        position = command.target_position[world] + settings.translation_scale * move
-        ahead = position - measured_position
-        distance = wp.length(ahead)
-        if distance > settings.max_lead:
-            position = measured_position + ahead * (settings.max_lead / distance)
-        position = _clamp_into(position, settings.workspace_lower, settings.workspace_upper)
-        yaw = command.target_yaw[world] + settings.rotation_scale * _clean(action[world, 3])
-        measured_yaw = _tool_yaw(wp.transform_get_rotation(measured_pose))
-        turn = yaw - measured_yaw
-        turn = turn - 2.0 * wp.pi * wp.round(turn / (2.0 * wp.pi))
-        yaw = measured_yaw + wp.clamp(turn, -settings.max_lead_angle, settings.max_lead_angle)
-        # Half a turn about y makes the tool point down; the yaw turns it about the vertical.
-        rotation = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw) * wp.quat(0.0, 1.0, 0.0, 0.0)
-        q = _inverse(chain, settings, world, position, rotation, q, low, high)
-        # Where limits or reach hold the joints back, the target waits at what they attain.
-        pose = _forward(chain, world, q)
-        attained = wp.transform_get_translation(pose)
-        if wp.length(attained - position) > 0.002:
-            position = attained
-        attained_yaw = _tool_yaw(wp.transform_get_rotation(pose))
-        missing = yaw - attained_yaw
-        missing = missing - 2.0 * wp.pi * wp.round(missing / (2.0 * wp.pi))
-        if wp.abs(missing) > 0.01:
-            yaw = attained_yaw
+        before, before_yaw = command.target_position[world], command.target_yaw[world]
+        entry = _clean(action[world, 3])
+        position, yaw = held_target(settings, before, before_yaw, measured_pose, move, entry)
+        q = _inverse(chain, settings, world, position, down_at(yaw), q, low, high)
+        position, yaw = attained_target(position, yaw, _forward(chain, world, q))
         command.target_position[world] = position
         command.target_yaw[world] = yaw
 
@@ -323,13 +363,8 @@ def move_command(
         command.commanded_q[world, k] = q[k]
     measured_opening = _read_opening(chain, world, joint_q_in)
     command.opening[world] = measured_opening
-    # The range of commands starts below zero, so that the drives reach their limit on thin objects too.
-    lead = settings.opening_lead
-    wanted = wp.lerp(-lead, settings.stroke, 0.5 * (1.0 + _clean(action[world, action.shape[1] - 1])))
     opening = command.commanded_q[world, _N] + command.commanded_q[world, _N + 1]
-    opening = opening + wp.clamp(wanted - opening, -settings.opening_rate, settings.opening_rate)
-    # The lead is taken from both fingers together: with equal targets an off-centre grasp is pushed back to the middle.
-    opening = wp.clamp(opening, measured_opening - lead, measured_opening + lead)
+    opening = moved_opening(settings, opening, measured_opening, _clean(action[world, action.shape[1] - 1]))
     command.commanded_q[world, _N] = 0.5 * opening
     command.commanded_q[world, _N + 1] = 0.5 * opening
 

@@ -21,7 +21,12 @@ from softmode.errors import AssetError, ConfigError
 from softmode.robots.assets import RobotAsset, find
 from softmode.robots.compiled import CompiledRobot
 from softmode.robots.description import RobotDescription
-from softmode.robots.references import check_references, read_xml, resolve_inside
+from softmode.robots.joint_split import hold_base, split_links
+from softmode.robots.meshes import use_meshes
+from softmode.robots.references import check_references, default_root, read_xml
+
+_LEAST_MASS, _LEAST_INERTIA = 1.0e-4, 1.0e-7
+"""What links that move get that have no mass of their own, [kg] and [kg m^2]."""
 
 
 def load(
@@ -34,6 +39,7 @@ def load(
     root: str | None = None,
     asset_root: str | Path | None = None,
     drive_bandwidth: float = 8.0,
+    floating: bool = False,
     download: bool = True,
 ) -> RobotDescription:
     """Load a robot by name, or from an MJCF or URDF file.
@@ -53,8 +59,11 @@ def load(
         home: Joint coordinates of the home pose [m or rad]; by default the key frame "home", else the first one, else
             zero, brought into the joint limits.
         root: Body whose subtree is the robot, moved to the origin; needed if the file holds several robots.
-        asset_root: Folder outside which the file may refer to nothing; its own folder if omitted.
+        asset_root: Folder outside which the file may refer to nothing. If omitted: its own folder, or the one above a
+            folder called `urdf` or `robots`, and of a URDF the packages that it names, found above it.
         drive_bandwidth: Natural frequency of the drives of joints without a servo [Hz].
+        floating: Whether a base on a free joint may move, by three slides and three hinges without drives;
+            otherwise it is held where the home pose has it.
         download: Whether a model that is not in the cache may be downloaded.
 
     Returns:
@@ -62,7 +71,7 @@ def load(
 
     Raises:
         AssetError: If the model cannot be fetched, or the file is missing, broken, refers outside the asset root, or
-            holds what is not supported: a free or ball joint, several joints in one link.
+            holds what is not supported: a ball joint, a free joint behind the first link.
         ConfigError: If a name is unknown, or a number out of range.
         MissingExtraError: If the name needs the extra ``[robots]`` and it is not installed.
     """
@@ -72,15 +81,23 @@ def load(
     if len(offset) != 3 or not all(math.isfinite(value) for value in offset):
         raise ConfigError(f"tool_offset = {offset} is not a point", hint="give three coordinates in metres")
     require_number("drive_bandwidth", drive_bandwidth, at_least=0.1, at_most=100.0, unit="Hz")
-    spec = _read(asset)
-    full = _compile(spec, asset)
+    spec, notes = _read(asset)
+    full = _compile(spec, asset, notes)
     keys = {full.key(k).name: full.key_qpos[k] for k in range(full.nkey)}
     key = keys.get("home", next(iter(keys.values()), full.qpos0))
+    free = [j for j in range(full.njnt) if full.jnt_type[j] == 0 and full.body_parentid[full.jnt_bodyid[j]] == 0]
     at_home = {full.joint(j).name: float(key[full.jnt_qposadr[j]]) for j in range(full.njnt)}
-    _keep_robot(spec, asset.root if root is None else root, asset)
-    robot = CompiledRobot(_compile(spec, asset), asset, at_home, drive_bandwidth)
+    root = asset.root if root is None else root
+    _keep_robot(spec, root, asset)
+    pose = [float(x) for x in key[full.jnt_qposadr[free[0]] :][:7]] if len(free) == 1 and root is None else None
+    loose, more = hold_base(spec, pose, floating=floating)
+    notes += more
+    spec, split = _split(spec, asset)
+    notes += [f"split into links of one joint each: {', '.join(map(repr, split))}"] if split else []
+    robot = CompiledRobot(_compile(spec, asset), asset, at_home, drive_bandwidth, loose)
     drives = robot.drives()
     start = robot.home(home)
+    robot.notes += notes
     if home is None:
         found = "home" if "home" in keys else next(iter(keys), None)
         robot.notes.append("home: zero, no key frame" if found is None else f"home: key frame {found!r}")
@@ -119,19 +136,21 @@ def _locate(source: str | Path, asset_root: str | Path | None, download: bool) -
     if isinstance(source, str) and not source.lower().endswith((".xml", ".mjcf", ".urdf")) and "/" not in source:
         return find(source, download=download)
     path = Path(source)
-    folder = path.parent if asset_root is None else Path(asset_root)
+    urdf = path.suffix.lower() == ".urdf"
+    folder = Path(asset_root) if asset_root is not None else default_root(path) if urdf else path.parent
     if path.exists() and not path.resolve().is_relative_to(folder.resolve()):
         raise AssetError(f"robot file {path} lies outside asset_root = {folder}", hint="name a folder that holds it")
-    return RobotAsset(name=path.stem, path=path, asset_root=folder)
+    return RobotAsset(name=path.stem, path=path, asset_root=folder, root_given=asset_root is not None)
 
 
-def _read(asset: RobotAsset) -> Any:
-    """Return the editable MuJoCo specification of a file whose references have been checked."""
+def _read(asset: RobotAsset) -> tuple[Any, list[str]]:
+    """Return the editable MuJoCo specification of a file whose references have been checked, and notes."""
     mujoco = importlib.import_module("mujoco")
-    tree = read_xml(asset.path)
+    tree, notes = read_xml(asset.path), []
     try:
         if tree.tag == "robot":
-            spec = mujoco.MjSpec.from_string(_prepare_urdf(tree, asset))
+            text, notes = _prepare_urdf(tree, asset)
+            spec = mujoco.MjSpec.from_string(text)
         elif tree.tag == "mujoco":
             check_references(asset.path, asset.asset_root)
             spec = mujoco.MjSpec.from_file(str(asset.path))
@@ -143,11 +162,11 @@ def _read(asset: RobotAsset) -> Any:
         if isinstance(error, AssetError):
             raise
         raise AssetError(f"robot file {asset.path}: {_one_line(error)}", hint="mend the file at that line") from error
-    return spec
+    return spec, notes
 
 
-def _prepare_urdf(tree: ElementTree.Element, asset: RobotAsset) -> str:
-    """Resolve the meshes of a URDF, and ask MuJoCo to keep its links and its shapes as they are."""
+def _prepare_urdf(tree: ElementTree.Element, asset: RobotAsset) -> tuple[str, list[str]]:
+    """Resolve the meshes of a URDF, and ask MuJoCo to keep its links and its shapes as they are; with notes."""
     tree = copy.deepcopy(tree)
     for old in tree.findall("mujoco"):
         tree.remove(old)
@@ -157,33 +176,55 @@ def _prepare_urdf(tree: ElementTree.Element, asset: RobotAsset) -> str:
         "compiler",
         {"strippath": "false", "fusestatic": "false", "discardvisual": "false", "balanceinertia": "true"},
     )
+    notes = use_meshes(tree, asset)
     for link in tree.iter("link"):
-        for visual in link.findall("visual"):
-            mesh = visual.find("geometry/mesh")
-            # MuJoCo reads no Collada; what only is there to be seen is left out.
-            if mesh is not None and not mesh.get("filename", "").lower().endswith((".stl", ".obj", ".msh")):
-                link.remove(visual)
-        for mesh in link.iter("mesh"):
-            value = mesh.get("filename", "")
-            values, bases = [value], [asset.path.parent]
-            if value.startswith("package://"):
-                whole = value.removeprefix("package://")
-                values, bases = [whole, whole.partition("/")[2]], [asset.asset_root]
-            file = resolve_inside(values, bases, asset.asset_root, asset.path, "<mesh>")
-            mesh.set("filename", str(file))
+        for second in link.findall("inertial")[1:]:
+            link.remove(second)
+            notes.append(f"link {link.get('name')!r} has its first <inertial>, of several")
+        inertia = link.find("inertial/inertia")
+        if inertia is not None and _mended(inertia):
+            notes.append(f"link {link.get('name')!r} had an inertia that is none, only its diagonal is kept")
     for texture in tree.iter("texture"):
         texture.attrib.pop("filename", None)
-    return ElementTree.tostring(tree, encoding="unicode")
+    return ElementTree.tostring(tree, encoding="unicode"), notes
 
 
-def _compile(spec: Any, asset: RobotAsset) -> Any:
-    """Compile a specification; errors of the compiler name the file."""
+def _mended(inertia: ElementTree.Element) -> bool:
+    """Keep the diagonal alone of an inertia that is not positive; return whether that was so."""
+    rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
+    try:
+        tensor = np.array([[float(inertia.get(name, "0")) for name in row] for row in rows])
+    except ValueError:
+        return False  # the compiler says where
+    if not np.all(np.isfinite(tensor)) or not tensor.any() or np.linalg.eigvalsh(tensor)[0] > 0.0:
+        return False
+    for k, row in enumerate(rows):
+        inertia.attrib.update({name: repr(max(float(tensor[k, k]), _LEAST_INERTIA)) for name in row[k : k + 1]})
+        inertia.attrib.update({name: "0" for name in row[k + 1 :]})
+    return True
+
+
+def _compile(spec: Any, asset: RobotAsset, notes: list[str] | None = None) -> Any:
+    """Compile a specification; errors of the compiler name the file. Links without mass that move get a little."""
     try:
         return spec.compile()
     except (ValueError, RuntimeError) as error:
         text = _one_line(error)
+        if notes is not None and "mjMINVAL" in text:
+            spec.compiler.boundmass, spec.compiler.boundinertia = _LEAST_MASS, _LEAST_INERTIA
+            notes.append(f"links that move and have no mass got {_LEAST_MASS} kg and {_LEAST_INERTIA} kg m^2")
+            return _compile(spec, asset)
         hint = "convert that mesh to .stl or .obj" if "no decoder found" in text else "mend the file"
         raise AssetError(f"robot file {asset.path}: {text}", hint=hint) from error
+
+
+def _split(spec: Any, asset: RobotAsset) -> tuple[Any, list[str]]:
+    """Return the specification with one joint per link and none on the first, and the names of changed links."""
+    if not spec.worldbody.first_body().joints and all(len(body.joints) < 2 for body in spec.bodies):
+        return spec, []
+    _compile(spec, asset)
+    text, names = split_links(spec.to_xml())
+    return importlib.import_module("mujoco").MjSpec.from_string(text), names
 
 
 def _balanced(text: str) -> str:
@@ -237,7 +278,7 @@ def _keep_robot(spec: Any, root: str | None, asset: RobotAsset) -> None:
     # What compiled once is found again; only the folder that a path counts from is made explicit.
     base = asset.path.parent.resolve() / spec.meshdir
     for element in (*spec.meshes, *spec.hfields):
-        if element.file:
+        if element.file and not Path(element.file).is_absolute():  # those of a URDF have been found already
             file = (base / element.file).resolve()
             if not file.is_relative_to(asset.asset_root.resolve()):
                 raise AssetError(f"robot file {asset.path} refers to {file}", hint="keep assets inside the asset root")

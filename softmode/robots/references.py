@@ -18,6 +18,10 @@ _FILE_ATTRIBUTES = ("file", "filename", "fileright", "fileleft", "fileup", "file
 _TEXTURE_TAGS = ("texture",)
 _NESTED_TAGS = ("include", "model")
 """Elements whose file is itself a model."""
+_LEVELS = 8
+"""How many folders above a robot file its packages are looked for in."""
+_URDF_FOLDERS = ("urdf", "urdfs", "robots")
+"""Names of folders of a package that hold URDF files alone; meshes lie beside them."""
 
 
 def read_xml(path: Path) -> ElementTree.Element:
@@ -115,6 +119,59 @@ def resolve_inside(values: list[str], bases: list[Path], root: Path, file: Path,
         hint = f"pass asset_root={found}" if found else "put the file in its place, or pass asset_root= its folder"
         raise AssetError(f"{file}: {tag} refers to {asked!r}, which does not exist in {root}", hint=hint)
     return existing[0]
+
+
+def resolve_package(whole: str, file: Path, root: Path, given: bool) -> Path:
+    """Return the file that a reference `package://NAME/PATH` means.
+
+    It is looked for in the asset root, and in the folder of the package: one called NAME above the file or beside what
+    lies above it, or the one above whose `package.xml` has that name.
+
+    Args:
+        whole: What stands behind `package://`.
+        file: The robot file.
+        root: The asset root.
+        given: Whether the caller named the asset root: nothing outside is then looked at.
+
+    Raises:
+        AssetError: If it leaves its folder or leads nowhere.
+    """
+    name, _, rest = whole.partition("/")
+    folder = package_folder(name, rest, file)
+    if folder is not None and not given:
+        return resolve_inside([rest], [folder], folder, file, "<mesh>")
+    bases = [root]
+    if folder is not None and folder.is_relative_to(root.resolve()):
+        bases.append(folder)
+    return resolve_inside([whole, rest], bases, root, file, "<mesh>")
+
+
+def package_folder(name: str, rest: str, file: Path) -> Path | None:
+    """Return the folder of a package that a robot file names and that holds `rest`; None if there is none."""
+    if name in ("", ".", ".."):
+        return None
+    for up in list(file.resolve().parents)[:_LEVELS]:
+        for folder in (up / name, up):
+            named = folder.name == name or _package_name(folder) == name
+            if named and (folder / rest).exists():
+                return folder
+    return None
+
+
+def default_root(file: Path) -> Path:
+    """Return the folder that a URDF may refer to: its own, or the one above if its own is one for URDF files."""
+    folder = file.parent
+    return folder.parent if folder.name in _URDF_FOLDERS else folder
+
+
+def _package_name(folder: Path) -> str | None:
+    """Return the name that a folder's package.xml says."""
+    file = folder / "package.xml"
+    try:
+        name = read_xml(file).findtext("name") if file.is_file() else None
+    except AssetError:
+        return None
+    return None if name is None else name.strip()
 
 
 def _common(file: Path, outside: list[Path]) -> Path | None:

@@ -10,7 +10,11 @@ from softmode.robots.control_kernels import (
     _rotation_between,
     _solve_spd,
     _tool_yaw,
+    attained_target,
+    down_at,
+    held_target,
     mat66,
+    moved_opening,
     vec6,
 )
 
@@ -199,7 +203,6 @@ def move_command(
     measured = _read_arm(chain, world, joint_q_in)
     measured_pose = _forward(chain, measured)
     command.tool_pose[world] = measured_pose
-    measured_position = wp.transform_get_translation(measured_pose)
     q = vec8()
     low = vec8()
     high = vec8()
@@ -228,29 +231,11 @@ def move_command(
         command.target_yaw[world] = _tool_yaw(wp.transform_get_rotation(pose))
     else:
         move = wp.vec3(_clean(action[world, 0]), _clean(action[world, 1]), _clean(action[world, 2]))
-        position = command.target_position[world] + settings.translation_scale * move
-        ahead = position - measured_position
-        distance = wp.length(ahead)
-        if distance > settings.max_lead:
-            position = measured_position + ahead * (settings.max_lead / distance)
-        position = _clamp_into(position, settings.workspace_lower, settings.workspace_upper)
-        yaw = command.target_yaw[world] + settings.rotation_scale * _clean(action[world, 3])
-        measured_yaw = _tool_yaw(wp.transform_get_rotation(measured_pose))
-        turn = yaw - measured_yaw
-        turn = turn - 2.0 * wp.pi * wp.round(turn / (2.0 * wp.pi))
-        yaw = measured_yaw + wp.clamp(turn, -settings.max_lead_angle, settings.max_lead_angle)
-        rotation = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw) * wp.quat(0.0, 1.0, 0.0, 0.0)
-        q = _inverse(chain, settings, position, rotation, q, low, high)
-        # Where limits or reach hold the joints back, the target waits at what they attain.
-        pose = _forward(chain, q)
-        attained = wp.transform_get_translation(pose)
-        if wp.length(attained - position) > 0.002:
-            position = attained
-        attained_yaw = _tool_yaw(wp.transform_get_rotation(pose))
-        missing = yaw - attained_yaw
-        missing = missing - 2.0 * wp.pi * wp.round(missing / (2.0 * wp.pi))
-        if wp.abs(missing) > 0.01:
-            yaw = attained_yaw
+        before, before_yaw = command.target_position[world], command.target_yaw[world]
+        entry = _clean(action[world, 3])
+        position, yaw = held_target(settings, before, before_yaw, measured_pose, move, entry)
+        q = _inverse(chain, settings, position, down_at(yaw), q, low, high)
+        position, yaw = attained_target(position, yaw, _forward(chain, q))
         command.target_position[world] = position
         command.target_yaw[world] = yaw
 
@@ -258,11 +243,8 @@ def move_command(
         command.commanded_q[world, k] = q[k]
     measured_opening = _read_opening(chain, world, joint_q_in)
     command.opening[world] = measured_opening
-    lead = settings.opening_lead
-    wanted = wp.lerp(-lead, settings.stroke, 0.5 * (1.0 + _clean(action[world, action.shape[1] - 1])))
     opening = command.commanded_q[world, chain.count] + command.commanded_q[world, chain.count + 1]
-    opening = opening + wp.clamp(wanted - opening, -settings.opening_rate, settings.opening_rate)
-    opening = wp.clamp(opening, measured_opening - lead, measured_opening + lead)
+    opening = moved_opening(settings, opening, measured_opening, _clean(action[world, action.shape[1] - 1]))
     command.commanded_q[world, chain.count] = 0.5 * opening
     command.commanded_q[world, chain.count + 1] = 0.5 * opening
 

@@ -86,6 +86,29 @@ class TableRobot:
         """Joints between base and tool."""
         return len(self.chain.joints)
 
+    @property
+    def tool_stiffness(self) -> float:
+        """Vertical stiffness of the drives between base and tool in the home pose, at the tool [N/m].
+
+        1 / k = sum over the joints of (dz / dq)^2 / k_joint.
+        """
+        chain = self.chain
+        vertical = chain.jacobian(chain.home[None])[0, 2]
+        drives = [self.robot.drives[j] for j in chain.joints]
+        stiffness = np.array([np.inf if drive is None else drive.stiffness for drive in drives])
+        return float(1.0 / max(np.sum(vertical**2 / stiffness), 1.0e-12))
+
+    def with_tool_stiffness(self, stiffness: float) -> TableRobot:
+        """Return the robot with drives of another vertical stiffness at the tool [N/m] and the same damping ratios."""
+        factor = stiffness / self.tool_stiffness
+        drives = list(self.robot.drives)
+        for j in self.chain.joints:
+            drive = drives[j]
+            if drive is not None:
+                softer = {"stiffness": factor * drive.stiffness, "damping": math.sqrt(factor) * drive.damping}
+                drives[j] = replace(drive, **softer)
+        return replace(self, robot=replace(self.robot, drives=tuple(drives)))
+
     def opening_at(self, gap: float) -> float:
         """Return the opening, 0 to 1, at which the fingers are so far apart [m]."""
         return float(np.interp(gap, self.gaps, np.linspace(0.0, 1.0, len(self.gaps))))
@@ -119,6 +142,13 @@ class TableRobot:
         """Add the robot in its home pose to a builder; `xform` places its base elsewhere."""
         newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
         return self.robot.add_to(builder, xform=base_pose(self.base) if xform is None else xform, label=label)
+
+
+def tip_length(arm: ArmDescription | TableRobot) -> float:
+    """Return the distance from the tool point to the finger tips [m]."""
+    if isinstance(arm, TableRobot):
+        return arm.jaw.tip
+    return arm.hand_length + arm.gripper.finger_length - arm.tool_length
 
 
 def finger_links(description: ArmDescription | TableRobot, arm: ArmIndices | RobotIndices) -> NDArray[np.int64]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import newton
 import numpy as np
@@ -11,9 +12,12 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.model.authoring import body_key
+from softmode.deformables.model.declare import launch
 from softmode.deformables.model.namespaces import soft
 from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.deformables.skinning.skinning_kernels import vec6
+from softmode.deformables.solver import body_choice_kernels as kernels
+from softmode.deformables.solver.body_choice import words_of
 from softmode.errors import ConfigError
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.host import host
@@ -21,6 +25,8 @@ from softmode.scenes.splat_axes_kernels import principal_axes
 from softmode.splats.rasterizer import SplatArrays
 from softmode.splats.splats import Splats
 
+_ARRAYS = ("means", "covariances", "opacities", "sh", "rotations", "spanning")
+"""Arrays of splats that may differ from world to world."""
 _ROWS = 400_000
 """Most splats of states that are moved in one launch; bounds the memory."""
 
@@ -67,6 +73,9 @@ class BoundSplats:
         worlds: Which worlds; all of them if None. Without a model: which states, the first if None.
         others: Splats behind those of the objects, which `update` leaves where they are: a marker, rigid toys; a list
             with one per world of the model where worlds differ.
+        resident: Objects of which the first soft body of each world may become any, see `choose`; lists in `others`
+            then have one Splats per resident.
+        choice: Which of them each world has, int32, shape (world_count,).
         sh_degree: Highest degree of the colours, 0 to 3; None for that of the splats.
         device: Warp device where there is no model.
 
@@ -81,10 +90,14 @@ class BoundSplats:
         *,
         worlds: Sequence[int] | None = None,
         others: Sequence[Splats | Sequence[Splats]] = (),
+        resident: Sequence[SoftObject] = (),
+        choice: wp.array | None = None,
         sh_degree: int | None = None,
         device: wp.DeviceLike = None,
     ) -> None:
         """Upload the splats at rest."""
+        self._choice: Any = choice
+        self._resident = tuple(resident)
         device = device if model is None else model.device
         each = [[thing] if thing is None or isinstance(thing, SoftObject) else list(thing) for thing in objects]
         self.indices = tuple(o for o, things in enumerate(each) if _has_splats(things))
@@ -96,16 +109,23 @@ class BoundSplats:
         else:
             raise ConfigError(f"there are {len(objects)} objects and no model", hint="give one object that has splats")
         chosen = range(len(starts)) if worlds is None else worlds
+        if self._resident:
+            chosen = range(len(self._resident))
         for part in others:
             if not isinstance(part, Splats) and len(part) <= max(chosen):
                 hint = "give one Splats, or one for each world of the model"
                 raise ConfigError(f"others has {len(part)} splats for world {max(chosen)}", hint=hint)
         parts: list[Splats | list[Splats]] = []
         for things in [each[o] for o in self.indices]:
+            things = self._resident or things
             splats = [thing.visible_splats for thing in things if thing is not None]
-            parts.append(splats[0] if len(things) == 1 else [splats[w] for w in chosen])
+            same = len(things) == 1 and not self._resident
+            parts.append(splats[0] if same else [splats[w] for w in chosen])
         parts += [part if isinstance(part, Splats) else [part[w] for w in chosen] for part in others]
-        self.arrays = SplatArrays.from_splats(parts, world_count=len(starts), sh_degree=sh_degree, device=device)
+        count = len(self._resident) or len(starts)
+        arrays = SplatArrays.from_splats(parts, world_count=count, sh_degree=sh_degree, device=device)
+        self._table = arrays
+        self.arrays = arrays if choice is None else _rows_of(arrays, np.asarray(choice.numpy(), np.int32))
         """The splats as they are, for cameras and rasterisers."""
         self._counts = [[part.count] if isinstance(part, Splats) else [one.count for one in part] for part in parts]
         ends = np.cumsum([max(counts) for counts in self._counts]).tolist()
@@ -113,6 +133,15 @@ class BoundSplats:
         """Where the splats of each object that has some are in `arrays`, then those of `others`; where worlds differ,
         the last columns of a world may be empty."""
         self._skins: list[_Skin] = []
+        if self._resident:
+            start = wp.array(np.ascontiguousarray(starts[:, 0]), dtype=int, device=device)
+            for thing in self._resident:
+                rest = thing.visible_splats
+                skin = SkinSplats(rest.means, rest.covariances(), thing.basis, thing.grad_basis, device=device)
+                rows = wp.zeros(len(starts), dtype=int, device=device)
+                self._skins.append(_Skin(skin=skin, start=start, rows=rows, first=self.columns[0].start))
+            self.choose(wp.ones(len(starts), dtype=wp.bool, device=device))
+            return
         for o, columns in zip(self.indices, self.columns, strict=False):
             things = each[o]
             for thing in {id(thing): thing for thing in things}.values():
@@ -125,6 +154,22 @@ class BoundSplats:
                 start = wp.array(np.ascontiguousarray(starts[mine, o]), dtype=int, device=device)
                 rows = None if len(things) == 1 else wp.array(mine, dtype=int, device=device)
                 self._skins.append(_Skin(skin=skin, start=start, rows=rows, first=columns.start))
+
+    def choose(self, world_mask: wp.array) -> None:
+        """Show the object that `choice` says in the masked worlds, shape (world_count,) bool; capturable."""
+        if self._choice is None:
+            return
+        for table, array in self.per_object:
+            rows, worlds = words_of(table, len(self._resident)), words_of(array, len(self._choice))
+            launch(self._choice.device, kernels.copy_rows, worlds.shape, rows, self._choice, world_mask, worlds)
+        for k, one in enumerate(self._skins):
+            launch(self._choice.device, kernels.rows_that_chose, len(self._choice), self._choice, k, one.rows)
+
+    @property
+    def per_object(self) -> list[tuple[wp.array, wp.array]]:
+        """Arrays of a row per resident object, and those of a row per world that follow them."""
+        named = ((getattr(self._table, name), getattr(self.arrays, name)) for name in _ARRAYS)
+        return [(table, array) for table, array in named if table is not array and table is not None]
 
     def update(self, state: newton.State) -> None:
         """Move the splats to where a state of the model has them; capturable after a first time."""
@@ -143,7 +188,8 @@ class BoundSplats:
         frames: dict[tuple[int, int], SplatFrame] = {}
         for o, columns, counts in zip(self.indices, self.columns, self._counts, strict=False):
             for w in range(len(means)):
-                mine = slice(columns.start, columns.start + counts[w % len(counts)])
+                k = w if self._choice is None else int(self._choice.numpy()[w])
+                mine = slice(columns.start, columns.start + counts[k % len(counts)])
                 frames[w, o] = SplatFrame(means=means[w, mine].copy(), covariances=covariances[w, mine].copy())
         return frames
 
@@ -165,6 +211,18 @@ def splats_of_states(thing: SoftObject, states: ArrayLike) -> Iterator[Splats]:
         for (k, _), frame in bound.frames().items():
             # colours of degree 0 look the same from everywhere, and no rotations are computed for them
             yield rest.with_covariances(frame.means, frame.covariances, turns[k] if rest.sh_degree else np.eye(3))
+
+
+def _rows_of(table: SplatArrays, rows: NDArray[np.int32]) -> SplatArrays:
+    """Return arrays with some of the rows of others; those that all rows share stay as they are."""
+
+    def chosen(name: str) -> Any:
+        array: Any = getattr(table, name)
+        if array is None or array.shape == (1, 1) or (array.shape[0] == 1 and table.means.shape[0] > 1):
+            return array
+        return wp.array(array.numpy()[rows], dtype=array.dtype, device=array.device)
+
+    return replace(table, **{name: chosen(name) for name in _ARRAYS})
 
 
 def _has_splats(things: Sequence[SoftObject | None]) -> bool:

@@ -14,9 +14,11 @@ from softmode.checks import require_number
 from softmode.deformables.coupling.rigid_solver import mujoco_warnings
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
-from softmode.deformables.model.authoring import register_custom_attributes
+from softmode.deformables.model.authoring import register_custom_attributes, reserve_room
 from softmode.deformables.model.declare import launch
 from softmode.deformables.model.status import status_reasons
+from softmode.deformables.solver.body_choice import BodyChoice, words_of
+from softmode.deformables.solver.body_choice_kernels import copy_rows
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.errors import ConfigError
@@ -102,7 +104,7 @@ class TableScene:
         camera_options: Light and background.
         camera_randomization: What `randomize` of the cameras draws.
         marker: Splats around the origin that mark a place, such as a goal, in pictures; they touch nothing. A list of
-            them has those of each world.
+            them has those of each world, or of each object of the set where a reset may change the object.
         device: Warp device; the default one if None.
         progress: Reports the build of the object, see :func:`softmode.deformables.build.build_body.build_body`.
     """
@@ -134,6 +136,7 @@ class TableScene:
         self.marker_place.fill_(wp.transform_identity())
         self.marker = marker
         """Splats that mark a place in pictures, as they were given; the last ones of `splats`."""
+        self._marker_rows: wp.array | None = None
         self.splats: BoundSplats | None = None
         """The splats of the objects, then those of the marker, as cameras see them; None without cameras."""
         self.cameras: dict[tuple[int, int], SplatCamera] = {}
@@ -141,9 +144,14 @@ class TableScene:
         self.film: FilmCamera | None = None
         """The cameras that people look through; None without any."""
         if cameras or film:
-            first = self.objects[0] if len(self.members) == 1 else [self.members[m] for m in self.member]
+            first = (
+                self.objects[0]
+                if len(self.members) == 1 and not self.resampled
+                else [self.members[m] for m in self.member]
+            )
             things = (first, *self.objects[1:])
-            self.splats = BoundSplats(self.model, things, others=() if marker is None else (marker,))
+            resident = {"resident": self.members, "choice": self.object_index} if self.resampled else {}
+            self.splats = BoundSplats(self.model, things, others=() if marker is None else (marker,), **resident)
             if marker is not None:
                 rest = self.splats.arrays.means.numpy()[:, self.splats.columns[-1]]
                 self.marker_points = wp.array(
@@ -151,6 +159,9 @@ class TableScene:
                 )
                 """Centres of the marker's splats from `marker_place` [m], shape (1 or world_count, splats); a task may
                 put an array of its own here before the first picture, to change the marker's shape."""
+                if self.resampled and not isinstance(marker, Splats):
+                    table = self.splats.per_object[0][0].numpy()[:, self.splats.columns[-1]]
+                    self._marker_rows = wp.array(table, dtype=wp.vec3, device=self.device)
         if cameras and self.splats is not None:
             self.cameras = cameras_by_size(
                 self.model, self.splats, cameras, options=camera_options, randomization=camera_randomization
@@ -169,13 +180,25 @@ class TableScene:
         """The first soft object, of world 0 where worlds differ."""
         return self.objects[0]
 
+    @property
+    def chosen(self) -> NDArray[np.intp]:
+        """Which object of the set each world has, shape (world_count,); zeros without a set."""
+        return self.object_index.numpy().astype(np.intp) if self.resampled else self._chosen
+
+    @property
+    def member(self) -> NDArray[np.intp]:
+        """Which of `members` each world has, shape (world_count,)."""
+        return self.chosen if self.resampled else self._member
+
     def objects_of(self, world: int) -> tuple[SoftObject, ...]:
         """Return the soft objects of a world."""
         return (self.members[self.member[world]], *self.objects[1:])
 
     def marker_of(self, world: int) -> Splats | None:
         """Return the splats that mark a place in a world, as they were given; None without any."""
-        return self.marker if self.marker is None or isinstance(self.marker, Splats) else self.marker[world]
+        if self.marker is None or isinstance(self.marker, Splats):
+            return self.marker
+        return self.marker[self.member[world] if self.resampled else world]
 
     # -- construction -------------------------------------------------------------------------------------------------
 
@@ -189,26 +212,34 @@ class TableScene:
                 loaded[kind, material] = load(kind, material=material, progress=progress)
             return loaded[kind, material]
 
-        self.chosen: NDArray[np.intp] = np.zeros(self.world_count, dtype=np.intp)
-        """Which object of the set each world has, shape (world_count,); zeros without a set."""
+        chosen: NDArray[np.intp] = np.zeros(self.world_count, dtype=np.intp)
+        self.resampled = config.objects is not None and config.objects.resample
+        """Whether a world may have another object of the set after a reset."""
         if config.objects is None:
             self.members: tuple[SoftObject, ...] = (loaded_once(config.object, config.material),)
             """What object 0 of the worlds is: one soft object, or those of the set that some world has."""
             self.materials: tuple[Material, ...] = (config.material,)
             """What each of them is made of."""
-            self.member = self.chosen
-            """Which of them each world has, shape (world_count,)."""
+            self._member = chosen
         else:
             given = config.objects.resolved(config.object)
-            self.chosen = given.chosen(self.world_count)
-            held, self.member = np.unique(self.chosen, return_inverse=True)
-            kinds = [(given.config(k), given.material(k, config.material)) for k in held]
+            chosen = given.chosen(self.world_count)
+            held, self._member = np.unique(chosen, return_inverse=True)
+            if self.resampled:
+                if config.others or config.grip_slots:
+                    what = "others" if config.others else "grip_slots"
+                    raise ConfigError(f"objects.resample and {what} exclude each other", hint=f"leave {what} out")
+                held, self._member = np.arange(given.count), chosen
+            kinds = [(given.config(int(k)), given.material(int(k), config.material)) for k in held]
             self.members = tuple(loaded_once(kind, own) for kind, own in kinds)
             self.materials = tuple(
                 own or thing.material or config.material for thing, (_, own) in zip(self.members, kinds, strict=True)
             )
+        self._chosen = chosen
+        self.object_index = wp.array(chosen, dtype=int, device=self.device)
+        """Which object of the set each world has, int32, shape (world_count,); zeros without a set."""
         others = tuple(loaded_once(kind, config.material) for kind in config.others)
-        self.objects: tuple[SoftObject, ...] = (self.members[self.member[0]], *others)
+        self.objects: tuple[SoftObject, ...] = (self.members[self._member[0]], *others)
         """The soft objects of a world, of world 0 where worlds differ (see `objects_of`); their instances follow each
         other, world by world."""
 
@@ -221,7 +252,7 @@ class TableScene:
         if len(worlds) == 1:
             builder.replicate(worlds[0], self.world_count)
         else:
-            for m in self.member:
+            for m in self._member:
                 builder.add_world(worlds[m])
         self.model: Any = builder.finalize(device=self.device)  # Any: it carries the attributes of soft bodies
 
@@ -240,6 +271,10 @@ class TableScene:
             instance = placed.add_to(world, material=material if thing is first else config.material)
             if config.grip_slots:
                 add_grip_slots(world, instance, config.grip_slots)
+            if self.resampled:
+                bodies = [one.body for one in self.members]
+                functions = max(body.function_count for body in bodies) - thing.body.function_count
+                reserve_room(world, functions, max(body.surface_count for body in bodies) - thing.body.surface_count)
         return world
 
     def _build_solver(self) -> None:
@@ -272,6 +307,11 @@ class TableScene:
         fingers = np.where(fingers < 0, -1, starts[:, None, None] + fingers)
         self._finger_body = wp.array(fingers, dtype=int, device=device)
         self._bases = self._object_bases()
+        self._choice: BodyChoice | None = None
+        if self.resampled:
+            self._choice = BodyChoice(self.solver, [thing.body for thing in self.members], self.materials)
+            rows = [distinct.index(thing.body) for thing in self.members]
+            self._base_rows = wp.array(np.array(rows)[:, None], dtype=int, device=device)
         self.world_mask = wp.ones(worlds, dtype=wp.bool, device=device)
         """Which worlds `reset_worlds` resets, shape (world_count,)."""
         self._solver_mask = wp.zeros(worlds + 1, dtype=wp.bool, device=device)
@@ -290,7 +330,7 @@ class TableScene:
         linear, mean = np.zeros((len(bodies), most, 4)), np.zeros((len(bodies), most))
         for b, body in enumerate(bodies):
             linear[b, : body.function_count], mean[b, : body.function_count] = body.linear_coordinates, body.mean_basis
-        first = np.array([rows[id(thing.body)] for thing in self.members])[self.member]
+        first = np.array([rows[id(thing.body)] for thing in self.members])[self._member]
         others = np.array([rows[id(thing.body)] for thing in self.objects[1:]], int)
         body = np.column_stack([first, np.tile(others, (self.world_count, 1))]).reshape(-1)
         bases = kernels.ObjectBases()
@@ -351,6 +391,28 @@ class TableScene:
         self.controller.reset(state, self.world_mask)
         self.controller.write_targets(self.control)
         self.observe()
+
+    def use_objects(self) -> None:
+        """Put the object that `object_index` says into the worlds of `world_mask`; capturable.
+
+        Materials, places and the state come after it: set the parameters and call `reset_worlds`.
+
+        Raises:
+            ConfigError: If worlds keep their objects.
+        """
+        if self._choice is None:
+            raise ConfigError("the worlds keep their objects", hint="give objects=ObjectSet([...], resample=True)")
+        self._choice.set(self.object_index, self.world_mask)
+        self.copy_rows(self._base_rows, self._bases.body)
+        if self.splats is not None:
+            self.splats.choose(self.world_mask)
+        if self._marker_rows is not None:
+            self.copy_rows(self._marker_rows, self.marker_points)
+
+    def copy_rows(self, table: wp.array, out: wp.array) -> None:
+        """Copy from a table with a row per object that of its object to each world of `world_mask`; capturable."""
+        rows, worlds = words_of(table, len(self.members)), words_of(out, self.world_count)
+        launch(self.device, copy_rows, worlds.shape, rows, self.object_index, self.world_mask, worlds)
 
     def _set_stiffness(self, mask: np.ndarray, youngs_modulus: np.ndarray) -> None:
         """Change E in the masked worlds."""

@@ -35,7 +35,7 @@ class TaskCheck:
     """What was found, or why nothing was."""
 
 
-def check_task(name: str, *, episodes: int = 5) -> list[TaskCheck]:
+def check_task(name: str, *, episodes: int = 5, **options: Any) -> list[TaskCheck]:
     """Check an environment of softmode's, or one of your own that is made of a softmode task.
 
     Gymnasium's checker on the single environment and `check_vector_env` on the vector one; world i of many against the
@@ -45,6 +45,7 @@ def check_task(name: str, *, episodes: int = 5) -> list[TaskCheck]:
     Args:
         name: Id of the environment, or module:id.
         episodes: Scripted episodes to play.
+        options: Keyword arguments of the environments, such as `robot` or `config`.
 
     Returns:
         A check each, all of them, also after one that fails.
@@ -54,11 +55,11 @@ def check_task(name: str, *, episodes: int = 5) -> list[TaskCheck]:
     """
     require_number("episodes", episodes, at_least=1, hint="give a count like 5")
     env_class(name)
-    env = gym.make(registered_id(name))
+    env = gym.make(registered_id(name), **options)
     checks: dict[str, Callable[[], tuple[bool | None, str]]] = {
         "Gymnasium's checker": lambda: _gymnasium(env),
-        "vector checker": lambda: _vector(name),
-        "world i of many": lambda: _worlds(name, env),
+        "vector checker": lambda: _vector(name, options),
+        "world i of many": lambda: _worlds(name, env, options),
         "replay": lambda: _replay(env),
         "observation from the state": lambda: _segments(env),
         "scripted policy": lambda: _scripted(env, episodes),
@@ -87,23 +88,23 @@ def _gymnasium(env: gym.Env) -> tuple[bool, str]:
     return True, "; ".join(sorted(lines)) or "no warnings"
 
 
-def _vector(name: str) -> tuple[bool, str]:
+def _vector(name: str, options: dict[str, Any]) -> tuple[bool, str]:
     """Run the vector checker."""
-    make = _vector_maker(name)
+    make = _vector_maker(name, options)
     report = check_vector_env(lambda count: make(count, max_episode_steps=8), steps=_STEPS)
     skipped = "".join(f"; skipped {rule}: {why}" for rule, why in report.skipped.items())
     return True, f"{len(report.checked)} rules{skipped}"
 
 
-def _vector_maker(name: str) -> Callable[..., Any]:
+def _vector_maker(name: str, given: dict[str, Any]) -> Callable[..., Any]:
     """Return what makes the vector environment of a number of worlds."""
     env_class(name, vector=True)
-    return lambda count, **options: gym.make_vec(registered_id(name), num_envs=count, **options)
+    return lambda count, **options: gym.make_vec(registered_id(name), num_envs=count, **given, **options)
 
 
-def _worlds(name: str, env: gym.Env) -> tuple[bool, str]:
+def _worlds(name: str, env: gym.Env, options: dict[str, Any]) -> tuple[bool, str]:
     """Compare each world of three with the single environment."""
-    many, single = _vector_maker(name)(3), env.unwrapped
+    many, single = _vector_maker(name, options)(3), env.unwrapped
     try:
         many.action_space.seed(0)
         actions = [many.action_space.sample() for _ in range(_STEPS)]

@@ -1,4 +1,4 @@
-"""LiftSoft with robots from files: observation, worlds, the scripted lift."""
+"""Tasks with robots from files: observation, worlds, the scripted policies."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 from softmode import robots
+from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.lift_soft.scripted import ScriptedLift
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv, LiftSoftVectorEnv
+from softmode.envs.tasks.place_in_bin.task import PlaceInBinEnv
+from softmode.envs.tasks.press_soft.task import PressSoftEnv
 from softmode.envs.tasks.push_soft.task import PushSoftEnv
 from softmode.errors import ConfigError
-from softmode.robots.table_robot import TableRobot
+from softmode.robots.table_robot import TableRobot, tip_length
 from tests.robots.files import MJCF, write_arm5, write_mjcf
 
 
@@ -101,7 +104,37 @@ def test_robots_and_tasks_that_do_not_fit(tmp_path: Path, arm5: Path) -> None:
     with pytest.raises(ConfigError, match="robot is a int"):
         LiftSoftEnv(robot=3)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="built-in arm only"):
-        PushSoftEnv(robot=arm5)
+        PlaceInBinEnv(robot=arm5)
+
+
+@pytest.mark.parametrize("kind", [PushSoftEnv, PressSoftEnv])
+def test_heights_are_those_of_finger_tips(kind: Any, arm5: Path) -> None:
+    """Tips begin as high as the built-in arm's and stay as far off the table; the scripted policy succeeds."""
+    env, own = kind(robot=arm5, device="cpu"), kind.task_class.config_class().scene
+    arm, control = env.config.scene.arm, env.config.scene.control
+    longer = tip_length(arm) - tip_length(own.arm)
+    assert arm.home_position[2] - longer == pytest.approx(own.arm.home_position[2])
+    assert control.workspace_lower[2] - longer == pytest.approx(own.control.workspace_lower[2])
+    if kind is PressSoftEnv:
+        assert arm.tool_stiffness == pytest.approx(env.task.arm_stiffness) == pytest.approx(3e3)
+    env.reset(seed=1)
+    policy = scripted_policy(env)
+    for _ in range(150):
+        _, _, terminated, _, info = env.step(policy(None))
+        if info["is_success"]:
+            return
+        assert not terminated
+    pytest.fail(f"no success: {info}")
+
+
+def test_tool_stiffness(arm5: Path) -> None:
+    """A vertical force at the tool bends the drives by force / stiffness, at first order."""
+    arm = robots.place_robot(robots.load(arm5)).with_tool_stiffness(2.0e3)
+    chain, force = arm.chain, 1.0
+    stiffness = np.array([drive.stiffness for j in chain.joints if (drive := arm.robot.drives[j]) is not None])
+    moved = chain.home + chain.jacobian(chain.home[None])[0, 2] * force / stiffness
+    rise = chain.forward(moved[None])[0][0, 2] - chain.forward(chain.home[None])[0][0, 2]
+    assert rise == pytest.approx(force / 2.0e3, rel=1e-2)  # the second order: 0.5 mm over a lever of 0.1 m
 
 
 @pytest.mark.slow

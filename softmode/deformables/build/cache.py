@@ -69,7 +69,7 @@ def cached(
     with contextlib.suppress(AssetError):
         return read(path)
     if directory is None:
-        path = _writable_cache(place) / path.name
+        path = writable_cache(place) / path.name
     path.parent.mkdir(parents=True, exist_ok=True)
     with _locked(path.with_suffix(".lock")):
         with contextlib.suppress(AssetError):
@@ -85,7 +85,7 @@ def cache_directory() -> Path:
     return Path(override) if override else Path.home() / ".cache" / "softmode"
 
 
-def _writable_cache(folder: Path) -> Path:
+def writable_cache(folder: Path) -> Path:
     """Return a cache folder, or one in a temporary folder where it cannot be made or written to.
 
     The temporary folder becomes SOFTMODE_CACHE of this process, so that its children share it, and ends with it.

@@ -221,6 +221,24 @@ def add_reduced_body(
     return index[f"{NAMESPACE}:function_start"]
 
 
+def reserve_room(builder: newton.ModelBuilder, functions: int, samples: int) -> None:
+    """Leave room behind the body that was added last, for a larger one that may take its place while the model runs.
+
+    Args:
+        builder: Builder of the world.
+        functions: More functions than the body has.
+        samples: More surface samples; they become particles without mass that nothing moves or touches.
+    """
+    if samples:
+        place = wp.vec3(*builder.particle_q[-1])
+        builder.add_particles(
+            pos=[place] * samples, vel=[wp.vec3()] * samples, mass=[0.0] * samples, radius=[1.0e-4] * samples
+        )
+    if functions:
+        empty = {f"{NAMESPACE}:{name}": wp.vec3d() for name in ("q", "qd", "q_driven")}
+        builder.add_custom_values_batch([dict(empty) for _ in range(functions)])
+
+
 def add_pins(
     builder: newton.ModelBuilder,
     instance: int,

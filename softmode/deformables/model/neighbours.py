@@ -56,7 +56,7 @@ def warn_foreign_deformables(model: newton.Model, layout: Layout) -> None:
 
 def foreign_deformables(model: newton.Model, layout: Layout) -> list[str]:
     """Return a phrase for each kind of deformable that is no reduced body, with what steps it."""
-    free = np.ones(model.particle_count, bool)
+    free = host(model.particle_mass)[: model.particle_count] > 0.0  # room for larger bodies has none
     for start, asset in zip(soft(model).particle_start.numpy(), layout.asset, strict=True):
         free[start : start + layout.bodies[asset].surface_count] = False
     if not free.any():

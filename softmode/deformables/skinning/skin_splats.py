@@ -132,7 +132,8 @@ class SkinSplats:
                 `SplatArrays` of degree 0, for colours that are the same from everywhere.
             first_splat: Column where this object's splats begin.
             rows: Row of each of the worlds in the outputs, int32, shape (world_count,), where other worlds show other
-                objects; None for outputs with one row per world, in their order.
+                objects, -1 for a world that does not show this one; None for outputs with one row per world, in their
+                order.
 
         Raises:
             BasisError: If an output has not a row per world or too few columns, `rotations` has another shape than

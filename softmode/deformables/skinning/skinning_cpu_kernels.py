@@ -48,6 +48,8 @@ def add_scaled(sum_in: block_vec, block_in: block_vec, factor: float) -> block_v
 def skin_blocks(skin: Skin):
     """Compute x = X + sum_k b_k q_k, F Sigma F^T and, if wanted, the rotation of F, of at least BLOCK splats."""
     block, world = wp.tid()
+    if skin.row.shape[0] > 0 and skin.row[world] < 0:
+        return
     # The last block overlaps the one before, and writes some splats a second time.
     count = skin.rest_mean.shape[0]
     first = wp.min(BLOCK * block, count - BLOCK)

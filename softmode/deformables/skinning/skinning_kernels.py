@@ -145,7 +145,7 @@ class Skin:
     offset: wp.array[wp.vec3d]  # (world_count,) [m]
     q: wp.array2d[wp.vec4]  # (world_count, function_count) [m]
     first_splat: int
-    row: wp.array[int]  # (world_count,) row of each world in the outputs, or of size zero: that of the world
+    row: wp.array[int]  # (world_count,) row of each world in the outputs, -1 for none; of size zero: that of the world
     # Out:
     mean: wp.array2d[wp.vec3]  # (rows, >= first_splat + splat_count) [m]
     covariance: wp.array2d[vec6]  # like mean [m^2]
@@ -162,6 +162,8 @@ def write_splat(skin: Skin, row0: wp.vec4, row1: wp.vec4, row2: wp.vec4, world: 
     row = world
     if skin.row.shape[0] > 0:
         row = skin.row[world]
+    if row < 0:
+        return
     if skin.rotation.shape[0] > 0:
         skin.rotation[row, column] = polar_rotation(gradient)
     f = limited_stretch(gradient, skin.stretch_limit)

@@ -25,8 +25,6 @@ class ScriptedPress(ScriptedPolicy):
         ConfigError: If the environment is another one, or its actions are not tool steps.
     """
 
-    ARM_STIFFNESS = 3.0e3
-    """Vertical stiffness of arm and drives at the tool [N/m]."""
     LEAST_STIFFNESS = 300.0
     """Stiffness taken for a pad that is hardly touched [N/m]."""
     SLOW_HEIGHT = 0.004
@@ -58,4 +56,4 @@ class ScriptedPress(ScriptedPolicy):
         if force < 0.05:
             return max(0.2 * (-indentation - self.SLOW_HEIGHT), 0.0) + self.TOUCH_STEP
         pad = max(force / max(indentation, 1.0e-4), self.LEAST_STIFFNESS)
-        return self._gain * missing * (1.0 / self.ARM_STIFFNESS + 1.0 / pad)
+        return self._gain * missing * (1.0 / self.task.arm_stiffness + 1.0 / pad)

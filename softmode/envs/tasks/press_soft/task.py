@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 
 from softmode.checks import require_fields, require_range
@@ -25,7 +24,7 @@ from softmode.errors import ConfigError
 from softmode.objects.config import ObjectConfig
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
-from softmode.robots.table_robot import TableRobot
+from softmode.robots.table_robot import TableRobot, tip_length
 from softmode.scenes.table_scene import TableSceneConfig
 from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.splats import Splats
@@ -36,6 +35,8 @@ START_HEIGHT = 0.02
 """Height of the finger tips over the pad at the start of an episode [m]."""
 COMPLIANCE = 6.0
 """Factor by which the arm's drives are more compliant than usual; their damping ratio stays."""
+TOOL_STIFFNESS = 3.0e3
+"""What its vertical stiffness at the tool then is [N/m]."""
 CLEARANCE = 0.005
 """What has to remain of it over a pad that is scaled up [m]."""
 MOST_FORCE = 100.0
@@ -82,6 +83,8 @@ def press_scene() -> TableSceneConfig:
 class PressSoftConfig(TaskConfig):
     """Goal and success of PressSoft."""
 
+    heights_of_tips = True
+    tool_stiffness = TOOL_STIFFNESS
     scene: TableSceneConfig = field(default_factory=press_scene)
     """Objects, robot and physics."""
     position_range: tuple[float, float] = (0.02, 0.02)
@@ -122,27 +125,35 @@ class PressSoft(Task):
     config_class = PressSoftConfig
     kernels = kernels
     takes_sets = True
+    any_robot = True
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
 
     def build(self) -> None:
         """Upload how high the pads are."""
-        self.top = wp.array(self.tops, dtype=float, device=self.device)
+        self.top = self.per_object(self._tops)
         """Height of every unscaled pad [m], shape (world_count,), on the device."""
+
+    @property
+    def _tops(self) -> NDArray[np.float64]:
+        """Height of every unscaled pad that a world may have [m], shape (members,)."""
+        return np.array([float(np.ptp(thing.body.surface_points[:, 2])) for thing in self.scene.members])
 
     @property
     def tops(self) -> NDArray[np.float64]:
         """Height of every unscaled pad [m], shape (world_count,)."""
-        heights = [float(np.ptp(thing.body.surface_points[:, 2])) for thing in self.scene.members]
-        return np.array(heights)[self.scene.member]
+        return self._tops[self.scene.member]
 
     @property
     def tip_length(self) -> float:
         """Distance from the tool point down to the finger tips [m]."""
+        return tip_length(self.config.scene.arm)
+
+    @property
+    def arm_stiffness(self) -> float:
+        """Vertical stiffness of arm and drives at the tool [N/m]."""
         arm = self.config.scene.arm
-        if isinstance(arm, TableRobot):
-            return arm.jaw.tip
-        return arm.hand_length + arm.gripper.finger_length - arm.tool_length
+        return arm.tool_stiffness if isinstance(arm, TableRobot) else TOOL_STIFFNESS
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the goal force [N]; a pad must not reach up to the fingers.
@@ -152,7 +163,7 @@ class PressSoft(Task):
         """
         config = self.config
         room = config.scene.arm.home_position[2] - self.tip_length - CLEARANCE
-        top = float(self.tops.max())
+        top = float(self._tops.max())
         most = min(2.0, room / top)
         largest = 1.0 if config.scale_range is None else config.scale_range[1]
         if largest > most:

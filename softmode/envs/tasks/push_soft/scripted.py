@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from softmode.envs.scripted_base import Environment, ScriptedPolicy, Vector, half_turn
 from softmode.envs.tasks.push_soft.task import PushSoft
+from softmode.robots.table_robot import tip_length
 
 
 class ScriptedPush(ScriptedPolicy):
@@ -82,7 +83,7 @@ class ScriptedPush(ScriptedPolicy):
 
     def _way_behind(self, tool: Vector, goal: Vector, is_behind: bool, size: float) -> Vector:
         """Return the move to the place behind the object: straight if it is free, else up, across and down."""
-        above = 2.0 * self.soft.height * size + 0.5 * self.arm.gripper.pad_size[2] + 0.012
+        above = 2.0 * self.soft.height * size + tip_length(self.arm) + 0.012
         move = goal - tool
         low = tool[2] < above - 0.005
         if (is_behind and low) or np.linalg.norm(move[:2]) < 0.006:

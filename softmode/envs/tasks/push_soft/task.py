@@ -28,6 +28,7 @@ from softmode.objects.loader import load
 from softmode.objects.soft_object import SoftObject
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
+from softmode.robots.table_robot import TableRobot
 from softmode.scenes.table_scene import TableSceneConfig
 from softmode.splats.splats import Splats
 
@@ -60,6 +61,7 @@ def push_scene() -> TableSceneConfig:
 class PushSoftConfig(TaskConfig):
     """Goal and success of PushSoft."""
 
+    heights_of_tips = True
     scene: TableSceneConfig = field(default_factory=push_scene)
     """Objects, robot and physics."""
     position_range: tuple[float, float] = (0.03, 0.06)
@@ -107,24 +109,30 @@ class PushSoft(Task):
     config_class = PushSoftConfig
     kernels = kernels
     takes_sets = True
+    any_robot = True
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
 
     def build(self) -> None:
         """Allocate what the reward remembers."""
         self.before = wp.zeros(self.world_count, dtype=float, device=self.device)
-        surfaces, member = [thing.body.surface_points for thing in self.scene.members], self.scene.member
-        rest = [surfaces[m][points] for m, points in zip(member, self.points_of_worlds, strict=True)]
-        self.rest = wp.array(np.stack(rest), dtype=wp.vec3, device=self.device)
+        surfaces = [thing.body.surface_points for thing in self.scene.members]
+        rest = [surface[points] for surface, points in zip(surfaces, self._points, strict=True)]
+        self.rest = self.per_object(np.stack(rest), wp.vec3)
         self.yaw_tolerance = -1.0 if self.config.yaw_tolerance is None else self.config.yaw_tolerance
-        pad = self.config.scene.arm.gripper.pad_size
-        radii = [float(np.linalg.norm(points[:, :2], axis=1).max() + 0.5 * pad[0]) for points in surfaces]
-        self.push_distance: NDArray[np.float64] = np.array(radii)[member]
+        arm = self.config.scene.arm
+        width = arm.jaw.finger_width if isinstance(arm, TableRobot) else arm.gripper.pad_size[0]
+        radii = [float(np.linalg.norm(points[:, :2], axis=1).max() + 0.5 * width) for points in surfaces]
+        self._push_distances = np.array(radii)
+        self.push_distances = self.per_object(self._push_distances)
         """From the centre of each unscaled object to the tool that pushes it [m], shape (world_count,)."""
-        self.push_distances = wp.array(self.push_distance, dtype=float, device=self.device)
-        """The same on the device."""
         self.push_height = self.config.scene.control.workspace_lower[2] + 0.006
         """Height of the tool that pushes [m]."""
+
+    @property
+    def push_distance(self) -> NDArray[np.float64]:
+        """The same on the host."""
+        return self._push_distances[self.scene.member]
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the goal: distance [m] and direction [rad] from the object, and the angle to turn [rad]."""
@@ -167,12 +175,13 @@ class PushSoft(Task):
         scene = self.scene_config()
         if scene.objects is None:
             return _outline(load(scene.object, material=scene.material))
-        chosen = scene.objects.chosen(self.world_count)
+        given = scene.objects
+        chosen = np.arange(given.count) if given.resample else given.chosen(self.world_count)
         drawn = {
             k: _outline(load(scene.objects.config(k), material=scene.objects.material(k, scene.material)))
             for k in np.unique(chosen).tolist()
         }
-        return drawn[chosen[0]] if len(drawn) == 1 else [drawn[k] for k in chosen.tolist()]
+        return drawn[chosen[0]] if len(drawn) == 1 and not given.resample else [drawn[k] for k in chosen.tolist()]
 
 
 def _outline(thing: SoftObject) -> Splats:

@@ -1,0 +1,125 @@
+"""Another body in the place of an instance, per world and inside a captured graph, as at a reset."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import body_key
+from softmode.deformables.model.struct_kernels import Motion, PointConstraints, Points, Samples
+from softmode.deformables.model.tables import allocate, starts_of
+from softmode.deformables.solver import body_choice_kernels as kernels
+from softmode.deformables.solver.iteration_kernels import NewtonArrays
+from softmode.deformables.solver.reduced_solver import ReducedSolver, require_reduced
+from softmode.errors import ConfigError
+
+_KEPT = ("rate", "volume_ratio", "constraint", "shape", "direction")
+"""Arrays of a step that do not begin with zeros, or that every step writes whole."""
+
+
+class BodyChoice:
+    """Bodies of which the only soft body of each world may be any; all are resident, instances point to theirs.
+
+    An instance must have room for the largest, see
+    :func:`softmode.deformables.model.authoring.reserve_room`: the memory of a world is that of the largest body, and
+    the bases of all bodies are stored once.
+
+    Args:
+        solver: A solver of soft bodies, with one of them per world.
+        bodies: The bodies, all of them among those of the solver.
+        materials: What each is made of; only what :func:`set_parameters` does not set is taken from it.
+
+    Raises:
+        ConfigError: If a world has not one soft body, a body is not among the solver's, or has exact regions or pins.
+    """
+
+    def __init__(self, solver: ReducedSolver, bodies: Sequence[ReducedBody], materials: Sequence[Material]) -> None:
+        """Upload a row per body."""
+        self._solver = require_reduced(solver)
+        tables = self._solver.tables
+        layout, options, device = tables.layout, tables.options, tables.model.device
+        if not np.array_equal(layout.instance_world, np.arange(layout.world_count)) or layout.pin_max:
+            raise ConfigError(
+                "a body can be chosen in worlds of one soft body without pins only",
+                hint="leave other soft bodies and pins out",
+            )
+        known = {body_key(body): a for a, body in enumerate(layout.bodies)}
+        missing = [body.name for body in bodies if body_key(body) not in known]
+        if missing or any(body.driven_count for body in bodies):
+            what = f"{missing[0]!r} is not among the solver's" if missing else "one has exact regions"
+            raise ConfigError(f"bodies to choose from: {what}", hint="give the solver all bodies")
+        asset = np.array([known[body_key(body)] for body in bodies])
+        points, samples = (
+            np.array([getattr(body, name) for body in layout.bodies]) for name in ("point_count", "surface_count")
+        )
+        size = np.array([float(np.linalg.norm(np.ptp(body.bounds, axis=0))) for body in bodies])
+        rows: dict[str, Any] = {
+            "asset": asset,
+            "key": np.array([body_key(body) for body in bodies]),
+            "function_count": [body.function_count for body in bodies],
+            "point_start": starts_of(points)[asset],
+            "point_count": points[asset],
+            "row_start": starts_of(samples)[asset],
+            "sample_count": samples[asset],
+            "volume": [body.volume for body in bodies],
+            "area": [body.surface_areas.sum() for body in bodies],
+            "size": size,
+            "tolerance": options.tolerance * size,
+            "margin": options.contact_margin * size,
+            "smoothing": options.contact_smoothing * size,
+            "spacing": [np.sqrt(body.surface_areas.mean()) for body in bodies],
+            "material_model": [int(one.model) for one in materials],
+            "viscosity": [one.viscosity for one in materials],
+            "mass_damping": [one.mass_damping for one in materials],
+        }
+        self._rows = allocate(kernels.BodyRows, "", {}, device, given=rows)
+        self._history = [*_histories(tables)]
+
+    def set(self, choice: wp.array, world_mask: wp.array) -> None:
+        """Put the chosen body into the masked worlds; reads nothing back and may be captured.
+
+        Parameters, places and the state come after it: call ``set_parameters`` and ``solver.reset`` for the same
+        worlds.
+
+        Args:
+            choice: Which body, int32, shape (world_count,).
+            world_mask: Which worlds, shape (world_count,) bool.
+        """
+        tables = self._solver.tables
+        worlds = tables.layout.world_count
+        out = (tables.scaled.rest, tables.instances, tables.parameters.body_key)
+        tables.launch(kernels.choose_bodies, worlds, self._rows, choice, world_mask, *out)
+        for words in self._history:
+            tables.launch(kernels.clear_rows, words.shape, world_mask, words)
+
+
+def words_of(array: wp.array, rows: int) -> wp.array:
+    """Return an array that has so many rows one after another as words of 32 bits, shape (rows, words); no copy."""
+    words = array.size * wp.types.type_size_in_bytes(array.dtype) // 4
+    return wp.array(ptr=array.ptr, dtype=wp.uint32, shape=(rows, words // rows), device=array.device, copy=False)
+
+
+def _histories(tables: Any) -> list[wp.array]:
+    """Return all that a step may leave behind in the row of an instance beyond the functions of a smaller body."""
+    count = tables.layout.instance_count
+    found = []
+    owned: list[tuple[Any, Any]] = [
+        (Motion, tables.motion),
+        (Points, tables.points),
+        (NewtonArrays, tables.arrays),
+        (Samples, tables.samples),
+        (PointConstraints, tables.constraints),
+    ]
+    for struct, table in owned:
+        for name in struct.vars:
+            value = getattr(table, name)
+            if not isinstance(value, wp.array) or name in _KEPT or not value.size or value.shape[0] != count:
+                continue
+            if value.is_contiguous:
+                found.append(words_of(value, count))
+    return found

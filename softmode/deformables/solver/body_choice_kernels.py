@@ -1,0 +1,106 @@
+"""Device side of bodies that take each other's place: where an instance finds its data, and rows without a history."""
+
+import warp as wp
+
+from softmode.deformables.model.declare import struct
+from softmode.deformables.model.parameter_kernels import RestQuantities
+from softmode.deformables.model.struct_kernels import Instances
+
+wp.set_module_options({"enable_backward": False})
+
+
+@struct
+class BodyRows:
+    """What an instance has of its body, at scale 1, and of its material, a row per choice."""
+
+    asset: wp.array[int]
+    key: wp.array[wp.int64]
+    function_count: wp.array[int]
+    point_start: wp.array[int]
+    point_count: wp.array[int]
+    row_start: wp.array[int]
+    sample_count: wp.array[int]
+    volume: wp.array[wp.float64]  # [m^3]
+    area: wp.array[float]  # [m^2]
+    size: wp.array[float]  # [m], as all that follow
+    tolerance: wp.array[float]
+    margin: wp.array[float]
+    smoothing: wp.array[float]
+    spacing: wp.array[float]
+    material_model: wp.array[int]
+    viscosity: wp.array[float]  # [s]
+    mass_damping: wp.array[float]  # [1/s]
+
+
+@wp.kernel
+def choose_bodies(
+    rows: BodyRows,
+    choice: wp.array[int],  # (instance_count,)
+    world_mask: wp.array[wp.bool],
+    # Out:
+    rest: RestQuantities,
+    instances: Instances,
+    key_out: wp.array[wp.int64],
+):
+    """Point the instances of masked worlds, one per world, to the body that is chosen."""
+    i = wp.tid()
+    if not world_mask[i]:
+        return
+    b = choice[i]
+    instances.asset[i] = rows.asset[b]
+    instances.function_count[i] = rows.function_count[b]
+    instances.point_start[i] = rows.point_start[b]
+    instances.point_count[i] = rows.point_count[b]
+    instances.row_start[i] = rows.row_start[b]
+    instances.sample_count[i] = rows.sample_count[b]
+    instances.material_model[i] = rows.material_model[b]
+    instances.viscosity[i] = rows.viscosity[b]
+    instances.mass_damping[i] = rows.mass_damping[b]
+    rest.volume[i] = rows.volume[b]
+    rest.area[i] = rows.area[b]
+    rest.size[i] = rows.size[b]
+    rest.tolerance[i] = rows.tolerance[b]
+    rest.margin[i] = rows.margin[b]
+    rest.smoothing[i] = rows.smoothing[b]
+    rest.spacing[i] = rows.spacing[b]
+    key_out[i] = rows.key[b]
+    for s in range(rows.sample_count[b]):
+        rest.radius[instances.particle_start[i] + s] = 0.5 * rows.spacing[b]
+
+
+@wp.kernel
+def copy_rows(
+    table: wp.array2d[wp.uint32],  # (choices, words)
+    choice: wp.array[int],  # (world_count,)
+    world_mask: wp.array[wp.bool],
+    # Out:
+    out: wp.array2d[wp.uint32],  # (world_count, words)
+):
+    """Copy the row of its choice to every masked world."""
+    w, k = wp.tid()
+    if world_mask[w]:
+        out[w, k] = table[choice[w], k]
+
+
+@wp.kernel
+def clear_rows(
+    world_mask: wp.array[wp.bool],
+    # Out:
+    out: wp.array2d[wp.uint32],  # (world_count, words)
+):
+    """Set the rows of masked worlds to zero."""
+    w, k = wp.tid()
+    if world_mask[w]:
+        out[w, k] = wp.uint32(0)
+
+
+@wp.kernel
+def rows_that_chose(
+    choice: wp.array[int],  # (world_count,)
+    wanted: int,
+    # Out:
+    row_out: wp.array[int],  # (world_count,)
+):
+    """Write the worlds that chose something, -1 for the others."""
+    w = wp.tid()
+    row_out[w] = wp.where(choice[w] == wanted, w, -1)
