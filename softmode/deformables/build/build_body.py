@@ -222,6 +222,7 @@ def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: Build
         RuntimeWarning: If these forces still err by more than was asked for.
     """
     trials = options.cubature_trials(len(volumes))
+    chosen = None
     for count, poses in trials:
         chosen = select_cubature(
             volumes,
@@ -234,6 +235,7 @@ def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: Build
         )
         if options.cubature_error is None or chosen.force_error <= options.cubature_error:
             return chosen
+    assert chosen is not None  # There is a first trial.
     if len(trials) > 1:
         warnings.warn(
             f"cubature_error: {len(chosen.index)} points leave {chosen.force_error:.2g}, "
