@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
 from softmode.deformables.build import cubature
 from softmode.deformables.build.build_body import build_body
@@ -175,3 +176,25 @@ def test_points_end_where_the_fit_ends_in_rounding() -> None:
     assert len(found.index) < 600 and found.force_error < 3e-4
     np.testing.assert_array_equal(found.index, again.index)
     np.testing.assert_array_equal(found.weights, again.weights)
+
+
+def test_poses_and_points_are_added_where_forces_want_them() -> None:
+    """From 384 points on, more poses, then more points, until forces are right; a smaller number stays."""
+    quadrature = quadrature_from_box((0.1, 0.06, 0.03), point_count=1500)
+
+    def build(count: int, error: float | None) -> ReducedBody:
+        options = BuildOptions(kernel_count=150, cubature_count=count, cubature_error=error)
+        return build_body(quadrature, options, progress=False)
+
+    asked = build(384, None)
+    left = float(str(asked.provenance["cubature_force_error"]))
+    more = build(384, 0.9 * left)
+    assert asked.point_count == 384 and more.point_count in (384, 576, 768)
+    assert float(str(more.provenance["cubature_force_error"])) <= 0.9 * left
+    assert not (more.point_count == 384 and np.array_equal(more.points, asked.points))
+    assert abs(more.weights.sum() / more.volume - 1.0) < 1e-12
+    assert build(96, left).point_count == 96
+    with pytest.raises(ConfigError, match="cubature_error"):
+        BuildOptions(cubature_error=0.0)
+    with pytest.warns(RuntimeWarning, match="cubature_error: 768 points leave"):
+        build(384, 1e-6)

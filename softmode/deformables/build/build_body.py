@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
@@ -16,9 +17,9 @@ from softmode.deformables.body.reduced_body import FORMAT_VERSION, ReducedBody, 
 from softmode.deformables.body.regions import Region
 from softmode.deformables.body.rkpm import BasisRKPM
 from softmode.deformables.body.visibility import Visibility
-from softmode.deformables.build.basis import Domain, make_body_basis
+from softmode.deformables.build.basis import BodyBasis, Domain, make_body_basis
 from softmode.deformables.build.cache import cache_directory, cached_body, fingerprint_of
-from softmode.deformables.build.cubature import select_cubature
+from softmode.deformables.build.cubature import Cubature, select_cubature
 from softmode.deformables.build.options import BuildOptions, HandleName
 from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.region_samples import octants_near, refine_at_faces, sample_regions
@@ -144,15 +145,7 @@ def _build(
             options,
             stage,
         )
-        count = len(points) if options.cubature_count is None else options.cubature_count
-        chosen = select_cubature(
-            volumes,
-            basis.gradient,
-            count,
-            stiffness_scale=stiffness,
-            driven_count=basis.functions.driven_count,
-            seed=options.seed,
-        )
+        chosen = _cubature(volumes, basis, stiffness, options)
         stage("cubature")
         function_count = basis.gradient.shape[1]
         cores = [region.cores for region in regions]
@@ -220,6 +213,37 @@ def _build(
         provenance=provenance,
         build_seconds=time.perf_counter() - start,
     )
+
+
+def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: BuildOptions) -> Cubature:
+    """Choose cubature points: fitted to more poses, or more than asked for, where forces of held-out poses want that.
+
+    Warns:
+        RuntimeWarning: If these forces still err by more than was asked for.
+    """
+    trials = options.cubature_trials(len(volumes))
+    chosen = None
+    for count, poses in trials:
+        chosen = select_cubature(
+            volumes,
+            basis.gradient,
+            count,
+            stiffness_scale=stiffness,
+            driven_count=basis.functions.driven_count,
+            pose_count=poses,
+            seed=options.seed,
+        )
+        if options.cubature_error is None or chosen.force_error <= options.cubature_error:
+            return chosen
+    assert chosen is not None  # There is a first trial.
+    if len(trials) > 1:
+        warnings.warn(
+            f"cubature_error: {len(chosen.index)} points leave {chosen.force_error:.2g}, "
+            f"{options.cubature_error:g} was asked for; give a larger cubature_count",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+    return chosen
 
 
 def _divided(visibility: Visibility | None) -> dict[str, NDArray]:

@@ -91,6 +91,8 @@ class ElasticChoice:
     """Dimension of the space."""
     complete_count: int
     """Functions with all that contribute as much as the last of them, those of exact regions included."""
+    space_eigenvalues: dict[float, Array]
+    """First eigenvalues of the whole space per E / rho [1/m^2], by Poisson's ratio."""
 
     def report(self) -> dict[str, float]:
         """Return what a body's provenance keeps."""
@@ -99,6 +101,11 @@ class ElasticChoice:
             **({} if self.space_error is None else {"space_error": self.space_error}),
             "space_functions": float(self.space_count),
             "complete_functions": float(self.complete_count),
+            **{
+                f"space_eigenvalue_{ratio:g}_{k}": float(value)
+                for ratio, values in self.space_eigenvalues.items()
+                for k, value in enumerate(values, 1)
+            },
         }
 
 
@@ -181,6 +188,7 @@ def choose_functions(
         space_error=None if smaller is None else space.frequency_error(smaller, modes),
         space_count=space.count + driven,
         complete_count=_complete(shares, chosen) + driven,
+        space_eigenvalues=modes,
     )
 
 

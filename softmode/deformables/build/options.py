@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from softmode.checks import require_choice, require_number
 from softmode.deformables.body.rkpm import KernelName
+from softmode.deformables.build.cubature import MANY_POSES, POSE_COUNT
 from softmode.deformables.build.functions import RANK_TOLERANCE
 from softmode.errors import ConfigError
 
@@ -38,6 +39,8 @@ FUNCTION_LEAST = 10
 """The fewest functions: with all quadratic fields the first bending is free."""
 FUNCTION_LIMIT = 120
 """The most functions that `BuildOptions.accuracy` may lead to."""
+CUBATURE_COUNT = 384
+"""Cubature points where no number is given. Fewer are a choice of speed over forces, and stay as they are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,10 +92,14 @@ class BuildOptions:
     rank_tolerance: float = RANK_TOLERANCE
     """Of FreeForm's functions those that add less than this fraction of mass (of the scaled Gram matrix) to the others
     are dropped, 0 < tolerance <= 1e-2; on a body with regions, or with local handles, it is at most 1e-7."""
-    cubature_count: int | None = 384
+    cubature_count: int | None = CUBATURE_COUNT
     """Points at which a step evaluates stress, or fewer where these fit the forces to rounding; None keeps all. Beyond
     100 functions allow six points for each: 384 make a held plate 40:1 of 132 functions 6 % too soft, 768 3 %.
     `provenance` has the body's own errors, of the forces also at smaller counts."""
+    cubature_error: float | None = 0.03
+    """Relative error of the forces on held-out poses. Where `cubature_count` is 384 or more and leaves a larger one,
+    points are fitted to three times as many poses, and if that is not enough, half as many points are added, or as many
+    again. None leaves it at the first fit."""
     seed: int = 0
     """Seed of every random choice of the build."""
 
@@ -135,6 +142,8 @@ class BuildOptions:
             raise ConfigError(f"kernel_count: expected more than mode_count + 4, got {self.kernel_count}")
         if self.cubature_count is not None:
             require_number("cubature_count", self.cubature_count, at_least=8)
+        if self.cubature_error is not None:
+            require_number("cubature_error", self.cubature_error, above=0.0, below=1.0)
         require_number("rank_tolerance", self.rank_tolerance, above=0.0, at_most=1.0e-2)
         require_number("response_derivatives", self.response_derivatives, at_least=0, at_most=18)
         if self.poissons_ratio == ():
@@ -173,6 +182,16 @@ class BuildOptions:
         most = KERNEL_COUNT if self.chosen or self.local else EIGENMODE_KERNEL_COUNT
         few = max(point_count // (8 if held else 5), KERNEL_LEAST)
         return most if point_count >= MANY_POINTS and not held else min(most, few)
+
+    def cubature_trials(self, point_count: int) -> tuple[tuple[int, int], ...]:
+        """Return numbers of cubature points and training poses to try in turn, of so many quadrature points."""
+        if self.cubature_count is None or self.cubature_count >= point_count:
+            return ((point_count, POSE_COUNT),)
+        first = self.cubature_count
+        if self.cubature_error is None or first < CUBATURE_COUNT:
+            return ((first, POSE_COUNT),)
+        counts = first, min(first * 3 // 2, point_count), min(first * 2, point_count)
+        return (first, POSE_COUNT), *((count, MANY_POSES) for count in counts)
 
     @property
     def local(self) -> int:
