@@ -91,17 +91,13 @@ class BodyBasis:
     """What the choice of the functions says of itself."""
 
 
-def make_body_basis(
-    domain: Domain, options: BuildOptions, stage: Callable[[str], None], *, space: int | None = None
-) -> BodyBasis:
+def make_body_basis(domain: Domain, options: BuildOptions, stage: Callable[[str], None]) -> BodyBasis:
     """Build kernels, weights and functions.
 
     Args:
         domain: The object.
         options: Sizes and seed.
         stage: Called with the name of each stage when it is done.
-        space: Eigenmodes whose quadratic handles are the space that functions are chosen from; None tries 48, and 96
-            where these are not enough.
 
     Raises:
         BasisError: If the basis cannot be built.
@@ -115,8 +111,7 @@ def make_body_basis(
         return _basis(ground, domain, options, _local_modes(ground, domain, options), stage)
     if not options.chosen:
         return _basis(ground, domain, options, _modes(ground, domain, options.mode_count or EIGENMODE_COUNT), stage)
-    tried = SPACE_MODE_COUNTS if space is None else (space, space)
-    small, large = (min(count, ground.shape.centre_count - 1) for count in tried)
+    small, large = (min(count, ground.shape.centre_count - 1) for count in SPACE_MODE_COUNTS)
     basis = _basis(ground, domain, options, _modes(ground, domain, small), stage)
     if basis.report["space_error"] > SPACE_ERROR and large > small:
         basis = _basis(ground, domain, options, _modes(ground, domain, large), stage)

@@ -97,7 +97,6 @@ def build_part(
     stiffness_scale: Array | None,
     density_scale: Array | None,
     progress: bool | Progress | None,
-    space: int | None,
 ) -> ReducedBody:
     """Reduce what a cut leaves, while someone waits: as `build_body`, with cubature points that come several at once.
 
@@ -109,13 +108,10 @@ def build_part(
         stiffness_scale: Relative Young's modulus, shape (P,), or None.
         density_scale: Relative density, likewise.
         progress: As for `build_body`.
-        space: Eigenmodes of the space that functions are chosen from; None tries 48, and 96 where these are not enough.
     """
     given = tuple(regions)
     with threadpool_limits(limits=1, user_api="blas"):
-        return _build(
-            quadrature, options, name, given, stiffness_scale, density_scale, progress, quick=True, space=space
-        )
+        return _build(quadrature, options, name, given, stiffness_scale, density_scale, progress, quick=True)
 
 
 def _build(
@@ -128,7 +124,6 @@ def _build(
     progress: bool | Progress | None,
     *,
     quick: bool = False,
-    space: int | None = None,
 ) -> ReducedBody:
     """Do what :func:`build_body` and :func:`build_part` say."""
     start = time.perf_counter()
@@ -176,7 +171,6 @@ def _build(
             ),
             options,
             stage,
-            space=space,
         )
         count = len(points) if options.cubature_count is None else options.cubature_count
         chosen = select_cubature(

@@ -6,9 +6,9 @@ forces over a set of training poses (An, Kim and James 2008), the same volume, a
 
 Why not `scipy.optimize.nnls` on the whole problem: it stops at its own number of points (as many as there are rows),
 and every step solves a full least-squares problem. The active-set method here (Lawson and Hanson 1974) adds the most
-useful point at a time, or the eight most useful ones where many are asked for, to a growing normal system, stops at the count asked for, and sees the forces
-through a few seeded random projections per pose. The forces of the lowest elastic modes are fitted each in its own
-energy: the bending of a thin body, soft beside its stretching, would otherwise come out a quarter too stiff.
+useful point at a time, or eight where many are asked for, to a growing normal system, stops at the count asked for, and
+sees the forces through a few seeded random projections per pose. The forces of the lowest elastic modes are fitted each
+in its own energy: the bending of a thin body, soft beside its stretching, would otherwise come out a quarter too stiff.
 """
 
 from __future__ import annotations

@@ -10,18 +10,20 @@ belongs to; one whose octant the patch crosses is in two parts, by volume. So th
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
+from threadpoolctl import threadpool_limits
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
 from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.build.build_body import build_part
-from softmode.deformables.build.elastic_functions import SPACE_MODE_COUNTS
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.patch import Patch
 from softmode.deformables.build.quadrature_grid import Cells, Quadrature
@@ -167,7 +169,13 @@ class _Cutter:
         mean = float(given.quadrature.weights @ every) / given.quadrature.volume
         pieces = [self._part(part) for part in range(self.part_count)]
         regions = [self._regions(quadrature) for quadrature, _, _ in pieces]
-        made = [self._built(part, *pieces[part][:2], regions[part], progress) for part in range(self.part_count)]
+        # One thread of BLAS each: their number decides the last bits.
+        with threadpool_limits(1, "blas"), ThreadPoolExecutor(min(self.part_count, os.cpu_count() or 1)) as threads:
+            waiting = [
+                threads.submit(self._built, part, *pieces[part][:2], regions[part], progress)
+                for part in range(self.part_count)
+            ]
+            made = [one.result() for one in waiting]
         bodies = [dataclasses.replace(one, provenance={**body.provenance, **one.provenance}) for one in made]
         densities = tuple(
             float(quadrature.weights @ every[points]) / quadrature.volume / mean for quadrature, points, _ in pieces
@@ -185,7 +193,7 @@ class _Cutter:
         progress: bool | Callable[[str, float], None] | None,
     ) -> ReducedBody:
         """Build a part."""
-        given, whole, modes = self.given, self.part_count == 1, len(self.body.eigenvalues) - 1
+        given, whole = self.given, self.part_count == 1
         stiffness, density = given.stiffness_scale, given.density_scale
         return build_part(
             quadrature,
@@ -195,8 +203,6 @@ class _Cutter:
             stiffness_scale=None if stiffness is None else stiffness[points],
             density_scale=None if density is None else density[points],
             progress=progress,
-            # A slit makes a body no simpler: where 48 eigenmodes were not enough, they are not tried again.
-            space=modes if whole and modes > min(SPACE_MODE_COUNTS) else None,
         )
 
     def _options(self, points: Indices) -> BuildOptions:
