@@ -164,8 +164,10 @@ class BasisRKPM:
             row, column, count = self._pairs(x[i : i + step])
             offset = x[i : i + step][row] - self.centres[column]
             poly = np.column_stack([np.ones(len(row)), offset / float(self.support.mean())])
-            entry = (poly[:, :, None] * poly[:, None]).reshape(-1, 16) * self._bell(offset, column)[0][:, None]
-            moment = np.stack([np.bincount(row, e, minlength=len(count)) for e in entry.T], axis=1).reshape(-1, 4, 4)
+            bell, moment = self._bell(offset, column)[0], np.empty((len(count), 4, 4))
+            for a, b in zip(*np.triu_indices(4), strict=True):
+                entry = np.bincount(row, poly[:, a] * poly[:, b] * bell, minlength=len(count))
+                moment[:, a, b] = moment[:, b, a] = entry
             good = np.flatnonzero((count >= 4) & (moment[:, 0, 0] > 1e-14))
             scaled = moment[good] / moment[good, :1, :1]
             value = np.linalg.cond(scaled, 1)

@@ -89,6 +89,32 @@ def build_body(
         )
 
 
+def build_part(
+    quadrature: Quadrature,
+    options: BuildOptions,
+    *,
+    name: str,
+    regions: Sequence[Region],
+    stiffness_scale: Array | None,
+    density_scale: Array | None,
+    progress: bool | Progress | None,
+) -> ReducedBody:
+    """Reduce what a cut leaves, while someone waits: as `build_body`, with cubature points that come several at once.
+
+    Args:
+        quadrature: The part.
+        options: Those of the body that was cut.
+        name: Name for messages and reports.
+        regions: Regions that the part holds enough of.
+        stiffness_scale: Relative Young's modulus, shape (P,), or None.
+        density_scale: Relative density, likewise.
+        progress: As for `build_body`.
+    """
+    given = tuple(regions)
+    with threadpool_limits(limits=1, user_api="blas"):
+        return _build(quadrature, options, name, given, stiffness_scale, density_scale, progress, quick=True)
+
+
 def _build(
     quadrature: Quadrature,
     options: BuildOptions,
@@ -97,8 +123,10 @@ def _build(
     stiffness_scale: Field | None,
     density_scale: Field | None,
     progress: bool | Progress | None,
+    *,
+    quick: bool = False,
 ) -> ReducedBody:
-    """Do what :func:`build_body` says."""
+    """Do what :func:`build_body` and :func:`build_part` say."""
     start = time.perf_counter()
     stiffness = positive_field("stiffness_scale", stiffness_scale, quadrature.points)
     density = positive_field("density_scale", density_scale, quadrature.points)
@@ -145,7 +173,7 @@ def _build(
             options,
             stage,
         )
-        chosen = _cubature(volumes, basis, stiffness, options)
+        chosen = _cubature(volumes, basis, stiffness, options, quick=quick)
         stage("cubature")
         function_count = basis.gradient.shape[1]
         cores = [region.cores for region in regions]
@@ -215,13 +243,15 @@ def _build(
     )
 
 
-def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: BuildOptions) -> Cubature:
+def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: BuildOptions, *, quick: bool) -> Cubature:
     """Choose cubature points: fitted to more poses, or more than asked for, where forces of held-out poses want that.
+
+    A quick choice is the first one.
 
     Warns:
         RuntimeWarning: If these forces still err by more than was asked for.
     """
-    trials = options.cubature_trials(len(volumes))
+    trials = options.cubature_trials(len(volumes))[: 1 if quick else None]
     chosen = None
     for count, poses in trials:
         chosen = select_cubature(
@@ -232,6 +262,7 @@ def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: Build
             driven_count=basis.functions.driven_count,
             pose_count=poses,
             seed=options.seed,
+            quick=quick,
         )
         if options.cubature_error is None or chosen.force_error <= options.cubature_error:
             return chosen

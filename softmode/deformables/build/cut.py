@@ -10,17 +10,20 @@ belongs to; one whose octant the patch crosses is in two parts, by volume. So th
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
+from threadpoolctl import threadpool_limits
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
 from softmode.deformables.body.rkpm import sample_farthest
-from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.build_body import build_part
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.patch import Patch
 from softmode.deformables.build.quadrature_grid import Cells, Quadrature
@@ -164,25 +167,43 @@ class _Cutter:
         self._refuse_exact_regions()
         every = np.ones(len(given.quadrature.points)) if given.density_scale is None else given.density_scale
         mean = float(given.quadrature.weights @ every) / given.quadrature.volume
-        bodies, densities, faces, kept = [], [], [], set()
-        for part in range(self.part_count):
-            quadrature, points, (X, normals) = self._part(part)
-            regions = self._regions(quadrature)
-            kept |= {region.name for region in regions}
-            stiffness, density = given.stiffness_scale, given.density_scale
-            made = build_body(
-                quadrature,
-                self._options(points),
-                name=body.name if self.part_count == 1 else f"{body.name} {part + 1}",
-                regions=regions,
-                stiffness_scale=None if stiffness is None else stiffness[points],
-                density_scale=None if density is None else density[points],
-                progress=progress,
-            )
-            bodies.append(dataclasses.replace(made, provenance={**body.provenance, **made.provenance}))
-            densities.append(float(quadrature.weights @ every[points]) / quadrature.volume / mean)
-            faces.append((X - made.offset, normals))
-        return self._cut(tuple(bodies), tuple(densities), tuple(faces), self._notes(bodies, kept))
+        pieces = [self._part(part) for part in range(self.part_count)]
+        regions = [self._regions(quadrature) for quadrature, _, _ in pieces]
+        # One thread of BLAS each: their number decides the last bits.
+        with threadpool_limits(1, "blas"), ThreadPoolExecutor(min(self.part_count, os.cpu_count() or 1)) as threads:
+            waiting = [
+                threads.submit(self._built, part, *pieces[part][:2], regions[part], progress)
+                for part in range(self.part_count)
+            ]
+            made = [one.result() for one in waiting]
+        bodies = [dataclasses.replace(one, provenance={**body.provenance, **one.provenance}) for one in made]
+        densities = tuple(
+            float(quadrature.weights @ every[points]) / quadrature.volume / mean for quadrature, points, _ in pieces
+        )
+        faces = tuple((X - one.offset, normals) for one, (_, _, (X, normals)) in zip(bodies, pieces, strict=True))
+        kept = {region.name for some in regions for region in some}
+        return self._cut(tuple(bodies), densities, faces, self._notes(bodies, kept))
+
+    def _built(
+        self,
+        part: int,
+        quadrature: Quadrature,
+        points: Indices,
+        regions: list[Region],
+        progress: bool | Callable[[str, float], None] | None,
+    ) -> ReducedBody:
+        """Build a part."""
+        given, whole = self.given, self.part_count == 1
+        stiffness, density = given.stiffness_scale, given.density_scale
+        return build_part(
+            quadrature,
+            self._options(points),
+            name=self.body.name if whole else f"{self.body.name} {part + 1}",
+            regions=regions,
+            stiffness_scale=None if stiffness is None else stiffness[points],
+            density_scale=None if density is None else density[points],
+            progress=progress,
+        )
 
     def _options(self, points: Indices) -> BuildOptions:
         """Return the options of the part that has some quadrature points, with the added kernels that lie in it."""

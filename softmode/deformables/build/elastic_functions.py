@@ -237,9 +237,10 @@ class _ElasticSpace:
             turn = vector[:, keep] / np.sqrt(size[keep])
             part = np.zeros((raw.shape[1], turn.shape[1]))
             part[index] = turn
-            value = np.concatenate([value, rest @ turn], axis=1)
             transform = np.concatenate([transform, part - transform @ (content @ turn)], axis=1)
-            counts.append(value.shape[1])
+            counts.append(transform.shape[1])
+            if index is kept:  # What comes after must be apart from these.
+                value = np.concatenate([value, rest @ turn], axis=1)
         self.fixed, self.count = counts[1:]
         """How many functions come first in any case, and how many there are."""
         self.transform = transform * scale[:, None]
