@@ -107,7 +107,7 @@ def main() -> None:
     wp.config.log_level = wp.LOG_WARNING
     seesaw = Seesaw(160 if given.short else 480, given.device)
     with Film(given.video) as film:
-        rows = seesaw.run(film, 60)
+        rows = seesaw.run(film, 80)  # a body that keeps its spin sways for longer
         film.publish()
     for k, (angle, box, bear, cube, _) in list(enumerate(rows))[2::6]:
         heights = ", ".join(f"{name} {1e3 * z:4.0f} mm" for name, z in (("box", box), ("bear", bear), ("cube", cube)))
