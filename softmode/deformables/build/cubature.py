@@ -346,7 +346,7 @@ def _apart(gain: Array, stack: Real, scale: Array, count: int) -> NDArray[np.int
         count: How many.
     """
     if count == 1:
-        return gain.argmax()[None]
+        return np.array([gain.argmax()])
     pool = np.argpartition(-gain, _POOL * count)[: _POOL * count] if len(gain) > _POOL * count else np.arange(len(gain))
     unit = stack[pool] * scale[pool, None]
     left, alike, found = gain[pool], unit @ unit.T, []
