@@ -168,7 +168,7 @@ class MorphPlanner:
         if not self.targets:
             raise ConfigError("target: expected one or more")
         o, mpm = self.options, self.options.mpm
-        self.simulation = MpmSimulation(source, mpm, step_count=o.segment_length, device=device)
+        self.simulation = MpmSimulation(source, mpm, step_count=o.segment_length, keep_grids=True, device=device)
         s = self.simulation
         real, _, mat = TYPES[mpm.precision]
         for goal in self.targets:

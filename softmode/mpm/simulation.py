@@ -77,6 +77,18 @@ class ParameterBars:
     """By lambda [1/Pa], (W, N)."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _MovedGrid:
+    """The grid in a step."""
+
+    mass: wp.array
+    """Masses of the nodes [kg], (W, nx, ny, nz)."""
+    velocity: wp.array
+    """Velocities that particles gather [m/s], (W, nx, ny, nz)."""
+    free_velocity: wp.array
+    """Those before shapes act; the same array without shapes."""
+
+
 class MpmSimulation:
     """A run of a fixed number of steps: forward, and backward for derivatives.
 
@@ -92,6 +104,7 @@ class MpmSimulation:
         step_count: int = 10,
         layer_count: int = 1,
         shapes: GridShapes | None = None,
+        keep_grids: bool = False,
         device: wp.DeviceLike = None,
     ) -> None:
         """Put bodies at rest on the grid.
@@ -102,6 +115,8 @@ class MpmSimulation:
             step_count: Number of steps T.
             layer_count: Number of controls L. Each acts in the first of its T / L steps; F keeps what it did.
             shapes: Rigid shapes that act on the grid.
+            keep_grids: Whether the grids of all steps are kept for the gradient, where the memory limit allows, not
+                computed again. To the same bits on a CPU.
             device: Where to compute; Warp's preferred device when None.
 
         Raises:
@@ -137,13 +152,11 @@ class MpmSimulation:
         nodes = (self.world_count, *grid.shape)
         self.grid_mass = self._zeros(self._real, *nodes)
         """Masses of the nodes after the last step, once :meth:`scatter_mass` ran [kg]."""
-        self._grid_velocity = self._zeros(self._vec, *nodes)
         self.grid_mass_bar = self._zeros(self._real, *nodes)
         four = wp.types.vector(4, self._real)
         # Momentum and mass of a node lie side by side: one operation adds to both. Who reads the sums clears them.
         self._scattered, self._grid_bar = self._zeros(four, *nodes), self._zeros(four, *nodes)
         self.shapes = shapes
-        self._free_velocity = self._grid_velocity if shapes is None else self._zeros(self._vec, *nodes)
         self.impulse = self._zeros(
             wp.spatial_vectord, step_count, self.world_count, 0 if shapes is None else shapes.model.shape_count
         )
@@ -167,6 +180,10 @@ class MpmSimulation:
                 f"{needed:.3g} bytes, {limit:.3g} are allowed",
                 hint="allow more, or take fewer steps or particles",
             )
+        per_grid = (4 if self.options.precision == "float32" else 8) * (4 if shapes is None else 7)
+        per_grid *= self.world_count * math.prod(grid.shape)
+        self._keeps_grids = keep_grids and not marks and needed + per_grid * step_count <= limit
+        self._grids = [self._moved_grid(nodes) for _ in range(step_count if self._keeps_grids else 1)]
         self._states = [self._state() for _ in range(self._chunk + 1)]
         self._marks = [self._state() for _ in range(marks)]
         self._bars: tuple[list[ParticleState], ParameterBars] | None = None
@@ -193,6 +210,11 @@ class MpmSimulation:
             if row.ndim > 1:
                 found[world, len(row) :] = row[0]
         return found
+
+    def _moved_grid(self, nodes: tuple[int, ...]) -> _MovedGrid:
+        velocity = self._zeros(self._vec, *nodes)
+        free = velocity if self.shapes is None else self._zeros(self._vec, *nodes)
+        return _MovedGrid(mass=self._zeros(self._real, *nodes), velocity=velocity, free_velocity=free)
 
     def _state(self) -> ParticleState:
         shape = (self.world_count, self.count)
@@ -257,8 +279,7 @@ class MpmSimulation:
         Raises:
             ConfigError: If memory did not allow to keep all states.
         """
-        self._move_grid(step, self.states()[step])
-        return self._grid_velocity
+        return self._move_grid(step, self.states()[step]).velocity
 
     def scatter_mass(self, state: ParticleState | None = None) -> None:
         """Put the masses of the particles on the grid: those after the last step, or of another state."""
@@ -396,11 +417,11 @@ class MpmSimulation:
     def _at_nodes(self, kernel: Callable[..., object], inputs: list[object]) -> None:
         wp.launch(kernel, self.grid_mass.shape, inputs=inputs, device=self.device)
 
-    def _obstacles(self, step: int) -> list[object]:
+    def _obstacles(self, step: int, grid: _MovedGrid) -> list[object]:
         """Return what both kernels of the shapes read."""
         assert self.shapes is not None
         time = wp.float32(step * self.options.dt)
-        return [self.shapes.obstacles, self.grid_mass, self._least, *self._place, time]
+        return [self.shapes.obstacles, grid.mass, self._least, *self._place, time]
 
     def _steps_in(self, chunk: int) -> int:
         return min(self._chunk, self.step_count - chunk * self._chunk)
@@ -442,22 +463,24 @@ class MpmSimulation:
             self._real(o.damping),
         ]
 
-    def _move_grid(self, step: int, state: ParticleState) -> None:
+    def _move_grid(self, step: int, state: ParticleState) -> _MovedGrid:
         """Compute the velocities of the grid in a step."""
+        grid = self._grids[step if self._keeps_grids else 0]
         inputs = [*self._particles(state, step), self._scattered, self.failure, step]
         self._scatter(particles_to_grid, inputs)
         push = self._vec(*(g * self.options.dt for g in self.options.gravity))
-        self._at_nodes(move_grid, [self._scattered, self._least, push, self.grid_mass, self._grid_velocity])
+        self._at_nodes(move_grid, [self._scattered, self._least, push, grid.mass, grid.velocity])
         if self.shapes is not None:
-            wp.copy(self._free_velocity, self._grid_velocity)
+            wp.copy(grid.free_velocity, grid.velocity)
             received = cast(wp.array, self.impulse[step : step + 1])
             received.zero_()
-            self._at_nodes(collide_grid, [*self._obstacles(step), self._grid_velocity, received])
+            self._at_nodes(collide_grid, [*self._obstacles(step, grid), grid.velocity, received])
+        return grid
 
     def _step(self, step: int, now: ParticleState, then: ParticleState) -> None:
         """Take one step: particles to grid, grid, grid to particles."""
         o = self.options
-        self._move_grid(step, now)
+        grid = self._move_grid(step, now)
         self._launch(
             grid_to_particles,
             [
@@ -466,7 +489,7 @@ class MpmSimulation:
                 self._control_at(step),
                 self.mass,
                 int(o.control == "material"),
-                self._grid_velocity,
+                grid.velocity,
                 *self._place,
                 self._real(o.dt),
                 self._real(o.smoothing),
@@ -488,9 +511,9 @@ class MpmSimulation:
         bar: ParticleState,
         parameters: ParameterBars,
     ) -> None:
-        """Carry the bars of a step's result to its start. The grid of the step is computed again."""
+        """Carry the bars of a step's result to its start. A grid that was not kept is computed again."""
         o = self.options
-        self._move_grid(step, now)
+        grid = self._grids[step] if self._keeps_grids else self._move_grid(step, now)
         self._scatter(
             grid_to_particles_adjoint,
             [
@@ -500,7 +523,7 @@ class MpmSimulation:
                 then.C,
                 self.mass,
                 int(o.control == "material"),
-                self._grid_velocity,
+                grid.velocity,
                 *self._place,
                 self._real(o.dt),
                 self._real(o.smoothing),
@@ -515,9 +538,9 @@ class MpmSimulation:
             ],
         )
         if self.shapes is not None:
-            self._at_nodes(collide_grid_adjoint, [*self._obstacles(step), self._free_velocity, self._scattered])
+            self._at_nodes(collide_grid_adjoint, [*self._obstacles(step, grid), grid.free_velocity, self._scattered])
         push = self._vec(*(g * o.dt for g in o.gravity))
-        inputs = [self.grid_mass, self._free_velocity, self._least, push, self._scattered, self._grid_bar]
+        inputs = [grid.mass, grid.free_velocity, self._least, push, self._scattered, self._grid_bar]
         self._at_nodes(move_grid_adjoint, inputs)
         control_bar = cast(wp.array, self._control_bars[self._layer(step)])
         self._launch(
