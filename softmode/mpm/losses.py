@@ -74,6 +74,7 @@ class MassLoss:
             ConfigError: If one of its particles lies outside of the grid.
         """
         self.grid.require(target.positions, "target")
+        self.target = target
         x = wp.array(target.positions[None], dtype=self._vec, device=self.device)
         wp.copy(self.target_mass, self._on_grid(x, wp.array(target.masses[None], dtype=self.dtype, device=self.device)))
 
@@ -153,18 +154,50 @@ class MassLoss:
         Raises:
             ConfigError: If a point lies outside of the grid.
         """
+        x, mass = self._particles(points, masses)
+        grid_mass = self._on_grid(x, mass)
+        loss, bar = wp.zeros(1, dtype=wp.float64, device=self.device), wp.zeros_like(grid_mass)
+        self.evaluate(grid_mass, loss, bar)
+        return float(loss.numpy()[0]), *self._spread_to(x, mass, bar)
+
+    def target_gradient(self, points: ArrayLike, masses: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivatives of the loss of particles by what the target is.
+
+        Args:
+            points: Positions [m], shape (N, 3), as of :meth:`value_and_gradient`.
+            masses: Masses [kg], shape (N,).
+
+        Returns:
+            Derivatives by the positions [1/m] (M, 3) and masses [1/kg] (M,) of the target's particles.
+
+        Raises:
+            ConfigError: If a point lies outside of the grid.
+        """
+        grid_mass = self._on_grid(*self._particles(points, masses))
+        loss, bar = wp.zeros(1, dtype=wp.float64, device=self.device), wp.zeros_like(grid_mass)
+        self.evaluate(grid_mass, loss, bar)
+        by_target = -bar.numpy()
+        if self.kind == "log":
+            # dL/dm = r / (m + s), dL/dm* = -r / (m* + s).
+            by_target *= (grid_mass.numpy() + self.mass_scale) / (self.target_mass.numpy() + self.mass_scale)
+        bar.assign(by_target)
+        return self._spread_to(*self._particles(self.target.positions, self.target.masses), bar)
+
+    def _particles(self, points: ArrayLike, masses: ArrayLike) -> tuple[wp.array, wp.array]:
+        """Return particles on the device, one world of them."""
         found = np.asarray(points, dtype=np.float64)
         self.grid.require(found, "points")
         x = wp.array(found[None], dtype=self._vec, device=self.device)
         mass = wp.array(np.asarray(masses, dtype=np.float64)[None], dtype=self.dtype, device=self.device)
         if mass.shape != x.shape:
             raise ConfigError(f"masses: expected shape ({len(found)},), got {np.shape(masses)}")
-        grid_mass = self._on_grid(x, mass)
-        loss, bar = wp.zeros(1, dtype=wp.float64, device=self.device), wp.zeros_like(grid_mass)
+        return x, mass
+
+    def _spread_to(self, x: wp.array, mass: wp.array, grid_mass_bar: wp.array) -> tuple[np.ndarray, np.ndarray]:
+        """Return derivatives by positions and masses of one world of particles."""
         x_bar, mass_bar = wp.zeros_like(x), wp.zeros_like(mass)
-        self.evaluate(grid_mass, loss, bar)
-        self.spread(x, mass, bar, x_bar, mass_bar)
-        return float(loss.numpy()[0]), x_bar.numpy()[0], mass_bar.numpy()[0]
+        self.spread(x, mass, grid_mass_bar, x_bar, mass_bar)
+        return x_bar.numpy()[0], mass_bar.numpy()[0]
 
     def scatter(self, x: wp.array, mass: wp.array, grid_mass: wp.array) -> None:
         """Write the masses of the nodes [kg], (W, nx, ny, nz), of particles x [m] and masses [kg], (W, N)."""

@@ -162,6 +162,9 @@ class MorphPlanner:
 
         Raises:
             ConfigError: If a body does not fit into the grid, a step is not stable, or there is no target.
+
+        Warns:
+            RuntimeWarning: If the mass of a source and that of a target differ by more than 30 %.
         """
         self.options = options or MorphOptions()
         self.targets = (target,) if isinstance(target, ParticleBody) else tuple(target)
@@ -179,13 +182,15 @@ class MorphPlanner:
         factors = COARSE if o.coarse and o.loss == "log" else ()
         self._coarse = [CoarseMassLoss(self.loss, s, self.targets[0], factor=factor) for factor in factors]
         self.notes = tuple(
-            f"world {world}: masses differ by {100.0 * abs(ratio - 1.0):.0f} % ({body.mass:.4g} and {goal.mass:.4g} "
-            "kg), so the loss cannot vanish"
+            f"world {world}: masses differ, {body.mass:.4g} kg become {goal.mass:.4g} kg (ratio {ratio:.3g}), so the "
+            "loss cannot vanish"
             for goal in self.targets
             for world, body in enumerate(s.bodies)
             if abs((ratio := body.mass / goal.mass) - 1.0) > UNEQUAL_MASS
         )
         """What is to be known before the run."""
+        for note in self.notes:
+            warnings.warn(f"{note}. Scale one of them, or change its density", RuntimeWarning, stacklevel=2)
         worlds, shape = s.world_count, (s.world_count, s.count)
         with wp.ScopedDevice(s.device):
             self._search = Search()

@@ -127,6 +127,21 @@ def test_mass_loss_of_points(kind: str) -> None:
     assert value > 0.0
 
 
+@pytest.mark.parametrize("kind", ["log", "squared"])
+def test_mass_loss_by_the_target(kind: str) -> None:
+    """Derivatives of a loss by positions and masses of the target's particles are those of differences."""
+    body, target, options = ball(2.0), torus(2.5, 1.0), MpmOptions()
+    loss = MassLoss(options.grid, target, kind=kind, mass_scale=2.0, dtype=wp.float64, device="cpu")
+    by_x, by_m = loss.target_gradient(body.positions + 0.03, body.masses)
+    rng = np.random.default_rng(5)
+    dx, dm = rng.standard_normal(target.positions.shape), rng.standard_normal(target.count)
+    ends = []
+    for e in (1e-5, -1e-5):
+        loss.aim(replace(target, positions=target.positions + e * dx, masses=target.masses + e * dm))
+        ends.append(loss.value_and_gradient(body.positions + 0.03, body.masses)[0])
+    assert (ends[0] - ends[1]) / 2e-5 == pytest.approx((by_x * dx).sum() + by_m @ dm, rel=1e-6)
+
+
 def test_coarse_losses_are_added() -> None:
     """The gradient of the sum is that of differences; a weight of 0 leaves the fine loss to the bit."""
     options = MpmOptions(precision="float64")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +29,7 @@ def test_ball_becomes_a_torus() -> None:
 def test_worlds_are_planned_alike_alone_and_together() -> None:
     """Two morphs side by side have the bits that each has alone, other line searches notwithstanding."""
     target = torus(3.5, 1.4)
-    bodies = [ball(2.6), ball(2.9)]
+    bodies = [ball(2.9), ball(3.1)]
     options = MorphOptions(frame_count=30)
     together = MorphPlanner(bodies, target, options, device="cpu").run()
     for body, run in zip(bodies, together, strict=True):
@@ -89,9 +90,15 @@ def test_line_search_never_accepts_a_rise() -> None:
 
 
 def test_notes_of_unequal_masses() -> None:
-    """Masses that differ by more than 30 % are told."""
-    planner = MorphPlanner(ball(3.0), ball(2.0), MorphOptions(), device="cpu")
-    assert any("masses differ" in note for note in planner.notes)
+    """Masses that differ by more than 30 % are told, with their ratio; those that differ by less are not."""
+    source, target = ball(3.0), ball(2.0)
+    with pytest.warns(RuntimeWarning, match=f"ratio {source.mass / target.mass:.3g}"):
+        planner = MorphPlanner(source, target, MorphOptions(), device="cpu")
+    assert "masses differ" in planner.notes[0]
+    close = replace(source, masses=1.2 * source.masses)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not MorphPlanner(source, close, MorphOptions(), device="cpu").notes
 
 
 def test_bad_options() -> None:
