@@ -20,7 +20,7 @@ from softmode.mpm.adjoint_kernels import mass_to_grid_adjoint
 from softmode.mpm.grid import MARGIN, Grid
 from softmode.mpm.loss_kernels import log_mass_at_nodes, mass_at_nodes, position_at_particles
 from softmode.mpm.particles import ParticleBody
-from softmode.mpm.simulation import MpmSimulation, ParameterBars, ParticleState
+from softmode.mpm.simulation import MpmSimulation, ParameterBars, ParticleState, lanes_of
 from softmode.mpm.step_kernels import mass_to_grid
 
 MassLossKind = Literal["log", "squared"]
@@ -63,6 +63,7 @@ class MassLoss:
         self._scale = dtype(mass_scale)
         self.dtype, self.mass_scale, self._vec = dtype, mass_scale, vec
         self._one = wp.full(1, 1.0, dtype=wp.float64, device=self.device)
+        self._all = wp.full(1, 1, dtype=int, device=self.device)
         self.target_mass = wp.zeros((1, *grid.shape), dtype=dtype, device=self.device)
         """Masses that the nodes should come to [kg], (1, nx, ny, nz)."""
         self.aim(target)
@@ -78,24 +79,42 @@ class MassLoss:
         x = wp.array(target.positions[None], dtype=self._vec, device=self.device)
         wp.copy(self.target_mass, self._on_grid(x, wp.array(target.masses[None], dtype=self.dtype, device=self.device)))
 
-    def evaluate(self, grid_mass: wp.array, loss: wp.array, grid_mass_bar: wp.array) -> None:
+    def evaluate(
+        self, grid_mass: wp.array, loss: wp.array, grid_mass_bar: wp.array, active: wp.array | None = None
+    ) -> None:
         """Write the loss of masses on the grid and its derivative by them.
 
         Args:
             grid_mass: Masses of the nodes [kg], (W, nx, ny, nz).
             loss: Where to write the losses, float64, (W,).
             grid_mass_bar: Where to write the derivatives [1/kg], (W, nx, ny, nz).
+            active: Worlds that are compared, (W,), None for all; the others keep their derivatives, and have loss 0.
         """
         loss.zero_()
         if self.kind == "log":
-            self.add_log(grid_mass, self._one, loss, grid_mass_bar)
+            self.add_log(grid_mass, self._one, loss, grid_mass_bar, active)
         else:
-            inputs = [grid_mass, self.target_mass, loss, grid_mass_bar]
+            inputs = [grid_mass, self.target_mass, loss, grid_mass_bar, self._all if active is None else active]
             wp.launch(mass_at_nodes, grid_mass.shape, inputs=inputs, device=self.device)
 
-    def add_log(self, grid_mass: wp.array, weight: wp.array, loss: wp.array, grid_mass_bar: wp.array) -> None:
-        """Add the logarithmic loss times a weight, and write its derivative."""
-        inputs = [grid_mass, self.target_mass, self._scale, weight, loss, grid_mass_bar]
+    def add_log(
+        self,
+        grid_mass: wp.array,
+        weight: wp.array,
+        loss: wp.array,
+        grid_mass_bar: wp.array,
+        active: wp.array | None = None,
+    ) -> None:
+        """Add the logarithmic loss times a weight, and write its derivative; of active worlds alone."""
+        inputs = [
+            grid_mass,
+            self.target_mass,
+            self._scale,
+            weight,
+            loss,
+            grid_mass_bar,
+            self._all if active is None else active,
+        ]
         wp.launch(log_mass_at_nodes, grid_mass.shape, inputs=inputs, device=self.device)
 
     def spread(self, x: wp.array, mass: wp.array, grid_mass_bar: wp.array, x_bar: wp.array, mass_bar: wp.array) -> None:
@@ -119,7 +138,7 @@ class MassLoss:
             loss: Where to write the losses of its worlds, float64, (W,).
         """
         simulation.scatter_mass()
-        self.evaluate(simulation.grid_mass, loss, simulation.grid_mass_bar)
+        self.evaluate(simulation.grid_mass, loss, simulation.grid_mass_bar, simulation.active)
 
     def gradient(
         self, simulation: MpmSimulation, coarse: Sequence[CoarseMassLoss] = ()
@@ -199,10 +218,12 @@ class MassLoss:
         self.spread(x, mass, grid_mass_bar, x_bar, mass_bar)
         return x_bar.numpy()[0], mass_bar.numpy()[0]
 
-    def scatter(self, x: wp.array, mass: wp.array, grid_mass: wp.array) -> None:
+    def scatter(self, x: wp.array, mass: wp.array, grid_mass: wp.array, active: wp.array | None = None) -> None:
         """Write the masses of the nodes [kg], (W, nx, ny, nz), of particles x [m] and masses [kg], (W, N)."""
         grid_mass.zero_()
-        wp.launch(mass_to_grid, x.shape, inputs=[x, mass, *self._place, grid_mass], device=self.device)
+        lanes = lanes_of(x)
+        inputs = [x, mass, *self._place, grid_mass, self._all if active is None else active, lanes]
+        wp.launch(mass_to_grid, (x.shape[0], lanes, x.shape[1]), inputs=inputs, device=self.device)
 
     def _on_grid(self, x: wp.array, mass: wp.array) -> wp.array:
         grid_mass = wp.zeros((x.shape[0], *self.grid.shape), dtype=self.dtype, device=self.device)
@@ -253,8 +274,8 @@ class CoarseMassLoss:
 
     def add(self, simulation: MpmSimulation, loss: wp.array) -> None:
         """Add the loss after the last step of a simulation, and keep its derivative on the grid."""
-        self._loss.scatter(simulation.last.x, simulation.mass, self._mass)
-        self._loss.add_log(self._mass, self._weight, loss, self._bar)
+        self._loss.scatter(simulation.last.x, simulation.mass, self._mass, simulation.active)
+        self._loss.add_log(self._mass, self._weight, loss, self._bar, simulation.active)
 
     def spread(self, simulation: MpmSimulation, x_bar: wp.array, mass_bar: wp.array) -> None:
         """Add the derivatives by positions and masses, after :meth:`add`."""

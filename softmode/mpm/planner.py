@@ -49,6 +49,8 @@ UNEQUAL_MASS = 0.3
 """Part by which masses may differ before it is told."""
 COARSE = (2, 4)
 """Cells of the coarser grids over those of the particles'."""
+NORM_THREADS = 512
+"""Threads of a GPU that sum up the gradient of a world."""
 WRITING = 9.0
 """Time between two writings of a file over the time that one takes."""
 
@@ -390,12 +392,14 @@ class MorphPlanner:
         control_bar = self.loss.gradient(s, self._coarse)[1].control[0]
         self._search.norm.zero_()
         self._search.any_searching.zero_()
-        self._per_particle(gradient_norm, [control_bar, self._search.norm])
+        # Without a trial, and after one that was rejected for good, the states are not those of the accepted control.
+        self._search.stale.fill_(1)
+        threads = NORM_THREADS if s.device.is_cuda else 1
+        inputs = [control_bar, self._search.norm, threads]
+        wp.launch(gradient_norm, (s.world_count, threads), inputs=inputs, device=s.device)
         self._per_world(begin_search, [self._search, wp.float64(o.gradient_tolerance), int(first)])
         moments = [self._first, self._second, self._first_trial, self._second_trial]
         self._per_particle(adam_direction, [self._search, control_bar, *moments, self._direction])
-        # Without a trial, and after one that was rejected for good, the states are not those of the accepted control.
-        self._search.stale.fill_(1)
         wp.capture_while(self._search.any_searching, self._try)
         wp.capture_while(self._search.stale, self._restore)
 
@@ -409,9 +413,13 @@ class MorphPlanner:
         """Try the step at hand in every world that searches."""
         s = self.simulation
         self._per_particle(try_control, [self._search, self._accepted, self._direction, s.control[0]])
+        everyone = s.active
+        if s.keeps_states:
+            # Worlds that do not search have the states, the loss and its derivative of their accepted control already.
+            s.active = self._search.searching
         self._evaluate()
+        s.active = everyone
         self._search.any_searching.zero_()
-        self._search.stale.zero_()
         inputs = [self._search, s.failure, self.options.most_halvings, self._accepted_now]
         self._per_world(judge_trial, inputs)
         self._per_particle(

@@ -133,5 +133,5 @@ class _Riders:
         o = self._simulation.options
         inputs = [self.x, self.F, self._control, self._mass, 0, self._simulation.find_velocities(step)]
         inputs += [self._vec(*o.grid.origin), *map(self._real, (o.grid.spacing, o.dt, 0.0))]
-        outputs = [self.x, self._v, self._C, self.F, self._failure, step]
+        outputs = [self.x, self._v, self._C, self.F, self._failure, step, self._simulation.active]
         wp.launch(grid_to_particles, self.x.shape, inputs=[*inputs, *outputs], device=self._simulation.device)

@@ -20,7 +20,14 @@ from softmode.mpm.options import COURANT_LIMIT, MpmOptions
 from softmode.mpm.particles import ParticleBody
 from softmode.mpm.shape_kernels import add_wrenches, collide_grid, collide_grid_adjoint, find_inside
 from softmode.mpm.shapes import GridShapes
-from softmode.mpm.step_kernels import grid_to_particles, mass_to_grid, move_grid, particle_volumes, particles_to_grid
+from softmode.mpm.step_kernels import (
+    clear_failures,
+    grid_to_particles,
+    mass_to_grid,
+    move_grid,
+    particle_volumes,
+    particles_to_grid,
+)
 
 Array = NDArray[np.float64]
 
@@ -37,6 +44,11 @@ FILLS_GPU = 30_000
 """Fewer particles do not fill a GPU: two threads scatter each (8 to 10 % of a morph's time)."""
 FEW_PARTICLES = 0.5
 """Particles per cell under which a body falls apart into unconnected clumps."""
+
+
+def lanes_of(x: wp.array) -> int:
+    """Return how many threads scatter the mass of each of the particles (W, N)."""
+    return 8 if x.device.is_cuda and x.size < FILLS_GPU else 1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -164,6 +176,10 @@ class MpmSimulation:
         a shape without one, about the origin; (T, W, shapes)."""
         self.failure = self._zeros(int, self.world_count, 4)
         """Failures of a world: how many, and the first one's kind, step and particle; (W, 4)."""
+        self.active = self._zeros(int, self.world_count)
+        """Which worlds take part in :meth:`forward`, (W,): the others keep their states and failures. All do at first;
+        with shapes, or where not all states are kept, all must."""
+        self.active.fill_(1)
         self._least = self._real(LEAST_MASS * min(float(body.masses.min()) for body in self.bodies))
         self._controls = self._zeros(self._mat, layer_count + 1, self.world_count, self.count)
         self.control = cast(wp.array, self._controls[:layer_count])
@@ -231,6 +247,11 @@ class MpmSimulation:
         """The state after the last step of :meth:`forward`."""
         return self._states[self.step_count - (len(self._marks) - 1) * self._chunk if self._marks else self.step_count]
 
+    @property
+    def keeps_states(self) -> bool:
+        """Whether memory allows to keep the states of all steps."""
+        return not self._marks
+
     def states(self) -> list[ParticleState]:
         """Return the states before and after every step.
 
@@ -263,7 +284,7 @@ class MpmSimulation:
 
     def forward(self) -> None:
         """Take all steps."""
-        self.failure.zero_()
+        wp.launch(clear_failures, self.world_count, inputs=[self.failure, self.active], device=self.device)
         if not self._marks:
             self._run(0)
             return
@@ -284,7 +305,7 @@ class MpmSimulation:
     def scatter_mass(self, state: ParticleState | None = None) -> None:
         """Put the masses of the particles on the grid: those after the last step, or of another state."""
         self.grid_mass.zero_()
-        self._launch(mass_to_grid, [(state or self.last).x, self.mass, *self._place, self.grid_mass])
+        self._scatter_mass((state or self.last).x)
 
     def bars(self) -> tuple[ParticleState, ParameterBars]:
         """Return what a loss writes before :meth:`backward`: bars of the last state, and those of the masses."""
@@ -379,7 +400,7 @@ class MpmSimulation:
     def _find_volumes(self) -> None:
         """Find rest volumes, and check what follows from them."""
         if self.options.rest_volume == "grid":
-            self._launch(mass_to_grid, [self.first.x, self.mass, *self._place, self.grid_mass])
+            self._scatter_mass(self.first.x)
             self._launch(particle_volumes, [self.first.x, self.mass, self.grid_mass, *self._place, self.volume])
         else:
             volumes = self._padded([body.masses / body.material.density for body in self.bodies])
@@ -413,6 +434,11 @@ class MpmSimulation:
     def _scatter(self, kernel: Callable[..., object], inputs: list[object]) -> None:
         shape = (self.world_count, self._lanes, self.count)
         wp.launch(kernel, shape, inputs=[*inputs, self._lanes], device=self.device)
+
+    def _scatter_mass(self, x: wp.array) -> None:
+        lanes = lanes_of(x)
+        inputs = [x, self.mass, *self._place, self.grid_mass, self.active, lanes]
+        wp.launch(mass_to_grid, (self.world_count, lanes, self.count), inputs=inputs, device=self.device)
 
     def _at_nodes(self, kernel: Callable[..., object], inputs: list[object]) -> None:
         wp.launch(kernel, self.grid_mass.shape, inputs=inputs, device=self.device)
@@ -466,10 +492,10 @@ class MpmSimulation:
     def _move_grid(self, step: int, state: ParticleState) -> _MovedGrid:
         """Compute the velocities of the grid in a step."""
         grid = self._grids[step if self._keeps_grids else 0]
-        inputs = [*self._particles(state, step), self._scattered, self.failure, step]
+        inputs = [*self._particles(state, step), self._scattered, self.failure, step, self.active]
         self._scatter(particles_to_grid, inputs)
         push = self._vec(*(g * self.options.dt for g in self.options.gravity))
-        self._at_nodes(move_grid, [self._scattered, self._least, push, grid.mass, grid.velocity])
+        self._at_nodes(move_grid, [self._scattered, self._least, push, grid.mass, grid.velocity, self.active])
         if self.shapes is not None:
             wp.copy(grid.free_velocity, grid.velocity)
             received = cast(wp.array, self.impulse[step : step + 1])
@@ -499,6 +525,7 @@ class MpmSimulation:
                 then.F,
                 self.failure,
                 step,
+                self.active,
             ],
         )
 

@@ -112,8 +112,8 @@ def test_bad_options() -> None:
 def test_a_morph_that_fails_keeps_what_it_reached() -> None:
     """A body thrown at the border of the grid ends with its last good segment, a warning and a note."""
     body = ball(3.0)
-    planner = MorphPlanner(body, torus(3.5, 1.4), MorphOptions(frame_count=60), device="cpu")
-    planner.simulation.start(v=np.tile([150.0, 0.0, 0.0], (1, body.count, 1)))
+    planner = MorphPlanner([body, body], torus(3.5, 1.4), MorphOptions(frame_count=60), device="cpu")
+    planner.simulation.start(v=np.tile([[[150.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]]], (1, body.count, 1)))
     with pytest.warns(RuntimeWarning, match="left the grid"):
         run = planner.run()[0]
     assert 2 <= len(run.losses) < 7
