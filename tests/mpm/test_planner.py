@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 from softmode.errors import AssetError, ConfigError
 from softmode.mpm import MassLoss, MorphOptions, MorphPlanner, MorphRun, MpmOptions, morph
 from softmode.mpm.run import ARRAYS
+from softmode.objects.solids import filled, solid_of
 from tests.mpm.scenes import ball, torus
 
 
@@ -47,6 +48,16 @@ def test_stops_at_the_accuracy_asked_for() -> None:
     assert reached[0] < 0.2 <= reached[1]
     found = np.abs(run.deformation - np.eye(3)).max(axis=(1, 2, 3)) > 0.0
     assert found[1:-7].all() and not found[-7:].any()
+
+
+def test_a_letter_becomes_another() -> None:
+    """With an eighth of the particles A becomes 8 by 95 % of the loss, and is left long before the last frame."""
+    bodies = filled([solid_of("A"), solid_of("8")], spacing=1.0)[1]
+    run = morph(*bodies, MorphOptions(target_accuracy=0.95), device="cpu")
+    assert run.accuracy >= 0.95
+    assert run.segment_count <= 25
+    goal = bodies[1].moved(run.offsets[1])
+    assert (KDTree(goal.positions).query(run.positions[-1])[0] > 1.0).mean() <= 0.005
 
 
 def test_the_logarithm_leaves_no_particle_behind() -> None:
