@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from softmode.errors import AssetError, ConfigError
-from softmode.mpm import MassLoss, MorphOptions, MorphPlanner, MorphRun, MpmOptions, morph
+from softmode.mpm import MassLoss, MorphOptions, MorphPlanner, MorphRun, MpmOptions, morph, replay
 from softmode.mpm.run import ARRAYS
 from softmode.objects.solids import filled, solid_of
 from tests.mpm.scenes import ball, torus
@@ -130,6 +130,21 @@ def test_a_morph_that_fails_keeps_what_it_reached() -> None:
     assert 2 <= len(run.losses) < 7
     assert np.isfinite(run.positions).all()
     assert "ended after" in run.notes[-1]
+
+
+def test_layers_of_controls(tmp_path: Path) -> None:
+    """Two controls in a segment are kept in the run, in its file and in its replay, and lower the loss no less."""
+    body, target = ball(2.9), torus(3.5, 1.4)
+    runs = []
+    for layers in (1, 2):
+        options = MorphOptions(frame_count=20, control_layers=layers)
+        runs.append(morph(body, target, options, device="cpu", file=tmp_path / f"{layers}"))
+    assert [len(run.control) for run in runs] == [2, 4] and runs[1].layer_count == 2
+    assert runs[1].control.any(axis=(1, 2, 3)).all()
+    assert runs[1].losses[1] <= 1.02 * runs[0].losses[1]
+    again = MorphRun.load(tmp_path / "2")
+    frames = list(replay(again, body, target, MorphOptions(control_layers=2), stride=10, device="cpu"))
+    assert np.abs(frames[1].particles - runs[1].positions[1]).max() == 0.0
 
 
 def planner(frame_count: int = 20, target_radius: float = 1.4) -> MorphPlanner:
