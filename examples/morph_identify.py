@@ -1,8 +1,7 @@
 """Find Young's modulus from where mass is, by two methods: no markers, and not even the same particles.
 
-A soft bar swings and bends for a quarter of a second. What is known of it afterwards are masses on a grid, as a scan
-would give them, of a bar that was filled with other particles. The adjoint of the material point method, and that of a
-reduced body on the same scene, give the derivative of the distance of the masses by E; a secant of it finds E.
+A soft bar swings for a quarter of a second. Known of it then are masses on a grid, those of other particles. Adjoints
+of the material point method and of a reduced body give the derivative of their distance by E; a secant finds E.
 
 Run: ``python examples/morph_identify.py [--short]``
 """
@@ -12,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import product
+from typing import Any
 
 import newton
 import numpy as np
@@ -37,9 +37,8 @@ def moved(modulus: float, h: float, options: mpm.MpmOptions) -> mpm.MpmSimulatio
     volume = float(np.prod(2.0 * HALF))
     body = mpm.particles_from_shape(lambda x: x[:, 0] < HALF[0], bounds, spacing=h, material=material, volume=volume)
     found = mpm.MpmSimulation(body, options, step_count=STEPS, keep_grids=True, device="cpu")
-    C = np.zeros((1, body.count, 3, 3))
-    C[0, :, 2, 0] = 32.0 * body.positions[:, 0] / HALF[0] ** 2
-    found.start(v=bend(body.positions)[None], C=C)
+    C = np.multiply.outer(32.0 * body.positions[:, 0] / HALF[0] ** 2, np.outer([0.0, 0.0, 1.0], [1.0, 0.0, 0.0]))
+    found.start(v=bend(body.positions)[None], C=C[None])
     found.forward()
     return found
 
@@ -57,18 +56,18 @@ class ReducedBar:
 
     def __init__(self) -> None:
         """Build it."""
-        quadrature = soft.quadrature_from_box(2.0 * HALF, point_count=3000, surface_count=200)
-        options = soft.BuildOptions(mode_count=4, kernel_count=60, cubature_count=96)
-        body = soft.build_body(quadrature, options, progress=False)
+        box = soft.quadrature_from_box(2.0 * HALF, point_count=3000, surface_count=200)
+        body = soft.build_body(box, soft.BuildOptions(mode_count=4, kernel_count=60, cubature_count=96), progress=False)
         builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
         soft.add_reduced_body(builder, body, material=MATERIAL)
-        self.model, self.particles = builder.finalize(device="cpu"), mpm.particles_from_body(body, material=MATERIAL)
+        self.model: Any = builder.finalize(device="cpu")
+        self.masses = mpm.particles_from_body(body, material=MATERIAL).masses
         tight = soft.SolverReducedOptions(integrator="bdf2", tolerance=1.0e-8)
         self.adjoint = soft.AdjointReduced(soft.SolverReduced(self.model, [body], options=tight), STEPS // 2)
-        self.markers, self.velocity = soft.Markers(self.adjoint.solver, quadrature.points), body.project(bend)
+        self.markers, self.velocity = soft.Markers(self.adjoint.solver, box.points), body.project(bend)
 
-    def slope(self, loss: mpm.MassLoss, modulus: float) -> float:
-        """Return dL/d(ln E)."""
+    def step_through(self, modulus: float) -> None:
+        """Simulate the same time."""
         self.model.softmode.youngs_modulus.fill_(modulus)
         state, after = self.model.state(), self.model.state()
         state.softmode.qd.assign(self.velocity)
@@ -76,9 +75,13 @@ class ReducedBar:
         for _ in range(STEPS // 2):
             self.adjoint.step(state, after, None, 2.0 * DT)
             state, after = after, state
+
+    def slope(self, loss: mpm.MassLoss, modulus: float) -> float:
+        """Return dL/d(ln E)."""
+        self.step_through(modulus)
         q = self.adjoint.q.numpy()
         loss_q, points = np.zeros_like(q), self.markers.positions(q[-1])
-        loss_q[-1] = self.markers.spread(loss.value_and_gradient(points, self.particles.masses)[1])
+        loss_q[-1] = self.markers.spread(loss.value_and_gradient(points, self.masses)[1])
         return float(self.adjoint.backward(loss_q=loss_q).youngs_modulus.numpy()[0]) * modulus
 
 
@@ -87,8 +90,7 @@ def identify(slope_at: Callable[[float], float], start: float) -> list[float]:
     x, iterates, before, step = float(np.log(start)), [], None, 1.0
     while abs(step) > 1.0e-3 and len(iterates) < 14:
         iterates.append(float(np.exp(x)))
-        slope = slope_at(iterates[-1])
-        step = -0.15 * float(np.sign(slope))
+        step = -0.15 * float(np.sign(slope := slope_at(iterates[-1])))
         if before and (slope - before[1]) * (x - before[0]) > 0.0:
             step = float(np.clip(-slope * (x - before[0]) / (slope - before[1]), -0.5, 0.5))
         before, x = (x, slope), x + step

@@ -48,7 +48,7 @@ FEW_PARTICLES = 0.5
 
 def lanes_of(x: wp.array) -> int:
     """Return how many threads scatter the mass of each of the particles (W, N)."""
-    return 8 if x.device.is_cuda and x.size < FILLS_GPU else 1
+    return 8 if wp.get_device(x.device).is_cuda and x.size < FILLS_GPU else 1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
