@@ -126,13 +126,15 @@ def morph_pairs(
             "ejected": 100.0 * ejected(run, goal),
             "kinetic_energy": float(run.kinetic_energy[-1]),
             "seconds_of_all": seconds,
+            "megabytes_of_all": 1e-6 * bytes_of(planner),
             "notes": "; ".join(run.notes),
         }
         print(
             f"zeta {row['damping']:g} {name} -> {target}: {row['first_loss']:.1f} -> {row['loss']:.2f} "
             f"({row['accuracy']:.2f} %), least {row['least_loss']:.2f}, rested {after:.2f}, "
             f"ejected {row['ejected']:.2f} %, E {row['kinetic_energy']:.3g} J, "
-            f"{run.segment_count} segments, {seconds:.1f} s for {len(sources)} {row['notes']}",
+            f"{run.segment_count} segments, {seconds:.1f} s and {row['megabytes_of_all']:.1f} MB for {len(sources)} "
+            f"{row['notes']}",
             flush=True,
         )
         rows.append(row)
@@ -183,8 +185,29 @@ def time_morph(ball: ParticleBody, goal: ParticleBody, options: MorphOptions, de
         f"{worlds} morphs, zeta {options.mpm.damping:g}, {len(run.losses) - 1} segments: {seconds:.2f} s, loss "
         f"{run.losses[0]:.0f} -> {run.losses[-1]:.1f} (least {run.losses.min():.1f}), accuracy "
         f"{100.0 * run.accuracy:.2f} %, {run.gradient_count} gradients, {run.trial_count} trials, "
-        f"{100.0 * ejected(run, goal):.2f} % over a cell away, kinetic energy {run.kinetic_energy[-1]:.3g} J"
+        f"{100.0 * ejected(run, goal):.2f} % over a cell away, kinetic energy {run.kinetic_energy[-1]:.3g} J, "
+        f"{1e-6 * bytes_of(planner):.1f} MB of arrays"
     )
+
+
+def bytes_of(thing: object) -> int:
+    """Return what the arrays of a planner take on its device [bytes]: states, grids, controls, moments, losses."""
+    found: dict[int, int] = {}
+    seen: set[int] = set()
+    waiting = [thing]
+    while waiting:
+        at = waiting.pop()
+        if id(at) in seen:
+            continue
+        seen.add(id(at))
+        if isinstance(at, wp.array):
+            if at.ptr is not None and at._ref is None:  # a view takes nothing of its own
+                found[at.ptr] = at.capacity
+        elif isinstance(at, list | tuple):
+            waiting += at
+        elif type(at).__module__.startswith("softmode.mpm"):
+            waiting += vars(at).values()
+    return sum(found.values())
 
 
 def clock(run: Callable[[], object], device: str) -> float:

@@ -4,6 +4,8 @@ from typing import Any
 
 import warp as wp
 
+from softmode.mpm.step_kernels import moves
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -15,9 +17,12 @@ def log_mass_at_nodes(
     weight: wp.array[wp.float64],
     loss: wp.array[wp.float64],
     bar: wp.array4d[Any],
+    active: wp.array[int],
 ):
     """Add a weight times 1/2 (ln(m/s + 1) - ln(m*/s + 1))^2 of every node; write its derivative by m."""
     world, i, j, k = wp.tid()
+    if not moves(active, world):
+        return
     m = grid_mass[world, i, j, k]
     goal = target[world % target.shape[0], i, j, k]
     r = type(scale)(0.0)
@@ -29,10 +34,16 @@ def log_mass_at_nodes(
 
 @wp.kernel(enable_backward=False, module="unique")
 def mass_at_nodes(
-    grid_mass: wp.array4d[Any], target: wp.array4d[Any], loss: wp.array[wp.float64], bar: wp.array4d[Any]
+    grid_mass: wp.array4d[Any],
+    target: wp.array4d[Any],
+    loss: wp.array[wp.float64],
+    bar: wp.array4d[Any],
+    active: wp.array[int],
 ):
     """Add 1/2 (m - m*)^2 of every node, and its derivative by m."""
     world, i, j, k = wp.tid()
+    if not moves(active, world):
+        return
     r = grid_mass[world, i, j, k] - target[world % target.shape[0], i, j, k]
     wp.atomic_add(loss, world, wp.float64(0.5) * wp.float64(r) * wp.float64(r))
     bar[world, i, j, k] = r

@@ -20,7 +20,7 @@ from softmode.mpm.adjoint_kernels import mass_to_grid_adjoint
 from softmode.mpm.grid import MARGIN, Grid
 from softmode.mpm.loss_kernels import log_mass_at_nodes, mass_at_nodes, position_at_particles
 from softmode.mpm.particles import ParticleBody
-from softmode.mpm.simulation import MpmSimulation, ParameterBars, ParticleState
+from softmode.mpm.simulation import MpmSimulation, ParameterBars, ParticleState, lanes_of
 from softmode.mpm.step_kernels import mass_to_grid
 
 MassLossKind = Literal["log", "squared"]
@@ -63,6 +63,7 @@ class MassLoss:
         self._scale = dtype(mass_scale)
         self.dtype, self.mass_scale, self._vec = dtype, mass_scale, vec
         self._one = wp.full(1, 1.0, dtype=wp.float64, device=self.device)
+        self._all = wp.full(1, 1, dtype=int, device=self.device)
         self.target_mass = wp.zeros((1, *grid.shape), dtype=dtype, device=self.device)
         """Masses that the nodes should come to [kg], (1, nx, ny, nz)."""
         self.aim(target)
@@ -74,27 +75,46 @@ class MassLoss:
             ConfigError: If one of its particles lies outside of the grid.
         """
         self.grid.require(target.positions, "target")
+        self.target = target
         x = wp.array(target.positions[None], dtype=self._vec, device=self.device)
         wp.copy(self.target_mass, self._on_grid(x, wp.array(target.masses[None], dtype=self.dtype, device=self.device)))
 
-    def evaluate(self, grid_mass: wp.array, loss: wp.array, grid_mass_bar: wp.array) -> None:
+    def evaluate(
+        self, grid_mass: wp.array, loss: wp.array, grid_mass_bar: wp.array, active: wp.array | None = None
+    ) -> None:
         """Write the loss of masses on the grid and its derivative by them.
 
         Args:
             grid_mass: Masses of the nodes [kg], (W, nx, ny, nz).
             loss: Where to write the losses, float64, (W,).
             grid_mass_bar: Where to write the derivatives [1/kg], (W, nx, ny, nz).
+            active: Worlds that are compared, (W,), None for all; the others keep their derivatives, and have loss 0.
         """
         loss.zero_()
         if self.kind == "log":
-            self.add_log(grid_mass, self._one, loss, grid_mass_bar)
+            self.add_log(grid_mass, self._one, loss, grid_mass_bar, active)
         else:
-            inputs = [grid_mass, self.target_mass, loss, grid_mass_bar]
+            inputs = [grid_mass, self.target_mass, loss, grid_mass_bar, self._all if active is None else active]
             wp.launch(mass_at_nodes, grid_mass.shape, inputs=inputs, device=self.device)
 
-    def add_log(self, grid_mass: wp.array, weight: wp.array, loss: wp.array, grid_mass_bar: wp.array) -> None:
-        """Add the logarithmic loss times a weight, and write its derivative."""
-        inputs = [grid_mass, self.target_mass, self._scale, weight, loss, grid_mass_bar]
+    def add_log(
+        self,
+        grid_mass: wp.array,
+        weight: wp.array,
+        loss: wp.array,
+        grid_mass_bar: wp.array,
+        active: wp.array | None = None,
+    ) -> None:
+        """Add the logarithmic loss times a weight, and write its derivative; of active worlds alone."""
+        inputs = [
+            grid_mass,
+            self.target_mass,
+            self._scale,
+            weight,
+            loss,
+            grid_mass_bar,
+            self._all if active is None else active,
+        ]
         wp.launch(log_mass_at_nodes, grid_mass.shape, inputs=inputs, device=self.device)
 
     def spread(self, x: wp.array, mass: wp.array, grid_mass_bar: wp.array, x_bar: wp.array, mass_bar: wp.array) -> None:
@@ -118,7 +138,7 @@ class MassLoss:
             loss: Where to write the losses of its worlds, float64, (W,).
         """
         simulation.scatter_mass()
-        self.evaluate(simulation.grid_mass, loss, simulation.grid_mass_bar)
+        self.evaluate(simulation.grid_mass, loss, simulation.grid_mass_bar, simulation.active)
 
     def gradient(
         self, simulation: MpmSimulation, coarse: Sequence[CoarseMassLoss] = ()
@@ -153,23 +173,57 @@ class MassLoss:
         Raises:
             ConfigError: If a point lies outside of the grid.
         """
+        x, mass = self._particles(points, masses)
+        grid_mass = self._on_grid(x, mass)
+        loss, bar = wp.zeros(1, dtype=wp.float64, device=self.device), wp.zeros_like(grid_mass)
+        self.evaluate(grid_mass, loss, bar)
+        return float(loss.numpy()[0]), *self._spread_to(x, mass, bar)
+
+    def target_gradient(self, points: ArrayLike, masses: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivatives of the loss of particles by what the target is.
+
+        Args:
+            points: Positions [m], shape (N, 3), as of :meth:`value_and_gradient`.
+            masses: Masses [kg], shape (N,).
+
+        Returns:
+            Derivatives by the positions [1/m] (M, 3) and masses [1/kg] (M,) of the target's particles.
+
+        Raises:
+            ConfigError: If a point lies outside of the grid.
+        """
+        grid_mass = self._on_grid(*self._particles(points, masses))
+        loss, bar = wp.zeros(1, dtype=wp.float64, device=self.device), wp.zeros_like(grid_mass)
+        self.evaluate(grid_mass, loss, bar)
+        by_target = -bar.numpy()
+        if self.kind == "log":
+            # dL/dm = r / (m + s), dL/dm* = -r / (m* + s).
+            by_target *= (grid_mass.numpy() + self.mass_scale) / (self.target_mass.numpy() + self.mass_scale)
+        bar.assign(by_target)
+        return self._spread_to(*self._particles(self.target.positions, self.target.masses), bar)
+
+    def _particles(self, points: ArrayLike, masses: ArrayLike) -> tuple[wp.array, wp.array]:
+        """Return particles on the device, one world of them."""
         found = np.asarray(points, dtype=np.float64)
         self.grid.require(found, "points")
         x = wp.array(found[None], dtype=self._vec, device=self.device)
         mass = wp.array(np.asarray(masses, dtype=np.float64)[None], dtype=self.dtype, device=self.device)
         if mass.shape != x.shape:
             raise ConfigError(f"masses: expected shape ({len(found)},), got {np.shape(masses)}")
-        grid_mass = self._on_grid(x, mass)
-        loss, bar = wp.zeros(1, dtype=wp.float64, device=self.device), wp.zeros_like(grid_mass)
-        x_bar, mass_bar = wp.zeros_like(x), wp.zeros_like(mass)
-        self.evaluate(grid_mass, loss, bar)
-        self.spread(x, mass, bar, x_bar, mass_bar)
-        return float(loss.numpy()[0]), x_bar.numpy()[0], mass_bar.numpy()[0]
+        return x, mass
 
-    def scatter(self, x: wp.array, mass: wp.array, grid_mass: wp.array) -> None:
+    def _spread_to(self, x: wp.array, mass: wp.array, grid_mass_bar: wp.array) -> tuple[np.ndarray, np.ndarray]:
+        """Return derivatives by positions and masses of one world of particles."""
+        x_bar, mass_bar = wp.zeros_like(x), wp.zeros_like(mass)
+        self.spread(x, mass, grid_mass_bar, x_bar, mass_bar)
+        return x_bar.numpy()[0], mass_bar.numpy()[0]
+
+    def scatter(self, x: wp.array, mass: wp.array, grid_mass: wp.array, active: wp.array | None = None) -> None:
         """Write the masses of the nodes [kg], (W, nx, ny, nz), of particles x [m] and masses [kg], (W, N)."""
         grid_mass.zero_()
-        wp.launch(mass_to_grid, x.shape, inputs=[x, mass, *self._place, grid_mass], device=self.device)
+        lanes = lanes_of(x)
+        inputs = [x, mass, *self._place, grid_mass, self._all if active is None else active, lanes]
+        wp.launch(mass_to_grid, (x.shape[0], lanes, x.shape[1]), inputs=inputs, device=self.device)
 
     def _on_grid(self, x: wp.array, mass: wp.array) -> wp.array:
         grid_mass = wp.zeros((x.shape[0], *self.grid.shape), dtype=self.dtype, device=self.device)
@@ -220,8 +274,8 @@ class CoarseMassLoss:
 
     def add(self, simulation: MpmSimulation, loss: wp.array) -> None:
         """Add the loss after the last step of a simulation, and keep its derivative on the grid."""
-        self._loss.scatter(simulation.last.x, simulation.mass, self._mass)
-        self._loss.add_log(self._mass, self._weight, loss, self._bar)
+        self._loss.scatter(simulation.last.x, simulation.mass, self._mass, simulation.active)
+        self._loss.add_log(self._mass, self._weight, loss, self._bar, simulation.active)
 
     def spread(self, simulation: MpmSimulation, x_bar: wp.array, mass_bar: wp.array) -> None:
         """Add the derivatives by positions and masses, after :meth:`add`."""

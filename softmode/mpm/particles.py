@@ -144,23 +144,39 @@ def particles_from_mesh(
     )
 
 
-def particles_from_body(body: ReducedBody, *, spacing: float, material: Material | None = None) -> ParticleBody:
-    """Fill the inside of a body's closed surface samples with a lattice, in the body frame.
+def particles_from_body(
+    body: ReducedBody, *, spacing: float | None = None, material: Material | None = None
+) -> ParticleBody:
+    """Return a body's quadrature points as particles, or fill its closed surface samples with a lattice; body frame.
 
     Args:
         body: A reduced body; inside is where its surface samples say so.
-        spacing: Distance between particles [m].
+        spacing: Distance between the particles of the lattice [m]. None takes the points that the body was built from,
+            each with its own volume: masses sum to density x the volume of the quadrature.
         material: What it is made of.
 
     Raises:
         AssetError: If no particle lies inside.
+        ConfigError: If the body does not keep its quadrature points, or their density was painted.
     """
+    made = material or Material()
+    if spacing is None:
+        from softmode.deformables.build.sources import unpack_sources
+
+        sources = unpack_sources(body)
+        if sources.density_scale is not None:
+            raise ConfigError(
+                f"body {body.name!r}: its density was painted, particles of a body have one density",
+                hint="give a spacing, or build the body without density_scale",
+            )
+        points, volumes = sources.quadrature.points - body.offset, sources.quadrature.weights
+        return ParticleBody(positions=points, masses=made.density * volumes, material=made)
     from softmode.deformables.build.interior import winding_numbers
 
     return particles_from_shape(
         lambda points: winding_numbers(body, points) > 0.5,
         body.bounds,
         spacing=spacing,
-        material=material,
+        material=made,
         volume=body.volume,
     )

@@ -16,7 +16,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast, get_args
+from typing import get_args
 
 import numpy as np
 import warp as wp
@@ -49,6 +49,8 @@ UNEQUAL_MASS = 0.3
 """Part by which masses may differ before it is told."""
 COARSE = (2, 4)
 """Cells of the coarser grids over those of the particles'."""
+NORM_THREADS = 512
+"""Threads of a GPU that sum up the gradient of a world."""
 WRITING = 9.0
 """Time between two writings of a file over the time that one takes."""
 
@@ -65,7 +67,9 @@ class MorphOptions:
     frame_count: int = 420
     """Steps in all; the last segment is filled up."""
     segment_length: int = 10
-    """Steps of a segment, which have one control."""
+    """Steps of a segment."""
+    control_layers: int = 1
+    """Controls of a particle in a segment, one after another: each acts in the first of its share of the steps."""
     pass_count: int = 3
     """Passes over a segment's control; each begins with the full step length."""
     iteration_count: int = 4
@@ -98,6 +102,7 @@ class MorphOptions:
         """Check ranges."""
         for name in ("frame_count", "segment_length", "pass_count", "iteration_count", "most_halvings"):
             require_number(name, getattr(self, name), at_least=1)
+        require_number("control_layers", self.control_layers, at_least=1, at_most=self.segment_length)
         require_number("step_length", self.step_length, above=0.0)
         require_number("gradient_tolerance", self.gradient_tolerance, at_least=0.0, below=1.0)
         require_choice("loss", self.loss, get_args(MassLossKind))
@@ -123,7 +128,7 @@ class _Log:
     @property
     def segment_count(self) -> int:
         """Number of segments so far."""
-        return len(self.rows["control"])
+        return len(self.rows["kinetic_energy"])
 
     def add(self, **rows: wp.array | np.ndarray) -> None:
         """Append rows."""
@@ -162,14 +167,23 @@ class MorphPlanner:
 
         Raises:
             ConfigError: If a body does not fit into the grid, a step is not stable, or there is no target.
+
+        Warns:
+            RuntimeWarning: If the mass of a source and that of a target differ by more than 30 %.
         """
         self.options = options or MorphOptions()
         self.targets = (target,) if isinstance(target, ParticleBody) else tuple(target)
         if not self.targets:
             raise ConfigError("target: expected one or more")
         o, mpm = self.options, self.options.mpm
-        self.simulation = MpmSimulation(source, mpm, step_count=o.segment_length, device=device)
-        s = self.simulation
+        self.simulation = s = MpmSimulation(
+            source,
+            mpm,
+            step_count=o.segment_length,
+            layer_count=o.control_layers,
+            keep_grids=True,
+            device=device,
+        )
         real, _, mat = TYPES[mpm.precision]
         for goal in self.targets:
             mpm.grid.require(goal.positions, "target")
@@ -179,14 +193,16 @@ class MorphPlanner:
         factors = COARSE if o.coarse and o.loss == "log" else ()
         self._coarse = [CoarseMassLoss(self.loss, s, self.targets[0], factor=factor) for factor in factors]
         self.notes = tuple(
-            f"world {world}: masses differ by {100.0 * abs(ratio - 1.0):.0f} % ({body.mass:.4g} and {goal.mass:.4g} "
-            "kg), so the loss cannot vanish"
+            f"world {world}: masses differ, {body.mass:.4g} kg become {goal.mass:.4g} kg (ratio {ratio:.3g}), so the "
+            "loss cannot vanish"
             for goal in self.targets
             for world, body in enumerate(s.bodies)
             if abs((ratio := body.mass / goal.mass) - 1.0) > UNEQUAL_MASS
         )
         """What is to be known before the run."""
-        worlds, shape = s.world_count, (s.world_count, s.count)
+        for note in self.notes:
+            warnings.warn(f"{note}. Scale one of them, or change its density", RuntimeWarning, stacklevel=2)
+        worlds, shape = s.world_count, (o.control_layers, s.world_count, s.count)
         with wp.ScopedDevice(s.device):
             self._search = Search()
             for name in ("loss", "trial_loss", "norm", "first_norm"):
@@ -273,9 +289,10 @@ class MorphPlanner:
                 log.add(
                     positions=s.first.x,
                     deformation=s.first.F,
-                    control=cast(wp.array, s.control[0]),
                     kinetic_energy=0.5 * (m * (v**2).sum(axis=2)).sum(axis=1),
                 )
+                for control in s.control.numpy().copy():
+                    log.add(control=control)
                 if progress is not None:
                     progress(log.segment_count - 1, float(log.rows["losses"][-1].max()))
                 now = time.monotonic()
@@ -382,38 +399,43 @@ class MorphPlanner:
     def _descend(self, *, first: bool) -> None:
         """Take a gradient and step along it."""
         o, s = self.options, self.simulation
-        control_bar = self.loss.gradient(s, self._coarse)[1].control[0]
+        control_bar = self.loss.gradient(s, self._coarse)[1].control
         self._search.norm.zero_()
         self._search.any_searching.zero_()
-        self._per_particle(gradient_norm, [control_bar, self._search.norm])
-        self._per_world(begin_search, [self._search, wp.float64(o.gradient_tolerance), int(first)])
-        moments = [self._first, self._second, self._first_trial, self._second_trial]
-        self._per_particle(adam_direction, [self._search, control_bar, *moments, self._direction])
         # Without a trial, and after one that was rejected for good, the states are not those of the accepted control.
         self._search.stale.fill_(1)
+        threads = NORM_THREADS if s.device.is_cuda else 1
+        self._per_layer(gradient_norm, [control_bar, self._search.norm, threads], threads)
+        self._per_world(begin_search, [self._search, wp.float64(o.gradient_tolerance), int(first)])
+        moments = [self._first, self._second, self._first_trial, self._second_trial]
+        self._per_layer(adam_direction, [self._search, control_bar, *moments, self._direction])
         wp.capture_while(self._search.any_searching, self._try)
         wp.capture_while(self._search.stale, self._restore)
 
     def _restore(self) -> None:
         """Step with the accepted controls."""
-        self._per_particle(try_control, [self._search, self._accepted, self._direction, self.simulation.control[0]])
+        self._per_layer(try_control, [self._search, self._accepted, self._direction, self.simulation.control])
         self._evaluate()
         self._search.stale.zero_()
 
     def _try(self) -> None:
         """Try the step at hand in every world that searches."""
         s = self.simulation
-        self._per_particle(try_control, [self._search, self._accepted, self._direction, s.control[0]])
+        self._per_layer(try_control, [self._search, self._accepted, self._direction, s.control])
+        everyone = s.active
+        if s.keeps_states:
+            # Worlds that do not search have the states, the loss and its derivative of their accepted control already.
+            s.active = self._search.searching
         self._evaluate()
+        s.active = everyone
         self._search.any_searching.zero_()
-        self._search.stale.zero_()
         inputs = [self._search, s.failure, self.options.most_halvings, self._accepted_now]
         self._per_world(judge_trial, inputs)
-        self._per_particle(
+        self._per_layer(
             keep_trial,
             [
                 self._accepted_now,
-                s.control[0],
+                s.control,
                 self._first_trial,
                 self._second_trial,
                 self._accepted,
@@ -433,6 +455,9 @@ class MorphPlanner:
     def _per_world(self, kernel: Callable[..., object], inputs: list[object]) -> None:
         wp.launch(kernel, self.simulation.world_count, inputs=inputs, device=self.simulation.device)
 
-    def _per_particle(self, kernel: Callable[..., object], inputs: list[object]) -> None:
-        shape = (self.simulation.world_count, self.simulation.count)
-        wp.launch(kernel, shape, inputs=inputs, device=self.simulation.device)
+    def _per_layer(self, kernel: Callable[..., object], inputs: list[object], threads: int | None = None) -> None:
+        """Launch a kernel with the particles of a layer after another, arrays (L, W, N) being given layer by layer."""
+        s = self.simulation
+        for layer in range(s.layer_count):
+            of_layer = [a[layer] if isinstance(a, wp.array) and a.ndim == 3 else a for a in inputs]
+            wp.launch(kernel, (s.world_count, threads or s.count), inputs=of_layer, device=s.device)

@@ -59,11 +59,14 @@ def judge_start(search: Search, failure: wp.array2d[int]):
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def gradient_norm(bar: wp.array2d[Any], norm: wp.array[wp.float64]):
-    """Add the squares of a gradient."""
-    world, p = wp.tid()
-    b = bar[world, p]
-    wp.atomic_add(norm, world, wp.float64(wp.ddot(b, b)))
+def gradient_norm(bar: wp.array2d[Any], norm: wp.array[wp.float64], threads: int):
+    """Add the squares of a gradient; each of the ``threads`` of a world sums its share."""
+    world, thread = wp.tid()
+    total = wp.float64(0.0)
+    for p in range(thread, bar.shape[1], threads):
+        b = bar[world, p]
+        total += wp.float64(wp.ddot(b, b))
+    wp.atomic_add(norm, world, total)
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -80,6 +83,7 @@ def begin_search(search: Search, tolerance: wp.float64, first: int):
     if search.active[world] != 0:
         search.gradient_count[world] = search.gradient_count[world] + 1
         wp.atomic_max(search.any_searching, 0, 1)
+        search.stale[0] = 0
 
 
 @wp.kernel(enable_backward=False, module="unique")

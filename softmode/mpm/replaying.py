@@ -77,7 +77,8 @@ def replay(
         )
     if stride < 1 or o.segment_length % stride:
         raise ConfigError(f"stride: {stride} does not divide a segment of {o.segment_length} steps")
-    s = MpmSimulation(source.moved(run.offsets[0]), o.mpm, step_count=o.segment_length, device=device)
+    steps, layers = o.segment_length, run.layer_count
+    s = MpmSimulation(source.moved(run.offsets[0]), o.mpm, step_count=steps, layer_count=layers, device=device)
     real, vec, mat = TYPES[o.mpm.precision]
     found = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     riders = _Riders(s, found + run.offsets[0], (real, vec, mat))
@@ -102,7 +103,7 @@ def replay(
             leg = target
             loss.aim(goals[leg].moved(run.offsets[leg + 1]))
         s.start(x=run.positions[segment][None], F=run.deformation[segment][None])
-        s.control.assign(run.control[segment][None, None])
+        s.control.assign(run.control[segment * layers : (segment + 1) * layers, None])
         s.forward()
         for step in range(o.segment_length):
             riders.move(step)
@@ -133,5 +134,5 @@ class _Riders:
         o = self._simulation.options
         inputs = [self.x, self.F, self._control, self._mass, 0, self._simulation.find_velocities(step)]
         inputs += [self._vec(*o.grid.origin), *map(self._real, (o.grid.spacing, o.dt, 0.0))]
-        outputs = [self.x, self._v, self._C, self.F, self._failure, step]
+        outputs = [self.x, self._v, self._C, self.F, self._failure, step, self._simulation.active]
         wp.launch(grid_to_particles, self.x.shape, inputs=[*inputs, *outputs], device=self._simulation.device)

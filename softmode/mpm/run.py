@@ -49,7 +49,7 @@ class MorphRun:
     deformation: Real
     """Deformation gradients at the start and after each segment, shape (S + 1, N, 3, 3)."""
     control: Real
-    """Control of each segment, shape (S, N, 3, 3)."""
+    """Controls of each segment, of its L layers one after another, shape (S L, N, 3, 3)."""
     velocity: Real
     """Velocities at the end [m/s], shape (N, 3)."""
     affine_velocity: Real
@@ -78,7 +78,12 @@ class MorphRun:
     @property
     def segment_count(self) -> int:
         """Number of segments S."""
-        return len(self.control)
+        return len(self.kinetic_energy)
+
+    @property
+    def layer_count(self) -> int:
+        """Number of controls L in a segment."""
+        return len(self.control) // max(self.segment_count, 1) or 1
 
     @property
     def target_count(self) -> int:
@@ -145,7 +150,7 @@ class MorphRun:
         shapes = {
             "positions": (segments + 1, count, 3),
             "deformation": (segments + 1, count, 3, 3),
-            "control": (segments, count, 3, 3),
+            "control": (segments * self.layer_count, count, 3, 3),
             "velocity": (count, 3),
             "affine_velocity": (count, 3, 3),
             "losses": (segments + 1,),

@@ -20,7 +20,14 @@ from softmode.mpm.options import COURANT_LIMIT, MpmOptions
 from softmode.mpm.particles import ParticleBody
 from softmode.mpm.shape_kernels import add_wrenches, collide_grid, collide_grid_adjoint, find_inside
 from softmode.mpm.shapes import GridShapes
-from softmode.mpm.step_kernels import grid_to_particles, mass_to_grid, move_grid, particle_volumes, particles_to_grid
+from softmode.mpm.step_kernels import (
+    clear_failures,
+    grid_to_particles,
+    mass_to_grid,
+    move_grid,
+    particle_volumes,
+    particles_to_grid,
+)
 
 Array = NDArray[np.float64]
 
@@ -37,6 +44,11 @@ FILLS_GPU = 30_000
 """Fewer particles do not fill a GPU: two threads scatter each (8 to 10 % of a morph's time)."""
 FEW_PARTICLES = 0.5
 """Particles per cell under which a body falls apart into unconnected clumps."""
+
+
+def lanes_of(x: wp.array) -> int:
+    """Return how many threads scatter the mass of each of the particles (W, N)."""
+    return 8 if wp.get_device(x.device).is_cuda and x.size < FILLS_GPU else 1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,6 +89,18 @@ class ParameterBars:
     """By lambda [1/Pa], (W, N)."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _MovedGrid:
+    """The grid in a step."""
+
+    mass: wp.array
+    """Masses of the nodes [kg], (W, nx, ny, nz)."""
+    velocity: wp.array
+    """Velocities that particles gather [m/s], (W, nx, ny, nz)."""
+    free_velocity: wp.array
+    """Those before shapes act; the same array without shapes."""
+
+
 class MpmSimulation:
     """A run of a fixed number of steps: forward, and backward for derivatives.
 
@@ -92,6 +116,7 @@ class MpmSimulation:
         step_count: int = 10,
         layer_count: int = 1,
         shapes: GridShapes | None = None,
+        keep_grids: bool = False,
         device: wp.DeviceLike = None,
     ) -> None:
         """Put bodies at rest on the grid.
@@ -102,6 +127,8 @@ class MpmSimulation:
             step_count: Number of steps T.
             layer_count: Number of controls L. Each acts in the first of its T / L steps; F keeps what it did.
             shapes: Rigid shapes that act on the grid.
+            keep_grids: Whether the grids of all steps are kept for the gradient, where the memory limit allows, not
+                computed again. To the same bits on a CPU.
             device: Where to compute; Warp's preferred device when None.
 
         Raises:
@@ -137,13 +164,11 @@ class MpmSimulation:
         nodes = (self.world_count, *grid.shape)
         self.grid_mass = self._zeros(self._real, *nodes)
         """Masses of the nodes after the last step, once :meth:`scatter_mass` ran [kg]."""
-        self._grid_velocity = self._zeros(self._vec, *nodes)
         self.grid_mass_bar = self._zeros(self._real, *nodes)
         four = wp.types.vector(4, self._real)
         # Momentum and mass of a node lie side by side: one operation adds to both. Who reads the sums clears them.
         self._scattered, self._grid_bar = self._zeros(four, *nodes), self._zeros(four, *nodes)
         self.shapes = shapes
-        self._free_velocity = self._grid_velocity if shapes is None else self._zeros(self._vec, *nodes)
         self.impulse = self._zeros(
             wp.spatial_vectord, step_count, self.world_count, 0 if shapes is None else shapes.model.shape_count
         )
@@ -151,6 +176,10 @@ class MpmSimulation:
         a shape without one, about the origin; (T, W, shapes)."""
         self.failure = self._zeros(int, self.world_count, 4)
         """Failures of a world: how many, and the first one's kind, step and particle; (W, 4)."""
+        self.active = self._zeros(int, self.world_count)
+        """Which worlds take part in :meth:`forward`, (W,): the others keep their states and failures. All do at first;
+        with shapes, or where not all states are kept, all must."""
+        self.active.fill_(1)
         self._least = self._real(LEAST_MASS * min(float(body.masses.min()) for body in self.bodies))
         self._controls = self._zeros(self._mat, layer_count + 1, self.world_count, self.count)
         self.control = cast(wp.array, self._controls[:layer_count])
@@ -167,6 +196,10 @@ class MpmSimulation:
                 f"{needed:.3g} bytes, {limit:.3g} are allowed",
                 hint="allow more, or take fewer steps or particles",
             )
+        per_grid = (4 if self.options.precision == "float32" else 8) * (4 if shapes is None else 7)
+        per_grid *= self.world_count * math.prod(grid.shape)
+        self._keeps_grids = keep_grids and not marks and needed + per_grid * step_count <= limit
+        self._grids = [self._moved_grid(nodes) for _ in range(step_count if self._keeps_grids else 1)]
         self._states = [self._state() for _ in range(self._chunk + 1)]
         self._marks = [self._state() for _ in range(marks)]
         self._bars: tuple[list[ParticleState], ParameterBars] | None = None
@@ -194,6 +227,11 @@ class MpmSimulation:
                 found[world, len(row) :] = row[0]
         return found
 
+    def _moved_grid(self, nodes: tuple[int, ...]) -> _MovedGrid:
+        velocity = self._zeros(self._vec, *nodes)
+        free = velocity if self.shapes is None else self._zeros(self._vec, *nodes)
+        return _MovedGrid(mass=self._zeros(self._real, *nodes), velocity=velocity, free_velocity=free)
+
     def _state(self) -> ParticleState:
         shape = (self.world_count, self.count)
         kinds = {"x": self._vec, "v": self._vec, "C": self._mat, "F": self._mat}
@@ -208,6 +246,11 @@ class MpmSimulation:
     def last(self) -> ParticleState:
         """The state after the last step of :meth:`forward`."""
         return self._states[self.step_count - (len(self._marks) - 1) * self._chunk if self._marks else self.step_count]
+
+    @property
+    def keeps_states(self) -> bool:
+        """Whether memory allows to keep the states of all steps."""
+        return not self._marks
 
     def states(self) -> list[ParticleState]:
         """Return the states before and after every step.
@@ -241,7 +284,7 @@ class MpmSimulation:
 
     def forward(self) -> None:
         """Take all steps."""
-        self.failure.zero_()
+        wp.launch(clear_failures, self.world_count, inputs=[self.failure, self.active], device=self.device)
         if not self._marks:
             self._run(0)
             return
@@ -257,13 +300,12 @@ class MpmSimulation:
         Raises:
             ConfigError: If memory did not allow to keep all states.
         """
-        self._move_grid(step, self.states()[step])
-        return self._grid_velocity
+        return self._move_grid(step, self.states()[step]).velocity
 
     def scatter_mass(self, state: ParticleState | None = None) -> None:
         """Put the masses of the particles on the grid: those after the last step, or of another state."""
         self.grid_mass.zero_()
-        self._launch(mass_to_grid, [(state or self.last).x, self.mass, *self._place, self.grid_mass])
+        self._scatter_mass((state or self.last).x)
 
     def bars(self) -> tuple[ParticleState, ParameterBars]:
         """Return what a loss writes before :meth:`backward`: bars of the last state, and those of the masses."""
@@ -358,7 +400,7 @@ class MpmSimulation:
     def _find_volumes(self) -> None:
         """Find rest volumes, and check what follows from them."""
         if self.options.rest_volume == "grid":
-            self._launch(mass_to_grid, [self.first.x, self.mass, *self._place, self.grid_mass])
+            self._scatter_mass(self.first.x)
             self._launch(particle_volumes, [self.first.x, self.mass, self.grid_mass, *self._place, self.volume])
         else:
             volumes = self._padded([body.masses / body.material.density for body in self.bodies])
@@ -393,14 +435,19 @@ class MpmSimulation:
         shape = (self.world_count, self._lanes, self.count)
         wp.launch(kernel, shape, inputs=[*inputs, self._lanes], device=self.device)
 
+    def _scatter_mass(self, x: wp.array) -> None:
+        lanes = lanes_of(x)
+        inputs = [x, self.mass, *self._place, self.grid_mass, self.active, lanes]
+        wp.launch(mass_to_grid, (self.world_count, lanes, self.count), inputs=inputs, device=self.device)
+
     def _at_nodes(self, kernel: Callable[..., object], inputs: list[object]) -> None:
         wp.launch(kernel, self.grid_mass.shape, inputs=inputs, device=self.device)
 
-    def _obstacles(self, step: int) -> list[object]:
+    def _obstacles(self, step: int, grid: _MovedGrid) -> list[object]:
         """Return what both kernels of the shapes read."""
         assert self.shapes is not None
         time = wp.float32(step * self.options.dt)
-        return [self.shapes.obstacles, self.grid_mass, self._least, *self._place, time]
+        return [self.shapes.obstacles, grid.mass, self._least, *self._place, time]
 
     def _steps_in(self, chunk: int) -> int:
         return min(self._chunk, self.step_count - chunk * self._chunk)
@@ -442,22 +489,24 @@ class MpmSimulation:
             self._real(o.damping),
         ]
 
-    def _move_grid(self, step: int, state: ParticleState) -> None:
+    def _move_grid(self, step: int, state: ParticleState) -> _MovedGrid:
         """Compute the velocities of the grid in a step."""
-        inputs = [*self._particles(state, step), self._scattered, self.failure, step]
+        grid = self._grids[step if self._keeps_grids else 0]
+        inputs = [*self._particles(state, step), self._scattered, self.failure, step, self.active]
         self._scatter(particles_to_grid, inputs)
         push = self._vec(*(g * self.options.dt for g in self.options.gravity))
-        self._at_nodes(move_grid, [self._scattered, self._least, push, self.grid_mass, self._grid_velocity])
+        self._at_nodes(move_grid, [self._scattered, self._least, push, grid.mass, grid.velocity, self.active])
         if self.shapes is not None:
-            wp.copy(self._free_velocity, self._grid_velocity)
+            wp.copy(grid.free_velocity, grid.velocity)
             received = cast(wp.array, self.impulse[step : step + 1])
             received.zero_()
-            self._at_nodes(collide_grid, [*self._obstacles(step), self._grid_velocity, received])
+            self._at_nodes(collide_grid, [*self._obstacles(step, grid), grid.velocity, received])
+        return grid
 
     def _step(self, step: int, now: ParticleState, then: ParticleState) -> None:
         """Take one step: particles to grid, grid, grid to particles."""
         o = self.options
-        self._move_grid(step, now)
+        grid = self._move_grid(step, now)
         self._launch(
             grid_to_particles,
             [
@@ -466,7 +515,7 @@ class MpmSimulation:
                 self._control_at(step),
                 self.mass,
                 int(o.control == "material"),
-                self._grid_velocity,
+                grid.velocity,
                 *self._place,
                 self._real(o.dt),
                 self._real(o.smoothing),
@@ -476,6 +525,7 @@ class MpmSimulation:
                 then.F,
                 self.failure,
                 step,
+                self.active,
             ],
         )
 
@@ -488,9 +538,9 @@ class MpmSimulation:
         bar: ParticleState,
         parameters: ParameterBars,
     ) -> None:
-        """Carry the bars of a step's result to its start. The grid of the step is computed again."""
+        """Carry the bars of a step's result to its start. A grid that was not kept is computed again."""
         o = self.options
-        self._move_grid(step, now)
+        grid = self._grids[step] if self._keeps_grids else self._move_grid(step, now)
         self._scatter(
             grid_to_particles_adjoint,
             [
@@ -500,7 +550,7 @@ class MpmSimulation:
                 then.C,
                 self.mass,
                 int(o.control == "material"),
-                self._grid_velocity,
+                grid.velocity,
                 *self._place,
                 self._real(o.dt),
                 self._real(o.smoothing),
@@ -515,9 +565,9 @@ class MpmSimulation:
             ],
         )
         if self.shapes is not None:
-            self._at_nodes(collide_grid_adjoint, [*self._obstacles(step), self._free_velocity, self._scattered])
+            self._at_nodes(collide_grid_adjoint, [*self._obstacles(step, grid), grid.free_velocity, self._scattered])
         push = self._vec(*(g * o.dt for g in o.gravity))
-        inputs = [self.grid_mass, self._free_velocity, self._least, push, self._scattered, self._grid_bar]
+        inputs = [grid.mass, grid.free_velocity, self._least, push, self._scattered, self._grid_bar]
         self._at_nodes(move_grid_adjoint, inputs)
         control_bar = cast(wp.array, self._control_bars[self._layer(step)])
         self._launch(

@@ -69,6 +69,20 @@ def in_lane(a: int, b: int, lane: int, lanes: int):
     return ((4 * a + b) & (lanes - 1)) == lane
 
 
+@wp.func
+def moves(active: wp.array[int], world: int):
+    """Return whether a world takes part in a run; one entry stands for all worlds."""
+    return active[world % active.shape[0]] != 0
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def clear_failures(failure: wp.array2d[int], active: wp.array[int]):
+    """Forget the failures of the worlds that take part in the run to come."""
+    world = wp.tid()
+    if moves(active, world):
+        failure[world, 0] = 0
+
+
 @wp.kernel(enable_backward=False, module="unique")
 def particles_to_grid(
     # State in:
@@ -93,6 +107,7 @@ def particles_to_grid(
     scattered: wp.array4d[Any],
     failure: wp.array2d[int],
     step: int,
+    active: wp.array[int],
     lanes: int,
 ):
     """Scatter momentum and mass: p_i = sum_p w_ip (m v (1 - zeta dt) + A (x_i - x_p)), A = m C - 3/dx^2 dt V tau.
@@ -101,7 +116,7 @@ def particles_to_grid(
     """
     world, lane, p = wp.tid()
     m = mass[world, p]
-    if m > type(dx)(0.0):
+    if m > type(dx)(0.0) and moves(active, world):
         x = x_in[world, p]
         i, j, k, f = cell_of(x, origin, dx)
         shape = wp.vec3i(scattered.shape[1], scattered.shape[2], scattered.shape[3])
@@ -131,11 +146,19 @@ def particles_to_grid(
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def mass_to_grid(x_in: wp.array2d[Any], mass: wp.array2d[Any], origin: Any, dx: Any, grid_mass: wp.array4d[Any]):
-    """Scatter mass alone."""
-    world, p = wp.tid()
+def mass_to_grid(
+    x_in: wp.array2d[Any],
+    mass: wp.array2d[Any],
+    origin: Any,
+    dx: Any,
+    grid_mass: wp.array4d[Any],
+    active: wp.array[int],
+    lanes: int,
+):
+    """Scatter mass alone; the ``lanes`` threads of a particle as in :func:`particles_to_grid`."""
+    world, lane, p = wp.tid()
     m = mass[world, p]
-    if m > type(dx)(0.0):
+    if m > type(dx)(0.0) and moves(active, world):
         i, j, k, f = cell_of(x_in[world, p], origin, dx)
         if in_grid(i, j, k, wp.vec3i(grid_mass.shape[1], grid_mass.shape[2], grid_mass.shape[3])):
             wx = spline(f[0])
@@ -143,8 +166,10 @@ def mass_to_grid(x_in: wp.array2d[Any], mass: wp.array2d[Any], origin: Any, dx: 
             wz = spline(f[2])
             for a in range(4):
                 for b in range(4):
-                    for c in range(4):
-                        wp.atomic_add(grid_mass, world, i + a - 1, j + b - 1, k + c - 1, (wx[a] * wy[b]) * (wz[c] * m))
+                    if in_lane(a, b, lane, lanes):
+                        wxy = wx[a] * wy[b]
+                        for c in range(4):
+                            wp.atomic_add(grid_mass, world, i + a - 1, j + b - 1, k + c - 1, wxy * (wz[c] * m))
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -181,9 +206,12 @@ def move_grid(
     # Out:
     grid_mass: wp.array4d[Any],
     grid_velocity: wp.array4d[Any],
+    active: wp.array[int],
 ):
     """Turn momentum into velocity, v = p / m + dt g; nodes without mass stand still."""
     world, i, j, k = wp.tid()
+    if not moves(active, world):
+        return
     both = scattered[world, i, j, k]
     scattered[world, i, j, k] = scattered.dtype()
     m = both[3]
@@ -215,9 +243,12 @@ def grid_to_particles(
     F_out: wp.array2d[Any],
     failure: wp.array2d[int],
     step: int,
+    active: wp.array[int],
 ):
     """Gather v and C, move, and deform: F' = (1 - gamma) (I + dt C) F(control) + gamma F."""
     world, p = wp.tid()
+    if not moves(active, world):
+        return
     x = x_in[world, p]
     if mass[world, p] > type(dx)(0.0):
         i, j, k, f = cell_of(x, origin, dx)

@@ -29,7 +29,7 @@ def torus(major: float, minor: float, spacing: float = 0.5, material: Material =
     )
 
 
-def moving(body: ParticleBody, options: MpmOptions, *, seed: int = 0, **arguments: int) -> MpmSimulation:
+def moving(body: ParticleBody, options: MpmOptions, *, seed: int = 0, **arguments: int | bool) -> MpmSimulation:
     """Return a simulation with random velocities and controls."""
     rng = np.random.default_rng(seed)
     found = MpmSimulation(body, options, device="cpu", **arguments)

@@ -90,17 +90,18 @@ def test_gradients_by_control_and_by_deformation_differ_by_smoothing() -> None:
 
 
 def test_checkpoints_give_the_same_bits() -> None:
-    """A run that keeps every sqrt(T)-th state has the gradient of one that keeps all, to the bit."""
+    """A run that keeps every sqrt(T)-th state, or all grids, has the gradient of one that keeps all states."""
     target = torus(3.0, 1.2)
     found = []
-    for limit in (2.0e9, 4.5e6):
+    for limit, keep_grids in ((2.0e9, False), (4.5e6, False), (2.0e9, True)):
         options = MpmOptions(control="additive", smoothing=0.5, memory_limit=limit)
-        s = moving(ball(2.5), options, step_count=90, layer_count=9)
+        s = moving(ball(2.5), options, step_count=90, layer_count=9, keep_grids=keep_grids)
         loss = MassLoss(options.grid, target, device="cpu")
         found.append((loss_of(s, loss), gradient_of(s, loss), s.last.x.numpy().copy()))
-    assert found[0][0] == found[1][0]
-    for name, value in found[0][1].items():
-        assert np.array_equal(value, found[1][1][name]), name
+    for other in found[1:]:
+        assert found[0][0] == other[0]
+        for name, value in found[0][1].items():
+            assert np.array_equal(value, other[1][name]), name
 
 
 def test_no_loss_and_no_gradient_at_the_target() -> None:
@@ -124,6 +125,21 @@ def test_mass_loss_of_points(kind: str) -> None:
     ends = [loss.value_and_gradient(x + e * dx, m + e * dm)[0] for e in (1e-5, -1e-5)]
     assert (ends[0] - ends[1]) / 2e-5 == pytest.approx((by_x * dx).sum() + by_m @ dm, rel=1e-6)
     assert value > 0.0
+
+
+@pytest.mark.parametrize("kind", ["log", "squared"])
+def test_mass_loss_by_the_target(kind: str) -> None:
+    """Derivatives of a loss by positions and masses of the target's particles are those of differences."""
+    body, target, options = ball(2.0), torus(2.5, 1.0), MpmOptions()
+    loss = MassLoss(options.grid, target, kind=kind, mass_scale=2.0, dtype=wp.float64, device="cpu")
+    by_x, by_m = loss.target_gradient(body.positions + 0.03, body.masses)
+    rng = np.random.default_rng(5)
+    dx, dm = rng.standard_normal(target.positions.shape), rng.standard_normal(target.count)
+    ends = []
+    for e in (1e-5, -1e-5):
+        loss.aim(replace(target, positions=target.positions + e * dx, masses=target.masses + e * dm))
+        ends.append(loss.value_and_gradient(body.positions + 0.03, body.masses)[0])
+    assert (ends[0] - ends[1]) / 2e-5 == pytest.approx((by_x * dx).sum() + by_m @ dm, rel=1e-6)
 
 
 def test_coarse_losses_are_added() -> None:

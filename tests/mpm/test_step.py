@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import newton
 import numpy as np
 import pytest
@@ -240,10 +242,11 @@ def test_failures_name_step_and_particle() -> None:
 
 
 def test_particles_of_a_mesh_and_of_a_body_have_its_mass() -> None:
-    """Masses sum to density times volume; a lattice of the paper has density times h^3 each."""
+    """Masses sum to density times volume; a lattice of the paper has density times h^3 each, a point its own volume."""
     import trimesh
 
-    from softmode.deformables import build_body, quadrature_from_box
+    from softmode.deformables import BuildOptions, build_body, quadrature_from_box
+    from softmode.deformables.build.sources import pack_sources, unpack_sources
 
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=2.0)
     found = particles_from_mesh(mesh.vertices, mesh.faces, spacing=0.25, material=MORPH_MATERIAL)
@@ -251,10 +254,20 @@ def test_particles_of_a_mesh_and_of_a_body_have_its_mass() -> None:
     assert np.linalg.norm(found.centre) < 0.05
     printed = particles_from_mesh(mesh.vertices, mesh.faces, spacing=0.25, material=MORPH_MATERIAL, exact=False)
     assert printed.masses == pytest.approx(75.0 * 0.25**3)
-    body = build_body(quadrature_from_box((0.2, 0.1, 0.1), point_count=600), progress=False)
+    quadrature = quadrature_from_box((0.2, 0.1, 0.1), point_count=600)
+    body = build_body(quadrature, BuildOptions(mode_count=2, kernel_count=40, cubature_count=32), progress=False)
     inside = particles_from_body(body, spacing=0.01, material=MORPH_MATERIAL)
     assert inside.mass == pytest.approx(75.0 * 0.2 * 0.1 * 0.1, rel=1e-12)
     assert inside.count == pytest.approx(2000, rel=0.2)
+    at_points = particles_from_body(body, material=MORPH_MATERIAL)
+    assert at_points.masses == pytest.approx(75.0 * quadrature.weights, rel=1e-15)
+    assert at_points.mass == pytest.approx(75.0 * quadrature.volume, rel=1e-12)
+    assert np.abs(at_points.centre).max() < 1e-12
+    painted = replace(unpack_sources(body), density_scale=np.linspace(0.5, 1.5, len(quadrature.points)))
+    with pytest.raises(ConfigError, match="painted"):
+        particles_from_body(replace(body, sources=pack_sources(painted)))
+    with pytest.raises(ConfigError, match="does not keep"):
+        particles_from_body(replace(body, sources=None))
 
 
 def test_bad_input() -> None:
