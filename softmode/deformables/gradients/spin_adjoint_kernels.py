@@ -188,6 +188,34 @@ def start_losses(
     return inertial, turned, away
 
 
+@wp.func
+def state_losses(
+    instances: Instances,
+    basis: Basis,
+    motion: Motion,
+    loss: SpinLoss,
+    spin: Spin,
+    turn: Turn,
+    S_bar: wp.mat33d,
+    U_bar: wp.mat33d,
+    q: wp.array2d[vec8d],
+    costate: wp.array2d[vec8d],
+    qd_bar: wp.array2d[vec8d],
+    dt: wp.float64,
+    i: int,
+    b: int,
+):
+    """Return eight coordinates of the losses by r and u at the start, those through S and U among them."""
+    rest, one = rest_block(basis, instances.asset[i], b)
+    _i, turned, away = start_losses(instances, motion, loss, spin, q, costate, qd_bar, dt, i, b, rest, one)
+    _x, r = turned_block(spin, i, unknown_block(motion.q_start, i, b), rest, one)
+    u = unknown_block(motion.qd_start, i, b) - wp.outer(spin.velocity[i], one)
+    by_r = wp.transpose(turn.R) * turned + wp.transpose(turn.D) * away
+    by_r += wp.float64(2.0) * S_bar * r + U_bar * u
+    by_u = turn.R * away + wp.transpose(U_bar) * r
+    return by_r, by_u
+
+
 @wp.kernel
 def propagate_spin(
     instances: Instances,
@@ -266,23 +294,12 @@ def propagate_spin(
     r_total = wp.vec3d()
     u_total = wp.vec3d()
     for b in range(blocks):
-        rest, one = rest_block(basis, a, b)
-        _i, turned, away = start_losses(instances, motion, loss, spin, q, costate, end, dt, i, b, rest, one)
-        _x, r = turned_block(spin, i, unknown_block(motion.q_start, i, b), rest, one)
-        u = unknown_block(motion.qd_start, i, b) - wp.outer(spin.velocity[i], one)
-        by_r = wp.transpose(turn.R) * turned + wp.transpose(turn.D) * away
-        by_r += wp.float64(2.0) * S_bar * r + U_bar * u
-        by_u = turn.R * away + wp.transpose(U_bar) * r
+        _rest, one = rest_block(basis, a, b)
+        by_r, by_u = state_losses(instances, basis, motion, loss, spin, turn, S_bar, U_bar, q, costate, end, dt, i, b)
         r_total += by_r * one
         u_total += by_u * one
     for b in range(blocks):
-        rest, one = rest_block(basis, a, b)
-        _i, turned, away = start_losses(instances, motion, loss, spin, q, costate, end, dt, i, b, rest, one)
-        _x, r = turned_block(spin, i, unknown_block(motion.q_start, i, b), rest, one)
-        u = unknown_block(motion.qd_start, i, b) - wp.outer(spin.velocity[i], one)
-        by_r = wp.transpose(turn.R) * turned + wp.transpose(turn.D) * away
-        by_r += wp.float64(2.0) * S_bar * r + U_bar * u
-        by_u = turn.R * away + wp.transpose(U_bar) * r
+        by_r, by_u = state_losses(instances, basis, motion, loss, spin, turn, S_bar, U_bar, q, costate, end, dt, i, b)
         mean = basis.mean[a, b]
         add_block(q_bar[t + 1], i, b, by_r + wp.outer(X_bar - r_total, mean))
         add_block(qd_bar[t + 1], i, b, by_u + wp.outer(V_bar - u_total, mean))

@@ -95,9 +95,7 @@ class Motion:
 class Points:
     """Results at the cubature points."""
 
-    start: wp.array2d[
-        wp.mat33d
-    ]  # (instance_count, point_max), elastic F - I at the start of the step, of viscous bodies
+    start: wp.array2d[wp.mat33d]  # (instance_count, point_max), elastic F - I at the step's start, of viscous bodies
     energy: wp.array2d[wp.float64]  # (instance_count, point_max) [J]
     stress: wp.array2d[wp.mat33d]  # (instance_count, point_max), V P [N m]
     hessian: wp.array3d[wp.mat33]  # (instance_count, 6, point_max), blocks 00, 01, 02, 11, 12, 22 of V d2Psi/dF2 [N m]

@@ -15,7 +15,6 @@ import warp as wp
 from softmode.deformables.contact.penalty_kernels import normal_potential, slip_potential
 from softmode.deformables.model.lane_kernels import team_sum, vec8d
 from softmode.deformables.model.struct_kernels import (
-    Basis,
     Instances,
     PointConstraints,
     Rigid,
@@ -27,6 +26,7 @@ from softmode.deformables.model.struct_kernels import (
 from softmode.deformables.solver.iteration_kernels import NewtonStep
 from softmode.deformables.solver.spin_kernels import (
     axial,
+    centre_of_mass,
     rest_block,
     rotation_of,
     team_sum3,
@@ -75,25 +75,39 @@ def solve_six(H: mat66d, g: vec6d):
 
 
 @wp.func
-def contact_place(
+def find_displacement(step: NewtonStep, i: int, e: int):
+    """Write the displacement of a contact at the iterate, relative to the other side; return offset + d."""
+    row = step.constraints.row[i, e]
+    count = step.instances.function_count[i]
+    d = interpolate_change(step.basis.row, row, step.arrays.q, step.motion.q_start, i, count)
+    d -= rigid_motion(step.instances, step.constraints, step.rigid, i, e)
+    step.constraints.displacement[i, e] = d
+    return step.constraints.offset[i, e] + d
+
+
+@wp.func
+def rigid_motion(instances: Instances, constraints: PointConstraints, rigid: Rigid, i: int, e: int):
+    """Return how far the rigid unknowns have moved the other side of a contact."""
+    w = instances.world[i]
+    moved = wp.vec3d()
+    for k in range(constraints.dof_begin[i, e], constraints.dof_end[i, e]):
+        moved += rigid.r[w, k] * wp.vec3d(constraints.jacobian[i, e, k])
+    return moved
+
+
+@wp.func
+def contact_arm(
     instances: Instances,
-    basis: Basis,
-    q_start: wp.array2d[vec8d],
     constraints: PointConstraints,
     rigid: Rigid,
     samples: Samples,
-    q: wp.array2d[vec8d],
+    X: wp.vec3d,
     i: int,
     e: int,
 ):
-    """Return offset + d of a contact at the iterate, and where its sample is."""
-    row = constraints.row[i, e]
-    d = interpolate_change(basis.row, row, q, q_start, i, instances.function_count[i])
-    place = samples.position[i, row - instances.row_start[i]] + d
-    w = instances.world[i]
-    for k in range(constraints.dof_begin[i, e], constraints.dof_end[i, e]):
-        d -= rigid.r[w, k] * wp.vec3d(constraints.jacobian[i, e, k])
-    return constraints.offset[i, e] + d, place
+    """Return where the sample of a contact is at the iterate, from X."""
+    start = samples.position[i, constraints.row[i, e] - instances.row_start[i]]
+    return start + constraints.displacement[i, e] + rigid_motion(instances, constraints, rigid, i, e) - X
 
 
 @wp.func
@@ -121,6 +135,13 @@ def contact_at(
 
 
 @wp.func
+def rigid_share(weight: wp.float64, away: wp.vec3d, C: wp.mat33d, t: wp.vec3d, R: wp.mat33d):
+    """Return what inertia and external forces have of the potential of the motion by t and R [J]."""
+    turned = wp.ddot(C, R - wp.identity(n=3, dtype=wp.float64))
+    return wp.float64(0.5) * weight * wp.dot(t, t + wp.float64(2.0) * away) - turned
+
+
+@wp.func
 def rigid_potential(
     step: NewtonStep,
     samples: Samples,
@@ -136,27 +157,14 @@ def rigid_potential(
     """Return the potential of the motion by t and R [J], with away = X - X* and C = sum (m/dt^2 r* + f) r^T."""
     share = wp.float64(0.0)
     for e in range(member, step.constraints.count[i] - step.constraints.pair_count[i], team):
-        total, place = contact_place(
-            step.instances,
-            step.basis,
-            step.motion.q_start,
-            step.constraints,
-            step.rigid,
-            samples,
-            step.arrays.q,
-            i,
-            e,
-        )
-        r = place - X
+        r = contact_arm(step.instances, step.constraints, step.rigid, samples, X, i, e)
+        total = step.constraints.offset[i, e] + step.constraints.displacement[i, e]
         value, _f, _H = contact_at(
             step.constraints, step.instances.smoothing[i], step.options.stick_range, total + t + R * r - r, i, e, 0
         )
         share += value
     weight = step.instances.mass[i] / (step.options.dt * step.options.dt)
-    rigid = wp.float64(0.5) * weight * wp.dot(t, t + wp.float64(2.0) * away) - wp.ddot(
-        C, R - wp.identity(n=3, dtype=wp.float64)
-    )
-    return team_sum(share) + rigid
+    return team_sum(share) + rigid_share(weight, away, C, t, R)
 
 
 @wp.kernel
@@ -170,7 +178,8 @@ def start_rigidly(step: NewtonStep, samples: Samples, team: int):
         return
     dt = step.options.dt
     a = step.instances.asset[i]
-    blocks = blocks_of(step.instances.function_count[i])
+    n = step.instances.function_count[i]
+    blocks = blocks_of(n)
     weight = step.instances.mass[i] / (dt * dt)
     moved = wp.float64(0.0)
     for e in range(member, step.arrays.q.shape[1], team):
@@ -181,17 +190,7 @@ def start_rigidly(step: NewtonStep, samples: Samples, team: int):
         return
     stored = wp.float64(0.0)
     for e in range(member, count, team):
-        total, _place = contact_place(
-            step.instances,
-            step.basis,
-            step.motion.q_start,
-            step.constraints,
-            step.rigid,
-            samples,
-            step.arrays.q,
-            i,
-            e,
-        )
+        total = find_displacement(step, i, e)
         penetration = -wp.dot(step.constraints.normal[i, e], total)
         psi, _slope, _curvature = normal_potential(penetration, wp.float64(step.instances.smoothing[i]))
         stored += step.constraints.stiffness[i, e] * psi
@@ -199,17 +198,13 @@ def start_rigidly(step: NewtonStep, samples: Samples, team: int):
     if stored < wp.float64(0.5) * weight * moved:
         return
 
-    X = wp.vec3d()
-    target = wp.vec3d()
+    X = centre_of_mass(step.basis, step.arrays.q, a, n, i, member, team)
+    target = centre_of_mass(step.basis, step.motion.q_inertial, a, n, i, member, team)
     force = wp.vec3d()
     for b in range(member, blocks, team):
-        rest, one = rest_block(step.basis, a, b)
-        mean = step.basis.mean[a, b]
-        X += (unknown_block(step.arrays.q, i, b) + rest) * mean
-        target += (unknown_block(step.motion.q_inertial, i, b) + rest) * mean
+        _rest, one = rest_block(step.basis, a, b)
         force += unknown_block(step.motion.force, i, b) * one
-    X = team_sum3(X)
-    away = X - team_sum3(target) - team_sum3(force) / weight
+    away = X - target - team_sum3(force) / weight
     C = wp.mat33d()
     for b in range(member, blocks, team):
         rest, one = rest_block(step.basis, a, b)
@@ -231,19 +226,9 @@ def start_rigidly(step: NewtonStep, samples: Samples, team: int):
         H_tr = wp.mat33d()
         H_rr = wp.mat33d()
         for e in range(member, count, team):
-            total, place = contact_place(
-                step.instances,
-                step.basis,
-                step.motion.q_start,
-                step.constraints,
-                step.rigid,
-                samples,
-                step.arrays.q,
-                i,
-                e,
-            )
-            r = place - X
+            r = contact_arm(step.instances, step.constraints, step.rigid, samples, X, i, e)
             arm = R * r
+            total = step.constraints.offset[i, e] + step.constraints.displacement[i, e]
             value, f, K = contact_at(
                 step.constraints, step.instances.smoothing[i], step.options.stick_range, total + t + arm - r, i, e, 1
             )
@@ -259,8 +244,7 @@ def start_rigidly(step: NewtonStep, samples: Samples, team: int):
         H_tt = team_sum33(H_tt)
         H_tr = team_sum33(H_tr)
         H_rr = team_sum33(H_rr)
-        potential = team_sum(share) + wp.float64(0.5) * weight * wp.dot(t, t + wp.float64(2.0) * away)
-        potential -= wp.ddot(C, R - wp.identity(n=3, dtype=wp.float64))
+        potential = team_sum(share) + rigid_share(weight, away, C, t, R)
         H = mat66d()
         g = vec6d()
         by_t = weight * (t + away) - push

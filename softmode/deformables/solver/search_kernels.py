@@ -21,6 +21,7 @@ from softmode.deformables.model.struct_kernels import (
 from softmode.deformables.solver.iteration_kernels import NewtonArrays, NewtonOptions, NewtonStep, mat38d
 from softmode.deformables.solver.spin_kernels import (
     axial,
+    centre_of_mass,
     rest_block,
     rotation_of,
     team_sum3,
@@ -238,17 +239,15 @@ def find_turn(instances: Instances, basis: Basis, arrays: NewtonArrays, i: int, 
     Along a straight line a rotation stretches, which a stiff body resists long before the rotation is done.
     """
     a = instances.asset[i]
-    X = wp.vec3d()
+    n = instances.function_count[i]
+    X = centre_of_mass(basis, arrays.q, a, n, i, member, team)
     shift = wp.vec3d()
-    for b in range(member, blocks_of(instances.function_count[i]), team):
-        rest, _one = rest_block(basis, a, b)
-        X += (unknown_block(arrays.q, i, b) + rest) * basis.mean[a, b]
+    for b in range(member, blocks_of(n), team):
         shift += direction_block(arrays, i, b) * basis.mean[a, b]
-    X = team_sum3(X)
     shift = team_sum3(shift)
     S = wp.mat33d()
     U = wp.mat33d()
-    for b in range(member, blocks_of(instances.function_count[i]), team):
+    for b in range(member, blocks_of(n), team):
         rest, one = rest_block(basis, a, b)
         r = unknown_block(arrays.q, i, b) + rest - wp.outer(X, one)
         S += r * wp.transpose(r)

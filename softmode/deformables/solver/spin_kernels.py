@@ -183,6 +183,16 @@ def team_sum33(value: wp.mat33d):
     return total
 
 
+@wp.func
+def centre_of_mass(basis: Basis, values: wp.array2d[vec8d], a: int, n: int, i: int, member: int, team: int):
+    """Return the centre of mass of a placement in blocks [m]."""
+    X = wp.vec3d()
+    for b in range(member, blocks_of(n), team):
+        rest, _one = rest_block(basis, a, b)
+        X += (unknown_block(values, i, b) + rest) * basis.mean[a, b]
+    return team_sum3(X)
+
+
 @wp.kernel
 def find_spin(
     step: NewtonStep,
@@ -314,11 +324,7 @@ def end_spin(
     a = step.instances.asset[i]
     n = step.instances.function_count[i]
     dt = step.options.dt
-    X = wp.vec3d()
-    for b in range(member, blocks_of(n), team):
-        rest, _one = rest_block(step.basis, a, b)
-        X += (unknown_block(step.arrays.q, i, b) + rest) * step.basis.mean[a, b]
-    X = team_sum3(X)
+    X = centre_of_mass(step.basis, step.arrays.q, a, n, i, member, team)
     S = wp.mat33d()
     G = wp.mat33d()
     free = step.constraints.count[i] == 0
