@@ -80,8 +80,9 @@ def robot_options(robot: str | None) -> dict[str, str]:
     """Return the keyword argument of environments that names a robot, a file by its whole path; none if omitted."""
     if robot is None:
         return {}
-    is_file = "/" in robot or robot.lower().endswith((".xml", ".mjcf", ".urdf"))
-    return {"robot": str(Path(robot).resolve()) if is_file else robot}
+    from softmode.robots.assets import names_file
+
+    return {"robot": str(Path(robot).resolve()) if names_file(robot) else robot}
 
 
 def optional_argument() -> Any:

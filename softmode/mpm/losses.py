@@ -20,8 +20,7 @@ from softmode.mpm.adjoint_kernels import mass_to_grid_adjoint
 from softmode.mpm.grid import MARGIN, Grid
 from softmode.mpm.loss_kernels import log_mass_at_nodes, mass_at_nodes, position_at_particles
 from softmode.mpm.particles import ParticleBody
-from softmode.mpm.simulation import MpmSimulation, ParameterBars, ParticleState, lanes_of
-from softmode.mpm.step_kernels import mass_to_grid
+from softmode.mpm.simulation import MpmSimulation, ParameterBars, ParticleState, scatter_masses
 
 MassLossKind = Literal["log", "squared"]
 
@@ -174,10 +173,8 @@ class MassLoss:
             ConfigError: If a point lies outside of the grid.
         """
         x, mass = self._particles(points, masses)
-        grid_mass = self._on_grid(x, mass)
-        loss, bar = wp.zeros(1, dtype=wp.float64, device=self.device), wp.zeros_like(grid_mass)
-        self.evaluate(grid_mass, loss, bar)
-        return float(loss.numpy()[0]), *self._spread_to(x, mass, bar)
+        loss, _, bar = self._compared(x, mass)
+        return loss, *self._spread_to(x, mass, bar)
 
     def target_gradient(self, points: ArrayLike, masses: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return the derivatives of the loss of particles by what the target is.
@@ -192,9 +189,7 @@ class MassLoss:
         Raises:
             ConfigError: If a point lies outside of the grid.
         """
-        grid_mass = self._on_grid(*self._particles(points, masses))
-        loss, bar = wp.zeros(1, dtype=wp.float64, device=self.device), wp.zeros_like(grid_mass)
-        self.evaluate(grid_mass, loss, bar)
+        _, grid_mass, bar = self._compared(*self._particles(points, masses))
         by_target = -bar.numpy()
         if self.kind == "log":
             # dL/dm = r / (m + s), dL/dm* = -r / (m* + s).
@@ -212,6 +207,13 @@ class MassLoss:
             raise ConfigError(f"masses: expected shape ({len(found)},), got {np.shape(masses)}")
         return x, mass
 
+    def _compared(self, x: wp.array, mass: wp.array) -> tuple[float, wp.array, wp.array]:
+        """Return the loss of one world of particles, their masses on the grid, and its derivatives by these."""
+        grid_mass = self._on_grid(x, mass)
+        loss, bar = wp.zeros(1, dtype=wp.float64, device=self.device), wp.zeros_like(grid_mass)
+        self.evaluate(grid_mass, loss, bar)
+        return float(loss.numpy()[0]), grid_mass, bar
+
     def _spread_to(self, x: wp.array, mass: wp.array, grid_mass_bar: wp.array) -> tuple[np.ndarray, np.ndarray]:
         """Return derivatives by positions and masses of one world of particles."""
         x_bar, mass_bar = wp.zeros_like(x), wp.zeros_like(mass)
@@ -221,9 +223,7 @@ class MassLoss:
     def scatter(self, x: wp.array, mass: wp.array, grid_mass: wp.array, active: wp.array | None = None) -> None:
         """Write the masses of the nodes [kg], (W, nx, ny, nz), of particles x [m] and masses [kg], (W, N)."""
         grid_mass.zero_()
-        lanes = lanes_of(x)
-        inputs = [x, mass, *self._place, grid_mass, self._all if active is None else active, lanes]
-        wp.launch(mass_to_grid, (x.shape[0], lanes, x.shape[1]), inputs=inputs, device=self.device)
+        scatter_masses(x, mass, self._place, grid_mass, self._all if active is None else active)
 
     def _on_grid(self, x: wp.array, mass: wp.array) -> wp.array:
         grid_mass = wp.zeros((x.shape[0], *self.grid.shape), dtype=self.dtype, device=self.device)

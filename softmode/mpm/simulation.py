@@ -46,9 +46,19 @@ FEW_PARTICLES = 0.5
 """Particles per cell under which a body falls apart into unconnected clumps."""
 
 
-def lanes_of(x: wp.array) -> int:
-    """Return how many threads scatter the mass of each of the particles (W, N)."""
-    return 8 if wp.get_device(x.device).is_cuda and x.size < FILLS_GPU else 1
+def scatter_masses(x: wp.array, mass: wp.array, place: Sequence[object], grid_mass: wp.array, active: wp.array) -> None:
+    """Add the masses of particles to those of the nodes.
+
+    Args:
+        x: Positions [m], (W, N).
+        mass: Masses [kg], (W, N).
+        place: Origin and spacing of the grid, in the type of the particles.
+        grid_mass: Masses of the nodes [kg], (W, nx, ny, nz).
+        active: Worlds that take part, (W,), or one entry for all.
+    """
+    lanes = 8 if wp.get_device(x.device).is_cuda and x.size < FILLS_GPU else 1
+    shape = (x.shape[0], lanes, x.shape[1])
+    wp.launch(mass_to_grid, shape, inputs=[x, mass, *place, grid_mass, active, lanes], device=x.device)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -436,9 +446,7 @@ class MpmSimulation:
         wp.launch(kernel, shape, inputs=[*inputs, self._lanes], device=self.device)
 
     def _scatter_mass(self, x: wp.array) -> None:
-        lanes = lanes_of(x)
-        inputs = [x, self.mass, *self._place, self.grid_mass, self.active, lanes]
-        wp.launch(mass_to_grid, (self.world_count, lanes, self.count), inputs=inputs, device=self.device)
+        scatter_masses(x, self.mass, self._place, self.grid_mass, self.active)
 
     def _at_nodes(self, kernel: Callable[..., object], inputs: list[object]) -> None:
         wp.launch(kernel, self.grid_mass.shape, inputs=inputs, device=self.device)

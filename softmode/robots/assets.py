@@ -95,6 +95,11 @@ def fetch(names: str | Sequence[str]) -> tuple[Path, ...]:
     return tuple(find(name).path.parent for name in wanted)
 
 
+def names_file(source: str) -> bool:
+    """Return whether a text means an MJCF or URDF file, not a robot by name."""
+    return "/" in source or source.lower().endswith((".xml", ".mjcf", ".urdf"))
+
+
 def find(name: str, *, download: bool = True) -> RobotAsset:
     """Return the model that a name stands for, downloading it if it is not in the cache.
 

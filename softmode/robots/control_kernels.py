@@ -206,6 +206,11 @@ def _clean(value: float):
 
 
 @wp.func
+def _within_half_turn(angle: float):
+    return angle - 2.0 * wp.pi * wp.round(angle / (2.0 * wp.pi))
+
+
+@wp.func
 def held_target(
     settings: Settings, position: wp.vec3, yaw: float, measured: wp.transform, move: wp.vec3, turn_entry: float
 ):
@@ -228,8 +233,7 @@ def held_target(
     moved = _clamp_into(moved, settings.workspace_lower, settings.workspace_upper)
     wanted = yaw + settings.rotation_scale * turn_entry
     measured_yaw = _tool_yaw(wp.transform_get_rotation(measured))
-    turn = wanted - measured_yaw
-    turn = turn - 2.0 * wp.pi * wp.round(turn / (2.0 * wp.pi))
+    turn = _within_half_turn(wanted - measured_yaw)
     return moved, measured_yaw + wp.clamp(turn, -settings.max_lead_angle, settings.max_lead_angle)
 
 
@@ -247,8 +251,7 @@ def attained_target(position: wp.vec3, yaw: float, pose: wp.transform):
     if wp.length(attained - position) > 0.002:
         at = attained
     attained_yaw = _tool_yaw(wp.transform_get_rotation(pose))
-    missing = yaw - attained_yaw
-    missing = missing - 2.0 * wp.pi * wp.round(missing / (2.0 * wp.pi))
+    missing = _within_half_turn(yaw - attained_yaw)
     return at, wp.where(wp.abs(missing) > 0.01, attained_yaw, yaw)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from softmode.checks import require_number
 from softmode.errors import AssetError, ConfigError
-from softmode.robots.assets import RobotAsset, find
+from softmode.robots.assets import RobotAsset, find, names_file
 from softmode.robots.compiled import CompiledRobot
 from softmode.robots.description import RobotDescription
 from softmode.robots.joint_split import hold_base, split_links
@@ -133,7 +133,7 @@ def _locate(source: str | Path, asset_root: str | Path | None, download: bool) -
     """Return the file that ``source`` means."""
     if not isinstance(source, (str, Path)):
         raise ConfigError(f"source is a {type(source).__name__}", hint="give a robot's name or the path of a file")
-    if isinstance(source, str) and not source.lower().endswith((".xml", ".mjcf", ".urdf")) and "/" not in source:
+    if isinstance(source, str) and not names_file(source):
         return find(source, download=download)
     path = Path(source)
     urdf = path.suffix.lower() == ".urdf"

@@ -185,11 +185,11 @@ class BoundSplats:
     def frames(self) -> dict[tuple[int, int], SplatFrame]:
         """Return the splats as they are by place of the world in `worlds` and object; reads from the device."""
         means, covariances = host(self.arrays.means), host(self.arrays.covariances)
+        shown = np.arange(len(means)) if self._choice is None else self._choice.numpy()
         frames: dict[tuple[int, int], SplatFrame] = {}
         for o, columns, counts in zip(self.indices, self.columns, self._counts, strict=False):
             for w in range(len(means)):
-                k = w if self._choice is None else int(self._choice.numpy()[w])
-                mine = slice(columns.start, columns.start + counts[k % len(counts)])
+                mine = slice(columns.start, columns.start + counts[shown[w] % len(counts)])
                 frames[w, o] = SplatFrame(means=means[w, mine].copy(), covariances=covariances[w, mine].copy())
         return frames
 

@@ -78,7 +78,7 @@ class BodyChoice:
             "mass_damping": [one.mass_damping for one in materials],
         }
         self._rows = allocate(kernels.BodyRows, "", {}, device, given=rows)
-        self._history = [*_histories(tables)]
+        self._history = _histories(tables)
 
     def set(self, choice: wp.array, world_mask: wp.array) -> None:
         """Put the chosen body into the masked worlds; reads nothing back and may be captured.
@@ -118,8 +118,8 @@ def _histories(tables: Any) -> list[wp.array]:
     for struct, table in owned:
         for name in struct.vars:
             value = getattr(table, name)
-            if not isinstance(value, wp.array) or name in _KEPT or not value.size or value.shape[0] != count:
+            if name in _KEPT or not isinstance(value, wp.array) or not value.is_contiguous:
                 continue
-            if value.is_contiguous:
+            if value.size and value.shape[0] == count:
                 found.append(words_of(value, count))
     return found
