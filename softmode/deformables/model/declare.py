@@ -35,6 +35,9 @@ def struct(declared: type) -> type[Struct]:
 def kernel_over(function: Any, name: str, *indices: str) -> Any:
     """Return the kernel that calls a device function at every point of its launch.
 
+    Such kernels are compiled apart from the others of their Python module, so that nobody compiles them who takes the
+    one launch.
+
     Args:
         function: A ``wp.func``. A launch per phase and the launch that takes a world through all of its iterations
             then run the same code.
@@ -51,7 +54,8 @@ def kernel_over(function: Any, name: str, *indices: str) -> Any:
     made = scope[name]
     made.__module__, made.__doc__ = function.func.__module__, function.func.__doc__
     made.__annotations__ = {p: types[p] for p in given}
-    return wp.Kernel(made, key=name, source=source)
+    apart = wp.get_module(f"{made.__module__}.phases")
+    return wp.Kernel(made, key=name, source=source, module=apart, options={"enable_backward": False})
 
 
 def launch(

@@ -44,6 +44,8 @@ wp.set_module_options({"enable_backward": False})
 
 TEAM = 96
 """Threads that share a world on CUDA."""
+BLOCKS = 4
+"""Worlds that a multiprocessor takes at a time: what registers are given out for."""
 
 
 @cache
@@ -58,7 +60,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0) -> Kernel:
     shared, dynamic = size > 0, dynamic_floats(size, width)
     shared_direction = shared_direction_of(size or 24, width or 32)  # called where ``shared`` says so
 
-    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(TEAM, 4))
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(TEAM, BLOCKS))
     def minimise_worlds(
         step: NewtonStep,
         unit: wp.array3d[unit_type],  # the systems in units of ``factor_width`` columns

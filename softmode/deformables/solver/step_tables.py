@@ -42,7 +42,7 @@ from softmode.deformables.solver.systems import join_systems
 CUDA_THREADS = 2**16
 """Threads that keep a GPU busy: sums over points are split until there are about so many."""
 ONE_LAUNCH_BLOCKS = 7
-"""Blocks of eight functions up to which a body is small enough for a team of threads on CUDA."""
+"""Blocks of eight functions up to which a body is small enough for a team of threads on CUDA; on CPU any is."""
 RESERVED_BYTES = 2048
 """Shared memory that the one launch needs besides its system, with what CUDA keeps for itself."""
 
@@ -129,7 +129,7 @@ class StepTables:
     team: int
     """Threads that share one system."""
     one_launch: bool
-    """Whether a team of threads takes a world through all of its Newton iterations in one launch."""
+    """Whether a team of threads, on CPU one, takes a world through all of its Newton iterations in one launch."""
     fused_kernel: Kernel
     """The kernel of that launch."""
     shared: bool
@@ -205,11 +205,12 @@ def allocate_tables(
     system_start, system = join_systems(layout, instances, rigid.count_max + 1, device)
 
     blocks, count, square = layout.block_count, layout.instance_count, 3 * layout.block_count**2
-    one_launch = device.is_cuda and layout.part_count == 1 and blocks <= ONE_LAUNCH_BLOCKS
+    one_launch = layout.part_count == 1 and (device.is_cpu or blocks <= ONE_LAUNCH_BLOCKS)
     one_each = count == layout.world_count and layout.pin_max == 0
     driven = any(body.driven_count for body in layout.bodies)
     size = (3 * layout.stride, system.scalars.shape[2])
-    shared = one_launch and one_each and not driven and fits_in_shared_memory(device.max_shared_memory_per_block, *size)
+    shared = device.is_cuda and one_launch and one_each and not driven
+    shared = shared and fits_in_shared_memory(device.max_shared_memory_per_block, *size)
 
     def chunks(threads: int, tasks: int) -> int:
         """Return into how many parts sums over points are split where a kernel has so many threads, a body tasks."""
