@@ -12,8 +12,8 @@ from softmode.deformables.model.status import status_reasons
 from softmode.envs.task import Task
 from softmode.envs.tensors import map_tree
 
-Tree = wp.array | dict[str, "Tree"]
-"""An array whose first axis is the world, or a dict of such trees."""
+Tree = wp.array | np.ndarray | dict[str, "Tree"] | list["Tree"]
+"""An array whose first axis is the world, or a dict or list of such trees."""
 
 
 def observation_arrays(task: Task, *, final: bool = False) -> Tree:
@@ -67,6 +67,20 @@ def columns_of(array: wp.array, columns: int | slice) -> wp.array:
     return cast(wp.array, array[:, columns])
 
 
+def host_view(array: wp.array) -> wp.array | np.ndarray:
+    """Return an array on CPU as a NumPy array of the same memory, and one on another device as it is."""
+    device: Any = array.device
+    return array.numpy() if device.is_cpu else array
+
+
+def write(values: np.ndarray, out: wp.array | np.ndarray) -> None:
+    """Write numbers of the host to what `host_view` returned."""
+    if isinstance(out, np.ndarray):
+        out[:] = values
+    else:
+        out.assign(values)
+
+
 def take(tree: Tree, world: int, *, scalars: bool = False) -> Any:
     """Return one world of a tree as NumPy arrays of its own.
 
@@ -76,8 +90,8 @@ def take(tree: Tree, world: int, *, scalars: bool = False) -> Any:
         scalars: Whether single numbers become Python's.
     """
 
-    def row(array: wp.array) -> Any:
-        value = array.numpy()[world]
+    def row(array: wp.array | np.ndarray) -> Any:
+        value = (array if isinstance(array, np.ndarray) else array.numpy())[world]
         return value.item() if scalars and value.ndim == 0 else value.copy()
 
     return map_tree(row, tree)

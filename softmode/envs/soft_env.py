@@ -33,9 +33,10 @@ from softmode.envs.env_state import (
     worlds_state,
 )
 from softmode.envs.parameters import check_options
-from softmode.envs.results import info_arrays, observation_arrays, take
+from softmode.envs.results import host_view, info_arrays, observation_arrays, take, write
 from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
+from softmode.envs.tensors import map_tree
 from softmode.errors import ConfigError
 from softmode.robots.description import RobotDescription
 from softmode.robots.table_robot import TableRobot
@@ -135,6 +136,10 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         self._object_names = () if self.config.object_set is None else self.config.object_set.names
         self.action_space = self.task.action_space
         self.observation_space = self.task.observation_space()
+        task = self.task
+        made = (task.scene.actions, observation_arrays(task), info_arrays(task))
+        self._arrays = map_tree(host_view, (*made, task.reward, task.terminated, task.truncated))
+        """Actions, observation, infos, reward and ends of the last step: always the same memory."""
 
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode."""
@@ -160,14 +165,15 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         Raises:
             ConfigError: If the action has another shape or holds NaN; nothing has moved then.
         """
-        task = self.task
-        task.scene.actions.assign(checked_actions(action, self.action_space)[None])
-        task.step()
+        given = checked_actions(action, self.action_space)[None]
+        actions, _, _, *ends = self._arrays
+        write(given, actions)
+        self.task.step()
         info = self._info()
-        terminated = bool(task.terminated.numpy()[0])
+        reward, terminated, truncated = take(ends, 0, scalars=True)
         if terminated:
             info["failure"] = EndReason(info["end_reason"]).name.lower()
-        return self._observe(), float(task.reward.numpy()[0]), terminated, bool(task.truncated.numpy()[0]), info
+        return self._observe(), reward, terminated, truncated, info
 
     def get_state(self) -> EnvState:
         """Return the state, from which `set_state` goes on with the same bits on CPU.
@@ -220,11 +226,11 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
 
     def _observe(self) -> Any:
         """Return the observation in arrays of its own."""
-        return take(observation_arrays(self.task), 0)
+        return take(self._arrays[1], 0)
 
     def _info(self) -> dict[str, Any]:
         """Return the info of the present state."""
-        info = take(info_arrays(self.task), 0, scalars=True)
+        info = take(self._arrays[2], 0, scalars=True)
         info["solver_reasons"] = status_reasons(info["solver_status"])
         if self._object_names:
             info["object_name"] = self._object_names[info["object"]]

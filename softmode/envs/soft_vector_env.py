@@ -416,11 +416,13 @@ class SoftVectorEnv(gym.vector.VectorEnv):
             return {name: self._join([tree[name] for tree in trees]) for name in first}
         if len(trees) > 1:
             return np.concatenate(trees)
+        on_host = isinstance(first, np.ndarray)
         if self.output == "numpy":
-            return first.numpy().copy()
+            return (first if on_host else first.numpy()).copy()
         import torch
 
-        return wp.to_torch(first).clone(memory_format=torch.contiguous_format)
+        tensor = torch.from_numpy(first) if on_host else wp.to_torch(first)
+        return tensor.clone(memory_format=torch.contiguous_format)
 
     def _add_final(self, infos: dict[str, Any], ended: Any) -> None:
         """Add the last observation and info of the episodes that ended; always, where nothing may be read back."""

@@ -16,7 +16,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softmode.envs.env_state import set_worlds_state, worlds_state
-from softmode.envs.results import info_arrays, observation_arrays
+from softmode.envs.results import host_view, info_arrays, observation_arrays, write
 from softmode.envs.task import Task
 from softmode.envs.tensors import map_tree
 from softmode.errors import SoftmodeError, WorkerError
@@ -26,7 +26,7 @@ ANSWERED = ("reset", "step", "set_state")
 
 
 class LocalWorlds:
-    """A task in this process; results are trees of Warp arrays, overwritten by the next call.
+    """A task in this process; results are trees of arrays, overwritten by the next call: on CPU NumPy's, else Warp's.
 
     Args:
         task_class: The task.
@@ -36,6 +36,8 @@ class LocalWorlds:
     def __init__(self, task_class: type[Task], arguments: dict[str, Any]) -> None:
         """Build the task."""
         self.task = task_class(**arguments)
+        self._result: dict[str, Any] | None = None
+        self._actions = host_view(self.task.scene.actions)
         self.parameters = self.task.reset_options
         self.segments = {name: columns for name, (columns, _) in self.task.segments.items()}
         self.action_space = self.task.action_space
@@ -65,13 +67,15 @@ class LocalWorlds:
     def step(self, actions: NDArray[np.float32] | None) -> None:
         """Advance all worlds; None takes the actions that are on the device already."""
         if actions is not None:
-            self.task.scene.actions.assign(actions)
+            write(actions, self._actions)
         self.task.step()
 
     def result(self) -> dict[str, Any]:
-        """Return what the last reset or step made."""
+        """Return what the last reset or step made: always the same arrays, since a task's step is captured."""
+        if self._result is not None:
+            return self._result
         task = self.task
-        return {
+        made = {
             "observation": observation_arrays(task),
             "state": task.observation,
             "reward": task.reward,
@@ -79,6 +83,8 @@ class LocalWorlds:
             "truncated": task.truncated,
             "info": info_arrays(task),
         }
+        self._result = result = map_tree(host_view, made)
+        return result
 
     def final(self) -> dict[str, Any]:
         """Return how the episodes that ended in the last step ended."""
