@@ -17,6 +17,7 @@ from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.build.build_body import Progress
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model import status as bits
+from softmode.deformables.model.compile_ahead import compile_launches
 from softmode.deformables.model.structs import filled
 from softmode.deformables.solver.parameters import set_parameters
 from softmode.envs import task_kernels as kernels
@@ -173,6 +174,7 @@ class Task:
             }
             self.plan = filled(self.kernels.Plan, self, config, config.scene.control, self.scene.soft, **columns)
             """What the task's own kernels know beside the state."""
+        compile_launches(self.scene.control_step, self.device)
         self.reset()
         self.graph = capture_graph(self._step, self.device)
         """The step as a captured graph."""

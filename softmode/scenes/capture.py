@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
+from softmode.deformables.model.compile_ahead import compile_launches
 from softmode.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ def capture_step(scene: Scene, step: Callable[[], None]) -> wp.Graph:
     """
     before = scene.model.state()
     before.assign(scene.state)
+    compile_launches(step, scene.model.device)
     graph = capture_graph(step, scene.model.device)
     scene.solver.reset(scene.state)
     scene.state.assign(before)

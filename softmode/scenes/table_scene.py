@@ -15,6 +15,7 @@ from softmode.deformables.coupling.rigid_solver import mujoco_warnings
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import register_custom_attributes, reserve_room
+from softmode.deformables.model.compile_ahead import compile_for_building
 from softmode.deformables.model.declare import launch
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.body_choice import BodyChoice, words_of
@@ -27,6 +28,7 @@ from softmode.objects.loader import Progress, load
 from softmode.objects.object_set import ObjectSet
 from softmode.objects.placed import Placed
 from softmode.objects.soft_object import SoftObject
+from softmode.robots import control_kernels
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
 from softmode.robots.robot_control import controller_of
@@ -129,6 +131,7 @@ class TableScene:
         self.device = wp.get_device(device)
         self.dt = 1.0 / (config.control_hz * config.substeps)
         self._load(progress)
+        compile_for_building(self.device, control_kernels, kernels)
         self._build_model()
         self._build_solver()
         self.marker_place = wp.zeros(world_count, dtype=wp.transform, device=self.device)
