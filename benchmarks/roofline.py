@@ -1,0 +1,149 @@
+"""How far each phase of a step in a grasp is from the arithmetic, the traffic and the launches that it needs.
+
+Run: ``python -m benchmarks.roofline [--device cuda:0 --worlds 4096] [--preset beam]``. The table of
+``docs/performance.md`` is its output.
+
+The object is held as in ``benchmarks/grasp_phases.py``. Each phase of Newton's iteration is launched by itself, in one
+eager control step, and timed; its flops and bytes per world follow from the sizes of the body, listed in `work`. The
+floor of a phase is the larger of its flops at the rate of a large product (float64 at half of it), its bytes at that of
+a large copy, and the time of a launch that does nothing. The last lines are the one launch that takes their place.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gymnasium as gym
+import warp as wp
+
+from benchmarks.camera import copy_rate
+from benchmarks.clock import Clock
+from benchmarks.grasp_phases import ENVIRONMENT, SUBSTEPS, time_kernels
+from benchmarks.step import product_rate
+from softmode.envs.catalogue import config_class
+from softmode.envs.throughput import _Source
+
+
+@dataclass(frozen=True)
+class Work:
+    """What one launch of a phase has to do for one world."""
+
+    flops: float
+    """Multiplications and additions."""
+    read_written: float
+    """Bytes that are read or written once."""
+    double: bool = False
+    """Whether it works in float64."""
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def nothing(out: wp.array[int]):
+    """Write a number."""
+    out[0] = 1  # pyright: ignore[reportIndexIssue]  # compiled by Warp
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--worlds", type=int, default=1)
+    parser.add_argument("--preset", default="plush")
+    parser.add_argument("--warmup", type=int, default=70, help="control steps before the fingers hold the object")
+    parser.add_argument("--repeats", type=int, default=5, help="control steps that are timed")
+    options = parser.parse_args()
+    wp.config.log_level = wp.LOG_WARNING
+    device = wp.get_device(options.device)
+    known = config_class(ENVIRONMENT)
+    config = known() if options.preset == "plush" else known.preset(options.preset)
+    config = replace(config, scene=replace(config.scene, control_hz=30.0, substeps=SUBSTEPS))
+    output = "torch" if device.is_cuda else "numpy"
+    env: Any = gym.make_vec(
+        ENVIRONMENT, num_envs=options.worlds, device=options.device, config=config, obs_type="state", output=output
+    )
+    source = _Source(env, "grasp", 0)
+    env.reset(seed=0)
+    for step in range(options.warmup):
+        env.step(source(step))
+    scene = env.task.scene
+    reduced = scene.solver.reduced
+    tables = reduced.tables
+    product, copy = product_rate(options.device), copy_rate(options.device)
+    flag = wp.zeros(1, dtype=int, device=device)
+    least = Clock(device, 20).replay(lambda: [wp.launch(nothing, 1, [flag], device=device) for _ in range(100)]) / 100
+    print(
+        f"{device.name or device}, {options.worlds} worlds of {options.preset}: product {product / 1e9:,.0f} Gflop/s, "
+        f"copy {copy / 1e9:,.0f} GB/s, a launch in a graph {1e3 * least:.2f} us\n"
+    )
+    whole = mean_times(scene, device, options.repeats)
+    reduced.tables = replace(tables, one_launch=False, shared=False)
+    apart = mean_times(scene, device, options.repeats)
+    print("| phase | launches | Mflop | kB | floor of flops | of bytes | measured, a launch | over the floor |")
+    print("|---|---|---|---|---|---|---|---|")
+    total = {"floor": 0.0, "measured": 0.0}
+    for name, todo in work(tables).items():
+        spent, launches = apart.get(name, (0.0, 0.0))
+        if not launches:
+            continue
+        rate = product / (2.0 if todo.double else 1.0)
+        flops, traffic = (1e6 * options.worlds * x for x in (todo.flops / rate, todo.read_written / copy))
+        floor, measured = max(flops, traffic), 1e3 * spent / launches
+        total["floor"] += launches * floor
+        total["measured"] += launches * measured
+        print(
+            f"| {name} | {launches:.0f} | {todo.flops / 1e6:.3f} | {todo.read_written / 1e3:.0f} | {flops:.1f} us | "
+            f"{traffic:.1f} us | {measured:.1f} us | {measured / max(floor, 1e3 * least):.1f} x |"
+        )
+    one = next(spent for name, (spent, _) in whole.items() if "minimise_worlds" in name)
+    count = sum(launches for name, (_, launches) in whole.items() if "minimise_worlds" not in name)
+    floor, measured = (1e-3 * total[name] for name in ("floor", "measured"))
+    print(
+        f"\nAll phases of a control step: floor {floor:.3f} ms, measured apart {measured:.3f} ms, "
+        f"as one launch {one:.3f} ms ({one / floor:.1f} x the floor). All else is {count:.0f} launches, which cost "
+        f"{least * count:.2f} ms at least as a graph."
+    )
+    env.close()
+
+
+def mean_times(scene: Any, device: wp.Device, repeats: int) -> dict[str, tuple[float, float]]:
+    """Return time [ms] and launches of every kernel in an eager control step, means of several."""
+    found: dict[str, list[tuple[float, int]]] = {}
+    for _ in range(repeats):
+        for name, pair in time_kernels(scene, device).items():
+            found.setdefault(name, []).append(pair)
+    return {
+        name: (sum(spent for spent, _ in pairs) / repeats, sum(count for _, count in pairs) / repeats)
+        for name, pairs in found.items()
+    }
+
+
+def work(tables: Any) -> dict[str, Work]:
+    """Return what the launches of each phase do for a world at least, by kernel.
+
+    With n functions, P points, E contacts of which A act, N = 3 n unknowns, padded to blocks of eight as they are
+    computed, and c columns of the rigid dofs. Numbers per point and contact that are guessed, such as 1,200 flops of a
+    material, are those of the code's size.
+    """
+    constraints, rigid = tables.constraints, tables.rigid.count_max
+    n, points = float(tables.layout.stride), float(tables.instances.point_count.numpy().mean())
+    near, acting = (float(array.numpy().mean()) for array in (constraints.count, constraints.acting_count))
+    unknowns = 3.0 * n
+    triangle, columns = unknowns * (unknowns + 1.0) / 2.0, rigid + 1.0
+    basis = 12.0 * n * points  # gradients of the functions, float32
+    return {
+        "evaluate_points": Work(18 * n * points + 1200 * points, basis + 300 * points, double=True),
+        "evaluate_constraints": Work(6 * n * near + 200 * near, 4 * n * near + 400 * near, double=True),
+        "sum_forces": Work(18 * n * points + 6 * n * acting, basis + 72 * points + 4 * n * acting, double=True),
+        "assemble_stiffness": Work(27 * n * n * points, basis + 216 * points + 4 * triangle),
+        "assemble_matrix": Work(triangle, 8 * triangle),
+        "add_contacts": Work(2 * acting * triangle, 8 * triangle + (4 * n + 40) * acting),
+        "assemble_columns": Work(6 * n * acting * rigid, 4 * unknowns * columns + (4 * n + 12 * rigid) * acting),
+        "factor": Work(unknowns**3 / 3 + unknowns**2 * columns, 8 * (triangle + unknowns * columns)),
+        "condense": Work(unknowns * rigid * (rigid + 1), 4 * unknowns * columns + 8 * rigid * rigid),
+        "solve": Work(unknowns**2 + 2 * unknowns * columns, 4 * (triangle + unknowns * columns)),
+    }
+
+
+if __name__ == "__main__":
+    main()
