@@ -30,8 +30,8 @@ Array = NDArray[np.float64]
 MATERIAL = Material(youngs_modulus=1.0e5, poissons_ratio=0.4, density=1000.0, viscosity=0.0)
 CASES = {
     "bar 10:1": (0, 1, (0.0, 4.0, -8.0)),
-    "hand": (2, 2, (14.0, 34.0, 0.0)),
-    "T": (2, 1, (16.0, 24.0, 0.0)),
+    "plate 20:1": (0, 1, (0.0, 6.0, -4.0)),
+    "L": (2, 1, (30.0, 60.0, 0.0)),
 }
 """Axis along whose lower side so many layers of bricks are held, and the acceleration [m/s^2]."""
 LOAD_STEPS, STEPS, DT = 4, 400, 0.04
