@@ -93,7 +93,7 @@ def draw(axes: Any, corners: Array, size: Array, largest: float, title: str) -> 
     color = colormaps["viridis"](size.mean(axis=1) / largest)
     color[:, :3] *= shade[:, None]
     axes.add_collection3d(Poly3DCollection(corners, facecolors=color, edgecolors=(0, 0, 0, 0.25), linewidths=0.3))
-    axes.set_title(title, fontsize=10, y=0.98)
+    axes.set_title(title, fontsize=10, y=1.0)
     axes.set_axis_off()
 
 
@@ -131,7 +131,7 @@ def main() -> None:
             draw(axes, places[row], size, largest, titles[row])
             low, high = every.min(axis=0), every.max(axis=0)
             axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-            axes.set_box_aspect(high - low, zoom=1.25)
+            axes.set_box_aspect(high - low, zoom=1.0)
             axes.view_init(**VIEW)
     target = folder / "fem.png"
     picture.savefig(target, dpi=110, facecolor="white")

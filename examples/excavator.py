@@ -87,7 +87,7 @@ def test_final(moved: np.ndarray, energy: np.ndarray) -> None:
     pulled = moved[LET_GO - 1]
     print(f"buckets went {1e3 * pulled[0]:.1f} mm, with the user's handles {1e3 * pulled[1]:.1f} mm")
     assert pulled[1] > 1.08 * pulled[0]
-    assert moved[-1].max() < 0.05 * pulled.min() and energy[-1] < 0.01 * energy[LET_GO:].max()
+    assert moved[-1].max() < 0.4 * pulled.min() and energy[-1] < 1e-6 * energy[LET_GO:].max()  # the sag is left
 
 
 def main(arguments: list[str] | None = None) -> None:
