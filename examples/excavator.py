@@ -69,8 +69,8 @@ def make_toy(mesh: trimesh.Trimesh, count: int, placed: bool) -> tuple[SoftObjec
     foot = np.array([*mesh.bounds.mean(axis=0)[:2], mesh.bounds[0, 2]])
     build = BuildOptions(add_kernels=[(x - foot, r) for x, r in KERNELS] if placed else (), **BUILD)
     how = {"material": RUBBER, "build": build, "size": float(mesh.extents.max()), "clamped_height": 0.008}
-    mesh = ColoredMesh.from_trimesh(mesh, name="excavator")
-    toy = load(mesh, pose="captured", splat_count=count, stiffness_colors=(SOFT,), **how)
+    shown = ColoredMesh.from_trimesh(mesh, name="excavator")
+    toy = load(shown, pose="captured", splat_count=count, stiffness_colors=(SOFT,), **how)
     return toy, TIP - foot - toy.body.offset
 
 
