@@ -69,7 +69,7 @@ def by_body(solid: Bricks, axis: int, height: float, acceleration: Array) -> tup
     scene = Scene(
         lambda builder: add_reduced_body(builder, body, material=MATERIAL),
         [body],
-        gravity=acceleration,
+        gravity=tuple(acceleration),
         options=SolverReducedOptions(tolerance=1e-7, contact_max=1),
         dt=DT,
     )

@@ -8,6 +8,7 @@ Run: ``python examples/excavator.py [--short]``; writes ``out/excavator.mp4`` an
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -40,13 +41,13 @@ KERNELS += [(hinge, 0.016) for hinge in (ROOT, ELBOW, WRIST)]
 BUILD = {"handles": "local", "local_count": 8, "function_count": 48, "cubature_count": 480}
 
 
-def make_mesh() -> trimesh.Trimesh:
+def make_mesh() -> Any:
     """Return the toy: tracks, platform, cab, two beams on hinges, a bucket."""
     parts, turned = [], trimesh.transformations.rotation_matrix
 
-    def add(mesh: trimesh.Trimesh, at: np.ndarray | tuple, color: tuple, angle: float = 0.0, axis: int = 1) -> None:
+    def add(mesh: Any, at: np.ndarray | tuple, color: tuple, angle: float = 0.0, axis: int = 1) -> None:
         mesh.apply_transform(turned(angle, np.eye(3)[axis])).apply_translation(at)
-        mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=np.tile([*color, 1.0], (len(mesh.vertices), 1)))
+        mesh.visual.vertex_colors = np.tile([*color, 1.0], (len(mesh.vertices), 1))
         parts.append(mesh)
 
     for size, at, color in BOXES:
@@ -64,13 +65,12 @@ def make_mesh() -> trimesh.Trimesh:
     return trimesh.util.concatenate(parts)
 
 
-def make_toy(mesh: trimesh.Trimesh, count: int, placed: bool) -> tuple[SoftObject, np.ndarray]:
+def make_toy(mesh: Any, count: int, placed: bool) -> tuple[SoftObject, np.ndarray]:
     """Return the toy, with handles that the user gives or without, and the place of its bucket in its frame [m]."""
     foot = np.array([*mesh.bounds.mean(axis=0)[:2], mesh.bounds[0, 2]])
     build = BuildOptions(add_kernels=[(x - foot, r) for x, r in KERNELS] if placed else (), **BUILD)
-    how = {"material": RUBBER, "build": build, "size": float(mesh.extents.max()), "clamped_height": 0.008}
-    shown = ColoredMesh.from_trimesh(mesh, name="excavator")
-    toy = load(shown, pose="captured", splat_count=count, stiffness_colors=(SOFT,), **how)
+    how = {"build": build, "size": float(mesh.extents.max()), "clamped_height": 0.008, "stiffness_colors": (SOFT,)}
+    toy = load(ColoredMesh.from_trimesh(mesh, name="toy"), pose="captured", splat_count=count, material=RUBBER, **how)
     return toy, TIP - foot - toy.body.offset
 
 
