@@ -34,9 +34,9 @@ BOXES = (  # edges, places [m] and colours
     ((0.045, 0.04, 0.05), (0.005, 0.03, 0.088), GLASS),
     ((0.06, 0.06, 0.02), (0.0, 0.0, 0.035), DARK),
 )
-KERNELS = [(ROOT + t * (ELBOW - ROOT), 0.035) for t in (0.25, 0.75)]
-KERNELS += [(ELBOW + t * (WRIST - ELBOW), 0.03) for t in (0.25, 0.75)] + [(TIP, 0.03)]
-KERNELS += [(hinge, 0.016) for hinge in (ROOT, ELBOW, WRIST)]
+BEAMS = ((ROOT, ELBOW, 0.035), (ELBOW, WRIST, 0.03))
+HANDLES = [(a + t * (b - a), radius) for a, b, radius in BEAMS for t in (0.25, 0.75)]
+KERNELS = [*HANDLES, (TIP, 0.03), *((hinge, 0.016) for hinge in (ROOT, ELBOW, WRIST))]
 """Places and radii of the handles that the user gives [m]."""
 BUILD = {"handles": "local", "local_count": 8, "function_count": 48, "cubature_count": 480}
 
