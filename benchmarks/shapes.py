@@ -1,10 +1,13 @@
 """Build every shape of the test suite, pull it, and print what came of it.
 
-Run from the repository root: ``python -m benchmarks.shapes [--only NAME ...] [--cells N] [--json FILE]``.
+Run from the repository root: ``python -m benchmarks.shapes [--only NAME ...] [--cells N] [--json FILE]``, the third
+table alone by ``--springs [SOLID ...]``.
 
 First table: quadrature and body against exact moments. Second table: each shape's voxel relative, held exactly at one
 end, against quadratic finite elements on the same voxels; work done by gravity and by forces on the other end, as a
-fraction of that of finite elements (1 is exact, less is too stiff), for several bases. The last lines count failures.
+fraction of that of finite elements (1 is exact, less is too stiff), for several bases. Q-GMLS knows no held ends and is
+not among them. Third table: clamps that no build was told of, as springs, for the default, local handles and Q-GMLS at
+equal unknowns (``benchmarks.springs``). The last lines count failures.
 """
 
 from __future__ import annotations
@@ -19,9 +22,11 @@ from typing import Any
 
 import warp as wp
 
+from benchmarks.springs import NAMES, print_springs
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import BuildOptions
 from softmode.errors import SoftmodeError
+from tests.oracle.solids import SOLIDS
 from tests.shape_trials import base_of, drop, solve_reference, try_build, try_pull, voxelise
 from tests.shapes import SHAPES, Shape
 
@@ -32,22 +37,29 @@ BASES: dict[str, BuildOptions] = {
     "quadratic 8": BuildOptions(mode_count=8, handles="quadratic"),
     "chosen 48": BuildOptions(),
     "chosen 57": BuildOptions(function_count=57),
+    "local 48": BuildOptions(function_count=48, handles="local", local_count=24),
 }
 """Bases of the second table; responses are on but in the first two."""
 
 
 def main() -> None:
-    """Print both tables."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="+", default=list(SHAPES), metavar="NAME")
     parser.add_argument("--cells", type=int, default=8, help="voxels along the longest edge")
     parser.add_argument("--bases", nargs="+", default=list(BASES), choices=list(BASES))
     parser.add_argument("--json", type=Path, default=None)
+    parser.add_argument("--springs", nargs="*", default=None, choices=[*SOLIDS, "star"], metavar="SOLID")
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
+    if options.springs is not None:
+        print_springs(options.springs or NAMES)
+        return
     shapes = [SHAPES[name] for name in options.only]
     built, build_failures = print_builds(shapes)
     pulled, pull_failures = print_pulls(shapes, options.cells, options.bases)
+    print()
+    print_springs(NAMES)
     print(f"\nbuilds: {build_failures} of {len(shapes)} failed; pulls: {pull_failures} of {len(pulled)} failed")
     if options.json:
         options.json.write_text(json.dumps({"builds": built, "pulls": pulled}, indent=1))

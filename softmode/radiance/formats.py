@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,11 @@ from numpy.typing import NDArray
 from softmode.errors import AssetError
 from softmode.files import damage_errors, read_arrays, whole_file
 from softmode.radiance.grid import RadianceGrid, check_size, sh_of_colors
+from softmode.radiance.nanovdb import BYTE_LIMIT, checked
 from softmode.radiance.nanovdb_kernels import read_values
 
 SUFFIXES = (".npz", ".nvdb")
 """What fields are read from."""
-BYTE_LIMIT = 2**31
-"""Most bytes of an array that is read from a file."""
 _OURS = ("density", "sh", "origin", "axes")
 _PLAIN = ("density", "bounds")
 _PLENOXELS = ("links", "density_data", "sh_data", "radius", "center")
@@ -158,10 +158,11 @@ def _plenoxels(arrays: dict[str, NDArray[Any]], name: str) -> RadianceGrid:
 
 def _read_nanovdb(file: Path) -> RadianceGrid:
     """Return the field of the grids of a NanoVDB file, on its active voxels and a rim around them."""
+    try:
+        content = checked(file.read_bytes())
+    except (OSError, ValueError, zlib.error) as error:
+        raise AssetError(f"radiance field {file}: {error}", hint=_HINT) from error
     with damage_errors(f"radiance field {file}", hint=_HINT):
-        content = file.read_bytes()
-        if len(content) < 192:
-            raise ValueError("the file is truncated")
         volumes = [wp.Volume.load_from_nvdb(content, device="cpu")]
         while (following := volumes[-1].load_next_grid()) is not None:
             volumes.append(following)

@@ -61,14 +61,26 @@ class Bricks:
             poissons_ratio: nu.
             hardness: Springs per volume, in units of E over the square of the end's width.
         """
-        mesh, (axis, _) = self.mesh(), self.end
-        held = 0.5 * (mesh.lower + mesh.upper)[:, axis] < self.end_width
-        kappa = hardness / self.end_width**2
+        return self.spring_work(body, poissons_ratio, hardness), self.spring_reference(poissons_ratio, hardness)
+
+    def spring_work(self, body: ReducedBody, poissons_ratio: float, hardness: float) -> float:
+        """Return that on a body."""
+        mesh, held = self._held()
         value = body.evaluate(mesh.points[held].reshape(-1, 3) - body.offset)[0]
-        springs = value.T @ (kappa * mesh.weights[held].reshape(-1, 1) * value)
+        springs = value.T @ (hardness / self.end_width**2 * mesh.weights[held].reshape(-1, 1) * value)
         whole = stiffness(body, poissons_ratio) + np.kron(np.eye(3), springs)
         force = np.outer(GRAVITY, body.volume * body.mean_basis).ravel()
-        return float(force @ np.linalg.solve(whole, force)), spring_work(mesh, poissons_ratio, held, kappa, GRAVITY)
+        return float(force @ np.linalg.solve(whole, force))
+
+    def spring_reference(self, poissons_ratio: float, hardness: float) -> float:
+        """Return that on finite elements."""
+        mesh, held = self._held()
+        return spring_work(mesh, poissons_ratio, held, hardness / self.end_width**2, GRAVITY)
+
+    def _held(self) -> tuple[Mesh, Mask]:
+        """Return the finite elements, and which of them the springs hold."""
+        mesh = self.mesh()
+        return mesh, 0.5 * (mesh.lower + mesh.upper)[:, self.end[0]] < self.end_width
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,7 +24,7 @@ from softmode.deformables.build.options import BuildOptions, HandleName
 from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.region_samples import octants_near, refine_at_faces, sample_regions
 from softmode.deformables.build.sources import Sources, pack_sources
-from softmode.deformables.build.visibility import material_of
+from softmode.deformables.build.visibility import lips_of, material_of
 from softmode.errors import MaterialError
 
 __all__ = [
@@ -169,9 +169,11 @@ def _build(
                 samples=samples,
                 added=np.reshape([np.append(*pair) for pair in options.add_kernels], (-1, 4)) - np.append(offset, 0.0),
                 material=None if quadrature.cells is None else material_of(quadrature.cells, offset),
+                lips=lips_of(quadrature.cells) - offset,
             ),
             options,
             stage,
+            quick=quick,
         )
         chosen = _cubature(volumes, basis, stiffness, options, quick=quick)
         stage("cubature")

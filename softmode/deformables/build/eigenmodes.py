@@ -36,6 +36,8 @@ class Eigenmodes:
     """Coefficients of W_j in the kernels, shape (K, mode_count + 1); column 0 is ones, so that W_0 = 1."""
     eigenvalues: Array
     """omega_j [1/m^2], ascending, shape (mode_count + 1,); the constant handle's is 0."""
+    local_count: int = 0
+    """How many of the last columns are local handles, whose eigenvalues are Rayleigh quotients in no order."""
 
 
 def solve_eigenmodes(

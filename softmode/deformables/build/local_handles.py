@@ -57,15 +57,8 @@ def gather_weights(kernels: BasisRKPM, count: int, added: Array) -> Array:
             f"add_kernels: the place of number {away.argmax()} lies {away.max():.3g} m away from the object's kernels",
             hint="give places of the object, in its own coordinates",
         )
-    acting = kernels.evaluate(centres).value.tocoo()
-    apart = np.linalg.norm(centres[acting.row] - centres[acting.col], axis=1)
-    graph = coo_matrix((apart, (acting.row, acting.col)), shape=acting.shape).tocsr()
-
-    def lengths(at: Any) -> Array:
-        """Return the lengths of paths [m] from some kernels (J,) to all, (J, K)."""
-        return np.asarray(dijkstra(graph, directed=False, indices=at))
-
-    seeds = _farthest(count, lengths)
+    lengths = _path_lengths(kernels)
+    seeds = _farthest(count, lengths, np.arange(len(centres)))
     away = lengths(seeds)
     for _ in range(LLOYD_ROUNDS):
         owner = away.argmin(axis=0)
@@ -85,6 +78,32 @@ def gather_weights(kernels: BasisRKPM, count: int, added: Array) -> Array:
                 )
         bump = np.concatenate([bump, _bump(path, added[:, 3])])
     return (bump / bump.sum(axis=0)).T
+
+
+def gather_at_lips(kernels: BasisRKPM, lips: Array, count: int) -> Array:
+    """Return the coefficients of handles along the lips of slits in the kernels, shape (K, J), J = count at most.
+
+    The paths around the tip of a slit are long, so a handle acts on its own lip. Nothing sums to one.
+
+    Args:
+        kernels: Reproducing kernels that do not act across the slits.
+        lips: Points on both sides of the severed links [m], shape (N, 3).
+        count: Number of handles.
+    """
+    beside = np.unique(KDTree(kernels.centres).query(lips)[1])
+    lengths = _path_lengths(kernels)
+    seeds = _farthest(min(count, len(beside)), lengths, beside)
+    away = lengths(seeds)
+    return _bump(away, _spread(away[:, seeds], away)).T
+
+
+def _path_lengths(kernels: BasisRKPM) -> Callable[[Any], Array]:
+    """Return what gives the lengths of paths [m] from some kernels (J,) to all, (J, K)."""
+    centres = kernels.centres
+    acting = kernels.evaluate(centres).value.tocoo()
+    apart = np.linalg.norm(centres[acting.row] - centres[acting.col], axis=1)
+    graph = coo_matrix((apart, (acting.row, acting.col)), shape=acting.shape).tocsr()
+    return lambda at: np.asarray(dijkstra(graph, directed=False, indices=at))
 
 
 def place_kernels(points: Array, volumes: Array, count: int, added: Array, *, seed: int) -> BasisQGMLS:
@@ -119,10 +138,7 @@ def covering_radii(between: Array, away: Array) -> Array:
     Raises:
         BasisError: If points stay uncovered after ten enlargements.
     """
-    apart = np.sort(between, axis=1)[:, : NEIGHBOUR + 1]
-    # Of a part that has fewer handles, the farthest of these.
-    radii = WIDTH * np.where(np.isfinite(apart), apart, 0.0).max(axis=1)
-    radii = np.where(radii > 0.0, radii, np.where(np.isfinite(away), away, 0.0).max(axis=1))
+    radii = _spread(between, away)
     for left in range(ENLARGEMENTS, -1, -1):
         bare = _bump(away, radii).max(axis=0) < COVERED
         if not bare.any():
@@ -137,6 +153,14 @@ def covering_radii(between: Array, away: Array) -> Array:
     return radii
 
 
+def _spread(between: Array, away: Array) -> Array:
+    """Return radii by the distance to the fourth nearest other centre; arguments as of `covering_radii`."""
+    apart = np.sort(between, axis=1)[:, : NEIGHBOUR + 1]
+    # Of a part that has fewer handles, the farthest of these.
+    radii = WIDTH * np.where(np.isfinite(apart), apart, 0.0).max(axis=1)
+    return np.where(radii > 0.0, radii, np.where(np.isfinite(away), away, 0.0).max(axis=1))
+
+
 def _distances(a: Array, b: Array) -> Array:
     return np.linalg.norm(a[:, None] - b, axis=2)
 
@@ -145,12 +169,12 @@ def _bump(away: Array, radii: Array) -> Array:
     return np.maximum(1.0 - (away / radii[:, None]) ** 2, 0.0) ** 3
 
 
-def _farthest(count: int, lengths: Callable[[Any], Array]) -> Indices:
-    """Return the places of a graph that are farthest from each other along its paths, the first from the first."""
-    nearest, seeds = lengths(np.zeros(1, dtype=np.intp))[0], np.zeros(count, dtype=np.intp)
+def _farthest(count: int, lengths: Callable[[Any], Array], among: Indices) -> Indices:
+    """Return which of some places of a graph are farthest from each other along its paths, the first from the first."""
+    nearest, seeds = lengths(among[:1])[0][among], np.zeros(count, dtype=np.intp)
     for i in range(count):
-        seeds[i] = nearest.argmax()
-        nearest = np.minimum(nearest if i else np.inf, lengths(seeds[i : i + 1])[0])
+        seeds[i] = among[nearest.argmax()]
+        nearest = np.minimum(nearest if i else np.inf, lengths(seeds[i : i + 1])[0][among])
     return seeds
 
 

@@ -136,6 +136,13 @@ def material_of(cells: Cells, offset: Array) -> Material | None:
     )
 
 
+def lips_of(cells: Cells | None) -> Array:
+    """Return the octants on both sides of the slits in a grid [m], shape (N, 3)."""
+    if cells is None or cells.severed is None:
+        return np.zeros((0, 3))
+    return cells.octants[np.unique(cells.severed)]
+
+
 def divide_at_gaps(kernels: BasisRKPM, material: Material, points: Array, spacing: float) -> BasisRKPM:
     """Return kernels that do not act across gaps, and more of them where too few are left.
 
@@ -151,12 +158,12 @@ def divide_at_gaps(kernels: BasisRKPM, material: Material, points: Array, spacin
     Warns:
         RuntimeWarning: If parts of the object are too thin for that; then kernels act across gaps.
     """
-    factor = _narrowing(material, kernels)
-    if factor is None:
+    found = _narrowing(material, kernels)
+    if found is None:
         return kernels
-    divided = replace(kernels, radii=kernels.radii * factor)
+    factor, hidden = found
+    divided = replace(kernels, radii=kernels.radii * factor, visibility=_visibility(material, hidden))
     for _ in range(ROUNDS):
-        divided = replace(divided, visibility=find_visibility(material, divided.centres, divided.support))
         distance, nearest = divided.nearest(points)
         ratio = distance / divided.support[nearest]
         bare = np.flatnonzero((ratio > REACH) | ~(divided.conditions(points) < CONDITION_LEAST))
@@ -168,12 +175,15 @@ def divide_at_gaps(kernels: BasisRKPM, material: Material, points: Array, spacin
             added.append(worst)
             away = np.linalg.norm(points[bare] - points[worst], axis=1)
             bare = bare[away > REACH * divided.support[nearest[worst]]]
+        first = divided.kernel_count
         divided = replace(
             divided,
             centres=np.concatenate([divided.centres, points[added]]),
             radii=np.concatenate([divided.radii, np.maximum(distance[added], 1.5 * spacing)]),
             visibility=None,
         )
+        hidden += _hidden(material, divided.centres, divided.support, first)  # Those before see what they saw.
+        divided = replace(divided, visibility=_visibility(material, hidden))
     warnings.warn(
         "the object's parts are too thin beside its gaps for its quadrature: kernels act across the gaps; build it with"
         " more points",
@@ -191,41 +201,62 @@ def find_visibility(material: Material, centres: Array, support: Array) -> Visib
         centres: Kernel centres, points of the material [m], shape (K, 3).
         support: Support radii [m], shape (K,).
     """
+    return _visibility(material, _hidden(material, centres, support, 0))
+
+
+def _visibility(material: Material, hidden: list[Indices]) -> Visibility | None:
+    """Return what kernels do not act on, from pairs of a kernel and a point as one number; None without any."""
+    return Visibility(points=material.points, hidden=np.sort(np.concatenate(hidden))) if hidden else None
+
+
+def _hidden(material: Material, centres: Array, support: Array, first: int) -> list[Indices]:
+    """Return the points that kernels from the first on reach and do not act on: kernel * N + point, chunk by chunk."""
     found = []
-    count = len(material.points)
-    size = np.diff(np.append(material.first, count))
-    for mine in _chunks(material, len(centres)):
+    for mine in _chunks(material, len(centres), first):
         points, lumps = material.distances(centres[mine])
         reach = (support[mine] + material.step) ** 2  # The nearest point to a place in the support lies within this.
-        apart = material.apart(lumps < reach, material.homes(centres[mine]))
-        if apart.any():
-            point, kernel = np.nonzero(np.repeat(apart, size, axis=0) & (points < reach))
-            found.append((kernel + mine.start) * count + point)
-    return Visibility(points=material.points, hidden=np.sort(np.concatenate(found))) if found else None
+        found += _pairs(material, points < reach, material.apart(lumps < reach, material.homes(centres[mine])), mine)
+    return found
 
 
-def _narrowing(material: Material, kernels: BasisRKPM) -> Array | None:
-    """Return the largest fraction of the support (K,) that connects no two sides of a gap; None if there is no gap.
+def _pairs(material: Material, near: Mask, apart: Mask, mine: slice) -> list[Indices]:
+    """Return the near points (N, k) in lumps that are apart (L, k), of a chunk of kernels; none or one array."""
+    if not apart.any():
+        return []
+    count = len(material.points)
+    size = np.diff(np.append(material.first, count))
+    point, kernel = np.nonzero(np.repeat(apart, size, axis=0) & near)
+    return [(kernel + mine.start) * count + point]
+
+
+def _narrowing(material: Material, kernels: BasisRKPM) -> tuple[Array, list[Indices]] | None:
+    """Return the largest fraction of the support that connects no two sides of a gap; None if there is no gap.
 
     Sides that are not connected within a support may be within a larger one.
+
+    Returns:
+        The fractions (K,), and what the kernels do not act on with these supports, as `_hidden` does.
     """
-    factor, gaps = np.full(kernels.kernel_count, NARROWER[0]), False
+    factor, gaps, hidden = np.full(kernels.kernel_count, NARROWER[0]), False, []
     for mine in _chunks(material, kernels.kernel_count):
-        homes, lumps = material.homes(kernels.centres[mine]), material.distances(kernels.centres[mine])[1]
+        homes, (points, lumps) = material.homes(kernels.centres[mine]), material.distances(kernels.centres[mine])
         good, before = np.ones(len(homes), dtype=bool), np.zeros(lumps.shape, dtype=bool)
+        unseen = np.zeros(lumps.shape, dtype=bool)
         for fraction in NARROWER:
             near = lumps < (fraction * kernels.support[mine] + material.step) ** 2
             apart = material.apart(near, homes)
             good &= ~(before & near & ~apart).any(axis=0)
             factor[mine][good] = fraction
+            unseen[:, good] = apart[:, good]
             before |= apart
         gaps |= bool(before.any())
-    return factor if gaps else None
+        hidden += _pairs(material, points < (factor[mine] * kernels.support[mine] + material.step) ** 2, unseen, mine)
+    return (factor, hidden) if gaps else None
 
 
-def _chunks(material: Material, kernel_count: int) -> list[slice]:
+def _chunks(material: Material, kernel_count: int, first: int = 0) -> list[slice]:
     step = max(1, _ENTRIES_PER_CHUNK // len(material.points))
-    return [slice(i, min(i + step, kernel_count)) for i in range(0, kernel_count, step)]
+    return [slice(i, min(i + step, kernel_count)) for i in range(first, kernel_count, step)]
 
 
 def components(count: int, pairs: Indices) -> Indices:
