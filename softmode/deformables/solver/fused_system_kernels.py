@@ -23,6 +23,10 @@ STATIC_BYTES = 44 * 1024
 """Shared memory that a kernel may have without asking: 48 kB, less the scratch of sums over a team."""
 
 
+CONTACTS = 16
+"""Contacts that are in shared memory at a time."""
+
+
 def shared_floats(size: int, width: int) -> int:
     """Return how many numbers a system takes of N = ``size`` unknowns and W = ``width`` columns, multiples of eight."""
     blocks = size // 8
@@ -37,7 +41,13 @@ def dynamic_floats(size: int, width: int) -> int:
 
 def shared_bytes(size: int, width: int) -> int:
     """Return how much shared memory a block needs for such a system, its right-hand side and the rigid unknowns."""
-    return 4 * (shared_floats(size, width) + size) + 8 * _rigid_doubles(width - size)
+    columns = width - size
+    return 4 * (shared_floats(size, width) + size) + 8 * _rigid_doubles(columns) + CONTACTS * _contact_bytes(size, columns)
+
+
+def _contact_bytes(size: int, columns: int) -> int:
+    """Return what a contact takes: a force in double precision, a row of the basis, a Hessian, motions of its shape."""
+    return 8 * 3 + 4 * (size // 3 + 9 + 2 * 3 * columns)
 
 
 def _rigid_doubles(columns: int) -> int:
@@ -80,6 +90,12 @@ _SYSTEM = """
     double* least = S + R * R;
     double* ratio = least + R;
     double* move = ratio + R;
+    // of some contacts: force, row of the basis, Hessian, motion of the shape, Hessian times motion
+    double* near_force = move + R;
+    float* near_values = (float*)(near_force + 3 * TILE);
+    float* near_hessian = near_values + 8 * (N / 24) * TILE;
+    float* near_jacobian = near_hessian + 9 * TILE;
+    float* near_coupling = near_jacobian + 3 * R * TILE;
     // column 0 of row r, were it there
     const auto row_of = [](int r) {
         const int b = r / 8;
@@ -97,6 +113,7 @@ _SYSTEM = """
     const int dofs = constraints.jacobian.shape[2];  // room for rigid unknowns
     const float* J = (const float*)constraints.jacobian.data + (size_t)i * capacity * dofs * 3;
     const float* HJ = (const float*)constraints.coupling.data + (size_t)i * capacity * dofs * 3;
+    const double* F = (const double*)constraints.force.data + (size_t)i * capacity * 3;
     const float* values = (const float*)basis.row.data;
     {
         const int chunks = arrays.stiffness.shape[1];
@@ -120,75 +137,159 @@ _SYSTEM = """
                 *(Quad*)&A[row_of(row) + first] = value;
             }
         }
-        // right of K: -sum_e b_k H_e J_e, and -g in column rigid_max
+        // right of K: -g in column rigid_max; the contacts' -sum_e b_k H_e J_e comes on top
         const double* g = (const double*)arrays.gradient.data + (size_t)i * N;
-        for (int t = member; t < 3 * blocks * R; t += team) {
-            const int j = t / (3 * blocks);
-            const int first = 8 * (t - j * 3 * blocks);
-            const int c = first / (8 * blocks);
-            const int k = first - c * 8 * blocks;
-            float sum[8];
-            #pragma unroll
-            for (int a = 0; a < 8; ++a) sum[a] = 0.0f;
-            if (j == rigid_max) {
+        for (int t = member; t < N * R; t += team) {
+            const int j = t / N;
+            const int row = t - j * N;
+            A[row_of(row) + N + j] = j == rigid_max ? (float)-g[row] : 0.0f;
+        }
+        // the rigid unknowns: inertia and rows; forces in ``move``
+        const double* M = (const double*)rigid.inertia.data + (size_t)world * dofs * dofs;
+        const double* r = (const double*)rigid.r.data + (size_t)world * dofs;
+        const double* predicted = (const double*)rigid.predicted.data + (size_t)world * dofs;
+        const int row_count = rigid.row_count.data[world];
+        const size_t first_row = (size_t)world * rigid.row_force.shape[1];
+        const float* row_jacobian = (const float*)rigid.row_jacobian.data + first_row * dofs;
+        const double* row_coupling = (const double*)rigid.row_coupling.data + first_row * dofs;
+        const double* row_force = (const double*)rigid.row_force.data + first_row;
+        for (int t = member; t < tail * (tail + 1); t += team) {
+            const int j = t / (tail + 1);
+            const int l = t - j * (tail + 1);
+            if (l > j && l < tail) continue;
+            double value = 0.0;
+            if (l == tail) {
+                for (int k = 0; k < tail; ++k) value += M[j * dofs + k] * (r[k] - predicted[k]);
+                for (int k = 0; k < row_count; ++k) value += (double)row_jacobian[k * dofs + j] * row_force[k];
+                move[j] = value;
+            } else {
+                value = M[j * dofs + l];
+                for (int k = 0; k < row_count; ++k) {
+                    value += (double)row_jacobian[k * dofs + j] * row_coupling[k * dofs + l];
+                }
+                S[j * R + l] = value;
+            }
+        }
+        // contacts, some at a time: fetched once by all threads, then read from shared memory by every sum
+        for (int start = 0; start == 0 || start < acting_count; start += TILE) {
+            const int held = acting_count - start < TILE ? acting_count - start : TILE;
+            for (int t = member; t < held * 2 * blocks; t += team) {
+                const int s = t / (2 * blocks);
+                const int k = 4 * (t - s * 2 * blocks);
+                const float* given = values + (size_t)rows[acting[start + s]] * 8 * blocks;
+                *(Quad*)&near_values[s * 8 * blocks + k] = *(const Quad*)&given[k];
+            }
+            for (int t = member; t < held * tail * 3; t += team) {
+                const int s = t / (3 * tail);
+                const int at = t - s * 3 * tail;
+                const int j = at / 3;
+                const int e = acting[start + s];
+                const bool moves = j >= begins[e] && j < ends[e];
+                near_jacobian[s * 3 * R + at] = moves ? J[e * dofs * 3 + at] : 0.0f;
+                near_coupling[s * 3 * R + at] = moves ? HJ[e * dofs * 3 + at] : 0.0f;
+            }
+            for (int t = member; t < held * 9; t += team) {
+                const int s = t / 9;
+                near_hessian[t] = H[9 * acting[start + s] + t - 9 * s];
+            }
+            for (int t = member; t < held * 3; t += team) {
+                const int s = t / 3;
+                near_force[t] = F[3 * acting[start + s] + t - 3 * s];
+            }
+            SOFTMODE_BARRIER;
+            for (int t = member; t < 3 * blocks * tail; t += team) {
+                const int j = t / (3 * blocks);
+                const int first = 8 * (t - j * 3 * blocks);
+                const int c = first / (8 * blocks);
+                const int k = first - c * 8 * blocks;
+                float sum[8];
                 #pragma unroll
-                for (int a = 0; a < 8; ++a) sum[a] = (float)-g[first + a];
-            } else if (j < tail) {
+                for (int a = 0; a < 8; ++a) sum[a] = 0.0f;
                 #pragma unroll 4
-                for (int s = 0; s < acting_count; ++s) {
-                    const int e = acting[s];
-                    const float given = HJ[(e * dofs + j) * 3 + c];
-                    const float h = j >= begins[e] && j < ends[e] ? given : 0.0f;
-                    const float* r = values + (size_t)rows[e] * 8 * blocks + k;
-                    const Quad u = *(const Quad*)&r[0];
-                    const Quad v = *(const Quad*)&r[4];
+                for (int s = 0; s < held; ++s) {
+                    const float h = near_coupling[(s * R + j) * 3 + c];
+                    const Quad u = *(const Quad*)&near_values[s * 8 * blocks + k];
+                    const Quad v = *(const Quad*)&near_values[s * 8 * blocks + k + 4];
                     sum[0] -= h * u.x; sum[1] -= h * u.y; sum[2] -= h * u.z; sum[3] -= h * u.w;
                     sum[4] -= h * v.x; sum[5] -= h * v.y; sum[6] -= h * v.z; sum[7] -= h * v.w;
                 }
-            }
-            #pragma unroll
-            for (int a = 0; a < 8; ++a) A[row_of(first + a) + N + j] = sum[a];
-        }
-        SOFTMODE_BARRIER;
-        // half blocks, 4 x 8: of the components (c, d), rows 4 k of the functions, columns 8 m
-        for (int t = member; t < 9 * 2 * blocks * blocks; t += team) {
-            const int c = t / (6 * blocks * blocks);
-            const int d = (t / (2 * blocks * blocks)) % 3;
-            const int k = (t / blocks) % (2 * blocks);
-            const int m = t % blocks;
-            if (c > d || (c == d && m < k / 2) || acting_count == 0) continue;
-            float sum[4][8];
-            #pragma unroll
-            for (int a = 0; a < 4; ++a) {
                 #pragma unroll
-                for (int b = 0; b < 8; ++b) sum[a][b] = 0.0f;
+                for (int a = 0; a < 8; ++a) A[row_of(first + a) + N + j] += sum[a];
             }
-            #pragma unroll 4
-            for (int s = 0; s < acting_count; ++s) {
-                const int e = acting[s];
-                const float* r = values + (size_t)rows[e] * 8 * blocks;
-                const float h = H[9 * e + 3 * c + d];
-                const Quad u = *(const Quad*)&r[4 * k];
-                const Quad v = *(const Quad*)&r[8 * m];
-                const Quad w = *(const Quad*)&r[8 * m + 4];
-                const float left[4] = {u.x * h, u.y * h, u.z * h, u.w * h};
+            // half blocks, 4 x 8: of the components (c, d), rows 4 k of the functions, columns 8 m. Of components
+            // c < d all of them; of c = d those that reach the diagonal
+            constexpr int whole = 2 * blocks * blocks;
+            constexpr int upper = blocks * (blocks + 1);
+            for (int t = member; t < 3 * (whole + upper); t += team) {
+                int c, d, k, m;
+                if (t < 3 * whole) {
+                    const int pair = t / whole;
+                    c = pair == 2 ? 1 : 0;
+                    d = pair == 0 ? 1 : 2;
+                    k = (t - pair * whole) / blocks;
+                    m = t % blocks;
+                } else {
+                    c = (t - 3 * whole) / upper;
+                    d = c;
+                    int rest = t - 3 * whole - c * upper;
+                    k = 0;
+                    while (rest >= blocks - k / 2) {
+                        rest -= blocks - k / 2;
+                        ++k;
+                    }
+                    m = k / 2 + rest;
+                }
+                float sum[4][8];
                 #pragma unroll
                 for (int a = 0; a < 4; ++a) {
-                    sum[a][0] += left[a] * v.x; sum[a][1] += left[a] * v.y;
-                    sum[a][2] += left[a] * v.z; sum[a][3] += left[a] * v.w;
-                    sum[a][4] += left[a] * w.x; sum[a][5] += left[a] * w.y;
-                    sum[a][6] += left[a] * w.z; sum[a][7] += left[a] * w.w;
+                    #pragma unroll
+                    for (int b = 0; b < 8; ++b) sum[a][b] = 0.0f;
                 }
-            }
-            #pragma unroll
-            for (int a = 0; a < 4; ++a) {
+                #pragma unroll 2
+                for (int s = 0; s < held; ++s) {
+                    const float* row = near_values + s * 8 * blocks;
+                    const float h = near_hessian[9 * s + 3 * c + d];
+                    const Quad u = *(const Quad*)&row[4 * k];
+                    const Quad v = *(const Quad*)&row[8 * m];
+                    const Quad w = *(const Quad*)&row[8 * m + 4];
+                    const float left[4] = {u.x * h, u.y * h, u.z * h, u.w * h};
+                    #pragma unroll
+                    for (int a = 0; a < 4; ++a) {
+                        sum[a][0] += left[a] * v.x; sum[a][1] += left[a] * v.y;
+                        sum[a][2] += left[a] * v.z; sum[a][3] += left[a] * v.w;
+                        sum[a][4] += left[a] * w.x; sum[a][5] += left[a] * w.y;
+                        sum[a][6] += left[a] * w.z; sum[a][7] += left[a] * w.w;
+                    }
+                }
                 #pragma unroll
-                for (int b = 0; b < 8; ++b) {
-                    A[row_of(c * 8 * blocks + 4 * k + a) + d * 8 * blocks + 8 * m + b] += sum[a][b];
+                for (int a = 0; a < 4; ++a) {
+                    #pragma unroll
+                    for (int b = 0; b < 8; ++b) {
+                        A[row_of(c * 8 * blocks + 4 * k + a) + d * 8 * blocks + 8 * m + b] += sum[a][b];
+                    }
                 }
             }
+            for (int t = member; t < tail * (tail + 1); t += team) {
+                const int j = t / (tail + 1);
+                const int l = t - j * (tail + 1);
+                if (l > j && l < tail) continue;
+                double value = l == tail ? move[j] : S[j * R + l];
+                #pragma unroll 4
+                for (int s = 0; s < held; ++s) {
+                    const float* u = &near_jacobian[(s * R + j) * 3];
+                    if (l == tail) {
+                        const double* f = &near_force[3 * s];
+                        value += u[0] * f[0] + u[1] * f[1] + u[2] * f[2];
+                    } else {
+                        const float* v = &near_coupling[(s * R + l) * 3];
+                        value += (double)(u[0] * v[0] + u[1] * v[1] + u[2] * v[2]);
+                    }
+                }
+                if (l == tail) move[j] = value;
+                else S[j * R + l] = value;
+            }
+            SOFTMODE_BARRIER;
         }
-        SOFTMODE_BARRIER;
         int bad = 0;
         for (int first = 0; first < N; first += 8) {
             float* here = A + row_of(first);
@@ -260,16 +361,7 @@ _SYSTEM = """
         SOFTMODE_BARRIER;
         if (member == 0) arrays.systems.indefinite.data[i] = bad;
         // the rigid unknowns, less the body: R - Y^T Y and -g_r - Y^T y
-        const double* M = (const double*)rigid.inertia.data + (size_t)world * dofs * dofs;
-        const double* r = (const double*)rigid.r.data + (size_t)world * dofs;
-        const double* predicted = (const double*)rigid.predicted.data + (size_t)world * dofs;
         const double* lowest = (const double*)rigid.pivot_floor.data + (size_t)world * dofs;
-        const double* F = (const double*)constraints.force.data + (size_t)i * capacity * 3;
-        const int row_count = rigid.row_count.data[world];
-        const size_t first_row = (size_t)world * rigid.row_force.shape[1];
-        const float* row_jacobian = (const float*)rigid.row_jacobian.data + first_row * dofs;
-        const double* row_coupling = (const double*)rigid.row_coupling.data + first_row * dofs;
-        const double* row_force = (const double*)rigid.row_force.data + first_row;
         for (int t = member; t < tail * (tail + 1); t += team) {
             const int j = t / (tail + 1);
             const int l = t - j * (tail + 1);
@@ -278,30 +370,10 @@ _SYSTEM = """
             int other = N + l;
             if (l == tail) {
                 other = N + rigid_max;
-                for (int k = 0; k < tail; ++k) value += M[j * dofs + k] * (r[k] - predicted[k]);
-                #pragma unroll 4
-                for (int s = 0; s < acting_count; ++s) {
-                    const int e = acting[s];
-                    const float* u = &J[(e * dofs + j) * 3];
-                    const double force = u[0] * F[3 * e] + u[1] * F[3 * e + 1] + u[2] * F[3 * e + 2];
-                    value += j >= begins[e] && j < ends[e] ? force : 0.0;
-                }
-                for (int k = 0; k < row_count; ++k) value += (double)row_jacobian[k * dofs + j] * row_force[k];
-                ((double*)rigid.gradient.data)[(size_t)world * dofs + j] = value;
-                value = -value;
+                value = -move[j];
+                ((double*)rigid.gradient.data)[(size_t)world * dofs + j] = move[j];
             } else {
-                value = M[j * dofs + l];
-                #pragma unroll 4
-                for (int s = 0; s < acting_count; ++s) {
-                    const int e = acting[s];
-                    const float* u = &J[(e * dofs + j) * 3];
-                    const float* v = &HJ[(e * dofs + l) * 3];
-                    const float h = u[0] * v[0] + u[1] * v[1] + u[2] * v[2];
-                    value += l >= begins[e] && j < ends[e] ? (double)h : 0.0;
-                }
-                for (int k = 0; k < row_count; ++k) {
-                    value += (double)row_jacobian[k * dofs + j] * row_coupling[k * dofs + l];
-                }
+                value = S[j * R + l];
                 if (l == j) least[j] = lowest[j] > CONDENSED * value ? lowest[j] : CONDENSED * value;
             }
             double part[4] = {0.0, 0.0, 0.0, 0.0};
@@ -394,6 +466,7 @@ def shared_direction_of(size: int, width: int) -> Any:
         "BYTES": shared_bytes(size, width),
         "SIZE": size,
         "WIDTH": width,
+        "TILE": CONTACTS,
         "CONDENSED": float(CONDENSED_ROUNDING),
     }
     for name, value in given.items():
