@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from softmode.robots.assets import available, fetch
     from softmode.robots.control import ArmController, ArmControlOptions
     from softmode.robots.description import JointDrive, RobotDescription, RobotGripper, RobotIndices
+    from softmode.robots.fingertips import Fingertips
     from softmode.robots.grasp_planner import Grasp, plan_grasps
     from softmode.robots.jaws import ParallelJaw
     from softmode.robots.loading import load
@@ -27,6 +28,7 @@ __all__ = [
     "ArmController",
     "ArmDescription",
     "ArmIndices",
+    "Fingertips",
     "Grasp",
     "GripperDescription",
     "JointDrive",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -167,4 +168,53 @@ def write_arm5(folder: Path, text: str = ARM5) -> Path:
     """Write the arm of five joints; return its path."""
     path = folder / "arm5.xml"
     path.write_text(text)
+    return path
+
+
+_FINGER = """
+      <body name="{name}_base" pos="{place}" euler="0 0 {yaw}">
+        <joint name="{name}_0" axis="0 0 1" range="-0.9 0.9"/>
+        <geom type="sphere" size="0.009" mass="0.02"/>
+        <body name="{name}_proximal">
+          <joint name="{name}_1" axis="0 1 0" range="-0.6 1.6"/>
+          <geom type="capsule" fromto="0.01 0 0 0.045 0 0" size="0.009" mass="0.03"/>
+          <body name="{name}_medial" pos="0.055 0 0">
+            <joint name="{name}_2" axis="0 1 0" range="-0.2 1.7"/>
+            <geom type="capsule" fromto="0.005 0 0 0.03 0 0" size="0.009" mass="0.02"/>
+            <body name="{name}_distal" pos="0.04 0 0">
+              <joint name="{name}_3" axis="0 1 0" range="-0.2 1.7"/>
+              <geom type="capsule" fromto="0.005 0 0 0.02 0 0" size="0.009" mass="0.01"/>
+              <body name="{name}_tip" pos="0.03 0 0">
+                <geom type="sphere" size="0.012" mass="0.01"/>
+              </body>
+            </body>
+          </body>
+        </body>
+      </body>"""
+_FINGERS = {"ff": -0.9, "mf": 0.0, "rf": 0.9, "th": math.pi}
+"""At which angle about the palm each finger stands out [rad]."""
+
+
+def hand_mjcf() -> str:
+    """Return a hand of 16 joints that looks down: a palm and four fingers, of capsules, that close downwards."""
+    places = {name: f"{0.045 * math.cos(yaw)} {0.045 * math.sin(yaw)} 0" for name, yaw in _FINGERS.items()}
+    fingers = "".join(_FINGER.format(name=name, place=places[name], yaw=yaw) for name, yaw in _FINGERS.items())
+    drives = "".join(f'<position joint="{name}_{k}" kp="2" kv="0.05"/>' for name in _FINGERS for k in range(4))
+    return f"""<mujoco model="hand">
+  <compiler angle="radian"/>
+  <default><joint damping="0.02" armature="0.001"/></default>
+  <worldbody>
+    <body name="palm">
+      <geom type="box" size="0.03 0.035 0.012" pos="0 0 0.012" mass="0.4"/>{fingers}
+    </body>
+  </worldbody>
+  <actuator>{drives}</actuator>
+</mujoco>
+"""
+
+
+def write_hand(folder: Path) -> Path:
+    """Write the hand of 16 joints; return its path."""
+    path = folder / "hand.xml"
+    path.write_text(hand_mjcf())
     return path
