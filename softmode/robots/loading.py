@@ -21,6 +21,7 @@ from softmode.errors import AssetError, ConfigError
 from softmode.robots.assets import RobotAsset, find, names_file
 from softmode.robots.compiled import CompiledRobot
 from softmode.robots.description import RobotDescription
+from softmode.robots.hand import find_end_effector
 from softmode.robots.joint_split import hold_base, split_links
 from softmode.robots.meshes import use_meshes
 from softmode.robots.references import check_references, default_root, read_xml
@@ -37,6 +38,7 @@ def load(
     gripper: Mapping[str, tuple[float, float]] | None = None,
     home: Sequence[float] | None = None,
     root: str | None = None,
+    hand: str | Path | None = None,
     asset_root: str | Path | None = None,
     drive_bandwidth: float = 8.0,
     floating: bool = False,
@@ -59,6 +61,9 @@ def load(
         home: Joint coordinates of the home pose [m or rad]; by default the key frame "home", else the first one, else
             zero, brought into the joint limits.
         root: Body whose subtree is the robot, moved to the origin; needed if the file holds several robots.
+        hand: A gripper that the robot's file has not: a name, or a file that holds nothing else. Its first link is put
+            upon `end_effector`, the flange; its own end effector becomes that of the robot, and its names begin with
+            "hand_".
         asset_root: Folder outside which the file may refer to nothing. If omitted: its own folder, or the one above a
             folder called `urdf` or `robots`, and of a URDF the packages that it names, found above it.
         drive_bandwidth: Natural frequency of the drives of joints without a servo [Hz].
@@ -89,6 +94,9 @@ def load(
     at_home = {full.joint(j).name: float(key[full.jnt_qposadr[j]]) for j in range(full.njnt)}
     root = asset.root if root is None else root
     _keep_robot(spec, root, asset)
+    if hand is not None:
+        end_effector, more = _attach(spec, asset, end_effector, _locate(hand, None, download))
+        notes += more
     pose = [float(x) for x in key[full.jnt_qposadr[free[0]] :][:7]] if len(free) == 1 and root is None else None
     loose, more = hold_base(spec, pose, floating=floating)
     notes += more
@@ -127,6 +135,27 @@ def load(
         gripper=jaws,
         notes=tuple(robot.notes),
     )
+
+
+def _attach(spec: Any, asset: RobotAsset, flange: str | None, hand: RobotAsset) -> tuple[str, list[str]]:
+    """Put a gripper upon a robot's flange; return the name of the site or link that carries the tool, and notes."""
+    tool, notes = _read(hand)
+    _compile(tool, hand, notes)
+    _keep_robot(tool, hand.root, hand)
+    compiled = CompiledRobot(_compile(tool, hand), hand, {})
+    name = hand.end_effector or find_end_effector(compiled, compiled.drives())[0]
+    if flange is None:
+        arm = CompiledRobot(_compile(spec, asset), asset, {})
+        flange, how = find_end_effector(arm, arm.drives())
+        notes.append(f"hand on {flange!r}: {how}")
+    site, body = spec.site(flange), spec.body(flange)
+    if site is None and body is None:
+        raise ConfigError(
+            f"robot {asset.name!r} has no site or body {flange!r} for the hand", hint="name the flange: end_effector="
+        )
+    tool.option.cone, tool.option.impratio = spec.option.cone, spec.option.impratio  # or MuJoCo warns of a conflict
+    (body.add_frame() if site is None else site).attach_body(tool.worldbody.first_body(), "hand_", "")
+    return f"hand_{name}", notes
 
 
 def _locate(source: str | Path, asset_root: str | Path | None, download: bool) -> RobotAsset:

@@ -171,6 +171,44 @@ def write_arm5(folder: Path, text: str = ARM5) -> Path:
     return path
 
 
+GRIPPER = """<mujoco model="gripper">
+  <compiler angle="radian"/>
+  <default><position kp="4000" kv="200"/></default>
+  <worldbody>
+    <body name="palm">
+      <geom type="box" size="0.03 0.06 0.006" pos="0 0 0.006" mass="0.2"/>
+      <site name="pinch" pos="0 0 0.06"/>
+      <body name="jaw_a" pos="0 0 0.012">
+        <joint name="jaw_a" type="slide" axis="0 1 0" range="0 0.045" armature="0.1"/>
+        <geom type="box" size="0.012 0.006 0.035" pos="0 0.006 0.035" mass="0.05"/>
+        <body name="knuckle_a"><geom type="box" size="0.012 0.005 0.005" pos="0 -0.006 0.005" mass="0.01"/></body>
+      </body>
+      <body name="jaw_b" pos="0 0 0.012">
+        <joint name="jaw_b" type="slide" axis="0 -1 0" range="0 0.045" armature="0.1"/>
+        <geom type="box" size="0.012 0.006 0.035" pos="0 -0.006 0.035" mass="0.05"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><position joint="jaw_a" ctrlrange="0 0.045"/><position joint="jaw_b" ctrlrange="0 0.045"/></actuator>
+</mujoco>
+"""
+"""A gripper alone; beside one finger's root a knuckle stands out towards the other."""
+
+
+def write_arm_and_gripper(folder: Path) -> tuple[Path, Path]:
+    """Write the arm of five joints without its jaws, and the gripper; return both paths."""
+    start, end = ARM5.index('<body name="jaw_a"'), ARM5.index("</body>", ARM5.index('<body name="jaw_b"'))
+    text = ARM5[:start] + ARM5[end + len("</body>") :]
+    tendon = text.index("<tendon>"), text.index("</tendon>") + len("</tendon>")
+    text = text[: tendon[0]] + text[tendon[1] :]
+    drive = text.index('<position tendon="both"')
+    text = text[:drive] + text[text.index("/>", drive) + 2 :]
+    arm = write_arm5(folder, text.replace(" 0.045 0.045", ""))
+    gripper = folder / "gripper.xml"
+    gripper.write_text(GRIPPER)
+    return arm, gripper
+
+
 _FINGER = """
       <body name="{name}_base" pos="{place}" euler="0 0 {yaw}">
         <joint name="{name}_0" axis="0 0 1" range="-0.9 0.9"/>
