@@ -17,7 +17,6 @@ from newton.solvers import SolverMuJoCo
 
 from softmode import robots
 from softmode.objects import Placed, load
-from softmode.robots.chain import serial_chain
 from softmode.scenes import Fixture, SplatScene, add_fixture
 from softmode.splats import CameraOptions, PinholeCamera, ShadowOptions
 from softmode.viz import Film
@@ -47,7 +46,7 @@ class Handover:
     def __init__(self, edge: int) -> None:
         """Build the scene; the left arm's fingers are around the cushion's rim."""
         self.arm = robots.load("aloha_arm")
-        self.chain = serial_chain(self.arm, robots.ParallelJaw.of(self.arm).frame)
+        self.chain = robots.serial_chain(self.arm, robots.ParallelJaw.of(self.arm).frame)
         toy = Placed(object=load(preset="cushion", size=SIZE), position=(START, 0.0, HEIGHT))
         world = newton.ModelBuilder()
         world.add_ground_plane(color=(0.62, 0.64, 0.66))

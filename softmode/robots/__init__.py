@@ -13,6 +13,7 @@ from softmode.lazy import lazy_names
 if TYPE_CHECKING:
     from softmode.robots.arm import ArmDescription, ArmIndices, GripperDescription, add_arm
     from softmode.robots.assets import available, fetch
+    from softmode.robots.chain import SerialChain, serial_chain
     from softmode.robots.control import ArmController, ArmControlOptions
     from softmode.robots.description import JointDrive, RobotDescription, RobotGripper, RobotIndices
     from softmode.robots.fingertips import Fingertips
@@ -37,6 +38,7 @@ __all__ = [
     "RobotDescription",
     "RobotGripper",
     "RobotIndices",
+    "SerialChain",
     "SoftFingertips",
     "TableRobot",
     "add_arm",
@@ -46,6 +48,7 @@ __all__ = [
     "load",
     "place_robot",
     "plan_grasps",
+    "serial_chain",
 ]
 
 __getattr__, __dir__ = lazy_names(__name__)

@@ -29,6 +29,9 @@ from softmode.robots.references import check_references, default_root, read_xml
 _LEAST_MASS, _LEAST_INERTIA = 1.0e-4, 1.0e-7
 """What links that move get that have no mass of their own, [kg] and [kg m^2]."""
 
+_SOLVER_DEFAULTS = {"solref": ("0.02", "1"), "solimp": ("0.9", "0.95", "0.001", "0.5", "2")}
+"""MuJoCo's own parameters of constraints, by the first letters of the attributes that hold them."""
+
 
 def load(
     source: str | Path,
@@ -257,7 +260,11 @@ def _split(spec: Any, asset: RobotAsset) -> tuple[Any, list[str]]:
 
 
 def _balanced(text: str) -> str:
-    """Keep the triangle inequality of principal inertias, which the digits of a written file may break."""
+    """Mend what the digits of a written file may break, and write out what MuJoCo leaves to its defaults.
+
+    Principal inertias keep the triangle inequality. Newton takes parameters of limits and constraints that are not
+    there for zeros, which switches limits off; MuJoCo leaves out those that are its defaults.
+    """
     tree, changed = ElementTree.fromstring(text), False
     for element in tree.iter("inertial"):
         inertia = [float(value) for value in element.get("diaginertia", "0 0 0").split()]
@@ -267,6 +274,12 @@ def _balanced(text: str) -> str:
             inertia[k] = others * (1.0 - 1.0e-5)
             element.set("diaginertia", " ".join(f"{value:.9g}" for value in inertia))
             changed = True
+    for element in tree.iter():
+        for name, value in element.attrib.items():
+            default, given = _SOLVER_DEFAULTS.get(name[:6], ()), value.split()
+            if 0 < len(given) < len(default):
+                element.set(name, " ".join((*given, *default[len(given) :])))
+                changed = True
     return ElementTree.tostring(tree, encoding="unicode") if changed else text
 
 
