@@ -114,7 +114,7 @@ def load(
         robot.notes.append("home: zero, no key frame" if found is None else f"home: key frame {found!r}")
     link, tool = robot.tool(end_effector, np.array(offset), drives)
     jaws, palm = robot.gripper(gripper, drives, start, link)
-    hand = sorted({*robot.behind(palm), *robot.behind(link)})
+    behind = sorted({*robot.behind(palm), *robot.behind(link)})
     for equality in list(spec.equalities):
         if equality.name in robot.dropped:
             spec.delete(equality)
@@ -134,7 +134,7 @@ def load(
         home=tuple(start.tolist()),
         end_effector=robot.link(link),
         tool=tool,
-        hand_links=tuple(robot.link(b) for b in hand),
+        hand_links=tuple(robot.link(b) for b in behind),
         gripper=jaws,
         notes=tuple(robot.notes),
     )
