@@ -13,8 +13,10 @@ from softmode.lazy import lazy_names
 if TYPE_CHECKING:
     from softmode.robots.arm import ArmDescription, ArmIndices, GripperDescription, add_arm
     from softmode.robots.assets import available, fetch
+    from softmode.robots.chain import SerialChain, serial_chain
     from softmode.robots.control import ArmController, ArmControlOptions
     from softmode.robots.description import JointDrive, RobotDescription, RobotGripper, RobotIndices
+    from softmode.robots.fingertips import Fingertips
     from softmode.robots.grasp_planner import Grasp, plan_grasps
     from softmode.robots.jaws import ParallelJaw
     from softmode.robots.loading import load
@@ -27,6 +29,7 @@ __all__ = [
     "ArmController",
     "ArmDescription",
     "ArmIndices",
+    "Fingertips",
     "Grasp",
     "GripperDescription",
     "JointDrive",
@@ -35,6 +38,7 @@ __all__ = [
     "RobotDescription",
     "RobotGripper",
     "RobotIndices",
+    "SerialChain",
     "SoftFingertips",
     "TableRobot",
     "add_arm",
@@ -44,6 +48,7 @@ __all__ = [
     "load",
     "place_robot",
     "plan_grasps",
+    "serial_chain",
 ]
 
 __getattr__, __dir__ = lazy_names(__name__)

@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 _FACE = 0.002
 """How far behind the foremost point of a finger its face reaches [m]: pads are rounded, and some are tilted."""
 
+_TIP = 0.01
+"""How far behind the tip of a finger a link may end that counts as its pad [m]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ParallelJaw:
@@ -96,8 +99,9 @@ def gap_of(robot: RobotDescription, jaw: ParallelJaw, opening: float) -> float:
     model: Any = importlib.import_module("mujoco").MjModel.from_xml_string(robot.mjcf)
     data = _kinematics(robot, model, opening)
     mount = data.xmat[model.body(robot.end_effector).id].reshape(3, 3)
-    y = mount @ (Rotation.from_quat(robot.tool[3:]) * Rotation.from_quat(jaw.frame[3:])).as_matrix()[:, 1]
-    left, right = (surface_corners(model, data, side) @ y for side in _fingers(robot, model))
+    turn = mount @ (Rotation.from_quat(robot.tool[3:]) * Rotation.from_quat(jaw.frame[3:])).as_matrix()
+    y, z = turn[:, 1], turn[:, 2]
+    left, right = (_pad_corners(model, data, side, z) @ y for side in _fingers(robot, model))
     # The closing axis may point from either finger to the other.
     return float(max(left.min() - right.max(), right.min() - left.max()))
 
@@ -126,7 +130,7 @@ def _measured(robot: RobotDescription) -> ParallelJaw:
     z = mount[:, k] * np.sign(along[k])
     z = z - y * (z @ y)
     turn = np.column_stack([np.cross(y, z / np.linalg.norm(z)), y, z / np.linalg.norm(z)])
-    left, right = (points @ turn for points in fingers)
+    left, right = (_pad_corners(model, wide, side, turn[:, 2]) @ turn for side in sides)
     face = np.array([left[:, 1].min(), right[:, 1].max()])
     opening = float(face[0] - face[1])
     if moved[0] @ y <= 0.0 or moved[1] @ y >= 0.0 or opening <= 0.0:
@@ -135,7 +139,8 @@ def _measured(robot: RobotDescription) -> ParallelJaw:
     low = np.max([pad.min(0) for pad in pads], axis=0)
     high = np.min([pad.max(0) for pad in pads], axis=0)
     tips = min(left[:, 2].max(), right[:, 2].max())
-    beside = left[left[:, 2] >= min(low[2], high[2]) - 1e-9]
+    whole = fingers[0] @ turn
+    beside = whole[whole[:, 2] >= min(low[2], high[2]) - 1e-9]
     base = base @ turn
     middle = np.array([0.5 * (low[0] + high[0]), 0.5 * (face[0] + face[1]), 0.5 * (low[2] + high[2])])
     tool = Rotation.from_matrix(mount) * Rotation.from_quat(robot.tool[3:])
@@ -155,6 +160,22 @@ def _measured(robot: RobotDescription) -> ParallelJaw:
         friction=float(model.geom_friction[faces, 0].mean()),
         frame=(*place.tolist(), *(tool.inv() * Rotation.from_matrix(turn)).as_quat().tolist()),
     )
+
+
+def _pad_corners(model: Any, data: Any, side: list[int], out: Array) -> Array:
+    """Return the corners of those links of a finger that reach its tip, (N, 3) [m]: pads, not the links of a linkage.
+
+    Args:
+        model: The compiled robot.
+        data: Where everything is.
+        side: The links of the finger.
+        out: The direction in which the fingers stand out.
+    """
+    solid = {int(model.geom_bodyid[geom]) for geom in colliding(model, side)}
+    links = {link: surface_corners(model, data, [link]) for link in side if link in solid}
+    tip = max((float((points @ out).max()) for points in links.values()), default=0.0)
+    near = [points for points in links.values() if float((points @ out).max()) >= tip - _TIP]
+    return np.concatenate(near) if near else np.empty((0, 3))
 
 
 _HINT = "give ParallelJaw(opening=..., ...) yourself"

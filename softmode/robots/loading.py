@@ -21,12 +21,16 @@ from softmode.errors import AssetError, ConfigError
 from softmode.robots.assets import RobotAsset, find, names_file
 from softmode.robots.compiled import CompiledRobot
 from softmode.robots.description import RobotDescription
+from softmode.robots.hand import find_end_effector
 from softmode.robots.joint_split import hold_base, split_links
 from softmode.robots.meshes import use_meshes
 from softmode.robots.references import check_references, default_root, read_xml
 
 _LEAST_MASS, _LEAST_INERTIA = 1.0e-4, 1.0e-7
 """What links that move get that have no mass of their own, [kg] and [kg m^2]."""
+
+_SOLVER_DEFAULTS = {"solref": ("0.02", "1"), "solimp": ("0.9", "0.95", "0.001", "0.5", "2")}
+"""MuJoCo's own parameters of constraints, by the first letters of the attributes that hold them."""
 
 
 def load(
@@ -37,6 +41,7 @@ def load(
     gripper: Mapping[str, tuple[float, float]] | None = None,
     home: Sequence[float] | None = None,
     root: str | None = None,
+    hand: str | Path | None = None,
     asset_root: str | Path | None = None,
     drive_bandwidth: float = 8.0,
     floating: bool = False,
@@ -59,6 +64,9 @@ def load(
         home: Joint coordinates of the home pose [m or rad]; by default the key frame "home", else the first one, else
             zero, brought into the joint limits.
         root: Body whose subtree is the robot, moved to the origin; needed if the file holds several robots.
+        hand: A gripper that the robot's file has not: a name, or a file that holds nothing else. Its first link is put
+            upon `end_effector`, the flange; its own end effector becomes that of the robot, and its names begin with
+            "hand_".
         asset_root: Folder outside which the file may refer to nothing. If omitted: its own folder, or the one above a
             folder called `urdf` or `robots`, and of a URDF the packages that it names, found above it.
         drive_bandwidth: Natural frequency of the drives of joints without a servo [Hz].
@@ -89,6 +97,9 @@ def load(
     at_home = {full.joint(j).name: float(key[full.jnt_qposadr[j]]) for j in range(full.njnt)}
     root = asset.root if root is None else root
     _keep_robot(spec, root, asset)
+    if hand is not None:
+        end_effector, more = _attach(spec, asset, end_effector, _locate(hand, None, download))
+        notes += more
     pose = [float(x) for x in key[full.jnt_qposadr[free[0]] :][:7]] if len(free) == 1 and root is None else None
     loose, more = hold_base(spec, pose, floating=floating)
     notes += more
@@ -103,7 +114,7 @@ def load(
         robot.notes.append("home: zero, no key frame" if found is None else f"home: key frame {found!r}")
     link, tool = robot.tool(end_effector, np.array(offset), drives)
     jaws, palm = robot.gripper(gripper, drives, start, link)
-    hand = sorted({*robot.behind(palm), *robot.behind(link)})
+    behind = sorted({*robot.behind(palm), *robot.behind(link)})
     for equality in list(spec.equalities):
         if equality.name in robot.dropped:
             spec.delete(equality)
@@ -123,10 +134,31 @@ def load(
         home=tuple(start.tolist()),
         end_effector=robot.link(link),
         tool=tool,
-        hand_links=tuple(robot.link(b) for b in hand),
+        hand_links=tuple(robot.link(b) for b in behind),
         gripper=jaws,
         notes=tuple(robot.notes),
     )
+
+
+def _attach(spec: Any, asset: RobotAsset, flange: str | None, hand: RobotAsset) -> tuple[str, list[str]]:
+    """Put a gripper upon a robot's flange; return the name of the site or link that carries the tool, and notes."""
+    tool, notes = _read(hand)
+    _compile(tool, hand, notes)
+    _keep_robot(tool, hand.root, hand)
+    compiled = CompiledRobot(_compile(tool, hand), hand, {})
+    name = hand.end_effector or find_end_effector(compiled, compiled.drives())[0]
+    if flange is None:
+        arm = CompiledRobot(_compile(spec, asset), asset, {})
+        flange, how = find_end_effector(arm, arm.drives())
+        notes.append(f"hand on {flange!r}: {how}")
+    site, body = spec.site(flange), spec.body(flange)
+    if site is None and body is None:
+        raise ConfigError(
+            f"robot {asset.name!r} has no site or body {flange!r} for the hand", hint="name the flange: end_effector="
+        )
+    tool.option.cone, tool.option.impratio = spec.option.cone, spec.option.impratio  # or MuJoCo warns of a conflict
+    (body.add_frame() if site is None else site).attach_body(tool.worldbody.first_body(), "hand_", "")
+    return f"hand_{name}", notes
 
 
 def _locate(source: str | Path, asset_root: str | Path | None, download: bool) -> RobotAsset:
@@ -228,7 +260,11 @@ def _split(spec: Any, asset: RobotAsset) -> tuple[Any, list[str]]:
 
 
 def _balanced(text: str) -> str:
-    """Keep the triangle inequality of principal inertias, which the digits of a written file may break."""
+    """Mend what the digits of a written file may break, and write out what MuJoCo leaves to its defaults.
+
+    Principal inertias keep the triangle inequality. Newton takes parameters of limits and constraints that are not
+    there for zeros, which switches limits off; MuJoCo leaves out those that are its defaults.
+    """
     tree, changed = ElementTree.fromstring(text), False
     for element in tree.iter("inertial"):
         inertia = [float(value) for value in element.get("diaginertia", "0 0 0").split()]
@@ -238,6 +274,12 @@ def _balanced(text: str) -> str:
             inertia[k] = others * (1.0 - 1.0e-5)
             element.set("diaginertia", " ".join(f"{value:.9g}" for value in inertia))
             changed = True
+    for element in tree.iter():
+        for name, value in element.attrib.items():
+            default, given = _SOLVER_DEFAULTS.get(name[:6], ()), value.split()
+            if 0 < len(given) < len(default):
+                element.set(name, " ".join((*given, *default[len(given) :])))
+                changed = True
     return ElementTree.tostring(tree, encoding="unicode") if changed else text
 
 

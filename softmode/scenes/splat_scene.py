@@ -20,7 +20,9 @@ from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.neighbours import listed, movable_bodies
 from softmode.deformables.model.status import status_reasons
+from softmode.deformables.solver.observables import ReducedObservableKind
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
+from softmode.deformables.tools.gaps import rigid_gaps
 from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.errors import ConfigError
 from softmode.objects.placed import Placed
@@ -74,6 +76,11 @@ class Record:
             f"status: {', '.join(self.reasons) or 'fine'}; {self.milliseconds:.1f} ms per step\n"
             f"deepest in a fixed shape {1e3 * self.depth:.2f} mm, in each other {1e3 * self.overlap:.2f} mm"
         )
+
+
+def _mass(placed: Placed) -> float:
+    """Return the mass of an object at its place [kg]."""
+    return (placed.object.material or FOAM).density * placed.scale**3 * placed.body.volume
 
 
 class SplatScene:
@@ -283,9 +290,42 @@ class SplatScene:
         total = 0.0
         for placed, first in zip(self.placed, start, strict=True):
             body = placed.body
-            mass = (placed.object.material or FOAM).density * body.volume
-            total += 0.5 * mass * float((qd[first : first + body.function_count] ** 2).sum())
+            total += 0.5 * _mass(placed) * float((qd[first : first + body.function_count] ** 2).sum())
         return total
+
+    def momentum(self) -> NDArray[np.float64]:
+        """Return the momentum of the soft objects, sum of m sum_k mean(b_k) dq_k/dt [kg m/s], shape (3,)."""
+        start, qd = self.model.softmode.function_start.numpy(), self.state.softmode.qd.numpy()
+        total = np.zeros(3)
+        for placed, first in zip(self.placed, start, strict=True):
+            body = placed.body
+            total += _mass(placed) * (body.mean_basis @ qd[first : first + body.function_count])
+        return total
+
+    def momentum_error(self, steps: int) -> float:
+        """Take steps one by one; return the largest error of the momentum after two of them [kg m/s].
+
+        The change of momentum of all soft objects is to be what weight and contact gave them in these steps. Grips,
+        pins, attachments and forces of :meth:`push` are not counted.
+
+        Args:
+            steps: How many; even.
+        """
+        require_even("steps", steps)
+        wanted: Any = self.solver.observables({ReducedObservableKind.INSTANCE_CONTACT_F})
+        weight = self.model.gravity.numpy()[0] * sum(_mass(placed) for placed in self.placed)
+        worst = 0.0
+        for _ in range(steps // 2):
+            expected = self.momentum()
+            for first, second in ((self.state, self._scratch), (self._scratch, self.state)):
+                self.solver.step(first, second, self.control, None, self.dt, observables=wanted)
+                expected += self.dt * (weight + wanted.instance_contact_f.numpy().sum(axis=0))
+            worst = max(worst, float(np.linalg.norm(self.momentum() - expected)))
+        return worst
+
+    def rigid_gaps(self) -> NDArray[np.float64]:
+        """Return the gaps of surface samples to the rigid shapes near them in the last step [m], negative inside."""
+        return rigid_gaps(self.solver)
 
     def soft_overlap(self) -> float:
         """Return how deep the surface of an object was inside another at the start of the last step [m]."""

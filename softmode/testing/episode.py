@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from softmode.deformables.tools.gaps import rigid_gaps
 from softmode.envs.env_state import EnvState
 from softmode.envs.soft_env import SoftEnv
 from softmode.errors import ConfigError
@@ -167,8 +168,4 @@ def played(env: gym.Env, base: SoftEnv, action: Any, result: list[Any] | None = 
 
 def _depth(base: SoftEnv) -> float:
     """Return how deep the deepest surface sample is in a rigid shape [m], zero where none is."""
-    contacts = base.scene.solver.view.constraints
-    used = np.arange(contacts.shape.shape[1]) < contacts.count.numpy()[:, None]
-    touching = used & (contacts.shape.numpy() >= 0)
-    gap = np.einsum("nek,nek->ne", contacts.normal.numpy(), contacts.offset.numpy())[touching]
-    return max(0.0, -float(gap.min(initial=0.0)))
+    return max(0.0, -float(rigid_gaps(base.scene.solver).min(initial=0.0)))

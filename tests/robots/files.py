@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -167,4 +168,91 @@ def write_arm5(folder: Path, text: str = ARM5) -> Path:
     """Write the arm of five joints; return its path."""
     path = folder / "arm5.xml"
     path.write_text(text)
+    return path
+
+
+GRIPPER = """<mujoco model="gripper">
+  <compiler angle="radian"/>
+  <default><position kp="4000" kv="200"/></default>
+  <worldbody>
+    <body name="palm">
+      <geom type="box" size="0.03 0.06 0.006" pos="0 0 0.006" mass="0.2"/>
+      <site name="pinch" pos="0 0 0.06"/>
+      <body name="jaw_a" pos="0 0 0.012">
+        <joint name="jaw_a" type="slide" axis="0 1 0" range="0 0.045" armature="0.1"/>
+        <geom type="box" size="0.012 0.006 0.035" pos="0 0.006 0.035" mass="0.05"/>
+        <body name="knuckle_a"><geom type="box" size="0.012 0.005 0.005" pos="0 -0.006 0.005" mass="0.01"/></body>
+      </body>
+      <body name="jaw_b" pos="0 0 0.012">
+        <joint name="jaw_b" type="slide" axis="0 -1 0" range="0 0.045" armature="0.1"/>
+        <geom type="box" size="0.012 0.006 0.035" pos="0 -0.006 0.035" mass="0.05"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><position joint="jaw_a" ctrlrange="0 0.045"/><position joint="jaw_b" ctrlrange="0 0.045"/></actuator>
+</mujoco>
+"""
+"""A gripper alone; beside one finger's root a knuckle stands out towards the other."""
+
+
+def write_arm_and_gripper(folder: Path) -> tuple[Path, Path]:
+    """Write the arm of five joints without its jaws, and the gripper; return both paths."""
+    start, end = ARM5.index('<body name="jaw_a"'), ARM5.index("</body>", ARM5.index('<body name="jaw_b"'))
+    text = ARM5[:start] + ARM5[end + len("</body>") :]
+    tendon = text.index("<tendon>"), text.index("</tendon>") + len("</tendon>")
+    text = text[: tendon[0]] + text[tendon[1] :]
+    drive = text.index('<position tendon="both"')
+    text = text[:drive] + text[text.index("/>", drive) + 2 :]
+    arm = write_arm5(folder, text.replace(" 0.045 0.045", ""))
+    gripper = folder / "gripper.xml"
+    gripper.write_text(GRIPPER)
+    return arm, gripper
+
+
+_FINGER = """
+      <body name="{name}_base" pos="{place}" euler="0 0 {yaw}">
+        <joint name="{name}_0" axis="0 0 1" range="-0.9 0.9"/>
+        <geom type="sphere" size="0.009" mass="0.02"/>
+        <body name="{name}_proximal">
+          <joint name="{name}_1" axis="0 1 0" range="-0.6 1.6"/>
+          <geom type="capsule" fromto="0.01 0 0 0.045 0 0" size="0.009" mass="0.03"/>
+          <body name="{name}_medial" pos="0.055 0 0">
+            <joint name="{name}_2" axis="0 1 0" range="-0.2 1.7"/>
+            <geom type="capsule" fromto="0.005 0 0 0.03 0 0" size="0.009" mass="0.02"/>
+            <body name="{name}_distal" pos="0.04 0 0">
+              <joint name="{name}_3" axis="0 1 0" range="-0.2 1.7"/>
+              <geom type="capsule" fromto="0.005 0 0 0.02 0 0" size="0.009" mass="0.01"/>
+              <body name="{name}_tip" pos="0.03 0 0">
+                <geom type="sphere" size="0.012" mass="0.01"/>
+              </body>
+            </body>
+          </body>
+        </body>
+      </body>"""
+_FINGERS = {"ff": -0.9, "mf": 0.0, "rf": 0.9, "th": math.pi}
+"""At which angle about the palm each finger stands out [rad]."""
+
+
+def hand_mjcf() -> str:
+    """Return a hand of 16 joints that looks down: a palm and four fingers, of capsules, that close downwards."""
+    places = {name: f"{0.045 * math.cos(yaw)} {0.045 * math.sin(yaw)} 0" for name, yaw in _FINGERS.items()}
+    fingers = "".join(_FINGER.format(name=name, place=places[name], yaw=yaw) for name, yaw in _FINGERS.items())
+    drives = "".join(f'<position joint="{name}_{k}" kp="2" kv="0.05"/>' for name in _FINGERS for k in range(4))
+    return f"""<mujoco model="hand">
+  <compiler angle="radian"/>
+  <default><joint damping="0.02" armature="0.001"/></default>
+  <worldbody>
+    <body name="palm">
+      <geom type="box" size="0.03 0.035 0.012" pos="0 0 0.012" mass="0.4"/>{fingers}
+    </body>
+  </worldbody>
+  <actuator>{drives}</actuator>
+</mujoco>
+"""
+
+
+def write_hand(folder: Path) -> Path:
+    """Write the hand of 16 joints; return its path."""
+    path = folder / "hand.xml"
+    path.write_text(hand_mjcf())
     return path

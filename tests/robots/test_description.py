@@ -372,3 +372,17 @@ def test_warnings_of_mujoco_are_pythons(tmp_path, monkeypatch):
     finally:
         mujoco.set_mju_user_warning(None)
     assert own and not (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+def test_limits_that_leave_something_to_the_defaults(tmp_path: Path) -> None:
+    """MuJoCo leaves out what is its default; Newton would take it for zero, which switches a limit off."""
+    text = MJCF.replace('name="elbow" class="arm"', 'name="elbow" class="arm" solreflimit="0.005 1" solimplimit="0.8"')
+    builder = newton.ModelBuilder()
+    newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
+    indices = robots.load(write_mjcf(tmp_path, text)).add_to(builder)
+    dof = indices.dof_start + 1
+    values = {
+        name: list(builder.custom_attributes[f"mujoco:{name}"].values[dof]) for name in ("solreflimit", "solimplimit")
+    }
+    np.testing.assert_allclose(values["solreflimit"], (0.005, 1.0), rtol=1e-6)
+    np.testing.assert_allclose(values["solimplimit"], (0.8, 0.95, 0.001, 0.5, 2.0), rtol=1e-6)

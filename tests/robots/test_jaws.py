@@ -10,7 +10,7 @@ import pytest
 from softmode import robots
 from softmode.errors import ConfigError, GraspError
 from softmode.robots import ArmDescription, GripperDescription, ParallelJaw, plan_grasps
-from tests.robots.files import write_mjcf, write_urdf
+from tests.robots.files import write_arm_and_gripper, write_mjcf, write_urdf
 from tests.robots.test_grasp_planner import block, check
 
 
@@ -37,6 +37,25 @@ def test_jaw_of_a_urdf(tmp_path: Path) -> None:
     assert jaw.opening == pytest.approx(0.07, abs=1e-6)
     assert jaw.pad_length == pytest.approx(0.04, abs=1e-6)
     np.testing.assert_allclose(jaw.frame[:3], 0.0, atol=1e-6)
+
+
+def test_hand_on_an_arm(tmp_path: Path) -> None:
+    """A gripper from a file of its own is put on the flange: joints, tool and jaw are the gripper's.
+
+    Its fingers travel 45 mm each from where they meet. The knuckle that stands out 10 mm is no pad.
+    """
+    arm, gripper = write_arm_and_gripper(tmp_path)
+    robot = robots.load(arm, hand=gripper, end_effector="roll")
+    assert robot.joint_names[-2:] == ("hand_jaw_a", "hand_jaw_b") and len(robot.joint_names) == 7
+    assert robot.gripper is not None and robot.gripper.joints == ("hand_jaw_a", "hand_jaw_b")
+    assert robot.end_effector == "hand_palm" and robot.tool[:3] == (0.0, 0.0, 0.06)
+    jaw = ParallelJaw.of(robot)
+    assert jaw.opening == pytest.approx(0.09, abs=1e-6)
+    assert jaw.pad_length == pytest.approx(0.07, abs=1e-6)
+    flange = robots.load(arm, end_effector="roll").tool_pose()
+    np.testing.assert_allclose(np.linalg.norm(np.subtract(robot.tool_pose()[:3], flange[:3])), 0.06, atol=1e-6)
+    with pytest.raises(ConfigError, match="no site or body 'elbow_joint' for the hand"):
+        robots.load(arm, hand=gripper, end_effector="elbow_joint")
 
 
 @pytest.mark.skipif("aloha_arm" not in robots.available(), reason="this mujoco-warp ships no ALOHA arm")
