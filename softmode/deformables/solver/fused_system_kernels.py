@@ -8,6 +8,9 @@ Only the upper triangle is kept: row block b, eight rows, from its diagonal bloc
 numbers a row. Diagonal blocks hold U with inverse pivots once they are factored. The sizes are constants of the code,
 so that indices cost no division; each size is compiled when it is first used. Compiled for a CPU the same code runs
 with one thread, for tests.
+
+Each piece of code that runs once in an iteration is fetched from L2 again, since the whole of it is several times larger
+than the instruction cache. Loops are unrolled where they are long, and kept (``unroll 1``) where that only adds code.
 """
 
 from functools import cache
@@ -159,11 +162,14 @@ _SYSTEM = """
             if (l > j && l < tail) continue;
             double value = 0.0;
             if (l == tail) {
+                #pragma unroll 1
                 for (int k = 0; k < tail; ++k) value += M[j * dofs + k] * (r[k] - predicted[k]);
+                #pragma unroll 1
                 for (int k = 0; k < row_count; ++k) value += (double)row_jacobian[k * dofs + j] * row_force[k];
                 move[j] = value;
             } else {
                 value = M[j * dofs + l];
+                #pragma unroll 1
                 for (int k = 0; k < row_count; ++k) {
                     value += (double)row_jacobian[k * dofs + j] * row_coupling[k * dofs + l];
                 }
@@ -291,6 +297,7 @@ _SYSTEM = """
             SOFTMODE_BARRIER;
         }
         int bad = 0;
+        #pragma unroll 1
         for (int first = 0; first < N; first += 8) {
             float* here = A + row_of(first);
             const int stride = W - first;
@@ -298,6 +305,7 @@ _SYSTEM = """
                 float r[8];
                 #pragma unroll
                 for (int a = 0; a < 8; ++a) r[a] = here[a * stride + l];
+                #pragma unroll 1
                 for (int above = 0; above < first; above += 8) {
                     const float* rows_above = A + row_of(above);
                     #pragma unroll
@@ -390,11 +398,14 @@ _SYSTEM = """
         }
         SOFTMODE_BARRIER;
         // as ``assembly_kernels.factor_rigid``
+        #pragma unroll 1
         for (int a = 0; a < tail; ++a) {
             double pivot = S[a * R + a];
+            #pragma unroll 1
             for (int s = 0; s < a; ++s) pivot -= S[a * R + s] * S[a * R + s];
             for (int b = a + 1 + member; b < tail; b += team) {
                 double value = S[b * R + a];
+                #pragma unroll 1
                 for (int s = 0; s < a; ++s) value -= S[b * R + s] * S[a * R + s];
                 S[b * R + a] = value;
                 const double diagonal = S[b * R + b] > least[b] ? S[b * R + b] : least[b];
@@ -409,14 +420,18 @@ _SYSTEM = """
             SOFTMODE_BARRIER;
         }
         if (member == 0) {
+            #pragma unroll 1
             for (int a = 0; a < tail; ++a) {
                 double value = move[a];
+                #pragma unroll 1
                 for (int s = 0; s < a; ++s) value -= S[a * R + s] * move[s];
                 move[a] = value * S[a * R + a];
             }
             double* out = (double*)rigid.direction.data + (size_t)world * dofs;
+            #pragma unroll 1
             for (int a = tail - 1; a >= 0; --a) {
                 double value = move[a];
+                #pragma unroll 1
                 for (int s = a + 1; s < tail; ++s) value -= S[s * R + a] * move[s];
                 move[a] = value * S[a * R + a];
                 out[a] = move[a];
@@ -430,6 +445,7 @@ _SYSTEM = """
         }
         SOFTMODE_BARRIER;
         float* out = (float*)arrays.direction.data + (size_t)i * N;
+        #pragma unroll 1
         for (int first = N - 8; first >= 0; first -= 8) {
             const float* here = A + row_of(first);
             float x[8];
