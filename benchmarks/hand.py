@@ -46,7 +46,8 @@ def main() -> None:
     wp.config.log_level = wp.LOG_WARNING
     wp.set_device(given.device)
     hand = Hand(robots.load(given.hand), 96, given.samples)
-    STAGES.pop("turn"), STAGES.pop("hold again")
+    for stage in ("turn", "hold again"):
+        STAGES.pop(stage)
     with Film(Path("out/benchmark_hand.mp4")) as film:
         hand.run(film)
     env = held_by_arm(given.device, given.samples)

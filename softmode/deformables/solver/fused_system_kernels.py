@@ -9,8 +9,8 @@ numbers a row. Diagonal blocks hold U with inverse pivots once they are factored
 so that indices cost no division; each size is compiled when it is first used. Compiled for a CPU the same code runs
 with one thread, for tests.
 
-Each piece of code that runs once in an iteration is fetched from L2 again, since the whole of it is several times larger
-than the instruction cache. Loops are unrolled where they are long, and kept (``unroll 1``) where that only adds code.
+Code that runs once in an iteration is fetched from L2 each time, since all of it is several times larger than the
+instruction cache. Loops are unrolled where they are long, and kept (``unroll 1``) where that would only add code.
 """
 
 from functools import cache
@@ -45,7 +45,8 @@ def dynamic_floats(size: int, width: int) -> int:
 def shared_bytes(size: int, width: int) -> int:
     """Return how much shared memory a block needs for such a system, its right-hand side and the rigid unknowns."""
     columns = width - size
-    return 4 * (shared_floats(size, width) + size) + 8 * _rigid_doubles(columns) + CONTACTS * _contact_bytes(size, columns)
+    system = 4 * (shared_floats(size, width) + size) + 8 * _rigid_doubles(columns)
+    return system + CONTACTS * _contact_bytes(size, columns)
 
 
 def _contact_bytes(size: int, columns: int) -> int:
