@@ -35,7 +35,7 @@ class Step:
     """Largest contact force of the soft objects on a rigid body [N], a mean over the last substep; what is fixed to the
     world is none."""
     depth: float
-    """Depth of the deepest surface sample in a rigid shape [m], at the start of the last substep."""
+    """Depth of the deepest surface sample in a rigid shape [m], at the start of the last substep, less its dent."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -166,9 +166,13 @@ def played(env: gym.Env, base: SoftEnv, action: Any, result: list[Any] | None = 
 
 
 def _depth(base: SoftEnv) -> float:
-    """Return how deep the deepest surface sample is in a rigid shape [m], zero where none is."""
+    """Return how deep the deepest surface sample is in a rigid shape besides its dent [m], zero where none is."""
     contacts = base.scene.solver.view.constraints
     used = np.arange(contacts.shape.shape[1]) < contacts.count.numpy()[:, None]
     touching = used & (contacts.shape.numpy() >= 0)
-    gap = np.einsum("nek,nek->ne", contacts.normal.numpy(), contacts.offset.numpy())[touching]
+    normal = contacts.normal.numpy()
+    gap = np.einsum("nek,nek->ne", normal, contacts.offset.numpy())[touching]
+    force = np.einsum("nek,nek->ne", normal, contacts.force.numpy())[touching]
+    give, most = (array.numpy()[touching] for array in (contacts.dent_compliance, contacts.dent_depth))
+    gap += np.minimum(give * np.maximum(force, 0.0), most)
     return max(0.0, -float(gap.min(initial=0.0)))

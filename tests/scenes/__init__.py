@@ -177,6 +177,18 @@ class Scene:
         """Return m/2 |qd|^2 [J]."""
         return 0.5 * self.mass(instance) * float((self.qd(instance) ** 2).sum())
 
+    def dents(self, instance: int = 0) -> tuple[np.ndarray, float]:
+        """Return the dents at the contacts of the last step [m], shape (count,), and their energy [J].
+
+        What a contact that has hardened presses is carried by the penalty in part: its dent counts up to there.
+        """
+        c, pins = self.reduced.view.constraints, int(self.reduced.view.instances.pin_count.numpy()[instance])
+        mine = slice(pins, int(c.count.numpy()[instance]))
+        normal, force = c.normal.numpy()[instance, mine], c.force.numpy()[instance, mine]
+        give, most = c.dent_compliance.numpy()[instance, mine], c.dent_depth.numpy()[instance, mine]
+        dent = np.minimum(give * np.maximum((normal * force).sum(axis=1), 0.0), most)
+        return dent, float(0.5 * (dent**2 / np.where(give > 0.0, give, 1.0)).sum())
+
     def rigid_momentum(self, body: int = 0) -> tuple[np.ndarray, np.ndarray, float]:
         """Return linear and angular momentum about the world's origin and the kinetic energy of a rigid body."""
         mass = float(self.model.body_mass.numpy()[body])

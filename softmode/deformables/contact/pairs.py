@@ -42,6 +42,7 @@ class SoftPairs:
         stick_ratio: Tangential over normal stiffness of a contact that sticks; 0 for friction without memory.
         spacing: Of the surface samples of each instance [m], shape (instance_count,).
         relative_stiffness: Young's modulus at the surface samples of all bodies relative to the body's.
+        dent_length: Dents at these samples under the pressure E / (1 - nu^2) [m].
         device: Where the tables lie.
     """
 
@@ -53,12 +54,13 @@ class SoftPairs:
         stick_ratio: float,
         spacing: wp.array,
         relative_stiffness: wp.array,
+        dent_length: wp.array,
         device: wp.Device,
     ) -> None:
         """Allocate the tables."""
         self.layout, self.instances, self.basis, self.device = layout, instances, basis, device
         self.stick_ratio, self.team = stick_ratio, team_size(device)
-        self.relative_stiffness = relative_stiffness
+        self.relative_stiffness, self.dent_length = relative_stiffness, dent_length
         sizes = {
             "instance": layout.instance_count,
             "sample": layout.sample_max,
@@ -102,8 +104,9 @@ class SoftPairs:
         launch_teams(self.device, kernels.compact_pairs, count, self.team, instances, self.team, pairs, state.status)
         found = (pairs, constraints, state.status)
         self._launch(kernels.accept_pairs, self.layout.world_count, state, constraint_max, *found)
-        stick = (self.relative_stiffness, wp.float64(self.stick_ratio), memory.stick_partner, memory.stick_slip, dt)
-        tables = (instances, basis, motion, samples, state, *stick)
+        surface = (self.relative_stiffness, self.dent_length)
+        stick = (wp.float64(self.stick_ratio), memory.stick_partner, memory.stick_slip, dt)
+        tables = (instances, basis, motion, samples, state, *surface, *stick)
         self._launch(kernels.write_pairs, pairs.sample.shape, *tables, pairs, constraints)
 
     def remember(self, motion: Motion, state: NewtonState, constraints: PointConstraints, memory: SoftState) -> None:

@@ -147,7 +147,8 @@ def add_reduced_body(
             body, at its scale, in its frame [m], shape (N, 3). The body takes the nearest that its functions can; see
             :meth:`softmode.deformables.body.reduced_body.ReducedBody.project`.
         contact_stiffness_per_area: Penalty stiffness of contact [Pa/m]; None or 0 lets it follow the material and the
-            step, see :func:`softmode.deformables.contact.penalty_kernels.stiffness_per_area`.
+            step, see :func:`softmode.deformables.contact.penalty_kernels.stiffness_per_area`. A number is the whole law
+            of the contact: nothing is added to it for the dent that the functions are too few for.
         contact_radius: How far the surface that touches stands out from the body's [m].
         self_contact: Whether the body may touch itself.
         particle_radius: Radius of the particles for viewers and picking [m]; default half their spacing.
