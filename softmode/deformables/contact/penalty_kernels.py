@@ -98,6 +98,13 @@ def normal_potential(penetration: wp.float64, eps: wp.float64, ratio: wp.float64
 
 
 @wp.func
+def contact_potential(constraints: PointConstraints, smoothing: float, penetration: wp.float64, i: int, e: int):
+    """Return the potential of a contact at a penetration [m] per unit stiffness, and its first two derivatives."""
+    ratio = constraints.stiffness[i, e] * constraints.dent_compliance[i, e]
+    return normal_potential(penetration, wp.float64(smoothing), ratio, constraints.dent_depth[i, e])
+
+
+@wp.func
 def friction_potential(y: wp.float64, eps: wp.float64):
     """Return f0(y), f1(y) / y and f1'(y), f1 = f0', of the smoothed Coulomb potential with stick range ``eps`` [m]."""
     one = wp.float64(1.0)

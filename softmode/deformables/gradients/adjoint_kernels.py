@@ -8,10 +8,10 @@ import warp as wp
 
 from softmode.deformables.contact.detection_kernels import Shapes, shape_area, shape_frame
 from softmode.deformables.contact.penalty_kernels import (
+    contact_potential,
     dent_exponents,
     dented_penalty,
     friction_potential,
-    normal_potential,
     slip_potential,
     stiffness_exponents,
 )
@@ -199,7 +199,7 @@ def place_constraints(
     p = -wp.dot(n, x)
     eps = wp.float64(instances.smoothing[i])
     ratio = k * constraints.dent_compliance[i, e]
-    _psi, slope, curvature = normal_potential(p, eps, ratio, constraints.dent_depth[i, e])
+    _psi, slope, curvature = contact_potential(constraints, instances.smoothing[i], p, i, e)
     _dented, dent_slope, dent_curvature = dented_penalty(p, eps, ratio)
     t = x + p * n
     y = wp.length(t)

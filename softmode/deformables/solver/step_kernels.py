@@ -20,7 +20,7 @@ Precision: basis data float32; q, energy and residual float64; the Newton direct
 
 import warp as wp
 
-from softmode.deformables.contact.penalty_kernels import normal_potential, slip_potential
+from softmode.deformables.contact.penalty_kernels import contact_potential, slip_potential
 from softmode.deformables.materials.hessian_kernels import hessian
 from softmode.deformables.materials.material_kernels import (
     MaterialModel,
@@ -420,17 +420,14 @@ def evaluate_constraint(
     else:
         n = step.constraints.normal[i, e]
         total = step.constraints.offset[i, e] + d
-        eps = wp.float64(smoothing)
-        dent_ratio = stiffness * step.constraints.dent_compliance[i, e]
-        dent_depth = step.constraints.dent_depth[i, e]
-        psi, slope, curvature = normal_potential(-wp.dot(n, total), eps, dent_ratio, dent_depth)
+        psi, slope, curvature = contact_potential(step.constraints, smoothing, -wp.dot(n, total), i, e)
         if derivatives != 0 and step.state.iteration[w] <= step.state.friction_lag:
             held = slope
             if step.state.iteration[w] == 0:
                 # in an impact the first guess lies far too deep: friction of such a force would be too stiff to solve
                 gap = wp.min(wp.dot(n, step.constraints.offset[i, e]), wp.float64(0.0))
-                deep = eps - wp.float64(2.0) * gap
-                _psi, most, _curvature = normal_potential(deep, eps, dent_ratio, dent_depth)
+                deep = wp.float64(smoothing) - wp.float64(2.0) * gap
+                _psi, most, _curvature = contact_potential(step.constraints, smoothing, deep, i, e)
                 held = wp.min(slope, most)
             step.constraints.normal_force[i, e] = stiffness * held
         normal_force = step.constraints.normal_force[i, e]
