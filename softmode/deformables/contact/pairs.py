@@ -7,6 +7,7 @@ import warp as wp
 from scipy.spatial import KDTree
 
 from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.contact import dent_kernels
 from softmode.deformables.contact import pair_kernels as kernels
 from softmode.deformables.model.declare import Kernel, launch, launch_teams
 from softmode.deformables.model.lane_kernels import team_size
@@ -114,6 +115,12 @@ class SoftPairs:
         tables = (self.instances, self.basis, motion, state, self.table, constraints)
         out = (memory.stick_partner, memory.stick_slip)
         self._launch(kernels.remember_pairs, self.table.surface_normal.shape, *tables, *out)
+
+    def leave_dents(self, constraints: PointConstraints, memory: SoftState) -> None:
+        """Add the dents that these contacts leave to those in the state ``memory``."""
+        surface = (self.relative_stiffness, self.dent_length)
+        tables = (self.instances, *surface, self.table, constraints, memory.dent)
+        self._launch(dent_kernels.leave_pair_dents, self.table.surface_normal.shape, *tables)
 
     def _launch(self, kernel: Kernel, dim: int | tuple[int, ...], *arguments: object) -> None:
         launch(self.device, kernel, dim, *arguments)

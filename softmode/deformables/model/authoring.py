@@ -84,6 +84,8 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
     particle = newton.Model.AttributeFrequency.PARTICLE
     declare("stick_shape stick_partner", wp.vec2i, particle, default=wp.vec2i(-1, -1), **state)
     declare("stick_point stick_slip", mat23d, particle, **state)
+    # how far the skin lies outside of what the functions say, see ``dent_kernels``
+    declare("dent", wp.vec3, particle, **state)
     declare("q_driven", wp.vec3d, _FUNCTION, **control)
     declare("pin_instance", wp.int32, _PIN, references=_INSTANCE)
     declare("pin_body", wp.int32, _PIN, references="body")

@@ -623,11 +623,12 @@ def skin_samples(
     # State in:
     q: wp.array[wp.vec3d],
     qd: wp.array[wp.vec3d],
+    dent: wp.array[wp.vec3],
     # Out:
     particle_q_out: wp.array[wp.vec3],
     particle_qd_out: wp.array[wp.vec3],
 ):
-    """Write position and velocity of the surface samples as Newton particles."""
+    """Write position, dent included, and velocity of the surface samples as Newton particles."""
     i, s = wp.tid()
     if s >= instances.sample_count[i]:
         return
@@ -642,7 +643,7 @@ def skin_samples(
             value = wp.float64(values[lane])
             x += value * q[first + LANES * b + lane]
             v += value * qd[first + LANES * b + lane]
-    particle_q_out[instances.particle_start[i] + s] = wp.vec3(x)
+    particle_q_out[instances.particle_start[i] + s] = wp.vec3(x + wp.vec3d(dent[instances.particle_start[i] + s]))
     particle_qd_out[instances.particle_start[i] + s] = wp.vec3(v)
 
 
