@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from softmode.deformables.contact.dents import contact_dents
 from softmode.envs.env_state import EnvState
 from softmode.envs.soft_env import SoftEnv
 from softmode.errors import ConfigError
@@ -170,9 +171,5 @@ def _depth(base: SoftEnv) -> float:
     contacts = base.scene.solver.view.constraints
     used = np.arange(contacts.shape.shape[1]) < contacts.count.numpy()[:, None]
     touching = used & (contacts.shape.numpy() >= 0)
-    normal = contacts.normal.numpy()
-    gap = np.einsum("nek,nek->ne", normal, contacts.offset.numpy())[touching]
-    force = np.einsum("nek,nek->ne", normal, contacts.force.numpy())[touching]
-    give, most = (array.numpy()[touching] for array in (contacts.dent_compliance, contacts.dent_depth))
-    gap += np.minimum(give * np.maximum(force, 0.0), most)
-    return max(0.0, -float(gap.min(initial=0.0)))
+    gap = np.einsum("nek,nek->ne", contacts.normal.numpy(), contacts.offset.numpy()) + contact_dents(contacts)
+    return max(0.0, -float(gap[touching].min(initial=0.0)))

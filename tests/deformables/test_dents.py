@@ -10,7 +10,7 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_sphere
-from softmode.deformables.contact.dents import DENT_FACTOR, WALL_SHARE, dent_lengths, resolved_size
+from softmode.deformables.contact.dents import DENT_FACTOR, WALL_SHARE, dent_lengths, dent_weights, resolved_size
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
@@ -196,3 +196,66 @@ def test_energy_of_a_bounce() -> None:
         dents = max(dents, scene.dents()[1])
         count = max(count, int(scene.reduced.view.constraints.count.numpy()[0]))
     assert dents > 0.01 * start and count > 10
+
+
+def test_weights() -> None:
+    """A point on a sample takes its dent, weights make up one on the skin and exp(-depth / h) below it.
+
+    Points of the other side of a thin sheet do not count.
+    """
+    body = ball(8, 400)
+    found = dent_weights(body, body.surface_points)
+    np.testing.assert_array_equal(found.samples[:, 0], np.arange(body.surface_count))
+    np.testing.assert_allclose(
+        found.weights, np.eye(1, found.weights.shape[1]).repeat(body.surface_count, 0), atol=1e-4
+    )
+    depth = 0.01
+    below = dent_weights(body, body.surface_points - depth * body.surface_normals).weights.sum(axis=1)
+    np.testing.assert_allclose(below, np.exp(-depth / resolved_size(body)), rtol=0.02)
+    sheet = build_body(
+        quadrature_from_box((0.1, 0.1, 0.004), point_count=1500, surface_count=600),
+        BuildOptions(mode_count=4, kernel_count=150, cubature_count=128),
+        name="sheet",
+    )
+    top = (sheet.surface_normals[:, 2] > 0.9) & (np.abs(sheet.surface_points[:, :2]).max(axis=1) < 0.045)
+    found = dent_weights(sheet, sheet.surface_points[top] - [0.002, 0.001, 0.0])
+    assert (found.weights * (sheet.surface_normals[found.samples, 2] < 0.9)).sum(axis=1).max() < 0.05
+
+
+def test_skin_stays_out() -> None:
+    """A ball at rest on the ground: particles take the dents off, which are as deep as the functions sink in.
+
+    What is left is the onset of the penalty. In two worlds both have the bits of one alone.
+    """
+    body, material = ball(8, 400), Material(youngs_modulus=2.0e4, density=300.0, mass_damping=20.0)
+
+    def populate(world: newton.ModelBuilder) -> None:
+        add_reduced_body(world, body, material=material, position=(0.0, 0.0, RADIUS))
+
+    found = []
+    for count in (1, 2):
+        scene = Scene(populate, [body], gravity=(0.0, 0.0, -GRAVITY), ground=0.5, dt=0.004, world_count=count)
+        scene.step(100)
+        found.append((scene.state.particle_q.numpy(), scene.state.softmode.dent.numpy()))
+    (skin, dent), both = found
+    sunk = float((skin - dent)[:, 2].min())
+    assert sunk < -5.0e-4
+    onset = float(scene.reduced.view.instances.smoothing.numpy()[0])
+    assert -onset < skin[:, 2].min() < 0.0
+    assert (dent[:, 2] >= 0.0).all() and not dent[:, :2].any() and 3 < np.count_nonzero(dent[:, 2]) < 60
+    for alone, worlds in zip(found[0], both, strict=True):
+        np.testing.assert_array_equal(np.concatenate([alone, alone]), worlds)
+    scene.reduced.reset(scene.state)
+    assert not scene.state.softmode.dent.numpy().any()
+
+
+def test_soft_bodies_share_their_dents() -> None:
+    """Two spheres in a row of which one is four times as stiff: the dents between them go as their compliances."""
+    press = Press(ball(8, 400), RADIUS, count=2)
+    press.scene.set_parameter("youngs_modulus", (1.0e6, 4.0e6))
+    press.force(0.02 * RADIUS)
+    dent = press.scene.state.softmode.dent.numpy().reshape(2, -1, 3)
+    middle = [abs(press.scene.body().surface_points[:, 2] - side * RADIUS) < 0.3 * RADIUS for side in (1, -1)]
+    soft, stiff = (np.abs(dent[k, middle[k], 2]) for k in range(2))
+    assert soft.max() == pytest.approx(4.0 * stiff.max(), rel=0.3)
+    assert (dent[0, middle[0], 2] <= 0.0).all() and (dent[1, middle[1], 2] >= 0.0).all()

@@ -1,6 +1,6 @@
 """Device code of the dents that a step leaves: how far the skin lies outside of what the functions of a body say.
 
-A contact sinks in by p = x + v: the penalty takes x, the dent v, see ``penalty_kernels``. The functions of the body move
+A contact sinks in by p = x + v: the penalty takes x, the dent v, see ``penalty_kernels``. The functions move
 a sample by p; the skin that one sees and touches has moved by v less, along the normal of the contact.
 """
 

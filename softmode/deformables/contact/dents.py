@@ -24,6 +24,7 @@ from scipy.spatial import KDTree
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.contact.pairs import thickness
+from softmode.deformables.model.struct_kernels import PointConstraints
 
 Array = NDArray[np.float64]
 
@@ -85,3 +86,14 @@ def dent_weights(body: ReducedBody, points: ArrayLike) -> DentWeights:
     share /= share.sum(axis=1, keepdims=True)
     deep = np.exp(-np.maximum(-height[:, :1], 0.0) / resolved_size(body))
     return DentWeights(samples=near[:, :NEAREST].astype(np.int32), weights=(share * deep).astype(np.float32))
+
+
+def contact_dents(constraints: PointConstraints) -> Array:
+    """Return how far the bodies give way at the contacts of the last step [m], shape (instance_count, constraint_max).
+
+    Of two soft bodies the sum. Counts for contacts; pins and what lies beyond the count of an instance mean nothing.
+    Reads from the device.
+    """
+    pressed = np.einsum("nek,nek->ne", constraints.normal.numpy(), constraints.force.numpy())
+    give = constraints.dent_compliance.numpy() * np.maximum(pressed, 0.0)
+    return np.minimum(give, constraints.dent_depth.numpy())  # from there on the stiffer penalty carries
