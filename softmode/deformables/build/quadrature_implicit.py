@@ -16,7 +16,7 @@ from softmode.deformables.build.quadrature_grid import (
     grid_shape,
     sum_pieces,
 )
-from softmode.deformables.build.surface_samples import CANDIDATES_PER_SAMPLE, select_surface
+from softmode.deformables.build.surface_samples import CANDIDATES_PER_SAMPLE, SURFACE_COUNT, select_surface
 from softmode.errors import AssetError
 
 Array = NDArray[np.float64]
@@ -31,7 +31,7 @@ def quadrature_from_implicit(
     bounds: ArrayLike,
     *,
     point_count: int = 4000,
-    surface_count: int = 400,
+    surface_count: int = SURFACE_COUNT,
     seed: int = 0,
     volume: float | None = None,
     area: float | None = None,

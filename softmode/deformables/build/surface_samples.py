@@ -10,6 +10,9 @@ from softmode.deformables.body.rkpm import sample_farthest
 
 Array = NDArray[np.float64]
 
+SURFACE_COUNT = 800
+"""Surface samples of a body by default. With 400 a ball of 50 mm presses 0.3 to 0.8 of what it should when it is
+pressed by 1 % of its radius, with 800 0.94; with more the step costs more."""
 CANDIDATES_PER_SAMPLE = 400
 """Uniform candidates whose number in the cell of a sample is its area: 0.05 of it is noise where they are random."""
 FIRST_PER_SAMPLE = 24
