@@ -189,7 +189,8 @@ def allocate_tables(
         ConfigError: If a body of the model is not among ``bodies``, or a shape cannot be touched.
     """
     device = model.device
-    layout = lay_out(model, bodies, pair_max=options.contact_max // 2 if options.soft_contact else 0)
+    room = options.contact_room(max((body.surface_count for body in bodies), default=0))
+    layout = lay_out(model, bodies, pair_max=room // 2 if options.soft_contact else 0)
     instances, basis = lay_out_instances(model, layout), lay_out_bases(model, layout)
     scaled = ScaledQuantities(
         model,
@@ -231,7 +232,7 @@ def allocate_tables(
         "sample": layout.sample_max,
         "slot": SLOTS,
         "team": team_size(device),
-        "constraint": options.contact_max + layout.pin_max,
+        "constraint": room + layout.pin_max,
         "rigid": rigid.count_max,
         "gradient_chunk": fused.TEAM // 32 if shared and device.is_cuda else chunks(count * blocks, blocks),
         "stiffness_chunk": chunks(count * square, square + (square + 3 * blocks) // 2),
