@@ -1,7 +1,7 @@
 """Draw the picture of dents: a finger in a sponge, without the dents of contact and with them.
 
-Run: ``python docs/dent_picture.py [docs/images]`` in the root of the repository. A finger of 16 mm presses 10 mm into the
-preset sponge, which lies on a table. Prints how deep splats lie in the finger.
+Run: ``python docs/dent_picture.py [docs/images]`` in the root of the repository. A finger of 16 mm presses 10 mm into
+the preset sponge, which lies on a table. Prints how deep splats lie in the finger.
 """
 
 from __future__ import annotations

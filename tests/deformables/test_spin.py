@@ -137,8 +137,8 @@ def test_what_turns_too_fast_falls_back(modulus, spin):
 def test_tumbling_bounce(modulus, dt):
     """A tumbling brick on the ground: energy never above its start; L changes by the moment of the contact forces.
 
-    Both are about the centre of mass, at the places that the functions give the samples at the end of the step, in float32. Newton
-    leaves a residual of 1e-8 of the forces.
+    Both are about the centre of mass, at the places that the functions give the samples at the end of the step, in
+    float32. Newton leaves a residual of 1e-8 of the forces.
     """
     material = Material(youngs_modulus=modulus, viscosity=0.0)
     options = SolverReducedOptions(force_tolerance=1e-8, friction_lag=100, iteration_max=100)
