@@ -325,7 +325,7 @@ class SplatScene:
         return worst
 
     def rigid_gaps(self) -> NDArray[np.float64]:
-        """Return the gaps of surfaces, dents in, to the rigid shapes near them in the last step [m], negative inside."""
+        """Return the gaps of skins, dents in, to the rigid shapes near them in the last step [m], negative inside."""
         return rigid_gaps(self.solver)
 
     def soft_overlap(self) -> float:

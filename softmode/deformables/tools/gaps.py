@@ -11,8 +11,8 @@ from softmode.deformables.solver.solver_reduced import SolverReduced
 def rigid_gaps(solver: SolverReduced | SolverCoupledReduced) -> NDArray[np.float64]:
     """Return the gaps between surface samples and the rigid shapes that they are near [m], shape (N,).
 
-    Negative where the skin is inside a shape: a sample with its dent. They are those of the last step's contacts, of all
-    worlds.
+    Negative where the skin, a sample with its dent, is inside a shape. They are those of the contacts of the last step in
+    all worlds.
     """
     contacts = solver.view.constraints
     used = np.arange(contacts.shape.shape[1]) < contacts.count.numpy()[:, None]
