@@ -24,12 +24,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from softmode.deformables.body.check import check_fields
+from softmode.deformables.body.detours import Detours
 from softmode.deformables.body.qgmls import BasisQGMLS
 from softmode.deformables.body.raw_functions import QuadraticFunctions, RawFunctions, SkinningFunctions
 from softmode.deformables.body.regions import Envelope, Region
 from softmode.deformables.body.rkpm import BasisRKPM, KernelName
 from softmode.deformables.body.skinning_weights import SkinningWeights
-from softmode.deformables.body.visibility import Visibility
 from softmode.errors import AssetError, BasisError, ConfigError
 from softmode.files import read_archive, write_archive
 
@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Scalar = str | int | float | bool | None
 
-FORMAT, FORMAT_VERSION = "softmode.ReducedBody", 2
+FORMAT, FORMAT_VERSION = "softmode.ReducedBody", 3
 """Kind and version of a body's file."""
 _HINT = "build the body again"
 RATIO_HARMLESS = 0.45
@@ -128,9 +128,13 @@ class ReducedBody:
     build_seconds: float
     """Wall time of the build [s]."""
     material_points: Array = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
-    """Points of the material [m], shape (N, 3); empty where every kernel acts on all within its support."""
-    hidden_pairs: Indices = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """Kernel * N + point of every kernel and point of the material, within its support, that a gap divides; (H,)."""
+    """Points of the material [m], shape (N, 3); empty where all distances of kernels are straight lines."""
+    material_steps: Array = dataclasses.field(default_factory=lambda: np.ones(3))
+    """Distance between neighbours of them along each axis [m], shape (3,)."""
+    detour_pairs: Indices = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """Kernel * N + point of every kernel and point of the material that no straight line joins; ascending, (H,)."""
+    detour_lengths: NDArray[np.float32] = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.float32))
+    """What is added to the distance of each pair [m], > 0, shape (H,)."""
     sources: Mapping[str, NDArray[Any]] | None = dataclasses.field(default=None, repr=False, compare=False)
     """What it was built from, for :func:`softmode.deformables.hold`, or None; see ``build.sources``."""
 
@@ -194,8 +198,15 @@ class ReducedBody:
                 f"body {self.name!r}: functions of Q-GMLS are made of no skinning weights and reproducing kernels",
                 hint="build it with other handles, such as handles='local'",
             )
-        visibility = Visibility(points=self.material_points, hidden=self.hidden_pairs) if self._divided else None
-        return BasisRKPM(centres=self.centres, radii=self.radii, kernel=self.kernel, visibility=visibility)
+        detours = None
+        if self._lengthened:
+            detours = Detours(
+                points=self.material_points,
+                steps=self.material_steps,
+                pairs=self.detour_pairs,
+                lengths=self.detour_lengths,
+            )
+        return BasisRKPM(centres=self.centres, radii=self.radii, kernel=self.kernel, detours=detours)
 
     @property
     def skinned(self) -> bool:
@@ -217,8 +228,8 @@ class ReducedBody:
         return SkinningFunctions(kernels=self.kernels, skin=skin, envelope=self._envelope, length=self.length)
 
     @property
-    def _divided(self) -> bool:
-        return len(self.hidden_pairs) > 0
+    def _lengthened(self) -> bool:
+        return len(self.detour_pairs) > 0
 
     def evaluate(self, points: ArrayLike, *, outside: str = "clamp") -> tuple[Array, Array]:
         """Evaluate the functions and their gradients at rest points of the body frame.
@@ -393,8 +404,8 @@ class ReducedBody:
         values = {f.name: getattr(self, f.name) for f in _own_fields()}
         arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
         told = {name: value for name, value in values.items() if name not in arrays}
-        if not self._divided:
-            arrays = {name: value for name, value in arrays.items() if name not in _DIVIDED}
+        if not self._lengthened:
+            arrays = {name: value for name, value in arrays.items() if name not in _LENGTHENED}
         return {"format": FORMAT, "version": FORMAT_VERSION, **told}, arrays
 
     @classmethod
@@ -413,8 +424,8 @@ class ReducedBody:
             AssetError: If they are not those of a body.
         """
         names = {f.name for f in _own_fields()}
-        if not arrays.keys() & _DIVIDED:
-            names -= _DIVIDED
+        if not arrays.keys() & _LENGTHENED:
+            names -= _LENGTHENED
         if set(header) | set(arrays) != names or set(header) & set(arrays):
             wrong = sorted(names ^ (set(header) | set(arrays)))
             raise AssetError(f"{source}: fields {wrong} do not match", hint=hint)
@@ -477,8 +488,8 @@ class ReducedBody:
         check_fields({f.name: getattr(self, f.name) for f in _own_fields()})
 
 
-_DIVIDED = {"material_points", "hidden_pairs"}
-"""Arrays that only the file of a body has whose kernels do not act across gaps."""
+_LENGTHENED = {"material_points", "material_steps", "detour_pairs", "detour_lengths"}
+"""Arrays that only the file of a body has whose kernels' distances are not all straight lines."""
 
 
 def _own_fields() -> list[dataclasses.Field[Any]]:

@@ -29,7 +29,7 @@ from softmode.deformables.build.local_handles import gather_weights, place_kerne
 from softmode.deformables.build.options import EIGENMODE_COUNT, BuildOptions
 from softmode.deformables.build.region_samples import RegionSamples, drive_matrices, rigid_motions
 from softmode.deformables.build.static_response import lame_parameters, solve_harmonic_weights, solve_static_responses
-from softmode.deformables.build.visibility import Material, divide_at_gaps
+from softmode.deformables.build.visibility import Material, follow_material
 from softmode.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -60,7 +60,7 @@ class Domain:
     added: Array
     """Places and radii of further local handles [m], shape (A, 4)."""
     material: Material | None = None
-    """Which points of the material touch, so that kernels do not act across gaps; None: they do."""
+    """What distances of kernels run through; None: straight lines."""
 
     @property
     def envelope(self) -> Envelope | None:
@@ -138,7 +138,7 @@ def _ground(domain: Domain, options: BuildOptions) -> _Ground:
     count = options.kernels(len(domain.seeds), held=bool(domain.regions))
     kernels = make_basis(domain.seeds, count, kernel=options.kernel, spacing=domain.spacing, seed=options.seed)
     if domain.material is not None:
-        kernels = divide_at_gaps(kernels, domain.material, domain.seeds, domain.spacing)
+        kernels = follow_material(kernels, domain.material, domain.seeds, domain.spacing)
     shape, blend, blend_slope = enveloped(kernels.evaluate(domain.points), domain.envelope)
     springs, pull = _springs(kernels, domain)
     mu, lame = lame_parameters(_mean_ratio(options))

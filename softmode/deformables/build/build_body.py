@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
+from softmode.deformables.body.detours import Detours
 from softmode.deformables.body.reduced_body import FORMAT_VERSION, ReducedBody, Scalar
 from softmode.deformables.body.regions import Region
 from softmode.deformables.body.rkpm import BasisRKPM
-from softmode.deformables.body.visibility import Visibility
 from softmode.deformables.build.basis import BodyBasis, Domain, make_body_basis
 from softmode.deformables.build.cache import cache_directory, cached_body, fingerprint_of
 from softmode.deformables.build.cubature import Cubature, select_cubature
@@ -216,7 +216,7 @@ def _build(
             provenance={},
             build_seconds=0.0,
             sources=pack_sources(sources),
-            **_divided(basis.kernels.visibility if isinstance(basis.kernels, BasisRKPM) else None),
+            **_lengthened(basis.kernels.detours if isinstance(basis.kernels, BasisRKPM) else None),
         )
         surface = body.evaluate(body.surface_points)[0]
         stage("surface")
@@ -277,9 +277,16 @@ def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: Build
     return chosen
 
 
-def _divided(visibility: Visibility | None) -> dict[str, NDArray]:
-    """Return the fields of a body whose kernels do not act across gaps."""
-    return {} if visibility is None else {"material_points": visibility.points, "hidden_pairs": visibility.hidden}
+def _lengthened(detours: Detours | None) -> dict[str, NDArray]:
+    """Return the fields of a body whose kernels' distances are not all straight lines."""
+    if detours is None:
+        return {}
+    return {
+        "material_points": detours.points,
+        "material_steps": detours.steps,
+        "detour_pairs": detours.pairs,
+        "detour_lengths": detours.lengths,
+    }
 
 
 def _scalar(value: Scalar | tuple[object, ...]) -> Scalar:

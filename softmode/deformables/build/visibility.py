@@ -1,9 +1,10 @@
-"""What kernels act on: paths through the graph of an object's material, and kernels where too few are left.
+"""What kernels see: lines and paths through an object's material, and kernels where too few are left.
 
-The points of the graph are the octants of the quadrature's grid. Two of them touch where they share a face, and also
-where they share an edge or a corner alone, as finite elements of the same bricks share the nodes there. So a gap is
-seen where an octant, half a cell, lies empty; a narrower one is not. Kernels still act across the gaps between parts
-of an object that touch nowhere, which would drift apart otherwise.
+The material is the octants of the quadrature's grid. Two of them touch where they share a face, and also where they
+share an edge or a corner alone, as finite elements of the same bricks share the nodes there. So a gap is seen where an
+octant, half a cell, lies empty; a narrower one is not. A straight line is a way where it leaves the material for less
+than a quarter of an octant. Else the way turns at octants beside inner edges. Kernels still act across the gaps between
+parts of an object that touch nowhere, which would drift apart otherwise.
 """
 
 from __future__ import annotations
@@ -11,72 +12,173 @@ from __future__ import annotations
 import itertools
 import warnings
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import KDTree
 
+from softmode.deformables.body.detours import WIDTH, Detours
 from softmode.deformables.body.rkpm import REACH, BasisRKPM
-from softmode.deformables.body.visibility import Visibility
 from softmode.deformables.build.quadrature_grid import Cells
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-NARROWER = (0.6, 0.7, 0.8, 0.9, 1.0)
-"""Supports that are tried for a kernel, as a fraction of what it has."""
+POWER = 3.0
+"""A way that is s times as long as the straight line counts as s to this power times as long (the diffraction method's
+parameter): beyond a corner kernels fall off faster."""
+GRAZING = 0.25
+"""A line may leave the material for this many octants: a convex object's drops what is hardly filled."""
 CONDITION_LEAST = 1e5
 """Where the condition number of the moment matrix is larger, kernels are added."""
 ROUNDS = 8
 """Most rounds of adding kernels."""
-_ENTRIES_PER_CHUNK = 8_000_000
+_LINES_PER_CHUNK = 100_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """The graph of an object's points, in lumps that no gap divides."""
+    """The octants of an object and which of them touch."""
 
     points: Array
-    """Positions [m], lump by lump, shape (N, 3)."""
-    first: Indices
-    """First point of each lump, ascending from 0, shape (L,)."""
+    """Their centroids [m], shape (N, 3)."""
+    place: NDArray[np.int64]
+    """Their places in the grid of octants, at least 1, shape (N, 3)."""
     links: Indices
-    """Pairs of lumps that touch, shape (E, 2)."""
-    part: Indices
-    """Part of the object that each lump belongs to, shape (L,); kernels act across the gaps between parts."""
-    step: float
-    """Largest distance between points that touch [m]."""
+    """Pairs that touch, the lower one first, shape (E, 2)."""
+    severed: Indices
+    """Pairs of neighbours that a cut divides, likewise, shape (C, 2)."""
 
-    def distances(self, centres: Array) -> tuple[Array, Array]:
-        """Return the squared distances of points [m^2] (N, K), and of lumps (L, K), to centres (K, 3)."""
-        origin = centres.mean(axis=0)
-        a, b = self.points - origin, centres - origin
-        square = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2.0 * (a @ b.T)
-        return square, np.minimum.reduceat(square, self.first)
+    @cached_property
+    def part(self) -> Indices:
+        """Part of the object that each octant belongs to, shape (N,); kernels act across the gaps between parts."""
+        return components(len(self.points), self.links)
 
-    def homes(self, centres: Array) -> Indices:
-        """Return the lump that each of some places (K, 3) [m] lies in."""
-        return np.asarray(np.searchsorted(self.first, KDTree(self.points).query(centres)[1], "right") - 1)
+    @cached_property
+    def steps(self) -> Array:
+        """Edges of an octant [m], shape (3,)."""
+        return np.array([_slope(*self._layers[d]) for d in range(3)])
 
-    def apart(self, near: Mask, homes: Indices) -> Mask:
-        """Return which lumps within the supports of kernels are not connected there with the kernels' centres.
-
-        Args:
-            near: Which lumps each support reaches, shape (L, K).
-            homes: Lump of each centre, shape (K,).
-        """
-        lump, kernel = np.nonzero(near)
-        node = np.full(near.shape, -1)
-        node[lump, kernel] = np.arange(len(lump))
-        link, at = np.nonzero(near[self.links[:, 0]] & near[self.links[:, 1]])
-        label = components(len(lump), node[self.links[link], at[:, None]])
-        own = label[node[homes, np.arange(len(homes))]]
-        found = np.zeros_like(near)
-        found[lump, kernel] = (label != own[kernel]) & (self.part[lump] == self.part[homes][kernel])
+    def coordinates(self, x: Array) -> Array:
+        """Return the coordinates of positions (M, 3) [m] in the grid: an octant's own lie within one from its place."""
+        found = np.empty(x.shape)
+        for d, (index, middle) in enumerate(self._layers):
+            h = self.steps[d]
+            first, last = x[:, d] < middle[0], x[:, d] > middle[-1]
+            found[:, d] = np.interp(x[:, d], middle, index) + 0.5
+            found[first, d] += (x[first, d] - middle[0]) / h
+            found[last, d] += (x[last, d] - middle[-1]) / h
         return found
+
+    @cached_property
+    def grid(self) -> Indices:
+        """Octant at each place, -1 where there is none."""
+        found = np.full(self.place.max(axis=0) + 2, -1)
+        found[tuple(self.place.T)] = np.arange(len(self.place))
+        return found
+
+    @cached_property
+    def own(self) -> Array:
+        """Coordinates of the octants, shape (N, 3)."""
+        return np.clip(self.coordinates(self.points), self.place + 1e-3, self.place + 1.0 - 1e-3)
+
+    def homes(self, x: Array) -> Indices:
+        """Return the octant that each of some points of the material (M, 3) [m] lies in."""
+        return np.asarray(KDTree(self.points / self.steps).query(x / self.steps)[1])
+
+    def sees(self, a: Array, b: Array) -> Mask:
+        """Return between which of the pairs of grid coordinates (M, 3) a straight line runs through the material."""
+        found = self._filled(np.minimum(a, b).astype(int), np.maximum(a, b).astype(int))
+        left = np.flatnonzero(~found)
+        for i in range(0, len(left), _LINES_PER_CHUNK):
+            some = left[i : i + _LINES_PER_CHUNK]
+            found[some] = self._clear(a[some], b[some])
+        return found
+
+    @cached_property
+    def turns(self) -> Indices:
+        """Octants at which ways turn: beside inner edges, contacts of edges and corners, and ends of cuts."""
+        grid, at = self.grid, self.place
+        shape = np.array(grid.shape)
+        stride = np.array([shape[1] * shape[2], shape[2], 1])
+        flat, home = grid.ravel(), at @ stride
+        steps = np.abs(at[self.links[:, 0]] - at[self.links[:, 1]])
+        found = [self.links[steps.sum(axis=1) > 1].ravel()]
+        cut = np.sort(self.severed, axis=1) @ np.array([len(at), 1])
+
+        def open_(i: Indices, j: Indices) -> Mask:
+            return (i >= 0) & (j >= 0) & ~np.isin(np.minimum(i, j) * len(at) + np.maximum(i, j), cut)
+
+        every = np.arange(len(at))
+        for a, b in itertools.combinations(range(3), 2):
+            for up, right in itertools.product((1, -1), repeat=2):
+                one, two = flat[home + up * stride[a]], flat[home + right * stride[b]]
+                far = flat[home + up * stride[a] + right * stride[b]]
+                found.append(every[(one >= 0) & (two >= 0) & (far < 0) & open_(every, one) & open_(every, two)])
+                if len(cut):
+                    whole = (one >= 0) & (two >= 0) & (far >= 0)
+                    links = np.stack([open_(every, one), open_(every, two), open_(one, far), open_(two, far)])
+                    found.append(every[whole & (links.sum(axis=0) == 3)])
+        return np.unique(np.concatenate(found))
+
+    @cached_property
+    def _layers(self) -> list[tuple[Array, Array]]:
+        """Indices of the layers of octants along each axis that hold full ones, and their middles [m]."""
+        found = []
+        for d in range(3):
+            x, index = self.points[:, d], self.place[:, d]
+            order = np.lexsort((x, index))
+            x, index = x[order], index[order]
+            first = np.searchsorted(index, np.unique(index))
+            count = np.diff(np.append(first, len(x)))
+            found.append((index[first].astype(np.float64), x[first + count // 2]))
+        return found
+
+    @cached_property
+    def _sums(self) -> NDArray[np.int64]:
+        """Octants missing, or beside a cut, below and left of each place."""
+        bad = (self.grid < 0).astype(np.int64)
+        bad[tuple(self.place[self.severed.ravel()].T)] = 1
+        return np.pad(bad.cumsum(0).cumsum(1).cumsum(2), ((1, 0), (1, 0), (1, 0)))
+
+    def _filled(self, low: Indices, high: Indices) -> Mask:
+        """Return which boxes of places, ends included, hold all octants."""
+        total = np.zeros(len(low), dtype=np.int64)
+        for corner in itertools.product((0, 1), repeat=3):
+            pick = [np.where(corner[d], high[:, d] + 1, low[:, d]) for d in range(3)]
+            total += (-1) ** (3 - sum(corner)) * self._sums[tuple(pick)]
+        return total == 0
+
+    def _clear(self, a: Array, b: Array) -> Mask:
+        """Return which lines leave the material for a quarter of an octant at most and cross no cut."""
+        along, parts = b - a, [np.zeros((len(a), 1)), np.ones((len(a), 1))]
+        for d in range(3):
+            low, high = np.floor(np.minimum(a, b)[:, d]), np.floor(np.maximum(a, b)[:, d])
+            step = np.arange(1, int((high - low).max(initial=0.0)) + 1)
+            plane = low[:, None] + step
+            with np.errstate(divide="ignore", invalid="ignore"):
+                t = (plane - a[:, None, d]) / along[:, None, d]
+            parts.append(np.where(plane <= high[:, None], t, 1.0))
+        t = np.sort(np.concatenate(parts, axis=1), axis=1)
+        middle = 0.5 * (t[:, 1:] + t[:, :-1])
+        where = (a[:, None] + middle[..., None] * along[:, None]).astype(int)
+        octant = self.grid[where[..., 0], where[..., 1], where[..., 2]]
+        outside = np.where(octant < 0, np.diff(t, axis=1), 0.0).sum(axis=1) * np.linalg.norm(along, axis=1)
+        clear = outside <= GRAZING
+        if len(self.severed):
+            key = np.array([len(self.points), 1])
+            low, high = np.minimum(octant[:, 1:], octant[:, :-1]), np.maximum(octant[:, 1:], octant[:, :-1])
+            clear &= ~np.isin(low * key[0] + high, np.sort(self.severed, axis=1) @ key).any(axis=1)
+        return clear
+
+
+def _slope(index: Array, middle: Array) -> float:
+    """Return the distance between layers [m]."""
+    return float(np.median(np.diff(middle) / np.diff(index))) if len(index) > 1 else 0.0
 
 
 def touching(cells: Cells) -> Indices | None:
@@ -110,53 +212,34 @@ def touching(cells: Cells) -> Indices | None:
 
 
 def material_of(cells: Cells, offset: Array) -> Material | None:
-    """Return the graph of the octants of a grid less an offset (3,) [m]; None if their places in it are not known."""
+    """Return the octants of a grid less an offset (3,) [m]; None if their places in it are not known."""
     pair = touching(cells)
-    if pair is None:
+    if pair is None or cells.place is None:
         return None
-    order = np.argsort(cells.of_octant, kind="stable")
-    points = cells.octants[order] - offset
-    # The octants of a full cell are one lump, which makes the graph eight times smaller; not of one that is cut.
-    size = np.bincount(cells.of_octant)
-    if cells.severed is not None:
-        size[cells.of_octant[cells.severed]] = 0
-    cell = cells.of_octant[order]
-    begins = (size[cell] < 8) | np.append(True, cell[1:] != cell[:-1])
-    lump = np.empty(len(order), dtype=np.intp)
-    lump[order] = np.cumsum(begins) - 1
-    links = np.unique(np.sort(lump[pair], axis=1), axis=0)
-    links = links[links[:, 0] < links[:, 1]]
-    step = float(np.linalg.norm(cells.octants[pair[:, 0]] - cells.octants[pair[:, 1]], axis=1).max(initial=0.0))
     return Material(
-        points=points,
-        first=np.flatnonzero(begins),
-        links=links,
-        part=components(int(lump.max()) + 1, links),
-        step=step,
+        points=cells.octants - offset,
+        place=cells.place - cells.place.min(axis=0) + 1,
+        links=pair,
+        severed=np.zeros((0, 2), dtype=np.intp) if cells.severed is None else cells.severed,
     )
 
 
-def divide_at_gaps(kernels: BasisRKPM, material: Material, points: Array, spacing: float) -> BasisRKPM:
-    """Return kernels that do not act across gaps, and more of them where too few are left.
-
-    A kernel acts on what is connected to its centre within its support. Beside the end of a gap that would hold both
-    sides together as far as it reaches, so there a kernel is made narrower, until the sides are not connected within.
+def follow_material(kernels: BasisRKPM, material: Material, points: Array, spacing: float) -> BasisRKPM:
+    """Return kernels whose distances run through the material, and more of them where too few are left.
 
     Args:
-        kernels: Kernels that act on all they reach.
-        material: The graph of the object's points.
+        kernels: Kernels whose distances are straight lines.
+        material: The object's octants.
         points: What must be covered: quadrature points [m], shape (P, 3).
         spacing: Their spacing [m].
 
     Warns:
         RuntimeWarning: If parts of the object are too thin for that; then kernels act across gaps.
     """
-    factor = _narrowing(material, kernels)
-    if factor is None:
+    divided = replace(kernels, detours=find_detours(material, kernels.centres, kernels.support))
+    if divided.detours is None:
         return kernels
-    divided = replace(kernels, radii=kernels.radii * factor)
     for _ in range(ROUNDS):
-        divided = replace(divided, visibility=find_visibility(material, divided.centres, divided.support))
         distance, nearest = divided.nearest(points)
         ratio = distance / divided.support[nearest]
         bare = np.flatnonzero((ratio > REACH) | ~(divided.conditions(points) < CONDITION_LEAST))
@@ -168,12 +251,10 @@ def divide_at_gaps(kernels: BasisRKPM, material: Material, points: Array, spacin
             added.append(worst)
             away = np.linalg.norm(points[bare] - points[worst], axis=1)
             bare = bare[away > REACH * divided.support[nearest[worst]]]
-        divided = replace(
-            divided,
-            centres=np.concatenate([divided.centres, points[added]]),
-            radii=np.concatenate([divided.radii, np.maximum(distance[added], 1.5 * spacing)]),
-            visibility=None,
-        )
+        centres = np.concatenate([divided.centres, points[added]])
+        radii = np.concatenate([divided.radii, np.maximum(distance[added], 1.5 * spacing)])
+        divided = replace(divided, centres=centres, radii=radii, detours=None)
+        divided = replace(divided, detours=find_detours(material, centres, divided.support))
     warnings.warn(
         "the object's parts are too thin beside its gaps for its quadrature: kernels act across the gaps; build it with"
         " more points",
@@ -183,49 +264,80 @@ def divide_at_gaps(kernels: BasisRKPM, material: Material, points: Array, spacin
     return kernels
 
 
-def find_visibility(material: Material, centres: Array, support: Array) -> Visibility | None:
-    """Return what kernels do not act on; None if all of them act on all that they reach.
+def find_detours(material: Material, centres: Array, support: Array) -> Detours | None:
+    """Return how much longer than straight lines kernels' ways are; None if all of them are straight.
 
     Args:
-        material: The graph of the object's points.
+        material: The object's octants.
         centres: Kernel centres, points of the material [m], shape (K, 3).
         support: Support radii [m], shape (K,).
     """
-    found = []
-    count = len(material.points)
-    size = np.diff(np.append(material.first, count))
-    for mine in _chunks(material, len(centres)):
-        points, lumps = material.distances(centres[mine])
-        reach = (support[mine] + material.step) ** 2  # The nearest point to a place in the support lies within this.
-        apart = material.apart(lumps < reach, material.homes(centres[mine]))
-        if apart.any():
-            point, kernel = np.nonzero(np.repeat(apart, size, axis=0) & (points < reach))
-            found.append((kernel + mine.start) * count + point)
-    return Visibility(points=material.points, hidden=np.sort(np.concatenate(found))) if found else None
+    count, margin = len(material.points), WIDTH * float(material.steps.max())
+    homes = material.homes(centres)
+    own = np.clip(material.coordinates(centres), material.place[homes] + 1e-3, material.place[homes] + 0.999)
+    straight = _distances(material.points, centres)
+    reach = support + margin
+    octant, kernel = np.nonzero((straight < reach) & (material.part[:, None] == material.part[homes]))
+    clear = material.sees(material.own[octant], own[kernel])
+    hidden_octant, hidden_kernel = octant[~clear], kernel[~clear]
+    if not len(hidden_octant):
+        return None
+    visible = np.zeros(straight.shape, dtype=bool)
+    visible[octant[clear], kernel[clear]] = True
+    turns = material.turns
+    by_turn = _ways_to(material, turns, straight, visible, float(reach.max()))
+    seen, which = np.unique(hidden_octant, return_inverse=True)
+    last = _seen_from(material, seen, turns, float(reach.max()))
+    length = np.full(len(which), np.inf)
+    order = np.argsort(hidden_kernel, kind="stable")
+    for some in np.split(order, np.flatnonzero(np.diff(hidden_kernel[order])) + 1):
+        near = np.flatnonzero(np.isfinite(by_turn[hidden_kernel[some[0]]]))
+        ways = last[np.ix_(which[some], near)] + by_turn[hidden_kernel[some[0]], near]
+        length[some] = ways.min(axis=1, initial=np.inf)
+    direct = straight[hidden_octant, hidden_kernel]
+    ratio = np.maximum(length, direct) / np.maximum(direct, 1e-300)
+    limit = reach[hidden_kernel] - direct
+    added = np.minimum(direct * (np.minimum(ratio, 1e3) ** POWER - 1.0), limit)
+    real = added > 1e-3 * reach[hidden_kernel]
+    if not real.any():
+        return None
+    key = hidden_kernel[real] * count + hidden_octant[real]
+    order = np.argsort(key)
+    return Detours(
+        points=material.points,
+        steps=material.steps,
+        pairs=key[order].astype(np.int64),
+        lengths=added[real][order].astype(np.float32),
+    )
 
 
-def _narrowing(material: Material, kernels: BasisRKPM) -> Array | None:
-    """Return the largest fraction of the support (K,) that connects no two sides of a gap; None if there is no gap.
-
-    Sides that are not connected within a support may be within a larger one.
-    """
-    factor, gaps = np.full(kernels.kernel_count, NARROWER[0]), False
-    for mine in _chunks(material, kernels.kernel_count):
-        homes, lumps = material.homes(kernels.centres[mine]), material.distances(kernels.centres[mine])[1]
-        good, before = np.ones(len(homes), dtype=bool), np.zeros(lumps.shape, dtype=bool)
-        for fraction in NARROWER:
-            near = lumps < (fraction * kernels.support[mine] + material.step) ** 2
-            apart = material.apart(near, homes)
-            good &= ~(before & near & ~apart).any(axis=0)
-            factor[mine][good] = fraction
-            before |= apart
-        gaps |= bool(before.any())
-    return factor if gaps else None
+def _ways_to(material: Material, turns: Indices, straight: Array, visible: Mask, limit: float) -> Array:
+    """Return the lengths of ways from kernels to octants where ways turn [m], (K, T); infinite beyond a limit."""
+    count = len(turns)
+    between = _seen_from(material, turns, turns, limit)
+    a, b = np.nonzero(np.isfinite(between) & (between > 0.0))
+    turn, kernel = np.nonzero(visible[turns])
+    rows, columns = np.concatenate([a, count + kernel]), np.concatenate([b, turn])
+    size = count + visible.shape[1]
+    entries = np.concatenate([between[a, b], np.maximum(straight[turns[turn], kernel], 1e-12)])
+    graph = coo_matrix((entries, (rows, columns)), shape=(size, size)).tocsr()
+    return np.asarray(dijkstra(graph, indices=np.arange(count, size), limit=limit))[:, :count]
 
 
-def _chunks(material: Material, kernel_count: int) -> list[slice]:
-    step = max(1, _ENTRIES_PER_CHUNK // len(material.points))
-    return [slice(i, min(i + step, kernel_count)) for i in range(0, kernel_count, step)]
+def _seen_from(material: Material, octants: Indices, turns: Indices, limit: float) -> Array:
+    """Return the distances of octants (M,) from others (T,) that see them within a limit [m], else infinity, (M, T)."""
+    away = _distances(material.points[octants], material.points[turns])
+    a, b = np.nonzero(away < limit)
+    clear = material.sees(material.own[octants[a]], material.own[turns[b]])
+    found = np.full(away.shape, np.inf)
+    found[a[clear], b[clear]] = away[a[clear], b[clear]]
+    return found
+
+
+def _distances(a: Array, b: Array) -> Array:
+    middle = b.mean(axis=0)
+    a, b = a - middle, b - middle
+    return np.sqrt(np.maximum((a * a).sum(1)[:, None] + (b * b).sum(1) - 2.0 * (a @ b.T), 0.0))
 
 
 def components(count: int, pairs: Indices) -> Indices:
