@@ -66,11 +66,43 @@ class Detours:
             share = np.concatenate([share[kept], np.ones(len(bare))])
             slope = np.concatenate([slope[kept], np.zeros((len(bare), 3))])
         table = self._table(kernel_count)
+        away = places[row] - self.points[point]
 
         def mean(data: Array) -> sparse.csr_matrix:
-            return sparse.csr_matrix((data, (row, point)), shape=(len(places), len(self.points))) @ table
+            return sparse.csr_matrix((data, (row, point)), shape=(len(places), len(self.points)))
 
-        return mean(share), [mean(slope[:, d]) for d in range(3)]
+        gradients = [(change @ table).multiply(table != 0.0).tocsr() for change in self._changes]
+        value = mean(share) @ table
+        for e in range(3):
+            value = value + mean(share * away[:, e]) @ gradients[e]
+        slopes = []
+        for d in range(3):
+            found = mean(slope[:, d]) @ table + mean(share) @ gradients[d]
+            for e in range(3):
+                found = found + mean(slope[:, d] * away[:, e]) @ gradients[e]
+            slopes.append(found)
+        return value, slopes
+
+    @cached_property
+    def _changes(self) -> list[sparse.csr_matrix]:
+        """Return what makes the gradient at a point of values at all, by least squares of those around, (N, N)."""
+        pair = self._tree.query_pairs(WIDTH, output_type="ndarray")
+        row, column = np.concatenate([pair, pair[:, ::-1]]).T
+        offset = self.points[column] - self.points[row]
+        weight = np.maximum(1.0 - ((offset / self.steps / WIDTH) ** 2).sum(axis=1), 0.0) ** 2
+        count = len(self.points)
+        moment = np.zeros((count, 3, 3))
+        for d in range(3):
+            for e in range(3):
+                moment[:, d, e] = np.bincount(row, weight * offset[:, d] * offset[:, e], minlength=count)
+        moment[:, range(3), range(3)] += 1e-6 * self.steps**2
+        factor = np.einsum("nde,ne->nd", np.linalg.inv(moment)[row], offset * weight[:, None])
+        found = []
+        for d in range(3):
+            own = -np.bincount(row, factor[:, d], minlength=count)
+            entries = np.concatenate([factor[:, d], own]), (np.append(row, np.arange(count)), np.append(column, np.arange(count)))
+            found.append(sparse.csr_matrix(entries, shape=(count, count)))
+        return found
 
     @cached_property
     def _tree(self) -> KDTree:

@@ -297,7 +297,7 @@ class ReducedBody:
         far = ratio > 1.0
         inner = np.where(far[:, None], centre + (x - centre) / np.maximum(ratio, 1.0)[:, None], x)
         # Between two leaves what is within reach of a kernel may be nearest to material that it does not act on.
-        bare = np.arange(len(x)) if self._divided else np.flatnonzero(far)
+        bare = np.arange(len(x)) if self._lengthened else np.flatnonzero(far)
         for nearer in (0.5, 0.5, 0.5, 0.0):
             bare = bare[~self.raw.covered(inner[bare])]
             inner[bare] = centre[bare] + nearer * (inner[bare] - centre[bare])

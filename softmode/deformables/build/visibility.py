@@ -46,8 +46,12 @@ class Material:
 
     points: Array
     """Their centroids [m], shape (N, 3)."""
+    volumes: Array
+    """Their volumes [m^3], shape (N,)."""
     place: NDArray[np.int64]
     """Their places in the grid of octants, at least 1, shape (N, 3)."""
+    borders: tuple[Array, Array, Array]
+    """Borders of the octants along each axis, one more than places, from place 0 on [m]."""
     links: Indices
     """Pairs that touch, the lower one first, shape (E, 2)."""
     severed: Indices
@@ -61,18 +65,11 @@ class Material:
     @cached_property
     def steps(self) -> Array:
         """Edges of an octant [m], shape (3,)."""
-        return np.array([_slope(*self._layers[d]) for d in range(3)])
+        return np.array([np.median(np.diff(line)) for line in self.borders])
 
     def coordinates(self, x: Array) -> Array:
-        """Return the coordinates of positions (M, 3) [m] in the grid: an octant's own lie within one from its place."""
-        found = np.empty(x.shape)
-        for d, (index, middle) in enumerate(self._layers):
-            h = self.steps[d]
-            first, last = x[:, d] < middle[0], x[:, d] > middle[-1]
-            found[:, d] = np.interp(x[:, d], middle, index) + 0.5
-            found[first, d] += (x[first, d] - middle[0]) / h
-            found[last, d] += (x[last, d] - middle[-1]) / h
-        return found
+        """Return the coordinates of positions (M, 3) [m] in the grid: an octant begins at its place."""
+        return np.stack([np.interp(x[:, d], line, np.arange(len(line))) for d, line in enumerate(self.borders)], axis=1)
 
     @cached_property
     def grid(self) -> Indices:
@@ -126,22 +123,27 @@ class Material:
         return np.unique(np.concatenate(found))
 
     @cached_property
-    def _layers(self) -> list[tuple[Array, Array]]:
-        """Indices of the layers of octants along each axis that hold full ones, and their middles [m]."""
-        found = []
-        for d in range(3):
-            x, index = self.points[:, d], self.place[:, d]
-            order = np.lexsort((x, index))
-            x, index = x[order], index[order]
-            first = np.searchsorted(index, np.unique(index))
-            count = np.diff(np.append(first, len(x)))
-            found.append((index[first].astype(np.float64), x[first + count // 2]))
-        return found
+    def _planes(self) -> tuple[Array, Array]:
+        """Return for each octant where it is filled, normal . x < offset in grid coordinates: (N, 3), (N,).
+
+        The plane of a part of an octant has its normal from the centroid to the middle, and lies as far beyond the
+        centroid as half its thickness.
+        """
+        normal = self.place + 0.5 - self.own
+        size = np.abs(normal).sum(axis=1)
+        whole = np.prod([np.diff(line)[self.place[:, d]] for d, line in enumerate(self.borders)], axis=0)
+        fill = np.minimum(self.volumes / whole, 1.0)
+        normal = normal / np.maximum(size, 1e-300)[:, None]
+        offset = (normal * self.own).sum(axis=1) + 0.5 * fill
+        full = (size < 1e-3) | (fill > 0.999)
+        normal[full], offset[full] = 0.0, 1.0
+        return normal, offset
 
     @cached_property
     def _sums(self) -> NDArray[np.int64]:
         """Octants missing, or beside a cut, below and left of each place."""
-        bad = (self.grid < 0).astype(np.int64)
+        partial = np.abs(self._planes[0]).sum(axis=1) > 0.0
+        bad = ((self.grid < 0) | partial[self.grid]).astype(np.int64)
         bad[tuple(self.place[self.severed.ravel()].T)] = 1
         return np.pad(bad.cumsum(0).cumsum(1).cumsum(2), ((1, 0), (1, 0), (1, 0)))
 
@@ -167,18 +169,19 @@ class Material:
         middle = 0.5 * (t[:, 1:] + t[:, :-1])
         where = (a[:, None] + middle[..., None] * along[:, None]).astype(int)
         octant = self.grid[where[..., 0], where[..., 1], where[..., 2]]
-        outside = np.where(octant < 0, np.diff(t, axis=1), 0.0).sum(axis=1) * np.linalg.norm(along, axis=1)
+        normal, offset = self._planes
+        # In a partly filled octant, the share of the line between two borders that lies beyond the plane.
+        ends = [offset[octant] - ((a[:, None] + x[..., None] * along[:, None]) * normal[octant]).sum(axis=2) for x in (t[:, 1:], t[:, :-1])]
+        low, high = np.minimum(*ends), np.maximum(*ends)
+        share = np.clip(-low / np.maximum(high - low, 1e-12), 0.0, 1.0)
+        share = np.where(octant < 0, 1.0, np.where(high <= 0.0, 1.0, np.where(low >= 0.0, 0.0, share)))
+        outside = (share * np.diff(t, axis=1)).sum(axis=1) * np.linalg.norm(along, axis=1)
         clear = outside <= GRAZING
         if len(self.severed):
             key = np.array([len(self.points), 1])
             low, high = np.minimum(octant[:, 1:], octant[:, :-1]), np.maximum(octant[:, 1:], octant[:, :-1])
             clear &= ~np.isin(low * key[0] + high, np.sort(self.severed, axis=1) @ key).any(axis=1)
         return clear
-
-
-def _slope(index: Array, middle: Array) -> float:
-    """Return the distance between layers [m]."""
-    return float(np.median(np.diff(middle) / np.diff(index))) if len(index) > 1 else 0.0
 
 
 def touching(cells: Cells) -> Indices | None:
@@ -214,11 +217,16 @@ def touching(cells: Cells) -> Indices | None:
 def material_of(cells: Cells, offset: Array) -> Material | None:
     """Return the octants of a grid less an offset (3,) [m]; None if their places in it are not known."""
     pair = touching(cells)
-    if pair is None or cells.place is None:
+    if pair is None or cells.place is None or cells.borders is None:
         return None
+    first = cells.place.min(axis=0)
+    borders = [line[np.isfinite(line)][low:] - offset[d] for d, (line, low) in enumerate(zip(cells.borders, first, strict=True))]
+    before = [np.concatenate([[2.0 * line[0] - line[1]], line, [2.0 * line[-1] - line[-2]]]) for line in borders]
     return Material(
         points=cells.octants - offset,
-        place=cells.place - cells.place.min(axis=0) + 1,
+        volumes=cells.weights,
+        place=cells.place - first + 1,
+        borders=(before[0], before[1], before[2]),
         links=pair,
         severed=np.zeros((0, 2), dtype=np.intp) if cells.severed is None else cells.severed,
     )
