@@ -37,6 +37,8 @@ CONDITION_LEAST = 1e5
 """Where the condition number of the moment matrix is larger, kernels are added."""
 ROUNDS = 8
 """Most rounds of adding kernels."""
+TURN = 0.49
+"""How far from the middle of an octant ways turn, towards an inner edge on its border."""
 _LINES_PER_CHUNK = 100_000
 
 
@@ -83,6 +85,12 @@ class Material:
         """Coordinates of the octants, shape (N, 3)."""
         return np.clip(self.coordinates(self.points), self.place + 1e-3, self.place + 1.0 - 1e-3)
 
+    def positions(self, coordinates: Array) -> Array:
+        """Return the positions [m] of grid coordinates (M, 3)."""
+        return np.stack(
+            [np.interp(coordinates[:, d], np.arange(len(line)), line) for d, line in enumerate(self.borders)], axis=1
+        )
+
     def homes(self, x: Array) -> Indices:
         """Return the octant that each of some points of the material (M, 3) [m] lies in."""
         return np.asarray(KDTree(self.points / self.steps).query(x / self.steps)[1])
@@ -97,14 +105,15 @@ class Material:
         return found
 
     @cached_property
-    def turns(self) -> Indices:
-        """Octants at which ways turn: beside inner edges, contacts of edges and corners, and ends of cuts."""
+    def turns(self) -> Array:
+        """Grid coordinates where ways turn: inner edges, contacts of edges and corners, ends of cuts, shape (T, 3)."""
         grid, at = self.grid, self.place
         shape = np.array(grid.shape)
         stride = np.array([shape[1] * shape[2], shape[2], 1])
         flat, home = grid.ravel(), at @ stride
-        steps = np.abs(at[self.links[:, 0]] - at[self.links[:, 1]])
-        found = [self.links[steps.sum(axis=1) > 1].ravel()]
+        a, b = self.links.T
+        contact = np.abs(at[a] - at[b]).sum(axis=1) > 1
+        found = [0.5 * (at[a[contact]] + at[b[contact]]) + 0.5]
         cut = np.sort(self.severed, axis=1) @ np.array([len(at), 1])
 
         def open_(i: Indices, j: Indices) -> Mask:
@@ -115,12 +124,13 @@ class Material:
             for up, right in itertools.product((1, -1), repeat=2):
                 one, two = flat[home + up * stride[a]], flat[home + right * stride[b]]
                 far = flat[home + up * stride[a] + right * stride[b]]
-                found.append(every[(one >= 0) & (two >= 0) & (far < 0) & open_(every, one) & open_(every, two)])
-                if len(cut):
-                    whole = (one >= 0) & (two >= 0) & (far >= 0)
-                    links = np.stack([open_(every, one), open_(every, two), open_(one, far), open_(two, far)])
-                    found.append(every[whole & (links.sum(axis=0) == 3)])
-        return np.unique(np.concatenate(found))
+                links = np.stack([open_(every, one), open_(every, two), open_(one, far), open_(two, far)])
+                bent = np.flatnonzero(((far < 0) & links[:2].all(axis=0)) | ((far >= 0) & (links.sum(axis=0) == 3)))
+                corner = at[bent] + 0.5
+                corner[:, a] += up * TURN
+                corner[:, b] += right * TURN
+                found.append(corner)
+        return np.unique(np.concatenate(found), axis=0)
 
     @cached_property
     def _planes(self) -> tuple[Array, Array]:
@@ -290,12 +300,11 @@ def find_detours(material: Material, centres: Array, support: Array) -> Detours 
     hidden_octant, hidden_kernel = octant[~clear], kernel[~clear]
     if not len(hidden_octant):
         return None
-    visible = np.zeros(straight.shape, dtype=bool)
-    visible[octant[clear], kernel[clear]] = True
     turns = material.turns
-    by_turn = _ways_to(material, turns, straight, visible, float(reach.max()))
+    at, limit = material.positions(turns), float(reach.max())
+    by_turn = _ways_to(material, turns, at, own, centres, limit)
     seen, which = np.unique(hidden_octant, return_inverse=True)
-    last = _seen_from(material, seen, turns, float(reach.max()))
+    last = _seen(material, material.own[seen], material.points[seen], turns, at, limit)
     length = np.full(len(which), np.inf)
     order = np.argsort(hidden_kernel, kind="stable")
     for some in np.split(order, np.flatnonzero(np.diff(hidden_kernel[order])) + 1):
@@ -319,26 +328,34 @@ def find_detours(material: Material, centres: Array, support: Array) -> Detours 
     )
 
 
-def _ways_to(material: Material, turns: Indices, straight: Array, visible: Mask, limit: float) -> Array:
-    """Return the lengths of ways from kernels to octants where ways turn [m], (K, T); infinite beyond a limit."""
-    count = len(turns)
-    between = _seen_from(material, turns, turns, limit)
-    a, b = np.nonzero(np.isfinite(between) & (between > 0.0))
-    turn, kernel = np.nonzero(visible[turns])
-    rows, columns = np.concatenate([a, count + kernel]), np.concatenate([b, turn])
-    size = count + visible.shape[1]
-    entries = np.concatenate([between[a, b], np.maximum(straight[turns[turn], kernel], 1e-12)])
-    graph = coo_matrix((entries, (rows, columns)), shape=(size, size)).tocsr()
+def _ways_to(material: Material, turns: Array, at: Array, own: Array, centres: Array, limit: float) -> Array:
+    """Return the lengths of ways from kernels to places where ways turn [m], (K, T); infinite beyond a limit."""
+    count, size = len(turns), len(turns) + len(own)
+    between = _seen(material, turns, at, turns, at, limit)
+    first = _seen(material, own, centres, turns, at, limit)
+    (a, b), (kernel, turn) = np.nonzero(np.isfinite(between) & (between > 0.0)), np.nonzero(np.isfinite(first))
+    entries = np.concatenate([between[a, b], np.maximum(first[kernel, turn], 1e-12)])
+    places = np.concatenate([a, count + kernel]), np.concatenate([b, turn])
+    graph = coo_matrix((entries, places), shape=(size, size)).tocsr()
     return np.asarray(dijkstra(graph, indices=np.arange(count, size), limit=limit))[:, :count]
 
 
-def _seen_from(material: Material, octants: Indices, turns: Indices, limit: float) -> Array:
-    """Return the distances of octants (M,) from others (T,) that see them within a limit [m], else infinity, (M, T)."""
-    away = _distances(material.points[octants], material.points[turns])
-    a, b = np.nonzero(away < limit)
-    clear = material.sees(material.own[octants[a]], material.own[turns[b]])
+def _seen(material: Material, a: Array, x: Array, b: Array, y: Array, limit: float) -> Array:
+    """Return the distances [m] between places that see each other within a limit, else infinity, (M, T).
+
+    Args:
+        material: The object's octants.
+        a: Grid coordinates, shape (M, 3).
+        x: Their positions [m], shape (M, 3).
+        b: Grid coordinates, shape (T, 3).
+        y: Their positions [m], shape (T, 3).
+        limit: Largest distance [m].
+    """
+    away = _distances(x, y)
+    i, j = np.nonzero(away < limit)
+    clear = material.sees(a[i], b[j])
     found = np.full(away.shape, np.inf)
-    found[a[clear], b[clear]] = away[a[clear], b[clear]]
+    found[i[clear], j[clear]] = away[i[clear], j[clear]]
     return found
 
 
