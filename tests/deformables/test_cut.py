@@ -203,7 +203,7 @@ def test_a_slit_opens(bar: ReducedBody) -> None:
     cut = cut_body(bar, SLIT)
     (slit,) = cut.bodies
     assert "slit" in cut.notes[0] and abs(slit.volume / bar.volume - 1.0) < 1e-12
-    assert len(slit.hidden_pairs) and slit.surface_areas.sum() > bar.surface_areas.sum() + 2.0 * 0.07 * SIZE[2]
+    assert len(slit.detour_pairs) and slit.surface_areas.sum() > bar.surface_areas.sum() + 2.0 * 0.07 * SIZE[2]
     lips = np.array([[0.095, side * 0.004, 0.0] for side in (-1.0, 1.0)])
 
     def opening(body: ReducedBody) -> float:
@@ -220,7 +220,7 @@ def test_a_slit_opens(bar: ReducedBody) -> None:
     across = cut_body(slit, Patch.plane((0.05, 0.0, 0.0), (1.0, 0.0, 0.0)))
     assert len(across.bodies) == 3
     np.testing.assert_allclose([part.volume / bar.volume for part in across.bodies], [0.75, 0.125, 0.125], atol=0.01)
-    assert len(across.bodies[0].hidden_pairs) and not any(len(part.hidden_pairs) for part in across.bodies[1:])
+    assert len(across.bodies[0].detour_pairs) and not any(len(part.detour_pairs) for part in across.bodies[1:])
 
 
 def test_prongs_that_touch_do_not_grow_together() -> None:

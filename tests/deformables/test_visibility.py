@@ -1,8 +1,7 @@
-"""Kernels act on what is connected to their centre within their support, not across gaps."""
+"""Kernels see distances through the material: not across gaps, and around inner corners."""
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_implicit, quadrature_from_mesh
 from softmode.deformables.build.quadrature_grid import Quadrature
-from softmode.deformables.build.visibility import Material, divide_at_gaps, find_visibility, material_of
+from softmode.deformables.build.visibility import find_detours, follow_material, material_of
 from softmode.errors import AssetError, BasisError
 from tests.shapes import voxels
 
@@ -37,12 +36,12 @@ def integrate(mask: np.ndarray, point_count: int = 1000) -> Quadrature:
 
 
 def divided(quadrature: Quadrature, kernel_count: int = 200) -> tuple[BasisRKPM, BasisRKPM]:
-    """Return kernels that act on all they reach, and those that do not act across gaps."""
+    """Return kernels whose distances are straight lines, and those whose distances run through the material."""
     assert quadrature.cells is not None
     whole = make_basis(quadrature.points, kernel_count, spacing=quadrature.spacing)
     material = material_of(quadrature.cells, np.zeros(3))
     assert material is not None
-    return whole, divide_at_gaps(whole, material, quadrature.points, quadrature.spacing)
+    return whole, follow_material(whole, material, quadrature.points, quadrature.spacing)
 
 
 @pytest.fixture(scope="module")
@@ -52,16 +51,32 @@ def body() -> ReducedBody:
     return build_body(integrate(fork()), options, progress=False)
 
 
-def test_a_kernel_acts_within_its_support_on_what_is_connected_there() -> None:
-    """On a U of five points, the kernel at one end sees the other only if its support holds the whole way."""
-    points = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [1.0, 0.0, -1.0], [2.0, 0.0, 0.0], [2.0, 0.0, 1.0]])
-    links = np.array([[0, 1], [1, 2], [2, 3], [3, 4]])
-    material = Material(points=points, first=np.arange(5), links=links, part=np.zeros(5, dtype=np.intp), step=0.1)
-    found = find_visibility(material, points[:1], np.array([2.05]))
-    assert found is not None and found.hidden.tolist() == [4]
-    assert find_visibility(material, points[:1], np.array([2.3])) is None
-    two = dataclasses.replace(material, part=np.array([0, 0, 0, 0, 1]))
-    assert find_visibility(two, points[:1], np.array([2.05])) is None
+def test_ways_around_an_inner_corner() -> None:
+    """Across the corner of an L of full bricks the way is |a - c| + |c - b|, and counts as its third power."""
+    mask = np.zeros((4, 2, 4), dtype=bool)
+    mask[:2] = mask[:, :, :2] = True
+    quadrature = integrate(mask, 2000)
+    assert quadrature.cells is not None
+    material = material_of(quadrature.cells, np.zeros(3))
+    assert material is not None
+    centre, corner = quadrature.points[((quadrature.points - [0.018, 0.01, 0.026]) ** 2).sum(axis=1).argmin()], 0.02
+    found = find_detours(material, centre[None], np.array([0.03]))
+    assert found is not None
+    added = np.zeros(len(material.points))
+    added[found.pairs] = found.lengths
+    x, z = material.points[:, 0], material.points[:, 2]
+    way = np.hypot(centre[0] - corner, centre[2] - corner) + np.hypot(x - corner, z - corner)
+    way = np.hypot(way, material.points[:, 1] - centre[1])
+    straight = np.linalg.norm(material.points - centre, axis=1)
+    beside = (x - centre[0]) * (corner - centre[2]) > (corner - centre[0]) * (z - centre[2])
+    shadow = (added > 1e-3) & (straight * (way / straight) ** 3 < 0.03)
+    assert shadow.sum() > 20 and (x[shadow] > corner).all()
+    # A way turns in the octants at the corner, less than half an octant from it.
+    step = material.steps.max()
+    length = straight * (1.0 + added / straight) ** (1.0 / 3.0)
+    assert np.abs(length - way)[shadow].max() < 0.3 * step
+    lit = (z > corner) | (x < centre[0])
+    assert (added[lit] == 0.0).all() and not beside[lit & (added > 0.0)].any()
 
 
 def test_functions_go_on_into_a_gap() -> None:
@@ -119,9 +134,22 @@ def test_gradients_beside_a_gap_are_those_of_the_values() -> None:
         assert np.abs((difference - found.gradient[d]).toarray()).max() < 1e-6 / h
 
 
-def test_convex_objects_have_nothing_hidden() -> None:
-    """The kernels of a bar are the same object."""
-    whole, kernels = divided(integrate(np.ones((8, 2, 2), dtype=bool)))
+@pytest.mark.parametrize("solid", ["bar", "ball", "tilted", "implicit"])
+def test_convex_objects_have_straight_lines(solid: str) -> None:
+    """The kernels of a bar, a ball, a bar along no axis and a ball by its level set are the same object."""
+    if solid == "bar":
+        quadrature = integrate(np.ones((8, 2, 2), dtype=bool))
+    elif solid == "implicit":
+        quadrature = quadrature_from_implicit(
+            lambda x: np.linalg.norm(x, axis=1) - 0.03, np.array([[-0.031] * 3, [0.031] * 3]), point_count=2000
+        )
+    else:
+        mesh: Any = (
+            trimesh.creation.icosphere(radius=0.03) if solid == "ball" else trimesh.creation.box((0.2, 0.05, 0.04))
+        )
+        mesh.apply_transform(trimesh.transformations.rotation_matrix(0.6, (0.3, 1.0, 0.2)))
+        quadrature = quadrature_from_mesh(mesh.vertices, mesh.faces, point_count=2000)
+    whole, kernels = divided(quadrature)
     assert kernels is whole
 
 
@@ -142,16 +170,19 @@ def test_bricks_that_share_an_edge_touch() -> None:
         material = material_of(quadrature.cells, np.zeros(3))
         assert material is not None and material.part.max() == (apart > 0.0)
         whole, kernels = divided(quadrature, 80)
-        assert kernels is whole
+        assert (kernels is whole) == (apart > 0.0)
 
 
-def test_thin_walls_get_kernels_of_their_own() -> None:
-    """Two sheets closer than kernels are apart: each is covered by kernels of its own."""
+def test_thin_walls_are_apart() -> None:
+    """Two sheets closer than kernels are wide: each is covered by kernels of its own."""
     mask = np.zeros((24, 12, 5), dtype=bool)
     mask[:, :, [0, 1, 3, 4]] = mask[:2] = True
     quadrature = integrate(mask, 6000)
-    whole, kernels = divided(quadrature, 60)
-    assert kernels.kernel_count > whole.kernel_count and kernels.visibility is not None
+    _, kernels = divided(quadrature, 60)
+    x, value = quadrature.points, kernels.evaluate(quadrature.points).value
+    far = x[:, 0] > 14 * EDGE
+    sheets = [value[far & (x[:, 2] < 2.5 * EDGE)], value[far & (x[:, 2] > 2.5 * EDGE)]]
+    assert not len(np.intersect1d(*(np.unique(sheet.indices) for sheet in sheets)))
     assert kernels.conditions(quadrature.points).max() < 1e5
 
 
@@ -161,36 +192,38 @@ def test_file_round_trip(body: ReducedBody, tmp_path: Path) -> None:
     body.save(path)
     loaded = ReducedBody.load(path)
     x = body.bounds[0] + np.random.default_rng(0).random((500, 3)) * np.ptp(body.bounds, axis=0)
-    assert len(body.hidden_pairs) > 1000
+    assert len(body.detour_pairs) > 1000
     np.testing.assert_array_equal(body.evaluate(x)[0], loaded.evaluate(x)[0])
     bar = build_body(integrate(np.ones((8, 2, 2), dtype=bool)), BuildOptions(function_count=20), progress=False)
     bar.save(path)
     with np.load(path) as file:
-        assert not {"material_points", "hidden_pairs"} & set(file.files)
-    assert ReducedBody.load(path).kernels.visibility is None
+        assert not {"material_points", "material_steps", "detour_pairs", "detour_lengths"} & set(file.files)
+    assert ReducedBody.load(path).kernels.detours is None
 
 
-@pytest.mark.parametrize("change", ["order", "range", "negative", "alone", "nan"])
+@pytest.mark.parametrize("change", ["order", "range", "negative", "alone", "nan", "sign"])
 def test_damaged_tables_are_refused(body: ReducedBody, tmp_path: Path, change: str) -> None:
     """Pairs out of order or range, points that are missing or no numbers, are named."""
     path = tmp_path / "fork.npz"
     body.save(path)
     with np.load(path) as file:
         stored = {name: file[name] for name in file.files}
-    pairs, points = stored["hidden_pairs"].copy(), stored["material_points"].copy()
+    pairs, points = stored["detour_pairs"].copy(), stored["material_points"].copy()
     if change == "order":
         pairs[[0, 1]] = pairs[[1, 0]]
     elif change == "range":
         pairs[-1] = len(points) * len(body.centres)
     elif change == "negative":
         pairs[0] = -1
+    elif change == "sign":
+        stored["detour_lengths"] = -stored["detour_lengths"]
     elif change == "nan":
         points[3] = np.nan
-    stored |= {"hidden_pairs": pairs, "material_points": points}
+    stored |= {"detour_pairs": pairs, "material_points": points}
     if change == "alone":
         del stored["material_points"]
     np.savez(path, **stored)
-    with pytest.raises(AssetError, match=r"hidden_pairs|material_points"):
+    with pytest.raises(AssetError, match=r"detour_pairs|material_points|detour_lengths"):
         ReducedBody.load(path)
 
 

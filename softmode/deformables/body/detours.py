@@ -100,7 +100,10 @@ class Detours:
         found = []
         for d in range(3):
             own = -np.bincount(row, factor[:, d], minlength=count)
-            entries = np.concatenate([factor[:, d], own]), (np.append(row, np.arange(count)), np.append(column, np.arange(count)))
+            entries = (
+                np.concatenate([factor[:, d], own]),
+                (np.append(row, np.arange(count)), np.append(column, np.arange(count))),
+            )
             found.append(sparse.csr_matrix(entries, shape=(count, count)))
         return found
 

@@ -208,7 +208,9 @@ class BasisRKPM:
     def _tree(self) -> KDTree:
         return KDTree(self.centres)
 
-    def _pairs(self, x: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], tuple[Array, Array] | None]:
+    def _pairs(
+        self, x: Array
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], tuple[Array, Array] | None]:
         """Return the row and kernel of every pair within reach, by rows, and kernels per point (N,).
 
         Last, what detours add to the distances of these pairs [m] (pairs,), and its gradient (pairs, 3), or None.
@@ -288,7 +290,7 @@ class BasisRKPM:
             small = q < 1e-8
             over_distance = np.where(small, -8.0, slope / np.where(small, 1.0, q)) * inverse**2
         if more is not None:  # The gradient of the distance is that of both its parts.
-            lengthened = np.where(more[0] > 0.0, distance / np.maximum(straight, 1e-300), 1.0)
+            lengthened = np.where(more[0] != 0.0, distance / np.maximum(straight, 1e-300), 1.0)
             offset = offset * lengthened[:, None] + more[1] * distance[:, None]
         return w, offset * over_distance[:, None]
 

@@ -37,6 +37,9 @@ CONDITION_LEAST = 1e5
 """Where the condition number of the moment matrix is larger, kernels are added."""
 ROUNDS = 8
 """Most rounds of adding kernels."""
+LEAST = 0.15
+"""Where no detour is longer than this fraction of a kernel's support, all lines are straight: a convex object along no
+axis of the grid has some of 0.11 at most, since its grid drops octants that it hardly fills."""
 TURN = 0.49
 """How far from the middle of an octant ways turn, towards an inner edge on its border."""
 _LINES_PER_CHUNK = 100_000
@@ -48,8 +51,6 @@ class Material:
 
     points: Array
     """Their centroids [m], shape (N, 3)."""
-    volumes: Array
-    """Their volumes [m^3], shape (N,)."""
     place: NDArray[np.int64]
     """Their places in the grid of octants, at least 1, shape (N, 3)."""
     borders: tuple[Array, Array, Array]
@@ -133,27 +134,9 @@ class Material:
         return np.unique(np.concatenate(found), axis=0)
 
     @cached_property
-    def _planes(self) -> tuple[Array, Array]:
-        """Return for each octant where it is filled, normal . x < offset in grid coordinates: (N, 3), (N,).
-
-        The plane of a part of an octant has its normal from the centroid to the middle, and lies as far beyond the
-        centroid as half its thickness.
-        """
-        normal = self.place + 0.5 - self.own
-        size = np.abs(normal).sum(axis=1)
-        whole = np.prod([np.diff(line)[self.place[:, d]] for d, line in enumerate(self.borders)], axis=0)
-        fill = np.minimum(self.volumes / whole, 1.0)
-        normal = normal / np.maximum(size, 1e-300)[:, None]
-        offset = (normal * self.own).sum(axis=1) + 0.5 * fill
-        full = (size < 1e-3) | (fill > 0.999)
-        normal[full], offset[full] = 0.0, 1.0
-        return normal, offset
-
-    @cached_property
     def _sums(self) -> NDArray[np.int64]:
         """Octants missing, or beside a cut, below and left of each place."""
-        partial = np.abs(self._planes[0]).sum(axis=1) > 0.0
-        bad = ((self.grid < 0) | partial[self.grid]).astype(np.int64)
+        bad = (self.grid < 0).astype(np.int64)
         bad[tuple(self.place[self.severed.ravel()].T)] = 1
         return np.pad(bad.cumsum(0).cumsum(1).cumsum(2), ((1, 0), (1, 0), (1, 0)))
 
@@ -179,13 +162,7 @@ class Material:
         middle = 0.5 * (t[:, 1:] + t[:, :-1])
         where = (a[:, None] + middle[..., None] * along[:, None]).astype(int)
         octant = self.grid[where[..., 0], where[..., 1], where[..., 2]]
-        normal, offset = self._planes
-        # In a partly filled octant, the share of the line between two borders that lies beyond the plane.
-        ends = [offset[octant] - ((a[:, None] + x[..., None] * along[:, None]) * normal[octant]).sum(axis=2) for x in (t[:, 1:], t[:, :-1])]
-        low, high = np.minimum(*ends), np.maximum(*ends)
-        share = np.clip(-low / np.maximum(high - low, 1e-12), 0.0, 1.0)
-        share = np.where(octant < 0, 1.0, np.where(high <= 0.0, 1.0, np.where(low >= 0.0, 0.0, share)))
-        outside = (share * np.diff(t, axis=1)).sum(axis=1) * np.linalg.norm(along, axis=1)
+        outside = np.where(octant < 0, np.diff(t, axis=1), 0.0).sum(axis=1) * np.linalg.norm(along, axis=1)
         clear = outside <= GRAZING
         if len(self.severed):
             key = np.array([len(self.points), 1])
@@ -230,11 +207,13 @@ def material_of(cells: Cells, offset: Array) -> Material | None:
     if pair is None or cells.place is None or cells.borders is None:
         return None
     first = cells.place.min(axis=0)
-    borders = [line[np.isfinite(line)][low:] - offset[d] for d, (line, low) in enumerate(zip(cells.borders, first, strict=True))]
+    borders = [
+        line[np.isfinite(line)][low:] - offset[d]
+        for d, (line, low) in enumerate(zip(cells.borders, first, strict=True))
+    ]
     before = [np.concatenate([[2.0 * line[0] - line[1]], line, [2.0 * line[-1] - line[-2]]]) for line in borders]
     return Material(
         points=cells.octants - offset,
-        volumes=cells.weights,
         place=cells.place - first + 1,
         borders=(before[0], before[1], before[2]),
         links=pair,
@@ -316,7 +295,7 @@ def find_detours(material: Material, centres: Array, support: Array) -> Detours 
     limit = reach[hidden_kernel] - direct
     added = np.minimum(direct * (np.minimum(ratio, 1e3) ** POWER - 1.0), limit)
     real = added > 1e-3 * reach[hidden_kernel]
-    if not real.any():
+    if not (added > LEAST * reach[hidden_kernel])[direct < support[hidden_kernel]].any():
         return None
     key = hidden_kernel[real] * count + hidden_octant[real]
     order = np.argsort(key)
