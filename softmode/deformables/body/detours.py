@@ -71,7 +71,13 @@ class Detours:
         def mean(data: Array) -> sparse.csr_matrix:
             return sparse.csr_matrix((data, (row, point)), shape=(len(places), len(self.points)))
 
-        gradients = [(change @ table).multiply(table != 0.0).tocsr() for change in self._changes]
+        acting = sparse.csr_matrix(
+            (np.ones(table.nnz), table.indices, table.indptr), shape=table.shape
+        )  # Lit: no change.
+        gradients: list[Any] = []
+        for change in self._changes:
+            product: Any = change @ table
+            gradients.append(product.multiply(acting).tocsr())
         value = mean(share) @ table
         for e in range(3):
             value = value + mean(share * away[:, e]) @ gradients[e]

@@ -175,7 +175,7 @@ class BasisRKPM:
         return found
 
     def nearest(self, points: Array) -> tuple[Array, NDArray[np.intp]]:
-        """Return the distance through the material [m] (N,) to the nearest kernel from points (N, 3), and which it is."""
+        """Return the distance through the material [m] (N,) from points (N, 3) to the nearest kernel, and its index."""
         found: Any = self._tree.query(points)
         distance, nearest = found
         if self.detours is None or not len(points):
@@ -183,7 +183,7 @@ class BasisRKPM:
         step = max(1, _PAIRS_PER_CHUNK // self.kernel_count)
         for i in range(0, len(points), step):
             mine = slice(i, i + step)
-            added = self.detours.added(points[mine], self.kernel_count)[0]
+            added: Any = self.detours.added(points[mine], self.kernel_count)[0]
             here = np.asarray(added[np.arange(added.shape[0]), nearest[mine]]).ravel()
             for row in i + np.flatnonzero(here > 0.0):
                 away = np.linalg.norm(points[row] - self.centres, axis=1) + added[row - i].toarray()[0]

@@ -88,9 +88,10 @@ class Material:
 
     def positions(self, coordinates: Array) -> Array:
         """Return the positions [m] of grid coordinates (M, 3)."""
-        return np.stack(
+        found: Array = np.stack(
             [np.interp(coordinates[:, d], np.arange(len(line)), line) for d, line in enumerate(self.borders)], axis=1
         )
+        return found
 
     def homes(self, x: Array) -> Indices:
         """Return the octant that each of some points of the material (M, 3) [m] lies in."""
@@ -131,7 +132,8 @@ class Material:
                 corner[:, a] += up * TURN
                 corner[:, b] += right * TURN
                 found.append(corner)
-        return np.unique(np.concatenate(found), axis=0)
+        turns: Array = np.unique(np.concatenate(found).astype(np.float64), axis=0)
+        return turns
 
     @cached_property
     def _sums(self) -> NDArray[np.int64]:
