@@ -48,7 +48,7 @@ class Cells:
     place: NDArray[np.int64] | None = None
     """Place of each octant in the grid of octants, shape (Q, 3); None in files written before 0.3."""
     borders: Array | None = None
-    """Borders of the octants along each axis [m], rows filled up by NaN, shape (3, B); None where `place` is."""
+    """Borders of the octants along each axis [m], rows filled up by infinity, shape (3, B); None where `place` is."""
     severed: NDArray[np.int64] | None = None
     """Pairs of octants that a cut divides, though they are neighbours, the lower one first, shape (E, 2)."""
 
@@ -218,8 +218,8 @@ def cell_points(moments: Array, lines: Sequence[Array]) -> CellPoints:
 
 
 def _octant_borders(lines: Sequence[Array]) -> Array:
-    """Return the borders of the octants of cells, rows filled up by NaN, shape (3, B) [m]."""
-    found = np.full((3, 2 * max(len(line) for line in lines) - 1), np.nan)
+    """Return the borders of the octants of cells, rows filled up by infinity, shape (3, B) [m]."""
+    found = np.full((3, 2 * max(len(line) for line in lines) - 1), np.inf)
     for row, line in zip(found, lines, strict=True):
         row[: 2 * len(line) - 1] = np.interp(0.5 * np.arange(2 * len(line) - 1), np.arange(len(line)), line)
     return found
