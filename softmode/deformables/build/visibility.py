@@ -254,6 +254,8 @@ def follow_material(kernels: BasisRKPM, material: Material, points: Array, spaci
         radii = np.concatenate([divided.radii, np.maximum(distance[added], 1.5 * spacing)])
         divided = replace(divided, centres=centres, radii=radii, detours=None)
         divided = replace(divided, detours=find_detours(material, centres, divided.support))
+    if divided.covered(points).all():
+        return divided
     warnings.warn(
         "the object's parts are too thin beside its gaps for its quadrature: kernels act across the gaps; build it with"
         " more points",
