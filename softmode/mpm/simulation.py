@@ -74,15 +74,20 @@ class ParticleState:
     F: wp.array
     """Deformation gradient, (W, N)."""
 
+    @property
+    def arrays(self) -> tuple[wp.array, wp.array, wp.array, wp.array]:
+        """x, v, C and F."""
+        return self.x, self.v, self.C, self.F
+
     def copy_from(self, other: ParticleState) -> None:
         """Take another state's values."""
-        for name in ("x", "v", "C", "F"):
-            wp.copy(getattr(self, name), getattr(other, name))
+        for mine, value in zip(self.arrays, other.arrays, strict=True):
+            wp.copy(mine, value)
 
     def zero(self) -> None:
         """Set all to zero."""
-        for name in ("x", "v", "C", "F"):
-            getattr(self, name).zero_()
+        for array in self.arrays:
+            array.zero_()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
