@@ -8,6 +8,7 @@ from typing import Any
 
 import warp as wp
 
+from softmode.mpm.cell_kernels import Cells, add_to_node, cell_index, enter, give
 from softmode.mpm.spline_kernels import cell_of, spline
 from softmode.mpm.stress_kernels import kirchhoff, polar_rotation
 
@@ -42,25 +43,6 @@ def controlled(F: Any, control: Any, material: int):
 def in_grid(i: int, j: int, k: int, shape: wp.vec3i):
     """Return whether all nodes of a particle in cell (i, j, k) exist."""
     return i >= 1 and j >= 1 and k >= 1 and i < shape[0] - 2 and j < shape[1] - 2 and k < shape[2] - 2
-
-
-# Four floats in one operation where the GPU has it: scatters are bound by the number of atomic operations.
-@wp.func_native("""
-    wp::vec_t<4, wp::float32>* at = wp::address(grid, world, i, j, k);
-#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
-    atomicAdd(reinterpret_cast<float4*>(at), make_float4(value[0], value[1], value[2], value[3]));
-#else
-    wp::atomic_add(at, value);
-#endif
-""")
-def add_to_node(grid: wp.array4d[wp.vec4f], world: int, i: int, j: int, k: int, value: wp.vec4f):
-    """Add to a node."""
-
-
-@wp.func
-def add_to_node(grid: wp.array4d[wp.vec4d], world: int, i: int, j: int, k: int, value: wp.vec4d):  # noqa: F811
-    """Add to a node."""
-    wp.atomic_add(grid, world, i, j, k, value)
 
 
 @wp.func
@@ -109,10 +91,13 @@ def particles_to_grid(
     step: int,
     active: wp.array[int],
     lanes: int,
+    cells: Cells,
+    given: wp.array3d[Any],
 ):
     """Scatter momentum and mass: p_i = sum_p w_ip (m v (1 - zeta dt) + A (x_i - x_p)), A = m C - 3/dx^2 dt V tau.
 
-    Each of the ``lanes`` threads of a particle, a power of two, serves its share of the 16 rows of nodes.
+    Each of the ``lanes`` threads of a particle, a power of two, serves its share of the 16 rows of nodes. With 0 lanes
+    a particle only notes what it gives, for :func:`softmode.mpm.cell_kernels.scatter_cells`.
     """
     world, lane, p = wp.tid()
     m = mass[world, p]
@@ -132,6 +117,9 @@ def particles_to_grid(
             wy = spline(f[1])
             wz = spline(f[2])
             A = A * dx
+            if lanes == 0:
+                give(cells, given, world, p, cell_index(i, j, k, shape), base, A, f, m)
+                return
             for a in range(4):
                 for b in range(4):
                     if in_lane(a, b, lane, lanes):
@@ -154,13 +142,22 @@ def mass_to_grid(
     grid_mass: wp.array4d[Any],
     active: wp.array[int],
     lanes: int,
+    cells: Cells,
 ):
-    """Scatter mass alone; the ``lanes`` threads of a particle as in :func:`particles_to_grid`."""
+    """Scatter mass alone; the ``lanes`` threads of a particle as in :func:`particles_to_grid`.
+
+    With 0 lanes particles are only strung on their cells, for
+    :func:`softmode.mpm.cell_kernels.scatter_cell_masses`.
+    """
     world, lane, p = wp.tid()
     m = mass[world, p]
     if m > type(dx)(0.0) and moves(active, world):
         i, j, k, f = cell_of(x_in[world, p], origin, dx)
-        if in_grid(i, j, k, wp.vec3i(grid_mass.shape[1], grid_mass.shape[2], grid_mass.shape[3])):
+        shape = wp.vec3i(grid_mass.shape[1], grid_mass.shape[2], grid_mass.shape[3])
+        if in_grid(i, j, k, shape):
+            if lanes == 0:
+                enter(cells, world, p, cell_index(i, j, k, shape))
+                return
             wx = spline(f[0])
             wy = spline(f[1])
             wz = spline(f[2])
