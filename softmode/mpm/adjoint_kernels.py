@@ -7,9 +7,9 @@ from typing import Any
 
 import warp as wp
 
-from softmode.mpm.cell_kernels import Cells, add_to_node, cell_index, give
+from softmode.mpm.scatter_kernels import add_to_node, in_grid, in_lane, load_node
 from softmode.mpm.spline_kernels import cell_of, spline, spline_slope
-from softmode.mpm.step_kernels import controlled, in_grid, in_lane
+from softmode.mpm.step_kernels import controlled
 from softmode.mpm.stress_kernels import kirchhoff, kirchhoff_adjoint, polar_rotation
 
 wp.set_module_options({"enable_backward": False})
@@ -49,13 +49,10 @@ def grid_to_particles_adjoint(
     Fs_bar: wp.array2d[Any],
     F_bar: wp.array2d[Any],
     lanes: int,
-    cells: Cells,
-    given: wp.array3d[Any],
 ):
     """Adjoint of the gather: scatter to the grid what particles ask of its velocity.
 
-    The ``lanes`` threads of a particle share the scatter; the first writes what the particle's bars are. With 0 lanes a
-    particle only notes what it asks, for :func:`softmode.mpm.cell_kernels.scatter_cells`.
+    The ``lanes`` threads of a particle share the scatter; the first writes what the particle's bars are.
     """
     world, lane, p = wp.tid()
     x = x_in[world, p]
@@ -83,8 +80,6 @@ def grid_to_particles_adjoint(
         base = v_bar - (B_bar * f) * dx
         B_dx = B_bar * dx
         lift = type(x)(B_dx[0, 2], B_dx[1, 2], B_dx[2, 2])
-        if lanes == 0:
-            give(cells, given, world, p, cell_index(i, j, k, shape), base, B_dx, f, type(dx)(0.0))
         for a in range(4):
             for b in range(4):
                 wxy = wx[a] * wy[b]
@@ -95,7 +90,7 @@ def grid_to_particles_adjoint(
                 for c in range(4):
                     asked = row + type(dx)(c - 1) * lift
                     node = grid_velocity[world, i + a - 1, j + b - 1, k + c - 1]
-                    if lanes > 0 and in_lane(a, b, lane, lanes):
+                    if in_lane(a, b, lane, lanes):
                         push = (wxy * wz[c]) * asked
                         both = scattered.dtype(push[0], push[1], push[2], type(dx)(0.0))
                         add_to_node(scattered, world, i + a - 1, j + b - 1, k + c - 1, both)
@@ -209,7 +204,7 @@ def particles_to_grid_adjoint(
                 work = type(dx)(0.0)
                 slope_z = type(dx)(0.0)
                 for c in range(4):
-                    both = grid_bar[world, i + a - 1, j + b - 1, k + c - 1]
+                    both = load_node(grid_bar, world, i + a - 1, j + b - 1, k + c - 1)
                     bar = type(x)(both[0], both[1], both[2])
                     node = both[3]
                     weighed = wz[c] * bar

@@ -17,11 +17,10 @@ from numpy.typing import ArrayLike
 from softmode.checks import require_choice, require_number
 from softmode.errors import ConfigError
 from softmode.mpm.adjoint_kernels import mass_to_grid_adjoint
-from softmode.mpm.cells import CellLists, scatter_masses
 from softmode.mpm.grid import MARGIN, Grid
 from softmode.mpm.loss_kernels import log_mass_at_nodes, mass_at_nodes, position_at_particles
 from softmode.mpm.particles import ParticleBody
-from softmode.mpm.simulation import MpmSimulation, ParameterBars, ParticleState
+from softmode.mpm.simulation import MpmSimulation, ParameterBars, ParticleState, scatter_masses
 
 MassLossKind = Literal["log", "squared"]
 
@@ -221,16 +220,10 @@ class MassLoss:
         self.spread(x, mass, grid_mass_bar, x_bar, mass_bar)
         return x_bar.numpy()[0], mass_bar.numpy()[0]
 
-    def scatter(
-        self,
-        x: wp.array,
-        mass: wp.array,
-        grid_mass: wp.array,
-        active: wp.array | None = None,
-        cells: CellLists | None = None,
-    ) -> None:
+    def scatter(self, x: wp.array, mass: wp.array, grid_mass: wp.array, active: wp.array | None = None) -> None:
         """Write the masses of the nodes [kg], (W, nx, ny, nz), of particles x [m] and masses [kg], (W, N)."""
-        scatter_masses(x, mass, self._place, grid_mass, self._all if active is None else active, cells)
+        grid_mass.zero_()
+        scatter_masses(x, mass, self._place, grid_mass, self._all if active is None else active)
 
     def _on_grid(self, x: wp.array, mass: wp.array) -> wp.array:
         grid_mass = wp.zeros((x.shape[0], *self.grid.shape), dtype=self.dtype, device=self.device)
@@ -269,9 +262,6 @@ class CoarseMassLoss:
         with wp.ScopedDevice(fine.device):
             self._mass, self._bar = (wp.zeros(nodes, dtype=fine.dtype) for _ in range(2))
             self._weight = wp.zeros(1, dtype=wp.float64)
-        by_cells = simulation.cells is not None
-        worlds, count = simulation.mass.shape
-        self._cells = CellLists(worlds, count, grid.shape, fine.device) if by_cells else None
         self.weigh(1.0)
 
     def weigh(self, weight: float) -> None:
@@ -284,7 +274,7 @@ class CoarseMassLoss:
 
     def add(self, simulation: MpmSimulation, loss: wp.array) -> None:
         """Add the loss after the last step of a simulation, and keep its derivative on the grid."""
-        self._loss.scatter(simulation.last.x, simulation.mass, self._mass, simulation.active, self._cells)
+        self._loss.scatter(simulation.last.x, simulation.mass, self._mass, simulation.active)
         self._loss.add_log(self._mass, self._weight, loss, self._bar, simulation.active)
 
     def spread(self, simulation: MpmSimulation, x_bar: wp.array, mass_bar: wp.array) -> None:

@@ -55,7 +55,7 @@ COARSE = (2, 4)
 """Cells of the coarser grids over those of the particles'."""
 NORM_THREADS = 512
 """Threads of a GPU that sum up the gradient of a world."""
-KEPT_BYTES = 2.5e8
+KEPT_BYTES = 1.0e8
 """Most memory that segments take on the device before they are read back."""
 WRITING = 9.0
 """Time between two writings of a file over the time that one takes."""
@@ -146,6 +146,7 @@ class _Kept:
         """Make room for a number of segments of a simulation."""
         s = self._simulation = simulation
         _, vec, mat = TYPES[s.options.precision]
+        self._mass = s.mass.numpy().astype(np.float64)
         self._segments, shape, layers = segments, (s.world_count, s.count), s.layer_count
         row = (15 + 9 * layers) * np.dtype(s.options.precision).itemsize * math.prod(shape)
         self.rows = max(1, min(segments, int(KEPT_BYTES / row)))
@@ -153,6 +154,9 @@ class _Kept:
             self.x, self.v = (wp.zeros((self.rows, *shape), dtype=vec) for _ in range(2))
             self.F = wp.zeros((self.rows, *shape), dtype=mat)
             self.control = wp.zeros((self.rows, layers, *shape), dtype=mat)
+            kept = (self.x, self.v, self.F, self.control)
+            pinned = s.device.is_cuda
+            self._fetched = tuple(wp.empty(a.shape, dtype=a.dtype, device="cpu", pinned=pinned) for a in kept)
             self.record = Record()
             for name in ("count", "row", "settles", "settling"):
                 setattr(self.record, name, wp.zeros(1, dtype=int))
@@ -167,8 +171,8 @@ class _Kept:
         self.deformation = np.empty((count + 1, *s.mass.shape, 3, 3), dtype=plain)
         self.controls = np.empty((count, *s.control.shape, 3, 3), dtype=plain)
         self.kinetic_energy = np.empty((count, s.world_count))
-        self.read, self.waiting = 0, 0
-        """Segments on the host, and those on the device alone."""
+        self.read, self._unstowed, self.waiting = 0, 0, 0
+        """Segments on the host, those that were fetched, and those on the device alone."""
         self.positions[0], self.deformation[0] = s.first.x.numpy(), s.first.F.numpy()
         self.record.count.zero_()
 
@@ -180,25 +184,36 @@ class _Kept:
         self.kinetic_energy[:n, 0] = run.kinetic_energy
 
     def keep(self) -> None:
-        """Note that a segment left a row; read all rows when there is no room for another."""
+        """Note that a segment left a row; when there is no room for another take all off the device."""
         self.waiting += 1
         if self.waiting == self.rows:
-            self.flush()
+            self._fetch()
 
     def flush(self) -> None:
-        """Read all rows back from the device."""
-        if not self.waiting:
-            return
-        begin, end = self.read, self.read + self.waiting
-        velocity = self.v[: self.waiting].numpy().astype(np.float64)
-        mass = self._simulation.mass.numpy().astype(np.float64)
-        self.kinetic_energy[begin:end] = 0.5 * (mass * (velocity**2).sum(axis=3)).sum(axis=2)
-        kept = ((self.positions[1:], self.x), (self.deformation[1:], self.F), (self.controls, self.control))
-        for host, rows in kept:
-            wp.copy(wp.array(host[begin:end], dtype=rows.dtype, device="cpu", copy=False), rows[: self.waiting])
+        """Read all rows back."""
+        self.stow()
+        if self.waiting:
+            self._fetch()
+            self.stow()
+
+    def _fetch(self) -> None:
+        """Take all rows off the device."""
+        for fetched, rows in zip(self._fetched, (self.x, self.v, self.F, self.control), strict=True):
+            wp.copy(fetched, rows, count=self.waiting * math.prod(rows.shape[1:]))
         wp.synchronize_device(self._simulation.device)
         self.record.count.zero_()
-        self.read, self.waiting = end, 0
+        self._unstowed, self.waiting = self.waiting, 0
+
+    def stow(self) -> None:
+        """Put what was taken off the device where it belongs; a GPU goes on with the next segment meanwhile."""
+        begin, end = self.read, self.read + self._unstowed
+        if begin == end:
+            return
+        x, v, F, control = (fetched.numpy()[: self._unstowed] for fetched in self._fetched)
+        self.positions[begin + 1 : end + 1], self.deformation[begin + 1 : end + 1] = x, F
+        self.controls[begin:end] = control
+        self.kinetic_energy[begin:end] = 0.5 * (self._mass * (v.astype(np.float64) ** 2).sum(axis=3)).sum(axis=2)
+        self.read, self._unstowed = end, 0
 
     def of_world(self, world: int, count: int) -> dict[str, np.ndarray]:
         """Return what was read of a world, without padding; it shares the memory of all worlds."""
@@ -336,6 +351,7 @@ class MorphPlanner:
             while log.segment_count < sum(self._settling(target)):
                 self._set_up_segment(target)
                 self._run_segment()
+                self._kept.stow()
                 loss, failed = self._kept.record.status.numpy().T
                 if failed.any():
                     try:

@@ -16,15 +16,15 @@ from softmode.checks import require_number
 from softmode.deformables.build.static_response import lame_parameters
 from softmode.errors import ConfigError, SolverDiverged
 from softmode.mpm.adjoint_kernels import grid_to_particles_adjoint, move_grid_adjoint, particles_to_grid_adjoint
-from softmode.mpm.cell_kernels import Cells, scatter_cells
-from softmode.mpm.cells import FILLS_GPU, CellLists, scatter_masses
 from softmode.mpm.options import COURANT_LIMIT, MpmOptions
 from softmode.mpm.particles import ParticleBody
+from softmode.mpm.scatter_kernels import scatter_given
 from softmode.mpm.shape_kernels import add_wrenches, collide_grid, collide_grid_adjoint, find_inside
 from softmode.mpm.shapes import GridShapes
 from softmode.mpm.step_kernels import (
     clear_failures,
     grid_to_particles,
+    mass_to_grid,
     move_grid,
     particle_volumes,
     particles_to_grid,
@@ -41,8 +41,25 @@ REASONS = {
     3: "has no finite position",
     4: "began inside of a shape",
 }
+FILLS_GPU = 30_000
+"""Fewer particles do not fill a GPU: several threads scatter each, in smaller blocks, which more processors share."""
 FEW_PARTICLES = 0.5
 """Particles per cell under which a body falls apart into unconnected clumps."""
+
+
+def scatter_masses(x: wp.array, mass: wp.array, place: Sequence[object], grid_mass: wp.array, active: wp.array) -> None:
+    """Add the masses of particles to those of the nodes.
+
+    Args:
+        x: Positions [m], (W, N).
+        mass: Masses [kg], (W, N).
+        place: Origin and spacing of the grid, in the type of the particles.
+        grid_mass: Masses of the nodes [kg], (W, nx, ny, nz).
+        active: Worlds that take part, (W,), or one entry for all.
+    """
+    lanes = 8 if wp.get_device(x.device).is_cuda and x.size < FILLS_GPU else 1
+    shape = (x.shape[0], lanes, x.shape[1])
+    wp.launch(mass_to_grid, shape, inputs=[x, mass, *place, grid_mass, active, lanes], device=x.device)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -116,7 +133,7 @@ class MpmSimulation:
         layer_count: int = 1,
         shapes: GridShapes | None = None,
         keep_grids: bool = False,
-        by_cells: bool | None = None,
+        scatter_apart: bool | None = None,
         device: wp.DeviceLike = None,
     ) -> None:
         """Put bodies at rest on the grid.
@@ -129,8 +146,7 @@ class MpmSimulation:
             shapes: Rigid shapes that act on the grid.
             keep_grids: Whether the grids of all steps are kept for the gradient, where the memory limit allows, not
                 computed again. To the same bits on a CPU.
-            by_cells: Whether what the particles of a cell give to a node is summed up before it is added, which saves
-                atomic operations; None does so on a GPU that is filled.
+            scatter_apart: Whether particles are added to the grid in a kernel of its own; None does so on a GPU.
             device: Where to compute; Warp's preferred device when None.
 
         Raises:
@@ -155,6 +171,9 @@ class MpmSimulation:
         self.world_count, self.count = len(self.bodies), max(body.count for body in self.bodies)
         fills = self.world_count * self.count >= FILLS_GPU
         self._lanes = 2 if self.device.is_cuda and not fills else 1
+        self._scatter_lanes = 1 if fills else 8
+        self._turn = 0
+        self._block = 256 if fills else 64
         self._model = int(models.pop())
         self._real, self._vec, self._mat = TYPES[self.options.precision]
         self.mass = self._array(self._padded([body.masses for body in self.bodies]), self._real)
@@ -171,10 +190,8 @@ class MpmSimulation:
         four = wp.types.vector(4, self._real)
         # Momentum and mass of a node lie side by side: one operation adds to both. Who reads the sums clears them.
         self._scattered, self._grid_bar = self._zeros(four, *nodes), self._zeros(four, *nodes)
-        with_cells = self.device.is_cuda and fills if by_cells is None else by_cells
-        self.cells = CellLists(self.world_count, self.count, grid.shape, self.device) if with_cells else None
-        """Particles by cell, where they are scattered by cells."""
-        self._given = self._zeros(four, self.world_count, self.count if with_cells else 0, 4)
+        self._apart = self.device.is_cuda if scatter_apart is None else scatter_apart
+        self._given = self._zeros(four, self.world_count, self.count if self._apart else 0, 4)
         self.shapes = shapes
         self.impulse = self._zeros(
             wp.spatial_vectord, step_count, self.world_count, 0 if shapes is None else shapes.model.shape_count
@@ -311,6 +328,7 @@ class MpmSimulation:
 
     def scatter_mass(self, state: ParticleState | None = None) -> None:
         """Put the masses of the particles on the grid: those after the last step, or of another state."""
+        self.grid_mass.zero_()
         self._scatter_mass((state or self.last).x)
 
     def bars(self) -> tuple[ParticleState, ParameterBars]:
@@ -435,21 +453,16 @@ class MpmSimulation:
         return [self._vec(*grid.origin), self._real(grid.spacing)]
 
     def _launch(self, kernel: Callable[..., object], inputs: list[object]) -> None:
-        wp.launch(kernel, (self.world_count, self.count), inputs=inputs, device=self.device)
+        shape = (self.world_count, self.count)
+        wp.launch(kernel, shape, inputs=inputs, device=self.device, block_dim=self._block)
 
-    def _scatter(self, kernel: Callable[..., object], inputs: list[object]) -> None:
-        """Launch a kernel that adds to nodes, particle by particle or cell by cell."""
-        if self.cells is None:
-            shape = (self.world_count, self._lanes, self.count)
-            wp.launch(kernel, shape, inputs=[*inputs, self._lanes, Cells(), self._given], device=self.device)
-            return
-        self.cells.clear()
-        inputs = [*inputs, 0, self.cells.lists, self._given]
-        wp.launch(kernel, (self.world_count, 1, self.count), inputs=inputs, device=self.device)
-        self.cells.launch(scatter_cells, [self._given, self._scattered])
+    def _scatter(self, kernel: Callable[..., object], inputs: list[object], lanes: int) -> None:
+        """Launch a kernel in which several threads of a particle add to nodes."""
+        shape = (self.world_count, max(lanes, 1), self.count)
+        wp.launch(kernel, shape, inputs=[*inputs, lanes], device=self.device, block_dim=self._block)
 
     def _scatter_mass(self, x: wp.array) -> None:
-        scatter_masses(x, self.mass, self._place, self.grid_mass, self.active, self.cells)
+        scatter_masses(x, self.mass, self._place, self.grid_mass, self.active)
 
     def _at_nodes(self, kernel: Callable[..., object], inputs: list[object]) -> None:
         wp.launch(kernel, self.grid_mass.shape, inputs=inputs, device=self.device)
@@ -503,8 +516,11 @@ class MpmSimulation:
     def _move_grid(self, step: int, state: ParticleState) -> _MovedGrid:
         """Compute the velocities of the grid in a step."""
         grid = self._grids[step if self._keeps_grids else 0]
-        inputs = [*self._particles(state, step), self._scattered, self.failure, step, self.active]
-        self._scatter(particles_to_grid, inputs)
+        inputs = [*self._particles(state, step), self._scattered, self.failure, step, self.active, self._given]
+        self._scatter(particles_to_grid, inputs, 0 if self._apart else self._lanes)
+        if self._apart:
+            inputs = [state.x, self.mass, self._given, *self._place, self._scattered, self.active, self._turn]
+            self._scatter(scatter_given, inputs, self._scatter_lanes)
         push = self._vec(*(g * self.options.dt for g in self.options.gravity))
         self._at_nodes(move_grid, [self._scattered, self._least, push, grid.mass, grid.velocity, self.active])
         if self.shapes is not None:
@@ -574,6 +590,7 @@ class MpmSimulation:
                 self._fs_bar,
                 bar.F,
             ],
+            self._lanes,
         )
         if self.shapes is not None:
             self._at_nodes(collide_grid_adjoint, [*self._obstacles(step, grid), grid.free_velocity, self._scattered])

@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from softmode.mpm.cell_kernels import Cells, add_to_node, cell_index, enter, give
+from softmode.mpm.scatter_kernels import add_to_node, give, in_grid, in_lane, load_node, moves
 from softmode.mpm.spline_kernels import cell_of, spline
 from softmode.mpm.stress_kernels import kirchhoff, polar_rotation
 
@@ -37,24 +37,6 @@ def controlled(F: Any, control: Any, material: int):
     if material != 0:
         return F + F * control
     return F + control
-
-
-@wp.func
-def in_grid(i: int, j: int, k: int, shape: wp.vec3i):
-    """Return whether all nodes of a particle in cell (i, j, k) exist."""
-    return i >= 1 and j >= 1 and k >= 1 and i < shape[0] - 2 and j < shape[1] - 2 and k < shape[2] - 2
-
-
-@wp.func
-def in_lane(a: int, b: int, lane: int, lanes: int):
-    """Return whether row (a, b) of the nodes around a particle is served by its thread ``lane`` of ``lanes``."""
-    return ((4 * a + b) & (lanes - 1)) == lane
-
-
-@wp.func
-def moves(active: wp.array[int], world: int):
-    """Return whether a world takes part in a run; one entry stands for all worlds."""
-    return active[world % active.shape[0]] != 0
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -90,14 +72,13 @@ def particles_to_grid(
     failure: wp.array2d[int],
     step: int,
     active: wp.array[int],
-    lanes: int,
-    cells: Cells,
     given: wp.array3d[Any],
+    lanes: int,
 ):
     """Scatter momentum and mass: p_i = sum_p w_ip (m v (1 - zeta dt) + A (x_i - x_p)), A = m C - 3/dx^2 dt V tau.
 
     Each of the ``lanes`` threads of a particle, a power of two, serves its share of the 16 rows of nodes. With 0 lanes
-    a particle only notes what it gives, for :func:`softmode.mpm.cell_kernels.scatter_cells`.
+    a particle only notes what it gives, for :func:`softmode.mpm.scatter_kernels.scatter_given`.
     """
     world, lane, p = wp.tid()
     m = mass[world, p]
@@ -118,7 +99,7 @@ def particles_to_grid(
             wz = spline(f[2])
             A = A * dx
             if lanes == 0:
-                give(cells, given, world, p, cell_index(i, j, k, shape), base, A, f, m)
+                give(given, world, p, base, A, m)
                 return
             for a in range(4):
                 for b in range(4):
@@ -142,22 +123,13 @@ def mass_to_grid(
     grid_mass: wp.array4d[Any],
     active: wp.array[int],
     lanes: int,
-    cells: Cells,
 ):
-    """Scatter mass alone; the ``lanes`` threads of a particle as in :func:`particles_to_grid`.
-
-    With 0 lanes particles are only strung on their cells, for
-    :func:`softmode.mpm.cell_kernels.scatter_cell_masses`.
-    """
+    """Scatter mass alone; the ``lanes`` threads of a particle as in :func:`particles_to_grid`."""
     world, lane, p = wp.tid()
     m = mass[world, p]
     if m > type(dx)(0.0) and moves(active, world):
         i, j, k, f = cell_of(x_in[world, p], origin, dx)
-        shape = wp.vec3i(grid_mass.shape[1], grid_mass.shape[2], grid_mass.shape[3])
-        if in_grid(i, j, k, shape):
-            if lanes == 0:
-                enter(cells, world, p, cell_index(i, j, k, shape))
-                return
+        if in_grid(i, j, k, wp.vec3i(grid_mass.shape[1], grid_mass.shape[2], grid_mass.shape[3])):
             wx = spline(f[0])
             wy = spline(f[1])
             wz = spline(f[2])
@@ -205,11 +177,16 @@ def move_grid(
     grid_velocity: wp.array4d[Any],
     active: wp.array[int],
 ):
-    """Turn momentum into velocity, v = p / m + dt g; nodes without mass stand still."""
+    """Turn momentum into velocity, v = p / m + dt g; nodes without mass stand still.
+
+    Most nodes are empty, and were when they were written last: what is zero already is not written again.
+    """
     world, i, j, k = wp.tid()
     if not moves(active, world):
         return
-    both = scattered[world, i, j, k]
+    both = load_node(scattered, world, i, j, k)
+    if both == scattered.dtype() and grid_mass[world, i, j, k] == both[3]:
+        return
     scattered[world, i, j, k] = scattered.dtype()
     m = both[3]
     v = type(gravity_dt)()

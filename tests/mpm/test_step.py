@@ -298,12 +298,12 @@ def test_bad_input() -> None:
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_scatters_by_cell_agree(precision: str) -> None:
-    """Summed up cell by cell, states, masses, losses and all gradients are those of particles one by one."""
+def test_scatters_apart_agree(precision: str) -> None:
+    """With a kernel of its own for the scatter states, masses, losses and all gradients are the same."""
     options = MpmOptions(precision=precision, smoothing=0.5, damping=0.5)  # type: ignore[arg-type]
     found = []
-    for by_cells in (False, True):
-        s = moving(ball(2.5), options, step_count=6, by_cells=by_cells)
+    for apart in (False, True):
+        s = moving(ball(2.5), options, step_count=6, scatter_apart=apart)
         loss = MassLoss(options.grid, torus(3.0, 1.2), dtype=TYPES[precision][0], device="cpu")
         level = CoarseMassLoss(loss, s, loss.target, factor=2)
         value = wp.zeros(1, dtype=wp.float64, device="cpu")
@@ -315,5 +315,5 @@ def test_scatters_by_cell_agree(precision: str) -> None:
         arrays = [*s.last.arrays, s.grid_mass, value, *bar.arrays, parameters.control, parameters.mu, parameters.mass]
         found.append([array.numpy().copy() for array in arrays])
     rounding = 2e-5 if precision == "float32" else 1e-12
-    for alone, by_cell in zip(*found, strict=True):
-        np.testing.assert_allclose(by_cell, alone, rtol=0.0, atol=rounding * np.abs(alone).max())
+    for together, separate in zip(*found, strict=True):
+        np.testing.assert_allclose(separate, together, rtol=0.0, atol=rounding * np.abs(together).max())
