@@ -21,12 +21,9 @@ from softmode import deformables as soft
 from softmode import mpm
 
 TRUE_MODULUS = 4.0e4  # What is to be found [Pa].
-HALF = np.array([6.0, 1.5, 1.5])  # Half edges of the bar [m].
+HALF, VOLUME = np.array([6.0, 1.5, 1.5]), 108.0  # Half edges [m] and volume [m^3] of the bar.
 DT, STEPS = 1.0 / 120.0, 30  # Of the particles; the reduced body takes steps twice as long.
-CELL, MASS_SCALE = (
-    0.5,
-    1.25,
-)  # Six cells across the bar [m]: three make it too stiff. What masses are compared with [kg].
+GRID = mpm.Grid(shape=(47, 27, 39), spacing=0.5, origin=(-11.5, -6.5, -9.5))  # Three cells across are too stiff.
 MATERIAL = soft.Material(youngs_modulus=TRUE_MODULUS, poissons_ratio=0.2, density=75.0, viscosity=0.0)
 
 
@@ -37,9 +34,8 @@ def bend(x: np.ndarray) -> np.ndarray:
 
 def moved(modulus: float, h: float, options: mpm.MpmOptions) -> mpm.MpmSimulation:
     """Return the bar as particles, after it has moved."""
-    material, bounds = replace(MATERIAL, youngs_modulus=modulus), [-HALF + 0.5 * h, HALF - 0.5 * h]
-    volume = float(np.prod(2.0 * HALF))
-    body = mpm.particles_from_shape(lambda x: x[:, 0] < HALF[0], bounds, spacing=h, material=material, volume=volume)
+    made, box = replace(MATERIAL, youngs_modulus=modulus), [-HALF + 0.5 * h, HALF - 0.5 * h]
+    body = mpm.particles_from_shape(lambda x: x[:, 0] < 6.0, box, spacing=h, material=made, volume=VOLUME)
     found = mpm.MpmSimulation(body, options, step_count=STEPS, keep_grids=True, device="cpu")
     C = np.multiply.outer(32.0 * body.positions[:, 0] / HALF[0] ** 2, np.outer([0.0, 0.0, 1.0], [1.0, 0.0, 0.0]))
     found.start(v=bend(body.positions)[None], C=C[None])
@@ -109,11 +105,10 @@ def test_final(iterates: list[float]) -> None:
 def main() -> None:
     """Observe, then identify."""
     wp.config.log_level = wp.LOG_WARNING
-    grid = mpm.Grid(shape=(47, 27, 39), spacing=CELL, origin=(-11.5, -6.5, -9.5))
-    options = mpm.MpmOptions(grid=grid, dt=DT, precision="float64")
+    options = mpm.MpmOptions(grid=GRID, dt=DT, precision="float64")
     true = moved(TRUE_MODULUS, 0.1875, options)
     observed = mpm.ParticleBody(positions=true.last.x.numpy()[0], masses=true.bodies[0].masses)
-    loss = mpm.MassLoss(options.grid, observed, mass_scale=MASS_SCALE, dtype=wp.float64, device="cpu")
+    loss = mpm.MassLoss(options.grid, observed, mass_scale=1.25, dtype=wp.float64, device="cpu")
     ways = {"particles": partial(slope_of_particles, loss, options), "reduced body": partial(ReducedBar().slope, loss)}
     for factor, (name, slope_at) in product((2.0,) if "--short" in sys.argv else (2.0, 0.5), ways.items()):
         iterates = identify(slope_at, factor * TRUE_MODULUS)

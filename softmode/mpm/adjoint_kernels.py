@@ -7,9 +7,8 @@ from typing import Any
 
 import warp as wp
 
-from softmode.mpm.scatter_kernels import add_to_node, in_grid, in_lane, load_node
 from softmode.mpm.spline_kernels import cell_of, spline, spline_slope
-from softmode.mpm.step_kernels import controlled
+from softmode.mpm.step_kernels import add_to_node, controlled, in_grid, in_lane
 from softmode.mpm.stress_kernels import kirchhoff, kirchhoff_adjoint, polar_rotation
 
 wp.set_module_options({"enable_backward": False})
@@ -204,7 +203,7 @@ def particles_to_grid_adjoint(
                 work = type(dx)(0.0)
                 slope_z = type(dx)(0.0)
                 for c in range(4):
-                    both = load_node(grid_bar, world, i + a - 1, j + b - 1, k + c - 1)
+                    both = grid_bar[world, i + a - 1, j + b - 1, k + c - 1]
                     bar = type(x)(both[0], both[1], both[2])
                     node = both[3]
                     weighed = wz[c] * bar

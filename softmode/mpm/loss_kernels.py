@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from softmode.mpm.scatter_kernels import moves
+from softmode.mpm.step_kernels import moves
 
 wp.set_module_options({"enable_backward": False})
 

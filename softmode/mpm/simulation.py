@@ -18,7 +18,6 @@ from softmode.errors import ConfigError, SolverDiverged
 from softmode.mpm.adjoint_kernels import grid_to_particles_adjoint, move_grid_adjoint, particles_to_grid_adjoint
 from softmode.mpm.options import COURANT_LIMIT, MpmOptions
 from softmode.mpm.particles import ParticleBody
-from softmode.mpm.scatter_kernels import scatter_given
 from softmode.mpm.shape_kernels import add_wrenches, collide_grid, collide_grid_adjoint, find_inside
 from softmode.mpm.shapes import GridShapes
 from softmode.mpm.step_kernels import (
@@ -42,7 +41,7 @@ REASONS = {
     4: "began inside of a shape",
 }
 FILLS_GPU = 30_000
-"""Fewer particles do not fill a GPU: several threads scatter each, in smaller blocks, which more processors share."""
+"""Fewer particles do not fill a GPU: two threads scatter each (8 to 10 % of a morph's time)."""
 FEW_PARTICLES = 0.5
 """Particles per cell under which a body falls apart into unconnected clumps."""
 
@@ -133,7 +132,6 @@ class MpmSimulation:
         layer_count: int = 1,
         shapes: GridShapes | None = None,
         keep_grids: bool = False,
-        scatter_apart: bool | None = None,
         device: wp.DeviceLike = None,
     ) -> None:
         """Put bodies at rest on the grid.
@@ -146,7 +144,6 @@ class MpmSimulation:
             shapes: Rigid shapes that act on the grid.
             keep_grids: Whether the grids of all steps are kept for the gradient, where the memory limit allows, not
                 computed again. To the same bits on a CPU.
-            scatter_apart: Whether particles are added to the grid in a kernel of its own; None does so on a GPU.
             device: Where to compute; Warp's preferred device when None.
 
         Raises:
@@ -169,11 +166,7 @@ class MpmSimulation:
         self.device = wp.get_device(device)
         self.step_count, self.layer_count = step_count, layer_count
         self.world_count, self.count = len(self.bodies), max(body.count for body in self.bodies)
-        fills = self.world_count * self.count >= FILLS_GPU
-        self._lanes = 2 if self.device.is_cuda and not fills else 1
-        self._scatter_lanes = 1 if fills else 8
-        self._turn = 0
-        self._block = 256 if fills else 64
+        self._lanes = 2 if self.device.is_cuda and self.world_count * self.count < FILLS_GPU else 1
         self._model = int(models.pop())
         self._real, self._vec, self._mat = TYPES[self.options.precision]
         self.mass = self._array(self._padded([body.masses for body in self.bodies]), self._real)
@@ -190,8 +183,6 @@ class MpmSimulation:
         four = wp.types.vector(4, self._real)
         # Momentum and mass of a node lie side by side: one operation adds to both. Who reads the sums clears them.
         self._scattered, self._grid_bar = self._zeros(four, *nodes), self._zeros(four, *nodes)
-        self._apart = self.device.is_cuda if scatter_apart is None else scatter_apart
-        self._given = self._zeros(four, self.world_count, self.count if self._apart else 0, 4)
         self.shapes = shapes
         self.impulse = self._zeros(
             wp.spatial_vectord, step_count, self.world_count, 0 if shapes is None else shapes.model.shape_count
@@ -453,13 +444,11 @@ class MpmSimulation:
         return [self._vec(*grid.origin), self._real(grid.spacing)]
 
     def _launch(self, kernel: Callable[..., object], inputs: list[object]) -> None:
-        shape = (self.world_count, self.count)
-        wp.launch(kernel, shape, inputs=inputs, device=self.device, block_dim=self._block)
+        wp.launch(kernel, (self.world_count, self.count), inputs=inputs, device=self.device)
 
-    def _scatter(self, kernel: Callable[..., object], inputs: list[object], lanes: int) -> None:
-        """Launch a kernel in which several threads of a particle add to nodes."""
-        shape = (self.world_count, max(lanes, 1), self.count)
-        wp.launch(kernel, shape, inputs=[*inputs, lanes], device=self.device, block_dim=self._block)
+    def _scatter(self, kernel: Callable[..., object], inputs: list[object]) -> None:
+        shape = (self.world_count, self._lanes, self.count)
+        wp.launch(kernel, shape, inputs=[*inputs, self._lanes], device=self.device)
 
     def _scatter_mass(self, x: wp.array) -> None:
         scatter_masses(x, self.mass, self._place, self.grid_mass, self.active)
@@ -516,11 +505,8 @@ class MpmSimulation:
     def _move_grid(self, step: int, state: ParticleState) -> _MovedGrid:
         """Compute the velocities of the grid in a step."""
         grid = self._grids[step if self._keeps_grids else 0]
-        inputs = [*self._particles(state, step), self._scattered, self.failure, step, self.active, self._given]
-        self._scatter(particles_to_grid, inputs, 0 if self._apart else self._lanes)
-        if self._apart:
-            inputs = [state.x, self.mass, self._given, *self._place, self._scattered, self.active, self._turn]
-            self._scatter(scatter_given, inputs, self._scatter_lanes)
+        inputs = [*self._particles(state, step), self._scattered, self.failure, step, self.active]
+        self._scatter(particles_to_grid, inputs)
         push = self._vec(*(g * self.options.dt for g in self.options.gravity))
         self._at_nodes(move_grid, [self._scattered, self._least, push, grid.mass, grid.velocity, self.active])
         if self.shapes is not None:
@@ -590,7 +576,6 @@ class MpmSimulation:
                 self._fs_bar,
                 bar.F,
             ],
-            self._lanes,
         )
         if self.shapes is not None:
             self._at_nodes(collide_grid_adjoint, [*self._obstacles(step, grid), grid.free_velocity, self._scattered])

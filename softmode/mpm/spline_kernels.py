@@ -39,16 +39,14 @@ def spline_slope(f: Any):
 
 
 @wp.func
-def spline_along(x: Any):
-    """Return the weight of a node that lies x cells away along one axis."""
-    r = wp.abs(x)
-    if r < type(r)(1.0):
-        return type(r)(0.5) * r * r * r - r * r + type(r)(2.0) / type(r)(3.0)
-    rest = wp.max(type(r)(2.0) - r, type(r)(0.0))
-    return rest * rest * rest / type(r)(6.0)
-
-
-@wp.func
 def spline_at(x: Any):
     """Return the weight of a node that lies x cells away along each axis."""
-    return spline_along(x[0]) * spline_along(x[1]) * spline_along(x[2])
+    w = type(x[0])(1.0)
+    for axis in range(3):
+        r = wp.abs(x[axis])
+        rest = wp.max(type(r)(2.0) - r, type(r)(0.0))
+        if r < type(r)(1.0):
+            w *= type(r)(0.5) * r * r * r - r * r + type(r)(2.0) / type(r)(3.0)
+        else:
+            w *= rest * rest * rest / type(r)(6.0)
+    return w

@@ -8,7 +8,6 @@ from typing import Any
 
 import warp as wp
 
-from softmode.mpm.scatter_kernels import add_to_node, give, in_grid, in_lane, load_node, moves
 from softmode.mpm.spline_kernels import cell_of, spline
 from softmode.mpm.stress_kernels import kirchhoff, polar_rotation
 
@@ -37,6 +36,43 @@ def controlled(F: Any, control: Any, material: int):
     if material != 0:
         return F + F * control
     return F + control
+
+
+@wp.func
+def in_grid(i: int, j: int, k: int, shape: wp.vec3i):
+    """Return whether all nodes of a particle in cell (i, j, k) exist."""
+    return i >= 1 and j >= 1 and k >= 1 and i < shape[0] - 2 and j < shape[1] - 2 and k < shape[2] - 2
+
+
+# Four floats in one operation where the GPU has it: scatters are bound by the number of atomic operations.
+@wp.func_native("""
+    wp::vec_t<4, wp::float32>* at = wp::address(grid, world, i, j, k);
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
+    atomicAdd(reinterpret_cast<float4*>(at), make_float4(value[0], value[1], value[2], value[3]));
+#else
+    wp::atomic_add(at, value);
+#endif
+""")
+def add_to_node(grid: wp.array4d[wp.vec4f], world: int, i: int, j: int, k: int, value: wp.vec4f):
+    """Add to a node."""
+
+
+@wp.func
+def add_to_node(grid: wp.array4d[wp.vec4d], world: int, i: int, j: int, k: int, value: wp.vec4d):  # noqa: F811
+    """Add to a node."""
+    wp.atomic_add(grid, world, i, j, k, value)
+
+
+@wp.func
+def in_lane(a: int, b: int, lane: int, lanes: int):
+    """Return whether row (a, b) of the nodes around a particle is served by its thread ``lane`` of ``lanes``."""
+    return ((4 * a + b) & (lanes - 1)) == lane
+
+
+@wp.func
+def moves(active: wp.array[int], world: int):
+    """Return whether a world takes part in a run; one entry stands for all worlds."""
+    return active[world % active.shape[0]] != 0
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -72,13 +108,11 @@ def particles_to_grid(
     failure: wp.array2d[int],
     step: int,
     active: wp.array[int],
-    given: wp.array3d[Any],
     lanes: int,
 ):
     """Scatter momentum and mass: p_i = sum_p w_ip (m v (1 - zeta dt) + A (x_i - x_p)), A = m C - 3/dx^2 dt V tau.
 
-    Each of the ``lanes`` threads of a particle, a power of two, serves its share of the 16 rows of nodes. With 0 lanes
-    a particle only notes what it gives, for :func:`softmode.mpm.scatter_kernels.scatter_given`.
+    Each of the ``lanes`` threads of a particle, a power of two, serves its share of the 16 rows of nodes.
     """
     world, lane, p = wp.tid()
     m = mass[world, p]
@@ -98,9 +132,6 @@ def particles_to_grid(
             wy = spline(f[1])
             wz = spline(f[2])
             A = A * dx
-            if lanes == 0:
-                give(given, world, p, base, A, m)
-                return
             for a in range(4):
                 for b in range(4):
                     if in_lane(a, b, lane, lanes):
@@ -184,7 +215,7 @@ def move_grid(
     world, i, j, k = wp.tid()
     if not moves(active, world):
         return
-    both = load_node(scattered, world, i, j, k)
+    both = scattered[world, i, j, k]
     if both == scattered.dtype() and grid_mass[world, i, j, k] == both[3]:
         return
     scattered[world, i, j, k] = scattered.dtype()

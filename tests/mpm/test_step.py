@@ -14,10 +14,8 @@ from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.errors import AssetError, ConfigError, SolverDiverged
 from softmode.mpm import (
     MORPH_MATERIAL,
-    CoarseMassLoss,
     Grid,
     GridShapes,
-    MassLoss,
     MpmOptions,
     MpmSimulation,
     ParticleBody,
@@ -26,7 +24,6 @@ from softmode.mpm import (
     particles_from_mesh,
     particles_from_shape,
 )
-from softmode.mpm.simulation import TYPES
 from tests.mpm.scenes import ball, moving, torus
 from tests.oracle.fem import Mesh, Solid, static
 
@@ -295,25 +292,3 @@ def test_bad_input() -> None:
         particles_from_mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], spacing=0.1)
     with pytest.raises(AssetError, match="masses"):
         ParticleBody(positions=np.zeros((2, 3)), masses=np.array([1.0, -1.0]))
-
-
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_scatters_apart_agree(precision: str) -> None:
-    """With a kernel of its own for the scatter states, masses, losses and all gradients are the same."""
-    options = MpmOptions(precision=precision, smoothing=0.5, damping=0.5)  # type: ignore[arg-type]
-    found = []
-    for apart in (False, True):
-        s = moving(ball(2.5), options, step_count=6, scatter_apart=apart)
-        loss = MassLoss(options.grid, torus(3.0, 1.2), dtype=TYPES[precision][0], device="cpu")
-        level = CoarseMassLoss(loss, s, loss.target, factor=2)
-        value = wp.zeros(1, dtype=wp.float64, device="cpu")
-        s.forward()
-        s.check()
-        loss.after(s, value)
-        level.add(s, value)
-        bar, parameters = loss.gradient(s, [level])
-        arrays = [*s.last.arrays, s.grid_mass, value, *bar.arrays, parameters.control, parameters.mu, parameters.mass]
-        found.append([array.numpy().copy() for array in arrays])
-    rounding = 2e-5 if precision == "float32" else 1e-12
-    for together, separate in zip(*found, strict=True):
-        np.testing.assert_allclose(separate, together, rtol=0.0, atol=rounding * np.abs(together).max())
