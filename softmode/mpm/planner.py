@@ -14,9 +14,9 @@ import os
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import get_args
+from typing import Literal, get_args
 
 import numpy as np
 import warp as wp
@@ -26,6 +26,7 @@ from softmode.checks import require_choice, require_number
 from softmode.deformables import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.errors import AssetError, ConfigError, SolverDiverged
+from softmode.mpm.grid import Grid
 from softmode.mpm.losses import CoarseMassLoss, MassLoss, MassLossKind
 from softmode.mpm.options import MpmOptions
 from softmode.mpm.particles import ParticleBody
@@ -46,6 +47,7 @@ from softmode.mpm.planner_kernels import (
 )
 from softmode.mpm.run import MorphRun
 from softmode.mpm.simulation import TYPES, MpmSimulation, ParticleState
+from softmode.mpm.step_kernels import LEFT_GRID
 
 Array = NDArray[np.float64]
 
@@ -57,8 +59,12 @@ NORM_THREADS = 512
 """Threads of a GPU that sum up the gradient of a world."""
 KEPT_BYTES = 1.0e8
 """Most memory that segments take on the device before they are read back."""
+ROOM = 4
+"""Cells that a grid which follows leaves free around particles and target, beside those that velocities cross."""
 WRITING = 9.0
 """Time between two writings of a file over the time that one takes."""
+
+GridMotion = Literal["fixed", "follow"]
 
 MORPH_MATERIAL = Material(
     youngs_modulus=1.4e5, poissons_ratio=0.2, density=75.0, viscosity=0.0, model=MaterialModel.COROTATED
@@ -100,6 +106,11 @@ class MorphOptions:
     """Last part of the segments to the last target, 0..1. Each of them begins, and the run ends, with half of the
     velocity and without stress: the shape at hand becomes the rest shape (F = I). Else the body moves on, and what
     stress is left bends it, when control ends."""
+    grid: GridMotion = "fixed"
+    """What happens where particles come near the border of the grid: "fixed" rejects controls that take them there, and
+    the run ends when all do; "follow" moves the grid by whole cells between segments, and gives it more nodes where it
+    has too few, as far as ``MpmOptions.memory_limit`` allows. Positions do not change with it: on a CPU the bits are
+    those of a grid that is large from the start."""
     mpm: MpmOptions = field(default_factory=lambda: MpmOptions(damping=4.0, smoothing=0.955, control="additive"))
     """How particles are stepped. The paper has a damping of 0.5 1/s, with which bodies arrive moving and leave again;
     and `rest_volume="grid"`, with which thin parts such as ears are too stiff for its steps."""
@@ -112,6 +123,7 @@ class MorphOptions:
         require_number("step_length", self.step_length, above=0.0)
         require_number("gradient_tolerance", self.gradient_tolerance, at_least=0.0, below=1.0)
         require_choice("loss", self.loss, get_args(MassLossKind))
+        require_choice("grid", self.grid, get_args(GridMotion))
         require_number("mass_scale", self.mass_scale, above=0.0, unit="kg")
         require_number("coarse", self.coarse, at_least=0.0, at_most=1.0)
         require_number("settling", self.settling, at_least=0.0, at_most=1.0)
@@ -257,20 +269,25 @@ class MorphPlanner:
         if not self.targets:
             raise ConfigError("target: expected one or more")
         o, mpm = self.options, self.options.mpm
+        sources = (source,) if isinstance(source, ParticleBody) else tuple(source)
+        points = [body.positions for body in sources] if o.grid == "follow" else []
+        if points:
+            mpm = replace(mpm, grid=mpm.grid.reaching(*points, room=ROOM))
         self.simulation = s = MpmSimulation(
-            source,
+            sources,
             mpm,
             step_count=o.segment_length,
             layer_count=o.control_layers,
             keep_grids=True,
             device=device,
         )
+        if points:
+            s.place_grid(mpm.grid.reaching(*points, self.targets[0].positions, room=ROOM))
+        grid = s.options.grid
+        for goal in self.targets[: 1 if points else None]:
+            grid.require(goal.positions, "target")
         real, _, mat = TYPES[mpm.precision]
-        for goal in self.targets:
-            mpm.grid.require(goal.positions, "target")
-        self.loss = MassLoss(
-            mpm.grid, self.targets[0], kind=o.loss, mass_scale=o.mass_scale, dtype=real, device=s.device
-        )
+        self.loss = MassLoss(grid, self.targets[0], kind=o.loss, mass_scale=o.mass_scale, dtype=real, device=s.device)
         factors = COARSE if o.coarse and o.loss == "log" else ()
         self._coarse = [CoarseMassLoss(self.loss, s, self.targets[0], factor=factor) for factor in factors]
         self.notes = tuple(
@@ -350,19 +367,15 @@ class MorphPlanner:
             self._aim(target)
             while log.segment_count < sum(self._settling(target)):
                 self._set_up_segment(target)
-                self._run_segment()
-                self._kept.stow()
-                loss, failed = self._kept.record.status.numpy().T
-                if failed.any():
-                    try:
-                        s.check()
-                    except SolverDiverged as error:
-                        if not log.segment_count:
-                            raise
-                        log.notes = (*log.notes, f"ended after {log.segment_count} segments: {error}")
-                        warnings.warn(log.notes[-1], RuntimeWarning, stacklevel=2)
-                        return self._runs(file)
-                log.losses.append(loss.copy())
+                try:
+                    loss = self._find_segment(target)
+                except (ConfigError, SolverDiverged) as error:
+                    if not log.segment_count:
+                        raise
+                    log.notes = (*log.notes, f"ended after {log.segment_count} segments: {error}")
+                    warnings.warn(log.notes[-1], RuntimeWarning, stacklevel=2)
+                    return self._runs(file)
+                log.losses.append(loss)
                 self._kept.keep()
                 if progress is not None:
                     progress(log.segment_count - 1, float(loss.max()))
@@ -373,8 +386,51 @@ class MorphPlanner:
             log.ends.append(log.segment_count)
         return self._runs(file)
 
+    def _find_segment(self, target: int) -> Array:
+        """Plan a segment and return its losses, (W,); with a grid that follows on one where it has room.
+
+        Raises:
+            ConfigError: If that grid does not fit into the memory limit.
+            SolverDiverged: If no control keeps the particles on the grid and finite.
+        """
+        s, follows = self.simulation, self.options.grid == "follow"
+        # Sound crosses at most a cell in a step: what leaves that much more room is thrown out, not pushed.
+        for room in (ROOM, ROOM + self.options.segment_length) if follows else (0,):
+            if follows:
+                self._follow(target, room)
+            self._run_segment()
+            self._kept.stow()
+            loss, failed = self._kept.record.status.numpy().T
+            if not (failed.any() and (s.failure.numpy()[failed > 0.0, 1] == LEFT_GRID).all()):
+                break
+        if failed.any():
+            s.check()
+        return loss.copy()
+
+    def _follow(self, target: int, room: int) -> None:
+        """Bring the grid to where particles, moving on, and the target have room."""
+        s = self.simulation
+        grid, duration = s.options.grid, s.step_count * s.options.dt
+        x, v = (array.numpy().astype(np.float64).reshape(-1, 3) for array in (s.first.x, s.first.v))
+        moved = x + duration * v
+        if np.isfinite(moved).all():
+            self._place(grid.reaching(x, moved, self.targets[target].positions, room=room), target)
+
+    def _place(self, grid: Grid, target: int) -> None:
+        """Take another part of the grid's nodes; a graph is captured again if arrays changed with it."""
+        s = self.simulation
+        if grid == s.options.grid:
+            return
+        self._kept.flush()
+        if s.place_grid(grid):
+            self._graph = None
+        for loss in (self.loss, *self._coarse):
+            loss.place(grid, self.targets[target])
+
     def _aim(self, target: int) -> None:
         """Turn to a target."""
+        if self.options.grid == "follow":
+            self._follow(target, ROOM)
         for loss in (self.loss, *self._coarse):
             loss.aim(self.targets[target])
         log = self._log
@@ -481,14 +537,13 @@ class MorphPlanner:
     def _warm_up(self) -> None:
         """Run every kernel of a segment once and forget what they did: compiles, and allocates what a graph needs."""
         s, search = self.simulation, self._search
-        begin = [(array, wp.clone(array)) for array in s.first.arrays]
+        changed = (*s.first.arrays, search.gradient_count, search.trial_count, self._kept.record.count)
+        begin = [(array, wp.clone(array)) for array in changed]
         self._begin_segment(self.options.iteration_count)
         self._descend()
         self._end_segment()
         for array, value in begin:
             wp.copy(array, value)
-        for array in (search.gradient_count, search.trial_count, self._kept.record.count):
-            array.zero_()
 
     def _plan_segment(self) -> None:
         self._begin_segment(self.options.pass_count * self.options.iteration_count)
