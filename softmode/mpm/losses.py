@@ -272,7 +272,8 @@ class CoarseMassLoss:
         """Return the coarse grid over a fine one; its nodes do not depend on where that one begins."""
         width, first = self._factor * grid.spacing, np.array(grid.first)
         begin = first // self._factor
-        shape = -(-(first + np.array(grid.shape) - 1) // self._factor) - begin + 2 * MARGIN + 1
+        # One more than cells on a grid that begins with a coarse node: the shape is that of any place.
+        shape = -(-(np.array(grid.shape) - 1) // self._factor) + 2 * MARGIN + 2
         origin = np.array(grid.origin) - MARGIN * width
         return Grid(
             shape=(int(shape[0]), int(shape[1]), int(shape[2])),

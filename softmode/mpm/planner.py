@@ -393,19 +393,25 @@ class MorphPlanner:
             ConfigError: If that grid does not fit into the memory limit.
             SolverDiverged: If no control keeps the particles on the grid and finite.
         """
-        s, follows = self.simulation, self.options.grid == "follow"
-        # Sound crosses at most a cell in a step: what leaves that much more room is thrown out, not pushed.
-        for room in (ROOM, ROOM + self.options.segment_length) if follows else (0,):
-            if follows:
-                self._follow(target, room)
+        if self.options.grid == "follow":
+            self._follow(target, ROOM)
             self._run_segment()
-            self._kept.stow()
-            loss, failed = self._kept.record.status.numpy().T
-            if not (failed.any() and (s.failure.numpy()[failed > 0.0, 1] == LEFT_GRID).all()):
-                break
+            if self._left_grid():
+                # Sound crosses at most a cell in a step: what leaves that much more room is thrown out, not pushed.
+                self._follow(target, ROOM + self.options.segment_length)
+                self._run_segment()
+        else:
+            self._run_segment()
+        self._kept.stow()
+        loss, failed = self._kept.record.status.numpy().T
         if failed.any():
-            s.check()
-        return loss.copy()
+            self.simulation.check()
+        return np.array(loss)
+
+    def _left_grid(self) -> bool:
+        """Return whether a segment failed since particles left the grid, and for no other reason."""
+        failed = self._kept.record.status.numpy()[:, 1] > 0.0
+        return bool(failed.any() and (self.simulation.failure.numpy()[failed, 1] == LEFT_GRID).all())
 
     def _follow(self, target: int, room: int) -> None:
         """Bring the grid to where particles, moving on, and the target have room."""
