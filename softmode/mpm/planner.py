@@ -47,7 +47,6 @@ from softmode.mpm.planner_kernels import (
 )
 from softmode.mpm.run import MorphRun
 from softmode.mpm.simulation import TYPES, MpmSimulation, ParticleState
-from softmode.mpm.step_kernels import LEFT_GRID
 
 Array = NDArray[np.float64]
 
@@ -394,33 +393,22 @@ class MorphPlanner:
             SolverDiverged: If no control keeps the particles on the grid and finite.
         """
         if self.options.grid == "follow":
-            self._follow(target, ROOM)
-            self._run_segment()
-            if self._left_grid():
-                # Sound crosses at most a cell in a step: what leaves that much more room is thrown out, not pushed.
-                self._follow(target, ROOM + self.options.segment_length)
-                self._run_segment()
-        else:
-            self._run_segment()
+            self._follow(target)
+        self._run_segment()
         self._kept.stow()
         loss, failed = self._kept.record.status.numpy().T
         if failed.any():
             self.simulation.check()
         return np.array(loss)
 
-    def _left_grid(self) -> bool:
-        """Return whether a segment failed since particles left the grid, and for no other reason."""
-        failed = self._kept.record.status.numpy()[:, 1] > 0.0
-        return bool(failed.any() and (self.simulation.failure.numpy()[failed, 1] == LEFT_GRID).all())
-
-    def _follow(self, target: int, room: int) -> None:
+    def _follow(self, target: int) -> None:
         """Bring the grid to where particles, moving on, and the target have room."""
         s = self.simulation
         grid, duration = s.options.grid, s.step_count * s.options.dt
         x, v = (array.numpy().astype(np.float64).reshape(-1, 3) for array in (s.first.x, s.first.v))
         moved = x + duration * v
         if np.isfinite(moved).all():
-            self._place(grid.reaching(x, moved, self.targets[target].positions, room=room), target)
+            self._place(grid.reaching(x, moved, self.targets[target].positions, room=ROOM), target)
 
     def _place(self, grid: Grid, target: int) -> None:
         """Take another part of the grid's nodes; a graph is captured again if arrays changed with it."""
@@ -436,7 +424,7 @@ class MorphPlanner:
     def _aim(self, target: int) -> None:
         """Turn to a target."""
         if self.options.grid == "follow":
-            self._follow(target, ROOM)
+            self._follow(target)
         for loss in (self.loss, *self._coarse):
             loss.aim(self.targets[target])
         log = self._log
