@@ -159,9 +159,7 @@ def bar_as_body(times: Array, substeps: int = 1) -> tuple[list[Array], int, floa
     """Let the bar fall as a reduced body; return its surface at some times [m], the number of steps, and their time."""
     wide = float("inf")
     root = Region(name="root", box=((-wide,) * 3, (-0.5 * LENGTH + CLAMP, wide, wide)))
-    body = build_body(
-        quadrature_from_box((LENGTH, EDGE, EDGE), point_count=4000, surface_count=2000), regions=(root,), progress=False
-    )
+    body = build_body(quadrature_from_box((LENGTH, EDGE, EDGE), point_count=4000), regions=(root,), progress=False)
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
     add_reduced_body(builder, body, material=BAR)
     model = builder.finalize(device="cpu")
@@ -196,12 +194,11 @@ def draw_bar(out: Path, plot: Any) -> None:
     ):
         end = places[0][:, 0] > 0.5 * LENGTH - 0.5 * CELL
         sinks[name] = np.array([-float((x - places[0])[end, 2].mean()) for x in places])
-        front = places[0][:, 1] < -0.5 * EDGE + 0.5 * CELL
-        for k, alpha in zip(FALLING, (0.3, 0.5, 1.0), strict=True):
-            x = places[k][front]
+        for k, alpha in zip(FALLING, (0.25, 0.5, 1.0), strict=True):
+            x = places[k]
             axis.scatter(100.0 * x[:, 0], 100.0 * x[:, 2], s=2.0, color=color, alpha=alpha, lw=0.0)
         axis.axvspan(-17.0, 100.0 * (-0.5 * LENGTH + CLAMP), color="0.85", zorder=0)
-        axis.set(xlim=(-17, 18), ylim=(-22, 4), aspect="equal", xlabel="x [cm]", ylabel="z [cm]")
+        axis.set(xlim=(-17, 18), ylim=(-28, 6), aspect="equal", xlabel="x [cm]", ylabel="z [cm]")
         axis.set_title(f"{name}: {len(places[0])} points\n{steps} steps, {seconds:.2g} s of a core", fontsize=9)
         axes[2].plot(times, 100.0 * sinks[name], color=color, label=name)
         print(
@@ -213,7 +210,7 @@ def draw_bar(out: Path, plot: Any) -> None:
     axes[2].set(xlabel="time [s]", ylabel="the end has sunk [cm]")
     axes[2].invert_yaxis()
     axes[2].grid(visible=True, alpha=0.3)
-    axes[2].legend(loc="lower right")
+    axes[2].legend()
     figure.savefig(out / "morph_bar.png", dpi=110)
 
 
