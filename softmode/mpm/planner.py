@@ -108,8 +108,8 @@ class MorphOptions:
     grid: GridMotion = "fixed"
     """What happens where particles come near the border of the grid: "fixed" rejects controls that take them there, and
     the run ends when all do; "follow" moves the grid by whole cells between segments, and gives it more nodes where it
-    has too few, as far as ``MpmOptions.memory_limit`` allows. Positions do not change with it: on a CPU the bits are
-    those of a grid that is large from the start."""
+    has too few, as far as ``MpmOptions.memory_limit`` allows. On a CPU the bits are those of a grid that is
+    large from the start, while no particle leaves its room within a segment (``docs/morphing.md``)."""
     mpm: MpmOptions = field(default_factory=lambda: MpmOptions(damping=4.0, smoothing=0.955, control="additive"))
     """How particles are stepped. The paper has a damping of 0.5 1/s, with which bodies arrive moving and leave again;
     and `rest_volume="grid"`, with which thin parts such as ears are too stiff for its steps."""
