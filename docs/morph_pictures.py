@@ -75,6 +75,7 @@ def draw_loss(out: Path, plot: Any) -> None:
     frames = {frame.step: frame for frame in replay(run, source, target, options, stride=10, device="cpu")}
     figure, axes = plot.subplots(1, len(SHOWN), figsize=(2.2 * len(SHOWN) + 0.8, 2.9), layout="constrained")
     turn = np.array([[np.cos(0.6), np.sin(0.6), 0.0], [-np.sin(0.6), np.cos(0.6), 0.0], [0.0, 0.0, 1.0]])
+    shown: Any = None
     for axis, step in zip(axes, SHOWN, strict=True):
         frame = frames[step]
         x = frame.particles @ turn.T
@@ -162,7 +163,7 @@ def bar_as_body(times: Array, substeps: int = 1) -> tuple[list[Array], int, floa
     body = build_body(quadrature_from_box((LENGTH, EDGE, EDGE), point_count=4000), regions=(root,), progress=False)
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
     add_reduced_body(builder, body, material=BAR)
-    model = builder.finalize(device="cpu")
+    model: Any = builder.finalize(device="cpu")
     solver = SolverReduced(model, [body], options=SolverReducedOptions(integrator="bdf2"))
     markers = Markers(solver, body.surface_points)
     duration = float(times[1]) / substeps
