@@ -35,6 +35,7 @@ def grid_to_particles_adjoint(
     grid_velocity: wp.array4d[Any],
     origin: Any,
     dx: Any,
+    first: wp.array[wp.vec3i],
     dt: Any,
     smoothing: Any,
     # Bars in:
@@ -55,7 +56,7 @@ def grid_to_particles_adjoint(
     """
     world, lane, p = wp.tid()
     x = x_in[world, p]
-    i, j, k, f = cell_of(x, origin, dx)
+    i, j, k, f = cell_of(x, origin, dx, first[0])
     shape = wp.vec3i(grid_velocity.shape[1], grid_velocity.shape[2], grid_velocity.shape[3])
     if mass[world, p] > type(dx)(0.0) and in_grid(i, j, k, shape):
         F = F_in[world, p]
@@ -149,6 +150,7 @@ def particles_to_grid_adjoint(
     # Grid:
     origin: Any,
     dx: Any,
+    first: wp.array[wp.vec3i],
     dt: Any,
     damping: Any,
     # Bars in:
@@ -168,7 +170,7 @@ def particles_to_grid_adjoint(
     world, p = wp.tid()
     x = x_in[world, p]
     m = mass[world, p]
-    i, j, k, f = cell_of(x, origin, dx)
+    i, j, k, f = cell_of(x, origin, dx, first[0])
     shape = wp.vec3i(grid_bar.shape[1], grid_bar.shape[2], grid_bar.shape[3])
     if m > type(dx)(0.0) and in_grid(i, j, k, shape):
         F = F_in[world, p]
@@ -198,7 +200,7 @@ def particles_to_grid_adjoint(
                 wxy = wx[a] * wy[b]
                 row = base + A_dx * type(x)(type(dx)(a - 1), type(dx)(b - 1), type(dx)(0.0))
                 along = type(x)()
-                first = type(x)()
+                along_z = type(x)()
                 mass_along = type(dx)(0.0)
                 work = type(dx)(0.0)
                 slope_z = type(dx)(0.0)
@@ -208,7 +210,7 @@ def particles_to_grid_adjoint(
                     node = both[3]
                     weighed = wz[c] * bar
                     along += weighed
-                    first += type(dx)(c - 1) * weighed
+                    along_z += type(dx)(c - 1) * weighed
                     mass_along += wz[c] * node
                     power = m * node + wp.dot(bar, row + type(dx)(c - 1) * lift)
                     work += wz[c] * power
@@ -220,7 +222,7 @@ def particles_to_grid_adjoint(
                 for r in range(3):
                     A_bar[r, 0] += type(dx)(a - 1) * along[r]
                     A_bar[r, 1] += type(dx)(b - 1) * along[r]
-                    A_bar[r, 2] += wxy * first[r]
+                    A_bar[r, 2] += wxy * along_z[r]
         A_bar = (A_bar - wp.outer(p_bar, f)) * dx
         x_bar[world, p] = x_bar[world, p] + slope / dx - wp.transpose(A) * p_bar
         v_bar[world, p] = (m * kept) * p_bar
@@ -243,6 +245,7 @@ def mass_to_grid_adjoint(
     mass: wp.array2d[Any],
     origin: Any,
     dx: Any,
+    first: wp.array[wp.vec3i],
     grid_mass_bar: wp.array4d[Any],
     # Out, added to:
     x_bar: wp.array2d[Any],
@@ -252,7 +255,7 @@ def mass_to_grid_adjoint(
     world, p = wp.tid()
     x = x_in[world, p]
     m = mass[world, p]
-    i, j, k, f = cell_of(x, origin, dx)
+    i, j, k, f = cell_of(x, origin, dx, first[0])
     slope = type(x)()
     m_bar = m * type(dx)(0.0)
     shape = wp.vec3i(grid_mass_bar.shape[1], grid_mass_bar.shape[2], grid_mass_bar.shape[3])

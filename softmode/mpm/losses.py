@@ -6,7 +6,6 @@ being thrown out for a small gain (Xu, Song, Levin, Hyde 2025, eqs. (5) to (7)).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Literal, get_args
 
@@ -58,7 +57,8 @@ class MassLoss:
         require_number("mass_scale", mass_scale, above=0.0, unit="kg")
         self.grid, self.kind, self.device = grid, kind, wp.get_device(device)
         vec = wp.vec3f if dtype is wp.float32 else wp.vec3d
-        self._place = [vec(*grid.origin), dtype(grid.spacing)]
+        self._first = wp.array([grid.first], dtype=wp.vec3i, device=self.device)
+        self._place = [vec(*grid.origin), dtype(grid.spacing), self._first]
         self._scale = dtype(mass_scale)
         self.dtype, self.mass_scale, self._vec = dtype, mass_scale, vec
         self._one = wp.full(1, 1.0, dtype=wp.float64, device=self.device)
@@ -77,6 +77,18 @@ class MassLoss:
         self.target = target
         x = wp.array(target.positions[None], dtype=self._vec, device=self.device)
         wp.copy(self.target_mass, self._on_grid(x, wp.array(target.masses[None], dtype=self.dtype, device=self.device)))
+
+    def place(self, grid: Grid, target: ParticleBody) -> None:
+        """Take another part of the same nodes, and a target; graphs that were captured hold while the shape does.
+
+        Raises:
+            ConfigError: If one of the target's particles lies outside of the grid.
+        """
+        if grid.shape != self.grid.shape:
+            self.target_mass = wp.zeros((1, *grid.shape), dtype=self.dtype, device=self.device)
+        self.grid = grid
+        self._first.assign([grid.first])
+        self.aim(target)
 
     def evaluate(
         self, grid_mass: wp.array, loss: wp.array, grid_mass_bar: wp.array, active: wp.array | None = None
@@ -247,22 +259,41 @@ class CoarseMassLoss:
             target: Particles that masses should come to.
             factor: Width of its cells over the grid's; also the factor of the loss, while :attr:`weight` is 1.
         """
-        low, width = np.array(fine.grid.origin), factor * fine.grid.spacing
-        shape = [math.ceil((n - 1) / factor) + 2 * MARGIN + 1 for n in fine.grid.shape]
-        origin = low - MARGIN * width
-        grid = Grid(
-            shape=(shape[0], shape[1], shape[2]),
-            spacing=width,
-            origin=(float(origin[0]), float(origin[1]), float(origin[2])),
-        )
         scale = factor**3 * fine.mass_scale
+        self._factor, self._worlds = factor, simulation.world_count
+        grid = self._coarse(fine.grid)
         self._loss = MassLoss(grid, target, mass_scale=scale, dtype=fine.dtype, device=fine.device)
-        self._factor = factor
-        nodes = (simulation.world_count, *grid.shape)
+        self._allocate()
         with wp.ScopedDevice(fine.device):
-            self._mass, self._bar = (wp.zeros(nodes, dtype=fine.dtype) for _ in range(2))
             self._weight = wp.zeros(1, dtype=wp.float64)
         self.weigh(1.0)
+
+    def _coarse(self, grid: Grid) -> Grid:
+        """Return the coarse grid over a fine one; its nodes do not depend on where that one begins."""
+        width, first = self._factor * grid.spacing, np.array(grid.first)
+        begin = first // self._factor
+        # One more than cells on a grid that begins with a coarse node: the shape is that of any place.
+        shape = -(-(np.array(grid.shape) - 1) // self._factor) + 2 * MARGIN + 2
+        origin = np.array(grid.origin) - MARGIN * width
+        return Grid(
+            shape=(int(shape[0]), int(shape[1]), int(shape[2])),
+            spacing=width,
+            origin=(float(origin[0]), float(origin[1]), float(origin[2])),
+            first=(int(begin[0]), int(begin[1]), int(begin[2])),
+        )
+
+    def _allocate(self) -> None:
+        """Make the arrays of the nodes."""
+        nodes, loss = (self._worlds, *self._loss.grid.shape), self._loss
+        self._mass, self._bar = (wp.zeros(nodes, dtype=loss.dtype, device=loss.device) for _ in range(2))
+
+    def place(self, fine: Grid, target: ParticleBody) -> None:
+        """Take another part of the fine grid's nodes, and a target, as :meth:`MassLoss.place`."""
+        grid = self._coarse(fine)
+        other = grid.shape != self._loss.grid.shape
+        self._loss.place(grid, target)
+        if other:
+            self._allocate()
 
     def weigh(self, weight: float) -> None:
         """Set the factor of the loss, beside that of its cells; graphs that were captured read it."""

@@ -45,9 +45,8 @@ def morph(
     """
     chosen = options or MorphOptions()
     grid = chosen.mpm.grid
-    middle = np.array(grid.origin) + 0.5 * (np.array(grid.shape) - 1) * grid.spacing
     bodies = [source, *((target,) if isinstance(target, ParticleBody) else target)]
-    offsets = np.array([middle - body.centre for body in bodies])
+    offsets = np.array([grid.middle - body.centre for body in bodies])
     first, *goals = (body.moved(offset) for body, offset in zip(bodies, offsets, strict=True))
     planner = MorphPlanner(first, goals, chosen, device=device)
     return planner.run(progress, file=file, names=names, offsets=offsets)[0]

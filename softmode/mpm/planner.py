@@ -2,21 +2,21 @@
 
 A segment is a few steps with one control for each particle. Its controls descend the loss of the masses at the end of
 the segment, by Adam with a halving line search; the state at its end is the start of the next (Xu, Song, Levin, Hyde
-2025, algorithms 1 and 2, with their errors mended: ``docs/morphing.md``). A segment stays on the device: gradients,
-steps, trials and their acceptance.
+2025, algorithms 1 and 2, with their errors mended: ``docs/morphing.md``). A segment stays on the device, as one graph:
+gradients, steps, trials, their acceptance, what the next begins with, and what is kept. Losses alone are read back.
 """
 
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import time
 import warnings
-from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import get_args
+from typing import Literal, get_args
 
 import numpy as np
 import warp as wp
@@ -26,22 +26,27 @@ from softmode.checks import require_choice, require_number
 from softmode.deformables import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.errors import AssetError, ConfigError, SolverDiverged
+from softmode.mpm.grid import Grid
 from softmode.mpm.losses import CoarseMassLoss, MassLoss, MassLossKind
 from softmode.mpm.options import MpmOptions
 from softmode.mpm.particles import ParticleBody
 from softmode.mpm.planner_kernels import (
+    Record,
     Search,
     adam_direction,
-    begin_pass,
+    begin_gradient,
     begin_search,
+    end_gradient,
+    end_segment,
     gradient_norm,
+    hand_over,
     judge_start,
     judge_trial,
     keep_trial,
     try_control,
 )
 from softmode.mpm.run import MorphRun
-from softmode.mpm.simulation import TYPES, MpmSimulation
+from softmode.mpm.simulation import TYPES, MpmSimulation, ParticleState
 
 Array = NDArray[np.float64]
 
@@ -51,8 +56,14 @@ COARSE = (2, 4)
 """Cells of the coarser grids over those of the particles'."""
 NORM_THREADS = 512
 """Threads of a GPU that sum up the gradient of a world."""
+KEPT_BYTES = 1.0e8
+"""Most memory that segments take on the device before they are read back."""
+ROOM = 4
+"""Cells that a grid which follows leaves free around particles and target, beside those that velocities cross."""
 WRITING = 9.0
 """Time between two writings of a file over the time that one takes."""
+
+GridMotion = Literal["fixed", "follow"]
 
 MORPH_MATERIAL = Material(
     youngs_modulus=1.4e5, poissons_ratio=0.2, density=75.0, viscosity=0.0, model=MaterialModel.COROTATED
@@ -94,6 +105,11 @@ class MorphOptions:
     """Last part of the segments to the last target, 0..1. Each of them begins, and the run ends, with half of the
     velocity and without stress: the shape at hand becomes the rest shape (F = I). Else the body moves on, and what
     stress is left bends it, when control ends."""
+    grid: GridMotion = "fixed"
+    """What happens where particles come near the border of the grid: "fixed" rejects controls that take them there, and
+    the run ends when all do; "follow" moves the grid by whole cells between segments, and gives it more nodes where it
+    has too few, as far as ``MpmOptions.memory_limit`` allows. On a CPU the bits are those of a grid that is
+    large from the start, while no particle leaves its room within a segment (``docs/morphing.md``)."""
     mpm: MpmOptions = field(default_factory=lambda: MpmOptions(damping=4.0, smoothing=0.955, control="additive"))
     """How particles are stepped. The paper has a damping of 0.5 1/s, with which bodies arrive moving and leave again;
     and `rest_volume="grid"`, with which thin parts such as ears are too stiff for its steps."""
@@ -106,6 +122,7 @@ class MorphOptions:
         require_number("step_length", self.step_length, above=0.0)
         require_number("gradient_tolerance", self.gradient_tolerance, at_least=0.0, below=1.0)
         require_choice("loss", self.loss, get_args(MassLossKind))
+        require_choice("grid", self.grid, get_args(GridMotion))
         require_number("mass_scale", self.mass_scale, above=0.0, unit="kg")
         require_number("coarse", self.coarse, at_least=0.0, at_most=1.0)
         require_number("settling", self.settling, at_least=0.0, at_most=1.0)
@@ -119,8 +136,10 @@ class _Log:
     def __init__(self, fingerprint: str, names: tuple[str, ...], offsets: Array, notes: tuple[str, ...]) -> None:
         """Begin with nothing."""
         self.fingerprint, self.names, self.offsets, self.notes = fingerprint, names, offsets, notes
-        self.rows: defaultdict[str, list[np.ndarray]] = defaultdict(list)
-        """Arrays of a :class:`MorphRun` by name, row by row, with the world as first axis."""
+        self.first_losses: list[Array] = []
+        """Losses to each target when its turn came, each (W,)."""
+        self.losses: list[Array] = []
+        """Losses at the start and after each segment, each (W,)."""
         self.ends: list[int] = []
         self.counts: tuple[int, int] = (0, 0)
         """Gradients and trials of the part that a file held."""
@@ -128,22 +147,95 @@ class _Log:
     @property
     def segment_count(self) -> int:
         """Number of segments so far."""
-        return len(self.rows["kinetic_energy"])
+        return len(self.losses) - 1
 
-    def add(self, **rows: wp.array | np.ndarray) -> None:
-        """Append rows."""
-        for name, row in rows.items():
-            self.rows[name].append(row.numpy().copy() if isinstance(row, wp.array) else row)
+
+class _Kept:
+    """States, controls and kinetic energies of segments: rows on the device until they are read into the host's."""
+
+    def __init__(self, simulation: MpmSimulation, segments: int) -> None:
+        """Make room for a number of segments of a simulation."""
+        s = self._simulation = simulation
+        _, vec, mat = TYPES[s.options.precision]
+        self._mass = s.mass.numpy().astype(np.float64)
+        self._segments, shape, layers = segments, (s.world_count, s.count), s.layer_count
+        row = (15 + 9 * layers) * np.dtype(s.options.precision).itemsize * math.prod(shape)
+        self.rows = max(1, min(segments, int(KEPT_BYTES / row)))
+        with wp.ScopedDevice(s.device):
+            self.x, self.v = (wp.zeros((self.rows, *shape), dtype=vec) for _ in range(2))
+            self.F = wp.zeros((self.rows, *shape), dtype=mat)
+            self.control = wp.zeros((self.rows, layers, *shape), dtype=mat)
+            kept = (self.x, self.v, self.F, self.control)
+            pinned = s.device.is_cuda
+            self._fetched = tuple(wp.empty(a.shape, dtype=a.dtype, device="cpu", pinned=pinned) for a in kept)
+            self.record = Record()
+            for name in ("count", "row", "settles", "settling"):
+                setattr(self.record, name, wp.zeros(1, dtype=int))
+            self.record.goal = wp.zeros(shape[0], dtype=wp.float64)
+            self.record.status = wp.zeros((shape[0], 2), dtype=wp.float64)
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin with the state at hand, and nothing else."""
+        s, count, plain = self._simulation, self._segments, np.dtype(self._simulation.options.precision)
+        self.positions = np.empty((count + 1, *s.mass.shape, 3), dtype=plain)
+        self.deformation = np.empty((count + 1, *s.mass.shape, 3, 3), dtype=plain)
+        self.controls = np.empty((count, *s.control.shape, 3, 3), dtype=plain)
+        self.kinetic_energy = np.empty((count, s.world_count))
+        self.read, self._unstowed, self.waiting = 0, 0, 0
+        """Segments on the host, those that were fetched, and those on the device alone."""
+        self.positions[0], self.deformation[0] = s.first.x.numpy(), s.first.F.numpy()
+        self.record.count.zero_()
+
+    def take(self, run: MorphRun) -> None:
+        """Take the segments of a run of one world."""
+        self.read = n = run.segment_count
+        self.positions[: n + 1, 0], self.deformation[: n + 1, 0] = run.positions, run.deformation
+        self.controls[:n, :, 0] = run.control.reshape(n, *self.controls.shape[1:2], *self.controls.shape[3:])
+        self.kinetic_energy[:n, 0] = run.kinetic_energy
+
+    def keep(self) -> None:
+        """Note that a segment left a row; when there is no room for another take all off the device."""
+        self.waiting += 1
+        if self.waiting == self.rows:
+            self._fetch()
+
+    def flush(self) -> None:
+        """Read all rows back."""
+        self.stow()
+        if self.waiting:
+            self._fetch()
+            self.stow()
+
+    def _fetch(self) -> None:
+        """Take all rows off the device."""
+        for fetched, rows in zip(self._fetched, (self.x, self.v, self.F, self.control), strict=True):
+            wp.copy(fetched, rows, count=self.waiting * math.prod(rows.shape[1:]))
+        wp.synchronize_device(self._simulation.device)
+        self.record.count.zero_()
+        self._unstowed, self.waiting = self.waiting, 0
+
+    def stow(self) -> None:
+        """Put what was taken off the device where it belongs; a GPU goes on with the next segment meanwhile."""
+        begin, end = self.read, self.read + self._unstowed
+        if begin == end:
+            return
+        x, v, F, control = (fetched.numpy()[: self._unstowed] for fetched in self._fetched)
+        self.positions[begin + 1 : end + 1], self.deformation[begin + 1 : end + 1] = x, F
+        self.controls[begin:end] = control
+        self.kinetic_energy[begin:end] = 0.5 * (self._mass * (v.astype(np.float64) ** 2).sum(axis=3)).sum(axis=2)
+        self.read, self._unstowed = end, 0
 
     def of_world(self, world: int, count: int) -> dict[str, np.ndarray]:
-        """Return the rows of a world without padding, stacked."""
-        tensors = {"positions": (3,), "deformation": (3, 3), "control": (3, 3)}
-        found = {
-            name: np.array([row[world, :count] for row in self.rows[name]]).reshape(-1, count, *shape)
-            for name, shape in tensors.items()
+        """Return what was read of a world, without padding; it shares the memory of all worlds."""
+        n = self.read
+        control = self.controls[:n, :, world, :count]
+        return {
+            "positions": self.positions[: n + 1, world, :count],
+            "deformation": self.deformation[: n + 1, world, :count],
+            "control": control.reshape(-1, *control.shape[2:]),
+            "kinetic_energy": self.kinetic_energy[:n, world],
         }
-        losses = ("losses", "first_losses", "kinetic_energy")
-        return found | {name: np.array([row[world] for row in self.rows[name]]) for name in losses}
 
 
 class MorphPlanner:
@@ -176,20 +268,25 @@ class MorphPlanner:
         if not self.targets:
             raise ConfigError("target: expected one or more")
         o, mpm = self.options, self.options.mpm
+        sources = (source,) if isinstance(source, ParticleBody) else tuple(source)
+        points = [body.positions for body in sources] if o.grid == "follow" else []
+        if points:
+            mpm = replace(mpm, grid=mpm.grid.reaching(*points, room=ROOM))
         self.simulation = s = MpmSimulation(
-            source,
+            sources,
             mpm,
             step_count=o.segment_length,
             layer_count=o.control_layers,
             keep_grids=True,
             device=device,
         )
+        if points:
+            s.place_grid(mpm.grid.reaching(*points, self.targets[0].positions, room=ROOM))
+        grid = s.options.grid
+        for goal in self.targets[: 1 if points else None]:
+            grid.require(goal.positions, "target")
         real, _, mat = TYPES[mpm.precision]
-        for goal in self.targets:
-            mpm.grid.require(goal.positions, "target")
-        self.loss = MassLoss(
-            mpm.grid, self.targets[0], kind=o.loss, mass_scale=o.mass_scale, dtype=real, device=s.device
-        )
+        self.loss = MassLoss(grid, self.targets[0], kind=o.loss, mass_scale=o.mass_scale, dtype=real, device=s.device)
         factors = COARSE if o.coarse and o.loss == "log" else ()
         self._coarse = [CoarseMassLoss(self.loss, s, self.targets[0], factor=factor) for factor in factors]
         self.notes = tuple(
@@ -210,15 +307,20 @@ class MorphPlanner:
             self._search.step = wp.zeros(worlds, dtype=float)
             for name in ("adam_count", "halvings", "searching", "active", "gradient_count", "trial_count"):
                 setattr(self._search, name, wp.zeros(worlds, dtype=int))
-            self._search.any_searching, self._search.stale = wp.zeros(1, dtype=int), wp.zeros(1, dtype=int)
+            for name in ("any_searching", "stale", "left"):
+                setattr(self._search, name, wp.zeros(1, dtype=int))
             self._accepted_now = wp.zeros(worlds, dtype=int)
             names = ("accepted", "first_moment", "second_moment", "first_trial", "second_trial", "direction")
             self._accepted, self._first, self._second, self._first_trial, self._second_trial, self._direction = (
                 wp.zeros(shape, dtype=mat) for _ in names
             )
+        self._kept = _Kept(s, self.segments * len(self.targets))
         self._graph: wp.Graph | None = None
-        self._compiled = False
-        """Whether a segment has run, which compiles kernels and allocates what a graph needs."""
+
+    @property
+    def segments(self) -> int:
+        """Most segments to a target."""
+        return -(-self.options.frame_count // self.options.segment_length)
 
     def run(
         self,
@@ -247,7 +349,7 @@ class MorphPlanner:
         Warns:
             RuntimeWarning: If none does in a later one: the runs then end with the last good segment.
         """
-        o, s = self.options, self.simulation
+        s = self.simulation
         if file is not None and s.world_count > 1:
             raise ConfigError(f"file: holds one morph, there are {s.world_count}", hint="save the runs one by one")
         self._log = log = _Log(
@@ -256,45 +358,26 @@ class MorphPlanner:
             np.zeros((len(self.targets) + 1, 3)) if offsets is None else np.asarray(offsets, dtype=np.float64),
             self.notes,
         )
+        self._kept.begin()
         if file is not None and Path(file).exists():
             self._resume(MorphRun.load(file), file)
-        else:
-            log.add(positions=s.first.x, deformation=s.first.F)
         due = 0.0
         for target in range(len(log.ends), len(self.targets)):
-            for loss in (self.loss, *self._coarse):
-                loss.aim(self.targets[target])
-            if len(log.rows["first_losses"]) == target:
-                loss = self._loss_at_hand()
-                log.add(first_losses=loss, **({} if target else {"losses": loss}))
+            self._aim(target)
             while log.segment_count < sum(self._settling(target)):
-                begun, count = log.ends[target - 1] if target else 0, -(-o.frame_count // o.segment_length)
-                for level in self._coarse:
-                    level.weigh(float(log.segment_count - begun < int(o.coarse * count)))
-                self.plan_segment()
+                self._set_up_segment(target)
                 try:
-                    s.check()
-                except SolverDiverged as error:
+                    loss = self._find_segment(target)
+                except (ConfigError, SolverDiverged) as error:
                     if not log.segment_count:
                         raise
                     log.notes = (*log.notes, f"ended after {log.segment_count} segments: {error}")
                     warnings.warn(log.notes[-1], RuntimeWarning, stacklevel=2)
                     return self._runs(file)
-                log.add(losses=self._loss_at_hand())
-                first, more = self._settling(target)
-                if more and log.segment_count + 1 >= first:
-                    s.first.F.fill_(np.eye(3))
-                    s.start(v=0.5 * s.first.v.numpy(), C=0.5 * s.first.C.numpy())
-                v, m = s.first.v.numpy().astype(np.float64), s.mass.numpy().astype(np.float64)
-                log.add(
-                    positions=s.first.x,
-                    deformation=s.first.F,
-                    kinetic_energy=0.5 * (m * (v**2).sum(axis=2)).sum(axis=1),
-                )
-                for control in s.control.numpy().copy():
-                    log.add(control=control)
+                log.losses.append(loss)
+                self._kept.keep()
                 if progress is not None:
-                    progress(log.segment_count - 1, float(log.rows["losses"][-1].max()))
+                    progress(log.segment_count - 1, float(loss.max()))
                 now = time.monotonic()
                 if file is not None and now >= due:
                     self._runs(file)
@@ -302,18 +385,80 @@ class MorphPlanner:
             log.ends.append(log.segment_count)
         return self._runs(file)
 
+    def _find_segment(self, target: int) -> Array:
+        """Plan a segment and return its losses, (W,); with a grid that follows on one where it has room.
+
+        Raises:
+            ConfigError: If that grid does not fit into the memory limit.
+            SolverDiverged: If no control keeps the particles on the grid and finite.
+        """
+        if self.options.grid == "follow":
+            self._follow(target)
+        self._run_segment()
+        self._kept.stow()
+        loss, failed = self._kept.record.status.numpy().T
+        if failed.any():
+            self.simulation.check()
+        return np.array(loss)
+
+    def _follow(self, target: int) -> None:
+        """Bring the grid to where particles, moving on, and the target have room."""
+        s = self.simulation
+        grid, duration = s.options.grid, s.step_count * s.options.dt
+        x, v = (array.numpy().astype(np.float64).reshape(-1, 3) for array in (s.first.x, s.first.v))
+        moved = x + duration * v
+        if np.isfinite(moved).all():
+            self._place(grid.reaching(x, moved, self.targets[target].positions, room=ROOM), target)
+
+    def _place(self, grid: Grid, target: int) -> None:
+        """Take another part of the grid's nodes; a graph is captured again if arrays changed with it."""
+        s = self.simulation
+        if grid == s.options.grid:
+            return
+        self._kept.flush()
+        if s.place_grid(grid):
+            self._graph = None
+        for loss in (self.loss, *self._coarse):
+            loss.place(grid, self.targets[target])
+
+    def _aim(self, target: int) -> None:
+        """Turn to a target."""
+        if self.options.grid == "follow":
+            self._follow(target)
+        for loss in (self.loss, *self._coarse):
+            loss.aim(self.targets[target])
+        log = self._log
+        if len(log.first_losses) == target:
+            self._find_loss_of(self.simulation.first)
+            log.first_losses.append(self._search.trial_loss.numpy().copy())
+            if not log.losses:
+                log.losses.append(log.first_losses[0])
+        settles = self._settling(target)[1] > 0
+        goal = self._goal(target) if settles else np.full(self.simulation.world_count, -np.inf)
+        self._kept.record.goal.assign(goal)
+
+    def _goal(self, target: int) -> Array:
+        """Return the losses with which a target is reached, (W,)."""
+        accuracy = self.options.target_accuracy
+        first = self._log.first_losses[target]
+        return np.full_like(first, -np.inf) if accuracy is None else (1.0 - accuracy) * first
+
     def _settling(self, target: int) -> tuple[int, int]:
         """Return how many segments of the run end before a target settles or is left, and how many settle."""
         o, log = self.options, self._log
-        count = -(-o.frame_count // o.segment_length)
-        settling = int(o.settling * count) if target + 1 == len(self.targets) else 0
+        settling = int(o.settling * self.segments) if target + 1 == len(self.targets) else 0
+        begun, goal = log.ends[target - 1] if target else 0, self._goal(target)
+        reached = [k for k, loss in enumerate(log.losses[begun + 1 :], 1) if (loss <= goal).all()]
+        return begun + min([self.segments - settling, *reached]), settling
+
+    def _set_up_segment(self, target: int) -> None:
+        """Tell the device what differs in the segment to come: coarse grids, and whether it settles for sure."""
+        log = self._log
         begun = log.ends[target - 1] if target else 0
-        first = count - settling
-        if o.target_accuracy is not None:
-            goal = (1.0 - o.target_accuracy) * log.rows["first_losses"][target]
-            reached = [k for k, loss in enumerate(log.rows["losses"][begun + 1 :], 1) if (loss <= goal).all()]
-            first = min([first, *reached])
-        return begun + first, settling
+        for level in self._coarse:
+            level.weigh(float(log.segment_count - begun < int(self.options.coarse * self.segments)))
+        first, settling = self._settling(target)
+        self._kept.record.settling.fill_(int(settling > 0 and log.segment_count + 1 >= first))
 
     @property
     def fingerprint(self) -> str:
@@ -332,8 +477,8 @@ class MorphPlanner:
                 f"morph {file}: is that of another source, target or options", hint="name another file, or remove it"
             )
         log, s = self._log, self.simulation
-        for name in ("positions", "deformation", "control", "losses", "kinetic_energy", "first_losses"):
-            log.rows[name] = [row[None] for row in getattr(run, name)]
+        self._kept.take(run)
+        log.losses, log.first_losses = ([loss[None] for loss in row] for row in (run.losses, run.first_losses))
         log.ends = list(run.ends)
         log.counts = (run.gradient_count, run.trial_count)
         log.names, log.offsets = run.names, run.offsets
@@ -343,11 +488,14 @@ class MorphPlanner:
     def _runs(self, file: str | os.PathLike[str] | None) -> list[MorphRun]:
         """Return the runs as they are, and write that of a file."""
         s, log = self.simulation, self._log
+        self._kept.flush()
         counts = (self._search.gradient_count.numpy(), self._search.trial_count.numpy())
         v, C = s.first.v.numpy(), s.first.C.numpy()
         found = [
             MorphRun(
-                **log.of_world(w, body.count),
+                **self._kept.of_world(w, body.count),
+                losses=np.array([loss[w] for loss in log.losses]),
+                first_losses=np.array([loss[w] for loss in log.first_losses]),
                 velocity=v[w, : body.count].copy(),
                 affine_velocity=C[w, : body.count].copy(),
                 offsets=log.offsets,
@@ -364,53 +512,66 @@ class MorphPlanner:
             found[0].save(file)
         return found
 
-    def _loss_at_hand(self) -> Array:
-        """Return the losses of the state that the next segment begins with."""
+    def _find_loss_of(self, state: ParticleState) -> None:
+        """Find the losses of a state, on the fine grid alone."""
         s = self.simulation
-        s.scatter_mass(s.first)
+        s.scatter_mass(state)
         self.loss.evaluate(s.grid_mass, self._search.trial_loss, s.grid_mass_bar)
-        return self._search.trial_loss.numpy().copy()
 
-    def plan_segment(self) -> None:
-        """Find the controls of the next segment and step through it; nothing is read back from the second on."""
-        if not self._compiled:
-            self._plan_segment()
-            self._compiled = True
-            return
+    def _run_segment(self) -> None:
+        """Find the controls of the next segment, step through it and hand over to the next; nothing is read back."""
         if self._graph is None:
+            self._warm_up()
             with wp.ScopedCapture(device=self.simulation.device) as capture:
                 self._plan_segment()
             self._graph = capture.graph
         assert self._graph is not None
         wp.capture_launch(self._graph)
 
+    def _warm_up(self) -> None:
+        """Run every kernel of a segment once and forget what they did: compiles, and allocates what a graph needs."""
+        s, search = self.simulation, self._search
+        changed = (*s.first.arrays, search.gradient_count, search.trial_count, self._kept.record.count)
+        begin = [(array, wp.clone(array)) for array in changed]
+        self._begin_segment(self.options.iteration_count)
+        self._descend()
+        self._end_segment()
+        for array, value in begin:
+            wp.copy(array, value)
+
     def _plan_segment(self) -> None:
-        o, s = self.options, self.simulation
-        for array in (self._accepted, self._first, self._second, s.control):
+        self._begin_segment(self.options.pass_count * self.options.iteration_count)
+        wp.capture_while(self._search.left, self._descend)
+        self._end_segment()
+
+    def _begin_segment(self, gradients: int) -> None:
+        """Begin without control."""
+        for array in (self._accepted, self._first, self._second, self.simulation.control):
             array.zero_()
         self._evaluate()
-        self._per_world(judge_start, [self._search, s.failure])
-        for _ in range(o.pass_count):
-            self._per_world(begin_pass, [self._search, o.step_length])
-            for iteration in range(o.iteration_count):
-                self._descend(first=iteration == 0)
-        s.first.copy_from(s.last)
+        self._per_world(judge_start, [self._search, self.simulation.failure, gradients])
 
-    def _descend(self, *, first: bool) -> None:
+    def _end_segment(self) -> None:
+        """Judge the segment, begin the next where it ends, and keep that."""
+        s, kept = self.simulation, self._kept
+        self._find_loss_of(s.last)
+        wp.launch(end_segment, 1, inputs=[self._search, s.failure, kept.record], device=s.device)
+        inputs = [kept.record, *s.last.arrays, s.control, *s.first.arrays, kept.x, kept.v, kept.F, kept.control]
+        wp.launch(hand_over, (s.world_count, s.count), inputs=inputs, device=s.device)
+
+    def _descend(self) -> None:
         """Take a gradient and step along it."""
         o, s = self.options, self.simulation
+        self._per_world(begin_gradient, [self._search, o.step_length, o.iteration_count])
         control_bar = self.loss.gradient(s, self._coarse)[1].control
-        self._search.norm.zero_()
-        self._search.any_searching.zero_()
-        # Without a trial, and after one that was rejected for good, the states are not those of the accepted control.
-        self._search.stale.fill_(1)
         threads = NORM_THREADS if s.device.is_cuda else 1
         self._per_layer(gradient_norm, [control_bar, self._search.norm, threads], threads)
-        self._per_world(begin_search, [self._search, wp.float64(o.gradient_tolerance), int(first)])
+        self._per_world(begin_search, [self._search, wp.float64(o.gradient_tolerance), o.iteration_count])
         moments = [self._first, self._second, self._first_trial, self._second_trial]
         self._per_layer(adam_direction, [self._search, control_bar, *moments, self._direction])
         wp.capture_while(self._search.any_searching, self._try)
         wp.capture_while(self._search.stale, self._restore)
+        wp.launch(end_gradient, 1, inputs=[self._search], device=s.device)
 
     def _restore(self) -> None:
         """Step with the accepted controls."""

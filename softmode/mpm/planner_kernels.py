@@ -25,6 +25,8 @@ class Search:
     """Accepted steps of Adam in this segment, t, (W,)."""
     halvings: wp.array[int]
     """Halvings in this search, (W,)."""
+    left: wp.array[int]
+    """Gradients that the segment has left, (1,)."""
     searching: wp.array[int]
     """Whether the world seeks a smaller loss, (W,)."""
     active: wp.array[int]
@@ -39,16 +41,32 @@ class Search:
     """Trials taken, (W,)."""
 
 
-@wp.kernel(enable_backward=False, module="unique")
-def begin_pass(search: Search, step: float):
-    """Start a pass over a control layer: all worlds, the first length of step again."""
-    world = wp.tid()
-    search.step[world] = step
-    search.active[world] = 1
+@wp.struct
+class Record:
+    """What segments leave behind, row by row until it is read."""
+
+    count: wp.array[int]
+    """Rows that are full, (1,)."""
+    row: wp.array[int]
+    """Row of the segment that ended just now, -1 if it failed, (1,)."""
+    settles: wp.array[int]
+    """Whether that segment ends without stress and with half of its velocity, (1,)."""
+    settling: wp.array[int]
+    """Whether all segments do, (1,)."""
+    goal: wp.array[wp.float64]
+    """Or the losses at which the first does; (W,)."""
+    status: wp.array2d[wp.float64]
+    """Loss at the end of the segment, and 1 if the world failed, (W, 2)."""
+
+
+@wp.func
+def begins_pass(search: Search, iterations: int):
+    """Return whether the gradient at hand is the first of a pass."""
+    return search.left[0] % iterations == 0
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def judge_start(search: Search, failure: wp.array2d[int]):
+def judge_start(search: Search, failure: wp.array2d[int], gradients: int):
     """Take the loss of the state at hand as that of the accepted control."""
     world = wp.tid()
     loss = search.trial_loss[world]
@@ -56,6 +74,20 @@ def judge_start(search: Search, failure: wp.array2d[int]):
         loss = wp.float64(wp.inf)
     search.loss[world] = loss
     search.adam_count[world] = 0
+    search.left[0] = gradients
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def begin_gradient(search: Search, step: float, iterations: int):
+    """Start a pass, if it is time: all worlds, the first length of step again."""
+    world = wp.tid()
+    if begins_pass(search, iterations):
+        search.step[world] = step
+        search.active[world] = 1
+    search.norm[world] = wp.float64(0.0)
+    search.any_searching[0] = 0
+    # Without a trial, and after one that was rejected for good, the states are not those of the accepted control.
+    search.stale[0] = 1
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -70,10 +102,10 @@ def gradient_norm(bar: wp.array2d[Any], norm: wp.array[wp.float64], threads: int
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def begin_search(search: Search, tolerance: wp.float64, first: int):
+def begin_search(search: Search, tolerance: wp.float64, iterations: int):
     """Begin a line search, unless the world's pass is over or its gradient has all but vanished."""
     world = wp.tid()
-    if first != 0:
+    if begins_pass(search, iterations):
         search.first_norm[world] = search.norm[world]
     small = search.norm[world] <= tolerance * tolerance * search.first_norm[world]
     if small or not wp.isfinite(search.norm[world]) or not wp.isfinite(search.loss[world]):
@@ -168,3 +200,73 @@ def keep_trial(
         accepted[world, p] = control[world, p]
         first_moment[world, p] = first_trial[world, p]
         second_moment[world, p] = second_trial[world, p]
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def end_gradient(search: Search):
+    """Count a gradient."""
+    search.left[0] = search.left[0] - 1
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def end_segment(search: Search, failure: wp.array2d[int], record: Record):
+    """Judge a segment, whose losses are those of the trial: in which row it is kept, if any, and whether it settles."""
+    failed = int(0)
+    reached = int(1)
+    for world in range(search.trial_loss.shape[0]):
+        loss = search.trial_loss[world]
+        record.status[world, 0] = loss
+        record.status[world, 1] = wp.where(failure[world, 0] > 0, wp.float64(1.0), wp.float64(0.0))
+        if failure[world, 0] > 0:
+            failed = 1
+        if not loss <= record.goal[world]:
+            reached = 0
+    record.settles[0] = wp.max(record.settling[0], reached)
+    record.row[0] = -1
+    if failed == 0:
+        record.row[0] = record.count[0]
+        record.count[0] = record.count[0] + 1
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def hand_over(
+    record: Record,
+    # State that the segment ends with, and its controls:
+    x_in: wp.array2d[Any],
+    v_in: wp.array2d[Any],
+    C_in: wp.array2d[Any],
+    F_in: wp.array2d[Any],
+    control: wp.array3d[Any],
+    # State that the next begins with:
+    x_out: wp.array2d[Any],
+    v_out: wp.array2d[Any],
+    C_out: wp.array2d[Any],
+    F_out: wp.array2d[Any],
+    # What is kept of it:
+    kept_x: wp.array3d[Any],
+    kept_v: wp.array3d[Any],
+    kept_F: wp.array3d[Any],
+    kept_control: wp.array4d[Any],
+):
+    """Begin the next segment where one ended, and keep that; what failed is left alone."""
+    world, p = wp.tid()
+    row = record.row[0]
+    if row < 0:
+        return
+    v = v_in[world, p]
+    C = C_in[world, p]
+    F = F_in[world, p]
+    if record.settles[0] != 0:
+        half = type(v[0])(0.5)
+        v = half * v
+        C = half * C
+        F = wp.identity(n=3, dtype=type(half))
+    x_out[world, p] = x_in[world, p]
+    v_out[world, p] = v
+    C_out[world, p] = C
+    F_out[world, p] = F
+    kept_x[row, world, p] = x_in[world, p]
+    kept_v[row, world, p] = v
+    kept_F[row, world, p] = F
+    for layer in range(control.shape[0]):
+        kept_control[row, layer, world, p] = control[layer, world, p]

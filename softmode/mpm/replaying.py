@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -78,17 +78,21 @@ def replay(
     if stride < 1 or o.segment_length % stride:
         raise ConfigError(f"stride: {stride} does not divide a segment of {o.segment_length} steps")
     steps, layers = o.segment_length, run.layer_count
-    s = MpmSimulation(source.moved(run.offsets[0]), o.mpm, step_count=steps, layer_count=layers, device=device)
-    real, vec, mat = TYPES[o.mpm.precision]
+    mpm = o.mpm
+    if o.grid == "follow":
+        aims = [goal.moved(offset).positions for goal, offset in zip(goals, run.offsets[1:], strict=True)]
+        mpm = replace(mpm, grid=mpm.grid.reaching(run.positions, *aims, room=steps))
+    s = MpmSimulation(source.moved(run.offsets[0]), mpm, step_count=steps, layer_count=layers, device=device)
+    real, vec, mat = TYPES[mpm.precision]
     found = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     riders = _Riders(s, found + run.offsets[0], (real, vec, mat))
-    loss = MassLoss(o.mpm.grid, goals[0].moved(run.offsets[1]), mass_scale=o.mass_scale, dtype=real, device=s.device)
+    loss = MassLoss(mpm.grid, goals[0].moved(run.offsets[1]), mass_scale=o.mass_scale, dtype=real, device=s.device)
 
     def frame(step: int, leg: int, x: wp.array) -> ReplayFrame:
         """Read what is on the device."""
         particles, moved = x.numpy()[0].astype(np.float64), riders.x.numpy()[0].astype(np.float64)
         ratio = (s.grid_mass.numpy()[0] + o.mass_scale) / (loss.target_mass.numpy()[0] + o.mass_scale)
-        at = (np.concatenate([particles, moved]) - np.array(o.mpm.grid.origin)) / o.mpm.grid.spacing
+        at = (np.concatenate([particles, moved]) - mpm.grid.low) / mpm.grid.spacing
         residual = map_coordinates(np.abs(np.log(ratio)).astype(np.float64), at.T, order=1, mode="nearest")
         gradients = riders.F.numpy()[0].astype(np.float64)
         return ReplayFrame(
@@ -127,12 +131,12 @@ class _Riders:
             self._v, self._C = wp.zeros((1, count), dtype=vec), wp.zeros((1, count), dtype=mat)
             self._control, self._mass = wp.zeros((1, count), dtype=mat), wp.full((1, count), 1.0, dtype=real)
             self._failure = wp.zeros((1, 4), dtype=int)
-        self._vec, self._real = vec, real
+        self._real = real
 
     def move(self, step: int) -> None:
         """Move with a step of the simulation; a point that leaves the grid stays where it left it."""
         o = self._simulation.options
         inputs = [self.x, self.F, self._control, self._mass, 0, self._simulation.find_velocities(step)]
-        inputs += [self._vec(*o.grid.origin), *map(self._real, (o.grid.spacing, o.dt, 0.0))]
+        inputs += [*self._simulation.place, *map(self._real, (o.dt, 0.0))]
         outputs = [self.x, self._v, self._C, self.F, self._failure, step, self._simulation.active]
         wp.launch(grid_to_particles, self.x.shape, inputs=[*inputs, *outputs], device=self._simulation.device)

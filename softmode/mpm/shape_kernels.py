@@ -142,6 +142,7 @@ def collide_grid(
     least_mass: Any,
     origin: Any,
     dx: Any,
+    first: wp.array[wp.vec3i],
     time: float,
     # In and out:
     grid_velocity: wp.array4d[Any],
@@ -152,7 +153,7 @@ def collide_grid(
     world, i, j, k = wp.tid()
     m = grid_mass[world, i, j, k]
     if m > least_mass:
-        x = node_at(i, j, k, origin, dx)
+        x = node_at(i + first[0][0], j + first[0][1], k + first[0][2], origin, dx)
         v = grid_velocity[world, i, j, k]
         for s in range(obstacles.index.shape[0]):
             at = touch(obstacles, s, world, x, time)
@@ -174,6 +175,7 @@ def collide_grid_adjoint(
     least_mass: Any,
     origin: Any,
     dx: Any,
+    first: wp.array[wp.vec3i],
     time: float,
     free_velocity: wp.array4d[Any],
     # In: bar of the velocity after the shapes; out: of that before.
@@ -182,7 +184,7 @@ def collide_grid_adjoint(
     """Adjoint of :func:`collide_grid`: the shapes in reverse, each with the velocity that the others before it left."""
     world, i, j, k = wp.tid()
     if grid_mass[world, i, j, k] > least_mass:
-        x = node_at(i, j, k, origin, dx)
+        x = node_at(i + first[0][0], j + first[0][1], k + first[0][2], origin, dx)
         both = grid_bar[world, i, j, k]
         bar = type(origin)(both[0], both[1], both[2])
         count = obstacles.index.shape[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import cast
 
 import newton
@@ -16,6 +16,7 @@ from softmode.checks import require_number
 from softmode.deformables.build.static_response import lame_parameters
 from softmode.errors import ConfigError, SolverDiverged
 from softmode.mpm.adjoint_kernels import grid_to_particles_adjoint, move_grid_adjoint, particles_to_grid_adjoint
+from softmode.mpm.grid import Grid
 from softmode.mpm.options import COURANT_LIMIT, MpmOptions
 from softmode.mpm.particles import ParticleBody
 from softmode.mpm.shape_kernels import add_wrenches, collide_grid, collide_grid_adjoint, find_inside
@@ -52,7 +53,7 @@ def scatter_masses(x: wp.array, mass: wp.array, place: Sequence[object], grid_ma
     Args:
         x: Positions [m], (W, N).
         mass: Masses [kg], (W, N).
-        place: Origin and spacing of the grid, in the type of the particles.
+        place: Origin and spacing of the grid, in the type of the particles, and its first node.
         grid_mass: Masses of the nodes [kg], (W, nx, ny, nz).
         active: Worlds that take part, (W,), or one entry for all.
     """
@@ -74,15 +75,20 @@ class ParticleState:
     F: wp.array
     """Deformation gradient, (W, N)."""
 
+    @property
+    def arrays(self) -> tuple[wp.array, wp.array, wp.array, wp.array]:
+        """x, v, C and F."""
+        return self.x, self.v, self.C, self.F
+
     def copy_from(self, other: ParticleState) -> None:
         """Take another state's values."""
-        for name in ("x", "v", "C", "F"):
-            wp.copy(getattr(self, name), getattr(other, name))
+        for mine, value in zip(self.arrays, other.arrays, strict=True):
+            wp.copy(mine, value)
 
     def zero(self) -> None:
         """Set all to zero."""
-        for name in ("x", "v", "C", "F"):
-            getattr(self, name).zero_()
+        for array in self.arrays:
+            array.zero_()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -171,13 +177,6 @@ class MpmSimulation:
         ]
         self.mu, self.lam = (self._array(np.tile([[c[k]] for c in lame], self.count), self._real) for k in (0, 1))
         self.volume = self._zeros(self._real, self.world_count, self.count)
-        nodes = (self.world_count, *grid.shape)
-        self.grid_mass = self._zeros(self._real, *nodes)
-        """Masses of the nodes after the last step, once :meth:`scatter_mass` ran [kg]."""
-        self.grid_mass_bar = self._zeros(self._real, *nodes)
-        four = wp.types.vector(4, self._real)
-        # Momentum and mass of a node lie side by side: one operation adds to both. Who reads the sums clears them.
-        self._scattered, self._grid_bar = self._zeros(four, *nodes), self._zeros(four, *nodes)
         self.shapes = shapes
         self.impulse = self._zeros(
             wp.spatial_vectord, step_count, self.world_count, 0 if shapes is None else shapes.model.shape_count
@@ -206,10 +205,9 @@ class MpmSimulation:
                 f"{needed:.3g} bytes, {limit:.3g} are allowed",
                 hint="allow more, or take fewer steps or particles",
             )
-        per_grid = (4 if self.options.precision == "float32" else 8) * (4 if shapes is None else 7)
-        per_grid *= self.world_count * math.prod(grid.shape)
-        self._keeps_grids = keep_grids and not marks and needed + per_grid * step_count <= limit
-        self._grids = [self._moved_grid(nodes) for _ in range(step_count if self._keeps_grids else 1)]
+        self._states_bytes, self._may_keep_grids = needed, keep_grids and not marks
+        self._first_node = wp.array([grid.first], dtype=wp.vec3i, device=self.device)
+        self._allocate_grid()
         self._states = [self._state() for _ in range(self._chunk + 1)]
         self._marks = [self._state() for _ in range(marks)]
         self._bars: tuple[list[ParticleState], ParameterBars] | None = None
@@ -236,6 +234,68 @@ class MpmSimulation:
             if row.ndim > 1:
                 found[world, len(row) :] = row[0]
         return found
+
+    def _grid_bytes(self, grid: Grid) -> tuple[float, float]:
+        """Return what a grid takes with all worlds: always, and once more for each step whose grid is kept."""
+        real = 4.0 if self.options.precision == "float32" else 8.0
+        per_step = (4.0 if self.shapes is None else 7.0) * real * self.world_count * math.prod(grid.shape)
+        return per_step + 10.0 * real * self.world_count * math.prod(grid.shape), per_step
+
+    def _allocate_grid(self) -> None:
+        """Make the arrays of the nodes."""
+        grid = self.options.grid
+        nodes = (self.world_count, *grid.shape)
+        self.grid_mass = self._zeros(self._real, *nodes)
+        """Masses of the nodes after the last step, once :meth:`scatter_mass` ran [kg]."""
+        self.grid_mass_bar = self._zeros(self._real, *nodes)
+        four = wp.types.vector(4, self._real)
+        # Momentum and mass of a node lie side by side: one operation adds to both. Who reads the sums clears them.
+        self._scattered, self._grid_bar = self._zeros(four, *nodes), self._zeros(four, *nodes)
+        kept = self._states_bytes + self.step_count * self._grid_bytes(grid)[1]
+        self._keeps_grids = self._may_keep_grids and kept <= self.options.memory_limit
+        self._grids = [self._moved_grid(nodes) for _ in range(self.step_count if self._keeps_grids else 1)]
+
+    def require_memory(self, grid: Grid) -> None:
+        """Raise unless states and a grid fit into the memory limit.
+
+        Raises:
+            ConfigError: If they do not.
+        """
+        needed, limit = self._states_bytes + self._grid_bytes(grid)[0], self.options.memory_limit
+        if needed > limit:
+            raise ConfigError(
+                f"memory_limit: states and a grid of {' x '.join(map(str, grid.shape))} nodes need {needed:.3g} bytes, "
+                f"{limit:.3g} are allowed",
+                hint="allow more, take larger cells, or keep particles together with more damping",
+            )
+
+    def place_grid(self, grid: Grid) -> bool:
+        """Take another part of the same nodes: one with another ``first`` or ``shape``. States stay.
+
+        Returns:
+            Whether arrays of nodes are other ones now, so that graphs that were captured are void.
+
+        Raises:
+            ConfigError: If the grid has other nodes, or does not fit into the memory limit.
+        """
+        before = self.options.grid
+        if (grid.spacing, grid.origin) != (before.spacing, before.origin):
+            raise ConfigError(
+                "grid: expected the spacing and origin of the grid at hand", hint="change first and shape"
+            )
+        self.require_memory(grid)
+        self.options = replace(self.options, grid=grid)
+        self._first_node.assign([grid.first])
+        if grid.shape != before.shape:
+            self._allocate_grid()
+            return True
+        # What is zero is not written again: nothing of the former place may be left.
+        for moved in self._grids:
+            for array in (moved.mass, moved.velocity, moved.free_velocity):
+                array.zero_()
+        for array in (self.grid_mass, self.grid_mass_bar, self._scattered, self._grid_bar):
+            array.zero_()
+        return False
 
     def _moved_grid(self, nodes: tuple[int, ...]) -> _MovedGrid:
         velocity = self._zeros(self._vec, *nodes)
@@ -411,7 +471,7 @@ class MpmSimulation:
         """Find rest volumes, and check what follows from them."""
         if self.options.rest_volume == "grid":
             self._scatter_mass(self.first.x)
-            self._launch(particle_volumes, [self.first.x, self.mass, self.grid_mass, *self._place, self.volume])
+            self._launch(particle_volumes, [self.first.x, self.mass, self.grid_mass, *self.place, self.volume])
         else:
             volumes = self._padded([body.masses / body.material.density for body in self.bodies])
             wp.copy(self.volume, self._array(volumes, self._real))
@@ -434,9 +494,10 @@ class MpmSimulation:
                 )
 
     @property
-    def _place(self) -> list[object]:
+    def place(self) -> list[object]:
+        """Origin, spacing and first node of the grid, as kernels read them."""
         grid = self.options.grid
-        return [self._vec(*grid.origin), self._real(grid.spacing)]
+        return [self._vec(*grid.origin), self._real(grid.spacing), self._first_node]
 
     def _launch(self, kernel: Callable[..., object], inputs: list[object]) -> None:
         wp.launch(kernel, (self.world_count, self.count), inputs=inputs, device=self.device)
@@ -446,7 +507,7 @@ class MpmSimulation:
         wp.launch(kernel, shape, inputs=[*inputs, self._lanes], device=self.device)
 
     def _scatter_mass(self, x: wp.array) -> None:
-        scatter_masses(x, self.mass, self._place, self.grid_mass, self.active)
+        scatter_masses(x, self.mass, self.place, self.grid_mass, self.active)
 
     def _at_nodes(self, kernel: Callable[..., object], inputs: list[object]) -> None:
         wp.launch(kernel, self.grid_mass.shape, inputs=inputs, device=self.device)
@@ -455,7 +516,7 @@ class MpmSimulation:
         """Return what both kernels of the shapes read."""
         assert self.shapes is not None
         time = wp.float32(step * self.options.dt)
-        return [self.shapes.obstacles, grid.mass, self._least, *self._place, time]
+        return [self.shapes.obstacles, grid.mass, self._least, *self.place, time]
 
     def _steps_in(self, chunk: int) -> int:
         return min(self._chunk, self.step_count - chunk * self._chunk)
@@ -492,7 +553,7 @@ class MpmSimulation:
             self.lam,
             self._model,
             material,
-            *self._place,
+            *self.place,
             self._real(o.dt),
             self._real(o.damping),
         ]
@@ -524,7 +585,7 @@ class MpmSimulation:
                 self.mass,
                 int(o.control == "material"),
                 grid.velocity,
-                *self._place,
+                *self.place,
                 self._real(o.dt),
                 self._real(o.smoothing),
                 then.x,
@@ -559,7 +620,7 @@ class MpmSimulation:
                 self.mass,
                 int(o.control == "material"),
                 grid.velocity,
-                *self._place,
+                *self.place,
                 self._real(o.dt),
                 self._real(o.smoothing),
                 bar_then.x,

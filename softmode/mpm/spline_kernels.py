@@ -8,14 +8,17 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def cell_of(x: Any, origin: Any, dx: Any):
-    """Return the grid coordinates of a point: the lower corner of its cell and the fraction within it, 0..1."""
+def cell_of(x: Any, origin: Any, dx: Any, first: wp.vec3i):
+    """Return the lower corner of a point's cell, counted from the node ``first``, and the fraction within it, 0..1.
+
+    A grid that moves by whole cells changes ``first`` and not ``origin``, so that fractions keep their bits.
+    """
     at = (x - origin) / dx
     i = int(wp.floor(at[0]))
     j = int(wp.floor(at[1]))
     k = int(wp.floor(at[2]))
     inside = type(x)(at[0] - type(dx)(i), at[1] - type(dx)(j), at[2] - type(dx)(k))
-    return i, j, k, inside
+    return i - first[0], j - first[1], k - first[2], inside
 
 
 @wp.func

@@ -101,6 +101,7 @@ def particles_to_grid(
     # Grid:
     origin: Any,
     dx: Any,
+    first: wp.array[wp.vec3i],
     dt: Any,
     damping: Any,
     # Out:
@@ -118,7 +119,7 @@ def particles_to_grid(
     m = mass[world, p]
     if m > type(dx)(0.0) and moves(active, world):
         x = x_in[world, p]
-        i, j, k, f = cell_of(x, origin, dx)
+        i, j, k, f = cell_of(x, origin, dx, first[0])
         shape = wp.vec3i(scattered.shape[1], scattered.shape[2], scattered.shape[3])
         if in_grid(i, j, k, shape):
             F = controlled(F_in[world, p], control[world, p], material_control)
@@ -151,6 +152,7 @@ def mass_to_grid(
     mass: wp.array2d[Any],
     origin: Any,
     dx: Any,
+    first: wp.array[wp.vec3i],
     grid_mass: wp.array4d[Any],
     active: wp.array[int],
     lanes: int,
@@ -159,7 +161,7 @@ def mass_to_grid(
     world, lane, p = wp.tid()
     m = mass[world, p]
     if m > type(dx)(0.0) and moves(active, world):
-        i, j, k, f = cell_of(x_in[world, p], origin, dx)
+        i, j, k, f = cell_of(x_in[world, p], origin, dx, first[0])
         if in_grid(i, j, k, wp.vec3i(grid_mass.shape[1], grid_mass.shape[2], grid_mass.shape[3])):
             wx = spline(f[0])
             wy = spline(f[1])
@@ -179,13 +181,14 @@ def particle_volumes(
     grid_mass: wp.array4d[Any],
     origin: Any,
     dx: Any,
+    first: wp.array[wp.vec3i],
     volume: wp.array2d[Any],
 ):
     """Find the volume that a particle stands for: V = m dx^3 / sum_i w_ip m_i."""
     world, p = wp.tid()
     m = mass[world, p]
     if m > type(dx)(0.0):
-        i, j, k, f = cell_of(x_in[world, p], origin, dx)
+        i, j, k, f = cell_of(x_in[world, p], origin, dx, first[0])
         wx = spline(f[0])
         wy = spline(f[1])
         wz = spline(f[2])
@@ -208,11 +211,16 @@ def move_grid(
     grid_velocity: wp.array4d[Any],
     active: wp.array[int],
 ):
-    """Turn momentum into velocity, v = p / m + dt g; nodes without mass stand still."""
+    """Turn momentum into velocity, v = p / m + dt g; nodes without mass stand still.
+
+    Most nodes are empty, and were when they were written last: what is zero already is not written again.
+    """
     world, i, j, k = wp.tid()
     if not moves(active, world):
         return
     both = scattered[world, i, j, k]
+    if both == scattered.dtype() and grid_mass[world, i, j, k] == both[3]:
+        return
     scattered[world, i, j, k] = scattered.dtype()
     m = both[3]
     v = type(gravity_dt)()
@@ -234,6 +242,7 @@ def grid_to_particles(
     grid_velocity: wp.array4d[Any],
     origin: Any,
     dx: Any,
+    first: wp.array[wp.vec3i],
     dt: Any,
     smoothing: Any,
     # State out:
@@ -251,7 +260,7 @@ def grid_to_particles(
         return
     x = x_in[world, p]
     if mass[world, p] > type(dx)(0.0):
-        i, j, k, f = cell_of(x, origin, dx)
+        i, j, k, f = cell_of(x, origin, dx, first[0])
         shape = wp.vec3i(grid_velocity.shape[1], grid_velocity.shape[2], grid_velocity.shape[3])
         if in_grid(i, j, k, shape):
             wx = spline(f[0])
@@ -262,17 +271,17 @@ def grid_to_particles(
             for a in range(4):
                 for b in range(4):
                     along = type(x)()
-                    first = type(x)()
+                    along_z = type(x)()
                     for c in range(4):
                         node = wz[c] * grid_velocity[world, i + a - 1, j + b - 1, k + c - 1]
                         along += node
-                        first += type(dx)(c - 1) * node
+                        along_z += type(dx)(c - 1) * node
                     along = (wx[a] * wy[b]) * along
                     v += along
                     for r in range(3):
                         B[r, 0] += type(dx)(a - 1) * along[r]
                         B[r, 1] += type(dx)(b - 1) * along[r]
-                        B[r, 2] += (wx[a] * wy[b]) * first[r]
+                        B[r, 2] += (wx[a] * wy[b]) * along_z[r]
             C = (B - wp.outer(v, f)) * (type(dx)(3.0) / dx)
             F = F_in[world, p]
             moved = x + dt * v

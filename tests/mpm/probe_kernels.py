@@ -19,7 +19,7 @@ def weigh(
 ):
     """Write the weights of the four nodes along each axis around every point, and their derivatives by the fraction."""
     i = wp.tid()
-    _a, _b, _c, fraction = cell_of(x[i], origin, dx)
+    _a, _b, _c, fraction = cell_of(x[i], origin, dx, wp.vec3i(0, 0, 0))
     for d in range(3):
         w = spline(fraction[d])
         s = spline_slope(fraction[d])
