@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -10,6 +11,7 @@ import numpy as np
 
 from softmode.envs.task_config import TaskConfig
 from softmode.errors import ConfigError
+from softmode.objects.config import ObjectConfig
 from softmode.robots.arm import ArmDescription
 from softmode.robots.description import RobotDescription
 from softmode.robots.jaws import ParallelJaw
@@ -20,8 +22,22 @@ Config = TypeVar("Config", bound=TaskConfig)
 
 _TOP = 0.17
 """Height that every tool is to reach where the workspace allows it: over what stands on the table [m]."""
+_MOST_SAMPLES = 2000
+"""Most surface samples that an object gets for the sake of narrow finger tips."""
 _RANGES = ("position_range", "goal_range", "goal_height")
 """Fields of configurations that shrink with the share of the places that a robot reaches."""
+
+
+def _sampled_for(thing: ObjectConfig, jaw: ParallelJaw) -> ObjectConfig:
+    """Return an object whose surface samples are no farther apart than a finger tip is wide.
+
+    Contact is that of samples: a narrower tip sinks in between them. Objects without extents stay as they are.
+    """
+    if thing.extents is None:
+        return thing
+    a, b, c = thing.extents
+    wanted = math.ceil(2.0 * (a * b + b * c + c * a) / min(jaw.pad_width, jaw.thickness) ** 2)
+    return replace(thing, surface_count=max(thing.surface_count, min(wanted, _MOST_SAMPLES)))
 
 
 def with_robot(config: Config, robot: str | Path | RobotDescription | TableRobot) -> Config:
@@ -77,6 +93,8 @@ def with_robot(config: Config, robot: str | Path | RobotDescription | TableRobot
         constraint_max=max(scene.constraint_max, 64) + 2 * more,
         rigid_contact_max=max(scene.rigid_contact_max, 64),
     )
+    if config.samples_for_tips:
+        scene = replace(scene, object=_sampled_for(scene.object, robot.jaw))
     changes: dict[str, Any] = {"scene": scene}
     if robot.share < 1.0:
         names = {field.name for field in fields(config)}

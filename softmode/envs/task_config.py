@@ -34,6 +34,8 @@ class TaskConfig:
     heights_of_tips: ClassVar[bool] = False
     """Whether heights of home pose and workspace are meant for the tips of the fingers; those of another robot are then
     raised by how much longer its fingers are."""
+    samples_for_tips: ClassVar[bool] = False
+    """Whether objects get as many surface samples as it takes for finger tips not to sink in between them."""
     tool_stiffness: ClassVar[float | None] = None
     """Vertical stiffness that the drives of another robot are to have at its tool in the home pose [N/m]; None keeps
     them."""

@@ -106,6 +106,17 @@ def gap_of(robot: RobotDescription, jaw: ParallelJaw, opening: float) -> float:
     return float(max(left.min() - right.max(), right.min() - left.max()))
 
 
+def dry_friction_of(robot: RobotDescription) -> float:
+    """Return the work against dry friction of all joints of the hand from closed to open, to be shared by travel [J].
+
+    Args:
+        robot: A robot with a gripper.
+    """
+    model: Any = importlib.import_module("mujoco").MjModel.from_xml_string(robot.mjcf)
+    closed, wide = (_kinematics(robot, model, opening).qpos for opening in (0.0, 1.0))
+    return float(np.abs(wide - closed) @ model.dof_frictionloss)
+
+
 def _measured(robot: RobotDescription) -> ParallelJaw:
     """Measure the jaw of a robot from a file."""
     model: Any = importlib.import_module("mujoco").MjModel.from_xml_string(robot.mjcf)

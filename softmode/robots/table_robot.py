@@ -19,7 +19,7 @@ from softmode.robots.arm import ArmDescription, ArmIndices, GripperDescription
 from softmode.robots.chain import SerialChain, serial_chain
 from softmode.robots.description import RobotDescription, RobotIndices
 from softmode.robots.hand import settled
-from softmode.robots.jaws import ParallelJaw, finger_names, gap_of
+from softmode.robots.jaws import ParallelJaw, dry_friction_of, finger_names, gap_of
 
 Array = NDArray[np.float64]
 
@@ -33,6 +33,8 @@ _YAW = 1.4
 """How far the tool must turn about the vertical to either side over the home position [rad]."""
 _NEAR = 2.0e-3
 """Error of the inverse kinematics that counts as reached [m]."""
+_STUCK = 0.5e-3
+"""How far dry friction of its joints may hold a finger from where its drive aims [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +54,9 @@ class TableRobot:
     gaps: tuple[float, ...] = field(repr=False)
     """Distance between the fingers [m] at openings from 0 to 1 of the gripper, evenly spaced and ascending."""
     grip_force: float
-    """Largest force of a finger [N]."""
+    """Largest force of a finger on what it holds [N]."""
+    grip_friction: float
+    """Dry friction of a finger's joints along the closing axis [N], which its drive overcomes besides."""
     grip_stiffness: float
     """Stiffness of a finger along the closing axis [N/m]."""
     share: float
@@ -71,7 +75,7 @@ class TableRobot:
             stroke=self.jaw.opening,
             finger_length=max(self.jaw.reach, self.jaw.pad_length),
             pad_size=(self.jaw.pad_width, self.jaw.thickness, self.jaw.pad_length),
-            force_limit=self.grip_force,
+            force_limit=self.grip_force + self.grip_friction,
             drive_stiffness=self.grip_stiffness,
             friction=self.jaw.friction,
         )
@@ -193,10 +197,12 @@ def place_robot(
         ranges: Half-widths of the places in x and y [m].
         height: Highest place over the table [m].
         base: Where the base stands, x, y, z [m] and rotation [rad]; searched if omitted.
-        grip_force: Largest force of a finger [N]; that of the file if it is less.
+        grip_force: Largest force of a finger on what it holds [N]; what the file's drive leaves over after the dry
+            friction of the finger's joints, if that is less.
         grip_way: How far past the object a finger's drive aims for that force [m], by which softer drives of the file
             are stiffened: models of grippers often have a servo so soft that it cannot press, where the device
-            controls the force. None keeps the file's drives.
+            controls the force. They are stiffened likewise where dry friction would hold a finger away from where its
+            drive aims. None keeps the file's drives.
 
     Returns:
         The robot at the table.
@@ -249,7 +255,9 @@ def place_robot(
     home[list(chain.joints)] = q
     home = _closed_loops(robot, robot.with_opening(fraction, home.tolist()))
     robot = replace(robot, home=tuple(home.tolist()))
-    robot, force, stiffness = _with_grip(robot, 0.5 * float(gaps[-1] - gaps[0]), grip_force, grip_way)
+    travel = 0.5 * float(gaps[-1] - gaps[0])
+    friction = 0.5 * dry_friction_of(robot) / travel
+    robot, force, stiffness = _with_grip(robot, travel, friction, grip_force, grip_way)
     return TableRobot(
         robot=robot,
         base=placed,
@@ -258,18 +266,19 @@ def place_robot(
         home_opening=opening,
         gaps=tuple(gaps.tolist()),
         grip_force=force,
+        grip_friction=friction,
         grip_stiffness=stiffness,
         share=share,
     )
 
 
 def _with_grip(
-    robot: RobotDescription, travel: float, most: float, way: float | None
+    robot: RobotDescription, travel: float, friction: float, most: float, way: float | None
 ) -> tuple[RobotDescription, float, float]:
     """Return the robot with drives of the fingers that press, the force [N] and the stiffness [N/m] of one finger.
 
     A joint that moves by R while its finger travels by T acts on it with the lever r = T / R: a force f = torque / r,
-    a stiffness k / r^2.
+    a stiffness k / r^2. Dry friction [N] takes its part of that force.
     """
     fingers = robot.gripper
     assert fingers is not None
@@ -282,18 +291,24 @@ def _with_grip(
     lever = travel / np.maximum(np.abs(np.array(fingers.open) - np.array(fingers.closed)), 1.0e-9)
     shared = 0.5 * len(index)  # joints of a finger
     limit = np.array([drive.effort_limit for drive in drives]) / lever * shared
-    force = float(min(most, limit.min()))
+    force = float(min(most, limit.min() - friction))
+    if force <= 0.0:
+        raise ConfigError(
+            f"the gripper of robot {robot.name!r} cannot close: its drives give {limit.min():.1f} N per finger, dry "
+            f"friction of its joints takes {friction:.1f} N",
+            hint="raise the force limit of its drives in the file, or lower frictionloss there",
+        )
     stiffness = np.array([drive.stiffness for drive in drives])
     damping = np.array([drive.damping for drive in drives])
     if way is not None:
-        wanted = force / way * lever**2 / shared
+        wanted = max(force / way, friction / _STUCK) * lever**2 / shared
         inertia = robot.joint_inertias()[index]
         critical = 2.0 * np.sqrt(np.maximum(wanted, stiffness) * inertia)
         damping = np.where(wanted > stiffness, np.maximum(damping, critical), damping)
         stiffness = np.maximum(stiffness, wanted)
     changed = list(robot.drives)
     for k, j in enumerate(index):
-        bounded = force * lever[k] / shared
+        bounded = (force + friction) * lever[k] / shared
         new = {"stiffness": float(stiffness[k]), "damping": float(damping[k]), "effort_limit": float(bounded)}
         changed[j] = replace(drives[k], **new)
     along = float((stiffness / lever**2).sum() / 2.0)

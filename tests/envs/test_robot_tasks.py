@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 
 from softmode import robots
+from softmode.envs.robots import with_robot
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.lift_soft.scripted import ScriptedLift
 from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv, LiftSoftVectorEnv
 from softmode.envs.tasks.place_in_bin.task import PlaceInBinEnv
-from softmode.envs.tasks.press_soft.task import PressSoftEnv
+from softmode.envs.tasks.press_soft.task import PressSoftConfig, PressSoftEnv
 from softmode.envs.tasks.push_soft.task import PushSoftEnv
 from softmode.errors import ConfigError
 from softmode.robots.table_robot import TableRobot, tip_length
-from tests.robots.files import MJCF, write_arm5, write_mjcf
+from tests.robots.files import ARM5, MJCF, write_arm5, write_mjcf
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +106,19 @@ def test_robots_and_tasks_that_do_not_fit(tmp_path: Path, arm5: Path) -> None:
         LiftSoftEnv(robot=3)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="built-in arm only"):
         PlaceInBinEnv(robot=arm5)
+
+
+def test_samples_of_the_pad_are_as_near_as_finger_tips_are_wide(arm5: Path, tmp_path: Path) -> None:
+    """Jaws of 4 mm take 168 cm2, the surface of the box around the pad, over 16 mm2; those of 12 mm the usual."""
+    usual = PressSoftConfig().scene.object.surface_count
+    assert with_robot(PressSoftConfig(), arm5).scene.object.surface_count == usual
+    narrow = write_arm5(tmp_path, ARM5.replace('size="0.012 0.006 0.035"', 'size="0.012 0.002 0.035"'))
+    found = with_robot(PressSoftConfig(), narrow)
+    assert isinstance(found.scene.arm, TableRobot)
+    width = found.scene.arm.jaw.thickness
+    assert width == pytest.approx(0.004, abs=1e-4)
+    assert found.scene.object.surface_count == pytest.approx(0.0168 / width**2, abs=1.0)
+    assert with_robot(LiftSoftConfig(), narrow).scene.object == LiftSoftConfig().scene.object
 
 
 @pytest.mark.parametrize("kind", [PushSoftEnv, PressSoftEnv])

@@ -78,6 +78,22 @@ def test_place_at_the_table(placed: TableRobot) -> None:
         placed.joint_q_over((3.0, 0.0, 0.1))
 
 
+def test_drives_overcome_dry_friction_of_the_fingers(tmp_path: Path) -> None:
+    """5 N of friction per slide leave 35 of 40 N, and the drive holds a finger within 0.5 mm: 10 kN/m. 50 N stop it."""
+    stiff = ARM5.replace(' range="0 0.045"', ' range="0 0.045" frictionloss="5"')
+    placed = robots.place_robot(robots.load(write_arm5(tmp_path, stiff)))
+    # The gaps are made ascending by steps of 0.1 um, of 90 mm.
+    near = 16 * 1e-7 / 0.09 * 2
+    assert placed.grip_friction == pytest.approx(5.0, rel=near)
+    assert placed.grip_force == pytest.approx(35.0, rel=2 * near)
+    assert placed.gripper.force_limit == pytest.approx(40.0, rel=2 * near)
+    assert placed.grip_stiffness == pytest.approx(1.0e4, rel=2 * near)
+    drive = placed.robot.drives[-1]
+    assert drive is not None and drive.effort_limit == pytest.approx(40.0, rel=2 * near)
+    with pytest.raises(ConfigError, match="dry friction of its joints takes 50"):
+        robots.place_robot(robots.load(write_arm5(tmp_path, stiff.replace('"5"', '"50"'))))
+
+
 def test_fingers_of_the_scene(placed: TableRobot) -> None:
     """Each finger's links are bodies of the builder."""
     builder = newton.ModelBuilder()

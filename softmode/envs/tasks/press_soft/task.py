@@ -84,6 +84,7 @@ class PressSoftConfig(TaskConfig):
     """Goal and success of PressSoft."""
 
     heights_of_tips = True
+    samples_for_tips = True
     tool_stiffness = TOOL_STIFFNESS
     scene: TableSceneConfig = field(default_factory=press_scene)
     """Objects, robot and physics."""
