@@ -12,6 +12,8 @@ from softmode.envs import (
     LiftSoftConfig,
     LiftSoftEnv,
     LiftSoftVectorEnv,
+    PlaceInBinConfig,
+    PlaceInBinEnv,
     PressSoftConfig,
     PressSoftEnv,
     PushSoftConfig,
@@ -76,6 +78,37 @@ def test_each_reset_is_pushed_and_pressed_as_alone(kind: Any, config: Any) -> No
         for one in (env, singles[k]):
             one.task.forget_film(np.ones(1, bool))  # the camera follows from where it was
         np.testing.assert_array_equal(env.render(), singles[k].render())
+
+
+def follow_resets(env: Any, singles: list[Any], actions: np.ndarray) -> None:
+    """Reset to the objects 0, 1, 0, play actions each time, and compare with the single environments by their bits."""
+    for seed, k in enumerate((0, 1, 0)):
+        _, info = env.reset(seed=seed, options={"object": k})
+        _, own = singles[k].reset(seed=seed)
+        assert info["object"] == k
+        for action in actions:
+            np.testing.assert_array_equal(*(one.task.observation.numpy() for one in (env, singles[k])))
+            _, reward, *_, info = env.step(action)
+            _, own_reward, *_, own = singles[k].step(action)
+            assert reward == own_reward
+            assert [info[name] for name in env.task.metric_names] == [own[name] for name in env.task.metric_names]
+        if env.render_mode is not None:
+            for one in (env, singles[k]):
+                one.task.forget_film(np.ones(1, bool))  # the camera follows from where it was
+            np.testing.assert_array_equal(env.render(), singles[k].render())
+
+
+def test_each_reset_is_placed_as_alone() -> None:
+    """The same for PlaceInBin, whose reward knows size and height of the toy; its bin is empty."""
+    toys = (CUBE, ROD)
+    config = PlaceInBinConfig(youngs_modulus_range=None, render_size=64, position_range=(0.01, 0.01))
+    film = {"render_mode": "rgb_array", "device": "cpu"}
+    scene = replace(config.scene, others=())
+    env = PlaceInBinEnv(config=replace(config, objects=ObjectSet(toys, resample=True), scene=scene), **film)
+    singles = [PlaceInBinEnv(config=replace(config, scene=replace(scene, object=toy)), **film) for toy in toys]
+    down = np.tile([0.0, -1.0, -1.0, 0.0, 1.0], (14, 1))
+    down[8:, 4] = -1.0
+    follow_resets(env, singles, down.astype(np.float32))
 
 
 def test_worlds_draw_as_the_single_environment() -> None:

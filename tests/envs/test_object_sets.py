@@ -20,6 +20,7 @@ from softmode.envs import (
     LiftSoftVectorEnv,
     PlaceInBinConfig,
     PlaceInBinEnv,
+    PlaceInBinVectorEnv,
     PressSoftConfig,
     PressSoftEnv,
     PressSoftVectorEnv,
@@ -28,6 +29,7 @@ from softmode.envs import (
     PushSoftVectorEnv,
     scripted_policy,
 )
+from softmode.envs.tasks.place_in_bin.task import PlaceInBin
 from softmode.errors import ConfigError, GraspError, StateError
 from softmode.learning.config_values import config_of, pinned_options, values_of
 from softmode.objects import ObjectConfig, ObjectSet
@@ -160,6 +162,69 @@ def test_each_world_is_pressed_as_alone() -> None:
             assert own_reward == reward[k]
 
 
+def follow(many: Any, singles: list[Any], seed: int, limit: int, done: str | None = "is_success") -> None:
+    """Play the scripted policy in worlds, the same actions in single environments, and compare all that comes of it.
+
+    Args:
+        many: Worlds of a set.
+        singles: The environment of each world on its own.
+        seed: Seed of world 0.
+        limit: Most steps.
+        done: Figure that every world is to reach within them; None for none.
+    """
+    seen, infos = many.reset(seed=seed)
+    rows, worlds = [(many.state_observation, None, infos)], len(singles)
+    policy, solved = scripted_policy(many), np.zeros(worlds, bool)
+    played = []
+    while len(played) < limit and not (done and solved.all()):
+        played.append(policy(seen))
+        seen, reward, *_, infos = many.step(played[-1])
+        rows.append((many.state_observation, reward, infos))
+        solved |= infos.get(done, solved)
+    assert done is None or solved.all()
+    figures = [name for name in infos if name in singles[0].task.metric_names]
+    assert figures
+    touched = np.zeros(worlds)
+    for k, single in enumerate(singles):
+        single.reset(seed=seed + k)
+        np.testing.assert_array_equal(single.task.observation.numpy()[0], rows[0][0][k])
+        for action, (observation, reward, infos) in zip(played, rows[1:], strict=True):
+            _, own_reward, *_, info = single.step(action[k])
+            np.testing.assert_array_equal(single.task.observation.numpy()[0], observation[k])
+            assert reward is not None and own_reward == reward[k]
+            assert info["solver_status"] == infos["solver_status"][k]
+            assert [info[name] for name in figures] == [infos[name][k] for name in figures]
+            touched[k] = max(touched[k], info["finger_force"].max())
+    assert (touched > 0.1).all()
+
+
+def place_in_bin(**changes: Any) -> PlaceInBinConfig:
+    """Return PlaceInBin with a toy of the set in every world, each of its own stiffness and density."""
+    materials = [replace(one, poissons_ratio=0.3) for one in MATERIALS]
+    toys = ObjectSet((*KINDS[:1], KINDS[2]), materials=(materials[0], materials[2]), order="in_turn")
+    return PlaceInBinConfig(**{"objects": toys, "youngs_modulus_range": None, **changes})
+
+
+def test_each_toy_is_placed_as_alone() -> None:
+    """World i of PlaceInBin, whose reward knows size and height, has the bits of the single environment; both win."""
+    config = place_in_bin()
+    given = config.objects
+    assert given is not None and given.materials is not None
+    many = PlaceInBinVectorEnv(given.count, config=config, device="cpu", autoreset_mode="Disabled")
+    singles = []
+    for kind, material in zip(given.objects, given.materials, strict=True):
+        scene = replace(config.scene, object=kind, material=material)
+        singles.append(PlaceInBinEnv(config=replace(config, objects=None, scene=scene), device="cpu"))
+    follow(many, singles, seed=2, limit=180)
+
+
+def test_toys_fit_the_bin() -> None:
+    """A toy wider than the bin is refused by name."""
+    bar = replace(CUBE, extents=(0.17, 0.04, 0.04))
+    with pytest.raises(ConfigError, match=r"objects: box#2 is 0.170 m by 0.040 m wide and does not fit the bin"):
+        PlaceInBinEnv(config=place_in_bin(objects=ObjectSet([CUBE, bar], order="in_turn", first_world=1)), device="cpu")
+
+
 def test_states_of_different_objects_go_on_as_they_did() -> None:
     """After a state, in bytes, all goes on with the same bits; a world takes another one's that has its object."""
     config = lift(objects=replace(SET, objects=(CUBE, BALL), materials=None), youngs_modulus_range=(2.0e4, 2.0e6))
@@ -228,10 +293,16 @@ def test_scripted_policies_take_each_object() -> None:
     assert solved.all()
 
 
+class OneBody(PlaceInBin):
+    """A task that knows one body only."""
+
+    takes_sets = False
+
+
 def test_what_cannot_take_a_set_says_so() -> None:
     """A task that knows one body, an object too wide for the gripper, another's state, one body for all, a shortcut."""
-    with pytest.raises(ConfigError, match="PlaceInBin cannot have another object"):
-        PlaceInBinEnv(config=PlaceInBinConfig(objects=SET), device="cpu")
+    with pytest.raises(ConfigError, match="OneBody cannot have another object"):
+        OneBody(PlaceInBinConfig(objects=SET), device="cpu")
     wide = replace(CUBE, extents=(0.16, 0.16, 0.16))
     with pytest.raises(GraspError, match="box#2 does not fit the gripper"):
         LiftSoftVectorEnv(2, config=lift(objects=ObjectSet([CUBE, wide], order="in_turn")), device="cpu")
