@@ -18,10 +18,14 @@ from softmode.envs import (
     PressSoftEnv,
     PushSoftConfig,
     PushSoftEnv,
+    RopeRouteConfig,
+    RopeRouteEnv,
+    ShapeSoftConfig,
+    ShapeSoftEnv,
 )
 from softmode.errors import ConfigError
 from softmode.objects import ObjectSet
-from tests.envs.test_object_sets import CUBE, KINDS, MATERIALS, PLACE, ROD, actions, alone
+from tests.envs.test_object_sets import CUBE, KINDS, MATERIALS, PLACE, ROD, actions, alone, alone_in, posts, ropes
 
 SET = ObjectSet(KINDS, materials=MATERIALS, resample=True)
 STEPS = 22
@@ -109,6 +113,24 @@ def test_each_reset_is_placed_as_alone() -> None:
     down = np.tile([0.0, -1.0, -1.0, 0.0, 1.0], (14, 1))
     down[8:, 4] = -1.0
     follow_resets(env, singles, down.astype(np.float32))
+
+
+def test_each_reset_is_bent_as_alone() -> None:
+    """The same for ShapeSoft: targets, marker and clamped foot follow the post."""
+    config = ShapeSoftConfig(objects=posts(resample=True), youngs_modulus_range=None, render_size=64)
+    film = {"render_mode": "rgb_array", "device": "cpu"}
+    env = ShapeSoftEnv(config=config, **film)
+    singles = [ShapeSoftEnv(config=alone_in(config, k), **film) for k in range(2)]
+    follow_resets(env, singles, np.tile([0.3, 0.6, 0.0, 0.1, 0.7], (12, 1)).astype(np.float32))
+
+
+def test_each_reset_is_led_as_alone() -> None:
+    """The same for RopeRoute: the end lies where it is drawn, whatever the length; the axis follows."""
+    config = RopeRouteConfig(objects=ropes(resample=True), youngs_modulus_range=None, render_size=64)
+    film = {"render_mode": "rgb_array", "device": "cpu"}
+    env = RopeRouteEnv(config=config, **film)
+    singles = [RopeRouteEnv(config=alone_in(config, k), **film) for k in range(2)]
+    follow_resets(env, singles, np.tile([0.1, -0.1, -1.0, 0.0, 0.0], (10, 1)).astype(np.float32))
 
 
 def test_worlds_draw_as_the_single_environment() -> None:

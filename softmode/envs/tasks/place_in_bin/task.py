@@ -200,12 +200,9 @@ class PlaceInBin(Task):
         Raises:
             ConfigError: If there is one; it names the toy.
         """
-        given, scene = self.object_set, self.scene
-        held = range(len(scene.members)) if scene.resampled else np.unique(scene.chosen)
         inner = np.sort(self.config.bin.inner)
-        for k, width in zip(held, widths, strict=True):
+        for name, width in zip(self.member_names, widths, strict=True):
             if (np.sort(width) > inner).any():
-                name = "the toy" if given is None else f"objects: {given.names[k]}"
                 raise ConfigError(
                     f"{name} is {width[0]:.3f} m by {width[1]:.3f} m wide and does not fit the bin",
                     hint="give it another size, leave it out of the set, or make bin.inner larger",
