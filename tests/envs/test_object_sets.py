@@ -36,7 +36,7 @@ from softmode.envs import (
     scripted_policy,
 )
 from softmode.envs.tasks.place_in_bin.task import PlaceInBin
-from softmode.envs.tasks.rope_route.task import rope_scene
+from softmode.envs.tasks.rope_route.task import RopeRoute, rope_scene
 from softmode.envs.tasks.shape_soft.config import POST, POST_MATERIAL
 from softmode.errors import ConfigError, GraspError, StateError
 from softmode.learning.config_values import config_of, pinned_options, values_of
@@ -284,6 +284,7 @@ def test_each_rope_is_led_as_alone() -> None:
         RopeRouteConfig.preset("one_peg"), objects=ropes(order="in_turn"), youngs_modulus_range=None, render_size=64
     )
     many = RopeRouteVectorEnv(2, config=config, device="cpu", autoreset_mode="Disabled")
+    assert isinstance(many.task, RopeRoute)
     lengths = np.linalg.norm(np.diff(many.task.axis.numpy(), axis=1), axis=2).sum(axis=1)
     np.testing.assert_allclose(lengths, (0.36, 0.38), rtol=5e-3)
     singles = [RopeRouteEnv(config=alone_in(config, k), device="cpu") for k in range(2)]
