@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.envs import (
     LiftSoftConfig,
     LiftSoftEnv,
@@ -122,6 +123,14 @@ def test_each_reset_is_bent_as_alone() -> None:
     env = ShapeSoftEnv(config=config, **film)
     singles = [ShapeSoftEnv(config=alone_in(config, k), **film) for k in range(2)]
     follow_resets(env, singles, np.tile([0.3, 0.6, 0.0, 0.1, 0.7], (12, 1)).astype(np.float32))
+
+
+def test_a_clamped_post_that_may_invert_is_refused() -> None:
+    """A post of the set that no world has yet is refused for its material, like one that stands there."""
+    given = (MATERIALS[0], replace(MATERIALS[0], model=MaterialModel.NEO_HOOKEAN))
+    objects = replace(posts(resample=True), materials=given, weights=(1.0, 0.0))
+    with pytest.raises(ConfigError, match="exact regions has the material NEO_HOOKEAN"):
+        ShapeSoftEnv(config=ShapeSoftConfig(objects=objects), device="cpu")
 
 
 def test_each_reset_is_led_as_alone() -> None:
