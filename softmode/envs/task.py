@@ -28,7 +28,9 @@ from softmode.envs.parameters import Parameter, ParameterTable
 from softmode.envs.reward_kernels import StepResult, WorldState
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.errors import ConfigError, GraspError
+from softmode.objects.loader import load
 from softmode.objects.rest_grasps import rest_grasps
+from softmode.objects.soft_object import SoftObject
 from softmode.robots.jaws import ParallelJaw
 from softmode.scenes.capture import capture_graph
 from softmode.scenes.table_scene import GAP, TableScene, TableSceneConfig
@@ -180,6 +182,15 @@ class Task:
         """The step as a captured graph."""
 
     @property
+    def member_names(self) -> tuple[str, ...]:
+        """What messages call each member of the scene, see `TableScene.members`."""
+        given, scene = self.object_set, self.scene
+        if given is None:
+            return ("the object",)
+        held = range(given.count) if scene.resampled else np.unique(scene.chosen).tolist()
+        return tuple(f"objects: {given.names[k]}" for k in held)
+
+    @property
     def points_of_worlds(self) -> NDArray[np.intp]:
         """Surface samples of object 0 in the observation, shape (world_count, point_count)."""
         return self._points[self.scene.member]
@@ -255,6 +266,7 @@ class Task:
         self._wanted = wp.full(worlds, -1, dtype=int, device=device)
         self.object_index = scene.object_index
         """Which object of the set each world has, shape (world_count,); zeros without a set."""
+        self._no_shift = zeros()
         self._low = wp.array(self.low, dtype=float, device=device)
         self._high = wp.array(self.high, dtype=float, device=device)
         self.state = filled(
@@ -310,15 +322,14 @@ class Task:
         """
         if self.object_set is None or not self.grasps:
             return
-        scene, jaw, names = self.scene, ParallelJaw.of(self.config.scene.arm), self.object_set.names
-        held = range(len(scene.members)) if scene.resampled else np.unique(scene.chosen)
-        for k, thing, material in zip(held, scene.members, scene.materials, strict=True):
+        scene, jaw = self.scene, ParallelJaw.of(self.config.scene.arm)
+        for name, thing, material in zip(self.member_names, scene.members, scene.materials, strict=True):
             friction = max(math.sqrt(material.friction * jaw.friction), 1.0e-3)
             try:
                 rest_grasps(thing.body, jaw, friction=friction)
             except GraspError as error:
                 hint = "give it another size, or leave it out of the set"
-                raise GraspError(f"objects: {names[k]} does not fit the gripper: {error.message}", hint=hint) from error
+                raise GraspError(f"{name} does not fit the gripper: {error.message}", hint=hint) from error
 
     def _kept(self, material: Material) -> dict[str, float]:
         """Return the properties of a material that are not drawn."""
@@ -397,6 +408,23 @@ class Task:
         """
         return None
 
+    def marker_per_object(self, draw: Callable[[SoftObject], Splats]) -> Splats | list[Splats]:
+        """Return a marker that depends on object 0; a list where the worlds differ, see `TableScene`.
+
+        Args:
+            draw: Makes the splats of an object.
+        """
+        scene = self.scene_config()
+        given = scene.objects
+        if given is None:
+            return draw(load(scene.object, material=scene.material))
+        chosen = np.arange(given.count) if given.resample else given.chosen(self.world_count)
+        drawn = {
+            k: draw(load(given.config(k), material=given.material(k, scene.material)))
+            for k in np.unique(chosen).tolist()
+        }
+        return drawn[chosen[0]] if len(drawn) == 1 and not given.resample else [drawn[k] for k in chosen.tolist()]
+
     def front_camera(self, name: str, edge: int) -> PinholeCamera:
         """Return the camera that looks at the object from the front, with pictures of `edge` x `edge` pixels."""
         return square_camera(name, edge, (0.86, 0.34, 0.25), (0.44, 0.0, 0.11), 0.60)
@@ -434,7 +462,14 @@ class Task:
         wp.launch(kernel, dim=dim, inputs=list(inputs), outputs=list(outputs), device=self.device)
 
     def place_object(
-        self, index: int, position: str, yaw: str, *, ground: float = 0.0, turn: float = 0.0, shift: float = 0.0
+        self,
+        index: int,
+        position: str,
+        yaw: str,
+        *,
+        ground: float = 0.0,
+        turn: float = 0.0,
+        shift: wp.array | None = None,
     ) -> None:
         """Put an object down.
 
@@ -444,11 +479,17 @@ class Task:
             yaw: The one that says its rotation about the vertical [rad].
             ground: Height over the table of what it stands on [m].
             turn: What is added to the yaw [rad].
-            shift: From the centre of the unscaled object to what lies at the position, along the yaw [m].
+            shift: From the centre of the unscaled object to what lies at the position, along the yaw [m], shape
+                (world_count,); None for the centre itself.
         """
         scene, names = self.scene, {"position": position, "yaw": yaw, "scale": "scale"}
         columns = {field: self.table.column(name) for field, name in names.items()}
-        given = {"turn": turn, "shift": shift, "gap": GAP + ground, "object_index": index}
+        given = {
+            "turn": turn,
+            "shift": self._no_shift if shift is None else shift,
+            "gap": GAP + ground,
+            "object_index": index,
+        }
         place = filled(kernels.Placement, **columns, **given, height=self._heights)
         outputs = [scene.place_position, scene.place_yaw]
         self.launch(kernels.place_object, [scene.world_mask, self.state, place], outputs)

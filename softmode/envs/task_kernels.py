@@ -49,7 +49,7 @@ class Placement:
     yaw: int  # [rad]
     scale: int
     turn: float  # what is added to the yaw [rad]
-    shift: float  # from the unscaled object's centre to what lies at the position, along the yaw [m]
+    shift: wp.array[float]  # from the unscaled object's centre to what lies at the position, along the yaw [m]
     height: wp.array2d[float]  # of the unscaled object's centre [m], (world_count, objects)
     gap: float  # [m]
     object_index: int
@@ -138,8 +138,8 @@ def place_object(
         return
     scale = state.parameters[w, place.scale]
     yaw = place.turn + state.parameters[w, place.yaw]
-    x = state.parameters[w, place.position] - scale * place.shift * wp.cos(yaw)
-    y = state.parameters[w, place.position + 1] - scale * place.shift * wp.sin(yaw)
+    x = state.parameters[w, place.position] - scale * place.shift[w] * wp.cos(yaw)
+    y = state.parameters[w, place.position + 1] - scale * place.shift[w] * wp.sin(yaw)
     z = place.height[w, place.object_index] * scale + place.gap
     i = w * state.stride + place.object_index
     position_out[i] = wp.vec3d(wp.float64(x), wp.float64(y), wp.float64(z))

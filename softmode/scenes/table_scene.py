@@ -285,7 +285,8 @@ class TableScene:
         config, model, worlds = self.config, self.model, self.world_count
         with mujoco_warnings():
             rigid = SolverMuJoCo(model, njmax=config.constraint_max, nconmax=config.rigid_contact_max)
-        distinct = list({id(thing.body): thing.body for thing in (*self.members, *self.objects)}.values())
+        found = {id(thing.body): thing.body for thing in (*self.members, *self.objects)}
+        distinct = list(found.values())
         self.solver = SolverCoupledReduced(model, distinct, options=config.solver, rigid=rigid)
         self.state: Any = model.state()
         self._scratch: Any = model.state()
@@ -313,7 +314,8 @@ class TableScene:
         self._choice: BodyChoice | None = None
         if self.resampled:
             self._choice = BodyChoice(self.solver, [thing.body for thing in self.members], self.materials)
-            rows = [distinct.index(thing.body) for thing in self.members]
+            place = {key: row for row, key in enumerate(found)}  # bodies are told apart by identity
+            rows = [place[id(thing.body)] for thing in self.members]
             self._base_rows = wp.array(np.array(rows)[:, None], dtype=int, device=device)
         self.world_mask = wp.ones(worlds, dtype=wp.bool, device=device)
         """Which worlds `reset_worlds` resets, shape (world_count,)."""

@@ -8,18 +8,25 @@ from typing import Any
 import numpy as np
 import pytest
 
+from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.envs import (
     LiftSoftConfig,
     LiftSoftEnv,
     LiftSoftVectorEnv,
+    PlaceInBinConfig,
+    PlaceInBinEnv,
     PressSoftConfig,
     PressSoftEnv,
     PushSoftConfig,
     PushSoftEnv,
+    RopeRouteConfig,
+    RopeRouteEnv,
+    ShapeSoftConfig,
+    ShapeSoftEnv,
 )
 from softmode.errors import ConfigError
 from softmode.objects import ObjectSet
-from tests.envs.test_object_sets import CUBE, KINDS, MATERIALS, PLACE, ROD, actions, alone
+from tests.envs.test_object_sets import CUBE, KINDS, MATERIALS, PLACE, ROD, actions, alone, alone_in, posts, ropes
 
 SET = ObjectSet(KINDS, materials=MATERIALS, resample=True)
 STEPS = 22
@@ -76,6 +83,63 @@ def test_each_reset_is_pushed_and_pressed_as_alone(kind: Any, config: Any) -> No
         for one in (env, singles[k]):
             one.task.forget_film(np.ones(1, bool))  # the camera follows from where it was
         np.testing.assert_array_equal(env.render(), singles[k].render())
+
+
+def follow_resets(env: Any, singles: list[Any], actions: np.ndarray) -> None:
+    """Reset to the objects 0, 1, 0, play actions each time, and compare with the single environments by their bits."""
+    for seed, k in enumerate((0, 1, 0)):
+        _, info = env.reset(seed=seed, options={"object": k})
+        _, own = singles[k].reset(seed=seed)
+        assert info["object"] == k
+        for action in actions:
+            np.testing.assert_array_equal(*(one.task.observation.numpy() for one in (env, singles[k])))
+            _, reward, *_, info = env.step(action)
+            _, own_reward, *_, own = singles[k].step(action)
+            assert reward == own_reward
+            assert [info[name] for name in env.task.metric_names] == [own[name] for name in env.task.metric_names]
+        if env.render_mode is not None:
+            for one in (env, singles[k]):
+                one.task.forget_film(np.ones(1, bool))  # the camera follows from where it was
+            np.testing.assert_array_equal(env.render(), singles[k].render())
+
+
+def test_each_reset_is_placed_as_alone() -> None:
+    """The same for PlaceInBin, whose reward knows size and height of the toy; its bin is empty."""
+    toys = (CUBE, ROD)
+    config = PlaceInBinConfig(youngs_modulus_range=None, render_size=64, position_range=(0.01, 0.01))
+    film = {"render_mode": "rgb_array", "device": "cpu"}
+    scene = replace(config.scene, others=())
+    env = PlaceInBinEnv(config=replace(config, objects=ObjectSet(toys, resample=True), scene=scene), **film)
+    singles = [PlaceInBinEnv(config=replace(config, scene=replace(scene, object=toy)), **film) for toy in toys]
+    down = np.tile([0.0, -1.0, -1.0, 0.0, 1.0], (14, 1))
+    down[8:, 4] = -1.0
+    follow_resets(env, singles, down.astype(np.float32))
+
+
+def test_each_reset_is_bent_as_alone() -> None:
+    """The same for ShapeSoft: targets, marker and clamped foot follow the post."""
+    config = ShapeSoftConfig(objects=posts(resample=True), youngs_modulus_range=None, render_size=64)
+    film = {"render_mode": "rgb_array", "device": "cpu"}
+    env = ShapeSoftEnv(config=config, **film)
+    singles = [ShapeSoftEnv(config=alone_in(config, k), **film) for k in range(2)]
+    follow_resets(env, singles, np.tile([0.3, 0.6, 0.0, 0.1, 0.7], (12, 1)).astype(np.float32))
+
+
+def test_a_clamped_post_that_may_invert_is_refused() -> None:
+    """A post of the set that no world has yet is refused for its material, like one that stands there."""
+    given = (MATERIALS[0], replace(MATERIALS[0], model=MaterialModel.NEO_HOOKEAN))
+    objects = replace(posts(resample=True), materials=given, weights=(1.0, 0.0))
+    with pytest.raises(ConfigError, match="exact regions has the material NEO_HOOKEAN"):
+        ShapeSoftEnv(config=ShapeSoftConfig(objects=objects), device="cpu")
+
+
+def test_each_reset_is_led_as_alone() -> None:
+    """The same for RopeRoute: the end lies where it is drawn, whatever the length; the axis follows."""
+    config = RopeRouteConfig(objects=ropes(resample=True), youngs_modulus_range=None, render_size=64)
+    film = {"render_mode": "rgb_array", "device": "cpu"}
+    env = RopeRouteEnv(config=config, **film)
+    singles = [RopeRouteEnv(config=alone_in(config, k), **film) for k in range(2)]
+    follow_resets(env, singles, np.tile([0.1, -0.1, -1.0, 0.0, 0.0], (10, 1)).astype(np.float32))
 
 
 def test_worlds_draw_as_the_single_environment() -> None:

@@ -20,17 +20,28 @@ from softmode.envs import (
     LiftSoftVectorEnv,
     PlaceInBinConfig,
     PlaceInBinEnv,
+    PlaceInBinVectorEnv,
     PressSoftConfig,
     PressSoftEnv,
     PressSoftVectorEnv,
     PushSoftConfig,
     PushSoftEnv,
     PushSoftVectorEnv,
+    RopeRouteConfig,
+    RopeRouteEnv,
+    RopeRouteVectorEnv,
+    ShapeSoftConfig,
+    ShapeSoftEnv,
+    ShapeSoftVectorEnv,
     scripted_policy,
 )
+from softmode.envs.tasks.place_in_bin.task import PlaceInBin
+from softmode.envs.tasks.rope_route.task import RopeRoute, rope_scene
+from softmode.envs.tasks.shape_soft.config import POST, POST_MATERIAL
 from softmode.errors import ConfigError, GraspError, StateError
 from softmode.learning.config_values import config_of, pinned_options, values_of
 from softmode.objects import ObjectConfig, ObjectSet
+from softmode.objects.task_objects import ROPE_MATERIAL
 from softmode.scenes import BoundSplats
 from softmode.splats import make_plush, write_splats
 
@@ -160,6 +171,134 @@ def test_each_world_is_pressed_as_alone() -> None:
             assert own_reward == reward[k]
 
 
+def follow(many: Any, singles: list[Any], seed: int, limit: int, done: str | None = "is_success") -> None:
+    """Play the scripted policy in worlds, the same actions in single environments, and compare all that comes of it.
+
+    Args:
+        many: Worlds of a set.
+        singles: The environment of each world on its own.
+        seed: Seed of world 0.
+        limit: Most steps.
+        done: Figure that every world is to reach within them; None for none.
+    """
+    seen, infos = many.reset(seed=seed)
+    rows, worlds = [(many.task.observation.numpy().copy(), None, infos)], len(singles)
+    policy, solved = scripted_policy(many), np.zeros(worlds, bool)
+    played = []
+    while len(played) < limit and not (done and solved.all()):
+        played.append(policy(seen))
+        seen, reward, *_, infos = many.step(played[-1])
+        rows.append((many.task.observation.numpy().copy(), reward, infos))
+        solved |= infos.get(done, solved)
+    assert done is None or solved.all()
+    figures = [name for name in infos if name in singles[0].task.metric_names]
+    assert figures
+    touched = np.zeros(worlds)
+    for k, single in enumerate(singles):
+        single.reset(seed=seed + k)
+        np.testing.assert_array_equal(single.task.observation.numpy()[0], rows[0][0][k])
+        for action, (observation, reward, infos) in zip(played, rows[1:], strict=True):
+            _, own_reward, *_, info = single.step(action[k])
+            np.testing.assert_array_equal(single.task.observation.numpy()[0], observation[k])
+            assert reward is not None and own_reward == reward[k]
+            assert info["solver_status"] == infos["solver_status"][k]
+            assert [info[name] for name in figures] == [infos[name][k] for name in figures]
+            touched[k] = max(touched[k], info["finger_force"].max())
+    assert (touched > 0.1).all()
+
+
+def place_in_bin(**changes: Any) -> PlaceInBinConfig:
+    """Return PlaceInBin with a toy of the set in every world, each of its own stiffness and density."""
+    materials = [replace(one, poissons_ratio=0.3) for one in MATERIALS]
+    toys = ObjectSet((*KINDS[:1], KINDS[2]), materials=(materials[0], materials[2]), order="in_turn")
+    return PlaceInBinConfig(**{"objects": toys, "youngs_modulus_range": None, **changes})
+
+
+def test_each_toy_is_placed_as_alone() -> None:
+    """World i of PlaceInBin, whose reward knows size and height, has the bits of the single environment; both win."""
+    config = place_in_bin()
+    many = PlaceInBinVectorEnv(2, config=config, device="cpu", autoreset_mode="Disabled")
+    singles = [PlaceInBinEnv(config=alone_in(config, k), device="cpu") for k in range(2)]
+    follow(many, singles, seed=2, limit=180)
+
+
+def test_toys_fit_the_bin() -> None:
+    """A toy wider than the bin is refused by name."""
+    bar = replace(CUBE, extents=(0.17, 0.04, 0.04))
+    with pytest.raises(ConfigError, match=r"objects: box#2 is 0.170 m by 0.040 m wide and does not fit the bin"):
+        PlaceInBinEnv(config=place_in_bin(objects=ObjectSet([CUBE, bar], order="in_turn", first_world=1)), device="cpu")
+
+
+def posts(**options: Any) -> ObjectSet:
+    """Return posts of two widths and heights, the second with more samples and functions."""
+    other = replace(POST, extents=(0.026, 0.026, 0.13), surface_count=270, build=BuildOptions(mode_count=3))
+    given = (replace(POST_MATERIAL, youngs_modulus=1.0e5), replace(POST_MATERIAL, density=400.0))
+    return ObjectSet((POST, other), materials=given, **options)
+
+
+def alone_in(config: Any, k: int) -> Any:
+    """Return the configuration of the single environment with object k, of its material."""
+    given = config.objects
+    scene = replace(config.scene, object=given.objects[k], material=given.materials[k])
+    return replace(config, objects=None, scene=scene)
+
+
+def test_each_post_is_bent_as_alone() -> None:
+    """World i of ShapeSoft, whose targets are bends of its own post, has the bits of the single environment."""
+    config = ShapeSoftConfig(objects=posts(order="in_turn"), youngs_modulus_range=None, render_size=64)
+    many = ShapeSoftVectorEnv(2, config=config, device="cpu", autoreset_mode="Disabled", render_mode="rgb_array")
+    film = {"device": "cpu", "render_mode": "rgb_array"}
+    singles = [ShapeSoftEnv(config=alone_in(config, k), **film) for k in range(2)]
+    follow(many, singles, seed=6, limit=100)
+    pictures = many.render()
+    assert pictures is not None
+    for k, single in enumerate(singles):
+        np.testing.assert_array_equal(single.render(), pictures[k])
+
+
+def test_posts_are_posts() -> None:
+    """A set with anything else is refused by name; the lowest post bounds the goal; a goal object fits all."""
+    with pytest.raises(ConfigError, match=r"objects: mug is a .*, clamped 0.0 m high"):
+        ShapeSoftConfig(objects=ObjectSet([POST, "mug"]))
+    low = replace(POST, extents=(0.03, 0.03, 0.09))
+    with pytest.raises(ConfigError, match="goal_displacement"):
+        ShapeSoftConfig(objects=ObjectSet([POST, low]))
+    with pytest.raises(ConfigError, match="goal_object: expected extents of the same height"):
+        ShapeSoftConfig(
+            objects=ObjectSet([POST, replace(POST, extents=(0.03, 0.03, 0.13))]), goal_object=POST, reward="log_mass"
+        )
+
+
+def ropes(**options: Any) -> ObjectSet:
+    """Return ropes of two lengths, radii and stiffnesses; the second has more samples and functions."""
+    first = rope_scene().object
+    build = replace(first.build, function_count=52, cubature_count=160)
+    second = replace(first, extents=(0.38, 0.018, 0.018), surface_count=180, build=build)
+    given = (ROPE_MATERIAL, replace(ROPE_MATERIAL, youngs_modulus=2.0e5, density=600.0))
+    return ObjectSet((first, second), materials=given, **options)
+
+
+def test_each_rope_is_led_as_alone() -> None:
+    """World i of RopeRoute, whose axis, end and point to grasp are those of its rope, has the bits of it alone."""
+    config = replace(
+        RopeRouteConfig.preset("one_peg"), objects=ropes(order="in_turn"), youngs_modulus_range=None, render_size=64
+    )
+    many = RopeRouteVectorEnv(2, config=config, device="cpu", autoreset_mode="Disabled")
+    assert isinstance(many.task, RopeRoute)
+    lengths = np.linalg.norm(np.diff(many.task.axis.numpy(), axis=1), axis=2).sum(axis=1)
+    np.testing.assert_allclose(lengths, (0.36, 0.38), rtol=5e-3)
+    singles = [RopeRouteEnv(config=alone_in(config, k), device="cpu") for k in range(2)]
+    follow(many, singles, seed=1, limit=130)
+
+
+def test_ropes_are_ropes() -> None:
+    """What is not slender, or bent, is refused by name."""
+    for other in (CUBE, "rope"):
+        given = ObjectSet([rope_scene().object, other], order="in_turn", first_world=1)
+        with pytest.raises(ConfigError, match=r"objects: (box|rope) is no rope: 0\.\d+ m along x, and"):
+            RopeRouteEnv(config=RopeRouteConfig(objects=given), device="cpu")
+
+
 def test_states_of_different_objects_go_on_as_they_did() -> None:
     """After a state, in bytes, all goes on with the same bits; a world takes another one's that has its object."""
     config = lift(objects=replace(SET, objects=(CUBE, BALL), materials=None), youngs_modulus_range=(2.0e4, 2.0e6))
@@ -228,10 +367,16 @@ def test_scripted_policies_take_each_object() -> None:
     assert solved.all()
 
 
+class OneBody(PlaceInBin):
+    """A task that knows one body only."""
+
+    takes_sets = False
+
+
 def test_what_cannot_take_a_set_says_so() -> None:
     """A task that knows one body, an object too wide for the gripper, another's state, one body for all, a shortcut."""
-    with pytest.raises(ConfigError, match="PlaceInBin cannot have another object"):
-        PlaceInBinEnv(config=PlaceInBinConfig(objects=SET), device="cpu")
+    with pytest.raises(ConfigError, match="OneBody cannot have another object"):
+        OneBody(PlaceInBinConfig(objects=SET), device="cpu")
     wide = replace(CUBE, extents=(0.16, 0.16, 0.16))
     with pytest.raises(GraspError, match="box#2 does not fit the gripper"):
         LiftSoftVectorEnv(2, config=lift(objects=ObjectSet([CUBE, wide], order="in_turn")), device="cpu")

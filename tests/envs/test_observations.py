@@ -163,11 +163,11 @@ def shape_soft(seen: HostState) -> Numbers:
     """The target: between the nearest recorded directions and displacements, turned into the wanted direction."""
     displacement, direction = seen.drawn["goal"]
     targets = seen.env.task.targets  # type: ignore[attr-defined]
-    table = targets.points.numpy()[:, :, : len(seen.rest)].astype(float)
+    table = targets.points.numpy()[0, :, :, : len(seen.rest)].astype(float)
     directions, levels = table.shape[:2]
     alpha = direction - 0.5 * np.pi
     at = ((seen.drawn["yaw"][0] - alpha) / (2.0 * np.pi)) % 1.0 * directions
-    depth = displacement / targets.displacement_max * (levels - 1)
+    depth = displacement / targets.displacement_max.numpy()[0] * (levels - 1)
     j, k = int(at), min(int(depth), levels - 2)
     between = [(1.0 - depth + k) * table[m, k] + (depth - k) * table[m, k + 1] for m in (j, (j + 1) % directions)]
     shape = (1.0 - at + j) * between[0] + (at - j) * between[1]

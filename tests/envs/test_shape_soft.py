@@ -218,7 +218,7 @@ def test_the_goal_is_another_body() -> None:
     given = {"position": (0.45, 0.0), "yaw": 0.0}
     observation, info = env.reset(seed=0, options={**given, "goal": (0.0, 0.0)})
     low = points(observation["desired_goal"])
-    low[:, 2] -= env.task.targets.points.numpy()[0, 0, :, 2].min()
+    low[:, 2] -= env.task.targets.points.numpy()[0, 0, 0, :, 2].min()
     assert np.abs(low[:, :2]).max() == pytest.approx(0.012, abs=1e-3)  # the square's side, not the post's radius
     assert np.hypot(*points(observation["achieved_goal"])[:, :2].T).max() > 0.0145
     at_rest = info["shape_error"]

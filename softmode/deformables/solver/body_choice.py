@@ -16,6 +16,7 @@ from softmode.deformables.model.tables import allocate, starts_of
 from softmode.deformables.solver import body_choice_kernels as kernels
 from softmode.deformables.solver.iteration_kernels import NewtonArrays
 from softmode.deformables.solver.reduced_solver import ReducedSolver, require_reduced
+from softmode.deformables.solver.solver_reduced import require_driven_material
 from softmode.errors import ConfigError
 
 _KEPT = ("rate", "volume_ratio", "constraint", "shape", "direction")
@@ -35,7 +36,8 @@ class BodyChoice:
         materials: What each is made of; only what :func:`set_parameters` does not set is taken from it.
 
     Raises:
-        ConfigError: If a world has not one soft body, a body is not among the solver's, or has exact regions or pins.
+        ConfigError: If a world has not one soft body, a body is not among the solver's or has pins, or one with exact
+            regions is NEO_HOOKEAN.
     """
 
     def __init__(self, solver: ReducedSolver, bodies: Sequence[ReducedBody], materials: Sequence[Material]) -> None:
@@ -50,9 +52,10 @@ class BodyChoice:
             )
         known = {body_key(body): a for a, body in enumerate(layout.bodies)}
         missing = [body.name for body in bodies if body_key(body) not in known]
-        if missing or any(body.driven_count for body in bodies):
-            what = f"{missing[0]!r} is not among the solver's" if missing else "one has exact regions"
-            raise ConfigError(f"bodies to choose from: {what}", hint="give the solver all bodies")
+        if missing:
+            what = f"bodies to choose from: {missing[0]!r} is not among the solver's"
+            raise ConfigError(what, hint="give the solver all bodies")
+        require_driven_material([body.driven_count for body in bodies], [int(one.model) for one in materials])
         asset = np.array([known[body_key(body)] for body in bodies])
         points, samples = (
             np.array([getattr(body, name) for body in layout.bodies]) for name in ("point_count", "surface_count")
@@ -62,6 +65,7 @@ class BodyChoice:
             "asset": asset,
             "key": np.array([body_key(body) for body in bodies]),
             "function_count": [body.function_count for body in bodies],
+            "driven_count": [body.driven_count for body in bodies],
             "point_start": starts_of(points)[asset],
             "point_count": points[asset],
             "row_start": starts_of(samples)[asset],

@@ -3,7 +3,9 @@
 from collections.abc import Callable, Sequence
 
 import newton
+import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material_kernels import MaterialModel
@@ -86,12 +88,7 @@ class SolverReduced(ReducedSolver):
 
     def _check_materials(self) -> None:
         """Refuse materials that the bodies cannot have."""
-        models = self.parameters.material_model.numpy()
-        if (self.tables.instances.driven_count.numpy()[models == int(MaterialModel.NEO_HOOKEAN)] > 0).any():
-            raise ConfigError(
-                "a body with exact regions has the material NEO_HOOKEAN, which a driven region may invert in one step",
-                hint="use STABLE_NEO_HOOKEAN_LOG, or a soft region",
-            )
+        require_driven_material(self.tables.instances.driven_count.numpy(), self.parameters.material_model.numpy())
 
     def notify_model_changed(self, flags: int) -> None:
         """Follow changes of the model: call it, with any flags, after a change of density, scale or material model.
@@ -208,3 +205,20 @@ class SolverReduced(ReducedSolver):
         """
         flags = newton.StateFlags.ALL if flags is None else flags
         last_phase.reset(self.tables, state, self.checked_mask(world_mask), flags)
+
+
+def require_driven_material(driven_counts: ArrayLike, models: ArrayLike) -> None:
+    """Refuse a material that a driven region may invert.
+
+    Args:
+        driven_counts: Prescribed functions of each body.
+        models: Numbers of the material models.
+
+    Raises:
+        ConfigError: If a body with exact regions is NEO_HOOKEAN.
+    """
+    if (np.asarray(driven_counts)[np.asarray(models) == int(MaterialModel.NEO_HOOKEAN)] > 0).any():
+        raise ConfigError(
+            "a body with exact regions has the material NEO_HOOKEAN, which a driven region may invert in one step",
+            hint="use STABLE_NEO_HOOKEAN_LOG, or a soft region",
+        )

@@ -42,8 +42,8 @@ class Plan:
     wall: float  # thickness of the walls [m]
     floor: float  # height of the bin's floor [m]
     highest: float  # height of the centre of what counts as inside [m]
-    height: float  # of the unscaled toy's centre at rest [m]
-    radius: float  # from there to its farthest point [m]
+    rest_height: wp.array[float]  # of the unscaled toy's centre [m], (world_count,)
+    radius: wp.array[float]  # from there to its farthest point [m], (world_count,)
     clearance: float  # over the rim while carrying [m]
     rest_speed: float  # [m/s]
     hold_steps: int
@@ -87,8 +87,8 @@ def evaluate(state: WorldState, plan: Plan, result: StepResult):
     distance = wp.length(x - tool_position(state, w))
     inside = result.metrics[w, Metric.bin_distance] == 0.0 and x[2] <= plan.highest
     # fingers may feel another object: only near the first one they hold that one
-    grip = grasped(state, w) and distance < size * plan.radius + 0.02
-    low = plan.height * size
+    grip = grasped(state, w) and distance < size * plan.radius[w] + 0.02
+    low = plan.rest_height[w] * size
     carried = rim[2] + low + plan.clearance
     aside = beyond(x, rim, plan.half - wp.vec2(plan.margin, plan.margin))
     held_or_in = wp.where(grip or inside, 1.0, 0.0)

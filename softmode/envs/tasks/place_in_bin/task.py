@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from softmode.checks import require_fields, require_number, require_numbers
 from softmode.deformables.build.options import BuildOptions
@@ -164,6 +165,7 @@ class PlaceInBin(Task):
     config_class = PlaceInBinConfig
     kernels = kernels
     grasps = True
+    takes_sets = True
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
 
@@ -181,17 +183,40 @@ class PlaceInBin(Task):
         """Half of its inner edges [m]."""
         self.highest = given.height + self.config.rim_allowance
         """Height of its centre below which an object is in the bin [m]."""
-        points = [thing.body.surface_points for thing in self.scene.objects]
+        toys = [thing.body.surface_points for thing in self.scene.members]
+        others = [thing.body.surface_points for thing in self.scene.objects[1:]]
         self.wall, self.floor, self.margin, self.clearance = given.wall, given.floor, 0.3 * min(self.half), CLEARANCE
-        self.radius = float(np.linalg.norm(points[0], axis=1).max())
+        self.radius = self.per_object([np.linalg.norm(x, axis=1).max() for x in toys])
+        """From the centre of each unscaled toy to its farthest point [m], shape (world_count,)."""
         self.other_offsets = self.column("other_offsets") if self.config.scene.others else 0
         scale = (self.config.scale_range or (1.0, 1.0))[1]
-        self._check_room([scale * float(np.linalg.norm(x[:, :2], axis=1).max()) for x in points])
+        radii = [[scale * float(np.linalg.norm(x[:, :2], axis=1).max()) for x in each] for each in (toys, others)]
+        self._check_room(max(radii[0]), radii[1])
+        self._check_widths([scale * np.ptp(x[:, :2], axis=0) for x in toys])
 
-    def _check_room(self, radii: list[float]) -> None:
-        """Refuse objects that may start in each other or in a wall; their horizontal radii are given [m]."""
+    def _check_widths(self, widths: list[NDArray[np.float64]]) -> None:
+        """Refuse toys that lie in the bin neither along nor across; their horizontal widths are given [m].
+
+        Raises:
+            ConfigError: If there is one; it names the toy.
+        """
+        inner = np.sort(self.config.bin.inner)
+        for name, width in zip(self.member_names, widths, strict=True):
+            if (np.sort(width) > inner).any():
+                raise ConfigError(
+                    f"{name} is {width[0]:.3f} m by {width[1]:.3f} m wide and does not fit the bin",
+                    hint="give it another size, leave it out of the set, or make bin.inner larger",
+                )
+
+    def _check_room(self, toy: float, others: list[float]) -> None:
+        """Refuse objects that may start in each other or in a wall.
+
+        Args:
+            toy: Horizontal radius of the largest toy [m].
+            others: Those of the other objects [m].
+        """
         config, (a, b) = self.config, self.half
-        (toy, *others), (dx, dy) = radii, config.other_range
+        dx, dy = config.other_range
         width = 2.0 * b / max(len(others), 1)
         fits = (
             all(dx + r <= a for r in others)

@@ -24,7 +24,6 @@ from softmode.envs.task_config import TaskConfig
 from softmode.envs.task_kernels import forget
 from softmode.envs.tasks.push_soft import kernels
 from softmode.objects.config import ObjectConfig
-from softmode.objects.loader import load
 from softmode.objects.soft_object import SoftObject
 from softmode.robots.arm import ArmDescription
 from softmode.robots.control import ArmControlOptions
@@ -172,16 +171,7 @@ class PushSoft(Task):
 
     def marker(self) -> Splats | Sequence[Splats]:
         """Return the outline of the object, to be drawn on the table; a list where the worlds differ."""
-        scene = self.scene_config()
-        if scene.objects is None:
-            return _outline(load(scene.object, material=scene.material))
-        given = scene.objects
-        chosen = np.arange(given.count) if given.resample else given.chosen(self.world_count)
-        drawn = {
-            k: _outline(load(scene.objects.config(k), material=scene.objects.material(k, scene.material)))
-            for k in np.unique(chosen).tolist()
-        }
-        return drawn[chosen[0]] if len(drawn) == 1 and not given.resample else [drawn[k] for k in chosen.tolist()]
+        return self.marker_per_object(_outline)
 
 
 def _outline(thing: SoftObject) -> Splats:

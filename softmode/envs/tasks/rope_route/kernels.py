@@ -34,13 +34,23 @@ class Columns:
 
 
 @wp.struct
+class Ropes:
+    """Points on the axes of the ropes that worlds may have."""
+
+    member: wp.array[int]  # which rope each world has, (world_count,)
+    rest: wp.array2d[wp.vec3d]  # (ropes, points) [m]
+    basis: wp.array3d[wp.float64]  # there, (ropes, points, functions)
+    function_count: wp.array[int]  # of each rope
+
+
+@wp.struct
 class Plan:
     """Columns, the rope's axis, the pegs, and when the goal is met."""
 
     drawn: Drawn
     columns: Columns
-    height: float  # of the unscaled rope's axis [m]
-    grasp_point: int  # index of the axis point to grasp
+    rest_height: wp.array[float]  # of the unscaled rope's axis [m], (world_count,)
+    grasp_point: wp.array[int]  # index of the axis point to grasp, (world_count,)
     axis: wp.array2d[wp.vec3]  # from tail to end [m]
     peg_position: wp.array[wp.vec2]  # [m]
     peg_height: float  # of the lowest peg's top [m]
@@ -74,17 +84,17 @@ def turn(a: wp.vec2, b: wp.vec2):
 @wp.kernel
 def trace_axis(
     state: WorldState,
-    rest: wp.array[wp.vec3d],
-    basis: wp.array2d[wp.float64],  # at the points of the axis, (points, functions)
+    ropes: Ropes,
     # Out:
     axis: wp.array2d[wp.vec3],
 ):
     """Deform the points of the axis: x = X + sum_k b_k(X) q_k."""
     w, i = wp.tid()
     start = state.function_start[w]
-    x = rest[i]
-    for k in range(basis.shape[1]):
-        x += basis[i, k] * state.q[start + k]
+    b = ropes.member[w]
+    x = ropes.rest[b, i]
+    for k in range(ropes.function_count[b]):
+        x += ropes.basis[b, i, k] * state.q[start + k]
     axis[w, i] = wp.vec3(x)
 
 
@@ -96,7 +106,7 @@ def observe(state: WorldState, plan: Plan, result: StepResult):
     goal = rope_goal(state, plan, w)
     points = plan.axis.shape[1]
     end = plan.axis[w, points - 1]
-    grasp = plan.axis[w, plan.grasp_point]
+    grasp = plan.axis[w, plan.grasp_point[w]]
     write(result.observation, w, plan.columns.goal, goal)
     write(result.observation, w, plan.columns.goal_offset, goal - wp.vec2(tool[0], tool[1]))
     write(result.observation, w, plan.columns.grasp_offset, grasp - tool)
@@ -122,7 +132,7 @@ def observe(state: WorldState, plan: Plan, result: StepResult):
     result.metrics[w, Metric.least_winding] = least
     result.metrics[w, Metric.highest_point] = top
     result.metrics[w, Metric.grasp_distance] = wp.length(grasp - tool)
-    result.marker_place[w] = wp.transform(wp.vec3(goal[0], goal[1], plan.height), wp.quat_identity())
+    result.marker_place[w] = wp.transform(wp.vec3(goal[0], goal[1], plan.rest_height[w]), wp.quat_identity())
 
 
 @wp.kernel

@@ -50,9 +50,10 @@ class ScriptedRope(ScriptedPolicy):
         """Return the action for the present state."""
         task, control, tool, force = self.task, self.control, self.tool, self.weaker_force
         axis = task.axis.numpy()[self.world].astype(float)
-        grasp, end = axis[task.grasp_point], axis[-1]
+        point = int(task.grasp_points[self.scene.member[self.world]])
+        grasp, end = axis[point], axis[-1]
         lowest = control.workspace_lower[2]
-        along = end - axis[task.grasp_point - 2]
+        along = end - axis[point - 2]
         yaw = float(np.arctan2(along[1], along[0]))
         yaw -= np.pi * np.round((yaw - 0.5 * np.pi) / np.pi)  # fingers may change sides
         turn = yaw - self.yaw

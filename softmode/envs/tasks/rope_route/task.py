@@ -10,6 +10,8 @@ import numpy as np
 import warp as wp
 
 from softmode.checks import require_fields, require_range
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.model.structs import filled
 from softmode.envs.cameras import square_camera
 from softmode.envs.markers import sphere_marker
 from softmode.envs.observation import Segment
@@ -33,6 +35,8 @@ AXIS_POINTS = 25
 """Points on the rope's axis that its winding is measured with."""
 GRASP = 0.03
 """Distance of the point to grasp from the rope's end [m]."""
+SLENDER = 8
+"""Least ratio of a rope's length to its width."""
 PEGS = ((0.45, -0.03), (0.45, 0.11))
 """Where the default pegs stand [m]; the rope is to pass them in this order, towards y."""
 PEG_SIZE = (0.015, 0.04)
@@ -138,26 +142,55 @@ class RopeRoute(Task):
     config: RopeRouteConfig
     config_class = RopeRouteConfig
     kernels = kernels
+    takes_sets = True
     grasps = True
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
 
     def build(self) -> None:
-        """Sample the axis."""
-        body, device = self.scene.soft.body, self.device
-        low, high = body.bounds
-        self.half_length = float(0.5 * (high[0] - low[0]))
-        rest = np.zeros((AXIS_POINTS, 3))
-        rest[:, 0] = np.linspace(-self.half_length, self.half_length, AXIS_POINTS)
-        self.grasp_point = int(np.argmin(np.abs(rest[:, 0] - (self.half_length - GRASP))))
-        """Index of the axis point to grasp."""
-        self._rest = wp.array(rest, dtype=wp.vec3d, device=device)
-        self._basis = wp.array(body.evaluate(rest)[0], dtype=wp.float64, device=device)
+        """Sample the axes."""
+        device, bodies = self.device, [thing.body for thing in self.scene.members]
+        self._check_ropes(bodies)
+        halves = np.array([0.5 * (body.bounds[1][0] - body.bounds[0][0]) for body in bodies])
+        self.half_length = self.per_object(halves)
+        """Half of the length of every unscaled rope [m], shape (world_count,)."""
+        rest = np.zeros((len(bodies), AXIS_POINTS, 3))
+        rest[:, :, 0] = [np.linspace(-half, half, AXIS_POINTS) for half in halves]
+        self.grasp_points = np.argmin(np.abs(rest[:, :, 0] - (halves - GRASP)[:, None]), axis=1)
+        """Index of the axis point to grasp, of every member of the scene."""
+        self.grasp_point = self.per_object(self.grasp_points, int)
+        counts = [body.function_count for body in bodies]
+        basis = np.zeros((len(bodies), AXIS_POINTS, max(counts)))
+        for b, body in enumerate(bodies):
+            basis[b, :, : counts[b]] = body.evaluate(rest[b])[0]
+        self._ropes = filled(
+            kernels.Ropes,
+            member=self.per_object(np.arange(len(bodies)), int),
+            rest=wp.array(rest, dtype=wp.vec3d, device=device),
+            basis=wp.array(basis, dtype=wp.float64, device=device),
+            function_count=wp.array(counts, dtype=int, device=device),
+        )
         self.axis = wp.zeros((self.world_count, AXIS_POINTS), dtype=wp.vec3, device=device)
         """Points on the axis, from tail to end [m], shape (world_count, AXIS_POINTS)."""
         self.peg_height = min(peg.position[2] + peg.size[1] for peg in self.config.pegs)
         """Height of the lowest peg's top [m]."""
         self.peg_position = wp.array([peg.position[:2] for peg in self.config.pegs], dtype=wp.vec2, device=device)
+
+    def _check_ropes(self, bodies: list[ReducedBody]) -> None:
+        """Refuse what does not lie straight along x, or is not slender.
+
+        Raises:
+            ConfigError: If a body is no rope; it names the object.
+        """
+        for name, body in zip(self.member_names, bodies, strict=True):
+            length = float(np.ptp(body.surface_points[:, 0]))
+            width = 2.0 * float(np.linalg.norm(body.surface_points[:, 1:], axis=1).max())
+            if length < SLENDER * width:
+                raise ConfigError(
+                    f"{name} is no rope: {length:.3f} m along x, and {width:.3f} m across",
+                    hint=f"give straight ropes along x, at least {SLENDER} times as long as wide, such as"
+                    " ObjectConfig(shape='capsule', extents=(0.36, 0.016, 0.016)); leave others out of the set",
+                )
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the side of the first peg, and the goal: aside of the last peg, and beyond it [m]."""
@@ -192,7 +225,7 @@ class RopeRoute(Task):
 
     def observe(self) -> None:
         """Trace the axis and write goal, end and winding."""
-        self.launch(kernels.trace_axis, [self.state, self._rest, self._basis], [self.axis], self.axis.shape)
+        self.launch(kernels.trace_axis, [self.state, self._ropes], [self.axis], self.axis.shape)
         super().observe()
 
     def marker(self) -> Splats:

@@ -82,26 +82,23 @@ class ShapeSoftConfig(TaskConfig):
     def __post_init__(self) -> None:
         """Check the ranges."""
         super().__post_init__()
-        thing, goal = self.scene.object, self.goal_object
-        upright = thing.shape == "cylinder" and thing.extents is not None and thing.extents[0] == thing.extents[1]
-        if not upright or not thing.clamped_height > 0.0:
-            raise ConfigError(
-                f"the object of ShapeSoft is a {thing.shape} {thing.extents}, clamped {thing.clamped_height} m high",
-                hint="give a cylinder with two equal horizontal extents and clamped_height > 0",
-            )
+        goal = self.goal_object
+        heights = self._heights()
+        height = min(heights)
         if self.scale_range is not None:
             raise ConfigError(
                 f"scale_range is {self.scale_range}", hint="a clamped object keeps its scale; leave it out"
             )
-        height = thing.extents[2] if thing.extents is not None else 0.0
         if goal is not None and self.reward != "log_mass":
             raise ConfigError(
                 f"goal_object needs points that do not correspond, reward is {self.reward!r}",
                 hint='take reward="log_mass"',
             )
-        if goal is not None and (goal.extents is None or goal.extents[2] != height or not goal.clamped_height > 0.0):
+        if goal is not None and (
+            goal.extents is None or any(goal.extents[2] != one for one in heights) or not goal.clamped_height > 0.0
+        ):
             raise ConfigError(
-                f"goal_object: expected extents of the same height, {height} m, and clamped_height > 0, got "
+                f"goal_object: expected extents of the same height, {heights} m, and clamped_height > 0, got "
                 f"{goal.extents} and {goal.clamped_height}"
             )
         require_range("goal_displacement", self.goal_displacement, at_least=0.0, at_most=0.6 * height, unit="m")
@@ -112,3 +109,26 @@ class ShapeSoftConfig(TaskConfig):
         require_number("log_mass_spacing", self.log_mass_spacing, above=0.0, at_most=0.1, unit="m")
         require_fields(self, ("log_mass_length", "log_mass_tolerance"), above=0.0, at_most=1.0)
         require_fields(self, ("hold_steps",), at_least=1)
+
+    def _heights(self) -> list[float]:
+        """Return how high the post is, or each of the set [m].
+
+        Raises:
+            ConfigError: If one is no post.
+        """
+        given, scene = self.object_set, self.scene
+        if given is None:
+            things = {"the object of ShapeSoft": scene.object}
+        else:
+            kinds = given.resolved(scene.object)
+            things = {f"objects: {name}": kinds.config(k) for k, name in enumerate(given.names)}
+        heights = []
+        for name, thing in things.items():
+            e = thing.extents
+            if thing.shape != "cylinder" or e is None or e[0] != e[1] or not thing.clamped_height > 0.0:
+                raise ConfigError(
+                    f"{name} is a {thing.shape} {e}, clamped {thing.clamped_height} m high",
+                    hint="give a cylinder with two equal horizontal extents and clamped_height > 0",
+                )
+            heights.append(e[2])
+        return heights

@@ -37,10 +37,11 @@ class Columns:
 
 @wp.struct
 class Target:
-    """A recorded press along y; see `targets.ShapeTargets`."""
+    """Recorded presses along y; see `targets.ShapeTargets`."""
 
-    points: wp.array3d[wp.vec3]  # (directions, levels, points) [m]
-    displacement_max: float  # of the last level [m]
+    points: wp.array4d[wp.vec3]  # (members, directions, levels, points) [m]
+    displacement_max: wp.array[float]  # of the last level [m], (members,)
+    member: wp.array[int]  # whose press the target of a world is, (world_count,)
 
 
 @wp.struct
@@ -72,19 +73,21 @@ def target_point(state: WorldState, plan: Plan, w: int, i: int):
 
     A post at yaw psi that is pressed in direction alpha + 90 degrees: R(alpha) x(R(psi - alpha) X), x the press.
     """
-    directions = plan.target.points.shape[0]
-    levels = plan.target.points.shape[1]
+    b = plan.target.member[w]
+    directions = plan.target.points.shape[1]
+    levels = plan.target.points.shape[2]
     alpha = state.parameters[w, plan.drawn.goal + 1] - 0.25 * TURN
     turns = (state.parameters[w, plan.drawn.yaw] - alpha) / TURN
     at = (turns - wp.floor(turns)) * float(directions)
     j = wp.min(int(at), directions - 1)
     u = at - float(j)
-    depth = wp.clamp(state.parameters[w, plan.drawn.goal] / plan.target.displacement_max, 0.0, 1.0) * float(levels - 1)
+    displacement = state.parameters[w, plan.drawn.goal] / plan.target.displacement_max[b]
+    depth = wp.clamp(displacement, 0.0, 1.0) * float(levels - 1)
     k = wp.min(int(depth), levels - 2)
     v = depth - float(k)
     m = (j + 1) % directions
-    near = (1.0 - v) * plan.target.points[j, k, i] + v * plan.target.points[j, k + 1, i]
-    far = (1.0 - v) * plan.target.points[m, k, i] + v * plan.target.points[m, k + 1, i]
+    near = (1.0 - v) * plan.target.points[b, j, k, i] + v * plan.target.points[b, j, k + 1, i]
+    far = (1.0 - v) * plan.target.points[b, m, k, i] + v * plan.target.points[b, m, k + 1, i]
     x = (1.0 - u) * near + u * far
     c = wp.cos(alpha)
     s = wp.sin(alpha)

@@ -29,19 +29,23 @@ class ScriptedShape(ScriptedPolicy):
         """Remember the environment and plan nothing yet."""
         super().__init__(env, world=world)
         self._speed, self._gain = speed, gain
-        bent = self.scene.soft.body.surface_points[self.task.points]
-        self._ends = [rest[:, 2] > rest[:, 2].max() - 0.02 for rest in (self.task.goal_rest, bent)]
         self.reset()
 
     def reset(self) -> None:
         """Forget the episode; call after ``env.reset``."""
         self._turned = False
 
+    def _ends(self) -> list[NDArray[np.bool_]]:
+        """Return which points are at the free end, of the target and of the post."""
+        task, world = self.task, self.world
+        bent = self.soft.body.surface_points[task.points_of_worlds[world]]
+        return [rest[:, 2] > rest[:, 2].max() - 0.02 for rest in (task.goal_rests[self.scene.member[world]], bent)]
+
     def __call__(self, observation: object = None) -> NDArray[np.float32]:
         """Return the action for the present state."""
         desired, achieved = (
             self.segment(name).reshape(-1, 3)[end, :2].mean(axis=0)
-            for name, end in zip(("desired_goal", "achieved_goal"), self._ends, strict=True)
+            for name, end in zip(("desired_goal", "achieved_goal"), self._ends(), strict=True)
         )
         tool, arm = self.tool, self.arm
         # the fingers close along the tool's y axis

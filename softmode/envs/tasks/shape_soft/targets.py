@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,37 +80,47 @@ def record_press(scene: TableScene, displacement: float) -> Press:
 
 @dataclass(frozen=True)
 class ShapeTargets:
-    """Points of the bent object on the device."""
+    """Points of bent objects on the device."""
 
     points: wp.array
-    """vec3, shape (DIRECTIONS, LEVELS, points): where the press moved the rest points that were turned by direction
-    j / DIRECTIONS of a turn, at level k / (LEVELS - 1) of the greatest displacement [m]."""
-    displacement_max: float
-    """The greatest displacement [m]."""
+    """vec3, shape (objects, DIRECTIONS, LEVELS, points): where the press moved the rest points that were turned by
+    direction j / DIRECTIONS of a turn, at level k / (LEVELS - 1) of the greatest displacement [m]. The last point is
+    repeated where an object has fewer than another."""
+    displacement_max: wp.array
+    """The greatest displacement of each [m], float32, shape (objects,)."""
 
     @staticmethod
-    def from_press(body: ReducedBody, press: Press, rest: NDArray[np.float64], device: wp.DeviceLike) -> ShapeTargets:
-        """Evaluate a press at rest points.
+    def from_presses(
+        presses: Sequence[tuple[ReducedBody, Press, NDArray[np.float64]]], device: wp.DeviceLike
+    ) -> ShapeTargets:
+        """Evaluate presses at rest points.
 
         Args:
-            body: The body.
-            press: What `record_press` returned.
-            rest: Rest points in the body frame [m], shape (N, 3).
+            presses: Of each object: its body, what `record_press` returned, and rest points in the body frame [m],
+                shape (N, 3).
             device: Warp device.
         """
-        displacement_max = float(press.displacements[-1])
-        levels = np.linspace(0.0, displacement_max, LEVELS)
-        table = np.empty((DIRECTIONS, LEVELS, len(rest), 3), np.float32)
-        # reduced coordinates between two records: the shape between two shapes
-        between = np.clip(
-            np.searchsorted(press.displacements, levels, side="right") - 1, 0, len(press.displacements) - 2
-        )
-        low, high = press.displacements[between], press.displacements[between + 1]
-        share = ((levels - low) / (high - low))[:, None, None]
-        q = (1.0 - share) * press.coordinates[between] + share * press.coordinates[between + 1]
-        for j in range(DIRECTIONS):
-            angle = 2.0 * np.pi * j / DIRECTIONS
-            c, s = np.cos(angle), np.sin(angle)
-            turned = rest @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-            table[j] = turned + np.einsum("pn,knc->kpc", body.evaluate(turned)[0], q)
-        return ShapeTargets(wp.array(table, dtype=wp.vec3, device=device), displacement_max)
+        most = max(len(rest) for _, _, rest in presses)
+        tables = [_bent(body, press, rest) for body, press, rest in presses]
+        padded = [np.pad(t, ((0, 0), (0, 0), (0, most - t.shape[2]), (0, 0)), mode="edge") for t in tables]
+        greatest = [press.displacements[-1] for _, press, _ in presses]
+        points = wp.array(np.stack(padded), dtype=wp.vec3, device=device)
+        return ShapeTargets(points, wp.array(greatest, dtype=float, device=device))
+
+
+def _bent(body: ReducedBody, press: Press, rest: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return rest points where a press moves them [m], shape (DIRECTIONS, LEVELS, N, 3)."""
+    displacement_max = float(press.displacements[-1])
+    levels = np.linspace(0.0, displacement_max, LEVELS)
+    table = np.empty((DIRECTIONS, LEVELS, len(rest), 3), np.float32)
+    # reduced coordinates between two records: the shape between two shapes
+    between = np.clip(np.searchsorted(press.displacements, levels, side="right") - 1, 0, len(press.displacements) - 2)
+    low, high = press.displacements[between], press.displacements[between + 1]
+    share = ((levels - low) / (high - low))[:, None, None]
+    q = (1.0 - share) * press.coordinates[between] + share * press.coordinates[between + 1]
+    for j in range(DIRECTIONS):
+        angle = 2.0 * np.pi * j / DIRECTIONS
+        c, s = np.cos(angle), np.sin(angle)
+        turned = rest @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        table[j] = turned + np.einsum("pn,knc->kpc", body.evaluate(turned)[0], q)
+    return table

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
+from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.model.structs import filled
 from softmode.envs.markers import dots
@@ -18,8 +21,10 @@ from softmode.envs.task import Task
 from softmode.envs.tasks.shape_soft import kernels
 from softmode.envs.tasks.shape_soft.config import ShapeSoftConfig
 from softmode.envs.tasks.shape_soft.goals import POINTS, ShapeGoals, reward_rules
-from softmode.envs.tasks.shape_soft.targets import ShapeTargets, record_press
+from softmode.envs.tasks.shape_soft.targets import Press, ShapeTargets, record_press
+from softmode.errors import ConfigError
 from softmode.objects.loader import load
+from softmode.objects.soft_object import SoftObject
 from softmode.scenes.table_scene import TableScene
 from softmode.splats.splats import Splats
 
@@ -40,30 +45,52 @@ class ShapeSoft(Task):
     config: ShapeSoftConfig
     config_class = ShapeSoftConfig
     kernels = kernels
+    takes_sets = True
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
     point_count = POINTS
 
     def build(self) -> None:
         """Record the targets."""
-        scene, goal = self.scene, self.config.goal_object
-        if goal is None:
-            body, chosen = scene.soft.body, self.points
-            press = record_press(scene, self.config.goal_displacement[1])
-        else:
-            other = TableScene(replace(self.scene_config(), object=goal), device=self.device)
-            body = other.soft.body
-            chosen = sample_farthest(body.surface_points, self.point_count, first=0)
-            press = record_press(other, self.config.goal_displacement[1])
-        rest = body.surface_points[chosen]
-        self.goal_rest = rest
-        """Rest points of the targets in the frame of their body [m], shape (points, 3)."""
+        scene = self.scene
+        members = range(len(scene.members))
+        presses = [self._record(m) for m in members]
+        rests = [body.surface_points[chosen] for body, _, chosen in presses]
+        self.goal_rests = tuple(rests)
+        """Rest points of the targets in the frame of their body [m], one of shape (points, 3) per member."""
         if scene.splats is not None:  # the marker shows the whole surface
-            rest = np.concatenate([rest, body.surface_points])
-            scene.marker_points = wp.zeros((self.world_count, body.surface_count), dtype=wp.vec3, device=self.device)
-        self.targets = ShapeTargets.from_press(body, press, rest, self.device)
-        self.target, self.rules = filled(kernels.Target, self.targets), reward_rules(self.config)
+            rests = [
+                np.concatenate([rest, body.surface_points]) for rest, (body, *_) in zip(rests, presses, strict=True)
+            ]
+            shape = (self.world_count, scene.marker_points.shape[1])
+            scene.marker_points = wp.zeros(shape, dtype=wp.vec3, device=self.device)
+        pressed = [(body, press, rest) for (body, press, _), rest in zip(presses, rests, strict=True)]
+        self.targets = ShapeTargets.from_presses(pressed, self.device)
+        self.target = filled(kernels.Target, self.targets, member=self.per_object(np.array(members), int))
+        self.rules = reward_rules(self.config)
         self.arm_size = self.segments["arm"][1].size
+
+    def _record(self, member: int) -> tuple[ReducedBody, Press, NDArray[np.intp]]:
+        """Press what makes the targets of a member of the scene; return its body, the press and the points chosen.
+
+        Raises:
+            ConfigError: If the arm does not bend it far enough; it names the object of a set.
+        """
+        scene, goal = self.scene, self.config.goal_object
+        if self.object_set is not None or goal is not None:  # on its own, so that a target depends on its object alone
+            alone = replace(
+                self.scene_config(),
+                object=goal or scene.members[member].config,
+                objects=None,
+                material=scene.materials[member],
+            )
+            scene = TableScene(alone, device=self.device)
+        body = scene.soft.body
+        points = self._points[member] if goal is None else sample_farthest(body.surface_points, POINTS, first=0)
+        try:
+            return body, record_press(scene, self.config.goal_displacement[1]), points
+        except ConfigError as error:
+            raise ConfigError(f"{self.member_names[member]}: {error.message}", hint=error.hint) from error
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the goal: displacement of the free end [m] and direction [rad]."""
@@ -98,14 +125,17 @@ class ShapeSoft(Task):
             points, inputs = self.scene.marker_points, [self.state, self.plan, self.point_count]
             self.launch(kernels.shape_marker, inputs, [points, self.result], points.shape)
 
-    def marker(self) -> Splats:
-        """Return the surface of the body that makes the targets; `observe` bends it."""
-        thing = self.config.goal_object or self.scene_config().object
-        return dots(
-            load(thing, material=self.config.scene.material).body.surface_points,
-            0.004,
-            opacity=0.35,
-        )
+    def marker(self) -> Splats | Sequence[Splats]:
+        """Return the surface of the body that makes the targets; `observe` bends it. A list where the worlds differ."""
+        goal = self.config.goal_object
+        if goal is not None:
+            return _surface(load(goal, material=self.config.scene.material))
+        return self.marker_per_object(_surface)
+
+
+def _surface(thing: SoftObject) -> Splats:
+    """Return dots on the surface of an object."""
+    return dots(thing.body.surface_points, 0.004, opacity=0.35)
 
 
 class ShapeSoftEnv(ShapeGoals, SoftEnv):
