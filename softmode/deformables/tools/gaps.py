@@ -11,7 +11,7 @@ from softmode.deformables.solver.solver_reduced import SolverReduced
 def rigid_gaps(solver: SolverReduced | SolverCoupledReduced) -> NDArray[np.float64]:
     """Return the gaps between surface samples and the rigid shapes that they are near [m], shape (N,).
 
-    Negative where the skin, a sample with its dent, is inside a shape. They are those of the contacts of the last step in
+    Negative where the skin, a sample with its dent, is inside a shape. They are those of the last step's contacts, of
     all worlds.
     """
     contacts = solver.view.constraints
