@@ -66,7 +66,7 @@ def load(
         root: Body whose subtree is the robot, moved to the origin; needed if the file holds several robots.
         hand: A gripper that the robot's file has not: a name, or a file that holds nothing else. Its first link is put
             upon `end_effector`, the flange; its own end effector becomes that of the robot, and its names begin with
-            "hand_".
+            ``hand_``.
         asset_root: Folder outside which the file may refer to nothing. If omitted: its own folder, or the one above a
             folder called `urdf` or `robots`, and of a URDF the packages that it names, found above it.
         drive_bandwidth: Natural frequency of the drives of joints without a servo [Hz].
