@@ -53,16 +53,16 @@ def test_final(rows: list[Row]) -> None:
 def main() -> None:
     """Print one row per episode."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--robot", default="aloha_arm", help="a name, or the path of an MJCF or URDF file")
+    parser.add_argument("--robot", default="aloha_arm", help="a name, the path of a robot file, or built-in")
     parser.add_argument("--hand", help="a gripper for a robot that has none, likewise")
     parser.add_argument("--episodes", type=int, default=8, help="how many, from soft to stiff")
     parser.add_argument("--short", action="store_true", help="2 episodes")
     given = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
-    env = LiftSoftEnv(robot=load(given.robot, hand=given.hand))
+    env = LiftSoftEnv(robot=None if given.robot == "built-in" else load(given.robot, hand=given.hand))
     arm = env.config.scene.arm
-    assert isinstance(arm, TableRobot)
-    print(f"{given.robot} stands at {np.round(arm.base, 3)}, its fingers open by {1e3 * arm.gripper.stroke:.0f} mm")
+    if isinstance(arm, TableRobot):
+        print(f"{given.robot} stands at {np.round(arm.base, 3)}, its fingers open by {1e3 * arm.gripper.stroke:.0f} mm")
     print("   E [Pa]  lifted  steps  force [N]  moved in the hand [mm]  dropped from [mm]")
     rows = []
     for seed, modulus in enumerate(np.geomspace(2.0e4, 2.0e6, 2 if given.short else given.episodes)):

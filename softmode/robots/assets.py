@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from softmode.errors import AssetError, ConfigError, MissingExtraError
+from softmode.stages.tokens import SUFFIXES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -96,8 +97,8 @@ def fetch(names: str | Sequence[str]) -> tuple[Path, ...]:
 
 
 def names_file(source: str) -> bool:
-    """Return whether a text means an MJCF or URDF file, not a robot by name."""
-    return "/" in source or source.lower().endswith((".xml", ".mjcf", ".urdf"))
+    """Return whether a text means an MJCF, URDF or OpenUSD file, not a robot by name."""
+    return "/" in source or source.lower().endswith((".xml", ".mjcf", ".urdf", *SUFFIXES))
 
 
 def find(name: str, *, download: bool = True) -> RobotAsset:

@@ -25,6 +25,8 @@ from softmode.robots.hand import find_end_effector
 from softmode.robots.joint_split import hold_base, split_links
 from softmode.robots.meshes import use_meshes
 from softmode.robots.references import check_references, default_root, read_xml
+from softmode.robots.stage_robot import read_stage
+from softmode.stages.tokens import SUFFIXES
 
 _LEAST_MASS, _LEAST_INERTIA = 1.0e-4, 1.0e-7
 """What links that move get that have no mass of their own, [kg] and [kg m^2]."""
@@ -177,6 +179,8 @@ def _locate(source: str | Path, asset_root: str | Path | None, download: bool) -
 
 def _read(asset: RobotAsset) -> tuple[Any, list[str]]:
     """Return the editable MuJoCo specification of a file whose references have been checked, and notes."""
+    if asset.path.suffix.lower() in SUFFIXES:
+        return read_stage(asset)
     mujoco = importlib.import_module("mujoco")
     tree, notes = read_xml(asset.path), []
     try:

@@ -35,7 +35,7 @@ class Arrays:
 def load(request: dict[str, Any]) -> None:
     """Import what the request needs: loading it shall not count against the limits."""
     modules = ["Sdf", "Usd", "UsdGeom"]
-    if request["what"] in ("scene", "asset"):
+    if request["what"] in ("scene", "asset", "robot"):
         modules += ["UsdPhysics", "UsdShade"]
         importlib.import_module("numpy")
     for module in modules:
