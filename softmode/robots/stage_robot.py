@@ -58,8 +58,9 @@ def read_stage(asset: RobotAsset) -> tuple[Any, list[str]]:
         request = process.make_request("robot", asset.path, answer, asset_root=root, limits=process.Limits())
         said = process.ask(request | {"copy": crate, "strict": True}, name=name).described
         scene, notes = _import(crate, name)
-    if not scene.body_count:
-        raise AssetError(f"{name} holds no rigid body", hint="give its links the schema PhysicsRigidBodyAPI")
+    for schema, there in (("RigidBodyAPI", scene.body_count), ("ArticulationRootAPI", said["articulations"])):
+        if not there:
+            raise AssetError(f"{name} has no prim with Physics{schema}", hint="export the robot as an articulation")
     if said["deformables"]:
         notes.append(f"deformables are left out: {', '.join(said['deformables'])}")
     return _Translation(scene, asset, notes).specification(said), notes
@@ -107,8 +108,14 @@ class _Translation:
         self.spec.compiler.inertiafromgeom = self.mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
         self.names = _short(scene.body_label)
         self.joints = _short(scene.joint_label)
+        labels = scene.custom_attributes["mujoco:joint_dof_label"].values or {}
+        self.paths = [str(labels.get(dof, "")) for dof in range(scene.joint_dof_count)]
+        """Per degree of freedom the prim that it comes from; one that has several says which behind a colon."""
+        self.dofs = _short(self.paths)
         self.scalars: dict[int, list[tuple[str, int]]] = {}
         """Per joint the names of its hinges and slides in the specification, and their degrees of freedom."""
+        self.targets: dict[str, float] = {}
+        """Targets of the drives of UsdPhysics, by hinge or slide."""
 
     def specification(self, said: dict[str, Any]) -> Any:
         """Return the specification.
@@ -176,8 +183,8 @@ class _Translation:
         elif kind in (newton.JointType.REVOLUTE, newton.JointType.PRISMATIC, newton.JointType.D6):
             slides, hinges = scene.joint_dof_dim[j]
             for k in range(slides + hinges):
-                name = self.joints[j] if slides + hinges == 1 else f"{self.joints[j]}_{k}"
                 dof = scene.joint_qd_start[j] + k
+                name = self.dofs[dof].replace(":", "_")
                 axis = wp.quat_rotate(wp.transform_get_rotation(inside), wp.vec3(*scene.joint_axis[dof]))
                 moving = kinds.mjJNT_SLIDE if k < slides else kinds.mjJNT_HINGE
                 link.add_joint(name=name, type=moving, pos=anchor, axis=list(axis), **self._properties(dof))
@@ -298,12 +305,15 @@ class _Translation:
         """Add drives of UsdPhysics as affine actuators, those without gains as motors; then MuJoCo's actuators."""
         scene, kinds = self.scene, newton.JointTargetMode
         inertia = self._inertias() if said["accelerations"] else {}
+        # Newton makes drives of MuJoCo's actuators too, without their limits and gears.
+        skipped = {path for given in said["actuators"] for path in given["target"]}
         for j, scalars in self.scalars.items():
-            scaled = scene.joint_label[j] in said["accelerations"]
             for name, dof in scalars:
-                mode, factor = kinds(scene.joint_target_mode[dof]), inertia[name] if scaled else 1.0
-                if mode == kinds.NONE:
+                mode, path = kinds(scene.joint_target_mode[dof]), self.paths[dof].partition(":")[0]
+                if mode == kinds.NONE or path in skipped:
                     continue
+                factor = inertia[name] if path in said["accelerations"] else 1.0
+                self.targets[name] = float(scene.joint_target_q[scene.joint_q_start[j] + dof - scene.joint_qd_start[j]])
                 stiffness, damping = factor * scene.joint_target_ke[dof], factor * scene.joint_target_kd[dof]
                 if mode in (kinds.POSITION, kinds.POSITION_VELOCITY):
                     self._actuator(name, [stiffness], [0.0, -stiffness, -damping])
@@ -327,9 +337,7 @@ class _Translation:
 
     def _add_mujoco_actuators(self, said: dict[str, Any]) -> None:
         """Add the actuators of MuJoCo's schema that act on joints, or on fixed tendons over joints."""
-        by_path = {
-            self.scene.joint_label[j]: scalars[0][0] for j, scalars in self.scalars.items() if len(scalars) == 1
-        }
+        by_path = {self.paths[dof]: name for scalars in self.scalars.values() for name, dof in scalars}
         tendons: dict[str, str] = {}
         for tendon in said["tendons"]:
             known = [by_path.get(path) for path in tendon["joints"]]
@@ -371,20 +379,20 @@ class _Translation:
 
     def _set_home(self) -> None:
         """Add the key frame "home": the joint states of the stage, else the targets of its drives."""
-        scene = self.scene
-        state, target = {}, {}
-        for j, scalars in self.scalars.items():
-            for k, (name, dof) in enumerate(scalars):
-                coordinate = scene.joint_q_start[j] + k
-                state[name], target[name] = float(scene.joint_q[coordinate]), float(scene.joint_target_q[coordinate])
-        home = next(({n: v for n, v in values.items() if v} for values in (state, target) if any(values.values())), {})
+        coordinates = [
+            (name, self.scene.joint_q[self.scene.joint_q_start[j] + k])
+            for j, scalars in self.scalars.items()
+            for k, (name, _) in enumerate(scalars)
+        ]
+        states = {name: float(value) for name, value in coordinates if value}
+        home = states or {name: value for name, value in self.targets.items() if value}
         if not home:
             return
         model, data = self._compiled()
         for name, value in home.items():
             data.qpos[model.jnt_qposadr[model.joint(name).id]] = value
         self.spec.add_key(name="home", qpos=data.qpos.tolist())
-        which = "joint states" if any(state.values()) else "targets of drives"
+        which = "joint states" if states else "targets of drives"
         self.notes.append(f"key frame 'home': {which} of the stage")
 
     def _compiled(self) -> tuple[Any, Any]:

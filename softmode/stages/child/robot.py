@@ -14,7 +14,7 @@ _LISTS = ("gear", "gainPrm", "biasPrm")
 
 
 def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any]:
-    """Write the crate; return MuJoCo's actuators and tendons, and the joints whose drives count per inertia.
+    """Write the crate; return MuJoCo's actuators and tendons, the joints driven by accelerations, and what is there.
 
     Args:
         stage: The stage.
@@ -33,6 +33,7 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
         "actuators": [_actuator(prim) for prim in prims if prim.GetTypeName() == "MjcActuator"],
         "tendons": [_tendon(prim) for prim in prims if prim.GetTypeName() == "MjcTendon"],
         "accelerations": [str(prim.GetPath()) for prim in prims if _by_acceleration(prim)],
+        "articulations": sum(prim.HasAPI(UsdPhysics.ArticulationRootAPI) for prim in prims),
         "deformables": [*paths, *(str(one.path) for one in left)],
     }
 
