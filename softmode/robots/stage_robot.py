@@ -3,6 +3,9 @@
 The stage is opened in a process of its own, see :mod:`softmode.stages.process`; what Newton reads is the checked crate
 that comes back. Newton resolves the schemas (UsdPhysics, and Newton's, PhysX' and MuJoCo's own attributes), units and
 axes; each of its joints becomes hinges and slides of a link, each loop a constraint, each drive an affine actuator.
+
+Others do not serve: MuJoCo 3.17 writes OpenUSD and reads none, and what `SolverMuJoCo(save_to_mjcf=...)` writes of the
+same model has its fixed base as a mocap body and contact masks of its own.
 """
 
 from __future__ import annotations
@@ -19,8 +22,8 @@ from typing import Any
 import newton
 import numpy as np
 import trimesh
-import warp as wp
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from softmode.deformables.build.cache import cache_directory, fingerprint_of, writable_cache
 from softmode.errors import AssetError, SoftmodeError, needs_extra
@@ -28,6 +31,7 @@ from softmode.files import whole_file
 from softmode.robots.assets import RobotAsset
 from softmode.stages import process
 
+Array = NDArray[np.float64]
 _UNLIMITED = 1.0e6
 """Efforts from which on Newton means none [N or N m]; limits from 1e9 on."""
 _PRIMITIVES = {
@@ -37,6 +41,8 @@ _PRIMITIVES = {
     newton.GeoType.BOX: "BOX",
     newton.GeoType.ELLIPSOID: "ELLIPSOID",
 }
+_LOOP_LEVER = 0.01
+"""How far from the joint the two points lie that a hinge which closes a loop holds together [m]."""
 _MESHES = (newton.GeoType.MESH, newton.GeoType.CONVEX_MESH)
 
 
@@ -86,13 +92,11 @@ def _import(crate: str, name: str) -> tuple[newton.ModelBuilder, list[str]]:
 def _short(paths: list[str]) -> list[str]:
     """Return the last part of each path where that is unique, else as much of its end as makes it so."""
     parts = [path.strip("/").split("/") for path in paths]
-    for depth in range(1, max((len(part) for part in parts), default=1) + 1):
-        names = ["/".join(part[-depth:]) for part in parts]
-        if depth == 1:
-            found = names
-        count = Counter(found)
-        found = [old if count[old] == 1 else new for old, new in zip(found, names, strict=True)]
-    return found
+    names = [part[-1] for part in parts]
+    for depth in range(2, max((len(part) for part in parts), default=1) + 1):
+        count = Counter(names)
+        names = [name if count[name] == 1 else "/".join(part[-depth:]) for name, part in zip(names, parts, strict=True)]
+    return names
 
 
 class _Translation:
@@ -108,7 +112,7 @@ class _Translation:
         self.spec.compiler.inertiafromgeom = self.mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
         self.names = _short(scene.body_label)
         self.joints = _short(scene.joint_label)
-        labels = scene.custom_attributes["mujoco:joint_dof_label"].values or {}
+        labels: Any = scene.custom_attributes["mujoco:joint_dof_label"].values or {}
         self.paths = [str(labels.get(dof, "")) for dof in range(scene.joint_dof_count)]
         """Per degree of freedom the prim that it comes from; one that has several says which behind a colon."""
         self.dofs = _short(self.paths)
@@ -132,7 +136,7 @@ class _Translation:
         links = {-1: self.spec.worldbody}
         for body in range(scene.body_count):
             if body not in moved:
-                links[body] = self._body(self.spec.worldbody, body, wp.transform(*scene.body_q[body]))
+                links[body] = self._body(self.spec.worldbody, body, *_pose(scene.body_q[body]))
         open_ends = list(links)
         while open_ends:
             parent = open_ends.pop()
@@ -151,11 +155,10 @@ class _Translation:
 
     # -- links --------------------------------------------------------------------------------------------------------
 
-    def _body(self, parent: Any, body: int, place: wp.transform) -> Any:
+    def _body(self, parent: Any, body: int, position: Array, turn: Rotation) -> Any:
         """Add a link with its inertia and shapes."""
         scene = self.scene
-        position, quat = _place(place)
-        link = parent.add_body(name=self.names[body], pos=position, quat=quat)
+        link = parent.add_body(name=self.names[body], pos=position, quat=_quat(turn))
         if scene.body_mass[body] > 0.0:
             inertia = np.array(scene.body_inertia[body], float).reshape(3, 3)
             link.mass, link.ipos = float(scene.body_mass[body]), np.array(scene.body_com[body], float)
@@ -169,14 +172,14 @@ class _Translation:
         """Add the link behind a joint, with the joint as hinges and slides."""
         scene, kinds = self.scene, self.mujoco.mjtJoint
         kind = newton.JointType(scene.joint_type[j])
-        at, inside = wp.transform(*scene.joint_X_p[j]), wp.transform(*scene.joint_X_c[j])
+        (at, at_turn), (anchor, inside) = _pose(scene.joint_X_p[j]), _pose(scene.joint_X_c[j])
         child = scene.joint_child[j]
-        free = kind == newton.JointType.FREE
-        place: Any = wp.transform(*scene.body_q[child]) if free else at * wp.transform_inverse(inside)
-        link = self._body(parent, child, place)
-        anchor = list(wp.transform_get_translation(inside))
+        position, turn = at - (at_turn * inside.inv()).apply(anchor), at_turn * inside.inv()
+        if kind == newton.JointType.FREE:
+            position, turn = _pose(scene.body_q[child])
+        link = self._body(parent, child, position, turn)
         self.scalars[j] = []
-        if free:
+        if kind == newton.JointType.FREE:
             link.add_joint(name=self.joints[j], type=kinds.mjJNT_FREE)
         elif kind == newton.JointType.BALL:
             link.add_joint(name=self.joints[j], type=kinds.mjJNT_BALL, pos=anchor)
@@ -185,9 +188,9 @@ class _Translation:
             for k in range(slides + hinges):
                 dof = scene.joint_qd_start[j] + k
                 name = self.dofs[dof].replace(":", "_")
-                axis = wp.quat_rotate(wp.transform_get_rotation(inside), wp.vec3(*scene.joint_axis[dof]))
+                axis = inside.apply(np.array(scene.joint_axis[dof], float))
                 moving = kinds.mjJNT_SLIDE if k < slides else kinds.mjJNT_HINGE
-                link.add_joint(name=name, type=moving, pos=anchor, axis=list(axis), **self._properties(dof))
+                link.add_joint(name=name, type=moving, pos=anchor, axis=axis, **self._properties(dof))
                 self.scalars[j].append((name, dof))
         elif kind != newton.JointType.FIXED:
             raise self._refusal(j, "has no counterpart in a robot")
@@ -215,17 +218,17 @@ class _Translation:
     def _shape(self, link: Any, shape: int) -> None:
         """Add a shape: one that collides, one that is only seen, or a site."""
         scene, kinds = self.scene, self.mujoco.mjtGeom
-        position, quat = _place(wp.transform(*scene.shape_transform[shape]))
+        position, turn = _pose(scene.shape_transform[shape])
         flags, kind = scene.shape_flags[shape], newton.GeoType(scene.shape_type[shape])
         if flags & newton.ShapeFlags.SITE:
-            link.add_site(name=scene.shape_label[shape].rpartition("/")[2], pos=position, quat=quat)
+            link.add_site(name=scene.shape_label[shape].rpartition("/")[2], pos=position, quat=_quat(turn))
             return
         size = np.array(scene.shape_scale[shape], float)
         solid = bool(flags & newton.ShapeFlags.COLLIDE_SHAPES)
         color = scene.shape_color[shape]
         options: dict[str, Any] = {
             "pos": position,
-            "quat": quat,
+            "quat": _quat(turn),
             "density": 0.0,
             "group": 3 if solid else 2,
             "rgba": [*(float(value) for value in color), 1.0],
@@ -245,7 +248,7 @@ class _Translation:
             return
         link.add_geom(type=kinds.mjGEOM_MESH, meshname=self._mesh(source, size), **options)
 
-    def _mesh(self, mesh: newton.Mesh, scale: NDArray[np.float64]) -> str:
+    def _mesh(self, mesh: newton.Mesh, scale: Array) -> str:
         """Keep a mesh in the cache, where MuJoCo and Newton find it; return its name in the specification."""
         points = np.asarray(mesh.vertices, float).reshape(-1, 3) * scale
         faces = np.asarray(mesh.indices).reshape(-1, 3)
@@ -274,22 +277,19 @@ class _Translation:
         """Add the constraint of a joint that is no part of the tree: points that coincide, or a weld."""
         scene, equality = self.scene, self.mujoco.mjtEq
         kind = newton.JointType(scene.joint_type[j])
-        at = wp.transform(*scene.joint_X_p[j])
-        anchor = wp.transform_get_translation(at)
-        sides: tuple[float, ...] = (0.0,)
+        anchor, turn = _pose(scene.joint_X_p[j])
+        points = [anchor]
         if kind == newton.JointType.REVOLUTE:
-            sides = (-0.01, 0.01)  # two points on the axis of a hinge [m]
-            axis = wp.quat_rotate(wp.transform_get_rotation(at), wp.vec3(*scene.joint_axis[scene.joint_qd_start[j]]))
-        elif kind in (newton.JointType.BALL, newton.JointType.FIXED):
-            axis = wp.vec3()
-        else:
+            axis = turn.apply(np.array(scene.joint_axis[scene.joint_qd_start[j]], float))
+            points = [anchor - _LOOP_LEVER * axis, anchor + _LOOP_LEVER * axis]
+        elif kind not in (newton.JointType.BALL, newton.JointType.FIXED):
             raise self._refusal(j, "cannot close a loop")
         ends = [self.names[body] if body >= 0 else "world" for body in (scene.joint_parent[j], scene.joint_child[j])]
-        for k, side in enumerate(sides):
+        for k, point in enumerate(points):
             loop = self.spec.add_equality(objtype=self.mujoco.mjtObj.mjOBJ_BODY, name=f"{self.joints[j]}_{k}")
             loop.type = equality.mjEQ_WELD if kind == newton.JointType.FIXED else equality.mjEQ_CONNECT
             loop.name1, loop.name2 = ends
-            loop.data[:3] = list(anchor + side * axis)
+            loop.data[:3] = point
             loop.data[10] = 1.0 if kind == newton.JointType.FIXED else 0.0
 
     def _tie(self, j: int, leader: int, coefficients: Any) -> None:
@@ -412,7 +412,12 @@ def _ends(given: dict[str, Any], what: str) -> tuple[float, float]:
     return (low, high) if math.isfinite(low) and math.isfinite(high) else (0.0, 0.0)
 
 
-def _place(transform: wp.transform) -> tuple[list[float], list[float]]:
-    """Return position and quaternion (wxyz)."""
-    x, y, z, i, j, k, w = (float(value) for value in transform)
-    return [x, y, z], [w, i, j, k]
+def _pose(transform: Any) -> tuple[Array, Rotation]:
+    """Return position and rotation of one of Newton's transforms."""
+    numbers = np.array([float(value) for value in transform])
+    return numbers[:3], Rotation.from_quat(numbers[3:])
+
+
+def _quat(turn: Rotation) -> Array:
+    """Return a rotation as MuJoCo's quaternion (wxyz)."""
+    return np.roll(turn.as_quat(), 1)

@@ -113,7 +113,17 @@ def write_wedge(path: Path) -> None:
     mesh.export(path)
 
 
-ARM5 = """<mujoco model="arm5">
+_JAWS = """
+      <body name="jaw_a" pos="0 0 0.012">
+        <joint name="jaw_a" type="slide" axis="0 1 0" range="0 0.045" armature="0.1"/>
+        <geom type="box" size="0.012 0.006 0.035" pos="0 0.006 0.035" mass="0.05"/>{knuckle}
+      </body>
+      <body name="jaw_b" pos="0 0 0.012">
+        <joint name="jaw_b" type="slide" axis="0 -1 0" range="0 0.045" armature="0.1"/>
+        <geom type="box" size="0.012 0.006 0.035" pos="0 -0.006 0.035" mass="0.05"/>
+      </body>"""
+
+_ARM5 = """<mujoco model="arm5">
   <compiler angle="radian"/>
   <default>
     <joint damping="2" armature="0.3"/>
@@ -136,31 +146,26 @@ ARM5 = """<mujoco model="arm5">
               <geom type="capsule" fromto="0 0 0 0 0 0.06" size="0.025" mass="0.6"/>
               <body name="roll" pos="0 0 0.09">
                 <joint name="roll" axis="0 0 1" range="-2.9 2.9"/>
-                <geom type="box" size="0.03 0.06 0.012" mass="0.4"/>
-                <body name="jaw_a" pos="0 0 0.012">
-                  <joint name="jaw_a" type="slide" axis="0 1 0" range="0 0.045" armature="0.1"/>
-                  <geom type="box" size="0.012 0.006 0.035" pos="0 0.006 0.035" mass="0.05"/>
-                </body>
-                <body name="jaw_b" pos="0 0 0.012">
-                  <joint name="jaw_b" type="slide" axis="0 -1 0" range="0 0.045" armature="0.1"/>
-                  <geom type="box" size="0.012 0.006 0.035" pos="0 -0.006 0.035" mass="0.05"/>
-                </body>
+                <geom type="box" size="0.03 0.06 0.012" mass="0.4"/>{jaws}
               </body>
             </body>
           </body>
         </body>
       </body>
     </body>
-  </worldbody>
-  <tendon><fixed name="both"><joint joint="jaw_a" coef="0.5"/><joint joint="jaw_b" coef="0.5"/></fixed></tendon>
+  </worldbody>{tendon}
   <actuator>
     <position joint="turn"/><position joint="shoulder"/><position joint="elbow"/><position joint="wrist"/>
-    <position joint="roll"/>
-    <position tendon="both" kp="100" kv="10" ctrlrange="0 0.045" forcerange="-80 80"/>
+    <position joint="roll"/>{servo}
   </actuator>
-  <keyframe><key name="home" qpos="0 0.2 1.6 1.34 0 0.045 0.045"/></keyframe>
+  <keyframe><key name="home" qpos="0 0.2 1.6 1.34 0{opening}"/></keyframe>
 </mujoco>
 """
+_TENDON = """
+  <tendon><fixed name="both"><joint joint="jaw_a" coef="0.5"/><joint joint="jaw_b" coef="0.5"/></fixed></tendon>"""
+_SERVO = """
+    <position tendon="both" kp="100" kv="10" ctrlrange="0 0.045" forcerange="-80 80"/>"""
+ARM5 = _ARM5.format(jaws=_JAWS.format(knuckle=""), tendon=_TENDON, servo=_SERVO, opening=" 0.045 0.045")
 """An arm of five joints whose gripper hangs on one soft servo; no link has a usual name, no equality ties the jaws."""
 
 
@@ -171,22 +176,15 @@ def write_arm5(folder: Path, text: str = ARM5) -> Path:
     return path
 
 
-GRIPPER = """<mujoco model="gripper">
+_KNUCKLE = """
+        <body name="knuckle_a"><geom type="box" size="0.012 0.005 0.005" pos="0 -0.006 0.005" mass="0.01"/></body>"""
+GRIPPER = f"""<mujoco model="gripper">
   <compiler angle="radian"/>
   <default><position kp="4000" kv="200"/></default>
   <worldbody>
     <body name="palm">
       <geom type="box" size="0.03 0.06 0.006" pos="0 0 0.006" mass="0.2"/>
-      <site name="pinch" pos="0 0 0.06"/>
-      <body name="jaw_a" pos="0 0 0.012">
-        <joint name="jaw_a" type="slide" axis="0 1 0" range="0 0.045" armature="0.1"/>
-        <geom type="box" size="0.012 0.006 0.035" pos="0 0.006 0.035" mass="0.05"/>
-        <body name="knuckle_a"><geom type="box" size="0.012 0.005 0.005" pos="0 -0.006 0.005" mass="0.01"/></body>
-      </body>
-      <body name="jaw_b" pos="0 0 0.012">
-        <joint name="jaw_b" type="slide" axis="0 -1 0" range="0 0.045" armature="0.1"/>
-        <geom type="box" size="0.012 0.006 0.035" pos="0 -0.006 0.035" mass="0.05"/>
-      </body>
+      <site name="pinch" pos="0 0 0.06"/>{_JAWS.format(knuckle=_KNUCKLE)}
     </body>
   </worldbody>
   <actuator><position joint="jaw_a" ctrlrange="0 0.045"/><position joint="jaw_b" ctrlrange="0 0.045"/></actuator>
@@ -197,13 +195,7 @@ GRIPPER = """<mujoco model="gripper">
 
 def write_arm_and_gripper(folder: Path) -> tuple[Path, Path]:
     """Write the arm of five joints without its jaws, and the gripper; return both paths."""
-    start, end = ARM5.index('<body name="jaw_a"'), ARM5.index("</body>", ARM5.index('<body name="jaw_b"'))
-    text = ARM5[:start] + ARM5[end + len("</body>") :]
-    tendon = text.index("<tendon>"), text.index("</tendon>") + len("</tendon>")
-    text = text[: tendon[0]] + text[tendon[1] :]
-    drive = text.index('<position tendon="both"')
-    text = text[:drive] + text[text.index("/>", drive) + 2 :]
-    arm = write_arm5(folder, text.replace(" 0.045 0.045", ""))
+    arm = write_arm5(folder, _ARM5.format(jaws="", tendon="", servo="", opening=""))
     gripper = folder / "gripper.xml"
     gripper.write_text(GRIPPER)
     return arm, gripper

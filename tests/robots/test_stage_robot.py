@@ -164,7 +164,7 @@ def test_actuators_of_mujoco_s_schema(tmp_path: Path) -> None:
 
 
 def test_joint_that_follows_another(tmp_path: Path) -> None:
-    """With q_b = q_a (NewtonMimicAPI) and a drive on a alone, each jaw has half of it, as in a file with an equality."""
+    """With q_b = q_a (NewtonMimicAPI) and a drive on a alone each jaw has half of it, as where a file ties them."""
     stage = arm(tmp_path)
     follower = stage.joint("jaw_b")
     follower.RemoveAppliedSchema("PhysicsDriveAPI:linear")
@@ -320,5 +320,5 @@ def test_several_robots_and_damaged_files(tmp_path: Path) -> None:
     assert robots.load(path, root="base").joint_names == stage.robot.joint_names
     broken = tmp_path / "broken.usda"
     broken.write_text("#usda 1.0\ndef Xform {")
-    with pytest.raises(AssetError, match="broken.usda"):
+    with pytest.raises(AssetError, match=r"broken\.usda"):
         robots.load(broken)
