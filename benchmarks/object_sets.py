@@ -3,7 +3,8 @@
 The objects are the fifteen presets and a box. The set is measured with an object per world, and with another one at
 every reset.
 
-Run: ``python -m benchmarks.object_sets [--num-envs 4096] [--device cuda:0] [--actions grasp]``
+Run: ``python -m benchmarks.object_sets [--num-envs 4096] [--device cuda:0] [--actions grasp]``; on a CPU add
+``--device cpu --num-envs 4 --steps 10 --warmup 4``.
 """
 
 import argparse

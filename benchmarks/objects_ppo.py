@@ -3,7 +3,8 @@
 The objects are fifteen presets, a box, a cylinder and a sphere; every third by name is unseen. Worlds get another
 object at every reset. Bodies are built into the cache first; the time limit is that of training.
 
-Run: ``python -m benchmarks.objects_ppo [--time-limit 411] [--num-envs 4096] [--device cuda:0]``
+Run: ``python -m benchmarks.objects_ppo [--time-limit 411] [--num-envs 4096] [--device cuda:0]``; on a CPU add
+``--device cpu --num-envs 8 --eval-envs 8 --time-limit 30``, which is too short to learn anything.
 """
 
 import argparse

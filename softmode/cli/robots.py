@@ -24,7 +24,7 @@ class Robots:
     action: Literal["list", "fetch", "check"]
     """list prints the names, fetch downloads models, check prints what was found in a file and what was guessed."""
     names: tuple[str, ...]
-    """What to fetch or check, for example so101 ur5e arm.urdf."""
+    """What to fetch or check, for example so101 ur5e arm.urdf arm.usd."""
     out: Annotated[Path | None, short_name("-o")] = None
     """Picture that check writes, NAME.png here if omitted; one robot only."""
     end_effector: str | None = None

@@ -45,7 +45,7 @@ def scripted_policy(env: Environment) -> Callable[[Any], Any]:
             policy = getattr(importlib.import_module(f"softmode.envs.tasks.{module}"), name)
             return scripted_worlds(policy)(env)
     hint = f"there is one for {', '.join(_POLICIES)}; a task of yours may set scripted_policy"
-    raise ConfigError(f"there is no scripted policy for {env}", hint=hint)
+    raise ConfigError(f"there is no scripted policy for {kind.__name__}", hint=hint)
 
 
 def scripted_worlds(policy: type[ScriptedPolicy]) -> Callable[[Any], Callable[[Any], Any]]:

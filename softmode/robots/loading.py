@@ -1,7 +1,8 @@
 """From a name or a file to a :class:`RobotDescription`: MuJoCo reads and compiles it, Newton imports the result.
 
 MuJoCo's own compiler resolves includes, defaults and classes, so what the description says (drives, limits, home pose)
-is what MuJoCo would simulate; see :mod:`softmode.robots.compiled` for how actuators become drives.
+is what MuJoCo would simulate; see :mod:`softmode.robots.compiled` for how actuators become drives, and
+:mod:`softmode.robots.stage_robot` for OpenUSD.
 """
 
 from __future__ import annotations
@@ -49,15 +50,15 @@ def load(
     floating: bool = False,
     download: bool = True,
 ) -> RobotDescription:
-    """Load a robot by name, or from an MJCF or URDF file.
+    """Load a robot by name, or from an MJCF, URDF or OpenUSD file.
 
-    A URDF, and an MJCF file without any actuator, gets critically damped drives on every joint, scaled by the joint's
+    A URDF, and another file without any actuator, gets critically damped drives on every joint, scaled by the joint's
     inertia in the home pose and limited by its effort limit. A torque motor becomes such a drive as well.
     ``RobotDescription.notes`` says what was chosen where the file does not say it.
 
     Args:
-        source: A name of :func:`available`, or the path of a file (a `Path`, or a string that ends in .xml, .mjcf or
-            .urdf).
+        source: A name of :func:`available`, or the path of a file (a `Path`, or a string that ends in .xml, .mjcf,
+            .urdf, .usd, .usda, .usdc or .usdz).
         end_effector: Site or body that carries the tool. If omitted, it is found by its usual names, else as the link
             in which two fingers meet, else as the last link of the longest chain.
         tool_offset: Tool point in the frame of that site or body [m], shape (3,).
@@ -83,7 +84,7 @@ def load(
         AssetError: If the model cannot be fetched, or the file is missing, broken, refers outside the asset root, or
             holds what is not supported: a ball joint, a free joint behind the first link.
         ConfigError: If a name is unknown, or a number out of range.
-        MissingExtraError: If the name needs the extra ``[robots]`` and it is not installed.
+        MissingExtraError: If the name needs the extra ``[robots]``, or a stage ``[usd]``, and it is not installed.
     """
     asset = _locate(source, asset_root, download)
     end_effector = asset.end_effector if end_effector is None else end_effector
