@@ -19,7 +19,9 @@ from softmode.envs import LiftSoftConfig, LiftSoftEnv, scripted_policy
 from softmode.robots import load
 
 SIZE, GAP = 384, 6
-"""Edge of a picture and the white between two [pixels]."""
+"""Edge of a view and the white between two [pixels]."""
+SKY, HEIGHT = 30, 300
+"""First row and number of rows of a view that are kept [pixels]."""
 ROBOTS: tuple[tuple[str, dict[str, Any]] | None, ...] = (
     None,
     ("aloha_arm", {}),
@@ -30,7 +32,7 @@ ROBOTS: tuple[tuple[str, dict[str, Any]] | None, ...] = (
 
 
 def picture(robot: Any) -> NDArray[np.uint8]:
-    """Return the overview of a scripted episode when the plush is at its goal, uint8 (SIZE, SIZE, 3)."""
+    """Return the overview of a scripted episode when the plush is at its goal, uint8 (HEIGHT, SIZE, 3)."""
     env = LiftSoftEnv(robot=robot, render_mode="rgb_array", config=LiftSoftConfig(render_size=SIZE))
     observation, info = env.reset(seed=0)
     policy, step = scripted_policy(env), 0
@@ -41,7 +43,7 @@ def picture(robot: Any) -> NDArray[np.uint8]:
             raise SystemExit(f"{robot} has not lifted the plush after {step} steps")
     views = env.render()
     assert views is not None
-    return np.asarray(views[:, -views.shape[0] :])
+    return np.asarray(views[SKY : SKY + HEIGHT, -views.shape[0] :])
 
 
 def main() -> None:
@@ -49,7 +51,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", nargs="?", type=Path, default=Path("docs/images/robots.png"))
     out = parser.parse_args().out
-    white = np.full((SIZE, GAP, 3), 255, np.uint8)
+    white = np.full((HEIGHT, GAP, 3), 255, np.uint8)
     row: list[NDArray[np.uint8]] = []
     for given in ROBOTS:
         row += [picture(None if given is None else load(given[0], **given[1])), white]

@@ -27,13 +27,11 @@ from softmode.robots.joint_split import hold_base, split_links
 from softmode.robots.meshes import use_meshes
 from softmode.robots.references import check_references, default_root, read_xml
 from softmode.robots.stage_robot import read_stage
+from softmode.robots.written_mjcf import written_mjcf
 from softmode.stages.tokens import SUFFIXES
 
 _LEAST_MASS, _LEAST_INERTIA = 1.0e-4, 1.0e-7
 """What links that move get that have no mass of their own, [kg] and [kg m^2]."""
-
-_SOLVER_DEFAULTS = {"solref": ("0.02", "1"), "solimp": ("0.9", "0.95", "0.001", "0.5", "2")}
-"""MuJoCo's own parameters of constraints, by the first letters of the attributes that hold them."""
 
 
 def load(
@@ -123,11 +121,11 @@ def load(
             spec.delete(equality)
     for actuator in list(spec.actuators):
         spec.delete(actuator)
-    _compile(spec, asset)
+    final = _compile(spec, asset)
     return RobotDescription(
         name=asset.name,
         path=asset.path,
-        mjcf=_balanced(spec.to_xml()),
+        mjcf=written_mjcf(spec, final),
         link_names=tuple(robot.link(b) for b in range(1, robot.model.nbody)),
         joint_names=robot.joint_names,
         joint_links=tuple(robot.link(b) for b in robot.model.jnt_bodyid),
@@ -262,30 +260,6 @@ def _split(spec: Any, asset: RobotAsset) -> tuple[Any, list[str]]:
     _compile(spec, asset)
     text, names = split_links(spec.to_xml())
     return importlib.import_module("mujoco").MjSpec.from_string(text), names
-
-
-def _balanced(text: str) -> str:
-    """Mend what the digits of a written file may break, and write out what MuJoCo leaves to its defaults.
-
-    Principal inertias keep the triangle inequality. Newton takes parameters of limits and constraints that are not
-    there for zeros, which switches limits off; MuJoCo leaves out those that are its defaults.
-    """
-    tree, changed = ElementTree.fromstring(text), False
-    for element in tree.iter("inertial"):
-        inertia = [float(value) for value in element.get("diaginertia", "0 0 0").split()]
-        k = max(range(3), key=lambda i: inertia[i])
-        others = sum(inertia) - inertia[k]
-        if inertia[k] > others * (1.0 - 1.0e-7) > 0.0:
-            inertia[k] = others * (1.0 - 1.0e-5)
-            element.set("diaginertia", " ".join(f"{value:.9g}" for value in inertia))
-            changed = True
-    for element in tree.iter():
-        for name, value in element.attrib.items():
-            default, given = _SOLVER_DEFAULTS.get(name[:6], ()), value.split()
-            if 0 < len(given) < len(default):
-                element.set(name, " ".join((*given, *default[len(given) :])))
-                changed = True
-    return ElementTree.tostring(tree, encoding="unicode") if changed else text
 
 
 def _one_line(error: Exception) -> str:

@@ -217,7 +217,8 @@ def test_collision_meshes(collision, tmp_path):
     robot = dataclasses.replace(description("mjcf", tmp_path), collision=collision)
     stand = Stand(robot, solve=False)
     world = stand.world
-    kinds = [newton.GeoType(world.shape_type[s]) for s in stand.indices.shapes]
+    solid = [s for s in stand.indices.shapes if world.shape_flags[s] & newton.ShapeFlags.COLLIDE_SHAPES]
+    kinds = [newton.GeoType(world.shape_type[s]) for s in solid]
     wanted = newton.GeoType.CONVEX_MESH if collision == "hull" else newton.GeoType.MESH
     assert kinds.count(wanted) == 1
     hand = {world.body_label.index(f"small/{name}") for name in robot.hand_links}
@@ -386,3 +387,29 @@ def test_limits_that_leave_something_to_the_defaults(tmp_path: Path) -> None:
     }
     np.testing.assert_allclose(values["solreflimit"], (0.005, 1.0), rtol=1e-6)
     np.testing.assert_allclose(values["solimplimit"], (0.8, 0.95, 0.001, 0.5, 2.0), rtol=1e-6)
+
+
+def test_what_is_seen(tmp_path: Path) -> None:
+    """Where one link has a visible shape, those that only collide show it too; white, MuJoCo's default, stays white."""
+    material = '<material name="white"/><material name="red" rgba="0.8 0.1 0.1 1"/>'
+    text = MJCF.replace("<asset>", f"<asset>{material}").replace('type="cylinder"', 'type="cylinder" material="white"')
+    robot = robots.load(write_mjcf(tmp_path, text.replace('mesh="wedge" mass', 'mesh="wedge" material="red" mass')))
+    world = newton.ModelBuilder()
+    indices = robot.add_to(world)
+    bodies = dict(zip(robot.link_names, indices.link_bodies, strict=True))
+    seen: dict[int, list[int]] = {body: [] for body in indices.link_bodies}
+    for shape in indices.shapes:
+        flags = world.shape_flags[shape]
+        if flags & newton.ShapeFlags.VISIBLE:
+            assert not flags & (newton.ShapeFlags.COLLIDE_SHAPES | newton.ShapeFlags.COLLIDE_PARTICLES)
+            seen[world.shape_body[shape]].append(shape)
+    assert [len(shapes) for shapes in seen.values()] == [1, 1, 1, 1, 1]
+    colors = {name: world.shape_color[seen[body][0]] for name, body in bodies.items()}
+    np.testing.assert_allclose(colors["base"], 1.0)
+    np.testing.assert_allclose(colors["jaw_left"], (0.8, 0.1, 0.1), atol=1e-6)
+    # The fore link has a box that collides beside the ball that is seen, which alone stays to be seen.
+    assert newton.GeoType(world.shape_type[seen[bodies["fore"]][0]]) == newton.GeoType.SPHERE
+    assert newton.GeoType(world.shape_type[seen[bodies["jaw_left"]][0]]) == newton.GeoType.MESH
+    hidden = newton.ModelBuilder()
+    dataclasses.replace(robot, visuals=False).add_to(hidden)
+    assert hidden.shape_count == 5
