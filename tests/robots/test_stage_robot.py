@@ -179,7 +179,7 @@ def test_joint_that_follows_another(tmp_path: Path) -> None:
 
 
 def test_joint_with_two_axes(tmp_path: Path) -> None:
-    """A joint that may turn about y and z becomes two links of a hinge each, with its limits in radians."""
+    """A joint that may turn about y and z becomes two links of a hinge each, with limits and drives in radians."""
     stage = arm(tmp_path)
     joint = UsdPhysics.Joint.Define(stage.stage, f"{JOINTS}/universal")
     old = stage.joint("roll")
@@ -192,7 +192,16 @@ def test_joint_with_two_axes(tmp_path: Path) -> None:
         limit = UsdPhysics.LimitAPI.Apply(joint.GetPrim(), axis)
         limit.CreateLowAttr(-30.0 if axis in ("rotY", "rotZ") else 1.0)
         limit.CreateHighAttr(60.0 if axis in ("rotY", "rotZ") else -1.0)
+    drive = UsdPhysics.DriveAPI.Apply(joint.GetPrim(), "rotZ")
+    drive.CreateStiffnessAttr(10.0)
+    drive.CreateDampingAttr(1.0)
+    drive.CreateMaxForceAttr(25.0)
     found = robots.load(stage.save())
+    assert found.drives[4] is None
+    servo = found.drives[5]
+    assert servo is not None
+    gains = (servo.stiffness, servo.damping, servo.effort_limit)
+    assert gains == pytest.approx((math.degrees(10.0), math.degrees(1.0), 25.0), rel=5e-6)  # per radian
     assert found.joint_names[4:6] == ("universal_rotY", "universal_rotZ")
     # Splitting a link goes through MJCF, which has six digits.
     np.testing.assert_allclose(found.joint_lower[4:6], math.radians(-30.0), rtol=5e-6)
