@@ -1,9 +1,9 @@
 """A robot from a file plays LiftSoft: it is placed at the table, grasps the plush and lifts it to the goal.
 
 The default robot is one arm of an ALOHA station, which ships with mujoco-warp, so nothing is downloaded. Any arm of
-five to eight joints with two driven fingers will do: a name, an MJCF or a URDF file. The scripted policy is the one of
-the built-in arm; the table shows for soft and stiff plushes whether they were lifted, how hard the fingers pressed, how
-far the plush moved in the hand, and from which height it was lost.
+five to eight joints with two driven fingers will do: a name, an MJCF, URDF or OpenUSD file; built-in is the arm of the
+environments. The scripted policy is the same for all; the table shows for soft and stiff plushes whether they were
+lifted, how hard the fingers pressed, how far the plush moved in the hand, and from which height it was lost.
 
 Run: ``python examples/any_robot.py [--robot ur5e --hand robotiq_2f85] [--episodes 20] [--short]``
 """

@@ -22,7 +22,7 @@ class Check:
     episodes: int = 5
     """Episodes of the scripted policy."""
     robot: str | None = None
-    """Robot in place of the built-in arm: a name of `softmode robots list`, or an MJCF or URDF file."""
+    """Robot in place of the built-in arm: a name of `softmode robots list`, or an MJCF, URDF or OpenUSD file."""
     toy: Annotated[ObjectOptions, own_object()] = dataclasses.field(default_factory=ObjectOptions)
     """Your own object; what is left out is as the task has it."""
 

@@ -59,7 +59,7 @@ class Play:
     usd_mode: Literal["handles", "baked"] = "handles"
     """What the stage samples: handle matrices only, or also every splat."""
     robot: str | None = None
-    """Robot in place of the built-in arm: a name of `softmode robots list`, or an MJCF or URDF file."""
+    """Robot in place of the built-in arm: a name of `softmode robots list`, or an MJCF, URDF or OpenUSD file."""
     device: str | None = None
     """Warp device, for example cpu or cuda:0."""
     toy: Annotated[ObjectOptions, own_object()] = dataclasses.field(default_factory=ObjectOptions)

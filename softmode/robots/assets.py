@@ -52,7 +52,7 @@ class RobotAsset:
     name: str
     """Name of the robot."""
     path: Path
-    """The MJCF or URDF file."""
+    """The MJCF, URDF or OpenUSD file."""
     root: str | None = None
     """Body whose subtree is the robot, or None for the only one."""
     end_effector: str | None = None
@@ -145,7 +145,7 @@ def _resolve(registry: Any, robot: Any, cache: Any, download: bool) -> Path:
     hint = (
         f"run `softmode robots fetch {robot.name}` where there is a network and copy that machine's cache folder here "
         "(or name it in MENAGERIE_CACHE_DIR), set MENAGERIE_ROOT to a checkout of the Menagerie, or give the path of "
-        "an MJCF or URDF file"
+        "an MJCF, URDF or OpenUSD file"
     )
     if not cache.root and not cache.is_cached(robot) and not download:
         raise AssetError(f"robot {robot.name!r} is not in {where} and download is off", hint=hint)
@@ -161,7 +161,7 @@ def _unknown(name: str, known: Sequence[str]) -> ConfigError:
     near = [other for other in known if name and name.lower() in other]
     near += [other for other in difflib.get_close_matches(name.lower(), known, n=5, cutoff=0.5) if other not in near]
     hint = f"did you mean {', '.join(repr(other) for other in near[:3])}? " if near else ""
-    hint += "softmode.robots.available() lists the names; a file is given as a path that ends in .xml or .urdf"
+    hint += "softmode.robots.available() lists the names; a file is given as a path that ends in .xml, .urdf or .usd"
     if _registry() is None:
         hint += "; more names come with: pip install 'softmode[robots]'"
     return ConfigError(f"robot {name!r} is unknown", hint=hint)
@@ -190,7 +190,7 @@ def _aloha_arm() -> RobotAsset:
     """Return the left arm of the ALOHA station."""
     path = _aloha_path()
     if path is None:
-        hint = "load 'vx300s', which is the same arm, or give the path of an MJCF or URDF file"
+        hint = "load 'vx300s', which is the same arm, or give the path of an MJCF, URDF or OpenUSD file"
         raise AssetError(f"robot {ALOHA_ARM!r} is not in the installed mujoco-warp", hint=hint)
     return RobotAsset(
         name=ALOHA_ARM, path=path, root="left\\base_link", end_effector="left\\gripper", asset_root=path.parent
