@@ -10,7 +10,13 @@ contact records are appended by an atomic counter: fixed slots per sample keep t
 
 import warp as wp
 
-from softmode.deformables.contact.penalty_kernels import stiffness_per_area
+from softmode.deformables.contact.penalty_kernels import (
+    dent_compliance,
+    dent_depth,
+    shear_ratio,
+    stick_stiffness,
+    stiffness_per_area,
+)
 from softmode.deformables.contact.shape_query_kernels import (
     HEIGHTFIELD,
     PLANE,
@@ -445,6 +451,7 @@ def gather_contacts(
     shapes: Shapes,
     samples: Samples,
     relative_stiffness: wp.array[float],  # (sample_total,), Young's modulus relative to the body's
+    dent_length: wp.array[float],  # (sample_total,), see ``dents`` [m]
     constraint_max: int,
     prescribed: int,
     stick_ratio: wp.float64,
@@ -519,7 +526,9 @@ def gather_contacts(
             kappa = stiffness_per_area(
                 instances, i, relative_stiffness[row], partner_mass, shape_area(shapes, shape), dt
             )
-            stiffness = wp.float64(kappa * sample_area(instances.scale[i], basis.row_area[row]))
+            area = wp.max(sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
+            stiffness = wp.float64(kappa * area)
+            compliance = dent_compliance(instances, i, relative_stiffness[row], dent_length[row]) / area
             slip, anchor = remembered_slip(
                 shapes,
                 shape,
@@ -533,8 +542,11 @@ def gather_contacts(
             # d enters as offset + displacement, with the gap along the normal and the shape's own motion taken off
             constraints.offset[i, e] = gap * normal + slip - wp.vec3d(drift)
             constraints.anchor[i, e] = anchor
-            constraints.stick[i, e] = stick_ratio * stiffness
+            sheared = wp.float64(shear_ratio(instances.poissons_ratio[i]) * compliance)
+            constraints.stick[i, e] = stick_stiffness(stick_ratio, stiffness, sheared)
             constraints.stiffness[i, e] = stiffness
+            constraints.dent_compliance[i, e] = wp.float64(compliance)
+            constraints.dent_depth[i, e] = wp.float64(dent_depth(instances, i, dent_length[row]))
             constraints.friction[i, e] = wp.float64(wp.sqrt(instances.friction[i] * shapes.friction[shape]))
 
 

@@ -71,9 +71,11 @@ def forget_slip(
     # State out:
     stick_shape_out: wp.array[wp.vec2i],
     stick_partner_out: wp.array[wp.vec2i],
+    dent_out: wp.array[wp.vec3],
 ):
-    """Let the samples in masked worlds stick to nothing."""
+    """Let the samples in masked worlds stick to nothing, and have no dent."""
     i, s = wp.tid()
     if s < instances.sample_count[i] and in_mask(instance_world[i], world_mask):
         stick_shape_out[instances.particle_start[i] + s] = wp.vec2i(-1, -1)
         stick_partner_out[instances.particle_start[i] + s] = wp.vec2i(-1, -1)
+        dent_out[instances.particle_start[i] + s] = wp.vec3()

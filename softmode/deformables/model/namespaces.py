@@ -29,6 +29,8 @@ class SoftState(Protocol):
     """Soft bodies of its world that a surface sample sticks to, vec2i (particle_count,); -1 for none."""
     stick_slip: wp.array
     """Its slip on them, carried back to rest [m], 2 x 3 float64 (particle_count,)."""
+    dent: wp.array
+    """How far its skin lies outside of what the functions of the body say [m], vec3 (particle_count,)."""
 
 
 class SoftControl(Protocol):

@@ -12,7 +12,7 @@ from typing import Any
 
 import warp as wp
 
-from softmode.deformables.contact.penalty_kernels import normal_potential, slip_potential
+from softmode.deformables.contact.penalty_kernels import contact_potential, slip_potential
 from softmode.deformables.model.lane_kernels import team_sum, vec8d
 from softmode.deformables.model.struct_kernels import (
     Instances,
@@ -123,7 +123,7 @@ def contact_at(
     """Return energy, force and Hessian of a contact at offset + d; ``follow``: its friction takes this normal force."""
     n = constraints.normal[i, e]
     k = constraints.stiffness[i, e]
-    psi, slope, curvature = normal_potential(-wp.dot(n, total), wp.float64(smoothing))
+    psi, slope, curvature = contact_potential(constraints, smoothing, -wp.dot(n, total), i, e)
     if follow != 0:
         constraints.normal_force[i, e] = k * slope
     limit = constraints.friction[i, e] * constraints.normal_force[i, e]
@@ -192,7 +192,8 @@ def start_rigidly(step: NewtonStep, samples: Samples, team: int):
     for e in range(member, count, team):
         total = find_displacement(step, i, e)
         penetration = -wp.dot(step.constraints.normal[i, e], total)
-        psi, _slope, _curvature = normal_potential(penetration, wp.float64(step.instances.smoothing[i]))
+        smoothing = step.instances.smoothing[i]
+        psi, _slope, _curvature = contact_potential(step.constraints, smoothing, penetration, i, e)
         stored += step.constraints.stiffness[i, e] * psi
     stored = team_sum(stored)
     if stored < wp.float64(0.5) * weight * moved:
