@@ -176,14 +176,28 @@ def viscous_hessian(F: np.ndarray, mu: float, lam: float, viscosity: float, dt: 
     return viscosity / dt * hooke_hessian(F, mu, lam)
 
 
-def normal_potential(penetration: np.ndarray, eps: float) -> np.ndarray:
-    """Return the contact potential per unit stiffness: a C2 penalty and one nine times as stiff from 2 eps on."""
+def penalty(p: np.ndarray, eps: float) -> np.ndarray:
+    """Return the C2 penalty of contact per unit stiffness."""
+    p = np.maximum(p, 0.0)
+    return np.where(p < eps, p**3 / (6 * eps), p * p / 2 - eps * p / 2 + eps * eps / 6)
 
-    def penalty(p, eps):
-        p = np.maximum(p, 0.0)
-        return np.where(p < eps, p**3 / (6 * eps), p * p / 2 - eps * p / 2 + eps * eps / 6)
 
-    return penalty(penetration, eps) + 9.0 * penalty(penetration - 2.0 * eps, 2.0 * eps)
+def dented_penalty(penetration: np.ndarray, eps: float, ratio: float) -> np.ndarray:
+    """Return min_x penalty(x) + (p - x)^2 / (2 ratio), by bisection of its derivative."""
+    if ratio == 0.0:
+        return penalty(penetration, eps)
+    p = np.maximum(penetration, 0.0)
+    low, high = np.zeros_like(p), p.copy()
+    for _ in range(200):
+        x = 0.5 * (low + high)
+        deep = x + ratio * np.where(x < eps, x * x / (2 * eps), x - eps / 2) > p
+        low, high = np.where(deep, low, x), np.where(deep, x, high)
+    return penalty(x, eps) + (p - x) ** 2 / (2 * ratio)
+
+
+def normal_potential(penetration: np.ndarray, eps: float, ratio: float = 0.0, depth: float = 0.0) -> np.ndarray:
+    """Return the contact potential per unit stiffness: a dented penalty, one nine times as stiff from depth + 2 eps."""
+    return dented_penalty(penetration, eps, ratio) + 9.0 * penalty(penetration - depth - 2.0 * eps, 2.0 * eps)
 
 
 def friction_potential(y: np.ndarray, eps: float) -> np.ndarray:
@@ -201,7 +215,7 @@ def contact_stiffness(
 ) -> float:
     """Return the automatic contact stiffness per area [Pa/m].
 
-    The largest of 40 M / L (P-wave modulus over size), 100 m_eff / (A dt^2) with 1/m_eff = 1/m + 1/m_partner and A the
+    The largest of 400 M / L (P-wave modulus over size), 100 m_eff / (A dt^2) with 1/m_eff = 1/m + 1/m_partner and A the
     smaller surface, and 1e8.
     """
     E, nu = material.youngs_modulus, material.poissons_ratio
@@ -209,7 +223,7 @@ def contact_stiffness(
     size = float(np.linalg.norm(np.ptp(body.bounds, axis=0)))
     mass = 1.0 / (1.0 / (material.density * body.volume) + 1.0 / partner_mass)
     area = min(float(body.surface_areas.sum()), partner_area)
-    return max(40.0 * wave / size, 100.0 * mass / (area * dt**2), 1.0e8)
+    return max(400.0 * wave / size, 100.0 * mass / (area * dt**2), 1.0e8)
 
 
 def distance_plane(x: np.ndarray) -> np.ndarray:

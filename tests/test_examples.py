@@ -24,7 +24,7 @@ NEEDS = {
 }
 """Optional packages of examples; the others run with the extras demo, data and robots."""
 
-NEWTONS = {"newton_example": ("--viewer", "null", "--test", "--num-frames", "120")}
+NEWTONS = {"newton_example": ("--viewer", "null", "--test", "--num-frames", "180")}
 """Examples in the shape of Newton's own, which ``newton.examples.run`` runs; the others take ``--short``."""
 
 

@@ -245,7 +245,9 @@ def _parts(task: Task) -> Iterator[tuple[str, Any, Parts]]:
     for owner, name in ((scene.state, "state"), (scene.control, "control")):
         for field_name, array in _fields(owner, name):
             of_body = ".softmode.q" in field_name
-            of_surface = ".particle_" in field_name or ".softmode.stick_" in field_name
+            of_surface = (
+                ".particle_" in field_name or ".softmode.stick_" in field_name or ".softmode.dent" in field_name
+            )
             yield field_name, array, functions if of_body else particles if of_surface else 1
     if differ:
         yield _OBJECT, scene.object_index, 1

@@ -10,6 +10,7 @@ import numpy as np
 
 from softmode.checks import require_choice, require_fields, require_number
 from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.surface_samples import SURFACE_COUNT
 from softmode.deformables.materials.material import Material
 from softmode.errors import AssetError, ConfigError
 from softmode.objects.fingerprint import file_fingerprint, find_file
@@ -84,7 +85,7 @@ class ObjectConfig:
     """Two colours, 0..1, of a shape or mesh, as a checker pattern; None for orange and cream, or the mesh's own."""
     splat_count: int | None = None
     """Number of splats on a shape, preset or mesh, or baked of a field; None for 6000 on a preset, else 2000."""
-    surface_count: int = 400
+    surface_count: int = SURFACE_COUNT
     """Number of surface samples, the points that feel contact."""
     up: UpAxis | None = None
     """Axis of the file that points up; None for "-y" (splat files: trained captures mostly have y down), "+y" (glTF) or

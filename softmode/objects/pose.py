@@ -41,7 +41,10 @@ def stable_rotation(points: NDArray[np.float64]) -> NDArray[np.float64] | None:
         stable &= (tilted @ points.T).max(axis=1) > (1.0 + rise) * height
     if stable[0] or not stable.any():
         return None
-    normal = candidates[stable][(candidates[stable] @ down[0]).argmax()]
+    standing, height = candidates[stable], height[stable]
+    least = standing @ standing[(standing @ down[0]).argmax()]
+    # of the facets that samples make of one face, the lowest lies flat
+    normal = standing[np.where(least > np.cos(2.0 * STABLE_TILT), height, np.inf).argmin()]
     axis, cosine = np.cross(normal, down[0]), float(normal @ down[0])
     if np.linalg.norm(axis) < 1e-9:  # upside down: any horizontal axis will do
         return np.diag([1.0, -1.0, -1.0])

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.build.report import Finding, object_findings
+from softmode.deformables.contact.dents import DentWeights, dent_weights
 from softmode.deformables.materials.material import Material
 from softmode.deformables.skinning.skin_splats import average_basis
 from softmode.errors import ConfigError, GraspError
@@ -93,6 +94,11 @@ class SoftObject:
     def grad_basis(self) -> Array:
         """Their gradients, averaged likewise [1/m], shape (N, n, 3)."""
         return self._averages[1]
+
+    @cached_property
+    def dents(self) -> DentWeights:
+        """How the splats follow the dents of the surface samples."""
+        return dent_weights(self.body, self.visible_splats.means)
 
     @cached_property
     def _averages(self) -> tuple[Array, Array]:

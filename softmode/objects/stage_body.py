@@ -13,6 +13,7 @@ from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_points, quadrature_from_splats
 from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.quadrature_mesh import cap_holes, quadrature_from_mesh
+from softmode.deformables.build.surface_samples import SURFACE_COUNT
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import SCALE_MAX, SCALE_MIN
 from softmode.errors import AssetError, BasisError
@@ -36,7 +37,7 @@ def place_deformable(
     options: BuildOptions | None = None,
     *,
     material: Material | None = None,
-    surface_count: int = 400,
+    surface_count: int = SURFACE_COUNT,
     splat_count: int = 2000,
     contact_radius: float = 0.0,
     progress: Progress = None,
@@ -96,7 +97,7 @@ def build_deformable(
     deformable: UsdDeformable,
     options: BuildOptions | None = None,
     *,
-    surface_count: int = 400,
+    surface_count: int = SURFACE_COUNT,
     progress: Progress = None,
 ) -> ReducedBody:
     """Build the body of a deformable, or recall it from the cache.

@@ -57,6 +57,8 @@ class _Skin:
     """The splats."""
     start: wp.array
     """Where q of the body begins in each of these worlds."""
+    samples: wp.array
+    """Where its surface samples begin, likewise."""
     rows: wp.array | None
     """The rows of these worlds in the arrays; None for all."""
     first: int
@@ -103,9 +105,10 @@ class BoundSplats:
         self.indices = tuple(o for o, things in enumerate(each) if _has_splats(things))
         """Which objects have splats."""
         if model is not None:
-            starts = _function_starts(model, each, worlds)
+            starts, samples = _starts(model, each, worlds)
         elif len(self.indices) == len(each) == len(each[0]) == 1 and each[0][0] is not None:
-            starts = np.array([0] if worlds is None else worlds)[:, None] * each[0][0].body.function_count
+            state = np.array([0] if worlds is None else worlds)[:, None]
+            starts, samples = state * each[0][0].body.function_count, state * each[0][0].body.surface_count
         else:
             raise ConfigError(f"there are {len(objects)} objects and no model", hint="give one object that has splats")
         chosen = range(len(starts)) if worlds is None else worlds
@@ -134,26 +137,25 @@ class BoundSplats:
         the last columns of a world may be empty."""
         self._skins: list[_Skin] = []
         if self._resident:
-            start = wp.array(np.ascontiguousarray(starts[:, 0]), dtype=int, device=device)
+            place = {"start": starts[:, 0], "samples": samples[:, 0]}
+            place = {name: _column(values, device) for name, values in place.items()}
             for thing in self._resident:
-                rest = thing.visible_splats
-                skin = SkinSplats(rest.means, rest.covariances(), thing.basis, thing.grad_basis, device=device)
+                skin = _skin(thing, device)
                 rows = wp.zeros(len(starts), dtype=int, device=device)
-                self._skins.append(_Skin(skin=skin, start=start, rows=rows, first=self.columns[0].start))
+                self._skins.append(_Skin(skin=skin, rows=rows, first=self.columns[0].start, **place))
             self.choose(wp.ones(len(starts), dtype=wp.bool, device=device))
             return
         for o, columns in zip(self.indices, self.columns, strict=False):
             things = each[o]
             for thing in {id(thing): thing for thing in things}.values():
                 assert thing is not None  # of those that have splats
-                rest = thing.visible_splats
-                skin = SkinSplats(rest.means, rest.covariances(), thing.basis, thing.grad_basis, device=device)
+                skin = _skin(thing, device)
                 mine = [k for k, w in enumerate(chosen) if things[w % len(things)] is thing]
                 if not mine:
                     continue
-                start = wp.array(np.ascontiguousarray(starts[mine, o]), dtype=int, device=device)
+                place = {"start": _column(starts[mine, o], device), "samples": _column(samples[mine, o], device)}
                 rows = None if len(things) == 1 else wp.array(mine, dtype=int, device=device)
-                self._skins.append(_Skin(skin=skin, start=start, rows=rows, first=columns.start))
+                self._skins.append(_Skin(skin=skin, rows=rows, first=columns.start, **place))
 
     def choose(self, world_mask: wp.array) -> None:
         """Show the object that `choice` says in the masked worlds, shape (world_count,) bool; capturable."""
@@ -173,14 +175,20 @@ class BoundSplats:
 
     def update(self, state: newton.State) -> None:
         """Move the splats to where a state of the model has them; capturable after a first time."""
-        self.move(soft(state).q)
+        self.move(soft(state).q, soft(state).dent)
 
-    def move(self, q: wp.array) -> None:
-        """Move the splats by the coordinates q of all instances [m], flat vec3d; capturable after a first time."""
+    def move(self, q: wp.array, dent: wp.array | None = None) -> None:
+        """Move the splats by the coordinates q of all instances [m], flat vec3d; capturable after a first time.
+
+        Args:
+            q: The coordinates.
+            dent: Dents of the surface samples of all instances [m], flat vec3; None for none.
+        """
         arrays = self.arrays
         moved, turns = (arrays.means, arrays.covariances), arrays.rotations
         for one in self._skins:
-            one.skin.launch(q, one.start, *moved, rotations=turns, first_splat=one.first, rows=one.rows)
+            where = {"rotations": turns, "first_splat": one.first, "rows": one.rows}
+            one.skin.launch(q, one.start, *moved, dent=dent, sample_start=one.samples, **where)
 
     def frames(self) -> dict[tuple[int, int], SplatFrame]:
         """Return the splats as they are by place of the world in `worlds` and object; reads from the device."""
@@ -230,10 +238,22 @@ def _has_splats(things: Sequence[SoftObject | None]) -> bool:
     return all(thing is not None and thing.splats is not None for thing in things)
 
 
-def _function_starts(
+def _skin(thing: SoftObject, device: wp.DeviceLike) -> SkinSplats:
+    """Return the splats of an object at rest, and how they move."""
+    rest, dents, count = thing.visible_splats, thing.dents, thing.body.surface_count
+    seen: Any = {"near": dents.samples, "share": dents.weights, "sample_count": count, "device": device}
+    return SkinSplats(rest.means, rest.covariances(), thing.basis, thing.grad_basis, **seen)
+
+
+def _column(values: NDArray[np.integer], device: wp.DeviceLike) -> wp.array:
+    """Return indices as an array of the device."""
+    return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=int, device=device)
+
+
+def _starts(
     model: newton.Model, each: Sequence[Sequence[SoftObject | None]], worlds: Sequence[int] | None
-) -> NDArray[np.int32]:
-    """Return where q of each of the soft bodies of a world begins, shape (worlds, bodies).
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return where q and the surface samples of each soft body of a world begin, each of shape (worlds, bodies).
 
     Raises:
         ConfigError: If the worlds do not hold that many, or one of them holds another body.
@@ -243,7 +263,10 @@ def _function_starts(
     if len(owner) != every * count or (every > 1 and not np.array_equal(owner, np.repeat(np.arange(every), count))):
         hint = "give one object, or None, per soft body of a world, in the order in which they were added"
         raise ConfigError(f"objects names {count} soft bodies, the model has {len(owner)} in {every} worlds", hint=hint)
-    starts = np.asarray(data.function_start.numpy(), dtype=np.int32).reshape(every, count)
+    starts, samples = (
+        np.asarray(array.numpy(), dtype=np.int32).reshape(every, count)
+        for array in (data.function_start, data.particle_start)
+    )
     keys, chosen = data.body_key.numpy().reshape(every, count), range(every) if worlds is None else worlds
     for o, things in enumerate(each):
         if len(things) not in (1, every):
@@ -255,4 +278,4 @@ def _function_starts(
             if wants not in (-1, int(keys[w, o])):
                 hint = "give the body of every world where worlds differ: TableScene.objects_of(world)"
                 raise ConfigError(f"objects[{o}] is not the body that world {w} holds", hint=hint)
-    return starts[list(chosen)]
+    return starts[list(chosen)], samples[list(chosen)]

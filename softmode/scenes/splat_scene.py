@@ -15,6 +15,7 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 from numpy.typing import ArrayLike, NDArray
 
+from softmode.deformables.contact.dents import contact_dents
 from softmode.deformables.coupling.rigid_solver import mujoco_warnings
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
@@ -324,15 +325,17 @@ class SplatScene:
         return worst
 
     def rigid_gaps(self) -> NDArray[np.float64]:
-        """Return the gaps of surface samples to the rigid shapes near them in the last step [m], negative inside."""
+        """Return the gaps of skins, dents in, to the rigid shapes near them in the last step [m], negative inside."""
         return rigid_gaps(self.solver)
 
     def soft_overlap(self) -> float:
-        """Return how deep the surface of an object was inside another at the start of the last step [m]."""
+        """Return how deep the surface of an object was in another at the start of the last step, besides dents [m]."""
         pairs = self.solver.view.pairs
         if pairs is None:
             return 0.0
         count = np.array([thing.body.surface_count for thing in self.objects])
         found = pairs.near.numpy().astype(bool)[:, None] & (np.arange(pairs.gap.shape[1]) < count[:, None])
         gap = np.where(found[:, :, None] & (pairs.other.numpy() >= 0), pairs.gap.numpy(), 0.0)
-        return float(max(-gap.min(), 0.0))
+        held, dents = pairs.held.numpy(), contact_dents(self.solver.view.constraints)
+        given = np.where(held >= 0, dents[np.arange(len(dents))[:, None, None], held], 0.0)
+        return float(max(-(gap + given).min(), 0.0))

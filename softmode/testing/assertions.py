@@ -42,7 +42,10 @@ def assert_no_flag(episode: Episode, *, allow: Collection[str] = ()) -> None:
 
 
 def assert_max_penetration(episode: Episode, mm: float) -> None:
-    """Assert that no surface sample was deeper in a rigid shape than so many millimetres, at the end of any step."""
+    """Assert that no surface sample was deeper in a rigid shape than so many millimetres, at the end of any step.
+
+    The dent of its contact does not count: there the skin of the body lies outside of what its functions say.
+    """
     require_number("mm", mm, at_least=0.0, unit="mm")
     _at_most(episode, [1.0e3 * step.depth for step in episode.steps], mm, "mm deep in a rigid shape")
 

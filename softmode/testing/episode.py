@@ -36,7 +36,7 @@ class Step:
     """Largest contact force of the soft objects on a rigid body [N], a mean over the last substep; what is fixed to the
     world is none."""
     depth: float
-    """Depth of the deepest surface sample in a rigid shape [m], at the start of the last substep."""
+    """Depth of the deepest surface sample in a rigid shape [m], at the start of the last substep, less its dent."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -167,5 +167,5 @@ def played(env: gym.Env, base: SoftEnv, action: Any, result: list[Any] | None = 
 
 
 def _depth(base: SoftEnv) -> float:
-    """Return how deep the deepest surface sample is in a rigid shape [m], zero where none is."""
+    """Return how deep the deepest surface sample is in a rigid shape besides its dent [m], zero where none is."""
     return max(0.0, -float(rigid_gaps(base.scene.solver).min(initial=0.0)))

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.surface_samples import SURFACE_COUNT
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import rotation_matrix
 from softmode.errors import AssetError, ConfigError, SoftmodeError
@@ -57,7 +58,7 @@ def add_usd(
     rotation: ArrayLike | None = None,
     build_options: BuildOptions | None = None,
     material: Material | None = None,
-    surface_count: int = 400,
+    surface_count: int = SURFACE_COUNT,
     splat_count: int = 2000,
     contact_radius: float = 0.0,
     newton_options: dict[str, Any] | None = None,

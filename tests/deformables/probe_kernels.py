@@ -76,13 +76,15 @@ def query_points(
 def evaluate_potentials(
     x: wp.array[wp.float64],
     eps: wp.float64,
+    ratio: wp.float64,
+    depth: wp.float64,
     # Out:
     normal_out: wp.array[wp.vec3d],
     friction_out: wp.array[wp.vec3d],
 ):
     """Evaluate both contact potentials: (value, slope, curvature) and (f0, f1 / y, f1')."""
     i = wp.tid()
-    value, slope, curvature = contact.normal_potential(x[i], eps)
+    value, slope, curvature = contact.normal_potential(x[i], eps, ratio, depth)
     normal_out[i] = wp.vec3d(value, slope, curvature)
     f0, f1_over_y, f1_slope = contact.friction_potential(x[i], eps)
     friction_out[i] = wp.vec3d(f0, f1_over_y, f1_slope)

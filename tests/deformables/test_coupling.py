@@ -44,10 +44,10 @@ def impact(ratio, *, offset=(0.0, 0.0), speed=0.5, friction=0.5, dt=0.001, pins=
 
 
 def totals(scene, twin):
-    """Return linear and angular momentum and energy of the soft and the rigid body together."""
+    """Return linear and angular momentum and energy of the soft and the rigid body together, that of dents included."""
     p, L = scene.momentum()
     P, spin, kinetic = scene.rigid_momentum()
-    return p + P, L + spin, scene.kinetic_energy() + kinetic + twin.elastic_energy(scene.q())
+    return p + P, L + spin, scene.kinetic_energy() + kinetic + twin.elastic_energy(scene.q()) + scene.dents()[1]
 
 
 # -- derivatives -------------------------------------------------------------------------------------------------------

@@ -305,6 +305,19 @@ def trimesh_ellipsoid_area(axes: np.ndarray) -> float:
     return float(mesh.area)
 
 
+def test_surface_areas() -> None:
+    """Areas vary by less than 0.15 of their mean, and make up a sphere's caps about the axes, 2 pi R h, to 4 %.
+
+    There the sphere touches the bounds that it is given in. A cap has 48 samples: the mean of six is meant.
+    """
+    radius, depth = 0.05, 0.003
+    quadrature = quadrature_from_sphere(radius, point_count=2000, surface_count=1600)
+    x, areas = quadrature.surface_points, quadrature.surface_areas
+    assert areas.std() < 0.15 * areas.mean()
+    caps = [areas[side * x[:, axis] > radius - depth].sum() for axis in range(3) for side in (-1, 1)]
+    assert np.mean(caps) == pytest.approx(2.0 * np.pi * radius * depth, rel=0.04)
+
+
 def test_bad_implicit_functions_are_refused() -> None:
     """An empty inside, NaN values, a wrong shape and inverted bounds raise AssetError."""
     box = [[-1.0] * 3, [1.0] * 3]

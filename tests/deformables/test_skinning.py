@@ -89,6 +89,27 @@ def test_matches_numpy(device: str) -> None:
     assert (np.abs(covariances - f @ case.covariances @ f.transpose(0, 1, 3, 2)) < bound[..., None, None]).all()
 
 
+def test_dents_move_splats(device: str) -> None:
+    """Each centre moves by sum_k share_k dent[near_k] of its own world; in a world without dents not by a bit."""
+    case, rng = Case(), np.random.default_rng(3)
+    samples, pad = 7, 2
+    near, share = rng.integers(0, samples, (N, 4)), rng.random((N, 4)).astype(np.float32)
+    dent = 1e-3 * rng.normal(size=(WORLDS, samples + pad, 3)).astype(np.float32)
+    dent[1, pad:] = 0.0
+    still, _ = run(case, device)
+    flat = wp.array(dent.reshape(-1, 3), dtype=wp.vec3, device=device)
+    first = wp.array(pad + (samples + pad) * np.arange(WORLDS), dtype=wp.int32, device=device)
+    out = wp.zeros((WORLDS, N), dtype=wp.vec3, device=device)
+    skin = case.skin(device, near=near, share=share, sample_count=samples)
+    q = (case.flat(case.q, device), case.starts(device))
+    skin.launch(*q, out, wp.zeros(out.shape, dtype=vec6, device=device), dent=flat, sample_start=first)
+    moved = np.einsum("nk,wnkd->wnd", share, dent[:, pad:][:, near])
+    np.testing.assert_allclose(out.numpy(), still + moved, atol=8 * FLOAT32 * 0.3)
+    np.testing.assert_array_equal(out.numpy()[1], still[1])
+    with pytest.raises(BasisError, match="near"):
+        case.skin(device, near=near, share=share, sample_count=5)
+
+
 def test_affine_motion_is_exact(device: str) -> None:
     """Q of x = A X + t gives means A X + t and covariances A Sigma A^T, a metre away from home too."""
     case = Case()

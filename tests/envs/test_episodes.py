@@ -15,7 +15,7 @@ from tests.envs.conftest import Episodes, MakeEnv
 
 LIMITS = {
     "LiftSoft": (9.0, 0.5),
-    "PushSoft": (0.6, 0.13),
+    "PushSoft": (0.6, 0.24),
     "PressSoft": (7.7, 2.6),
     "RopeRoute": (21.0, 2.2),
     "ShapeSoft": (1.1, 2.0),

@@ -15,6 +15,7 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.contact.dents import contact_dents
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.model.authoring import register_custom_attributes
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
@@ -176,6 +177,13 @@ class Scene:
     def kinetic_energy(self, instance: int = 0) -> float:
         """Return m/2 |qd|^2 [J]."""
         return 0.5 * self.mass(instance) * float((self.qd(instance) ** 2).sum())
+
+    def dents(self, instance: int = 0) -> tuple[np.ndarray, float]:
+        """Return the dents at the contacts of the last step [m], shape (count,), and their energy [J]."""
+        c, pins = self.reduced.view.constraints, int(self.reduced.view.instances.pin_count.numpy()[instance])
+        mine = slice(pins, int(c.count.numpy()[instance]))
+        dent, give = contact_dents(c)[instance, mine], c.dent_compliance.numpy()[instance, mine]
+        return dent, float(0.5 * (dent**2 / np.where(give > 0.0, give, 1.0)).sum())
 
     def rigid_momentum(self, body: int = 0) -> tuple[np.ndarray, np.ndarray, float]:
         """Return linear and angular momentum about the world's origin and the kinetic energy of a rigid body."""

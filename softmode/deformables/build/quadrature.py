@@ -17,6 +17,7 @@ from softmode.deformables.build.occupancy import fill_splats
 from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.quadrature_implicit import SignedDistance, quadrature_from_implicit
 from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
+from softmode.deformables.build.surface_samples import SURFACE_COUNT
 from softmode.errors import AssetError
 
 __all__ = [
@@ -35,7 +36,7 @@ Array = NDArray[np.float64]
 
 
 def quadrature_from_box(
-    size: ArrayLike, *, point_count: int = 4000, surface_count: int = 400, seed: int = 0
+    size: ArrayLike, *, point_count: int = 4000, surface_count: int = SURFACE_COUNT, seed: int = 0
 ) -> Quadrature:
     """Integrate a box with edges `size` [m] centred at the origin; see `quadrature_from_mesh`."""
     extent = np.asarray(size, dtype=np.float64)
@@ -48,14 +49,14 @@ def quadrature_from_box(
 
 
 def quadrature_from_sphere(
-    radius: float, *, point_count: int = 4000, surface_count: int = 400, seed: int = 0
+    radius: float, *, point_count: int = 4000, surface_count: int = SURFACE_COUNT, seed: int = 0
 ) -> Quadrature:
     """Integrate a sphere of `radius` [m] centred at the origin; volume and area are the exact ones."""
     return quadrature_from_capsule(radius, 0.0, point_count=point_count, surface_count=surface_count, seed=seed)
 
 
 def quadrature_from_capsule(
-    radius: float, half_height: float, *, point_count: int = 4000, surface_count: int = 400, seed: int = 0
+    radius: float, half_height: float, *, point_count: int = 4000, surface_count: int = SURFACE_COUNT, seed: int = 0
 ) -> Quadrature:
     """Integrate a capsule: a segment of 2 `half_height` [m] along z, swept by `radius` [m]; exact volume and area."""
     if not (np.isfinite(radius) and radius > 0.0):
@@ -87,7 +88,7 @@ def quadrature_from_splats(
     *,
     outset: ArrayLike = 0.0,
     point_count: int = 4000,
-    surface_count: int = 400,
+    surface_count: int = SURFACE_COUNT,
     resolution: int | None = None,
     seed: int = 0,
 ) -> Quadrature:
@@ -128,7 +129,7 @@ def quadrature_from_points(
     *,
     radius: float = 0.0,
     point_count: int = 4000,
-    surface_count: int = 400,
+    surface_count: int = SURFACE_COUNT,
     resolution: int | None = None,
     seed: int = 0,
 ) -> Quadrature:

@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 from softmode.checks import require_choice, require_number
 from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.quadrature_implicit import quadrature_from_implicit
+from softmode.deformables.build.surface_samples import SURFACE_COUNT
 from softmode.errors import AssetError
 
 Array = NDArray[np.float64]
@@ -43,7 +44,7 @@ def quadrature_from_density(
     resolution: int = 64,
     fill_voids: bool = True,
     point_count: int = 4000,
-    surface_count: int = 400,
+    surface_count: int = SURFACE_COUNT,
     seed: int = 0,
 ) -> Quadrature:
     """Integrate the solid that a density shows.

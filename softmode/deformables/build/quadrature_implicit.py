@@ -16,7 +16,7 @@ from softmode.deformables.build.quadrature_grid import (
     grid_shape,
     sum_pieces,
 )
-from softmode.deformables.build.surface_samples import CANDIDATES_PER_SAMPLE, select_surface
+from softmode.deformables.build.surface_samples import CANDIDATES_PER_SAMPLE, SURFACE_COUNT, select_surface
 from softmode.errors import AssetError
 
 Array = NDArray[np.float64]
@@ -31,7 +31,7 @@ def quadrature_from_implicit(
     bounds: ArrayLike,
     *,
     point_count: int = 4000,
-    surface_count: int = 400,
+    surface_count: int = SURFACE_COUNT,
     seed: int = 0,
     volume: float | None = None,
     area: float | None = None,
@@ -147,16 +147,33 @@ def _filled(distance: Array, width: Array) -> Array:
     return np.clip(0.5 - distance / width.prod() ** (1.0 / 3.0), 0.0, 1.0)
 
 
+def _layer_cells(nodes: Array, distance: Array, width: Array, layer: float) -> Array:
+    """Return the centres of all cells (N, 3) that a layer about the zero level may cut.
+
+    Where the surface touches the box of the grid, as a sphere does that is given in its own bounds, half of the layer
+    lies outside: there cells are added, or these places would get half as many points as others.
+    """
+    reach = layer + 0.5 * float(np.linalg.norm(width))
+    cells, away = nodes[np.abs(distance) < reach + layer], distance[np.abs(distance) < reach + layer]
+    keep = [cells[np.abs(away) < reach]]
+    lower, upper = nodes.min(axis=0) + 0.5 * width, nodes.max(axis=0) - 0.5 * width
+    for axis in range(3):
+        step = width * np.eye(3)[axis]
+        beyond = [cells[cells[:, axis] < lower[axis]] - step, cells[cells[:, axis] > upper[axis]] + step]
+        keep, cells = [*keep, *beyond], np.concatenate([cells, *beyond])
+    return np.concatenate(keep)
+
+
 def _project_surface(
     level: Callable[[Array], Array], nodes: Array, distance: Array, width: Array, surface_count: int, seed: int
 ) -> tuple[Array, Array]:
     """Draw points in a thin layer around the zero level, which makes their density uniform, and project them on it."""
     rng = np.random.default_rng(seed)
     layer = 0.5 * float(width.max())
-    near = np.flatnonzero(np.abs(distance) < layer + 0.5 * float(np.linalg.norm(width)))
+    cells = _layer_cells(nodes, distance, width, layer)
     wanted = 3 * CANDIDATES_PER_SAMPLE * surface_count
-    pick = near[rng.permutation(len(near) * max(1, -(-wanted // max(len(near), 1))))[:wanted] % len(near)]
-    x = nodes[pick] + (rng.random((len(pick), 3)) - 0.5) * width
+    pick = rng.permutation(len(cells) * max(1, -(-wanted // max(len(cells), 1))))[:wanted] % len(cells)
+    x = cells[pick] + (rng.random((len(pick), 3)) - 0.5) * width
     step = 0.25 * float(width.min())
 
     value, slope = level(x), _gradient(level, x, step)

@@ -20,7 +20,7 @@ from softmode.deformables.build.quadrature_grid import (
     match_moments,
     sum_pieces,
 )
-from softmode.deformables.build.surface_samples import CANDIDATES_PER_SAMPLE, select_surface
+from softmode.deformables.build.surface_samples import CANDIDATES_PER_SAMPLE, SURFACE_COUNT, select_surface
 from softmode.errors import AssetError
 
 Array = NDArray[np.float64]
@@ -32,7 +32,7 @@ LARGE_FACE = 0.05
 
 
 def quadrature_from_mesh(
-    vertices: ArrayLike, faces: ArrayLike, *, point_count: int = 4000, surface_count: int = 400, seed: int = 0
+    vertices: ArrayLike, faces: ArrayLike, *, point_count: int = 4000, surface_count: int = SURFACE_COUNT, seed: int = 0
 ) -> Quadrature:
     """Integrate a closed triangle mesh.
 

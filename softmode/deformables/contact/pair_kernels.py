@@ -25,7 +25,7 @@ whose row is the difference.
 import warp as wp
 
 from softmode.deformables.contact.detection_kernels import rank_contacts
-from softmode.deformables.contact.penalty_kernels import stiffness_per_area
+from softmode.deformables.contact.penalty_kernels import dent_compliance, dent_depth, stiffness_per_area
 from softmode.deformables.model.declare import struct
 from softmode.deformables.model.deformation_kernels import displacement_gradient
 from softmode.deformables.model.lane_kernels import vec8
@@ -449,6 +449,7 @@ def write_pairs(
     samples: Samples,
     state: NewtonState,
     relative_stiffness: wp.array[float],  # (sample_total,), Young's modulus relative to the body's
+    dent_length: wp.array[float],  # (sample_total,), see ``dents`` [m]
     stick_ratio: wp.float64,
     stick_partner: wp.array[wp.vec2i],  # (particle_count,), see ``stick_kernels``
     stick_slip: wp.array[mat23d],  # (particle_count,) [m]
@@ -504,7 +505,14 @@ def write_pairs(
     ki = stiffness_per_area(instances, i, relative_stiffness[own], float(instances.mass[j]), instances.area[j], dt)
     kj = stiffness_per_area(instances, j, relative_stiffness[at], float(instances.mass[i]), instances.area[i], dt)
     # two layers in series; each of the two surfaces brings its samples, so that each counts one half
-    stiffness = wp.float64(0.5 * ki * kj / (ki + kj) * sample_area(instances.scale[i], basis.row_area[own]))
+    half_area = wp.max(0.5 * sample_area(instances.scale[i], basis.row_area[own]), 1.0e-30)
+    stiffness = wp.float64(ki * kj / (ki + kj) * half_area)
+    wi = dent_compliance(instances, i, relative_stiffness[own], dent_length[own]) / half_area
+    wj = dent_compliance(instances, j, relative_stiffness[at], dent_length[at]) / half_area
+    compliance = wp.float64(wi + wj)
+    thick = wp.max(instances.scale[i] * pairs.thickness[own], instances.scale[j] * pairs.thickness[at])
+    depth = dent_depth(instances, i, dent_length[own]) + dent_depth(instances, j, dent_length[at])
+    depth = wp.min(depth, 0.5 * DEPTH * thick)
     friction = wp.float64(wp.sqrt(instances.friction[i] * instances.friction[j]))
     n = pairs.normal[i, s, slot]
     deepest = -wp.float64(OVERLAP * wp.min(instances.size[i], instances.size[j]))
@@ -537,6 +545,8 @@ def write_pairs(
             constraints.offset[a, e] = direction * offset
             constraints.stiffness[a, e] = stiffness
             constraints.stick[a, e] = stick_ratio * stiffness
+            constraints.dent_compliance[a, e] = compliance
+            constraints.dent_depth[a, e] = wp.float64(depth)
             constraints.friction[a, e] = friction
 
 

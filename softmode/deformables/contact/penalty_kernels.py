@@ -4,8 +4,9 @@ With the displacement d of the sample relative to the shape during the step, a c
 
     E(d) = A kappa psi_n(-g0 - n . d) + psi_t(|s + d_t|; mu f_n, k_t),
 
-psi_n the C2 penalty p^3/(6 eps) for p < eps, p^2/2 - eps p/2 + eps^2/6 beyond (p the penetration), and a stiffer one
-where p is large (see ``normal_potential``); s the slip that the contact remembers (see ``stick_kernels``); psi_t the
+psi_n the C2 penalty p^3/(6 eps) for p < eps, p^2/2 - eps p/2 + eps^2/6 beyond (p the penetration), in series with the
+dent that the functions of the body cannot carry, and a stiffer one where p is large (see ``normal_potential``); s the
+slip that the contact remembers (see ``stick_kernels``); psi_t the
 incremental potential of elastic-plastic friction, a spring k_t up to the force mu f_n and that force beyond (Cundall
 and Strack 1979, doi:10.1680/geot.1979.29.1.47), with the normal force f_n of the last Newton iterate. k_t does not
 depend on f_n: the energy of the spring cannot grow but by work, whatever the normal force does, so friction takes
@@ -18,6 +19,7 @@ doi:10.1145/3386569.3392425, eq. 13), mu f_n f0(|d_t|), which creeps.
 import warp as wp
 
 from softmode.deformables.model.struct_kernels import (
+    OVERLAP,
     Instances,
     NewtonState,
     PointConstraints,
@@ -27,9 +29,9 @@ from softmode.deformables.model.struct_kernels import (
 
 wp.set_module_options({"enable_backward": False})
 
-BULK_FACTOR = wp.constant(40.0)
+BULK_FACTOR = wp.constant(400.0)
 """Contact stiffness per area over P-wave modulus per size: under a pressure that squeezes a body by 10 %, contact sinks
-by 0.25 % of its size. 20 sinks 1.4 to 1.6 times as deep in a grasp and saves 3 % of the iterations."""
+by 0.025 % of its size. The dent gives way, the penalty only keeps surfaces apart."""
 INERTIA_FACTOR = wp.constant(100.0)
 """Contact stiffness over effective mass / dt^2, per area: what hits flat is stopped within a step, v dt / 100 deep. 0
 sinks 1.5 to 3 mm at 5 m/s instead of 0.2 to 0.9; 1000 sinks 0.2 mm for a third more iterations."""
@@ -54,15 +56,52 @@ def penalty(penetration: wp.float64, eps: wp.float64):
 
 
 @wp.func
-def normal_potential(penetration: wp.float64, eps: wp.float64):
+def dented_penalty(penetration: wp.float64, eps: wp.float64, ratio: wp.float64):
+    """Return the penalty in series with a spring of 1 / ratio of its stiffness, and its first two derivatives.
+
+    min_x penalty(x) + (p - x)^2 / (2 ratio), x what is left of a penetration p besides the dent p - x. It is as convex
+    and as smooth as the penalty. The root of x + ratio penalty'(x) = p is that of a quadratic where x < eps and linear
+    beyond, so it is exact.
+    """
+    zero = wp.float64(0.0)
+    half = wp.float64(0.5)
+    one = wp.float64(1.0)
+    two = wp.float64(2.0)
+    p = wp.max(penetration, zero)
+    x = p
+    if ratio > zero:
+        if p < eps * (one + half * ratio):
+            x = two * p / (one + wp.sqrt(one + two * ratio * p / eps))
+        else:
+            x = (p + half * ratio * eps) / (one + ratio)
+    psi, slope, curvature = penalty(x, eps)
+    return psi + half * ratio * slope * slope, slope, curvature / (one + ratio * curvature)
+
+
+@wp.func
+def normal_potential(penetration: wp.float64, eps: wp.float64, ratio: wp.float64, depth: wp.float64):
     """Return the contact potential of a penetration [m] per unit stiffness, and its first two derivatives.
 
-    The C2 penalty, and a stiffer one that sets in twice as deep and as slowly.
+    The C2 penalty in series with the dent, and a stiffer penalty that sets in twice as deep and as slowly, ``depth``
+    deeper where there is a dent.
+
+    Args:
+        penetration: p [m].
+        eps: Range of the onset [m].
+        ratio: Compliance of the dent over that of the penalty; 0 for none.
+        depth: Dent [m] from which on the stiffer penalty carries.
     """
-    psi, slope, curvature = penalty(penetration, eps)
+    psi, slope, curvature = dented_penalty(penetration, eps, ratio)
     deep = HARDENING_DEPTH * eps
-    psi_deep, slope_deep, curvature_deep = penalty(penetration - deep, deep)
+    psi_deep, slope_deep, curvature_deep = penalty(penetration - depth - deep, deep)
     return psi + HARDENING * psi_deep, slope + HARDENING * slope_deep, curvature + HARDENING * curvature_deep
+
+
+@wp.func
+def contact_potential(constraints: PointConstraints, smoothing: float, penetration: wp.float64, i: int, e: int):
+    """Return the potential of a contact at a penetration [m] per unit stiffness, and its first two derivatives."""
+    ratio = constraints.stiffness[i, e] * constraints.dent_compliance[i, e]
+    return normal_potential(penetration, wp.float64(smoothing), ratio, constraints.dent_depth[i, e])
 
 
 @wp.func
@@ -159,6 +198,48 @@ def stiffness_exponents(instances: Instances, i: int, relative: float, partner_a
     nu = wp.float64(instances.poissons_ratio[i])
     by_nu = two / (one - two * nu) - one / (one - nu) - one / (one + nu)
     return wp.vec4d(one, by_nu, none, one)
+
+
+@wp.func
+def dent_depth(instances: Instances, i: int, length: float):
+    """Return the dent [m] beyond which the contact of a body hardens.
+
+    It is what the pressure E / (2 - 2 nu^2) dents, E that where it is touched, and a quarter of the overlap that a step
+    may start from at the most: deeper, samples at an edge of what presses would take one face for the other in turns.
+    Zero where ``contact_stiffness`` is given: the penalty is then the whole law of the contact.
+
+    Args:
+        instances: The bodies.
+        i: The body.
+        length: Dent at scale 1 under the pressure E / (1 - nu^2) [m], see ``dents``.
+    """
+    if instances.contact_stiffness[i] > 0.0:
+        return float(0.0)
+    return wp.min(0.5 * instances.scale[i] * length, 0.25 * OVERLAP * instances.size[i])
+
+
+@wp.func
+def dent_compliance(instances: Instances, i: int, relative: float, length: float):
+    """Return the dent per pressure w [m/Pa] of a body, from the parameters as they are now; 0 as ``dent_depth``.
+
+    Args:
+        instances: The bodies.
+        i: The body.
+        relative: Young's modulus where they touch relative to the body's.
+        length: Dent at scale 1 under the pressure E / (1 - nu^2) [m].
+    """
+    if instances.contact_stiffness[i] > 0.0:
+        return float(0.0)
+    nu = instances.poissons_ratio[i]
+    return instances.scale[i] * length * (1.0 - nu * nu) / (relative * instances.youngs_modulus[i])
+
+
+@wp.func
+def dent_exponents(instances: Instances, i: int):
+    """Return d ln(w / A) / d(ln E, nu, ln m, ln s) of a dent, w its compliance and A the sample's area."""
+    one = wp.float64(1.0)
+    nu = wp.float64(instances.poissons_ratio[i])
+    return wp.vec4d(-one, wp.float64(-2.0) * nu / (one - nu * nu), wp.float64(0.0), -one)
 
 
 @wp.kernel

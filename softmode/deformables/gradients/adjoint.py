@@ -43,7 +43,7 @@ from softmode.errors import ConfigError, SolverDiverged
 
 Array = NDArray[np.float64]
 
-_CONSTRAINT = ("row", "shape", "normal", "offset", "stiffness", "friction", "stick")
+_CONSTRAINT = ("row", "shape", "normal", "offset", "stiffness", "dent_compliance", "dent_depth", "friction", "stick")
 """What a step's point constraints are made of, besides their count: members of the solver's ``PointConstraints``."""
 FLAT = 0.02
 """Turn of a normal [rad] over the size of a body up to which a shape counts as flat: what float32 leaves of a plane."""
@@ -192,7 +192,9 @@ class AdjointReduced:
             "pin": self.pin_total,
             "unknown": 3 * layout.block_count,
         }
-        of_constraints = "constraint_slip constraint_size constraint_hessian constraint memory memory_start"
+        of_constraints = (
+            "constraint_slip constraint_normal constraint_gain constraint_hessian constraint memory memory_start"
+        )
         axes = {"": "instance point", of_constraints: "instance constraint"}
         self._step = allocate(kernels.Linearised, axes, self._sizes, self.device)
         points, constraints = Points(), PointConstraints()

@@ -8,8 +8,10 @@ import warp as wp
 
 from softmode.deformables.contact.detection_kernels import Shapes, shape_area, shape_frame
 from softmode.deformables.contact.penalty_kernels import (
+    contact_potential,
+    dent_exponents,
+    dented_penalty,
     friction_potential,
-    normal_potential,
     slip_potential,
     stiffness_exponents,
 )
@@ -42,7 +44,8 @@ class Linearised:
     place_start: wp.array2d[wp.mat33d]  # the same at the start of the step
     point: wp.array2d[wp.mat33d]  # V times what is summed over the points next [N m]
     constraint_slip: wp.array2d[wp.vec3d]  # pins: x - target [m]; contacts: -d force / d friction coefficient [N]
-    constraint_size: wp.array2d[wp.vec3d]  # contacts: d force / d(ln scale) at the same stiffness [N]
+    constraint_normal: wp.array2d[wp.vec3d]  # contacts: d force / d normal force
+    constraint_gain: wp.array2d[wp.vec3d]  # contacts: d normal force / d ln of stiffness, dent compliance, lengths [N]
     constraint_hessian: wp.array2d[wp.mat33d]  # -d force / d displacement [N/m]; not symmetric where a contact slips
     constraint: wp.array2d[wp.vec3d]  # what is summed over the constraints next [N]
     memory: wp.array2d[wp.vec3d]  # what the next step feels of a contact's memory, over the stick stiffness
@@ -178,7 +181,8 @@ def place_constraints(
     """Linearise pins and contacts, the normal force of friction included, at fixed normals.
 
     With x = offset + d, p = -n . x and t the tangential part of x, a contact's force is
-    f = k psi_n'(p) n - secant(|t|, c k psi_n'(p)) t, see ``penalty_kernels``.
+    f = k psi_n'(p) n - secant(|t|, c k psi_n'(p)) t, see ``penalty_kernels``. psi_n' depends on the ratio r of the
+    dent's compliance to the penalty's by r dpsi_n'/dr = -r g' g, g the slope of the dented penalty.
     """
     i, e = wp.tid()
     if e >= constraints.count[i]:
@@ -193,7 +197,10 @@ def place_constraints(
         return
     n = constraints.normal[i, e]
     p = -wp.dot(n, x)
-    _psi, slope, curvature = normal_potential(p, wp.float64(instances.smoothing[i]))
+    eps = wp.float64(instances.smoothing[i])
+    ratio = k * constraints.dent_compliance[i, e]
+    _psi, slope, curvature = contact_potential(constraints, instances.smoothing[i], p, i, e)
+    _dented, dent_slope, dent_curvature = dented_penalty(p, eps, ratio)
     t = x + p * n
     y = wp.length(t)
     c = constraints.friction[i, e]
@@ -209,10 +216,11 @@ def place_constraints(
     slip = secant * (identity - N)
     if y > wp.float64(1.0e-9) * stick_range:
         slip += (tangent - secant) / (y * y) * wp.outer(t, t)
-    # psi_n' is of degree one in p and its range, which grows with s
-    size = k * (slope - p * curvature)
     step.constraint_slip[i, e] = k * slope * by_limit * t
-    step.constraint_size[i, e] = size * (n - c * by_limit * t)
+    step.constraint_normal[i, e] = n - c * by_limit * t
+    # psi_n' is of degree one in p and in the ranges, which grow with s
+    by_ratio = -ratio * dent_curvature * dent_slope
+    step.constraint_gain[i, e] = k * wp.vec3d(slope + by_ratio, by_ratio, slope - p * curvature)
     step.constraint_hessian[i, e] = k * curvature * N + slip - c * k * curvature * by_limit * wp.outer(t, n)
 
 
@@ -484,12 +492,23 @@ def accumulate_constraints(
         pin_target_out[pin] = constraints.stiffness[i, e] * L
         sums.pin_stiffness[pin] = sums.pin_stiffness[pin] - wp.dot(L, step.constraint_slip[i, e])
         return
-    # all force of a contact is in proportion to its stiffness, what it remembers does not depend on it
+    # by ln E, nu, ln m and ln s: of the penalty, which k_t follows, and of the dent
     shape = constraints.shape[i, e]
-    powers = stiffness_exponents(instances, i, relative_stiffness[row], shape_area(shapes, shape), dt)
-    gain = wp.dot(L, constraints.force[i, e]) * powers
+    none = wp.float64(0.0)
+    stiffness_powers = stiffness_exponents(instances, i, relative_stiffness[row], shape_area(shapes, shape), dt)
+    dent_powers = dent_exponents(instances, i)
+    by = step.constraint_gain[i, e]
+    normal_gain = by[0] * stiffness_powers + by[1] * dent_powers + wp.vec4d(none, none, none, by[2])
+    # what a contact remembers is its tangential force over k_t; the force of one that sticks is k_t times its slip
+    force = constraints.force[i, e]
+    along = force - wp.dot(constraints.normal[i, e], force) * constraints.normal[i, e]
+    limit = constraints.friction[i, e] * wp.length(force - along)
+    stuck = constraints.stick[i, e] > none and constraints.stick[i, e] * wp.length(constraints.slip[i, e]) <= limit
+    gain = wp.dot(step.memory[i, e], along) * stiffness_powers
     L -= step.memory[i, e]
-    gain[3] += wp.dot(L, step.constraint_size[i, e])
+    gain += wp.dot(L, step.constraint_normal[i, e]) * normal_gain
+    if stuck:
+        gain += wp.dot(L, along) * stiffness_powers
     sums.contact[i, e] = sums.contact[i, e] + gain
     # of x = gap n + slip - drift + d, the gap grows along n as the sample's place at the start does, d falls by as much
     # as that, and the drift of a shape that turns by R within the step grows by R - I of it

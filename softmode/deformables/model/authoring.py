@@ -84,6 +84,8 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
     particle = newton.Model.AttributeFrequency.PARTICLE
     declare("stick_shape stick_partner", wp.vec2i, particle, default=wp.vec2i(-1, -1), **state)
     declare("stick_point stick_slip", mat23d, particle, **state)
+    # how far the skin lies outside of what the functions say, see ``dent_kernels``
+    declare("dent", wp.vec3, particle, **state)
     declare("q_driven", wp.vec3d, _FUNCTION, **control)
     declare("pin_instance", wp.int32, _PIN, references=_INSTANCE)
     declare("pin_body", wp.int32, _PIN, references="body")
@@ -147,7 +149,8 @@ def add_reduced_body(
             body, at its scale, in its frame [m], shape (N, 3). The body takes the nearest that its functions can; see
             :meth:`softmode.deformables.body.reduced_body.ReducedBody.project`.
         contact_stiffness_per_area: Penalty stiffness of contact [Pa/m]; None or 0 lets it follow the material and the
-            step, see :func:`softmode.deformables.contact.penalty_kernels.stiffness_per_area`.
+            step, see :func:`softmode.deformables.contact.penalty_kernels.stiffness_per_area`. A number is the whole law
+            of the contact: nothing is added to it for the dent that the functions are too few for.
         contact_radius: How far the surface that touches stands out from the body's [m].
         self_contact: Whether the body may touch itself.
         particle_radius: Radius of the particles for viewers and picking [m]; default half their spacing.

@@ -20,7 +20,8 @@ class SoftState(Protocol):
     qd_before: wp.array
     """Velocities at the start of the last step [m/s], vec3d (function_total,)."""
     dt_before: wp.array
-    """Length of the last step [s], float64 (instance_count,); 0 where there was none."""
+    """Length of the last step [s], float64 (instance_count,); 0 where there was none, its negative where it was near a
+    shape, so that BDF2 starts over."""
     stick_shape: wp.array
     """Shapes that a surface sample sticks to, vec2i (particle_count,); -1 for none."""
     stick_point: wp.array
@@ -29,6 +30,8 @@ class SoftState(Protocol):
     """Soft bodies of its world that a surface sample sticks to, vec2i (particle_count,); -1 for none."""
     stick_slip: wp.array
     """Its slip on them, carried back to rest [m], 2 x 3 float64 (particle_count,)."""
+    dent: wp.array
+    """How far its skin lies outside of what the functions of the body say [m], vec3 (particle_count,)."""
 
 
 class SoftControl(Protocol):

@@ -117,6 +117,8 @@ class PointConstraints:
     normal: wp.array2d[wp.vec3d]
     offset: wp.array2d[wp.vec3d]  # pin: x_n - target; contact: gap n + memory; less the drift of a prescribed body [m]
     stiffness: wp.array2d[wp.float64]  # [N/m]
+    dent_compliance: wp.array2d[wp.float64]  # contacts: of the dent in series with it [m/N]
+    dent_depth: wp.array2d[wp.float64]  # contacts: dent from which on they harden [m]
     friction: wp.array2d[wp.float64]
     stick: wp.array2d[wp.float64]  # tangential stiffness of a contact with memory [N/m]; 0: smoothed Coulomb friction
     anchor: wp.array2d[wp.vec3d]  # where the sample stuck at the start of the step, in the shape's frame [m]

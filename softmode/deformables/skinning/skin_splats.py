@@ -62,6 +62,10 @@ class SkinSplats:
         basis: Basis values, averaged over each splat (`average_basis`) or at its centre, shape (N, n).
         grad_basis: Basis gradients likewise [1/m], shape (N, n, 3).
         stretch_limit: Largest principal stretch that a splat follows.
+        near: Surface samples of the body whose dents move each splat, shape (N, k), see
+            `softmode.deformables.contact.dents.dent_weights`; None where dents are not to be seen.
+        share: By how much of them, shape (N, k).
+        sample_count: Surface samples of the body.
         device: Warp device.
 
     Raises:
@@ -76,6 +80,9 @@ class SkinSplats:
         grad_basis: ArrayLike,
         *,
         stretch_limit: float = STRETCH_LIMIT,
+        near: ArrayLike | None = None,
+        share: ArrayLike | None = None,
+        sample_count: int = 0,
         device: str | wp.Device | None = None,
     ) -> None:
         """Upload the rest state."""
@@ -86,6 +93,16 @@ class SkinSplats:
             raise BasisError(
                 f"means {x.shape}, covariances {s.shape}, basis {b.shape}, grad_basis {g.shape} do not belong together",
                 hint="Expected (N, 3), (N, 3, 3), (N, n) and (N, n, 3)",
+            )
+        near, share = (np.zeros((n, 0)) if a is None else np.asarray(a) for a in (near, share))
+        if (
+            len(near) != n
+            or near.shape != share.shape
+            or (near.size and not 0 <= near.min() <= near.max() < sample_count)
+        ):
+            raise BasisError(
+                f"near {near.shape} and share {share.shape} are not those of {n} splats and {sample_count} samples",
+                hint="give samples and weights of dent_weights(body, means), and body.surface_count",
             )
         self.stretch_limit = float(stretch_limit)
         self.device = wp.get_device(device)
@@ -98,7 +115,12 @@ class SkinSplats:
         """Gradient [1/m] and value less its average over the splats, shape (n, N)."""
         self.mean_basis = wp.array(mean, dtype=wp.float64, device=self.device)
         """Average of the basis values over the splats, shape (n,)."""
-        self._motion: dict[int, tuple[wp.array, wp.array]] = {}  # by world count; kept, as graphs may hold them
+        self.sample_count = sample_count if near.size else 0
+        self.near = wp.array(near.astype(np.int32), dtype=int, device=self.device)
+        self.share = wp.array(share.astype(np.float32), dtype=float, device=self.device)
+        self._motion: dict[
+            int, tuple[wp.array, wp.array, wp.array]
+        ] = {}  # by world count; kept, as graphs may hold them
 
     @property
     def count(self) -> int:
@@ -120,6 +142,8 @@ class SkinSplats:
         rotations: wp.array | None = None,
         first_splat: int = 0,
         rows: wp.array | None = None,
+        dent: wp.array | None = None,
+        sample_start: wp.array | None = None,
     ) -> None:
         """Write the deformed means and covariances of all worlds; capturable after one launch for as many worlds.
 
@@ -134,6 +158,8 @@ class SkinSplats:
             rows: Row of each of the worlds in the outputs, int32, shape (world_count,), where other worlds show other
                 objects, -1 for a world that does not show this one; None for outputs with one row per world, in their
                 order.
+            dent: Dents of the surface samples of all instances [m], flat vec3, `state.softmode.dent`; None for none.
+            sample_start: First of them of this object's instance in each world, int32, shape (world_count,).
 
         Raises:
             BasisError: If an output has not a row per world or too few columns, `rotations` has another shape than
@@ -163,14 +189,23 @@ class SkinSplats:
             self._motion[worlds] = (
                 wp.zeros(worlds, dtype=wp.vec3d, device=self.device),
                 wp.zeros((worlds, self.function_count), dtype=wp.vec4, device=self.device),
+                wp.zeros(worlds, dtype=int, device=self.device),
             )
-        offset, moved = self._motion[worlds]
+        offset, moved, dented = self._motion[worlds]
         lanes = 32 if self.device.is_cuda else 1
-        inputs = [self.mean_basis, function_start, q, lanes]
-        wp.launch(kernels.split_motion, (worlds, lanes), inputs, [offset, moved], device=self.device)
+        samples = 0 if dent is None else self.sample_count
+        inputs = [self.mean_basis, function_start, q, sample_start, samples, dent, lanes]
+        wp.launch(kernels.split_motion, (worlds, lanes), inputs, [dented, offset, moved], device=self.device)
         skin = kernels.Skin()
         skin.rest_mean, skin.rest_covariance, skin.basis = self.rest_means, self.rest_covariances, self.basis
         skin.stretch_limit, skin.first_splat, skin.offset, skin.q = self.stretch_limit, first_splat, offset, moved
+        skin.sample_start, skin.dent, skin.dented, skin.near, skin.share = (
+            sample_start,
+            dent,
+            dented,
+            self.near,
+            self.share,
+        )
         skin.mean, skin.covariance, skin.rotation, skin.row = means, covariances, rotations, rows
         if self.device.is_cpu and self.count >= cpu_kernels.BLOCK:
             blocks = -(-self.count // cpu_kernels.BLOCK)

@@ -113,12 +113,16 @@ def split_motion(
     # State in:
     function_start: wp.array[int],  # (world_count,) first entry of q of the object's instance in each world
     q_in: wp.array[wp.vec3d],  # [m]
+    sample_start: wp.array[int],  # (world_count,) first of its entries in dent
+    sample_count: int,  # how many; 0 where nothing dents
+    dent: wp.array[wp.vec3],  # [m]
     lanes: int,  # threads per world: a warp on CUDA, 1 on CPU
     # Out:
+    dented_out: wp.array[int],  # (world_count,) whether it has a dent at all
     offset_out: wp.array[wp.vec3d],  # (world_count,) [m]
     q_out: wp.array2d[wp.vec4],  # (world_count, function_count) [m]; the fourth is not used
 ):
-    """Write the mean displacement sum_k mean(b_k) q_k in float64, and q in float32 for what is left of b.
+    """Write the mean displacement sum_k mean(b_k) q_k in float64, q in float32 for what is left of b, and what dents.
 
     Metres of rigid motion go into the offset; the rest is of the size of the object, and float32 holds it.
     """
@@ -130,8 +134,14 @@ def split_motion(
         offset = offset + mean_basis[k] * q
         q_out[world, k] = wp.vec4(float(q[0]), float(q[1]), float(q[2]), 0.0)
     offset = wp.vec3d(sum_over_lanes(offset[0]), sum_over_lanes(offset[1]), sum_over_lanes(offset[2]))
+    dents = wp.float64(0.0)
+    for s in range(lane, sample_count, lanes):
+        if wp.length_sq(dent[sample_start[world] + s]) > 0.0:
+            dents += wp.float64(1.0)
+    dents = sum_over_lanes(dents)
     if lane == 0:
         offset_out[world] = offset
+        dented_out[world] = int(dents)
 
 
 @wp.struct
@@ -145,6 +155,11 @@ class Skin:
     offset: wp.array[wp.vec3d]  # (world_count,) [m]
     q: wp.array2d[wp.vec4]  # (world_count, function_count) [m]
     first_splat: int
+    sample_start: wp.array[int]  # (world_count,) first of the object's entries in dent
+    dent: wp.array[wp.vec3]  # of surface samples [m]
+    dented: wp.array[int]  # (world_count,) whether any of the object's is not zero
+    near: wp.array2d[int]  # (splat_count, k) surface samples whose dents move a splat, and
+    share: wp.array2d[float]  # by how much of them
     row: wp.array[int]  # (world_count,) row of each world in the outputs, -1 for none; of size zero: that of the world
     # Out:
     mean: wp.array2d[wp.vec3]  # (rows, >= first_splat + splat_count) [m]
@@ -170,6 +185,11 @@ def write_splat(skin: Skin, row0: wp.vec4, row1: wp.vec4, row2: wp.vec4, world: 
     s = f * symmetric_matrix(skin.rest_covariance[i]) * wp.transpose(f)
     x = skin.offset[world] + wp.vec3d(skin.rest_mean[i])
     x = x + wp.vec3d(wp.float64(row0[3]), wp.float64(row1[3]), wp.float64(row2[3]))
+    if skin.dented[world] != 0:
+        moved = wp.vec3()
+        for k in range(skin.near.shape[1]):
+            moved += skin.share[i, k] * skin.dent[skin.sample_start[world] + skin.near[i, k]]
+        x = x + wp.vec3d(moved)
     skin.mean[row, column] = wp.vec3(x)
     skin.covariance[row, column] = vec6(s[0, 0], s[0, 1], s[0, 2], s[1, 1], s[1, 2], s[2, 2])
 

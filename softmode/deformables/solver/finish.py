@@ -1,10 +1,10 @@
-"""Last phase of a step: write the state, remember where contacts stick, and sum what they put on the bodies."""
+"""Last phase of a step: write the state, what contacts leave (where they stick, dents), and sum what they put on."""
 
 import newton
 import warp as wp
 
+from softmode.deformables.contact import dent_kernels, penalty_kernels
 from softmode.deformables.contact import friction_memory_kernels as memory_kernels
-from softmode.deformables.contact import penalty_kernels
 from softmode.deformables.model.namespaces import soft
 from softmode.deformables.solver import attachment_kernels, spin_kernels
 from softmode.deformables.solver import step_kernels as kernels
@@ -28,8 +28,10 @@ def finish(tables: StepTables, state: newton.State, dt: float, *, prescribed: bo
     if t.model.shape_count:
         sticking = (t.instances, t.shapes, t.samples, t.constraints, int(prescribed))
         t.launch(memory_kernels.remember_slip, t.samples.position.shape, *sticking, out.stick_shape, out.stick_point)
+    t.launch(dent_kernels.leave_dents, t.samples.position.shape, t.instances, t.samples, t.constraints, out.dent)
     if t.pairs is not None:
         t.pairs.remember(t.motion, t.newton, t.constraints, out)
+        t.pairs.leave_dents(t.constraints, out)
     t.body_wrench.zero_()
     reactions = (t.body_wrench, t.instance_force)
     t.launch(penalty_kernels.sum_reactions, worlds, t.instances, t.newton, t.constraints, *reactions)
@@ -37,10 +39,12 @@ def finish(tables: StepTables, state: newton.State, dt: float, *, prescribed: bo
 
 
 def move_particles(tables: StepTables, state: newton.State) -> None:
-    """Move the surface particles of ``state`` to where its reduced coordinates put them."""
+    """Move the surface particles of ``state`` to where its reduced coordinates and its dents put them."""
     t, data = tables, soft(state)
     particles = (state.particle_q, state.particle_qd)
-    t.launch(kernels.skin_samples, t.samples.position.shape, t.instances, t.basis, data.q, data.qd, *particles)
+    t.launch(
+        kernels.skin_samples, t.samples.position.shape, t.instances, t.basis, data.q, data.qd, data.dent, *particles
+    )
 
 
 def reset(tables: StepTables, state: newton.State, world_mask: wp.array, flags: newton.StateFlags | int) -> None:
@@ -61,7 +65,9 @@ def reset(tables: StepTables, state: newton.State, world_mask: wp.array, flags: 
         *(t.instances, t.basis, initial.placed_scale, world, world_mask, *chosen),
         *(initial.q, initial.qd, out.q, out.qd, out.dt_before),
     )
-    t.launch(memory_kernels.forget_slip, every, t.instances, world, world_mask, out.stick_shape, out.stick_partner)
+    t.launch(
+        memory_kernels.forget_slip, every, t.instances, world, world_mask, out.stick_shape, out.stick_partner, out.dent
+    )
     t.launch(
         kernels.reset_worlds,
         max(count, t.model.body_count),

@@ -1,5 +1,6 @@
 """How a step is solved."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -45,8 +46,9 @@ class SolverReducedOptions:
     step cheaper, and friction of the last iterate but a few."""
     step_length_min: float = 2.0**-16
     """Shortest step the line search tries."""
-    contact_max: int = 256
-    """Contacts per instance at most; more raise the overflow flag and drop those that do not touch yet."""
+    contact_max: int | None = None
+    """Contacts per instance at most; more raise the overflow flag and drop those that do not touch yet. None for 0.64
+    per surface sample of the body that has most, and 256 at least."""
     contact_margin: float = 0.01
     """Detection distance as a fraction of the body size, on top of twice the motion of the step."""
     soft_contact: bool = True
@@ -59,11 +61,17 @@ class SolverReducedOptions:
     stick_velocity: float = 1.0e-4
     """Slip velocity [m/s] below which friction without memory counts as sticking."""
 
+    def contact_room(self, sample_max: int) -> int:
+        """Return how many contacts an instance may have where no body has more than so many surface samples."""
+        return self.contact_max or max(256, 64 * math.ceil(0.64 * sample_max / 64))
+
     def __post_init__(self) -> None:
         """Check every range."""
         if self.integrator not in ("euler", "bdf2"):
             raise ConfigError(f"integrator must be 'euler' or 'bdf2', got {self.integrator!r}")
-        require_fields(self, ("iteration_max", "stiffness_renewal", "contact_max"), at_least=1)
+        require_fields(self, ("iteration_max", "stiffness_renewal"), at_least=1)
+        if self.contact_max is not None:
+            require_fields(self, ("contact_max",), at_least=1)
         require_fields(self, ("friction_lag",), at_least=0)
         require_fields(self, ("renewal_distance", "stick_ratio"), at_least=0.0)
         positive = ("tolerance", "force_tolerance", "step_length_min", "contact_margin", "contact_smoothing")

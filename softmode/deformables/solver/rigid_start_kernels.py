@@ -12,7 +12,7 @@ from typing import Any
 
 import warp as wp
 
-from softmode.deformables.contact.penalty_kernels import normal_potential, slip_potential
+from softmode.deformables.contact.penalty_kernels import contact_potential, slip_potential
 from softmode.deformables.model.lane_kernels import team_sum, vec8d
 from softmode.deformables.model.struct_kernels import (
     Instances,
@@ -43,8 +43,12 @@ IMPACT_MOTION = wp.constant(wp.float64(0.02))
 """Least motion of a step, over the size of the body (rms), for which a start is looked for: slower ones do well."""
 ITERATIONS = 20
 """Steps of the rigid body at most."""
+HALVINGS = 16
+"""Lengths of such a step that are tried: out of contact it would go centimetres, and what stops it sets in within the
+range of the onset, a thousandth of the body."""
 GAIN_LEAST = wp.constant(wp.float64(1.0e-3))
-"""Decrease of the potential, over what is left of it, below which it stops: the rest is Newton's."""
+"""Decrease that the quadratic model promises, over what is left of the potential, below which it stops: the rest is
+Newton's. The decrease that was found says less: it is small too where contact has cut a step short."""
 
 
 @wp.func
@@ -123,7 +127,7 @@ def contact_at(
     """Return energy, force and Hessian of a contact at offset + d; ``follow``: its friction takes this normal force."""
     n = constraints.normal[i, e]
     k = constraints.stiffness[i, e]
-    psi, slope, curvature = normal_potential(-wp.dot(n, total), wp.float64(smoothing))
+    psi, slope, curvature = contact_potential(constraints, smoothing, -wp.dot(n, total), i, e)
     if follow != 0:
         constraints.normal_force[i, e] = k * slope
     limit = constraints.friction[i, e] * constraints.normal_force[i, e]
@@ -192,7 +196,8 @@ def start_rigidly(step: NewtonStep, samples: Samples, team: int):
     for e in range(member, count, team):
         total = find_displacement(step, i, e)
         penetration = -wp.dot(step.constraints.normal[i, e], total)
-        psi, _slope, _curvature = normal_potential(penetration, wp.float64(step.instances.smoothing[i]))
+        smoothing = step.instances.smoothing[i]
+        psi, _slope, _curvature = contact_potential(step.constraints, smoothing, penetration, i, e)
         stored += step.constraints.stiffness[i, e] * psi
     stored = team_sum(stored)
     if stored < wp.float64(0.5) * weight * moved:
@@ -261,7 +266,7 @@ def start_rigidly(step: NewtonStep, samples: Samples, team: int):
         x = solve_six(H, g)
         alpha = wp.float64(1.0)
         before = potential
-        for _trial in range(8):
+        for _trial in range(HALVINGS):
             shift = t + alpha * wp.vec3d(x[0], x[1], x[2])
             turned = rotation_of(alpha * wp.vec3d(x[3], x[4], x[5])) * R
             value = rigid_potential(step, samples, i, X, away, C, shift, turned, member, team)
@@ -271,7 +276,8 @@ def start_rigidly(step: NewtonStep, samples: Samples, team: int):
                 R = turned
                 break
             alpha *= wp.float64(0.5)
-        if not (before - potential > GAIN_LEAST * wp.abs(potential)):
+        promised = wp.float64(-0.5) * wp.dot(g, x)
+        if not (promised > GAIN_LEAST * wp.abs(potential) and before > potential):
             break
 
     stride = step.basis.row.shape[1]

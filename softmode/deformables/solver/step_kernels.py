@@ -20,7 +20,7 @@ Precision: basis data float32; q, energy and residual float64; the Newton direct
 
 import warp as wp
 
-from softmode.deformables.contact.penalty_kernels import normal_potential, slip_potential
+from softmode.deformables.contact.penalty_kernels import contact_potential, slip_potential
 from softmode.deformables.materials.hessian_kernels import hessian
 from softmode.deformables.materials.material_kernels import (
     MaterialModel,
@@ -420,14 +420,14 @@ def evaluate_constraint(
     else:
         n = step.constraints.normal[i, e]
         total = step.constraints.offset[i, e] + d
-        psi, slope, curvature = normal_potential(-wp.dot(n, total), wp.float64(smoothing))
+        psi, slope, curvature = contact_potential(step.constraints, smoothing, -wp.dot(n, total), i, e)
         if derivatives != 0 and step.state.iteration[w] <= step.state.friction_lag:
             held = slope
             if step.state.iteration[w] == 0:
                 # in an impact the first guess lies far too deep: friction of such a force would be too stiff to solve
                 gap = wp.min(wp.dot(n, step.constraints.offset[i, e]), wp.float64(0.0))
                 deep = wp.float64(smoothing) - wp.float64(2.0) * gap
-                _psi, most, _curvature = normal_potential(deep, wp.float64(smoothing))
+                _psi, most, _curvature = contact_potential(step.constraints, smoothing, deep, i, e)
                 held = wp.min(slope, most)
             step.constraints.normal_force[i, e] = stiffness * held
         normal_force = step.constraints.normal_force[i, e]
@@ -586,8 +586,10 @@ def end_step(
             q_before_out[out] = wp.vec3d(before[0, lane], before[1, lane], before[2, lane])
             qd_before_out[out] = wp.vec3d(qd_before[0, lane], qd_before[1, lane], qd_before[2, lane])
     if b == 0:
-        fresh = failed or has_contacts(step.instances, step.constraints, i)
-        dt_before_out[i] = wp.where(fresh, wp.float64(0.0), dt)
+        if failed:
+            dt_before_out[i] = wp.float64(0.0)
+        else:
+            dt_before_out[i] = wp.where(has_contacts(step.instances, step.constraints, i), -dt, dt)
 
 
 @wp.kernel
@@ -623,11 +625,12 @@ def skin_samples(
     # State in:
     q: wp.array[wp.vec3d],
     qd: wp.array[wp.vec3d],
+    dent: wp.array[wp.vec3],
     # Out:
     particle_q_out: wp.array[wp.vec3],
     particle_qd_out: wp.array[wp.vec3],
 ):
-    """Write position and velocity of the surface samples as Newton particles."""
+    """Write position, dent included, and velocity of the surface samples as Newton particles."""
     i, s = wp.tid()
     if s >= instances.sample_count[i]:
         return
@@ -642,7 +645,7 @@ def skin_samples(
             value = wp.float64(values[lane])
             x += value * q[first + LANES * b + lane]
             v += value * qd[first + LANES * b + lane]
-    particle_q_out[instances.particle_start[i] + s] = wp.vec3(x)
+    particle_q_out[instances.particle_start[i] + s] = wp.vec3(x + wp.vec3d(dent[instances.particle_start[i] + s]))
     particle_qd_out[instances.particle_start[i] + s] = wp.vec3(v)
 
 

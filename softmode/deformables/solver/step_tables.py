@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.contact.dents import dent_lengths
 from softmode.deformables.contact.detection_kernels import Shapes
 from softmode.deformables.contact.pairs import SoftPairs
 from softmode.deformables.contact.shape_tables import candidate_shapes, shape_table
@@ -106,6 +107,8 @@ class StepTables:
     """Joint dofs that take part in the solve."""
     surface_stiffness: wp.array
     """Young's modulus at the surface samples of all bodies relative to the body's, float (sample_total,)."""
+    dent_length: wp.array
+    """Dents at these samples under the pressure E / (1 - nu^2) at scale 1 [m], likewise."""
     shapes: Shapes
     """The rigid shapes."""
     meshes: list[Any]
@@ -186,7 +189,8 @@ def allocate_tables(
         ConfigError: If a body of the model is not among ``bodies``, or a shape cannot be touched.
     """
     device = model.device
-    layout = lay_out(model, bodies, pair_max=options.contact_max // 2 if options.soft_contact else 0)
+    room = options.contact_room(max((body.surface_count for body in bodies), default=0))
+    layout = lay_out(model, bodies, pair_max=room // 2 if options.soft_contact else 0)
     instances, basis = lay_out_instances(model, layout), lay_out_bases(model, layout)
     scaled = ScaledQuantities(
         model,
@@ -199,9 +203,11 @@ def allocate_tables(
     candidate = wp.array(candidate_shapes(model, layout), dtype=int, device=device)
     shapes, meshes = shape_table(model)
     stiffness = wp.array(surface_stiffness(layout.bodies), dtype=float, device=device)
+    dents = wp.array(np.concatenate([dent_lengths(body) for body in layout.bodies]), dtype=float, device=device)
     pairs = None
     if layout.pair_max:
-        pairs = SoftPairs(layout, instances, basis, options.stick_ratio, scaled.spacing, stiffness, device)
+        surface = (scaled.spacing, stiffness, dents)
+        pairs = SoftPairs(layout, instances, basis, options.stick_ratio, *surface, device)
     system_start, system = join_systems(layout, instances, rigid.count_max + 1, device)
 
     blocks, count, square = layout.block_count, layout.instance_count, 3 * layout.block_count**2
@@ -227,7 +233,7 @@ def allocate_tables(
         "sample": layout.sample_max,
         "slot": SLOTS,
         "team": team_size(device),
-        "constraint": options.contact_max + layout.pin_max,
+        "constraint": room + layout.pin_max,
         "rigid": rigid.count_max,
         "gradient_chunk": fused.TEAM // 32 if shared and device.is_cuda else chunks(count * blocks, blocks),
         "stiffness_chunk": chunks(count * square, square + (square + 3 * blocks) // 2),
@@ -264,6 +270,7 @@ def allocate_tables(
         step=step,
         rigid=rigid,
         surface_stiffness=stiffness,
+        dent_length=dents,
         shapes=shapes,
         meshes=meshes,
         candidate=candidate,

@@ -1,0 +1,261 @@
+"""Dents: what a contact gives beyond the functions of the body, against Hertz, punches and conservation of energy."""
+
+import functools
+
+import newton
+import numpy as np
+import pytest
+
+from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.build.build_body import build_body
+from softmode.deformables.build.options import BuildOptions
+from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_sphere
+from softmode.deformables.contact.dents import DENT_FACTOR, WALL_SHARE, dent_lengths, dent_weights, resolved_size
+from softmode.deformables.materials.material import Material
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.solver.solver_reduced import SolverReducedOptions
+from tests import reference
+from tests.scenes import GRAVITY, Scene, cube
+
+RADIUS, RATIO = 0.05, 0.3
+SHAPE = 0.02
+"""Half the height of what presses [m]."""
+MANY = SolverReducedOptions(contact_max=2048)
+FINITE = ((0.0, 0.01, 0.02, 0.04, 0.08, 0.11), (1.0, 1.02, 1.10, 1.12, 1.18, 1.23))
+"""Force of a sphere between plates over Hertz's by depth over radius: 2,600 kernels, linear elasticity; the far field
+of each contact moves the centre."""
+
+
+@functools.cache
+def ball(mode_count: int = 8, surface_count: int = 1500) -> ReducedBody:
+    """Return a sphere of few functions and many samples."""
+    quadrature = quadrature_from_sphere(RADIUS, point_count=3000, surface_count=surface_count)
+    options = BuildOptions(mode_count=mode_count, kernel_count=250, cubature_count=300)
+    return build_body(quadrature, options, name="ball")
+
+
+def hertz(depth: float, youngs_modulus: float) -> float:
+    """Return the force of a sphere pressed by a rigid plane [N]: 4/3 E* sqrt(R) d^(3/2), for a sphere between two."""
+    modulus = youngs_modulus / (1.0 - RATIO**2)
+    return 4.0 / 3.0 * modulus * RADIUS**0.5 * depth**1.5 * float(np.interp(depth / RADIUS, *FINITE))
+
+
+class Press:
+    """Bodies in a row along z between two rigid shapes that overlap them, without friction and gravity.
+
+    Args:
+        body: The body.
+        half_height: Half its height [m].
+        count: How many stand in the row.
+        punch: Radius of the cylinders that press [m]; None for plates.
+        youngs_modulus: E [Pa].
+        scale: Of the bodies.
+        stiffness: Contact stiffness per area [Pa/m]; None for the one that follows the body.
+    """
+
+    def __init__(
+        self,
+        body: ReducedBody,
+        half_height: float,
+        *,
+        count: int = 1,
+        punch: float | None = None,
+        youngs_modulus: float = 1.0e6,
+        scale: float = 1.0,
+        stiffness: float | None = None,
+    ) -> None:
+        """Build the scene."""
+        self.half, self.count = scale * half_height, count
+        material = Material(
+            youngs_modulus=youngs_modulus, poissons_ratio=RATIO, density=300.0, friction=0.0, mass_damping=50.0
+        )
+
+        def populate(world: newton.ModelBuilder) -> None:
+            for k in range(count):
+                place = (0.0, 0.0, (2 * k + 1 - count) * self.half)
+                add_reduced_body(
+                    world,
+                    body,
+                    material=material,
+                    position=place,
+                    scale=scale,
+                    contact_stiffness_per_area=stiffness,
+                )
+            for _ in range(2):
+                shape = world.add_body(is_kinematic=True)
+                if punch is None:
+                    world.add_shape_box(shape, hx=0.1, hy=0.1, hz=SHAPE)
+                else:
+                    world.add_shape_cylinder(shape, radius=punch, half_height=SHAPE)
+
+        self.scene = Scene(populate, [body], options=MANY, dt=0.01)
+
+    def force(self, depth: float, steps: int = 40) -> float:
+        """Press by ``depth`` [m] at every contact and return the force on the lower shape [N]."""
+        scene, end = self.scene, self.count * (self.half - depth) + SHAPE
+        scene.restart()
+        for k in range(self.count):
+            closer = np.array([0.0, 0.0, -(2 * k + 1 - self.count) * depth])
+            scene.set(q=scene.q(k) + scene.body(k).linear_coordinates[:, 3:] * closer, instance=k)
+        poses = np.array([[0.0, 0.0, side * end, 0.0, 0.0, 0.0, 1.0] for side in (-1, 1)], dtype=np.float32)
+        for state in (scene.state, scene.next_state):
+            state.body_q.assign(poses)
+        scene.step(steps)
+        constraints = scene.reduced.view.constraints
+        count = int(constraints.count.numpy()[0])
+        below = constraints.shape.numpy()[0, :count] == 0
+        return float(constraints.force.numpy()[0, :count][below, 2].sum())
+
+
+@pytest.mark.parametrize("youngs_modulus", [1.0e5, 1.0e6])
+def test_hertz(youngs_modulus: float) -> None:
+    """A sphere between plates presses as Hertz's, made finite: within 15 % from 2 to 11 % of its radius.
+
+    32 functions alone press 1.6 to 3.6 times as hard there.
+    """
+    press = Press(ball(), RADIUS, youngs_modulus=youngs_modulus)
+    for share in (0.02, 0.04, 0.08, 0.11):
+        depth = share * RADIUS
+        assert press.force(depth) == pytest.approx(hertz(depth, youngs_modulus), rel=0.15), share
+
+
+def test_follows_parameters() -> None:
+    """The force goes with E as it is now, and at equal d / R with the square of the scale; to what float32 leaves."""
+    press, depth = Press(ball(), RADIUS), 0.04 * RADIUS
+    force = press.force(depth)
+    press.scene.set_parameter("youngs_modulus", 3.0e6)
+    assert press.force(depth) == pytest.approx(3.0 * force, rel=1.0e-3)
+    half = Press(ball(), RADIUS, scale=0.5)
+    assert half.force(0.5 * depth) == pytest.approx(0.25 * force, rel=1.0e-3)
+
+
+def test_two_spheres() -> None:
+    """Two soft spheres in a row press each other as each presses a plate: by symmetry the plane between is one.
+
+    To what their samples differ, which do not mirror each other.
+    """
+    depth = 0.03 * RADIUS
+    single = Press(ball(8, 400), RADIUS).force(depth)
+    assert Press(ball(8, 400), RADIUS, count=2).force(depth, steps=8) == pytest.approx(single, rel=0.15)
+
+
+def test_patch() -> None:
+    """Two flat punches of 24 mm on a cube of 100 mm: within 20 % of two half spaces.
+
+    The axis of a half space under a rigid punch of radius a sinks by u(z) = F (1 + nu) / (2 pi a E) (2 (1 - nu)
+    arctan(a / z) + (z / a) / (1 + z^2 / a^2)); the approach of both punches is 2 (u(0) - u(2 H)), their distance 2 H.
+    Functions alone give way by less than half of that.
+    """
+    a, edge, modulus, depth = 0.012, 0.1, 1.0e6, 0.001
+    z = edge / a
+    u = np.array([np.pi * (1.0 - RATIO), 2.0 * (1.0 - RATIO) * np.arctan(1.0 / z) + z / (1.0 + z * z)])
+    compliance = (1.0 + RATIO) / (2.0 * np.pi * a * modulus) * (u[0] - u[1])
+    quadrature = quadrature_from_box((edge,) * 3, point_count=2000, surface_count=1500)
+    body = build_body(quadrature, BuildOptions(mode_count=8, kernel_count=250, cubature_count=300), name="cube")
+    assert Press(body, 0.5 * edge, punch=a).force(depth) == pytest.approx(depth / compliance, rel=0.2)
+
+
+def test_given_stiffness_has_no_dent() -> None:
+    """A contact stiffness that is given is the whole law: no dent, and the functions alone press twice too hard."""
+    press, depth = Press(ball(), RADIUS, stiffness=3.0e9), 0.04 * RADIUS
+    assert press.force(depth) > 1.5 * hertz(depth, 1.0e6)
+    assert not press.scene.reduced.view.constraints.dent_compliance.numpy().any()
+
+
+def test_wall() -> None:
+    """Where a body is thin its wall bounds the dent: a share of a sheet's 4 mm, less than its functions resolve."""
+    sheet = build_body(
+        quadrature_from_box((0.1, 0.1, 0.004), point_count=1500, surface_count=600),
+        BuildOptions(mode_count=4, kernel_count=150, cubature_count=128),
+        name="sheet",
+    )
+    face = np.abs(sheet.surface_normals[:, 2]) > 0.9
+    assert resolved_size(sheet) > 0.004
+    np.testing.assert_allclose(dent_lengths(sheet)[face], DENT_FACTOR * WALL_SHARE * 0.004, rtol=0.02)
+
+
+def test_energy_of_a_bounce() -> None:
+    """Thrown at the ground with friction, kinetic and elastic energy, weight and dents never exceed their start."""
+    body, material = cube(), Material(youngs_modulus=1.0e5, density=300.0, friction=0.5)
+
+    def populate(world: newton.ModelBuilder) -> None:
+        place = {"position": (0.0, 0.0, 0.06), "velocity": (0.5, 0.0, -1.0), "angular_velocity": (1.0, 2.0, 0.0)}
+        add_reduced_body(world, body, material=material, **place)
+
+    scene = Scene(populate, [body], gravity=(0.0, 0.0, -GRAVITY), ground=0.5, dt=0.002)
+    twin = reference.FreeBody(body=body, material=reference.with_float32(material), dt=scene.dt)
+
+    def energy() -> float:
+        height = GRAVITY * scene.mass() * scene.centre()[2]
+        return scene.kinetic_energy() + twin.elastic_energy(scene.q()) + height + scene.dents()[1]
+
+    start, dents, count = energy(), 0.0, 0
+    for _ in range(100):
+        scene.step()
+        assert energy() <= (1.0 + 1.0e-6) * start
+        dents = max(dents, scene.dents()[1])
+        count = max(count, int(scene.reduced.view.constraints.count.numpy()[0]))
+    assert dents > 0.01 * start and count > 10
+
+
+def test_weights() -> None:
+    """A point on a sample takes its dent, weights make up one on the skin and exp(-depth / h) below it.
+
+    Points of the other side of a thin sheet do not count.
+    """
+    body = ball(8, 400)
+    found = dent_weights(body, body.surface_points)
+    np.testing.assert_array_equal(found.samples[:, 0], np.arange(body.surface_count))
+    np.testing.assert_allclose(
+        found.weights, np.eye(1, found.weights.shape[1]).repeat(body.surface_count, 0), atol=1e-4
+    )
+    depth = 0.01
+    below = dent_weights(body, body.surface_points - depth * body.surface_normals).weights.sum(axis=1)
+    np.testing.assert_allclose(below, np.exp(-depth / resolved_size(body)), rtol=0.02)
+    sheet = build_body(
+        quadrature_from_box((0.1, 0.1, 0.004), point_count=1500, surface_count=600),
+        BuildOptions(mode_count=4, kernel_count=150, cubature_count=128),
+        name="sheet",
+    )
+    top = (sheet.surface_normals[:, 2] > 0.9) & (np.abs(sheet.surface_points[:, :2]).max(axis=1) < 0.045)
+    found = dent_weights(sheet, sheet.surface_points[top] - [0.002, 0.001, 0.0])
+    assert (found.weights * (sheet.surface_normals[found.samples, 2] < 0.9)).sum(axis=1).max() < 0.05
+
+
+def test_skin_stays_out() -> None:
+    """A ball at rest on the ground: particles take the dents off, which are as deep as the functions sink in.
+
+    What is left is the onset of the penalty. In two worlds both have the bits of one alone.
+    """
+    body, material = ball(8, 400), Material(youngs_modulus=2.0e4, density=300.0, mass_damping=20.0)
+
+    def populate(world: newton.ModelBuilder) -> None:
+        add_reduced_body(world, body, material=material, position=(0.0, 0.0, RADIUS))
+
+    found = []
+    for count in (1, 2):
+        scene = Scene(populate, [body], gravity=(0.0, 0.0, -GRAVITY), ground=0.5, dt=0.004, world_count=count)
+        scene.step(100)
+        found.append((scene.state.particle_q.numpy(), scene.state.softmode.dent.numpy()))
+    (skin, dent), both = found
+    sunk = float((skin - dent)[:, 2].min())
+    assert sunk < -5.0e-4
+    onset = float(scene.reduced.view.instances.smoothing.numpy()[0])
+    assert -onset < skin[:, 2].min() < 0.0
+    assert (dent[:, 2] >= 0.0).all() and not dent[:, :2].any() and 3 < np.count_nonzero(dent[:, 2]) < 60
+    for alone, worlds in zip(found[0], both, strict=True):
+        np.testing.assert_array_equal(np.concatenate([alone, alone]), worlds)
+    scene.reduced.reset(scene.state)
+    assert not scene.state.softmode.dent.numpy().any()
+
+
+def test_soft_bodies_share_their_dents() -> None:
+    """Two spheres in a row of which one is four times as stiff: the dents between them go as their compliances."""
+    press = Press(ball(8, 400), RADIUS, count=2)
+    press.scene.set_parameter("youngs_modulus", (1.0e6, 4.0e6))
+    press.force(0.02 * RADIUS)
+    dent = press.scene.state.softmode.dent.numpy().reshape(2, -1, 3)
+    middle = [abs(press.scene.body().surface_points[:, 2] - side * RADIUS) < 0.3 * RADIUS for side in (1, -1)]
+    soft, stiff = (np.abs(dent[k, middle[k], 2]) for k in range(2))
+    assert soft.max() == pytest.approx(4.0 * stiff.max(), rel=0.3)
+    assert (dent[0, middle[0], 2] <= 0.0).all() and (dent[1, middle[1], 2] >= 0.0).all()
