@@ -58,8 +58,12 @@ def resolved_size(body: ReducedBody) -> float:
 
 
 def dent_lengths(body: ReducedBody) -> Array:
-    """Return w E / (1 - nu^2) at the surface samples of a body, shape (surface_count,) [m]."""
-    return DENT_FACTOR * np.minimum(resolved_size(body), WALL_SHARE * thickness(body))
+    """Return w E / (1 - nu^2) at the surface samples of a body, shape (surface_count,) [m].
+
+    Zero on exact regions, which are where they are driven to, and rigid.
+    """
+    free = (body.surface_basis[:, body.driven_count :] != 0.0).any(axis=1)
+    return np.where(free, DENT_FACTOR * np.minimum(resolved_size(body), WALL_SHARE * thickness(body)), 0.0)
 
 
 def dent_weights(body: ReducedBody, points: ArrayLike) -> DentWeights:

@@ -43,8 +43,12 @@ IMPACT_MOTION = wp.constant(wp.float64(0.02))
 """Least motion of a step, over the size of the body (rms), for which a start is looked for: slower ones do well."""
 ITERATIONS = 20
 """Steps of the rigid body at most."""
+HALVINGS = 16
+"""Lengths of such a step that are tried: out of contact it would go centimetres, and what stops it sets in within the
+range of the onset, a thousandth of the body."""
 GAIN_LEAST = wp.constant(wp.float64(1.0e-3))
-"""Decrease of the potential, over what is left of it, below which it stops: the rest is Newton's."""
+"""Decrease that the quadratic model promises, over what is left of the potential, below which it stops: the rest is
+Newton's. The decrease that was found says less: it is small too where contact has cut a step short."""
 
 
 @wp.func
@@ -262,7 +266,7 @@ def start_rigidly(step: NewtonStep, samples: Samples, team: int):
         x = solve_six(H, g)
         alpha = wp.float64(1.0)
         before = potential
-        for _trial in range(8):
+        for _trial in range(HALVINGS):
             shift = t + alpha * wp.vec3d(x[0], x[1], x[2])
             turned = rotation_of(alpha * wp.vec3d(x[3], x[4], x[5])) * R
             value = rigid_potential(step, samples, i, X, away, C, shift, turned, member, team)
@@ -272,7 +276,8 @@ def start_rigidly(step: NewtonStep, samples: Samples, team: int):
                 R = turned
                 break
             alpha *= wp.float64(0.5)
-        if not (before - potential > GAIN_LEAST * wp.abs(potential)):
+        promised = wp.float64(-0.5) * wp.dot(g, x)
+        if not (promised > GAIN_LEAST * wp.abs(potential) and before > potential):
             break
 
     stride = step.basis.row.shape[1]

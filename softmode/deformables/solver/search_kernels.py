@@ -3,7 +3,7 @@
 import warp as wp
 
 from softmode.deformables.model.declare import kernel_over
-from softmode.deformables.model.lane_kernels import LANES, barrier, team_sum, vec8d
+from softmode.deformables.model.lane_kernels import LANES, barrier, team_sum, vec8, vec8d
 from softmode.deformables.model.status import WORLD_ITERATION_LIMIT, WORLD_NO_DESCENT, WORLD_NOT_FINITE
 from softmode.deformables.model.struct_kernels import (
     Basis,
@@ -139,13 +139,10 @@ def rigid_excess(
 
 
 @wp.func
-def moves_freely(step: NewtonStep, i: int, e: int):
-    """Return whether the free functions of an instance move a constraint: they vanish on its exact regions."""
-    driven = step.instances.driven_count[i]
-    if driven == 0 or e >= step.constraints.count[i] - step.constraints.pair_count[i]:
-        return 1
-    for b in range(driven / LANES, blocks_of(step.instances.function_count[i])):
-        values = step.basis.row[step.constraints.row[i, e], b]
+def moves_freely(row: wp.array2d[vec8], r: int, driven: int, function_count: int):
+    """Return 1 if a row of the basis moves with functions after the first ``driven``: they vanish on exact regions."""
+    for b in range(driven / LANES, blocks_of(function_count)):
+        values = row[r, b]
         for lane in range(LANES):
             if LANES * b + lane >= driven and values[lane] != 0.0:
                 return 1
@@ -194,10 +191,16 @@ def check_convergence(step: NewtonStep, team: int, w: int, member: int):
             for e in range(member, q.shape[1], team):
                 residual += wp.dot(gradient[i, e], gradient[i, e])
                 external += wp.dot(step.motion.force[i, e], step.motion.force[i, e])
+            driven = step.instances.driven_count[i]
+            count = step.instances.function_count[i]
+            alone = step.constraints.count[i] - step.constraints.pair_count[i]
             for k in range(member, step.constraints.acting_count[i], team):
                 at = step.constraints.acting[i, k]
                 # what presses on an exact region is no force on the rest: a foot stuck in a pot meets meganewtons
-                if moves_freely(step, i, at) != 0:
+                free = int(1)
+                if driven > 0 and at < alone:
+                    free = moves_freely(step.basis.row, step.constraints.row[i, at], driven, count)
+                if free != 0:
                     scale += wp.length(step.constraints.force[i, at])
             residual = team_sum(residual)
             scale = wp.sqrt(team_sum(external)) + team_sum(scale)
