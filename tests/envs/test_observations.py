@@ -81,8 +81,9 @@ class HostState:
         """
         body, view, data = self.scene.soft.body, self.scene.solver.view, self.scene.model.softmode
         young, ratio, scale = (float(getattr(data, name).numpy()[0]) for name in MATERIAL)
-        size = (body.volume / body.function_count) ** (1.0 / 3.0)
-        w = 0.3 * scale * np.minimum(size, 0.6 * thickness(body)) * (1.0 - ratio**2) / young
+        size = (body.volume / (body.function_count - body.driven_count)) ** (1.0 / 3.0)
+        free = np.abs(body.surface_basis[:, body.driven_count :]).max(axis=1) > 1.0e-6  # the clamped foot has none
+        w = 0.3 * scale * np.minimum(size, 0.6 * thickness(body)) * (1.0 - ratio**2) / young * free
         c = view.constraints
         assert not c.pair_count.numpy()[0]
         held = slice(int(view.instances.pin_count.numpy()[0]), int(c.count.numpy()[0]))
