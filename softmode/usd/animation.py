@@ -256,7 +256,7 @@ class UsdAnimation:
             stage.SetEndTimeCode(codes[-1])
             paths = author_bodies(stage, self._placed, self.options.export)
             for k, (path, placed) in enumerate(zip(paths, self._placed, strict=True)):
-                states, dents = ([frame[k] for frame in frames] for frames in (self._states, self._dents))
+                states, dents = [frame[k] for frame in self._states], [frame[k] for frame in self._dents]
                 self._author_motion(stage, layer, path, placed, codes, states, dents)
             if self._meshes is not None:
                 self._meshes.author(stage, codes)
