@@ -9,6 +9,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from softmode.deformables import InverseMap, SolverReduced, add_reduced_body
+from softmode.deformables.model.namespaces import soft
 from softmode.errors import ConfigError
 from softmode.objects import SoftObject
 from softmode.radiance import MarchOptions, RadianceGrid, RadianceMarch, render_radiance, splats_from_radiance
@@ -99,8 +100,8 @@ def test_dents_are_seen():
     wanted = layers(body.affine(np.eye(3), shift), eye)[0][..., 3]
     found = []
     for dent in (shift, 0.0 * shift):
-        state.softmode.dent.fill_(wp.vec3())
-        state.softmode.dent[body.surface_count :].fill_(wp.vec3(*dent))
+        soft(state).dent.fill_(wp.vec3())
+        soft(state).dent[body.surface_count :].fill_(wp.vec3(*dent))
         march.update(state)
         layer = march.march(ViewArrays.from_cameras([eye], device="cpu"), (eye.height, eye.width))[0]
         found.append(psnr(layer.numpy()[0, 0, ..., 3], wanted))
