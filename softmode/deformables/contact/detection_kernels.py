@@ -10,13 +10,7 @@ contact records are appended by an atomic counter: fixed slots per sample keep t
 
 import warp as wp
 
-from softmode.deformables.contact.penalty_kernels import (
-    dent_compliance,
-    dent_depth,
-    shear_ratio,
-    stick_stiffness,
-    stiffness_per_area,
-)
+from softmode.deformables.contact.penalty_kernels import dent_compliance, dent_depth, stiffness_per_area
 from softmode.deformables.contact.shape_query_kernels import (
     HEIGHTFIELD,
     PLANE,
@@ -271,10 +265,17 @@ def find_contacts(
     near: wp.array2d[int],
     shapes: Shapes,
     dt: float,
+    # State in:
+    stick_shape: wp.array[wp.vec2i],  # (particle_count,), see ``remember_slip``
+    dt_before: wp.array[wp.float64],  # (instance_count,) [s], 0 where no step led here
     # In and out:
     samples: Samples,
 ):
-    """Keep the deepest contacts of each sample within margin plus twice the relative motion of the step."""
+    """Keep the deepest contacts of each sample within margin plus twice the relative motion of the step.
+
+    A sample outside of a shape that lies between it and the inside of its body has gone through, unless it did not
+    touch that shape in the step before: then the body is bent around an end of the shape.
+    """
     i, s = wp.tid()
     if s >= instances.sample_count[i]:
         return
@@ -284,6 +285,7 @@ def find_contacts(
     samples.gap[i, s, 1] = wp.float64(1.0e30)
     x = samples.position[i, s]
     row = instances.row_start[i] + s
+    stuck = stick_shape[instances.particle_start[i] + s]
     for c in range(candidate.shape[1]):
         if near[i, c] == 0:
             continue
@@ -319,7 +321,9 @@ def find_contacts(
             bent = interpolate(basis.inner_row, row, motion.q_start, i, instances.function_count[i])
             inner = wp.quat_rotate_inv(turn, wp.vec3(basis.inner_point[row] + bent))
             depth = wp.length(inner)
-            if query.distance < depth and wp.dot(query.normal, inner) < -OPPOSED * depth:
+            touched = stuck[0] == shape or stuck[1] == shape or dt_before[i] == wp.float64(0.0)
+            near_back = query.distance <= 0.0 or (touched and query.distance < depth)
+            if near_back and wp.dot(query.normal, inner) < -OPPOSED * depth:
                 # the nearest surface faces away from the body's inside: the sample must go back to it
                 along = inner / depth
                 end = 2.0 * depth
@@ -542,8 +546,7 @@ def gather_contacts(
             # d enters as offset + displacement, with the gap along the normal and the shape's own motion taken off
             constraints.offset[i, e] = gap * normal + slip - wp.vec3d(drift)
             constraints.anchor[i, e] = anchor
-            sheared = wp.float64(shear_ratio(instances.poissons_ratio[i]) * compliance)
-            constraints.stick[i, e] = stick_stiffness(stick_ratio, stiffness, sheared)
+            constraints.stick[i, e] = stick_ratio * stiffness
             constraints.stiffness[i, e] = stiffness
             constraints.dent_compliance[i, e] = wp.float64(compliance)
             constraints.dent_depth[i, e] = wp.float64(dent_depth(instances, i, dent_length[row]))

@@ -23,9 +23,10 @@ def remember_slip(
     stick_shape_out: wp.array[wp.vec2i],
     stick_point_out: wp.array[mat23d],
 ):
-    """Write where every sample sticks at the end of the step: what of its slip is elastic stays, the rest is slid.
+    """Write what every sample touches at the end of the step, and where: what of its slip is elastic stays there.
 
-    A contact that has opened has no friction to hold a displacement, and is forgotten. Shapes with dofs in the solve
+    The rest is slid; without friction, or friction that remembers, all of it. A contact that has opened has no friction
+    to hold a displacement, and is forgotten. Shapes with dofs in the solve
     keep the anchor, to the bit while the contact sticks, so that errors of the solve do not add up; shapes that move as
     prescribed keep the displacement itself, in their frame, because a belt moves without its pose.
     """
@@ -38,20 +39,24 @@ def remember_slip(
         e = samples.constraint[i, s, slot]
         if e < 0:
             continue
-        limit = constraints.friction[i, e] * constraints.normal_force[i, e]
-        if not (limit > wp.float64(0.0)) or constraints.stick[i, e] == wp.float64(0.0):
+        if not (constraints.normal_force[i, e] > wp.float64(0.0)):
             continue
+        limit = constraints.friction[i, e] * constraints.normal_force[i, e]
         shape = constraints.shape[i, e]
         origin, rotation = shape_frame(shapes, shape)
         total = constraints.slip[i, e]
         stretch = constraints.stick[i, e] * wp.length(total)
         if not wp.isfinite(stretch + limit):
             continue
-        elastic = wp.where(stretch > limit, limit / stretch * total, total)
+        elastic = wp.vec3d()
+        if stretch > limit:
+            elastic = limit / stretch * total
+        elif stretch > wp.float64(0.0):
+            elastic = total
         point = constraints.anchor[i, e]
         if prescribed != 0:
             point = wp.quat_rotate_inv(rotation, elastic)
-        elif stretch > limit:
+        elif stretch > limit or constraints.stick[i, e] == wp.float64(0.0):
             n = constraints.normal[i, e]
             before = constraints.offset[i, e] - wp.dot(n, constraints.offset[i, e]) * n
             slid = samples.position[i, s] - before + total - elastic

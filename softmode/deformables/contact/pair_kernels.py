@@ -25,13 +25,7 @@ whose row is the difference.
 import warp as wp
 
 from softmode.deformables.contact.detection_kernels import rank_contacts
-from softmode.deformables.contact.penalty_kernels import (
-    dent_compliance,
-    dent_depth,
-    shear_ratio,
-    stick_stiffness,
-    stiffness_per_area,
-)
+from softmode.deformables.contact.penalty_kernels import dent_compliance, dent_depth, stiffness_per_area
 from softmode.deformables.model.declare import struct
 from softmode.deformables.model.deformation_kernels import displacement_gradient
 from softmode.deformables.model.lane_kernels import vec8
@@ -516,7 +510,6 @@ def write_pairs(
     wi = dent_compliance(instances, i, relative_stiffness[own], dent_length[own]) / half_area
     wj = dent_compliance(instances, j, relative_stiffness[at], dent_length[at]) / half_area
     compliance = wp.float64(wi + wj)
-    sheared = wp.float64(shear_ratio(instances.poissons_ratio[i]) * wi + shear_ratio(instances.poissons_ratio[j]) * wj)
     thick = wp.max(instances.scale[i] * pairs.thickness[own], instances.scale[j] * pairs.thickness[at])
     depth = dent_depth(instances, i, dent_length[own]) + dent_depth(instances, j, dent_length[at])
     depth = wp.min(depth, 0.5 * DEPTH * thick)
@@ -551,7 +544,7 @@ def write_pairs(
             constraints.normal[a, e] = direction * n
             constraints.offset[a, e] = direction * offset
             constraints.stiffness[a, e] = stiffness
-            constraints.stick[a, e] = stick_stiffness(stick_ratio, stiffness, sheared)
+            constraints.stick[a, e] = stick_ratio * stiffness
             constraints.dent_compliance[a, e] = compliance
             constraints.dent_depth[a, e] = wp.float64(depth)
             constraints.friction[a, e] = friction

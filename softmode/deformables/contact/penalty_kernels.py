@@ -235,21 +235,6 @@ def dent_compliance(instances: Instances, i: int, relative: float, length: float
 
 
 @wp.func
-def shear_ratio(poissons_ratio: float):
-    """Return how much softer a dent is along the surface than across it: (2 - nu) / (2 - 2 nu), Mindlin 1949."""
-    return (2.0 - poissons_ratio) / (2.0 - 2.0 * poissons_ratio)
-
-
-@wp.func
-def stick_stiffness(ratio: wp.float64, stiffness: wp.float64, compliance: wp.float64):
-    """Return k_t [N/m] of a contact: the penalty's and the dent's in series; 0 where friction has no memory."""
-    if ratio <= wp.float64(0.0):
-        return wp.float64(0.0)
-    k = ratio * stiffness
-    return k / (wp.float64(1.0) + k * compliance)
-
-
-@wp.func
 def dent_exponents(instances: Instances, i: int):
     """Return d ln(w / A) / d(ln E, nu, ln m, ln s) of a dent, w its compliance and A the sample's area."""
     one = wp.float64(1.0)

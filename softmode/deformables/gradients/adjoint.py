@@ -351,8 +351,7 @@ class AdjointReduced:
             wp.copy(error[k], self._gmres.error)
             t.launch(kernels.accumulate_points, points, *bodies, costate, dt, sums, self._step)
             if self.constraint_max:
-                ratio = wp.float64(self.solver.options.stick_ratio)
-                contacts = (t.shapes, t.constraints, t.surface_stiffness, ratio, costate, self.dt[k])
+                contacts = (t.shapes, t.constraints, t.surface_stiffness, costate, self.dt[k])
                 found = (sums, pin_target[k], self._step)
                 t.launch(kernels.accumulate_constraints, constraints, *bodies, *contacts, *found)
             self._sum_points(t.newton.active)

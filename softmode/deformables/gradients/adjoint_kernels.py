@@ -472,7 +472,6 @@ def accumulate_constraints(
     shapes: Shapes,
     constraints: PointConstraints,
     relative_stiffness: wp.array[float],  # (sample_total,), Young's modulus relative to the body's
-    stick_ratio: wp.float64,
     costate: wp.array2d[vec8d],
     dt: float,
     # In and out:
@@ -493,21 +492,11 @@ def accumulate_constraints(
         pin_target_out[pin] = constraints.stiffness[i, e] * L
         sums.pin_stiffness[pin] = sums.pin_stiffness[pin] - wp.dot(L, step.constraint_slip[i, e])
         return
-    # by ln E, nu, ln m and ln s: of the penalty, of the dent across and along the surface, and of k_t, in series
+    # by ln E, nu, ln m and ln s: of the penalty, which k_t follows, and of the dent
     shape = constraints.shape[i, e]
     none = wp.float64(0.0)
     stiffness_powers = stiffness_exponents(instances, i, relative_stiffness[row], shape_area(shapes, shape), dt)
-    dent_powers = wp.vec4d()
-    stick_powers = stiffness_powers
-    if constraints.dent_compliance[i, e] > none:
-        nu = wp.float64(instances.poissons_ratio[i])
-        one = wp.float64(1.0)
-        dent_powers = dent_exponents(instances, i)
-        share = none
-        if stick_ratio > none:
-            share = constraints.stick[i, e] / (stick_ratio * constraints.stiffness[i, e])
-        sheared = dent_powers + wp.vec4d(none, one / (one - nu) - one / (wp.float64(2.0) - nu), none, none)
-        stick_powers = share * stiffness_powers - (one - share) * sheared
+    dent_powers = dent_exponents(instances, i)
     by = step.constraint_gain[i, e]
     normal_gain = by[0] * stiffness_powers + by[1] * dent_powers + wp.vec4d(none, none, none, by[2])
     # what a contact remembers is its tangential force over k_t; the force of one that sticks is k_t times its slip
@@ -515,11 +504,11 @@ def accumulate_constraints(
     along = force - wp.dot(constraints.normal[i, e], force) * constraints.normal[i, e]
     limit = constraints.friction[i, e] * wp.length(force - along)
     stuck = constraints.stick[i, e] > none and constraints.stick[i, e] * wp.length(constraints.slip[i, e]) <= limit
-    gain = wp.dot(step.memory[i, e], along) * stick_powers
+    gain = wp.dot(step.memory[i, e], along) * stiffness_powers
     L -= step.memory[i, e]
     gain += wp.dot(L, step.constraint_normal[i, e]) * normal_gain
     if stuck:
-        gain += wp.dot(L, along) * stick_powers
+        gain += wp.dot(L, along) * stiffness_powers
     sums.contact[i, e] = sums.contact[i, e] + gain
     # of x = gap n + slip - drift + d, the gap grows along n as the sample's place at the start does, d falls by as much
     # as that, and the drift of a shape that turns by R within the step grows by R - I of it

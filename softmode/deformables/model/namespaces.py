@@ -20,7 +20,8 @@ class SoftState(Protocol):
     qd_before: wp.array
     """Velocities at the start of the last step [m/s], vec3d (function_total,)."""
     dt_before: wp.array
-    """Length of the last step [s], float64 (instance_count,); 0 where there was none."""
+    """Length of the last step [s], float64 (instance_count,); 0 where there was none, its negative where it was near a
+    shape, so that BDF2 starts over."""
     stick_shape: wp.array
     """Shapes that a surface sample sticks to, vec2i (particle_count,); -1 for none."""
     stick_point: wp.array

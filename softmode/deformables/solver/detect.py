@@ -72,8 +72,9 @@ def _find_contacts(t: StepTables, state: newton.State, dt: float, prescribed: bo
     memory, candidate = soft(state), t.candidate
     culled = (t.instances, candidate, t.shapes, t.samples, *t.pin_arrays, float(dt), t.near, t.newton.status)
     t.launch(kernels.cull_shapes, candidate.shape, *culled)
-    found = (t.instances, t.basis, t.motion, candidate, t.near, t.shapes, float(dt), t.samples)
-    t.launch(kernels.find_contacts, t.samples.position.shape, *found)
+    known = (t.instances, t.basis, t.motion, candidate, t.near, t.shapes, float(dt))
+    before = (memory.stick_shape, memory.dt_before)
+    t.launch(kernels.find_contacts, t.samples.position.shape, *known, *before, t.samples)
     stick = (int(prescribed), wp.float64(t.options.stick_ratio), t.team, float(dt))
     t.launch_teams(
         kernels.gather_contacts,

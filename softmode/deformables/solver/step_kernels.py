@@ -586,8 +586,10 @@ def end_step(
             q_before_out[out] = wp.vec3d(before[0, lane], before[1, lane], before[2, lane])
             qd_before_out[out] = wp.vec3d(qd_before[0, lane], qd_before[1, lane], qd_before[2, lane])
     if b == 0:
-        fresh = failed or has_contacts(step.instances, step.constraints, i)
-        dt_before_out[i] = wp.where(fresh, wp.float64(0.0), dt)
+        if failed:
+            dt_before_out[i] = wp.float64(0.0)
+        else:
+            dt_before_out[i] = wp.where(has_contacts(step.instances, step.constraints, i), -dt, dt)
 
 
 @wp.kernel
