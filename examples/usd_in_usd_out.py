@@ -2,7 +2,7 @@
 
 The stage below is text as other tools write it: a closed mesh with the deformable schemas of the AOUSD proposal, a
 material bound for physics, a rigid body, and ground. Out come two files: the cushion as softmode reduced it, which
-comes back to the bit, and an animation that holds handle matrices, about a kilobyte per frame.
+comes back to the bit, and an animation that holds handle matrices and the dents of contact, some kilobytes per frame.
 
 Needs the extra usd. Run: ``python examples/usd_in_usd_out.py [FILE] [--short]``; writes ``out/usd_in_usd_out.*``
 """

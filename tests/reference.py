@@ -182,17 +182,23 @@ def penalty(p: np.ndarray, eps: float) -> np.ndarray:
     return np.where(p < eps, p**3 / (6 * eps), p * p / 2 - eps * p / 2 + eps * eps / 6)
 
 
-def dented_penalty(penetration: np.ndarray, eps: float, ratio: float) -> np.ndarray:
-    """Return min_x penalty(x) + (p - x)^2 / (2 ratio), by bisection of its derivative."""
-    if ratio == 0.0:
-        return penalty(penetration, eps)
+def dent(penetration: np.ndarray, eps: float | np.ndarray, ratio: float | np.ndarray) -> np.ndarray:
+    """Return the dent p - x at the minimum over x of penalty(x) + (p - x)^2 / (2 ratio), by bisection [m]."""
     p = np.maximum(penetration, 0.0)
     low, high = np.zeros_like(p), p.copy()
     for _ in range(200):
         x = 0.5 * (low + high)
         deep = x + ratio * np.where(x < eps, x * x / (2 * eps), x - eps / 2) > p
         low, high = np.where(deep, low, x), np.where(deep, x, high)
-    return penalty(x, eps) + (p - x) ** 2 / (2 * ratio)
+    return p - x
+
+
+def dented_penalty(penetration: np.ndarray, eps: float, ratio: float) -> np.ndarray:
+    """Return min_x penalty(x) + (p - x)^2 / (2 ratio)."""
+    if ratio == 0.0:
+        return penalty(penetration, eps)
+    v = dent(penetration, eps, ratio)
+    return penalty(np.maximum(penetration, 0.0) - v, eps) + v**2 / (2 * ratio)
 
 
 def normal_potential(penetration: np.ndarray, eps: float, ratio: float = 0.0, depth: float = 0.0) -> np.ndarray:

@@ -202,19 +202,28 @@ class BoundSplats:
         return frames
 
 
-def splats_of_states(thing: SoftObject, states: ArrayLike) -> Iterator[Splats]:
+def splats_of_states(thing: SoftObject, states: ArrayLike, dents: ArrayLike | None = None) -> Iterator[Splats]:
     """Yield the splats of an object in each of its states, on the host.
 
     Args:
         thing: The object.
         states: Reduced coordinates [m], shape (F, n, 3).
+        dents: Dents of its surface samples [m], shape (F, surface_count, 3); None for none.
+
+    Raises:
+        ConfigError: If there are dents of another shape.
     """
     q, rest = np.asarray(states, dtype=np.float64), thing.visible_splats
+    given = None if dents is None else np.asarray(dents, dtype=np.float32)
+    if given is not None and given.shape != (len(q), thing.body.surface_count, 3):
+        hint = f"give one vector for each state and surface sample: {(len(q), thing.body.surface_count, 3)}"
+        raise ConfigError(f"dents has shape {given.shape}", hint=hint)
     count = max(1, _ROWS // rest.count)
     for first in range(0, len(q), count):
         part = q[first : first + count]
         bound = BoundSplats(None, [thing], worlds=range(len(part)), device="cpu")
-        bound.move(wp.array(part.reshape(-1, 3), dtype=wp.vec3d, device="cpu"))
+        left = None if given is None else wp.array(given[first : first + count].reshape(-1, 3), wp.vec3, device="cpu")
+        bound.move(wp.array(part.reshape(-1, 3), dtype=wp.vec3d, device="cpu"), left)
         turns = bound.arrays.rotations.numpy()
         for (k, _), frame in bound.frames().items():
             # colours of degree 0 look the same from everywhere, and no rotations are computed for them

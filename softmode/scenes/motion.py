@@ -99,6 +99,7 @@ def set_motion(scene: Scene, before: Motion, came_from: Sequence[int] | None = N
         share = low
         elastic()
     state.dt_before.zero_()
+    state.dent.zero_()  # the next step finds what is touched
     scene.solver.update_particles(scene.state)
 
 

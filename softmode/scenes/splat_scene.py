@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 from softmode.deformables.contact.dents import contact_dents
 from softmode.deformables.coupling.rigid_solver import mujoco_warnings
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
-from softmode.deformables.materials.material import Material
 from softmode.deformables.model.neighbours import listed, movable_bodies
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.observables import ReducedObservableKind
@@ -49,10 +48,6 @@ class FrameSink(Protocol):
         """Add a picture, shape (height, width, 3), of a film with ``rate`` pictures per second."""
 
 
-FOAM = Material(youngs_modulus=1.0e5, density=250.0)
-"""What objects are made of that do not say it."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Record:
     """What the physics did while it was filmed."""
@@ -77,11 +72,6 @@ class Record:
             f"status: {', '.join(self.reasons) or 'fine'}; {self.milliseconds:.1f} ms per step\n"
             f"deepest in a fixed shape {1e3 * self.depth:.2f} mm, in each other {1e3 * self.overlap:.2f} mm"
         )
-
-
-def _mass(placed: Placed) -> float:
-    """Return the mass of an object at its place [kg]."""
-    return (placed.object.material or FOAM).density * placed.scale**3 * placed.body.volume
 
 
 class SplatScene:
@@ -141,7 +131,7 @@ class SplatScene:
             for fixture in fixtures:
                 add_fixture(builder, fixture)
         for placed in self.placed:
-            instance = placed.add_to(builder, material=placed.object.material or FOAM)
+            instance = placed.add_to(builder)
             if grip_slots:
                 add_grip_slots(builder, instance, grip_slots)
         self.model: Any = builder.finalize(device=device)  # Any: it carries the attributes of soft bodies
@@ -291,7 +281,7 @@ class SplatScene:
         total = 0.0
         for placed, first in zip(self.placed, start, strict=True):
             body = placed.body
-            total += 0.5 * _mass(placed) * float((qd[first : first + body.function_count] ** 2).sum())
+            total += 0.5 * placed.mass * float((qd[first : first + body.function_count] ** 2).sum())
         return total
 
     def momentum(self) -> NDArray[np.float64]:
@@ -300,7 +290,7 @@ class SplatScene:
         total = np.zeros(3)
         for placed, first in zip(self.placed, start, strict=True):
             body = placed.body
-            total += _mass(placed) * (body.mean_basis @ qd[first : first + body.function_count])
+            total += placed.mass * (body.mean_basis @ qd[first : first + body.function_count])
         return total
 
     def momentum_error(self, steps: int) -> float:
@@ -314,7 +304,7 @@ class SplatScene:
         """
         require_even("steps", steps)
         wanted: Any = self.solver.observables({ReducedObservableKind.INSTANCE_CONTACT_F})
-        weight = self.model.gravity.numpy()[0] * sum(_mass(placed) for placed in self.placed)
+        weight = self.model.gravity.numpy()[0] * sum(placed.mass for placed in self.placed)
         worst = 0.0
         for _ in range(steps // 2):
             expected = self.momentum()

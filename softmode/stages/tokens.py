@@ -76,6 +76,11 @@ HANDLES = "softmode:handles"
 """Time samples of the handles' transforms, on the body's prim: matrix4d[], see `usd.handles`."""
 HANDLES_QUADRATIC = "softmode:handles:quadratic"
 """Time samples of what quadratic handles have beside: double3[], six rows for each."""
+DENTS = "softmode:dents"
+"""Time samples of the dents that contact leaves, on the body's prim: float3[] in its frame, see `deformables.contact`.
+Absent where nothing was touched."""
+DENT_SAMPLES = "softmode:dents:samples"
+"""The surface samples that have them: int[], as many."""
 
 # Kaolin's exchange format, a schema applied several times: `kaolin_skinned_physics:<instance>:<name>`.
 KAOLIN_SKINNED_API = "KaolinSkinnedPhysicsAPI"

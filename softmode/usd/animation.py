@@ -28,6 +28,7 @@ from softmode.splats.formats.usd import set_splat_column, splat_columns
 from softmode.splats.pinhole import PinholeCamera
 from softmode.stages import tokens
 from softmode.stages.openusd import Layer, Stage
+from softmode.usd.dents import Dents
 from softmode.usd.handles import handles_from_coordinates, local_coordinates, rigid_motion
 from softmode.usd.openusd import check_stage, openusd, whole_stage
 from softmode.usd.rigid import RigidMeshes
@@ -41,6 +42,7 @@ from softmode.usd.writer import (
     save,
     set_place,
     set_points,
+    vectors,
 )
 
 Mode = Literal["handles", "baked"]
@@ -57,8 +59,8 @@ class UsdAnimationOptions:
     """
 
     mode: Mode = "handles"
-    """What is sampled: handle matrices only, a kilobyte per frame and body; or also all positions, orientations and
-    scales of splats, 40 bytes for each splat and frame, which any viewer of splats plays."""
+    """What is sampled: handle matrices and dents, a kilobyte per frame and body; or also all positions, orientations
+    and scales of splats, 40 bytes for each splat and frame, which any viewer of splats plays."""
     fps: float = 30.0
     """Frames per second where no times are given [1/s], and time codes per second; as many times more of these as make
     the time codes of all frames whole, up to 64."""
@@ -82,9 +84,9 @@ class UsdAnimationOptions:
 class UsdAnimation:
     """Records one world of a simulation; the file appears complete with `publish` or not at all.
 
-    Recording keeps the reduced coordinates, a kilobyte or so per frame; everything else is done by `publish`. As a
-    context manager it publishes when the block ends without an error. Recording reads from the device: not for captured
-    graphs.
+    Recording keeps the reduced coordinates and dents, a kilobyte or so per frame; everything else is done by `publish`.
+    As a context manager it publishes when the block ends without an error. Recording reads from the device: not for
+    captured graphs.
 
     Args:
         path: A `.usdc` or `.usd` (binary) or `.usda` (text) file; folders are made.
@@ -125,12 +127,14 @@ class UsdAnimation:
                 hint="pass a Placed for each add_reduced_body, in that order",
             )
         self._starts = data.function_start.numpy()[self._instances].tolist()
+        self._samples = data.particle_start.numpy()[self._instances].tolist()
         self._bodies = tuple(bodies)
         self._placed: tuple[Placed, ...] = ()
         self._meshes = RigidMeshes(model, world) if self.options.rigid_meshes else None
         self._live: Any = None
         self._times: list[float] = []
         self._states: list[list[NDArray[np.float64]]] = []
+        self._dents: list[list[Dents]] = []
 
     @classmethod
     def of_env(
@@ -194,7 +198,7 @@ class UsdAnimation:
         if not (np.isfinite(when) and (not self._times or when > self._times[-1])):
             before = f" after one at {self._times[-1]} s" if self._times else ""
             raise ConfigError(f"time is {when} s{before}", hint="give times that grow, or None")
-        q = state.softmode.q.numpy()
+        q, dent = state.softmode.q.numpy(), state.softmode.dent.numpy()
         parts = [
             np.array(q[start : start + placed.body.function_count], dtype=np.float64)
             for start, placed in zip(self._starts, self._bodies, strict=True)
@@ -207,6 +211,12 @@ class UsdAnimation:
             self._meshes.record(state)
         self._times.append(when)
         self._states.append(parts)
+        self._dents.append(
+            [
+                Dents.of(dent[start : start + placed.body.surface_count])
+                for start, placed in zip(self._samples, self._bodies, strict=True)
+            ]
+        )
 
     def _in_model(self, states: Sequence[NDArray[np.float64]]) -> tuple[Placed, ...]:
         """Return the bodies with material, size and place as they are in the model at the first frame."""
@@ -246,7 +256,8 @@ class UsdAnimation:
             stage.SetEndTimeCode(codes[-1])
             paths = author_bodies(stage, self._placed, self.options.export)
             for k, (path, placed) in enumerate(zip(paths, self._placed, strict=True)):
-                self._author_motion(stage, layer, path, placed, codes, [frame[k] for frame in self._states])
+                states, dents = [frame[k] for frame in self._states], [frame[k] for frame in self._dents]
+                self._author_motion(stage, layer, path, placed, codes, states, dents)
             if self._meshes is not None:
                 self._meshes.author(stage, codes)
             fixed = [camera for camera in self.options.cameras if camera.body is None]
@@ -267,6 +278,7 @@ class UsdAnimation:
         placed: Placed,
         codes: list[float],
         states: list[NDArray[np.float64]],
+        dents: list[Dents],
     ) -> None:
         """Author the samples of one body."""
         UsdGeom, Vt = openusd("UsdGeom", "Vt")
@@ -274,20 +286,34 @@ class UsdAnimation:
         handles = attribute(prim, tokens.HANDLES, "Matrix4dArray", None, custom=True)
         curved = bool((body.handle_degrees == 2).any())
         more = attribute(prim, tokens.HANDLES_QUADRATIC, "Double3Array", None, custom=True) if curved else None
-        local = np.empty((len(states), body.function_count, 3))
-        for f, (code, q) in enumerate(zip(codes, states, strict=True)):
+        local, seen = np.empty((len(states), body.function_count, 3)), list[Dents]()
+        for f, (code, q, dent) in enumerate(zip(codes, states, dents, strict=True)):
             rotation, translation = rigid_motion(body, q)
             set_place(UsdGeom.Xform(prim), translation, rotation, placed.scale, code)
             local[f] = local_coordinates(body, q, rotation, translation, placed.scale)
+            seen.append(dent.mapped(rotation.T / placed.scale))
             matrices, quadratic = handles_from_coordinates(body, local[f])
             handles.Set(Vt.Matrix4dArray.FromNumpy(matrices), code)
             if more is not None:
                 more.Set(Vt.Vec3dArray.FromNumpy(quadratic.reshape(-1, 3)), code)
+        if any(len(dent.samples) for dent in seen):
+            samples = attribute(prim, tokens.DENT_SAMPLES, "IntArray", None, custom=True)
+            vector = attribute(prim, tokens.DENTS, "Float3Array", None, custom=True)
+            for code, dent in zip(codes, seen, strict=True):
+                samples.Set(Vt.IntArray.FromNumpy(dent.samples), code)
+                vector.Set(vectors(dent.vectors), code)
         if self.options.mode == "baked":
-            self._bake(stage, layer, path, placed, codes, local)
+            self._bake(stage, layer, path, placed, codes, local, seen)
 
     def _bake(
-        self, stage: Stage, layer: Layer, path: str, placed: Placed, codes: list[float], local: NDArray[np.float64]
+        self,
+        stage: Stage,
+        layer: Layer,
+        path: str,
+        placed: Placed,
+        codes: list[float],
+        local: NDArray[np.float64],
+        dents: list[Dents],
     ) -> None:
         """Author points and splats frame by frame, in the frame of their body."""
         UsdGeom, UsdVol = openusd("UsdGeom", "UsdVol")
@@ -300,7 +326,8 @@ class UsdAnimation:
         prim = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath(f"{path}/Splats"))
         turning = placed.splats.sh_degree > 0
         near, waiting = placed.splats.quats, 0.0
-        for code, splats in zip(codes, splats_of_states(placed.object, local), strict=True):
+        every = np.array([dent.full(placed.body.surface_count) for dent in dents])
+        for code, splats in zip(codes, splats_of_states(placed.object, local, every), strict=True):
             columns = splat_columns(splats, near=near)
             near = columns["orientations"]
             del columns["opacities"]

@@ -17,6 +17,7 @@ from softmode.scenes.binding import splats_of_states
 from softmode.splats.formats.usd import splats_from_prim
 from softmode.splats.splats import MAX_SPLATS, Splats
 from softmode.stages import process
+from softmode.usd.dents import NO_DENTS, Dents
 from softmode.usd.handles import coordinates_from_handles, world_coordinates
 
 Array = NDArray[np.float64]
@@ -35,6 +36,8 @@ class PlayedBody:
     """When the frames are [s], shape (F,)."""
     coordinates: Array
     """Reduced coordinates in the world, as in `state.softmode.q` [m], shape (F, n, 3)."""
+    dents: tuple[Dents, ...]
+    """What contact dented in each frame, in the world; as `state.softmode.dent` by `dents_at`."""
 
     def splats_at(self, frame: int) -> Splats:
         """Return its splats in the world in one frame.
@@ -44,12 +47,17 @@ class PlayedBody:
         """
         if not -len(self.times) <= frame < len(self.times):
             raise ConfigError(f"frame is {frame}, there are {len(self.times)}")
-        return next(splats_of_states(self.object, self.coordinates[frame][None]))
+        return next(splats_of_states(self.object, self.coordinates[frame][None], self.dents_at(frame)[None]))
 
     def points_at(self, frame: int) -> Array:
-        """Return its surface samples in the world in one frame [m], shape (S, 3)."""
+        """Return its surface samples in the world in one frame, dents in [m], shape (S, 3)."""
         body = self.object.body
-        return body.surface_points + body.surface_basis.astype(np.float64) @ self.coordinates[frame]
+        moved = body.surface_basis.astype(np.float64) @ self.coordinates[frame]
+        return body.surface_points + moved + self.dents_at(frame)
+
+    def dents_at(self, frame: int) -> NDArray[np.float32]:
+        """Return the dents of its surface samples in the world in one frame [m], shape (S, 3)."""
+        return self.dents[frame].full(self.object.body.surface_count)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -122,6 +130,7 @@ def _played(sent: dict[str, Any], arrays: list[NDArray[Any]], rate: float, name:
     quadratic = np.array([arrays[k] for k in sent["quadratic"]]).reshape(len(codes), curved, 6, 3)
     if not all(np.isfinite(values).all() for values in (codes, places, matrices, quadratic)):
         raise AssetError(f"{source}: its time samples are not all finite", hint=process.REEXPORT)
+    dents = _dents(sent["dents"], arrays, body.surface_count, len(codes), source)
     local = coordinates_from_handles(body, matrices, quadratic)
     linear = places[:, :3, :3].transpose(0, 2, 1)
     scale = np.cbrt(np.linalg.det(linear))
@@ -138,4 +147,23 @@ def _played(sent: dict[str, Any], arrays: list[NDArray[Any]], rate: float, name:
         ),
         times=codes / rate,
         coordinates=np.array(world),
+        dents=tuple(one.mapped(place[:3, :3].T) for one, place in zip(dents, places, strict=True)),
     )
+
+
+def _dents(sent: list[list[int]], arrays: list[NDArray[Any]], count: int, frames: int, source: str) -> list[Dents]:
+    """Return the dents of each frame from what the process sent, in the frame of the body; none where it sent none.
+
+    Raises:
+        AssetError: If they are not finite, or those of samples that the body does not have.
+    """
+    if not sent:
+        return [NO_DENTS] * frames
+    none: NDArray[Any] = np.zeros(0, np.int32)
+    found = [[none if k < 0 else arrays[k] for k in pair] for pair in sent]
+    dents = [Dents(samples=samples, vectors=vectors.reshape(-1, 3)) for samples, vectors in found]
+    for one in dents:
+        known = len(one.samples) == len(one.vectors) and bool(((one.samples >= 0) & (one.samples < count)).all())
+        if not known or not np.isfinite(one.vectors).all():
+            raise AssetError(f"{source}: its dents are not those of {count} samples", hint=process.REEXPORT)
+    return dents

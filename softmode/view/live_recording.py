@@ -15,7 +15,7 @@ from softmode.errors import AssetError, ConfigError
 from softmode.files import read_arrays
 from softmode.scenes.scene import Scene
 
-_FORMAT = "softmode live recording 1"
+_FORMAT = "softmode live recording 2"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +26,8 @@ class LiveRecording:
     """Simulated time of each frame [s], shape (T,)."""
     q: NDArray[np.float64]
     """Reduced coordinates of all objects, one after another [m], shape (T, functions, 3)."""
+    dent: NDArray[np.float32]
+    """Dents of their surface samples, as in `state.softmode.dent` [m], shape (T, samples, 3)."""
     body_q: NDArray[np.float32]
     """Poses of the rigid bodies, position [m] and quaternion xyzw, shape (T, B, 7)."""
     fingerprints: tuple[str, ...]
@@ -39,17 +41,19 @@ class LiveRecording:
             AssetError: If the file is missing, damaged or foreign.
         """
         hint = "record it again"
-        names = ("format", "times", "q", "body_q", "fingerprints")
+        names = ("format", "times", "q", "dent", "body_q", "fingerprints")
         data = read_arrays(path, names, what="recording", hint=hint)
         if set(names) != set(data):
             raise AssetError(f"recording {path} is not one of a live session", hint=hint)
-        times, q, body_q = data["times"], data["q"], data["body_q"]
-        good = str(data["format"]) == _FORMAT and times.ndim == 1 and q.ndim == 3 and body_q.ndim == 3
-        good = good and len(times) == len(q) == len(body_q) and q.shape[2] == 3 and body_q.shape[2] == 7
-        if not good or not all(np.isfinite(x).all() for x in (times, q, body_q)):
+        times, columns = data["times"], {"q": data["q"], "dent": data["dent"], "body_q": data["body_q"]}
+        good = str(data["format"]) == _FORMAT and times.ndim == 1
+        for (name, values), width in zip(columns.items(), (3, 3, 7), strict=True):
+            good = good and values.ndim == 3 and len(values) == len(times) and values.shape[2] == width
+            columns[name] = values.astype(np.float64 if name == "q" else np.float32)
+        if not good or not all(np.isfinite(x).all() for x in (times, *columns.values())):
             raise AssetError(f"recording {path} is not one of a live session", hint=hint)
         prints = tuple(str(x) for x in data["fingerprints"])
-        return cls(times=times, q=q, body_q=body_q.astype(np.float32), fingerprints=prints)
+        return cls(times=times, fingerprints=prints, **columns)
 
     def check(self, scene: Scene, index: int) -> None:
         """Raise unless it is of the objects of a scene, and has a frame.
@@ -58,7 +62,9 @@ class LiveRecording:
             ConfigError: If it is of other objects, or has no such frame.
         """
         own = tuple(thing.body.fingerprint for thing in scene.objects)
-        if self.fingerprints != own or self.q.shape[1] != soft(scene.state).q.shape[0]:
+        state = soft(scene.state)
+        shapes = (self.q.shape[1], self.dent.shape[1]), (state.q.shape[0], state.dent.shape[0])
+        if self.fingerprints != own or shapes[0] != shapes[1]:
             raise ConfigError("the recording is of other objects", hint="open the objects that were recorded")
         require_number("index", index, at_least=0, at_most=len(self.times) - 1)
 
@@ -66,6 +72,7 @@ class LiveRecording:
         """Put everything of a scene where a frame has it, at rest."""
         state = soft(scene.state)
         state.q.assign(self.q[index])
+        state.dent.assign(self.dent[index])
         state.qd.zero_()
         state.dt_before.zero_()
         poses = scene.state.body_q

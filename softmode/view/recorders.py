@@ -54,17 +54,19 @@ class Recorder:
 def _coordinates(path: Path, objects: Sequence[SoftObject]) -> Recorder:
     """Return what keeps coordinates and poses in memory and writes them at the end."""
     pending = PendingFile(path, "recording")
-    frames: list[tuple[float, NDArray[np.float64], NDArray[np.float32]]] = []
+    frames: list[tuple[float, NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]] = []
 
     def take(time: float, state: newton.State) -> None:
         poses = host(state.body_q).astype(np.float32).reshape(-1, 7)
-        frames.append((time, np.array(soft(state).q.numpy(), dtype=np.float64), poses))
+        q, dent = (np.array(array.numpy()) for array in (soft(state).q, soft(state).dent))
+        frames.append((time, q.astype(np.float64), dent.astype(np.float32), poses))
 
     def finish() -> None:
-        times, q, poses = (np.array(column) for column in zip(*frames, strict=True))
+        times, q, dent, poses = (np.array(column) for column in zip(*frames, strict=True))
         prints = tuple(thing.body.fingerprint for thing in objects)
         body_q = poses.astype(np.float32).reshape(len(times), -1, 7)
-        recording = LiveRecording(times=times.astype(np.float64), q=q, body_q=body_q, fingerprints=prints)
+        moved = {"q": q, "dent": dent, "body_q": body_q}
+        recording = LiveRecording(times=times.astype(np.float64), fingerprints=prints, **moved)
         recording.save(pending.temporary)
         pending.publish()
 

@@ -11,6 +11,7 @@ from softmode.deformables.body.regions import Region
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.contact.dents import dent_lengths
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body, drive_regions
 from softmode.deformables.model.lane_kernels import from_blocks
@@ -50,6 +51,13 @@ def region_positions(scene, name):
     body = scene.body()
     rows = body.region_rows(name)
     return body.region_points[rows] + body.evaluate(body.region_points[rows])[0] @ scene.q(), body.region_points[rows]
+
+
+def test_exact_regions_have_no_dents():
+    """Samples of an exact region are where they are driven to; all others may be dented."""
+    body = held_bar()
+    lengths, held = dent_lengths(body), body.surface_points[:, 0] < -0.5 * LENGTH + 0.05 - 1e-9
+    assert held.sum() > 10 and not lengths[held].any() and (lengths[~held] > 0.0).all()
 
 
 def test_exact_region_in_a_shape():

@@ -12,16 +12,20 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from softmode.deformables.contact.pairs import thickness
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.tasks.push_soft.task import PushSoftConfig
 from softmode.robots import ArmDescription
+from tests import reference
 
 Vector = NDArray[np.float64]
 Numbers = dict[str, Vector]
 
 TOLERANCE = {"rtol": 1.0e-5, "atol": 5.0e-6}
 """Ten transforms in a row, of lengths of order one in float32: about 40 eps."""
+MATERIAL = ("youngs_modulus", "poissons_ratio", "scale")
+"""What a dent depends on."""
 VISIBLE = 1.0e-4
 """Size from which a wrong sign of a number shows."""
 
@@ -57,7 +61,9 @@ class HostState:
         self.centres = np.array([body.mean_basis @ q[span] for body, span in zip(bodies, spans, strict=True)])
         self.velocity = bodies[0].mean_basis @ qd[spans[0]]
         self.rest = bodies[0].surface_points[env.task.points]
-        self.points = self.deformed(self.rest)
+        dents = self.dents()[env.task.points]
+        self.dented = float(np.abs(dents).max())
+        self.points = self.deformed(self.rest) + dents
         self.drawn = {
             name: env.task.table.values.numpy()[0, env.task.table.columns(name)].astype(float)
             for name in env.task.table.parameters
@@ -66,6 +72,30 @@ class HostState:
     def deformed(self, rest: Vector) -> Vector:
         """Return where rest points of object 0 are [m], x = X + sum_k b_k(X) q_k, shape (N, 3)."""
         return rest + self.scene.soft.body.evaluate(rest)[0] @ self.q
+
+    def dents(self) -> Vector:
+        """Return how far the skin at the surface samples of object 0 lies outside of `deformed` [m], shape (N, 3).
+
+        By the law: a contact sinks in by p, of which a bed of springs of w = 0.3 min((V / n)^(1/3), 0.6 t) (1 - nu^2) /
+        E takes its part in series with the penalty, along the normal. Soft bodies that touch object 0 are refused.
+        """
+        body, view, data = self.scene.soft.body, self.scene.solver.view, self.scene.model.softmode
+        young, ratio, scale = (float(getattr(data, name).numpy()[0]) for name in MATERIAL)
+        size = (body.volume / (body.function_count - body.driven_count)) ** (1.0 / 3.0)
+        free = np.abs(body.surface_basis[:, body.driven_count :]).max(axis=1) > 1.0e-6  # the clamped foot has none
+        w = 0.3 * scale * np.minimum(size, 0.6 * thickness(body)) * (1.0 - ratio**2) / young * free
+        c = view.constraints
+        assert not c.pair_count.numpy()[0]
+        held = slice(int(view.instances.pin_count.numpy()[0]), int(c.count.numpy()[0]))
+        sample = c.row.numpy()[0, held] - int(view.instances.row_start.numpy()[0])
+        normal, moved = c.normal.numpy()[0, held], c.offset.numpy()[0, held] + c.displacement.numpy()[0, held]
+        softer = c.stiffness.numpy()[0, held] * w[sample] / (scale**2 * body.surface_areas[sample])
+        penetration = -np.einsum("ek,ek->e", normal, moved)
+        depth = reference.dent(penetration, float(view.instances.smoothing.numpy()[0]), softer)
+        out = np.zeros((body.surface_count, 3))
+        for s, n, v in zip(sample, normal, depth, strict=True):
+            out[s] += max(v - n @ out[s], 0.0) * n
+        return out
 
 
 def common(seen: HostState) -> Numbers:
@@ -207,11 +237,12 @@ def test_every_segment_is_what_the_state_says(name: str) -> None:
     given = {"config": dataclasses.replace(PushSoftConfig(), goal_yaw=(0.4, 0.9))} if name == "PushSoft" else {}
     env = gym.make(f"softmode/{name}-v0", **given).unwrapped
     assert isinstance(env, SoftEnv)
-    segments, largest, touched = env.task.segments, np.zeros(len(env.task.low)), False
+    segments, largest, touched, dented = env.task.segments, np.zeros(len(env.task.low)), False, 0.0
 
     def check() -> None:
-        nonlocal touched
+        nonlocal touched, dented
         seen = HostState(env)
+        dented = max(dented, seen.dented)
         touched |= bool(np.linalg.norm(seen.finger_force, axis=1).max() > 0.05)
         expected = common(seen) | own(seen)
         assert expected.keys() == segments.keys()
@@ -234,6 +265,6 @@ def test_every_segment_is_what_the_state_says(name: str) -> None:
             env.step(random.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32))
             check()
     env.close()
-    assert touched
+    assert touched and dented > 2.0 * TOLERANCE["atol"]
     small = {segment for segment, (columns, _) in segments.items() if (largest[columns] < VISIBLE).any()}
     assert small <= STILL.get(name, set()), {segment: largest[segments[segment][0]] for segment in small}

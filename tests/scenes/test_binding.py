@@ -80,6 +80,22 @@ def test_states_without_a_model_are_the_same(cube: SoftObject) -> None:
     np.testing.assert_array_equal(alone.frames()[3, 0].covariances, bound.frames()[1, 1].covariances)
 
 
+def test_states_without_a_model_have_their_dents(cube: SoftObject) -> None:
+    """Dents move them as they move those of the model, bit for bit; they are one vector per state and sample."""
+    model, state = two_cubes(cube, 2)
+    bound, dents = BoundSplats(model, [cube, cube]), np.zeros((4, cube.body.surface_count, 3), np.float32)
+    dents[:, :5] = 1e-3 * np.arange(60, dtype=np.float32).reshape(4, 5, 3)
+    state.softmode.dent.assign(dents.reshape(-1, 3))
+    bound.update(state)
+    states = state.softmode.q.numpy().reshape(4, -1, 3)
+    bare = list(splats_of_states(cube, states))
+    for k, splats in enumerate(splats_of_states(cube, states, dents)):
+        np.testing.assert_array_equal(splats.means, bound.frames()[divmod(k, 2)].means)
+        assert np.abs(splats.means - bare[k].means).max() > 1e-4
+    with pytest.raises(ConfigError, match=r"dents has shape \(3, "):
+        next(splats_of_states(cube, states, dents[:3]))
+
+
 def test_other_bodies_are_refused(cube: SoftObject) -> None:
     """As many objects as the model has soft bodies in a world; one where there is no model."""
     with pytest.raises(ConfigError, match="objects names 1 soft bodies, the model has 4 in 2 worlds"):

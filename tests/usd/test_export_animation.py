@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import json
 import subprocess
@@ -17,6 +18,7 @@ import warp as wp
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.errors import AssetError, ConfigError, SolverDiverged, StorageError
 from softmode.objects import Placed, SoftObject
+from softmode.scenes import BoundSplats
 from softmode.splats.formats import read_usd
 from softmode.splats.pinhole import PinholeCamera
 from softmode.splats.splats import rotations_from_quats
@@ -29,6 +31,7 @@ from softmode.usd import (
     read_animation,
     write_usd,
 )
+from softmode.usd.dents import Dents
 from softmode.usd.playback import animation_from_answer, animation_request
 from tests.usd.export_scenes import (
     KINDS,
@@ -46,6 +49,11 @@ Gf, Usd, UsdGeom = (importlib.import_module(f"pxr.{name}") for name in ("Gf", "U
 EPSILON = float(np.finfo(np.float32).eps)
 FRAMES = 4
 BAKED = UsdAnimationOptions(mode="baked")
+
+
+def sample_total(scene: Scene) -> int:
+    """Return how many surface samples the model of a scene has."""
+    return scene.state.softmode.dent.shape[0]
 
 
 class Scene:
@@ -117,6 +125,61 @@ def test_handles_hold_the_states(tmp_path: Path, kind: str) -> None:
     again = add_usd(newton.ModelBuilder(), tmp_path / "a.usdc")  # the first frame as a scene to go on from
     assert [body.material for body in again.bodies.values()] == [MATERIAL, MATERIAL]
     np.testing.assert_allclose([body.scale for body in again.bodies.values()], scene.scales, rtol=EPSILON)
+
+
+@pytest.mark.parametrize("options", [None, BAKED])
+def test_dents_come_back(tmp_path: Path, options: UsdAnimationOptions | None) -> None:
+    """Surface and splats are played with the dents that they had, in the world of a scaled and turned body.
+
+    Splats are those that cameras draw. A frame in which nothing was touched has none, and a stage neither.
+    """
+    scene, surfaces, means = Scene("affine", "regions"), [], []
+    bound, rng = (
+        BoundSplats(scene.model, [placed.object for placed in scene.bodies], worlds=[1]),
+        np.random.default_rng(5),
+    )
+    data, body = scene.model.softmode, scene.bodies[1].body
+    first = int(data.particle_start.numpy()[3])
+    dents = np.zeros((FRAMES, sample_total(scene), 3), dtype=np.float32)
+    for frame in (0, 2, 3):
+        touched = first + rng.choice(body.surface_count, 7, replace=False)
+        dents[frame, touched] = 1e-3 * rng.normal(size=(7, 3))
+    with UsdAnimation(tmp_path / "a.usdc", scene.model, scene.bodies, world=1, options=options) as animation:
+        for frame in range(FRAMES):
+            q = scene.move(frame)[1]
+            scene.state.softmode.dent.assign(dents[frame])
+            animation.record(scene.state, 0.1 * frame)
+            bound.update(scene.state)
+            means.append(bound.frames()[0, 1].means)
+            surfaces.append(body.surface_points + body.surface_basis.astype(float) @ q)
+    plain, played = read_animation(tmp_path / "a.usdc").bodies
+    stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
+    assert not plain.dents_at(0).any() and not stage.GetPrimAtPath(plain.path).HasAttribute("softmode:dents")
+    for frame in range(FRAMES):
+        given = dents[frame, first : first + body.surface_count]
+        np.testing.assert_allclose(played.dents_at(frame), given, atol=4 * EPSILON * 3e-3)
+        np.testing.assert_allclose(played.points_at(frame), surfaces[frame] + given, atol=4 * EPSILON * 3e-3)
+        assert len(played.dents[frame].samples) == (0 if frame == 1 else 7)
+        np.testing.assert_allclose(played.splats_at(frame).means, means[frame], atol=8 * EPSILON)
+    bare = dataclasses.replace(played, dents=(Dents.of(np.zeros((1, 3))),) * FRAMES)
+    assert np.abs(bare.splats_at(2).means - means[2]).max() > 1e-4
+    if options is BAKED:
+        seen = read_usd(tmp_path / "a.usdc", time_code=6.0).means[-len(means[2]) :]
+        np.testing.assert_allclose(seen, means[2], atol=8 * EPSILON)
+
+
+def test_dents_of_other_samples_are_refused(tmp_path: Path) -> None:
+    """Indices that no sample has, and vectors that are no numbers."""
+    for name, value in (("softmode:dents:samples", [10_000]), ("softmode:dents", [(float("nan"), 0.0, 0.0)])):
+        scene = Scene("affine")
+        scene.state.softmode.dent.assign(np.eye(sample_total(scene), 3, -sample_total(scene) // 2, dtype=np.float32))
+        scene.record(tmp_path / "a.usda")
+        stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+        assert read_animation(tmp_path / "a.usda").bodies[0].dents_at(0).any()
+        stage.GetPrimAtPath("/World/bar_affine").GetAttribute(name).Set(value, 3.0)
+        stage.GetRootLayer().Save()
+        with pytest.raises(AssetError, match="its dents are not those of"):
+            read_animation(tmp_path / "a.usda")
 
 
 @pytest.mark.parametrize(("kind", "coefficients"), [("affine", 1), ("quadratic", 4), ("regions", 1)])

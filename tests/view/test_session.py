@@ -606,6 +606,24 @@ def test_a_recording_of_coordinates_is_played_back(hanging, tmp_path):
         LiveRecording.load(path)
 
 
+def test_a_recording_keeps_dents(tmp_path):
+    """What stands on the table is shown again with the dents that it had: surface and splats, while it is elsewhere."""
+    live, path = session("drop"), tmp_path / "stand.npz"
+    settle(live, 60)
+    live.start_recording(path)
+    settle(live, 2)
+    kept, drawn = live.surface(), live.splats().means
+    live.stop_recording()
+    recording = LiveRecording.load(path)
+    dents = recording.dent[-1]
+    assert dents.shape == kept.shape and dents[:, 2].max() > 1e-5 and abs(kept[:, 2].min()) < 1e-4
+    live.reset()
+    assert live.surface()[:, 2].min() > 1e-3
+    live.show_frame(recording, len(recording.times) - 1)
+    np.testing.assert_array_equal(live.surface(), kept)
+    np.testing.assert_array_equal(live.splats().means, drawn)
+
+
 def test_a_recording_as_a_stage(hanging, tmp_path):
     """What is pulled, and of what it is made, comes back from an OpenUSD stage."""
     pytest.importorskip("pxr", reason="needs the extra [usd]")

@@ -21,6 +21,7 @@ from scipy import ndimage
 
 from softmode.checks import require_number
 from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.contact.dents import dent_weights
 from softmode.deformables.model.declare import launch
 from softmode.deformables.model.namespaces import soft
 from softmode.deformables.skinning.skin_splats import SkinSplats
@@ -43,7 +44,8 @@ MARGIN = 2
 class InverseMap:
     """Rest points of places in the world, for one body in every world.
 
-    Arrays have the world as first axis. `update`, `move` and `find` are capturable after a first time.
+    Places are those that one sees: they have the dents of contact in, as splats have them (`dent_weights`). Arrays have
+    the world as first axis. `update`, `move` and `find` are capturable after a first time.
 
     Args:
         solver: Solver that holds the body; None for states of a body on their own.
@@ -79,6 +81,7 @@ class InverseMap:
             if solver is not None:
                 raise ConfigError("a solver and a body were given", hint="give the index of the body in its world")
             self.body, starts = body, np.arange(world_count) * body.function_count
+            samples = np.arange(world_count) * body.surface_count
             self.device = wp.get_device(device)
         else:
             held = require_reduced(solver)
@@ -87,9 +90,13 @@ class InverseMap:
             if not 0 <= body or (instances >= layout.instance_start[1:]).any():
                 raise ConfigError(f"no world has a body {body}", hint="count the bodies of a world from 0")
             self.body = layout.bodies[layout.asset[instances[0]]]
-            starts = held.parameters.function_start.numpy()[instances]
+            data = held.parameters
+            starts, samples = (array.numpy()[instances] for array in (data.function_start, data.particle_start))
         self.world_count = worlds = len(starts)
-        self._start = wp.array(np.ascontiguousarray(starts, np.int32), dtype=int, device=self.device)
+        self._start, self._samples = (
+            wp.array(np.ascontiguousarray(first, np.int32), dtype=int, device=self.device)
+            for first in (starts, samples)
+        )
         low, high = self.body.bounds
         edge = float((high - low).max()) / (nodes - 1)
         size = np.ceil((high - low) / edge - 1e-6).astype(int) + 1 + 2 * MARGIN
@@ -99,7 +106,9 @@ class InverseMap:
         cell, core = self._cells(rest, size, edge, within)
         value, gradient = continued_basis(self.body, rest)
         still = np.zeros((len(rest), 3, 3))
-        self._skin = SkinSplats(rest, still, value, gradient, device=self.device)
+        dents = dent_weights(self.body, rest)
+        seen: Any = {"near": dents.samples, "share": dents.weights, "sample_count": self.body.surface_count}
+        self._skin = SkinSplats(rest, still, value, gradient, device=self.device, **seen)
         array: Any = lambda shape, kind: wp.zeros(shape, dtype=kind, device=self.device)  # noqa: E731
         wanted = np.zeros(len(rest), dtype=np.int32)
         wanted[cell] = 1
@@ -140,12 +149,12 @@ class InverseMap:
 
     def update(self, state: newton.State) -> None:
         """Follow the body to where a state of the model has it."""
-        self.move(soft(state).q)
+        self.move(soft(state).q, soft(state).dent)
 
-    def move(self, q: wp.array) -> None:
-        """Follow the coordinates q of all bodies [m], flat vec3d."""
+    def move(self, q: wp.array, dent: wp.array | None = None) -> None:
+        """Follow the coordinates q of all bodies [m], flat vec3d, and the dents of their samples [m], flat vec3."""
         lattice, grid, device, worlds = self.lattice, self.grid, self.device, self.world_count
-        self._skin.launch(q, self._start, lattice.node, self._spread)
+        self._skin.launch(q, self._start, lattice.node, self._spread, dent=dent, sample_start=self._samples)
         cells = (worlds, lattice.cell.shape[0])
         launch(device, kernels.bend_lattice, lattice.node.shape, lattice)
         launch(device, kernels.clear_bound, worlds, grid)
@@ -176,7 +185,9 @@ class InverseMap:
 
     # -- on the host --------------------------------------------------------------------------------------------------
 
-    def rest_points(self, points: ArrayLike, *, world: int = 0, q: ArrayLike | None = None) -> tuple[Array, Flags]:
+    def rest_points(
+        self, points: ArrayLike, *, world: int = 0, q: ArrayLike | None = None, dent: ArrayLike | None = None
+    ) -> tuple[Array, Flags]:
         """Return the rest points of places in one world, read back.
 
         Args:
@@ -184,6 +195,7 @@ class InverseMap:
             world: Which world.
             q: Coordinates of the body there, as last given to `update` [m], shape (n, 3): one Newton step on the body's
                 own functions is added, x <- X - F(X)^-1 (x(X) - place), which the lattice only interpolates.
+            dent: Dents of its surface samples there, for that step [m], shape (surface_count, 3); None for none.
 
         Returns:
             Rest points in the body frame [m], shape (N, 3), the place itself where there is none; flags, shape (N,).
@@ -200,7 +212,12 @@ class InverseMap:
         self.find(place, rest, flag)
         found, flags = rest.numpy()[world].astype(np.float64), flag.numpy()[world]
         if q is not None and (known := flags != OUTSIDE).any():
-            found[known] = true_step(self.body, np.asarray(q, dtype=np.float64), found[known], x[known])
+            target = x[known]
+            if dent is not None:
+                left = dent_weights(self.body, found[known])
+                given = np.asarray(dent, dtype=np.float64)[left.samples]
+                target = target - np.einsum("nk,nkd->nd", left.weights, given)
+            found[known] = true_step(self.body, np.asarray(q, dtype=np.float64), found[known], target)
         return np.where(flags[:, None] == OUTSIDE, x, found), flags
 
     def signed_distance(self, points: ArrayLike, field: Callable[[Array], ArrayLike], *, world: int = 0) -> Array:

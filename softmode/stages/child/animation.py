@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from .. import tokens
-from ..openusd import Stage, pxr
+from ..openusd import Stage, Value, pxr
 from .answer import Arrays, prims_of
 from .limits import Refused
 from .scene import bundle_of
@@ -35,6 +35,7 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
         if len(codes) > MAX_FRAMES:
             raise Refused(f"{prim.GetPath()}: has more than {MAX_FRAMES} time samples", "Record a shorter animation")
         more = prim.GetAttribute(tokens.HANDLES_QUADRATIC)
+        dents = [prim.GetAttribute(name) for name in (tokens.DENT_SAMPLES, tokens.DENTS)]
         transforms = [UsdGeom.XformCache(Usd.TimeCode(code)).GetLocalToWorldTransform(prim) for code in codes]
         splats = None
         for child in prim.GetChildren():
@@ -50,6 +51,7 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
                 "places": arrays.add(Vt.Matrix4dArray(transforms)),
                 "handles": [arrays.add(handles.Get(code)) for code in codes],
                 "quadratic": [arrays.add(more.Get(code)) for code in codes] if more else [],
+                "dents": [[_some(part.Get(code), arrays) for part in dents] for code in codes] if all(dents) else [],
             }
         )
     return {
@@ -58,3 +60,8 @@ def read(stage: Stage, request: dict[str, Any], arrays: Arrays) -> dict[str, Any
         "rate": stage.GetTimeCodesPerSecond(),
         "bodies": bodies,
     }
+
+
+def _some(values: Value, arrays: Arrays) -> int:
+    """Add an array; return its number, -1 if it is empty."""
+    return arrays.add(values) if len(values) else -1

@@ -10,6 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from softmode.deformables.body.reduced_body import ReducedBody
+from softmode.deformables.contact.dents import dent_weights
 from softmode.errors import ConfigError
 from softmode.scenes.table_scene import TableScene
 
@@ -31,6 +32,8 @@ class Press:
     """Displacement of the free end [m], rising from 0, shape (records,)."""
     coordinates: NDArray[np.float64]
     """Reduced coordinates with the middle of the foot at x = y = 0 and the table at z = 0 [m], (records, n, 3)."""
+    dents: NDArray[np.float64]
+    """Dents of the surface samples [m], (records, surface_count, 3)."""
 
 
 def record_press(scene: TableScene, displacement: float) -> Press:
@@ -48,15 +51,20 @@ def record_press(scene: TableScene, displacement: float) -> Press:
     top = body.evaluate(np.array([[0.0, 0.0, body.surface_points[:, 2].max()]]))[0][0]
     action = np.zeros((scene.world_count, control.action_size), np.float32)
     action[:, -1] = 2.0 * config.arm.home_opening / gripper.stroke - 1.0
-    start = int(scene.model.softmode.function_start.numpy()[0])
+    start, first = (
+        int(a.numpy()[0]) for a in (scene.model.softmode.function_start, scene.model.softmode.particle_start)
+    )
     place = np.array([*config.object_position, 0.0])
     shift = np.outer(body.linear_coordinates[:, 3], place)
 
     def coordinates() -> NDArray[np.float64]:
         return scene.state.softmode.q.numpy()[start : start + body.function_count].astype(float) - shift
 
+    def dented() -> NDArray[np.float64]:
+        return scene.state.softmode.dent.numpy()[first : first + body.surface_count].astype(float)
+
     scene.reset()
-    records = [coordinates()]
+    records, dents = [coordinates()], [dented()]
     moved, limit = 0.0, gripper.stroke + 1.5 * displacement
     ends = [0.0]
     while ends[-1] < displacement + 0.002:
@@ -73,9 +81,10 @@ def record_press(scene: TableScene, displacement: float) -> Press:
         end = float(np.hypot(*(top @ (now - records[0]))[:2]))
         if end > ends[-1] + 1.0e-4:
             records.append(now)
+            dents.append(dented())
             ends.append(end)
     scene.reset()
-    return Press(np.array(ends), np.array(records))
+    return Press(np.array(ends), np.array(records), np.array(dents))
 
 
 @dataclass(frozen=True)
@@ -109,7 +118,7 @@ class ShapeTargets:
 
 
 def _bent(body: ReducedBody, press: Press, rest: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return rest points where a press moves them [m], shape (DIRECTIONS, LEVELS, N, 3)."""
+    """Return rest points where a press moves them, dents in [m], shape (DIRECTIONS, LEVELS, N, 3)."""
     displacement_max = float(press.displacements[-1])
     levels = np.linspace(0.0, displacement_max, LEVELS)
     table = np.empty((DIRECTIONS, LEVELS, len(rest), 3), np.float32)
@@ -117,10 +126,14 @@ def _bent(body: ReducedBody, press: Press, rest: NDArray[np.float64]) -> NDArray
     between = np.clip(np.searchsorted(press.displacements, levels, side="right") - 1, 0, len(press.displacements) - 2)
     low, high = press.displacements[between], press.displacements[between + 1]
     share = ((levels - low) / (high - low))[:, None, None]
-    q = (1.0 - share) * press.coordinates[between] + share * press.coordinates[between + 1]
+    q, dents = (
+        (1.0 - share) * values[between] + share * values[between + 1] for values in (press.coordinates, press.dents)
+    )
     for j in range(DIRECTIONS):
         angle = 2.0 * np.pi * j / DIRECTIONS
         c, s = np.cos(angle), np.sin(angle)
         turned = rest @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        table[j] = turned + np.einsum("pn,knc->kpc", body.evaluate(turned)[0], q)
+        left = dent_weights(body, turned)
+        seen = np.einsum("pn,kpnc->kpc", left.weights, dents[:, left.samples])
+        table[j] = turned + np.einsum("pn,knc->kpc", body.evaluate(turned)[0], q) + seen
     return table
