@@ -13,6 +13,7 @@ from softmode.deformables.body.raw_functions import QuadraticFunctions
 from softmode.deformables.body.regions import Envelope, Region
 from softmode.deformables.body.rkpm import BasisRKPM, ShapeFunctions, make_basis
 from softmode.deformables.body.skinning_weights import SkinningWeights, constant_handle, enveloped
+from softmode.deformables.build.detours import Octants, follow_material
 from softmode.deformables.build.eigenmodes import Eigenmodes, solve_eigenmodes
 from softmode.deformables.build.elastic_functions import SPACE_ERROR, SPACE_MODE_COUNTS, Held, choose_functions
 from softmode.deformables.build.functions import (
@@ -69,6 +70,8 @@ class Domain:
     """Places and radii of further local handles [m], shape (A, 4)."""
     material: Material | None
     """Which points of the material touch, so that kernels do not act across gaps; None: they do."""
+    octants: Octants | None
+    """What distances of kernels run through; None: straight lines."""
     lips: Array
     """Points on both sides of slits [m], shape (N, 3)."""
 
@@ -152,7 +155,9 @@ def _ground(domain: Domain, options: BuildOptions) -> _Ground:
     """Return the kernels of a domain and the weights of its regions."""
     count = options.kernels(len(domain.seeds), held=bool(domain.regions))
     kernels = make_basis(domain.seeds, count, kernel=options.kernel, spacing=domain.spacing, seed=options.seed)
-    if domain.material is not None:
+    if domain.octants is not None:
+        kernels = follow_material(kernels, domain.octants, domain.seeds, domain.spacing)
+    if kernels.detours is None and domain.material is not None:
         kernels = divide_at_gaps(kernels, domain.material, domain.seeds, domain.spacing)
     shape, blend, blend_slope = enveloped(kernels.evaluate(domain.points), domain.envelope)
     springs, pull = _springs(kernels, domain)

@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
+from softmode.deformables.body.qgmls import BasisQGMLS
 from softmode.deformables.body.reduced_body import FORMAT_VERSION, ReducedBody, Scalar
 from softmode.deformables.body.regions import Region
 from softmode.deformables.body.rkpm import BasisRKPM
-from softmode.deformables.body.visibility import Visibility
 from softmode.deformables.build.basis import BodyBasis, Domain, make_body_basis
 from softmode.deformables.build.cache import cache_directory, cached_body, fingerprint_of
 from softmode.deformables.build.cubature import Cubature, select_cubature
+from softmode.deformables.build.detours import octants_of
 from softmode.deformables.build.options import BuildOptions, HandleName
 from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.region_samples import octants_near, refine_at_faces, sample_regions
@@ -169,6 +170,7 @@ def _build(
                 samples=samples,
                 added=np.reshape([np.append(*pair) for pair in options.add_kernels], (-1, 4)) - np.append(offset, 0.0),
                 material=None if quadrature.cells is None else material_of(quadrature.cells, offset),
+                octants=None if quadrature.cells is None else octants_of(quadrature.cells, offset),
                 lips=lips_of(quadrature.cells) - offset,
             ),
             options,
@@ -218,7 +220,7 @@ def _build(
             provenance={},
             build_seconds=0.0,
             sources=pack_sources(sources),
-            **_divided(basis.kernels.visibility if isinstance(basis.kernels, BasisRKPM) else None),
+            **_bounded(basis.kernels),
         )
         surface = body.evaluate(body.surface_points)[0]
         stage("surface")
@@ -279,9 +281,16 @@ def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: Build
     return chosen
 
 
-def _divided(visibility: Visibility | None) -> dict[str, NDArray]:
-    """Return the fields of a body whose kernels do not act across gaps."""
-    return {} if visibility is None else {"material_points": visibility.points, "hidden_pairs": visibility.hidden}
+def _bounded(kernels: BasisRKPM | BasisQGMLS) -> dict[str, NDArray[Any]]:
+    """Return the fields of a body whose kernels do not act across gaps, or whose distances are not straight lines."""
+    found: dict[str, NDArray[Any]] = {}
+    if isinstance(kernels, BasisRKPM) and kernels.visibility is not None:
+        found |= {"material_points": kernels.visibility.points, "hidden_pairs": kernels.visibility.hidden}
+    if isinstance(kernels, BasisRKPM) and kernels.detours is not None:
+        table = kernels.detours
+        found |= {"material_points": table.points, "material_steps": table.steps}
+        found |= {"detour_pairs": table.pairs, "detour_lengths": table.lengths}
+    return found
 
 
 def _scalar(value: Scalar | tuple[object, ...]) -> Scalar:

@@ -310,6 +310,7 @@ class _Cutter:
                 weights=cells.weights[octants] * share[octants],
                 of_octant=cells.of_octant[octants],
                 place=None if cells.place is None else cells.place[octants],
+                borders=cells.borders,
                 severed=severed if len(severed) else None,
             ),
         )
