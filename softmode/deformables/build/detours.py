@@ -43,7 +43,32 @@ LEAST = 0.15
 axis of the grid has some of 0.11 at most, since its grid drops octants that it hardly fills."""
 TURN = 0.49
 """How far from the middle of an octant ways turn, towards an inner edge on its border."""
+SLACK = 0.02
+"""How far behind an inner edge, in octants, a way need not turn there."""
 _LINES_PER_CHUNK = 100_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Turns:
+    """Places where ways through the material turn."""
+
+    places: Array
+    """Coordinates in the grid, shape (T, 3)."""
+    walls: Array
+    """Where the empty octant at the inner edge lies: signs along two axes, shape (T, 3); zeros at contacts."""
+    positions: Array
+    """Positions [m], shape (T, 3)."""
+
+    def slack(self, coordinates: Array) -> Mask:
+        """Return from which grid coordinates (M, 3) a way that turns could be shortened there, (M, T).
+
+        From behind the edge, where both of its sides are in sight, it need not turn.
+        """
+        behind = np.ones((len(coordinates), len(self.places)), dtype=bool)
+        for d in range(3):
+            away = (coordinates[:, d, None] - self.places[:, d]) * self.walls[:, d]
+            behind &= (away < -SLACK) | (self.walls[:, d] == 0.0)
+        return behind & (self.walls != 0.0).any(axis=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,8 +83,6 @@ class Octants:
     """Borders of the octants along each axis, one more than places, from place 0 on [m]."""
     links: Indices
     """Pairs that touch, the lower one first, shape (E, 2)."""
-    severed: Indices
-    """Pairs of neighbours that a cut divides, likewise, shape (C, 2)."""
 
     @cached_property
     def part(self) -> Indices:
@@ -108,39 +131,29 @@ class Octants:
         return found
 
     @cached_property
-    def turns(self) -> Array:
-        """Grid coordinates where ways turn: inner edges, contacts of edges and corners, ends of cuts, shape (T, 3)."""
+    def turns(self) -> Turns:
+        """Where ways turn: inner edges, and contacts of edges and corners."""
         grid, at = self.grid, self.place
-        shape = np.array(grid.shape)
-        stride = np.array([shape[1] * shape[2], shape[2], 1])
+        stride = np.array([grid.shape[1] * grid.shape[2], grid.shape[2], 1])
         flat, home = grid.ravel(), at @ stride
         a, b = self.links.T
         contact = np.abs(at[a] - at[b]).sum(axis=1) > 1
-        found = [0.5 * (at[a[contact]] + at[b[contact]]) + 0.5]
-        cut = np.sort(self.severed, axis=1) @ np.array([len(at), 1])
-
-        def open_(i: Indices, j: Indices) -> Mask:
-            return (i >= 0) & (j >= 0) & ~np.isin(np.minimum(i, j) * len(at) + np.maximum(i, j), cut)
-
-        every = np.arange(len(at))
+        middle = 0.5 * (at[a[contact]] + at[b[contact]]) + 0.5
+        found = [np.concatenate([middle, np.zeros_like(middle)], axis=1)]
         for a, b in itertools.combinations(range(3), 2):
             for up, right in itertools.product((1, -1), repeat=2):
-                one, two = flat[home + up * stride[a]], flat[home + right * stride[b]]
-                far = flat[home + up * stride[a] + right * stride[b]]
-                links = np.stack([open_(every, one), open_(every, two), open_(one, far), open_(two, far)])
-                bent = np.flatnonzero(((far < 0) & links[:2].all(axis=0)) | ((far >= 0) & (links.sum(axis=0) == 3)))
-                corner = at[bent] + 0.5
-                corner[:, a] += up * TURN
-                corner[:, b] += right * TURN
-                found.append(corner)
-        turns: Array = np.unique(np.concatenate(found).astype(np.float64), axis=0)
-        return turns
+                wall = np.zeros(3)
+                wall[[a, b]] = up, right
+                there = [flat[home + wall.astype(int) @ (stride * axes)] >= 0 for axes in np.eye(3, dtype=int)[[a, b]]]
+                bent = np.flatnonzero(there[0] & there[1] & (flat[home + wall.astype(int) @ stride] < 0))
+                found.append(np.concatenate([at[bent] + 0.5 + TURN * wall, np.tile(wall, (len(bent), 1))], axis=1))
+        places = np.unique(np.concatenate(found), axis=0)
+        return Turns(places=places[:, :3], walls=places[:, 3:], positions=self.positions(places[:, :3]))
 
     @cached_property
     def _sums(self) -> NDArray[np.int64]:
-        """Octants missing, or beside a cut, below and left of each place."""
+        """Octants missing below and left of each place."""
         bad = (self.grid < 0).astype(np.int64)
-        bad[tuple(self.place[self.severed.ravel()].T)] = 1
         return np.pad(bad.cumsum(0).cumsum(1).cumsum(2), ((1, 0), (1, 0), (1, 0)))
 
     def _filled(self, low: Indices, high: Indices) -> Mask:
@@ -197,7 +210,6 @@ def octants_of(cells: Cells, offset: Array) -> Octants | None:
         place=cells.place - first + 1,
         borders=(before[0], before[1], before[2]),
         links=pair,
-        severed=np.zeros((0, 2), dtype=np.intp) if cells.severed is None else cells.severed,
     )
 
 
@@ -254,70 +266,83 @@ def find_detours(octants: Octants, centres: Array, support: Array) -> Detours | 
     count, margin = len(octants.points), WIDTH * float(octants.steps.max())
     homes = octants.homes(centres)
     own = np.clip(octants.coordinates(centres), octants.place[homes] + 1e-3, octants.place[homes] + 0.999)
-    straight = _distances(octants.points, centres)
+    straight = _distances(centres, octants.points)
     reach = support + margin
-    octant, kernel = np.nonzero((straight < reach) & (octants.part[:, None] == octants.part[homes]))
-    clear = octants.sees(octants.own[octant], own[kernel])
-    hidden_octant, hidden_kernel = octant[~clear], kernel[~clear]
-    if not len(hidden_octant):
+    kernel, octant = np.nonzero((straight < reach[:, None]) & (octants.part[homes][:, None] == octants.part))
+    hidden = ~octants.sees(own[kernel], octants.own[octant])
+    kernel, octant = kernel[hidden], octant[hidden]
+    if not len(kernel):
         return None
-    turns = octants.turns
-    at, limit = octants.positions(turns), float(reach.max())
-    by_turn = _ways_to(octants, turns, at, own, centres, limit)
-    seen, which = np.unique(hidden_octant, return_inverse=True)
-    last = _seen(octants, octants.own[seen], octants.points[seen], turns, at, limit)
-    length = np.full(len(which), np.inf)
-    order = np.argsort(hidden_kernel, kind="stable")
-    for some in np.split(order, np.flatnonzero(np.diff(hidden_kernel[order])) + 1):
-        near = np.flatnonzero(np.isfinite(by_turn[hidden_kernel[some[0]]]))
-        ways = last[np.ix_(which[some], near)] + by_turn[hidden_kernel[some[0]], near]
-        length[some] = ways.min(axis=1, initial=np.inf)
-    direct = straight[hidden_octant, hidden_kernel]
+    direct, most = straight[kernel, octant], reach[kernel]
+    # A longer way would count as longer than the reach.
+    length = _shortest(octants, own, centres, kernel, octant, np.cbrt(most * direct**2))
     ratio = np.maximum(length, direct) / np.maximum(direct, 1e-300)
-    limit = reach[hidden_kernel] - direct
-    added = np.minimum(direct * (np.minimum(ratio, 1e3) ** POWER - 1.0), limit)
-    real = added > 1e-3 * reach[hidden_kernel]
-    if not (added > LEAST * reach[hidden_kernel])[direct < support[hidden_kernel]].any():
+    added = np.minimum(direct * (np.minimum(ratio, 1e3) ** POWER - 1.0), most - direct)
+    if not (added > LEAST * most)[direct < support[kernel]].any():
         return None
-    key = hidden_kernel[real] * count + hidden_octant[real]
-    order = np.argsort(key)
+    real = added > 1e-3 * most
     return Detours(
         points=octants.points,
         steps=octants.steps,
-        pairs=key[order].astype(np.int64),
-        lengths=added[real][order].astype(np.float32),
+        pairs=(kernel * count + octant)[real].astype(np.int64),
+        lengths=added[real].astype(np.float32),
     )
 
 
-def _ways_to(octants: Octants, turns: Array, at: Array, own: Array, centres: Array, limit: float) -> Array:
-    """Return the lengths of ways from kernels to places where ways turn [m], (K, T); infinite beyond a limit."""
-    count, size = len(turns), len(turns) + len(own)
-    between = _seen(octants, turns, at, turns, at, limit)
-    first = _seen(octants, own, centres, turns, at, limit)
-    (a, b), (kernel, turn) = np.nonzero(np.isfinite(between) & (between > 0.0)), np.nonzero(np.isfinite(first))
-    entries = np.concatenate([between[a, b], np.maximum(first[kernel, turn], 1e-12)])
-    places = np.concatenate([a, count + kernel]), np.concatenate([b, turn])
-    graph = coo_matrix((entries, places), shape=(size, size)).tocsr()
-    return np.asarray(dijkstra(graph, indices=np.arange(count, size), limit=limit))[:, :count]
-
-
-def _seen(octants: Octants, a: Array, x: Array, b: Array, y: Array, limit: float) -> Array:
-    """Return the distances [m] between places that see each other within a limit, else infinity, (M, T).
+def _shortest(
+    octants: Octants, own: Array, centres: Array, kernel: Indices, octant: Indices, limit: Array
+) -> Array:
+    """Return the lengths of the shortest ways between kernels and octants that do not see each other [m], (H,).
 
     Args:
         octants: The object's octants.
-        a: Grid coordinates, shape (M, 3).
-        x: Their positions [m], shape (M, 3).
-        b: Grid coordinates, shape (T, 3).
-        y: Their positions [m], shape (T, 3).
-        limit: Largest distance [m].
+        own: Grid coordinates of the kernels, shape (K, 3).
+        centres: Their positions [m], shape (K, 3).
+        kernel: Kernel of each pair, ascending, shape (H,).
+        octant: Octant of each pair, shape (H,).
+        limit: Longer ways need not be found [m], shape (H,).
     """
-    away = _distances(x, y)
-    i, j = np.nonzero(away < limit)
-    clear = octants.sees(a[i], b[j])
-    found = np.full(away.shape, np.inf)
-    found[i[clear], j[clear]] = away[i[clear], j[clear]]
-    return found
+    turns, length = octants.turns, np.full(len(octant), np.inf)
+    if not len(turns.places):
+        return length
+    to_turns = _ways_to_turns(octants, own, centres, float(limit.max()))
+    some, which = np.unique(octant, return_inverse=True)
+    away = _distances(octants.points[some], turns.positions)
+    away[turns.slack(octants.own[some])] = np.inf
+    groups = np.split(np.arange(len(octant)), np.flatnonzero(np.diff(kernel)) + 1)
+    wanted = np.zeros(away.shape, dtype=bool)
+    ways = []
+    for pairs in groups:
+        near = np.flatnonzero(to_turns[kernel[pairs[0]]] < limit[pairs].max())
+        at = np.ix_(which[pairs], near)
+        way = away[at] + to_turns[kernel[pairs[0]], near]
+        wanted[at] |= way < limit[pairs][:, None]
+        ways.append((at, way))
+    i, j = np.nonzero(wanted)
+    hidden = ~octants.sees(octants.own[some[i]], turns.places[j])
+    wanted[i[hidden], j[hidden]] = False
+    for pairs, (at, way) in zip(groups, ways, strict=True):
+        length[pairs] = np.where(wanted[at], way, np.inf).min(axis=1, initial=np.inf)
+    return length
+
+
+def _ways_to_turns(octants: Octants, own: Array, centres: Array, limit: float) -> Array:
+    """Return the lengths of ways from kernels to places where ways turn [m], (K, T); infinite beyond a limit."""
+    turns = octants.turns
+    count, size = len(turns.places), len(turns.places) + len(own)
+    slack = turns.slack(turns.places)
+    between = _distances(turns.positions, turns.positions)
+    a, b = np.nonzero(np.triu((between < limit) & ~slack & ~slack.T, 1))
+    clear = octants.sees(turns.places[a], turns.places[b])
+    a, b = a[clear], b[clear]
+    first = _distances(centres, turns.positions)
+    kernel, turn = np.nonzero((first < limit) & ~turns.slack(own))
+    clear = octants.sees(own[kernel], turns.places[turn])
+    kernel, turn = kernel[clear], turn[clear]
+    entries = np.concatenate([between[a, b], between[a, b], first[kernel, turn]])
+    places = np.concatenate([a, b, count + kernel]), np.concatenate([b, a, turn])
+    graph = coo_matrix((np.maximum(entries, 1e-12), places), shape=(size, size)).tocsr()
+    return np.asarray(dijkstra(graph, indices=np.arange(count, size), limit=limit))[:, :count]
 
 
 def _distances(a: Array, b: Array) -> Array:
