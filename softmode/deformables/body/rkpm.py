@@ -240,7 +240,10 @@ class BasisRKPM:
             acting = ~self.visibility.hides(x, row, column)
             row, column = row[acting], column[acting]
         if self.detours is not None:
-            longer = added[row, column], np.stack([d[row, column] for d in along], axis=1) if slopes else np.zeros((1, 1))
+            longer = (
+                added[row, column],
+                np.stack([d[row, column] for d in along], axis=1) if slopes else np.zeros((1, 1)),
+            )
         return row, column, np.bincount(row, minlength=len(x)), longer
 
     def _evaluate_chunk(self, x: Array, first: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
@@ -281,9 +284,7 @@ class BasisRKPM:
         gradient += slope_s
         return count, column, value, gradient
 
-    def _bell(
-        self, offset: Array, column: Indices, longer: Longer | None
-    ) -> tuple[Array, Array]:
+    def _bell(self, offset: Array, column: Indices, longer: Longer | None) -> tuple[Array, Array]:
         """Return w (pairs,) and its gradient (pairs, 3) for offsets X - p_k (pairs, 3) and what detours add."""
         straight = distance = np.sqrt(np.einsum("pd,pd->p", offset, offset))
         if longer is not None:

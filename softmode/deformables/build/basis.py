@@ -13,7 +13,6 @@ from softmode.deformables.body.raw_functions import QuadraticFunctions
 from softmode.deformables.body.regions import Envelope, Region
 from softmode.deformables.body.rkpm import BasisRKPM, ShapeFunctions, make_basis
 from softmode.deformables.body.skinning_weights import SkinningWeights, constant_handle, enveloped
-from softmode.deformables.build.detours import Octants, follow_material
 from softmode.deformables.build.eigenmodes import Eigenmodes, solve_eigenmodes
 from softmode.deformables.build.elastic_functions import SPACE_ERROR, SPACE_MODE_COUNTS, Held, choose_functions
 from softmode.deformables.build.functions import (
@@ -27,6 +26,7 @@ from softmode.deformables.build.functions import (
 )
 from softmode.deformables.build.galerkin import mass_matrix
 from softmode.deformables.build.local_handles import gather_at_lips, gather_weights, place_kernels
+from softmode.deformables.build.octants import Octants
 from softmode.deformables.build.options import EIGENMODE_COUNT, BuildOptions
 from softmode.deformables.build.region_samples import RegionSamples, drive_matrices, rigid_motions
 from softmode.deformables.build.static_response import lame_parameters, solve_harmonic_weights, solve_static_responses
@@ -155,10 +155,8 @@ def _ground(domain: Domain, options: BuildOptions) -> _Ground:
     """Return the kernels of a domain and the weights of its regions."""
     count = options.kernels(len(domain.seeds), held=bool(domain.regions))
     kernels = make_basis(domain.seeds, count, kernel=options.kernel, spacing=domain.spacing, seed=options.seed)
-    if domain.octants is not None:
-        kernels = follow_material(kernels, domain.octants, domain.seeds, domain.spacing)
-    if kernels.detours is None and domain.material is not None:
-        kernels = divide_at_gaps(kernels, domain.material, domain.seeds, domain.spacing)
+    if domain.material is not None:
+        kernels = divide_at_gaps(kernels, domain.material, domain.seeds, domain.spacing, domain.octants)
     shape, blend, blend_slope = enveloped(kernels.evaluate(domain.points), domain.envelope)
     springs, pull = _springs(kernels, domain)
     mu, lame = lame_parameters(_mean_ratio(options))

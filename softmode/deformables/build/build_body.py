@@ -20,7 +20,7 @@ from softmode.deformables.body.rkpm import BasisRKPM
 from softmode.deformables.build.basis import BodyBasis, Domain, make_body_basis
 from softmode.deformables.build.cache import cache_directory, cached_body, fingerprint_of
 from softmode.deformables.build.cubature import Cubature, select_cubature
-from softmode.deformables.build.detours import octants_of
+from softmode.deformables.build.octants import octants_of
 from softmode.deformables.build.options import BuildOptions, HandleName
 from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.region_samples import octants_near, refine_at_faces, sample_regions
@@ -281,9 +281,9 @@ def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: Build
     return chosen
 
 
-def _bounded(kernels: BasisRKPM | BasisQGMLS) -> dict[str, NDArray[Any]]:
+def _bounded(kernels: BasisRKPM | BasisQGMLS) -> dict[str, NDArray]:
     """Return the fields of a body whose kernels do not act across gaps, or whose distances are not straight lines."""
-    found: dict[str, NDArray[Any]] = {}
+    found: dict[str, NDArray] = {}
     if isinstance(kernels, BasisRKPM) and kernels.visibility is not None:
         found |= {"material_points": kernels.visibility.points, "hidden_pairs": kernels.visibility.hidden}
     if isinstance(kernels, BasisRKPM) and kernels.detours is not None:
