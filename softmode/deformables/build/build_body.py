@@ -250,15 +250,15 @@ def _build(
 def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: BuildOptions, *, quick: bool) -> Cubature:
     """Choose cubature points: fitted to more poses, or more than asked for, where forces of held-out poses want that.
 
-    A quick choice is the first one.
+    If none errs as little as was asked for, it is the one that errs least. A quick choice is the first one.
 
     Warns:
         RuntimeWarning: If these forces still err by more than was asked for.
     """
     trials = options.cubature_trials(len(volumes))[: 1 if quick else None]
-    chosen = None
+    best = None
     for count, poses in trials:
-        chosen = select_cubature(
+        found = select_cubature(
             volumes,
             basis.gradient,
             count,
@@ -268,17 +268,19 @@ def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: Build
             seed=options.seed,
             quick=quick,
         )
-        if options.cubature_error is None or chosen.force_error <= options.cubature_error:
-            return chosen
-    assert chosen is not None  # There is a first trial.
+        if options.cubature_error is None or found.force_error <= options.cubature_error:
+            return found
+        if best is None or found.force_error < best.force_error:
+            best = found
+    assert best is not None  # There is a first trial.
     if len(trials) > 1:
         warnings.warn(
-            f"cubature_error: {len(chosen.index)} points leave {chosen.force_error:.2g}, "
+            f"cubature_error: {len(best.index)} points leave {best.force_error:.2g}, "
             f"{options.cubature_error:g} was asked for; give a larger cubature_count",
             RuntimeWarning,
             stacklevel=4,
         )
-    return chosen
+    return best
 
 
 def _bounded(kernels: BasisRKPM | BasisQGMLS) -> dict[str, NDArray]:
