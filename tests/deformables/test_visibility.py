@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.rkpm import BasisRKPM, make_basis
@@ -21,11 +22,10 @@ from softmode.deformables.build.patch import Patch
 from softmode.deformables.build.quadrature import quadrature_from_implicit, quadrature_from_mesh
 from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.sources import unpack_sources
-from softmode.deformables.build.detours import find_detours
-from softmode.deformables.build.octants import octants_of
 from softmode.deformables.build.visibility import Material, divide_at_gaps, find_visibility, material_of
 from softmode.errors import AssetError, BasisError
 from softmode.files import write_archive
+from softmode.objects.primitives import scaled, turned
 from tests.shapes import voxels
 
 EDGE = 0.01
@@ -126,6 +126,32 @@ def test_ways_around_an_inner_corner() -> None:
     assert np.abs(length - way)[shadow].max() < 0.3 * octants.steps.max()
     lit = (z > corner) | (x < centre[0])
     assert (added[lit] == 0.0).all() and not beside[lit & (added > 0.0)].any()
+
+
+def test_detours_turn_and_scale_with_the_object() -> None:
+    """An object that was laid down and enlarged after it was integrated has the same ways, and kernels, there."""
+    quadrature = integrate(fork(), 2000)
+    rotation = Rotation.from_rotvec([0.3, -0.7, 1.1]).as_matrix()
+    other = turned(scaled(quadrature, 2.5), rotation)
+    centres = quadrature.points[::9]
+    found = []
+    for one, at, size in ((quadrature, centres, 1.0), (other, 2.5 * centres @ rotation.T, 2.5)):
+        assert one.cells is not None
+        octants = octants_of(one.cells, at[0])
+        assert octants is not None
+        detours = find_detours(octants, at - at[0], np.full(len(at), 0.03 * size))
+        assert detours is not None
+        found.append((detours, at - at[0], one.points - at[0]))
+    (here, _, x), (there, _, y) = found
+    np.testing.assert_array_equal(here.pairs, there.pairs)
+    np.testing.assert_allclose(2.5 * here.lengths, there.lengths, atol=1e-6)
+    first, second = (
+        table.added(places, len(centres), slopes=True)
+        for table, places in ((here, x + 1e-4), (there, y + 2.5e-4 * rotation.sum(axis=1)))
+    )
+    np.testing.assert_allclose(2.5 * first[0].toarray(), second[0].toarray(), atol=1e-6)
+    slopes = [np.stack([along.toarray() for along in one[1:]], axis=2) for one in (first, second)]
+    np.testing.assert_allclose(slopes[0] @ rotation.T, slopes[1], atol=1e-3)
 
 
 def test_functions_go_on_into_a_gap() -> None:
@@ -280,7 +306,7 @@ def test_file_round_trip(body: ReducedBody, slit: ReducedBody, tmp_path: Path) -
     bar = build_body(integrate(np.ones((8, 2, 2), dtype=bool)), BuildOptions(function_count=20), progress=False)
     bar.save(path)
     with np.load(path) as file:
-        assert not {"material_points", "material_steps", "hidden_pairs", "detour_pairs", "detour_lengths"} & set(
+        assert not {"material_points", "material_frame", "hidden_pairs", "detour_pairs", "detour_lengths"} & set(
             file.files
         )
     assert ReducedBody.load(path).kernels.visibility is None and ReducedBody.load(path).kernels.detours is None
@@ -295,7 +321,7 @@ def test_files_of_version_2_are_read(slit: ReducedBody, tmp_path: Path) -> None:
             slit,
             hidden_pairs=hidden,
             material_points=slit.material_points[: len(hidden) and None],
-            material_steps=np.ones(3),
+            material_frame=np.eye(3),
             detour_pairs=none,
             detour_lengths=np.zeros(0, dtype=np.float32),
         )

@@ -68,7 +68,7 @@ def check_fields(body: Mapping[str, Any]) -> None:
         "transform": (raw, n),
         "material_points": (material, 3),
         "hidden_pairs": (hidden,),
-        "material_steps": (3,),
+        "material_frame": (3, 3),
         "detour_pairs": (detours,),
         "detour_lengths": (detours,),
         "region_stiffness": (regions,),
@@ -108,9 +108,10 @@ def check_fields(body: Mapping[str, Any]) -> None:
     for name in ("hidden_pairs", "detour_pairs"):
         if (np.diff(body[name]) <= 0).any():
             raise BasisError(f"{name}: not in ascending order")
-    for name in ("material_steps", "detour_lengths"):
-        if not (body[name] > 0.0).all():
-            raise BasisError(f"{name}: expected > 0, got {body[name].min()}")
+    if not (body["detour_lengths"] > 0.0).all():
+        raise BasisError(f"detour_lengths: expected > 0, got {body['detour_lengths'].min()}")
+    if not np.linalg.det(body["material_frame"]):
+        raise BasisError("material_frame: takes different places to one")
     own = FUNCTIONS * k if body["kernel"] == "qgmls" else 0
     counts = np.array([1, 4, 10])[body["handle_degrees"]]
     if counts.sum() + own != raw or set(body["core_index"]) != set(range(regions)):

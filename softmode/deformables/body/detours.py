@@ -32,8 +32,8 @@ class Detours:
 
     points: Array
     """Points of the material [m], shape (N, 3)."""
-    steps: Array
-    """Distance between neighbours along each axis [m], shape (3,)."""
+    frame: Array
+    """Takes positions to coordinates in which neighbours are one apart, shape (3, 3) [1/m]."""
     pairs: NDArray[np.int64]
     """Kernel * N + point of every pair whose way is longer than the straight line, ascending, shape (H,)."""
     lengths: NDArray[np.float32]
@@ -66,14 +66,14 @@ class Detours:
 
     def _shares(self, places: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
         """Return which points count at places: rows and points of the pairs, shares (pairs,), gradients (pairs, 3)."""
-        scaled = places / self.steps
+        scaled = places @ self.frame.T
         near = self._tree.query_ball_point(scaled, WIDTH, return_sorted=True)
         count = np.array([len(found) for found in near], dtype=np.intp)
         row = np.repeat(np.arange(len(places)), count)
         point = np.fromiter(itertools.chain.from_iterable(near), dtype=np.intp, count=count.sum())
         offset = (scaled[row] - self._tree.data[point]) / WIDTH
         rest = np.maximum(1.0 - (offset * offset).sum(axis=1), 0.0)
-        bump, slope = rest**3, offset * (-6.0 * rest**2 / WIDTH)[:, None] / self.steps
+        bump, slope = rest**3, (offset * (-6.0 * rest**2 / WIDTH)[:, None]) @ self.frame
         size = np.bincount(row, bump, len(places))
         total = np.maximum(size, 1e-300)
         share = bump / total[row]
@@ -104,15 +104,15 @@ class Detours:
         """Return what makes the gradient at a point of values at all, by least squares of those around, (N, N)."""
         pair = self._tree.query_pairs(WIDTH, output_type="ndarray")
         row, column = np.concatenate([pair, pair[:, ::-1]]).T
-        offset = self.points[column] - self.points[row]
-        weight = np.maximum(1.0 - ((offset / self.steps / WIDTH) ** 2).sum(axis=1), 0.0) ** 2
+        offset = self._tree.data[column] - self._tree.data[row]
+        weight = np.maximum(1.0 - ((offset / WIDTH) ** 2).sum(axis=1), 0.0) ** 2
         count = len(self.points)
         moment = np.zeros((count, 3, 3))
         for d in range(3):
             for e in range(3):
                 moment[:, d, e] = np.bincount(row, weight * offset[:, d] * offset[:, e], minlength=count)
-        moment[:, range(3), range(3)] += 1e-6 * self.steps**2
-        factor = np.einsum("nde,ne->nd", np.linalg.inv(moment)[row], offset * weight[:, None])
+        moment[:, range(3), range(3)] += 1e-6
+        factor = np.einsum("nde,ne->nd", np.linalg.inv(moment)[row], offset * weight[:, None]) @ self.frame
         found = []
         for d in range(3):
             own = -np.bincount(row, factor[:, d], minlength=count)
@@ -125,4 +125,4 @@ class Detours:
 
     @cached_property
     def _tree(self) -> KDTree:
-        return KDTree(self.points / self.steps)
+        return KDTree(self.points @ self.frame.T)

@@ -134,8 +134,8 @@ class ReducedBody:
     """Points of the material [m], shape (N, 3); empty where every kernel acts on all within its support."""
     hidden_pairs: Indices = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """Kernel * N + point of every kernel and point of the material, within its support, that a gap divides; (H,)."""
-    material_steps: Array = dataclasses.field(default_factory=lambda: np.ones(3))
-    """Distance between neighbouring points of the material along each axis [m], shape (3,)."""
+    material_frame: Array = dataclasses.field(default_factory=lambda: np.eye(3))
+    """Takes positions to coordinates in which neighbouring points are one apart, shape (3, 3) [1/m]."""
     detour_pairs: Indices = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """Kernel * N + point of every kernel and point of the material that no straight line joins; ascending, (D,)."""
     detour_lengths: NDArray[np.float32] = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.float32))
@@ -209,7 +209,7 @@ class ReducedBody:
         if len(self.detour_pairs):
             detours = Detours(
                 points=self.material_points,
-                steps=self.material_steps,
+                frame=self.material_frame,
                 pairs=self.detour_pairs,
                 lengths=self.detour_lengths,
             )
@@ -504,7 +504,7 @@ class ReducedBody:
 
 _TABLES = {
     "hidden_pairs": {"material_points", "hidden_pairs"},
-    "detour_pairs": {"material_points", "material_steps", "detour_pairs", "detour_lengths"},
+    "detour_pairs": {"material_points", "material_frame", "detour_pairs", "detour_lengths"},
 }
 """Arrays that only the file of a body has whose kernels do not act across gaps, or go around corners."""
 

@@ -290,7 +290,7 @@ def _bounded(kernels: BasisRKPM | BasisQGMLS) -> dict[str, NDArray]:
         found |= {"material_points": kernels.visibility.points, "hidden_pairs": kernels.visibility.hidden}
     if isinstance(kernels, BasisRKPM) and kernels.detours is not None:
         table = kernels.detours
-        found |= {"material_points": table.points, "material_steps": table.steps}
+        found |= {"material_points": table.points, "material_frame": table.frame}
         found |= {"detour_pairs": table.pairs, "detour_lengths": table.lengths}
     return found
 

@@ -311,6 +311,7 @@ class _Cutter:
                 of_octant=cells.of_octant[octants],
                 place=None if cells.place is None else cells.place[octants],
                 borders=cells.borders,
+                axes=cells.axes,
                 severed=severed if len(severed) else None,
             ),
         )

@@ -57,7 +57,7 @@ def more_detours(octants: Octants, found: Detours, centres: Array, support: Arra
 def _table(octants: Octants, kernel: Indices, octant: Indices, added: Array) -> Detours:
     """Return detours from kernel, octant and length of every pair."""
     pairs = (kernel * len(octants.points) + octant).astype(np.int64)
-    return Detours(points=octants.points, steps=octants.steps, pairs=pairs, lengths=added.astype(np.float32))
+    return Detours(points=octants.points, frame=octants.frame, pairs=pairs, lengths=added.astype(np.float32))
 
 
 def _longer(octants: Octants, centres: Array, support: Array) -> tuple[Indices, Indices, Array, Array]:

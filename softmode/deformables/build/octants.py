@@ -68,7 +68,9 @@ class Octants:
     place: NDArray[np.int64]
     """Their places in the grid of octants, at least 1, shape (N, 3)."""
     borders: tuple[Array, Array, Array]
-    """Borders of the octants along each axis, one more than places, from place 0 on [m]."""
+    """Borders of the octants along each axis of the grid, one more than places, from place 0 on [m]."""
+    axes: Array
+    """Axes of the grid, unit vectors in rows, shape (3, 3)."""
     links: Indices
     """Pairs that touch, the lower one first, shape (E, 2)."""
 
@@ -96,9 +98,16 @@ class Octants:
         """Edges of an octant [m], shape (3,)."""
         return np.array([np.median(np.diff(line)) for line in self.borders])
 
+    @property
+    def frame(self) -> Array:
+        """What takes positions to coordinates in which octants are one apart, shape (3, 3) [1/m]."""
+        return self.axes / self.steps[:, None]
+
     def coordinates(self, x: Array) -> Array:
         """Return the coordinates of positions (M, 3) [m] in the grid: an octant begins at its place."""
-        return np.stack([np.interp(x[:, d], line, np.arange(len(line))) for d, line in enumerate(self.borders)], axis=1)
+        along = x @ self.axes.T
+        found = [np.interp(along[:, d], line, np.arange(len(line))) for d, line in enumerate(self.borders)]
+        return np.stack(found, axis=1)
 
     @cached_property
     def grid(self) -> Indices:
@@ -114,14 +123,12 @@ class Octants:
 
     def positions(self, coordinates: Array) -> Array:
         """Return the positions [m] of grid coordinates (M, 3)."""
-        found: Array = np.stack(
-            [np.interp(coordinates[:, d], np.arange(len(line)), line) for d, line in enumerate(self.borders)], axis=1
-        )
-        return found
+        along = [np.interp(coordinates[:, d], np.arange(len(line)), line) for d, line in enumerate(self.borders)]
+        return np.stack(along, axis=1) @ self.axes
 
     def homes(self, x: Array) -> Indices:
         """Return the octant that each of some points of the material (M, 3) [m] lies in."""
-        return np.asarray(KDTree(self.points / self.steps).query(x / self.steps)[1])
+        return np.asarray(KDTree(self.points @ self.frame.T).query(x @ self.frame.T)[1])
 
     def sees(self, a: Array, b: Array) -> Mask:
         """Return between which of the pairs of grid coordinates (M, 3) a straight line runs through the material."""
@@ -240,14 +247,15 @@ def octants_of(cells: Cells, offset: Array) -> Octants | None:
     links = touching(whole)
     assert links is not None and whole.place is not None  # Their places are known.
     first = whole.place.min(axis=0)
-    lines = []
+    axes, lines = np.eye(3) if cells.axes is None else cells.axes, []
     for d, (line, low) in enumerate(zip(cells.borders, first, strict=True)):
-        known = line[np.isfinite(line)][low:] - offset[d]
+        known = line[np.isfinite(line)][low:] - axes[d] @ offset
         lines.append(np.concatenate([[2.0 * known[0] - known[1]], known, [2.0 * known[-1] - known[-2]]]))
     return Octants(
         points=whole.octants - offset,
         place=whole.place - first + 1,
         borders=(lines[0], lines[1], lines[2]),
+        axes=axes,
         links=links,
     )
 

@@ -48,7 +48,10 @@ class Cells:
     place: NDArray[np.int64] | None = None
     """Place of each octant in the grid of octants, shape (Q, 3); None in files written before 0.3."""
     borders: Array | None = None
-    """Borders of the octants along each axis [m], rows filled up by infinity, shape (3, B); None where `place` is."""
+    """Borders of the octants along each axis of the grid [m], rows filled up by infinity, shape (3, B); None in files
+    of bodies of version 2."""
+    axes: Array | None = None
+    """Axes of the grid, unit vectors in rows, shape (3, 3); None: those of the coordinates."""
     severed: NDArray[np.int64] | None = None
     """Pairs of octants that a cut divides, though they are neighbours, the lower one first, shape (E, 2)."""
 
