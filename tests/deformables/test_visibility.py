@@ -101,33 +101,6 @@ def test_ways_around_an_inner_corner() -> None:
     assert (added[lit] == 0.0).all() and not beside[lit & (added > 0.0)].any()
 
 
-def test_ways_around_an_inner_corner() -> None:
-    """Across the corner of an L of full bricks the way is |a - c| + |c - b|, and counts as its third power."""
-    mask = np.zeros((4, 2, 4), dtype=bool)
-    mask[:2] = mask[:, :, :2] = True
-    quadrature = integrate(mask, 2000)
-    assert quadrature.cells is not None
-    octants = octants_of(quadrature.cells, np.zeros(3))
-    assert octants is not None
-    centre, corner = quadrature.points[((quadrature.points - [0.018, 0.01, 0.026]) ** 2).sum(axis=1).argmin()], 0.02
-    found = find_detours(octants, centre[None], np.array([0.03]))
-    assert found is not None
-    added = np.zeros(len(octants.points))
-    added[found.pairs] = found.lengths
-    x, z = octants.points[:, 0], octants.points[:, 2]
-    way = np.hypot(centre[0] - corner, centre[2] - corner) + np.hypot(x - corner, z - corner)
-    way = np.hypot(way, octants.points[:, 1] - centre[1])
-    straight = np.linalg.norm(octants.points - centre, axis=1)
-    beside = (x - centre[0]) * (corner - centre[2]) > (corner - centre[0]) * (z - centre[2])
-    shadow = (added > 1e-3) & (straight * (way / straight) ** 3 < 0.03)
-    assert shadow.sum() > 20 and (x[shadow] > corner).all()
-    # A way turns in the octants at the corner, less than half an octant from it.
-    length = straight * (1.0 + added / straight) ** (1.0 / 3.0)
-    assert np.abs(length - way)[shadow].max() < 0.3 * octants.steps.max()
-    lit = (z > corner) | (x < centre[0])
-    assert (added[lit] == 0.0).all() and not beside[lit & (added > 0.0)].any()
-
-
 def test_detours_turn_and_scale_with_the_object() -> None:
     """An object that was laid down and enlarged after it was integrated has the same ways, and kernels, there."""
     quadrature = integrate(fork(), 2000)

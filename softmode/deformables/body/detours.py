@@ -22,6 +22,8 @@ from scipy.spatial import KDTree
 
 Array = NDArray[np.float64]
 
+SOFT = 0.05
+"""Detours shorter than this fraction of an octant fade out smoothly."""
 WIDTH = 1.5
 """Points of the material count at a place nearer than this many steps: not those beyond a gap of one step."""
 
@@ -57,12 +59,21 @@ class Detours:
                 factors.append([slope[:, d], *(slope[:, d, None] * away).T])
                 factors[-1][1 + d] = factors[-1][1 + d] + share
         entries = np.stack(factors)  # (1 or 4, 4, pairs)
+
+        def like(matrix: Any, data: Array) -> Any:
+            return sparse.csr_matrix((data, matrix.indices, matrix.indptr), shape=matrix.shape)
+
         at = np.arange(len(entries))[:, None, None] * count + row, np.arange(4)[:, None] * size + point
         at = tuple(np.broadcast_to(index, entries.shape).ravel() for index in at)
         means: Any = sparse.csr_matrix((entries.ravel(), at), shape=(len(entries) * count, 4 * size))
         table = self._linear
         found = means @ sparse.csr_matrix((table.data, table.indices, table.indptr), shape=(4 * size, kernel_count))
-        return [found[i * count : (i + 1) * count] for i in range(len(entries))]
+        value, *along = [found[i * count : (i + 1) * count] for i in range(len(entries))]
+        # Linear functions go below zero where the shadow begins: from there on nothing is added, without a kink.
+        rest = np.maximum(value.data, 0.0)
+        soft = SOFT / float(np.linalg.norm(self.frame, axis=1).max())
+        factor = like(value, rest * (rest + 2.0 * soft) / (rest + soft) ** 2)
+        return [like(value, rest**2 / (rest + soft)), *(slope.multiply(factor).tocsr() for slope in along)]
 
     def _shares(self, places: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
         """Return which points count at places: rows and points of the pairs, shares (pairs,), gradients (pairs, 3)."""
