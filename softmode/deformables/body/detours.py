@@ -108,7 +108,8 @@ class Detours:
         table = sparse.csr_matrix(entries, shape=(len(self.points), int(kernel[-1]) + 1))
         acting = sparse.csr_matrix((np.ones(table.nnz), table.indices, table.indptr), shape=table.shape)
         changes: list[Any] = [change @ table for change in self._changes]
-        return sparse.vstack([table, *(change.multiply(acting) for change in changes)], format="csr")  # Lit: no change.
+        found: Any = sparse.vstack([table, *(change.multiply(acting) for change in changes)], format="csr")
+        return found  # Lit: no change.
 
     @cached_property
     def _changes(self) -> list[sparse.csr_matrix]:

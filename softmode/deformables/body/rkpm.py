@@ -229,21 +229,19 @@ class BasisRKPM:
         origin = self.centres.mean(axis=0)
         a, b = x - origin, self.centres - origin
         distance_sq = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2.0 * (a @ b.T)
-        near, longer = distance_sq < self.support**2 * (1.0 + 1e-9), None
+        near, tables = distance_sq < self.support**2 * (1.0 + 1e-9), []
         if self.detours is not None:
-            tables = self.detours.added(x, self.kernel_count, slopes=slopes)
-            added, *along = (matrix.toarray() for matrix in tables)
+            tables = [matrix.toarray() for matrix in self.detours.added(x, self.kernel_count, slopes=slopes)]
             straight = np.sqrt(np.maximum(distance_sq, 0.0))
-            near &= (added == 0.0) | (straight + added < self.support * (1.0 + 1e-9))
+            near &= (tables[0] == 0.0) | (straight + tables[0] < self.support * (1.0 + 1e-9))
         row, column = np.nonzero(near)
         if self.visibility is not None:
             acting = ~self.visibility.hides(x, row, column)
             row, column = row[acting], column[acting]
-        if self.detours is not None:
-            longer = (
-                added[row, column],
-                np.stack([d[row, column] for d in along], axis=1) if slopes else np.zeros((1, 1)),
-            )
+        longer = None
+        if tables:
+            along = [table[row, column] for table in tables]
+            longer = along[0], np.stack(along[1:], axis=1) if slopes else np.zeros((1, 1))
         return row, column, np.bincount(row, minlength=len(x)), longer
 
     def _evaluate_chunk(self, x: Array, first: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:

@@ -90,7 +90,7 @@ class Octants:
             hull = ConvexHull(self.points).equations
         except QhullError:
             return False
-        middle = self.positions(np.argwhere(flat & beside) + 0.5)
+        middle = self.positions(np.argwhere(flat & beside).astype(np.float64) + 0.5)
         return not (middle @ hull[:, :3].T + hull[:, 3] < -1e-9).all(axis=1).any()
 
     @cached_property
@@ -156,7 +156,7 @@ class Octants:
                 there = [flat[home + wall.astype(int) @ (stride * axes)] >= 0 for axes in np.eye(3, dtype=int)[[a, b]]]
                 bent = np.flatnonzero(there[0] & there[1] & (flat[home + wall.astype(int) @ stride] < 0))
                 found.append(np.concatenate([at[bent] + 0.5 + TURN * wall, np.tile(wall, (len(bent), 1))], axis=1))
-        places = _thinned(np.unique(np.concatenate(found), axis=0))
+        places = _thinned(np.unique(np.concatenate(found).astype(np.float64), axis=0))
         return Turns(places=places[:, :3], walls=places[:, 3:], positions=self.positions(places[:, :3]))
 
     @cached_property
@@ -167,10 +167,10 @@ class Octants:
 
     def _filled(self, low: Indices, high: Indices) -> Mask:
         """Return which boxes of places, ends included, hold all octants."""
-        total = np.zeros(len(low), dtype=np.int64)
+        ends, total = (low, high + 1), np.zeros(len(low), dtype=np.int64)
         for corner in itertools.product((0, 1), repeat=3):
-            pick = [np.where(corner[d], high[:, d] + 1, low[:, d]) for d in range(3)]
-            total += (-1) ** (3 - sum(corner)) * self._sums[tuple(pick)]
+            x, y, z = (ends[end][:, d] for d, end in enumerate(corner))
+            total += (-1) ** (3 - sum(corner)) * self._sums[x, y, z]
         return total == 0
 
     def _clear(self, a: Array, b: Array) -> Mask:
@@ -187,8 +187,7 @@ class Octants:
         missing, outside, since = self.grid.ravel() < 0, np.zeros(len(a)), np.zeros(len(a))
         clear = np.zeros(len(a), dtype=bool)
         while len(lines):
-            axis = ahead.argmin(axis=1)
-            pick = np.arange(len(lines)), axis
+            pick = np.arange(len(lines)), ahead.argmin(axis=1)
             until = np.minimum(ahead[pick], 1.0)
             outside += np.where(missing[at], (until - since) * length, 0.0)
             over, last = outside > GRAZING, until >= 1.0
@@ -198,8 +197,9 @@ class Octants:
             since = until
             if (done := over | last).any():
                 left = np.flatnonzero(~done)
-                lines, at, outside, since, length = (part[left] for part in (lines, at, outside, since, length))
-                ahead, per, towards = ahead[left], per[left], towards[left]
+                lines, at, towards = lines[left], at[left], towards[left]
+                outside, since, length = outside[left], since[left], length[left]
+                ahead, per = ahead[left], per[left]
         return clear
 
 
