@@ -230,7 +230,7 @@ def archive_bytes(header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]])
 def read_archive(
     path: str | os.PathLike[str] | bytes,
     kind: str,
-    version: int,
+    version: int | Collection[int],
     *,
     what: str = "archive",
     hint: str = "write it again",
@@ -241,7 +241,7 @@ def read_archive(
     Args:
         path: The file, or its bytes.
         kind: Its `format`.
-        version: Its `version`.
+        version: Its `version`, or all that are read.
         what: What it is, for messages.
         hint: The remedy if it cannot be read.
         error: What is raised then.
@@ -258,8 +258,11 @@ def read_archive(
         header = json.loads(arrays.pop("header").tobytes()) if "header" in arrays else None
     if not isinstance(header, dict) or header.pop("format", None) != kind:
         raise error(f"{what} {path}: not a {kind}", hint=hint)
-    if (found := header.pop("version", None)) != version:
-        raise error(f"{what} {path}: format version {found}, this softmode reads {version}", hint=hint)
+    read = (version,) if isinstance(version, int) else tuple(version)
+    if (found := header.pop("version", None)) not in read:
+        raise error(
+            f"{what} {path}: format version {found}, this softmode reads {' and '.join(map(str, read))}", hint=hint
+        )
     return header, arrays
 
 

@@ -94,7 +94,7 @@ def primitive_quadrature(shape: Primitive, extents: Extents, surface_count: int)
 
 def turned(quadrature: Quadrature, rotation: ArrayLike) -> Quadrature:
     """Return the quadrature after a rotation (3, 3); the same points, so that a stable pose stays one."""
-    turn = np.asarray(rotation, dtype=np.float64)
+    turn, cells = np.asarray(rotation, dtype=np.float64), quadrature.cells
     surface = quadrature.surface_points @ turn.T
     return replace(
         quadrature,
@@ -102,7 +102,10 @@ def turned(quadrature: Quadrature, rotation: ArrayLike) -> Quadrature:
         surface_points=surface,
         surface_normals=quadrature.surface_normals @ turn.T,
         bounds=np.stack([surface.min(axis=0), surface.max(axis=0)]),
-        cells=quadrature.cells and replace(quadrature.cells, octants=quadrature.cells.octants @ turn.T),
+        cells=cells
+        and replace(
+            cells, octants=cells.octants @ turn.T, axes=(np.eye(3) if cells.axes is None else cells.axes) @ turn.T
+        ),
     )
 
 
@@ -120,7 +123,13 @@ def scaled(quadrature: Quadrature, factor: float) -> Quadrature:
         volume=quadrature.volume * factor**3,
         bounds=quadrature.bounds * factor,
         report=told,
-        cells=cells and replace(cells, octants=cells.octants * factor, weights=cells.weights * factor**3),
+        cells=cells
+        and replace(
+            cells,
+            octants=cells.octants * factor,
+            weights=cells.weights * factor**3,
+            borders=None if cells.borders is None else cells.borders * factor,
+        ),
     )
 
 

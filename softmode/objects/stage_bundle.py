@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softmode.deformables.body.reduced_body import FORMAT, FORMAT_VERSION, ReducedBody
+from softmode.deformables.body.reduced_body import FORMAT, READABLE, ReducedBody
 from softmode.errors import AssetError
 from softmode.stages import tokens
 
@@ -83,7 +83,7 @@ def decode_body(header: str, arrays: Mapping[str, NDArray], digest: str, source:
         shaped[name] = flat[name].reshape(shape).copy()
     if set(flat) != set(described):
         raise AssetError(f"{source}: its softmode body has arrays that its header does not name", hint=_HINT)
-    if (fields.pop("format", None), fields.pop("version", None)) != (FORMAT, FORMAT_VERSION):
+    if fields.pop("format", None) != FORMAT or fields.pop("version", None) not in READABLE:
         raise AssetError(f"{source}: its softmode body is of another version", hint=_HINT)
     return ReducedBody.from_fields(fields, shaped, source, hint=_HINT)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -151,6 +153,24 @@ def test_deterministic_and_seeded(full) -> None:
     np.testing.assert_array_equal(first.index, again.index)
     np.testing.assert_array_equal(first.weights, again.weights)
     assert not np.array_equal(first.index, other.index)
+
+
+def test_the_best_trial_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where no trial meets the goal the body has the one that errs least, though a later one errs more."""
+    errors = []
+
+    def poorer(weights: np.ndarray, gradient: np.ndarray, count: int, **settings: Any) -> cubature.Cubature:
+        found = select_cubature(weights, gradient, count if len(errors) < 2 else 48, **settings)
+        errors.append(found.force_error)
+        return found
+
+    monkeypatch.setattr("softmode.deformables.build.build_body.select_cubature", poorer)
+    options = BuildOptions(function_count=36, cubature_count=384, cubature_error=1e-9)
+    with pytest.warns(RuntimeWarning, match="cubature_error"):
+        body = build_body(quadrature_from_box((0.06, 0.05, 0.04), point_count=800), options, progress=False)
+    assert len(errors) == 4 and min(errors) < errors[-1]
+    assert body.provenance["cubature_force_error"] == min(errors)
+    assert len(body.points) > 48
 
 
 def test_all_points_and_bad_input(full) -> None:

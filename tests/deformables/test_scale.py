@@ -49,6 +49,7 @@ def enlarged(body, s):
         "points": 1, "weights": 3, "grad_basis": -1, "surface_points": 1, "surface_areas": 2, "volume": 3,
         "eigenvalues": -2, "bounds": 1, "offset": 1, "centres": 1, "radii": 1, "length": 1, "region_stiffness": -2,
         "region_radii": 1, "region_cores": 1, "region_points": 1, "region_weights": 3, "material_points": 1,
+        "material_frame": -1, "detour_lengths": 1,
     }  # fmt: skip
     changes = {}
     for name, power in powers.items():

@@ -21,8 +21,8 @@ _KINDS = {
     "provenance": dict,
     "build_seconds": float,
 }
-_FLOAT32 = ("grad_basis", "surface_basis")
-_INDICES = ("handle_degrees", "handle_regions", "core_index", "region_index", "hidden_pairs")
+_FLOAT32 = ("grad_basis", "surface_basis", "detour_lengths")
+_INDICES = ("handle_degrees", "handle_regions", "core_index", "region_index", "hidden_pairs", "detour_pairs")
 
 
 def check_fields(body: Mapping[str, Any]) -> None:
@@ -43,7 +43,7 @@ def check_fields(body: Mapping[str, Any]) -> None:
 
     p, s, n, k = count("points", "surface_points", "mean_basis", "centres")
     m, j, raw = count("eigenvalues", "handle_degrees", "transform")
-    material, hidden = count("material_points", "hidden_pairs")
+    material, hidden, detours = count("material_points", "hidden_pairs", "detour_pairs")
     regions, cores, samples = count("region_names", "core_index", "region_index")
     r, volume, weights = body["driven_count"], body["volume"], body["weights"]
     expected = {
@@ -68,6 +68,9 @@ def check_fields(body: Mapping[str, Any]) -> None:
         "transform": (raw, n),
         "material_points": (material, 3),
         "hidden_pairs": (hidden,),
+        "material_frame": (3, 3),
+        "detour_pairs": (detours,),
+        "detour_lengths": (detours,),
         "region_stiffness": (regions,),
         "region_radii": (regions,),
         "region_cores": (cores, 2, 3),
@@ -96,13 +99,19 @@ def check_fields(body: Mapping[str, Any]) -> None:
         "core_index": (0, regions - 1),
         "region_index": (0, regions - 1),
         "hidden_pairs": (0, k * material - 1),
+        "detour_pairs": (0, k * material - 1),
     }
     for name, (low, high) in ranges.items():
         value = body[name]
         if len(value) and not (low <= value.min() and value.max() <= high):
             raise BasisError(f"{name}: expected {low}..{high}, got {value.min()}..{value.max()}")
-    if (np.diff(body["hidden_pairs"]) <= 0).any():
-        raise BasisError("hidden_pairs: not in ascending order")
+    for name in ("hidden_pairs", "detour_pairs"):
+        if (np.diff(body[name]) <= 0).any():
+            raise BasisError(f"{name}: not in ascending order")
+    if not (body["detour_lengths"] > 0.0).all():
+        raise BasisError(f"detour_lengths: expected > 0, got {body['detour_lengths'].min()}")
+    if not np.linalg.det(body["material_frame"]):
+        raise BasisError("material_frame: takes different places to one")
     own = FUNCTIONS * k if body["kernel"] == "qgmls" else 0
     counts = np.array([1, 4, 10])[body["handle_degrees"]]
     if counts.sum() + own != raw or set(body["core_index"]) != set(range(regions)):

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from softmode.deformables.body.check import check_fields
+from softmode.deformables.body.detours import Detours
 from softmode.deformables.body.qgmls import BasisQGMLS
 from softmode.deformables.body.raw_functions import QuadraticFunctions, RawFunctions, SkinningFunctions
 from softmode.deformables.body.regions import Envelope, Region
@@ -37,8 +38,10 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Scalar = str | int | float | bool | None
 
-FORMAT, FORMAT_VERSION = "softmode.ReducedBody", 2
+FORMAT, FORMAT_VERSION = "softmode.ReducedBody", 3
 """Kind and version of a body's file."""
+READABLE = (2, 3)
+"""Versions that are read. Bodies of version 2 have no detours, and keep the functions that they had."""
 _HINT = "build the body again"
 RATIO_HARMLESS = 0.45
 """Poisson's ratio up to which functions made for any other serve."""
@@ -131,6 +134,12 @@ class ReducedBody:
     """Points of the material [m], shape (N, 3); empty where every kernel acts on all within its support."""
     hidden_pairs: Indices = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """Kernel * N + point of every kernel and point of the material, within its support, that a gap divides; (H,)."""
+    material_frame: Array = dataclasses.field(default_factory=lambda: np.eye(3))
+    """Takes positions to coordinates in which neighbouring points are one apart, shape (3, 3) [1/m]."""
+    detour_pairs: Indices = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """Kernel * N + point of every kernel and point of the material that no straight line joins; ascending, (D,)."""
+    detour_lengths: NDArray[np.float32] = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.float32))
+    """What is added to the distance of each pair [m], > 0, shape (D,)."""
     sources: Mapping[str, NDArray[Any]] | None = dataclasses.field(default=None, repr=False, compare=False)
     """What it was built from, for :func:`softmode.deformables.hold`, or None; see ``build.sources``."""
 
@@ -194,8 +203,19 @@ class ReducedBody:
                 f"body {self.name!r}: functions of Q-GMLS are made of no skinning weights and reproducing kernels",
                 hint="build it with other handles, such as handles='local'",
             )
-        visibility = Visibility(points=self.material_points, hidden=self.hidden_pairs) if self._divided else None
-        return BasisRKPM(centres=self.centres, radii=self.radii, kernel=self.kernel, visibility=visibility)
+        visibility = detours = None
+        if len(self.hidden_pairs):
+            visibility = Visibility(points=self.material_points, hidden=self.hidden_pairs)
+        if len(self.detour_pairs):
+            detours = Detours(
+                points=self.material_points,
+                frame=self.material_frame,
+                pairs=self.detour_pairs,
+                lengths=self.detour_lengths,
+            )
+        return BasisRKPM(
+            centres=self.centres, radii=self.radii, kernel=self.kernel, visibility=visibility, detours=detours
+        )
 
     @property
     def skinned(self) -> bool:
@@ -218,7 +238,7 @@ class ReducedBody:
 
     @property
     def _divided(self) -> bool:
-        return len(self.hidden_pairs) > 0
+        return len(self.hidden_pairs) + len(self.detour_pairs) > 0
 
     def evaluate(self, points: ArrayLike, *, outside: str = "clamp") -> tuple[Array, Array]:
         """Evaluate the functions and their gradients at rest points of the body frame.
@@ -393,8 +413,10 @@ class ReducedBody:
         values = {f.name: getattr(self, f.name) for f in _own_fields()}
         arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
         told = {name: value for name, value in values.items() if name not in arrays}
-        if not self._divided:
-            arrays = {name: value for name, value in arrays.items() if name not in _DIVIDED}
+        empty = set().union(*(names for name, names in _TABLES.items() if not len(getattr(self, name))))
+        if self._divided:
+            empty -= {"material_points"}
+        arrays = {name: value for name, value in arrays.items() if name not in empty}
         return {"format": FORMAT, "version": FORMAT_VERSION, **told}, arrays
 
     @classmethod
@@ -413,8 +435,11 @@ class ReducedBody:
             AssetError: If they are not those of a body.
         """
         names = {f.name for f in _own_fields()}
-        if not arrays.keys() & _DIVIDED:
-            names -= _DIVIDED
+        for table in _TABLES.values():
+            if not arrays.keys() & (table - {"material_points"}):
+                names -= table
+        if arrays.keys() & set().union(*_TABLES.values()):
+            names |= {"material_points"}
         if set(header) | set(arrays) != names or set(header) & set(arrays):
             wrong = sorted(names ^ (set(header) | set(arrays)))
             raise AssetError(f"{source}: fields {wrong} do not match", hint=hint)
@@ -461,7 +486,7 @@ class ReducedBody:
         Raises:
             AssetError: If the file is missing, damaged, foreign, or of another version.
         """
-        header, arrays = read_archive(path, FORMAT, FORMAT_VERSION, what="body file", hint=_HINT)
+        header, arrays = read_archive(path, FORMAT, READABLE, what="body file", hint=_HINT)
         own = {name: array for name, array in arrays.items() if "." not in name}
         body = cls.from_fields(header, own, f"body file {path}")
         sources = {n.removeprefix(_SOURCES): a for n, a in arrays.items() if n.startswith(_SOURCES)}
@@ -477,8 +502,11 @@ class ReducedBody:
         check_fields({f.name: getattr(self, f.name) for f in _own_fields()})
 
 
-_DIVIDED = {"material_points", "hidden_pairs"}
-"""Arrays that only the file of a body has whose kernels do not act across gaps."""
+_TABLES = {
+    "hidden_pairs": {"material_points", "hidden_pairs"},
+    "detour_pairs": {"material_points", "material_frame", "detour_pairs", "detour_lengths"},
+}
+"""Arrays that only the file of a body has whose kernels do not act across gaps, or go around corners."""
 
 
 def _own_fields() -> list[dataclasses.Field[Any]]:

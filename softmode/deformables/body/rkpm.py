@@ -22,11 +22,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from scipy.spatial import KDTree
 
+from softmode.deformables.body.detours import Detours
 from softmode.deformables.body.visibility import Visibility
 from softmode.errors import BasisError, ConfigError
 
 KernelName = Literal["cubic", "gaussian"]
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Longer = tuple[Array, Array]
+"""What detours add to the distances of pairs [m] (pairs,), and its gradient (pairs, 3) where that is asked for."""
 
 CUBIC_SUPPORT = 3.0
 """Support radius of the cubic spline in units of r_k (measured: faster than, and as accurate as, the Gaussian)."""
@@ -95,6 +99,8 @@ class BasisRKPM:
     kernel: KernelName = "cubic"
     visibility: Visibility | None = None
     """What of the material the kernels act on; None: all within their support."""
+    detours: Detours | None = None
+    """By how much their distances through the material are longer than straight lines; None: nowhere."""
 
     def __post_init__(self) -> None:
         """Check shapes, finiteness and the kernel's name."""
@@ -161,10 +167,10 @@ class BasisRKPM:
         found = np.full(len(x), np.inf)
         step = max(1, _PAIRS_PER_CHUNK // self.kernel_count)
         for i in range(0, len(x), step):
-            row, column, count = self._pairs(x[i : i + step])
+            row, column, count, longer = self._pairs(x[i : i + step])
             offset = x[i : i + step][row] - self.centres[column]
             poly = np.column_stack([np.ones(len(row)), offset / float(self.support.mean())])
-            bell, moment = self._bell(offset, column)[0], np.empty((len(count), 4, 4))
+            bell, moment = self._bell(offset, column, longer)[0], np.empty((len(count), 4, 4))
             for a, b in zip(*np.triu_indices(4), strict=True):
                 entry = np.bincount(row, poly[:, a] * poly[:, b] * bell, minlength=len(count))
                 moment[:, a, b] = moment[:, b, a] = entry
@@ -178,25 +184,35 @@ class BasisRKPM:
         """Return the distance [m] (N,) to the nearest kernel that acts at each of points (N, 3), and which it is."""
         found: Any = self._tree.query(points)
         distance, nearest = found
-        if self.visibility is not None:
-            lost = np.flatnonzero(self.visibility.hides(points, np.arange(len(points)), nearest))
-            for rows in np.array_split(lost, 1 + len(lost) * self.kernel_count // _PAIRS_PER_CHUNK):
-                away = np.linalg.norm(points[rows, None] - self.centres, axis=2)
+        if self.visibility is None and self.detours is None:
+            return distance, nearest
+        for rows in np.array_split(np.arange(len(points)), 1 + len(points) * self.kernel_count // _PAIRS_PER_CHUNK):
+            some = np.arange(len(rows))
+            added: Any = None if self.detours is None else self.detours.added(points[rows], self.kernel_count)[0]
+            lost = np.zeros(len(rows), dtype=bool) if added is None else np.ravel(added[some, nearest[rows]]) > 0.0
+            if self.visibility is not None:
+                lost |= self.visibility.hides(points[rows], some, nearest[rows])
+            some = np.flatnonzero(lost)
+            away = np.linalg.norm(points[rows[some], None] - self.centres, axis=2)
+            if added is not None:
+                away += added[some].toarray()
+            if self.visibility is not None:
                 row, column = np.divmod(np.arange(away.size), self.kernel_count)
-                away[self.visibility.hides(points[rows], row, column).reshape(away.shape)] = np.inf
-                nearest[rows] = away.argmin(axis=1)
-                distance[rows] = away.min(axis=1)
+                away[self.visibility.hides(points[rows[some]], row, column).reshape(away.shape)] = np.inf
+            nearest[rows[some]] = away.argmin(axis=1)
+            distance[rows[some]] = away.min(axis=1)
         return distance, nearest
 
     def covered(self, points: Array) -> NDArray[np.bool_]:
         """Return at which of points (N, 3) `evaluate` finds enough kernels, shape (N,)."""
         found = np.zeros(len(points), dtype=bool)
         for some in np.array_split(np.arange(len(points)), 1 + len(points) * self.kernel_count // _PAIRS_PER_CHUNK):
-            row, column, count = self._pairs(points[some])
+            row, column, count, longer = self._pairs(points[some])
             offset = points[some[row]] - self.centres[column]
             poly = np.column_stack([np.ones(len(row)), offset / float(self.support.mean())])
             moment = np.zeros((len(some), 4, 4))
-            np.add.at(moment, row, self._bell(offset, column)[0][:, None, None] * poly[:, :, None] * poly[:, None])
+            bell = self._bell(offset, column, longer)[0]
+            np.add.at(moment, row, bell[:, None, None] * poly[:, :, None] * poly[:, None])
             found[some] = (count >= 4) & ~_inverted(moment)[1]
         return found
 
@@ -204,25 +220,38 @@ class BasisRKPM:
     def _tree(self) -> KDTree:
         return KDTree(self.centres)
 
-    def _pairs(self, x: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-        """Return the row and kernel of every pair within reach, by rows, and kernels per point (N,)."""
+    def _pairs(self, x: Array, *, slopes: bool = False) -> tuple[Indices, Indices, Indices, Longer | None]:
+        """Return the row and kernel of every pair within reach, by rows, and kernels per point (N,).
+
+        Last, what detours add to the distances of these pairs [m] (pairs,), and, if asked for, its gradient (pairs, 3),
+        else zeros (1, 1); None without detours.
+        """
         origin = self.centres.mean(axis=0)
         a, b = x - origin, self.centres - origin
         distance_sq = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2.0 * (a @ b.T)
-        row, column = np.nonzero(distance_sq < self.support**2 * (1.0 + 1e-9))
+        near, tables = distance_sq < self.support**2 * (1.0 + 1e-9), []
+        if self.detours is not None:
+            tables = [matrix.toarray() for matrix in self.detours.added(x, self.kernel_count, slopes=slopes)]
+            straight = np.sqrt(np.maximum(distance_sq, 0.0))
+            near &= (tables[0] == 0.0) | (straight + tables[0] < self.support * (1.0 + 1e-9))
+        row, column = np.nonzero(near)
         if self.visibility is not None:
             acting = ~self.visibility.hides(x, row, column)
             row, column = row[acting], column[acting]
-        return row, column, np.bincount(row, minlength=len(x))
+        longer = None
+        if tables:
+            along = [table[row, column] for table in tables]
+            longer = along[0], np.stack(along[1:], axis=1) if slopes else np.zeros((1, 1))
+        return row, column, np.bincount(row, minlength=len(x)), longer
 
     def _evaluate_chunk(self, x: Array, first: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
         """Return kernels per point (N,), column of each pair, value (pairs,) and gradient (pairs, 3)."""
-        row, column, count = self._pairs(x)
+        row, column, count, longer = self._pairs(x, slopes=True)
         if count.min() < 4:
             self._raise_uncovered(np.flatnonzero(count < 4) + first, x[count < 4])
         h = float(self.support.mean())
         offset = np.take(x, row, axis=0) - np.take(self.centres, column, axis=0)
-        w, slope = self._bell(offset, column)
+        w, slope = self._bell(offset, column, longer)
         poly = np.empty((len(row), 4))
         poly[:, 0] = 1.0
         np.divide(offset, h, out=poly[:, 1:])
@@ -253,9 +282,11 @@ class BasisRKPM:
         gradient += slope_s
         return count, column, value, gradient
 
-    def _bell(self, offset: Array, column: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Return w (pairs,) and its gradient (pairs, 3) for offsets X - p_k (pairs, 3)."""
-        distance = np.sqrt(np.einsum("pd,pd->p", offset, offset))
+    def _bell(self, offset: Array, column: Indices, longer: Longer | None) -> tuple[Array, Array]:
+        """Return w (pairs,) and its gradient (pairs, 3) for offsets X - p_k (pairs, 3) and what detours add."""
+        straight = distance = np.sqrt(np.einsum("pd,pd->p", offset, offset))
+        if longer is not None:
+            distance = straight + longer[0]
         if self.kernel == "gaussian":
             inverse = (1.0 / self.radii)[column]
             w = np.exp(-((distance * inverse) ** 2))
@@ -270,6 +301,9 @@ class BasisRKPM:
             slope = -4.0 * rest**2 + 16.0 * near**2
             small = q < 1e-8
             over_distance = np.where(small, -8.0, slope / np.where(small, 1.0, q)) * inverse**2
+        if longer is not None:  # The gradient of the distance is that of both its parts.
+            lengthened = np.where(longer[0] != 0.0, distance / np.maximum(straight, 1e-300), 1.0)
+            offset = offset * lengthened[:, None] + longer[1] * distance[:, None]
         return w, offset * over_distance[:, None]
 
     def _invert(self, moment: Array, x: Array, first: int) -> Array:

@@ -26,6 +26,7 @@ from softmode.deformables.build.functions import (
 )
 from softmode.deformables.build.galerkin import mass_matrix
 from softmode.deformables.build.local_handles import gather_at_lips, gather_weights, place_kernels
+from softmode.deformables.build.octants import Octants
 from softmode.deformables.build.options import EIGENMODE_COUNT, BuildOptions
 from softmode.deformables.build.region_samples import RegionSamples, drive_matrices, rigid_motions
 from softmode.deformables.build.static_response import lame_parameters, solve_harmonic_weights, solve_static_responses
@@ -69,6 +70,8 @@ class Domain:
     """Places and radii of further local handles [m], shape (A, 4)."""
     material: Material | None
     """Which points of the material touch, so that kernels do not act across gaps; None: they do."""
+    octants: Octants | None
+    """What distances of kernels run through; None: straight lines."""
     lips: Array
     """Points on both sides of slits [m], shape (N, 3)."""
 
@@ -153,7 +156,7 @@ def _ground(domain: Domain, options: BuildOptions) -> _Ground:
     count = options.kernels(len(domain.seeds), held=bool(domain.regions))
     kernels = make_basis(domain.seeds, count, kernel=options.kernel, spacing=domain.spacing, seed=options.seed)
     if domain.material is not None:
-        kernels = divide_at_gaps(kernels, domain.material, domain.seeds, domain.spacing)
+        kernels = divide_at_gaps(kernels, domain.material, domain.seeds, domain.spacing, domain.octants)
     shape, blend, blend_slope = enveloped(kernels.evaluate(domain.points), domain.envelope)
     springs, pull = _springs(kernels, domain)
     mu, lame = lame_parameters(_mean_ratio(options))

@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
+from softmode.deformables.body.qgmls import BasisQGMLS
 from softmode.deformables.body.reduced_body import FORMAT_VERSION, ReducedBody, Scalar
 from softmode.deformables.body.regions import Region
 from softmode.deformables.body.rkpm import BasisRKPM
-from softmode.deformables.body.visibility import Visibility
 from softmode.deformables.build.basis import BodyBasis, Domain, make_body_basis
 from softmode.deformables.build.cache import cache_directory, cached_body, fingerprint_of
 from softmode.deformables.build.cubature import Cubature, select_cubature
+from softmode.deformables.build.octants import octants_of
 from softmode.deformables.build.options import BuildOptions, HandleName
 from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.region_samples import octants_near, refine_at_faces, sample_regions
@@ -169,6 +170,7 @@ def _build(
                 samples=samples,
                 added=np.reshape([np.append(*pair) for pair in options.add_kernels], (-1, 4)) - np.append(offset, 0.0),
                 material=None if quadrature.cells is None else material_of(quadrature.cells, offset),
+                octants=None if quadrature.cells is None else octants_of(quadrature.cells, offset),
                 lips=lips_of(quadrature.cells) - offset,
             ),
             options,
@@ -218,7 +220,7 @@ def _build(
             provenance={},
             build_seconds=0.0,
             sources=pack_sources(sources),
-            **_divided(basis.kernels.visibility if isinstance(basis.kernels, BasisRKPM) else None),
+            **_bounded(basis.kernels),
         )
         surface = body.evaluate(body.surface_points)[0]
         stage("surface")
@@ -248,15 +250,15 @@ def _build(
 def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: BuildOptions, *, quick: bool) -> Cubature:
     """Choose cubature points: fitted to more poses, or more than asked for, where forces of held-out poses want that.
 
-    A quick choice is the first one.
+    If none errs as little as was asked for, it is the one that errs least. A quick choice is the first one.
 
     Warns:
         RuntimeWarning: If these forces still err by more than was asked for.
     """
     trials = options.cubature_trials(len(volumes))[: 1 if quick else None]
-    chosen = None
+    best = None
     for count, poses in trials:
-        chosen = select_cubature(
+        found = select_cubature(
             volumes,
             basis.gradient,
             count,
@@ -266,22 +268,31 @@ def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: Build
             seed=options.seed,
             quick=quick,
         )
-        if options.cubature_error is None or chosen.force_error <= options.cubature_error:
-            return chosen
-    assert chosen is not None  # There is a first trial.
+        if options.cubature_error is None or found.force_error <= options.cubature_error:
+            return found
+        if best is None or found.force_error < best.force_error:
+            best = found
+    assert best is not None  # There is a first trial.
     if len(trials) > 1:
         warnings.warn(
-            f"cubature_error: {len(chosen.index)} points leave {chosen.force_error:.2g}, "
+            f"cubature_error: {len(best.index)} points leave {best.force_error:.2g}, "
             f"{options.cubature_error:g} was asked for; give a larger cubature_count",
             RuntimeWarning,
             stacklevel=4,
         )
-    return chosen
+    return best
 
 
-def _divided(visibility: Visibility | None) -> dict[str, NDArray]:
-    """Return the fields of a body whose kernels do not act across gaps."""
-    return {} if visibility is None else {"material_points": visibility.points, "hidden_pairs": visibility.hidden}
+def _bounded(kernels: BasisRKPM | BasisQGMLS) -> dict[str, NDArray]:
+    """Return the fields of a body whose kernels do not act across gaps, or whose distances are not straight lines."""
+    found: dict[str, NDArray] = {}
+    if isinstance(kernels, BasisRKPM) and kernels.visibility is not None:
+        found |= {"material_points": kernels.visibility.points, "hidden_pairs": kernels.visibility.hidden}
+    if isinstance(kernels, BasisRKPM) and kernels.detours is not None:
+        table = kernels.detours
+        found |= {"material_points": table.points, "material_frame": table.frame}
+        found |= {"detour_pairs": table.pairs, "detour_lengths": table.lengths}
+    return found
 
 
 def _scalar(value: Scalar | tuple[object, ...]) -> Scalar:

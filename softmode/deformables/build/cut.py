@@ -24,11 +24,11 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.body.regions import Region
 from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.build.build_body import build_part
+from softmode.deformables.build.octants import components, touching
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.patch import Patch
 from softmode.deformables.build.quadrature_grid import Cells, Quadrature
 from softmode.deformables.build.sources import Sources, unpack_sources
-from softmode.deformables.build.visibility import components, touching
 from softmode.errors import BasisError, ConfigError
 
 Array = NDArray[np.float64]
@@ -310,6 +310,8 @@ class _Cutter:
                 weights=cells.weights[octants] * share[octants],
                 of_octant=cells.of_octant[octants],
                 place=None if cells.place is None else cells.place[octants],
+                borders=cells.borders,
+                axes=cells.axes,
                 severed=severed if len(severed) else None,
             ),
         )

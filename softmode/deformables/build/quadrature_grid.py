@@ -47,6 +47,11 @@ class Cells:
     """Cell of each octant, shape (Q,)."""
     place: NDArray[np.int64] | None = None
     """Place of each octant in the grid of octants, shape (Q, 3); None in files written before 0.3."""
+    borders: Array | None = None
+    """Borders of the octants along each axis of the grid [m], rows filled up by infinity, shape (3, B); None in files
+    of bodies of version 2."""
+    axes: Array | None = None
+    """Axes of the grid, unit vectors in rows, shape (3, 3); None: those of the coordinates."""
     severed: NDArray[np.int64] | None = None
     """Pairs of octants that a cut divides, though they are neighbours, the lower one first, shape (E, 2)."""
 
@@ -209,9 +214,18 @@ def cell_points(moments: Array, lines: Sequence[Array]) -> CellPoints:
             weights=octants[:, 0],
             of_octant=of_octant,
             place=2 * first + np.stack([where // 4, where // 2 % 2, where % 2], axis=1),
+            borders=_octant_borders(lines),
         ),
         counted=counted,
     )  # fmt: skip
+
+
+def _octant_borders(lines: Sequence[Array]) -> Array:
+    """Return the borders of the octants of cells, rows filled up by infinity, shape (3, B) [m]."""
+    found = np.full((3, 2 * max(len(line) for line in lines) - 1), np.inf)
+    for row, line in zip(found, lines, strict=True):
+        row[: 2 * len(line) - 1] = np.interp(0.5 * np.arange(2 * len(line) - 1), np.arange(len(line)), line)
+    return found
 
 
 def match_moments(points: Array, weights: Array, centre: Array, second: Array) -> Array:
@@ -277,5 +291,10 @@ def finish_quadrature(
             "weight_scaling": scaling,
             "box_fill": float(volume / np.prod(bounds[1] - bounds[0])),
         },
-        cells=replace(cells, octants=cells.octants + middle, weights=cells.weights * scaling),
+        cells=replace(
+            cells,
+            octants=cells.octants + middle,
+            weights=cells.weights * scaling,
+            borders=None if cells.borders is None else cells.borders + middle[:, None],
+        ),
     )

@@ -1,25 +1,22 @@
 """What kernels act on: paths through the graph of an object's material, and kernels where too few are left.
 
-The points of the graph are the octants of the quadrature's grid. Two of them touch where they share a face, and also
-where they share an edge or a corner alone, as finite elements of the same bricks share the nodes there. So a gap is
-seen where an octant, half a cell, lies empty; a narrower one is not. Kernels still act across the gaps between parts
-of an object that touch nowhere, which would drift apart otherwise.
+The points of the graph are the octants of the quadrature's grid. Kernels still act across the gaps between parts of
+an object that touch nowhere, which would drift apart otherwise.
 """
 
 from __future__ import annotations
 
-import itertools
 import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from softmode.deformables.body.rkpm import REACH, BasisRKPM
 from softmode.deformables.body.visibility import Visibility
+from softmode.deformables.build.detours import find_detours, more_detours
+from softmode.deformables.build.octants import Octants, components, touching
 from softmode.deformables.build.quadrature_grid import Cells
 
 Array = NDArray[np.float64]
@@ -49,6 +46,8 @@ class Material:
     """Part of the object that each lump belongs to, shape (L,); kernels act across the gaps between parts."""
     step: float
     """Largest distance between points that touch [m]."""
+    cut: bool = False
+    """Whether some points are neighbours that a cut divides."""
 
     def distances(self, centres: Array) -> tuple[Array, Array]:
         """Return the squared distances of points [m^2] (N, K), and of lumps (L, K), to centres (K, 3)."""
@@ -79,36 +78,6 @@ class Material:
         return found
 
 
-def touching(cells: Cells) -> Indices | None:
-    """Return the pairs of octants of a grid that touch, the lower one first (E, 2); None if their places are not known.
-
-    Two touch where they share a face; where they share an edge or a corner, unless others between link them.
-    """
-    if cells.place is None:
-        return None
-    place = cells.place - cells.place.min(axis=0) + 1
-    shape = place.max(axis=0) + 2
-    stride = np.array([shape[1] * shape[2], shape[2], 1])
-    at = np.full(shape.prod(), -1)
-    at[place @ stride] = np.arange(len(place))
-    pairs = []
-    for towards in itertools.product((-1, 0, 1), repeat=3):
-        if towards <= (0, 0, 0):
-            continue
-        steps = np.array(towards) * stride
-        other = at[place @ stride + steps.sum()]
-        touch = other >= 0
-        if np.count_nonzero(towards) > 1:
-            for step in steps[steps != 0]:
-                touch &= at[place @ stride + step] < 0
-        pairs.append(np.stack([np.flatnonzero(touch), other[touch]], axis=1))
-    pair = np.sort(np.concatenate(pairs), axis=1)
-    if cells.severed is None:
-        return pair
-    key = np.array([len(place), 1])
-    return pair[~np.isin(pair @ key, cells.severed @ key)]
-
-
 def material_of(cells: Cells, offset: Array) -> Material | None:
     """Return the graph of the octants of a grid less an offset (3,) [m]; None if their places in it are not known."""
     pair = touching(cells)
@@ -133,6 +102,7 @@ def material_of(cells: Cells, offset: Array) -> Material | None:
         links=links,
         part=components(int(lump.max()) + 1, links),
         step=step,
+        cut=cells.severed is not None,
     )
 
 
@@ -143,26 +113,34 @@ def lips_of(cells: Cells | None) -> Array:
     return cells.octants[np.unique(cells.severed)]
 
 
-def divide_at_gaps(kernels: BasisRKPM, material: Material, points: Array, spacing: float) -> BasisRKPM:
-    """Return kernels that do not act across gaps, and more of them where too few are left.
+def divide_at_gaps(
+    kernels: BasisRKPM, material: Material, points: Array, spacing: float, octants: Octants | None = None
+) -> BasisRKPM:
+    """Return kernels that reach around gaps and corners, or do not act across gaps, and more where too few are left.
 
-    A kernel acts on what is connected to its centre within its support. Beside the end of a gap that would hold both
-    sides together as far as it reaches, so there a kernel is made narrower, until the sides are not connected within.
+    With octants kernels see distances through the material where it has inner corners. Else, and at cuts, which that
+    does not see, a kernel acts on what is connected to its centre within its support. Beside the end of a gap that
+    would hold both sides together as far as it reaches, so there a kernel is made narrower, until the sides are not
+    connected within.
 
     Args:
         kernels: Kernels that act on all they reach.
         material: The graph of the object's points.
         points: What must be covered: quadrature points [m], shape (P, 3).
         spacing: Their spacing [m].
+        octants: What distances run through; None: they are straight lines.
 
     Warns:
         RuntimeWarning: If parts of the object are too thin for that; then kernels act across gaps.
     """
-    found = _narrowing(material, kernels)
-    if found is None:
+    detours = None if octants is None else find_detours(octants, kernels.centres, kernels.support)
+    found = _narrowing(material, kernels) if detours is None or material.cut else None
+    if found is None and detours is None:
         return kernels
-    factor, hidden = found
-    divided = replace(kernels, radii=kernels.radii * factor, visibility=_visibility(material, hidden))
+    divided, hidden = replace(kernels, detours=detours), None
+    if found is not None:
+        factor, hidden = found
+        divided = replace(divided, radii=kernels.radii * factor, visibility=_visibility(material, hidden))
     for _ in range(ROUNDS):
         distance, nearest = divided.nearest(points)
         ratio = distance / divided.support[nearest]
@@ -181,9 +159,17 @@ def divide_at_gaps(kernels: BasisRKPM, material: Material, points: Array, spacin
             centres=np.concatenate([divided.centres, points[added]]),
             radii=np.concatenate([divided.radii, np.maximum(distance[added], 1.5 * spacing)]),
             visibility=None,
+            detours=None,
         )
-        hidden += _hidden(material, divided.centres, divided.support, first)  # Those before see what they saw.
-        divided = replace(divided, visibility=_visibility(material, hidden))
+        if detours is not None and octants is not None:
+            detours = more_detours(octants, detours, divided.centres, divided.support, first)
+        if hidden is not None:  # Those before see what they saw.
+            hidden += _hidden(material, divided.centres, divided.support, first)
+        divided = replace(
+            divided, detours=detours, visibility=None if hidden is None else _visibility(material, hidden)
+        )
+    if detours is not None:
+        return divided if divided.covered(points).all() else divide_at_gaps(kernels, material, points, spacing)
     warnings.warn(
         "the object's parts are too thin beside its gaps for its quadrature: kernels act across the gaps; build it with"
         " more points",
@@ -257,9 +243,3 @@ def _narrowing(material: Material, kernels: BasisRKPM) -> tuple[Array, list[Indi
 def _chunks(material: Material, kernel_count: int, first: int = 0) -> list[slice]:
     step = max(1, _ENTRIES_PER_CHUNK // len(material.points))
     return [slice(i, min(i + step, kernel_count)) for i in range(first, kernel_count, step)]
-
-
-def components(count: int, pairs: Indices) -> Indices:
-    """Return the connected component of each of some nodes, from pairs of them (E, 2)."""
-    graph = coo_matrix((np.ones(len(pairs), dtype=bool), pairs.T), shape=(count, count))
-    return connected_components(graph, directed=False)[1].astype(np.intp)
