@@ -7,6 +7,9 @@ import warp as wp
 TOUCH_FORCE = wp.constant(0.02)
 """Force from which a finger counts as touching [N]."""
 
+NEAR = wp.constant(0.02)
+"""Distance of the tool from an object's farthest point within which fingers that feel something hold that object [m]."""
+
 
 @wp.struct
 class WorldState:

@@ -98,12 +98,11 @@ class ScriptedPolicy:
         return self.task.table.values.numpy()[self.world, self.task.table.columns(name)].astype(float)
 
     def surfaces(self) -> list[Vector]:
-        """Return the surface samples of every object [m], each of shape (N, 3)."""
-        counts = [thing.body.surface_count for thing in self.scene.objects_of(self.world)]
-        state = self.task.state
-        start = int(state.particle_start.numpy()[self.world * state.stride])
-        points = self.scene.state.particle_q.numpy()[start : start + sum(counts)].astype(float)
-        return np.split(points, np.cumsum(counts)[:-1])
+        """Return the surface samples of every object that is there [m], each of shape (N, 3)."""
+        starts = self.task.state.particle_start.numpy()[list(self.scene.instances_of(self.world))]
+        points = self.scene.state.particle_q.numpy()
+        things = self.scene.objects_of(self.world)
+        return [points[a : a + thing.body.surface_count].astype(float) for a, thing in zip(starts, things, strict=True)]
 
     # -- acting -------------------------------------------------------------------------------------------------------
 

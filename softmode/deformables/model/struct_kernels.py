@@ -197,6 +197,13 @@ class NewtonState:
 
 
 @wp.func
+def exists(instances: Instances, i: int):
+    """Return whether an instance is a body: an empty one has neither functions, points nor samples, see
+    ``body_choice``."""
+    return instances.function_count[i] > 0
+
+
+@wp.func
 def has_contacts(instances: Instances, constraints: PointConstraints, i: int):
     """Return whether an instance is near a shape: its constraints are more than its pins."""
     return constraints.count[i] > instances.pin_count[i]

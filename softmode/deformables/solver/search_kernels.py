@@ -13,6 +13,7 @@ from softmode.deformables.model.struct_kernels import (
     Points,
     Rigid,
     blocks_of,
+    exists,
     first_coupled,
     has_contacts,
     hessian_key,
@@ -171,6 +172,8 @@ def check_convergence(step: NewtonStep, team: int, w: int, member: int):
     if step.state.iteration[w] == 0:
         done = 0
     for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
+        if not exists(step.instances, i):
+            continue
         if done == 1 and not pushes(step.instances, step.constraints, i):
             done = step.state.last[w]
         elif done == 1:
@@ -386,6 +389,8 @@ def rounding_of(instances: Instances, instance_start: wp.array[int], potential: 
     """Return what rounding leaves of the potential of a world [J]."""
     total = wp.float64(1.0e-12) * wp.abs(potential)
     for i in range(instance_start[w], instance_start[w + 1]):
+        if not exists(instances, i):
+            continue
         volume = instances.mass[i] * wp.float64(instances.size[i] * instances.size[i] / instances.inertia[i])
         total += ENERGY_ROUNDING * wp.float64(instances.youngs_modulus[i]) * volume
     return total

@@ -5,7 +5,16 @@ from enum import IntEnum
 import warp as wp
 
 from softmode.envs.end_reason import EndReason
-from softmode.envs.reward_kernels import StepResult, WorldState, count_held, grasped, tool_position, touched, write
+from softmode.envs.reward_kernels import (
+    NEAR,
+    StepResult,
+    WorldState,
+    count_held,
+    grasped,
+    tool_position,
+    touched,
+    write,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -87,7 +96,7 @@ def evaluate(state: WorldState, plan: Plan, result: StepResult):
     distance = wp.length(x - tool_position(state, w))
     inside = result.metrics[w, Metric.bin_distance] == 0.0 and x[2] <= plan.highest
     # fingers may feel another object: only near the first one they hold that one
-    grip = grasped(state, w) and distance < size * plan.radius[w] + 0.02
+    grip = grasped(state, w) and distance < size * plan.radius[w] + NEAR
     low = plan.rest_height[w] * size
     carried = rim[2] + low + plan.clearance
     aside = beyond(x, rim, plan.half - wp.vec2(plan.margin, plan.margin))
