@@ -204,6 +204,17 @@ def exists(instances: Instances, i: int):
 
 
 @wp.func
+def instance_end(instances: Instances, instance_start: wp.array[int], w: int):
+    """Return the end of the instances of a world, less the last ones that are no bodies."""
+    end = instance_start[w + 1]
+    while end > instance_start[w]:
+        if exists(instances, end - 1):
+            break
+        end -= 1
+    return end
+
+
+@wp.func
 def has_contacts(instances: Instances, constraints: PointConstraints, i: int):
     """Return whether an instance is near a shape: its constraints are more than its pins."""
     return constraints.count[i] > instances.pin_count[i]

@@ -12,6 +12,7 @@ import warp as wp
 
 from softmode.deformables.model.declare import Kernel
 from softmode.deformables.model.lane_kernels import LANES, barrier
+from softmode.deformables.model.struct_kernels import instance_end
 from softmode.deformables.solver.assembly_kernels import (
     column_block,
     condensed_entry,
@@ -76,7 +77,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool
             _room = wp.tile_empty(shape=wp.static(dynamic), dtype=float, storage="shared")
         dt = step.options.dt
         begin = step.state.instance_start[w]
-        end = step.state.instance_start[w + 1]
+        end = instance_end(step.instances, step.state.instance_start, w)
         blocks = step.basis.row.shape[1]
         n = step.rigid.count[w]
         tasks = 3 * blocks * blocks + 3 * (blocks * blocks + blocks) / 2
