@@ -16,7 +16,7 @@ from softmode.objects.soft_object import SoftObject
 from softmode.scenes.table_scene import TABLE_PLACE, TABLE_SIZE
 
 BASE = 0.12
-"""Distance in front of the robot's base up to which nothing lies [m]."""
+"""Half of the edges of the square about the robot's base in which nothing lies [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,10 +127,9 @@ def _check_table(config: TaskConfig, places: Sequence[Place], reach: float, *, t
         points.append(place.distance * np.column_stack([np.cos(angles), np.sin(angles)]))
     x = np.concatenate(points) + np.array(config.scene.object_position)
     play = np.array(config.position_range) + reach
-    lower = np.array(TABLE_PLACE[:2]) - TABLE_SIZE[:2]
-    lower[0] = BASE
-    upper = np.array(TABLE_PLACE[:2]) + TABLE_SIZE[:2]
-    if (x - play < lower).any() or (x + play > upper).any():
+    on_table = (np.abs(x - TABLE_PLACE[:2]) + play <= TABLE_SIZE[:2]).all(axis=1)
+    in_base = (np.abs(x) - play < BASE).all(axis=1)
+    if not on_table.all() or in_base.any():
         raise ConfigError(
             f"{len(places) + 1} objects of radius up to {reach:.3f} m do not fit on the table",
             hint="make objects.per_world, the objects, others_clearance or position_range smaller",
