@@ -193,7 +193,7 @@ def test_distractors_are_not_the_object() -> None:
     place = {"position": (0.45, 0.1), "others_turn": 0.0, "other_place_1": (-np.pi / 2, 0.1), "other_yaw_1": 0.0}
     env.reset(seed=0, options={**place, "object": [0, 0, -1, -1]})
     felt = 0.0
-    for step in range(30):
+    for step in range(70):
         down = np.array([0.0, 0.0, -1.0, 0.0, 1.0 if step < 18 else -1.0], np.float32)
         *_, info = env.step(down)
         felt = max(felt, info["finger_force"].min())

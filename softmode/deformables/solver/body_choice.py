@@ -20,8 +20,8 @@ from softmode.deformables.solver.reduced_solver import ReducedSolver, require_re
 from softmode.deformables.solver.solver_reduced import require_driven_material
 from softmode.errors import ConfigError
 
-_KEPT = ("rate", "volume_ratio", "constraint", "shape", "direction")
-"""Arrays of a step that do not begin with zeros, or that every step writes whole."""
+_KEPT = ("rate", "volume_ratio", "constraint", "shape", "direction", "system_start", "rigid_tolerance")
+"""Arrays of a step that do not begin with zeros, that every step writes whole, or that have a row per world."""
 
 
 class BodyChoice:
