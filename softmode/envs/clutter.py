@@ -29,6 +29,10 @@ class Arcs:
     """Angle between these ranges and the ways that are to stay free [rad], a right angle where there are none."""
 
 
+    within: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    """Least and largest x and y of the centres [m]; None for all of the table."""
+
+
 @dataclass(frozen=True)
 class Place:
     """Where one of the objects lies, as seen from object 0."""
@@ -55,7 +59,7 @@ def ring_places(count: int, spacing: float, spread: float, arcs: Arcs) -> list[P
     places: list[Place] = []
     while len(places) < count:
         half = math.asin(0.5 * spacing / distance)
-        room = [max(1, int((b - a) / (2.0 * half))) for a, b in ranges]
+        room = [max(1, int((b - a) / (2.0 * half) + 1.0e-9)) for a, b in ranges]
         given = [0] * len(ranges)
         for _ in range(min(sum(room), count - len(places))):
             free = [k for k in range(len(ranges)) if given[k] < room[k]]
@@ -93,7 +97,7 @@ def clutter_parameters(
     radius = scale * max(float(np.linalg.norm(one.body.surface_points[:, :2], axis=1).max()) for one in members)
     spread = 0.5 * config.others_clearance
     places = ring_places(count, 2.0 * radius + config.others_clearance, spread, arcs)
-    _check_table(config, places, radius + spread, turned=not arcs.ranges)
+    _check_table(config, places, radius, spread, arcs)
     turn = 0.0 if arcs.ranges else math.pi
     made = [_number("others_turn", turn)]
     for k, place in enumerate(places, 1):
@@ -111,26 +115,31 @@ def _number(name: str, half: float) -> Parameter:
     return Parameter(name=name, low=(-half,), high=(half,), least=(-math.tau,), most=(math.tau,))
 
 
-def _check_table(config: TaskConfig, places: Sequence[Place], reach: float, *, turned: bool) -> None:
-    """Refuse places that are not on the table, or in the robot's base.
+def _check_table(config: TaskConfig, places: Sequence[Place], radius: float, spread: float, arcs: Arcs) -> None:
+    """Refuse places that are not on the table, out of bounds, or in the robot's base.
 
     Args:
         config: The task's configuration.
         places: The places.
-        reach: How far an object reaches beyond the least distance of its place [m].
-        turned: Whether they are turned about object 0 by any angle.
+        radius: Of the largest object [m].
+        spread: How far an object may lie beyond the least distance of its place [m].
+        arcs: Where they may lie.
     """
     points = []
     for place in places:
-        half = math.pi if turned else place.play
+        half = place.play if arcs.ranges else math.pi
         angles = place.angle + np.linspace(-half, half, 33)
-        points.append(place.distance * np.column_stack([np.cos(angles), np.sin(angles)]))
+        points.append((place.distance + spread) * np.column_stack([np.cos(angles), np.sin(angles)]))
     x = np.concatenate(points) + np.array(config.scene.object_position)
-    play = np.array(config.position_range) + reach
-    on_table = (np.abs(x - TABLE_PLACE[:2]) + play <= TABLE_SIZE[:2]).all(axis=1)
-    in_base = (np.abs(x) - play < BASE).all(axis=1)
-    if not on_table.all() or in_base.any():
+    play = np.array(config.position_range)
+    on_table = np.abs(x - TABLE_PLACE[:2]) + play + radius <= TABLE_SIZE[:2]
+    in_base = (np.abs(x) - play - radius < BASE).all(axis=1)
+    fits = on_table.all() and not in_base.any()
+    if arcs.within is not None:
+        fits = fits and (x - play >= arcs.within[0]).all() and (x + play <= arcs.within[1]).all()
+    if not fits:
+        where = "on the table" if arcs.within is None else f"within x, y of {arcs.within[0]} to {arcs.within[1]} m"
         raise ConfigError(
-            f"{len(places) + 1} objects of radius up to {reach:.3f} m do not fit on the table",
+            f"{len(places) + 1} objects of radius up to {radius:.3f} m do not fit {where}",
             hint="make objects.per_world, the objects, others_clearance or position_range smaller",
         )

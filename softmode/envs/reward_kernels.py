@@ -26,6 +26,8 @@ class WorldState:
     particle_q: wp.array[wp.vec3]  # surface samples [m]
     points: wp.array2d[int]  # those of object 0 that are observed, (world_count, points)
     stride: int  # soft objects per world
+    slots: int  # of them those of a set, the first ones
+    occupant: wp.array[int]  # (world_count * slots,) which object of the set that is, -1 for none
 
 
 @wp.struct
@@ -58,6 +60,14 @@ def tool_position(state: WorldState, world: int):
 def surface_point(state: WorldState, world: int, point: int):
     """Return where an observed surface point of object 0 is [m]."""
     return state.particle_q[state.particle_start[world * state.stride] + state.points[world, point]]
+
+
+@wp.func
+def is_there(state: WorldState, world: int, o: int):
+    """Return whether a world has its object o."""
+    if o >= state.slots:
+        return True
+    return state.occupant[world * state.slots + o] >= 0
 
 
 @wp.func

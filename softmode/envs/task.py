@@ -139,7 +139,7 @@ class Task:
         if self.slots > 1 and not self.takes_several:
             raise ConfigError(
                 f"{type(self).__name__} has one object per world, objects.per_world asks for {self.slots}",
-                hint="leave per_world out, or take LiftSoft or PushSoft",
+                hint="leave per_world out, or take LiftSoft, PushSoft or PlaceInBin",
             )
         self.limit, self.autoreset_mode = limit, autoreset_mode
         cameras = []
@@ -274,7 +274,8 @@ class Task:
         self.any_done = wp.zeros(1, dtype=int, device=device)
         scene, instances = self.scene, worlds * len(self.scene.objects)
         self._material = wp.zeros((len(MATERIAL), instances), dtype=float, device=device)
-        self._materials = {name: cast(wp.array, self._material[k]) for k, name in enumerate(MATERIAL)}
+        self.materials = {name: cast(wp.array, self._material[k]) for k, name in enumerate(MATERIAL)}
+        """Material and scale of every soft object by name, each of shape (world_count * objects,)."""
         columns = [self.table.column(name) for name in MATERIAL]
         self._material_columns = wp.array(columns, dtype=int, device=device)
         self._solver_mask = wp.zeros(worlds + 1, dtype=wp.bool, device=device)
@@ -303,6 +304,8 @@ class Task:
             points=self.per_object(self._points, int),
             q=scene.state.softmode.q,
             stride=len(scene.objects),
+            slots=self.slots,
+            occupant=self._choice,
         )
         """What the kernels of a task read."""
         self.result = filled(StepResult, self, marker_place=scene.marker_place)
@@ -636,7 +639,7 @@ class Task:
         inputs = [self.state, self._material_columns, self._own_materials, self._choice, self.slots]
         self.launch(kernels.spread_materials, inputs, [values], values.shape[1])
         wp.copy(self._solver_mask, self.scene.world_mask, count=self.world_count)
-        set_parameters(self.scene.solver, self._solver_mask, **self._materials)
+        set_parameters(self.scene.solver, self._solver_mask, **self.materials)
 
     def write_observation(self) -> None:
         """Write the observation and the metrics of all worlds."""
