@@ -28,7 +28,6 @@ class Arcs:
     aside: float = math.pi / 2
     """Angle between these ranges and the ways that are to stay free [rad], a right angle where there are none."""
 
-
     within: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     """Least and largest x and y of the centres [m]; None for all of the table."""
 
@@ -73,7 +72,7 @@ def ring_places(count: int, spacing: float, spread: float, arcs: Arcs) -> list[P
 def _row(low: float, high: float, number: int, half: float, distance: float) -> list[Place]:
     """Return a number of places side by side in a range of directions; each takes `half` to either side [rad]."""
     width = (high - low) / max(number, 1)
-    play = 0.5 * width - (half if number > 1 else 0.0)
+    play = max(0.5 * width - (half if number > 1 else 0.0), 0.0)
     return [Place(low + (k + 0.5) * width, play, distance) for k in range(number)]
 
 

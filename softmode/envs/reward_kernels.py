@@ -8,7 +8,7 @@ TOUCH_FORCE = wp.constant(0.02)
 """Force from which a finger counts as touching [N]."""
 
 NEAR = wp.constant(0.02)
-"""Distance of the tool from an object's farthest point within which fingers that feel something hold that object [m]."""
+"""How far the tool may be beyond an object's farthest point where fingers that feel something hold that object [m]."""
 
 
 @wp.struct

@@ -22,8 +22,8 @@ from softmode.deformables.model.structs import filled
 from softmode.deformables.solver.parameters import set_parameters
 from softmode.envs import task_kernels as kernels
 from softmode.envs.cameras import FollowCamera, overview, square_camera, wrist_camera
-from softmode.envs.end_reason import EndReason
 from softmode.envs.clutter import Arcs, clutter_parameters
+from softmode.envs.end_reason import EndReason
 from softmode.envs.observation import (
     ObservationLayout,
     Segment,

@@ -125,7 +125,8 @@ class BoundSplats:
         count = len(self._resident) or len(starts)
         arrays = SplatArrays.from_splats(parts, world_count=count, sh_degree=sh_degree, device=device)
         if self._resident and len(each) > 1:
-            arrays = _one_row_each(arrays, count, [max(part.count for part in splats) for splats in map(_listed, parts)])
+            widths = [max(part.count for part in splats) for splats in map(_listed, parts)]
+            arrays = _one_row_each(arrays, count, widths)
         self._table = arrays
         self._slots = len(each) if self._resident else 1
         rows = None if choice is None else self._choice.numpy()[:: self._slots].astype(np.int32)

@@ -454,9 +454,7 @@ class TableScene:
             every_slot: Whether the second axis has an entry per slot, which follows the object of that slot, and is
                 zero where there is none. Else all follows the first.
         """
-        copy_slots(
-            table, out, self._choice_of_slots, self.world_mask, parts=[1] * self.slots if every_slot else None
-        )
+        copy_slots(table, out, self._choice_of_slots, self.world_mask, parts=[1] * self.slots if every_slot else None)
 
     def _set_stiffness(self, mask: np.ndarray, youngs_modulus: np.ndarray) -> None:
         """Change E in the masked worlds."""

@@ -12,11 +12,15 @@ from softmode.envs import (
     LiftSoftConfig,
     LiftSoftEnv,
     LiftSoftVectorEnv,
+    PlaceInBinConfig,
+    PlaceInBinEnv,
     PressSoftConfig,
     PressSoftEnv,
     PushSoftConfig,
     PushSoftEnv,
+    scripted_policy,
 )
+from softmode.envs.tasks.place_in_bin.task import BALL, TOY, Bin, bin_scene
 from softmode.errors import ConfigError, StateError
 from softmode.learning.config_values import config_of, values_of
 from softmode.objects import ObjectSet
@@ -44,7 +48,7 @@ def others(env: Any, name: str) -> np.ndarray:
 
 
 def test_absent_objects_are_inert() -> None:
-    """With one of four objects there a world has the bits of the scene of that object: states, rewards; the same picture."""
+    """With one of four objects there a world has the bits of the scene of that object, and its picture."""
     config = lift(image_outputs=("segmentation",))
     env = LiftSoftEnv(config=config, obs_type="pixels", device="cpu")
     graph, place = env.task.graph, {**PLACE, "yaw": 0.3, "goal": (0.45, 0.0, 0.15)}
@@ -201,6 +205,67 @@ def test_distractors_are_not_the_object() -> None:
     assert felt > 0.1
 
 
+def test_toys_are_placed_one_after_another() -> None:
+    """The scripted policy puts three toys into the bin; success is all of them, the reward counts those that are in."""
+    env = PlaceInBinEnv(config=bin_of((TOY, BALL), per_world=(1, 4)), device="cpu")
+    policy: Any = scripted_policy(env)
+    env.reset(seed=1, options={"object": [0, 0, 1, -1]})
+    policy.reset()
+    placed = {0: 0.0}
+    for _ in range(700):
+        _, reward, terminated, _, info = env.step(policy())
+        assert not terminated
+        inside = int(info["others_inside"])
+        terms = info["reward_terms"]
+        assert inside / 3 <= terms["reach"] <= 1.0 and terms["lift"] >= inside / 3 - 1e-6
+        placed[inside] = reward
+        if info["is_success"]:
+            break
+    assert info["is_success"] and list(placed) == [0, 1, 2]
+    assert reward == pytest.approx(sum(terms.values()))
+    assert terms["rest"] == 2.0 and terms["release"] == pytest.approx(1.0)
+
+
+def test_one_toy_of_several_is_placed_as_alone() -> None:
+    """Where one toy is there PlaceInBin has the bits of the task of that toy, reward and figures included."""
+    config = bin_of((TOY, BALL), per_world=(1, 3))
+    env = PlaceInBinEnv(config=config, device="cpu")
+    single = PlaceInBinEnv(config=replace(config, objects=None, scene=replace(config.scene, object=BALL)), device="cpu")
+    place = {"position": (0.43, -0.12), "yaw": 0.2, "youngs_modulus": 1e5}
+    env.reset(seed=0, options={**place, "object": [1, -1, -1]})
+    single.reset(seed=0, options=place)
+    policies = [scripted_policy(one) for one in (env, single)]
+    for _ in range(60):
+        move = policies[0]()
+        np.testing.assert_array_equal(move, policies[1]())
+        _, reward, _, _, info = env.step(move)
+        _, own_reward, _, _, own = single.step(move)
+        assert reward == own_reward and str(info["reward_terms"]) == str(own["reward_terms"])
+        assert [info[name] for name in env.task.metric_names] == [own[name] for name in env.task.metric_names]
+    assert info["object_height"] > 0.05
+
+
+def test_a_toy_that_falls_ends_the_episode() -> None:
+    """Any toy that leaves the table is dropped."""
+    env = PlaceInBinEnv(config=bin_of((TOY,), per_world=2), device="cpu")
+    env.reset(seed=0, options={"other_place_1": (-np.pi / 2, 0.5)})
+    for _ in range(20):
+        *_, terminated, _, info = env.step(np.zeros(5, np.float32))
+        if terminated:
+            break
+    assert terminated and info["failure"] == "dropped"
+
+
+def bin_of(toys: Any, **number: Any) -> PlaceInBinConfig:
+    """Return PlaceInBin with toys of a set on the table and an empty bin."""
+    return PlaceInBinConfig(
+        objects=ObjectSet(toys, resample=True, **number),
+        scene=replace(bin_scene(), others=()),
+        position_range=(0.02, 0.02),
+        others_clearance=0.05,
+    )
+
+
 def test_configuration_is_kept_in_files() -> None:
     """Training files hold the number of objects."""
     config = lift()
@@ -218,6 +283,13 @@ def test_what_cannot_be_says_so() -> None:
         PressSoftEnv(config=PressSoftConfig(objects=SET), device="cpu")
     with pytest.raises(ConfigError, match="do not fit on the table"):
         LiftSoftEnv(config=lift(objects=replace(SET, per_world=8), others_clearance=0.2), device="cpu")
+    with pytest.raises(ConfigError, match="others exclude each other"):
+        PlaceInBinEnv(config=replace(bin_of((TOY,), per_world=2), scene=bin_scene()), device="cpu")
+    with pytest.raises(ConfigError, match="do not fit within"):
+        PlaceInBinEnv(config=bin_of((TOY,), per_world=8), device="cpu")
+    small = replace(bin_of((TOY,), per_world=4), bin=Bin(inner=(0.06, 0.06)))
+    with pytest.raises(ConfigError, match="do not fit a bin"):
+        PlaceInBinEnv(config=small, device="cpu")
     env = LiftSoftEnv(config=lift(), device="cpu")
     for wrong in ([-1, 0, -1, -1], [0, 3, -1, -1], [0, 1]):
         with pytest.raises(ConfigError, match="object"):

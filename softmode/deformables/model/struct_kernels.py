@@ -198,8 +198,7 @@ class NewtonState:
 
 @wp.func
 def exists(instances: Instances, i: int):
-    """Return whether an instance is a body: an empty one has neither functions, points nor samples, see
-    ``body_choice``."""
+    """Return whether an instance is a body: one that is none has no functions, points and samples."""
     return instances.function_count[i] > 0
 
 

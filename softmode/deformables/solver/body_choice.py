@@ -112,7 +112,8 @@ def copy_slots(
         parts: How many entries of the second axis follow each slot; those behind them follow the first, as all do where
             there are none.
     """
-    worlds, device = out.shape[0], out.device
+    device: Any = out.device
+    worlds = out.shape[0]
     slots = choice.shape[0] // worlds
     rows, words = words_of(table, table.shape[0]), words_of(out, worlds)
     each = words.shape[1] // out.shape[1] if out.ndim > 1 else 1

@@ -32,7 +32,7 @@ class Systems:
     world: wp.array[int]  # (system_count,)
     matrix: wp.array3d[vec8]  # (system_count, N, (N + M) / 8), of the first N columns the upper triangle
     scalars: wp.array3d[float]  # (system_count, N, N + M), the same memory number by number
-    pattern: wp.array3d[int]  # (system_count, part_count, part_count), which parts are related, upper triangle; which exist
+    pattern: wp.array3d[int]  # (system_count, part_count, part_count), related parts, upper triangle; which ones exist
     diagonal: wp.array2d[vec8]  # (system_count, N): diagonal blocks of U with inverse pivots
     bounds: wp.array2d[wp.vec2]  # (system_count, N / 8): least pivots of eight rows, and what rounding may take of them
     indefinite: wp.array[int]  # (system_count,), 1 where a pivot had to be raised by more than rounding

@@ -14,8 +14,8 @@ from softmode.envs.tasks.place_in_bin.task import PlaceInBin
 class ScriptedPlace(ScriptedPolicy):
     """Grasp the toy, carry it over the rim to where the bin has most room, lower it, let go, rise.
 
-    Of several toys one is placed after another. It is let go as soon as fingers or toy are about to meet what lies in the bin. A toy that slips on the way is
-    grasped again where it comes to rest.
+    It is let go as soon as fingers or toy are about to meet what lies in the bin. A toy that slips on the way is
+    grasped again where it comes to rest. Of several toys one is placed after another.
 
     Args:
         env: A PlaceInBin environment, wrapped or not.
