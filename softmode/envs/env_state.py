@@ -23,7 +23,7 @@ _KIND = "softmode-env-state"
 _OPTIONAL = ("hessian.", "camera.")
 """Parts that an environment may lack, by the first letters of their names."""
 _OBJECT = "task.object"
-"""Which object of the set each world has; where all have the same, the owner says it."""
+"""Which objects of the set each world has; where all have the same, the owner says it."""
 Parts = int | NDArray[Any]
 """How the worlds lie in an array, see `_parts`."""
 _SHAPES = "state.softmode.stick_shape"
@@ -205,7 +205,7 @@ def set_worlds_state(
 
 def owner_of(task: Task) -> dict[str, str]:
     """Return what a state is bound to: task, robot and objects."""
-    things = (*task.scene.members, *task.scene.objects[1:])
+    things = (*task.scene.members, *task.scene.objects[task.scene.slots :])
     bodies = ", ".join(thing.body.fingerprint[:16] for thing in things)
     robot = hashlib.sha256(repr(task.config.scene.arm).encode()).hexdigest()[:16]
     return {"task": type(task).__name__, "robot": robot, "objects": bodies}
@@ -249,7 +249,7 @@ def _parts(task: Task) -> Iterator[tuple[str, Any, Parts]]:
                 ".particle_" in field_name or ".softmode.stick_" in field_name or ".softmode.dent" in field_name
             )
             yield field_name, array, functions if of_body else particles if of_surface else 1
-    if differ:
+    if differ or scene.slots > 1:
         yield _OBJECT, scene.object_index, 1
     tables, data = scene.solver.tables, scene.solver.rigid.mjw_data
     for name in ("commanded_q", "previous_q", "target_position", "target_yaw"):

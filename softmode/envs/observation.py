@@ -68,13 +68,25 @@ def object_part(point_count: int) -> tuple[Segment, ...]:
     )
 
 
-def one_hot_part(object_count: int) -> tuple[Segment, ...]:
-    """Return the segment that says which object of a set is there.
+def others_part(count: int) -> tuple[Segment, ...]:
+    """Return the segments of objects of a set beside object 0, zero where one is not there; none for none.
+
+    Args:
+        count: How many there may be.
+    """
+    if not count:
+        return ()
+    return (Segment("other_offsets", 3 * count, -4.0, 4.0), Segment("other_present", count, 0.0, 1.0))
+
+
+def one_hot_part(object_count: int, slots: int = 1) -> tuple[Segment, ...]:
+    """Return the segment that says which objects of a set are there.
 
     Args:
         object_count: Number of objects of the set.
+        slots: How many of them a world has room for.
     """
-    return (Segment("object_one_hot", object_count, 0.0, 1.0),)
+    return (Segment("object_one_hot", slots * object_count, 0.0, 1.0),)
 
 
 class ObservationLayout:

@@ -57,9 +57,23 @@ def named_reasons(infos: dict[str, Any]) -> None:
 
 
 def add_object_names(infos: dict[str, Any], names: Sequence[str]) -> None:
-    """Add the name of the object of every world to infos in NumPy, with their mask."""
-    infos["object_name"] = np.array(names, dtype=object)[infos["object"]]
-    infos["_object_name"] = infos["_object"].copy()
+    """Add the name of the object of every world to infos in NumPy, with their mask; a tuple where several may be."""
+    found = np.empty(len(infos["object"]), dtype=object)
+    for world, index in enumerate(infos["object"]):
+        found[world] = name_of(index, names)
+    infos["object_name"], infos["_object_name"] = found, infos["_object"].copy()
+
+
+def name_of(index: Any, names: Sequence[str]) -> str | tuple[str, ...]:
+    """Return the name of the object of a world; of several the names of those that are there.
+
+    Args:
+        index: Which object of the set it is; or that of each slot, -1 for none.
+        names: Names of the objects of the set.
+    """
+    if np.ndim(index):
+        return tuple(names[int(k)] for k in index if k >= 0)
+    return names[int(index)]
 
 
 def columns_of(array: wp.array, columns: int | slice) -> wp.array:

@@ -7,6 +7,9 @@ import warp as wp
 TOUCH_FORCE = wp.constant(0.02)
 """Force from which a finger counts as touching [N]."""
 
+NEAR = wp.constant(0.02)
+"""How far the tool may be beyond an object's farthest point where fingers that feel something hold that object [m]."""
+
 
 @wp.struct
 class WorldState:
@@ -23,6 +26,8 @@ class WorldState:
     particle_q: wp.array[wp.vec3]  # surface samples [m]
     points: wp.array2d[int]  # those of object 0 that are observed, (world_count, points)
     stride: int  # soft objects per world
+    slots: int  # of them those of a set, the first ones
+    occupant: wp.array[int]  # (world_count * slots,) which object of the set that is, -1 for none
 
 
 @wp.struct
@@ -55,6 +60,14 @@ def tool_position(state: WorldState, world: int):
 def surface_point(state: WorldState, world: int, point: int):
     """Return where an observed surface point of object 0 is [m]."""
     return state.particle_q[state.particle_start[world * state.stride] + state.points[world, point]]
+
+
+@wp.func
+def is_there(state: WorldState, world: int, o: int):
+    """Return whether a world has its object o."""
+    if o >= state.slots:
+        return True
+    return state.occupant[world * state.slots + o] >= 0
 
 
 @wp.func

@@ -44,6 +44,8 @@ class ScriptedPolicy:
             )
         self.task, self.scene, self.world = task, task.scene, world
         self.arm, self.control = task.config.scene.arm, task.config.scene.control
+        self.target = 0
+        """Which object of the world it is about."""
 
     def reset(self) -> None:
         """Forget the episode; call after ``env.reset``."""
@@ -71,18 +73,25 @@ class ScriptedPolicy:
 
     @property
     def soft(self) -> SoftObject:
-        """Object 0 of the world."""
-        return self.scene.objects_of(self.world)[0]
+        """The object that it is about."""
+        return self.scene.objects_of(self.world)[self._order[0]]
+
+    @property
+    def _order(self) -> list[int]:
+        """The objects that are there by their places in `TableScene.objects_of`, the one that it is about first."""
+        there = self.scene.instances_of(self.world)
+        first = there.index(self.world * self.task.state.stride + self.target)
+        return [first, *(k for k in range(len(there)) if k != first)]
 
     @property
     def centre(self) -> Vector:
-        """Centre of mass of object 0 [m]."""
-        return self.scene.object_position.numpy()[self.world, 0].astype(float)
+        """Centre of mass of the object [m]."""
+        return self.scene.object_position.numpy()[self.world, self.target].astype(float)
 
     @property
     def velocity(self) -> Vector:
         """Its velocity [m/s]."""
-        return self.scene.object_velocity.numpy()[self.world, 0].astype(float)
+        return self.scene.object_velocity.numpy()[self.world, self.target].astype(float)
 
     @property
     def weaker_force(self) -> np.floating:
@@ -97,13 +106,15 @@ class ScriptedPolicy:
         """Return a parameter of the episode."""
         return self.task.table.values.numpy()[self.world, self.task.table.columns(name)].astype(float)
 
+    def material(self, name: str) -> float:
+        """Return a property of the object: of its material, or its scale."""
+        return float(self.task.materials[name].numpy()[self.world * self.task.state.stride + self.target])
+
     def surfaces(self) -> list[Vector]:
-        """Return the surface samples of every object [m], each of shape (N, 3)."""
-        counts = [thing.body.surface_count for thing in self.scene.objects_of(self.world)]
-        state = self.task.state
-        start = int(state.particle_start.numpy()[self.world * state.stride])
-        points = self.scene.state.particle_q.numpy()[start : start + sum(counts)].astype(float)
-        return np.split(points, np.cumsum(counts)[:-1])
+        """Return the surface samples of every object that is there [m], each of shape (N, 3), the object's first."""
+        starts = self.task.state.particle_start.numpy()[list(self.scene.instances_of(self.world))]
+        points, things = self.scene.state.particle_q.numpy(), self.scene.objects_of(self.world)
+        return [points[starts[k] : starts[k] + things[k].body.surface_count].astype(float) for k in self._order]
 
     # -- acting -------------------------------------------------------------------------------------------------------
 

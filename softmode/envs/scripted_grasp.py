@@ -154,12 +154,12 @@ class ScriptedGrasp(ScriptedPolicy):
 
     def _plan(self) -> Grasp | None:
         """Choose a grasp where the object is, another one after every failed attempt; None if none fits any more."""
-        body, scale = self.soft.body, float(self.drawn("scale")[0])
+        body, scale = self.soft.body, self.material("scale")
         points = self.surfaces()
         turn = Rotation.align_vectors(points[0] - points[0].mean(0), body.surface_points - body.surface_points.mean(0))[
             0
         ]
-        stiffness = float(self.drawn("youngs_modulus")[0]) * scale
+        stiffness = self.material("youngs_modulus") * scale
         modes = np.einsum("ab,sbm->sam", turn.as_matrix(), _modes(self.soft)) / np.sqrt(stiffness)
         try:
             found = plan_grasps(
@@ -186,12 +186,12 @@ class ScriptedGrasp(ScriptedPolicy):
 
     def _weight(self) -> float:
         """Return the weight of the object [N]."""
-        volume = self.soft.body.volume * float(self.drawn("scale")[0]) ** 3
-        return float(self.drawn("density")[0]) * volume * 9.81
+        volume = self.soft.body.volume * self.material("scale") ** 3
+        return self.material("density") * volume * 9.81
 
     def _friction(self) -> float:
         """Return the friction coefficient between object and pads."""
-        return float(np.sqrt(self.drawn("friction")[0] * self.arm.gripper.friction))
+        return float(np.sqrt(self.material("friction") * self.arm.gripper.friction))
 
     def _needed_force(self) -> float:
         """Force of each finger that carries the weight by friction with a margin [N]."""

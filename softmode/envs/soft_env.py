@@ -33,7 +33,7 @@ from softmode.envs.env_state import (
     worlds_state,
 )
 from softmode.envs.parameters import check_options
-from softmode.envs.results import host_view, info_arrays, observation_arrays, take, write
+from softmode.envs.results import host_view, info_arrays, name_of, observation_arrays, take, write
 from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.envs.tensors import map_tree
@@ -233,5 +233,5 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         info = take(self._arrays[2], 0, scalars=True)
         info["solver_reasons"] = status_reasons(info["solver_status"])
         if self._object_names:
-            info["object_name"] = self._object_names[info["object"]]
+            info["object_name"] = name_of(info["object"], self._object_names)
         return info

@@ -22,8 +22,16 @@ from softmode.deformables.model.structs import filled
 from softmode.deformables.solver.parameters import set_parameters
 from softmode.envs import task_kernels as kernels
 from softmode.envs.cameras import FollowCamera, overview, square_camera, wrist_camera
+from softmode.envs.clutter import Arcs, clutter_parameters
 from softmode.envs.end_reason import EndReason
-from softmode.envs.observation import ObservationLayout, Segment, object_part, one_hot_part, proprioception
+from softmode.envs.observation import (
+    ObservationLayout,
+    Segment,
+    object_part,
+    one_hot_part,
+    others_part,
+    proprioception,
+)
 from softmode.envs.parameters import Parameter, ParameterTable
 from softmode.envs.reward_kernels import StepResult, WorldState
 from softmode.envs.task_config import ObservationType, TaskConfig
@@ -94,6 +102,9 @@ class Task:
     takes_sets: ClassVar[bool] = False
     """Whether object 0 may be another one in every world (`TaskConfig.objects`): what the task reads of it comes from
     `WorldState`, or is one per world, never of `scene.soft`."""
+    takes_several: ClassVar[bool] = False
+    """Whether worlds may have several objects of the set (`ObjectSet.per_world`): object 0 is that of the task, the
+    others lie beside it, see `other_arcs`."""
     any_robot: ClassVar[bool] = False
     """Whether the task has been tried with robots from files, which `robot` names."""
     kernels: ClassVar[Any] = None
@@ -123,6 +134,13 @@ class Task:
                 f" {self.object_set.count}",
                 hint="give config.scene.object one object; a task of yours may set takes_sets",
             )
+        self.slots = 1 if self.object_set is None else self.object_set.number_range[1]
+        """How many objects of the set a world has room for."""
+        if self.slots > 1 and not self.takes_several:
+            raise ConfigError(
+                f"{type(self).__name__} has one object per world, objects.per_world asks for {self.slots}",
+                hint="leave per_world out, or take LiftSoft, PushSoft or PlaceInBin",
+            )
         self.limit, self.autoreset_mode = limit, autoreset_mode
         cameras = []
         if obs_type != "state":
@@ -147,7 +165,7 @@ class Task:
         self._check_objects()
         kept = [self._kept(material) for material in self.scene.materials]
         self.table = ParameterTable(self.parameters(), world_count, self.device, kinds=kept, kind=self.scene.member)
-        self._rows: list[tuple[wp.array, wp.array]] = []
+        self._rows: list[tuple[wp.array, wp.array, bool]] = []
         members = self.scene.members
         points = [sample_farthest(thing.body.surface_points, self.point_count, first=0) for thing in members]
         self._points: NDArray[np.intp] = np.stack(points)
@@ -157,10 +175,11 @@ class Task:
         self.rest_height = self.per_object(heights)
         """Height of the centre of every unscaled object 0 over the table at rest [m], shape (world_count,)."""
         given = self.object_set
-        code = one_hot_part(given.count) if given is not None and config.objects_one_hot else ()
+        code = one_hot_part(given.count, self.slots) if given is not None and config.objects_one_hot else ()
+        beside = others_part(self.slots - 1)
         proprioception_and_goal = (*proprioception(self.scene.controller.joint_count), *self.goal_segments())
         self.layout = ObservationLayout(
-            (*proprioception_and_goal, *object_part(self.point_count), *self.object_segments(), *code)
+            (*proprioception_and_goal, *object_part(self.point_count), *self.object_segments(), *beside, *code)
         )
         self.segments = self.layout.segments
         """Columns of each segment: proprioception, goal, object, and what a task adds about it."""
@@ -201,19 +220,21 @@ class Task:
         given = self.object_set
         if given is None or not given.resample:
             return self.table.parameters
-        return {**self.table.parameters, "object": Parameter(name="object", low=(0.0,), high=(given.count - 1.0,))}
+        low, high = (0.0, *[-1.0] * (self.slots - 1)), (given.count - 1.0,) * self.slots
+        return {**self.table.parameters, "object": Parameter(name="object", low=low, high=high)}
 
-    def per_object(self, values: ArrayLike, dtype: type = float) -> wp.array:
+    def per_object(self, values: ArrayLike, dtype: type = float, *, every_slot: bool = False) -> wp.array:
         """Return an array with a row per world: that of its object, which follows it where a reset may change it.
 
         Args:
             values: A row per member of the scene, see `TableScene.members`.
             dtype: Type of the array, of a multiple of 32 bits.
+            every_slot: Whether the second axis has an entry per slot, which follows the object there.
         """
         table = np.asarray(values)
         array = wp.array(table[self.scene.member], dtype=dtype, device=self.device)
         if self.scene.resampled:
-            self._rows.append((wp.array(table, dtype=dtype, device=self.device), array))
+            self._rows.append((wp.array(table, dtype=dtype, device=self.device), array, every_slot))
         return array
 
     def column(self, segment: str) -> int:
@@ -253,19 +274,23 @@ class Task:
         self.any_done = wp.zeros(1, dtype=int, device=device)
         scene, instances = self.scene, worlds * len(self.scene.objects)
         self._material = wp.zeros((len(MATERIAL), instances), dtype=float, device=device)
-        self._materials = {name: cast(wp.array, self._material[k]) for k, name in enumerate(MATERIAL)}
+        self.materials = {name: cast(wp.array, self._material[k]) for k, name in enumerate(MATERIAL)}
+        """Material and scale of every soft object by name, each of shape (world_count * objects,)."""
         columns = [self.table.column(name) for name in MATERIAL]
         self._material_columns = wp.array(columns, dtype=int, device=device)
         self._solver_mask = wp.zeros(worlds + 1, dtype=wp.bool, device=device)
-        others = [thing.height for thing in scene.objects[1:]]
-        heights = np.array([[thing.height, *others] for thing in scene.members])
-        self._heights = self.per_object(heights)
+        others = [thing.height for thing in scene.objects[self.slots :]]
+        heights = np.array([[*[thing.height] * self.slots, *others] for thing in scene.members])
+        self._heights = self.per_object(heights, every_slot=self.slots > 1)
         self._lowest = self.per_object(heights[:, 0] - FALL)
         given = self.object_set
         self._ends = wp.array([1.0] if given is None else given.ends, dtype=float, device=device)
-        self._wanted = wp.full(worlds, -1, dtype=int, device=device)
+        self._wanted = wp.full(worlds * self.slots, int(kernels.UNASKED), dtype=int, device=device)
         self.object_index = scene.object_index
-        """Which object of the set each world has, shape (world_count,); zeros without a set."""
+        """Which object of the set each world has, see `TableScene.object_index`."""
+        self._choice: wp.array = scene.object_index.flatten()  # the same memory
+        own = [[kept.get(name, math.nan) for name in MATERIAL] for kept in map(self._kept, scene.materials)]
+        self._own_materials = wp.array(own, dtype=float, device=device)
         self._no_shift = zeros()
         self._low = wp.array(self.low, dtype=float, device=device)
         self._high = wp.array(self.high, dtype=float, device=device)
@@ -279,6 +304,8 @@ class Task:
             points=self.per_object(self._points, int),
             q=scene.state.softmode.q,
             stride=len(scene.objects),
+            slots=self.slots,
+            occupant=self._choice,
         )
         """What the kernels of a task read."""
         self.result = filled(StepResult, self, marker_place=scene.marker_place)
@@ -336,6 +363,14 @@ class Task:
         names = MATERIAL[: MATERIAL.index("scale")] if self.object_set is not None else ()
         return {name: getattr(material, name) for name in names if getattr(self.config, f"{name}_range") is None}
 
+    def other_arcs(self) -> Arcs:
+        """Return the ranges of directions from object 0 [rad] in which others of a set may lie; none for all around.
+
+        With them comes the distance that nothing there is to be nearer than, from the middle of object 0, in radii of
+        the objects with the clearance.
+        """
+        return Arcs()
+
     def build(self) -> None:
         """Allocate what the subclass needs; called once, when the scene stands."""
 
@@ -361,7 +396,14 @@ class Task:
             ranged("density", 1.0, 2.0e4, log=True),
             ranged("friction", 0.0, 10.0),
             ranged("scale", 0.5, 2.0),
+            *self._clutter_parameters(),
         )
+
+    def _clutter_parameters(self) -> tuple[Parameter, ...]:
+        """Return where objects beside object 0 lie."""
+        if self.slots == 1:
+            return ()
+        return clutter_parameters(self.config, self.slots - 1, self.scene.members, self.other_arcs())
 
     def goal_segments(self) -> tuple[Segment, ...]:
         """Return the segments of the observation that say what to reach."""
@@ -374,6 +416,7 @@ class Task:
     def place(self) -> None:
         """Write `place_position` and `place_yaw` of all objects of the worlds in `scene.world_mask`."""
         self.place_object(0, "position", "yaw")
+        self.place_others()
 
     def clear(self) -> None:
         """Reset `held`, and counters of the subclass, in the worlds of `scene.world_mask`."""
@@ -494,6 +537,18 @@ class Task:
         outputs = [scene.place_position, scene.place_yaw]
         self.launch(kernels.place_object, [scene.world_mask, self.state, place], outputs)
 
+    def place_others(self) -> None:
+        """Put the objects of a set beside object 0 down, about it."""
+        scene, others = self.scene, self.slots - 1
+        if not others:
+            return
+        names = {"turn": "others_turn", "place": "other_place_1", "yaw": "other_yaw_1", "scale": "scale"}
+        columns = {field: self.table.column(name) for field, name in names.items()}
+        stride = self.table.column("other_place_2") - columns["place"] if others > 1 else 0
+        clutter = filled(kernels.Clutter, **columns, stride=stride, height=self._heights, gap=GAP)
+        inputs, outputs = [scene.world_mask, self.state, clutter], [scene.place_position, scene.place_yaw]
+        self.launch(kernels.place_beside, inputs, outputs, (self.world_count, others))
+
     # -- episodes -----------------------------------------------------------------------------------------------------
 
     def reset(
@@ -523,9 +578,10 @@ class Task:
         options = dict(options or {})
         wanted = options.pop("object", None)
         if wanted is not None:
-            self._wanted.assign(np.where(mask, np.rint(wanted[:, 0]), -1).astype(np.int32))
+            asked = np.where(mask[:, None], np.rint(wanted), int(kernels.UNASKED)).astype(np.int32)
+            self._wanted.assign(asked.reshape(-1))
         self._draw()
-        self._wanted.fill_(-1)
+        self._wanted.fill_(int(kernels.UNASKED))
         if options:
             values = self.table.values.numpy().copy()
             for name, numbers in options.items():
@@ -551,8 +607,9 @@ class Task:
         """Draw the parameters of the worlds in `scene.world_mask`."""
         table = self.table
         if self.scene.resampled:
-            inputs = [self.scene.world_mask, self.seed, self.episode, self._ends, self._wanted]
-            self.launch(kernels.draw_objects, inputs, [self.object_index, table.kind])
+            least = 1 if self.object_set is None else self.object_set.number_range[0]
+            inputs = [self.scene.world_mask, self.seed, self.episode, self._ends, least, self.slots, self._wanted]
+            self.launch(kernels.draw_objects, inputs, [self._choice, table.kind])
         inputs = [self.scene.world_mask, self.seed, table.kind, table.low, table.high, table.log]
         self.launch(kernels.draw_parameters, inputs, [self.episode, table.values])
 
@@ -573,23 +630,28 @@ class Task:
     def use_objects(self) -> None:
         """Let the worlds in `scene.world_mask` have the objects that `object_index` says, with what is theirs."""
         self.scene.use_objects()
-        for table, array in self._rows:
-            self.scene.copy_rows(table, array)
+        for table, array, every_slot in self._rows:
+            self.scene.copy_rows(table, array, every_slot=every_slot)
 
     def apply_materials(self) -> None:
         """Give the bodies of the worlds in `scene.world_mask` the materials and sizes of their parameters."""
         values = self._material
-        self.launch(kernels.spread_materials, [self.state, self._material_columns], [values], values.shape[1])
+        inputs = [self.state, self._material_columns, self._own_materials, self._choice, self.slots]
+        self.launch(kernels.spread_materials, inputs, [values], values.shape[1])
         wp.copy(self._solver_mask, self.scene.world_mask, count=self.world_count)
-        set_parameters(self.scene.solver, self._solver_mask, **self._materials)
+        set_parameters(self.scene.solver, self._solver_mask, **self.materials)
 
     def write_observation(self) -> None:
         """Write the observation and the metrics of all worlds."""
         columns = self.layout.columns_in(kernels.Columns)
         self.launch(kernels.observe, [self.state, self._arm, columns], [self.observation])
         if self.object_set is not None and self.config.objects_one_hot:
-            dim, column = (self.world_count, self.object_set.count), self.column("object_one_hot")
-            self.launch(kernels.observe_kind, [self.object_index, column], [self.observation], dim)
+            count = self.object_set.count
+            inputs = [self._choice, self.slots, count, self.column("object_one_hot")]
+            self.launch(kernels.observe_kind, inputs, [self.observation], (self.world_count, self.slots * count))
+        if self.slots > 1:
+            inputs = [self.state, self._choice, self.column("other_offsets"), self.column("other_present")]
+            self.launch(kernels.observe_others, inputs, [self.observation], (self.world_count, self.slots - 1))
         self.observe()
         self.launch(kernels.bound_observation, [self._low, self._high], [self.observation, self.finite])
 

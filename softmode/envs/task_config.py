@@ -43,10 +43,13 @@ class TaskConfig:
     scene: TableSceneConfig = field(default_factory=TableSceneConfig)
     """Objects, robot and physics."""
     objects: ObjectSet | None = None
-    """Objects of which every world gets one and keeps it, in place of `scene.object`; material properties without a
+    """Objects of which every world gets one, or several, in place of `scene.object`; material properties without a
     range are those of the object, the range of another property holds for all."""
+    others_clearance: float = 0.03
+    """With several objects per world (`ObjectSet.per_world`): room around each where they are put down [m]."""
     objects_one_hot: bool = False
-    """Whether observations end with a number per object of the set: 1 for the one that is there, 0 for others."""
+    """Whether observations end with a number per object of the set: 1 for the one that is there, 0 for others; of
+    several per world those of one after another."""
     position_range: tuple[float, float] = (0.05, 0.08)
     """Half-width of the object's random position in x and y [m]."""
     yaw_range: float = math.pi
@@ -83,6 +86,7 @@ class TaskConfig:
         if self.objects_one_hot and self.object_set is None:
             raise ConfigError("objects_one_hot without objects", hint="give objects=ObjectSet([...])")
         require_numbers("position_range", self.position_range, 2, at_least=0.0, unit="m")
+        require_number("others_clearance", self.others_clearance, at_least=0.0, at_most=0.5, unit="m")
         require_number("yaw_range", self.yaw_range, at_least=0.0, unit="rad")
         for name, limits in _RANGES.items():
             if getattr(self, name) is not None:

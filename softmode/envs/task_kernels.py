@@ -10,6 +10,10 @@ from softmode.envs.reward_kernels import StepResult, WorldState, surface_point, 
 wp.set_module_options({"enable_backward": False})
 
 
+UNASKED = wp.constant(-2)
+"""In the place of an object that a reset is to draw."""
+
+
 @wp.struct
 class ArmState:
     """Joints and command of the arm in every world; two entries behind the joints' command the opening."""
@@ -53,6 +57,19 @@ class Placement:
     height: wp.array2d[float]  # of the unscaled object's centre [m], (world_count, objects)
     gap: float  # [m]
     object_index: int
+
+
+@wp.struct
+class Clutter:
+    """Columns of what objects beside object 0 are drawn and observed by; those of each follow each other."""
+
+    turn: int  # about object 0 [rad]
+    place: int  # angle [rad] and distance [m] from object 0
+    yaw: int  # [rad]
+    stride: int  # columns from one object to the next
+    scale: int
+    height: wp.array2d[float]  # of the unscaled objects' centres [m], (world_count, objects)
+    gap: float  # [m]
 
 
 @wp.struct
@@ -104,23 +121,32 @@ def draw_objects(
     seed: wp.array[int],
     episode: wp.array[int],  # before it is counted
     ends: wp.array[float],  # (objects,) where the share of each ends in [0, 1]
-    wanted: wp.array[int],  # the object that was asked for, -1 to draw one
+    least: int,  # objects that a world has
+    slots: int,  # most of them
+    wanted: wp.array[int],  # (world_count * slots,) the objects that were asked for, -1 for none; UNASKED to draw
     # Out:
-    object_out: wp.array[int],
-    kind_out: wp.array[int],
+    object_out: wp.array[int],  # (world_count * slots,), -1 for none
+    kind_out: wp.array[int],  # (world_count,), the first
 ):
-    """Draw the object of an episode by the weights; parameters, whose offsets are not negative, draw from others."""
+    """Draw the objects of an episode by the weights; parameters, whose offsets are not negative, draw from others."""
     w = wp.tid()
     if not world_mask[w]:
         return
-    chosen = wanted[w]
-    if chosen < 0:
-        u = wp.randf(wp.rand_init(seed[w], -2 - episode[w]))
-        chosen = int(0)
-        while chosen < ends.shape[0] - 1 and u >= ends[chosen]:
-            chosen += 1
-    object_out[w] = chosen
-    kind_out[w] = chosen
+    random = wp.rand_init(seed[w], -2 - episode[w])
+    number = slots
+    for slot in range(slots):
+        chosen = wanted[w * slots + slot]
+        if chosen == UNASKED:
+            u = wp.randf(random)
+            chosen = int(0)
+            while chosen < ends.shape[0] - 1 and u >= ends[chosen]:
+                chosen += 1
+            if slot == 0 and least < slots:
+                number = wp.min(least + int(float(slots + 1 - least) * wp.randf(random)), slots)
+            if slot >= number:
+                chosen = -1
+        object_out[w * slots + slot] = chosen
+    kind_out[w] = object_out[w * slots]
 
 
 @wp.kernel
@@ -147,16 +173,48 @@ def place_object(
 
 
 @wp.kernel
+def place_beside(
+    world_mask: wp.array[wp.bool],
+    state: WorldState,
+    clutter: Clutter,
+    # Out, per instance; that of object 0 is written:
+    position_out: wp.array[wp.vec3d],
+    yaw_out: wp.array[wp.float64],
+):
+    """Write where the objects beside object 0 are put down."""
+    w, k = wp.tid()
+    if not world_mask[w]:
+        return
+    place = clutter.place + k * clutter.stride
+    angle = state.parameters[w, clutter.turn] + state.parameters[w, place]
+    distance = state.parameters[w, place + 1]
+    middle = position_out[w * state.stride]
+    z = clutter.height[w, k + 1] * state.parameters[w, clutter.scale] + clutter.gap
+    x = float(middle[0]) + distance * wp.cos(angle)
+    y = float(middle[1]) + distance * wp.sin(angle)
+    i = w * state.stride + k + 1
+    position_out[i] = wp.vec3d(wp.float64(x), wp.float64(y), wp.float64(z))
+    yaw_out[i] = wp.float64(state.parameters[w, clutter.yaw + k * clutter.stride])
+
+
+@wp.kernel
 def spread_materials(
     state: WorldState,
     columns: wp.array[int],
+    kept: wp.array2d[float],  # (members, columns) what is the object's own; no number where it is drawn
+    choice: wp.array[int],  # (world_count * slots,)
+    slots: int,
     # Out, (columns, instance_count):
     values: wp.array2d[float],
 ):
-    """Give all soft objects of a world the drawn material and scale."""
+    """Give all soft objects of a world the drawn material and scale; beside the first, an object of a set keeps its."""
     i = wp.tid()
     for m in range(values.shape[0]):
-        values[m, i] = state.parameters[i // state.stride, columns[m]]
+        value = state.parameters[i // state.stride, columns[m]]
+        if slots > 1 and i % slots > 0:
+            if choice[i] >= 0 and wp.isfinite(kept[choice[i], m]):
+                value = kept[choice[i], m]
+        values[m, i] = value
 
 
 @wp.kernel
@@ -200,15 +258,36 @@ def observe(
 
 
 @wp.kernel
+def observe_others(
+    state: WorldState,
+    choice: wp.array[int],  # (world_count * objects,), -1 for none
+    offsets: int,  # columns
+    present: int,
+    # Out:
+    observation: wp.array2d[float],
+):
+    """Write the ways from object 0 to the others and whether these are there; zeros for those that are not."""
+    w, k = wp.tid()
+    way = wp.vec3()
+    there = choice[w * state.stride + k + 1] >= 0
+    if there:
+        way = state.object_position[w, k + 1] - state.object_position[w, 0]
+    write(observation, w, offsets + 3 * k, way)
+    observation[w, present + k] = wp.where(there, 1.0, 0.0)
+
+
+@wp.kernel
 def observe_kind(
-    kind: wp.array[int],  # object of the set that each world has
+    kind: wp.array[int],  # (world_count * slots,) objects of the set that each world has
+    slots: int,
+    count: int,  # objects of the set
     column: int,
     # Out:
     observation: wp.array2d[float],
 ):
-    """Write 1 for the object of the set that is there, and 0 for the others."""
+    """Write for each slot 1 for the object of the set that is there, and 0 for the others."""
     w, k = wp.tid()
-    observation[w, column + k] = wp.where(kind[w] == k, 1.0, 0.0)
+    observation[w, column + k] = wp.where(kind[w * slots + k / count] == k % count, 1.0, 0.0)
 
 
 @wp.kernel

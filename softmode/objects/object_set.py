@@ -22,19 +22,22 @@ from softmode.splats.formats import READABLE
 from softmode.stages import tokens
 
 Order = Literal["drawn", "in_turn"]
+MOST = 8
+"""Most objects of a set that a world may have at a time."""
 MESHES = (".obj", ".glb", ".gltf", ".stl", ".off")
 _READ = frozenset((*READABLE, *RADIANCE, *MESHES, *tokens.SUFFIXES, ".xyz"))
 
 
 @dataclass(frozen=True)
 class ObjectSet:
-    """Soft objects of which every world gets one when it is made, and keeps it.
+    """Soft objects of which every world gets one when it is made, and keeps it; or another one, or several, at resets.
 
     Objects that are named get the `build` and `surface_count` of the scene's object; configurations are taken as they
     are. World i gets the same object whatever the number of worlds is.
 
     Raises:
-        ConfigError: If it is empty, an object is none, or weights or materials are not one per object.
+        ConfigError: If it is empty, an object is none, weights or materials are not one per object, or `per_world` lies
+            outside 1..8.
         AssetError: If a file that is named is missing.
     """
 
@@ -55,6 +58,9 @@ class ObjectSet:
     resample: bool = field(default=False, kw_only=True)
     """Whether a world gets another object at every reset, drawn by the weights and the seed of `reset`, or named by its
     option `object`; all objects of the set are then resident, and each world has room for the largest."""
+    per_world: int | tuple[int, int] = field(default=1, kw_only=True)
+    """How many objects a world has at a time, a number or (least, most), 1..8; from a range each reset draws it, all
+    numbers equally often. The same object may be there several times. More than one needs `resample`."""
 
     def __post_init__(self) -> None:
         """Check the objects and what belongs to each."""
@@ -85,6 +91,7 @@ class ObjectSet:
         require_number("seed", self.seed, at_least=0, at_most=SEED_MAX)
         if self.resample and self.order != "drawn":
             raise ConfigError("resample draws objects, and order deals them out in turn", hint="leave order out")
+        self._check_per_world()
         require_number("first_world", self.first_world, at_least=0)
         if self.weights is not None:
             for k, weight in enumerate(self.weights):
@@ -94,6 +101,28 @@ class ObjectSet:
             if self.order != "drawn":
                 hint = "leave one of them out"
                 raise ConfigError("weights are given, and objects are dealt out in turn", hint=hint)
+
+    def _check_per_world(self) -> None:
+        """Check how many objects a world has."""
+        given: Any = self.per_world
+        pair = given if isinstance(given, tuple | list) else (given, given)
+        if len(pair) != 2:
+            raise ConfigError(f"per_world is {given!r}", hint="give a number, or the least and the most")
+        for number in pair:
+            require_number("per_world", number, at_least=1, at_most=MOST)
+            if int(number) != number:
+                raise ConfigError(f"per_world is {given!r}", hint="give whole numbers")
+        least, most = (int(number) for number in pair)
+        if least > most:
+            raise ConfigError(f"per_world ranges from {least} to {most}", hint="give the least first")
+        if most > 1 and not self.resample:
+            raise ConfigError(f"per_world is {given!r} and worlds keep their objects", hint="give resample=True")
+        object.__setattr__(self, "per_world", most if least == most else (least, most))
+
+    @property
+    def number_range(self) -> tuple[int, int]:
+        """The least and the most objects that a world has at a time."""
+        return self.per_world if isinstance(self.per_world, tuple) else (self.per_world, self.per_world)
 
     @classmethod
     def folder(cls, path: str | os.PathLike[str], **options: Any) -> Self:

@@ -17,12 +17,12 @@ from softmode.deformables.model.namespaces import soft
 from softmode.deformables.skinning.skin_splats import SkinSplats
 from softmode.deformables.skinning.skinning_kernels import vec6
 from softmode.deformables.solver import body_choice_kernels as kernels
-from softmode.deformables.solver.body_choice import words_of
+from softmode.deformables.solver.body_choice import copy_slots
 from softmode.errors import ConfigError
 from softmode.objects.soft_object import SoftObject
 from softmode.scenes.host import host
 from softmode.scenes.splat_axes_kernels import principal_axes
-from softmode.splats.rasterizer import SplatArrays
+from softmode.splats.rasterizer import SplatArrays, spanning_columns
 from softmode.splats.splats import Splats
 
 _ARRAYS = ("means", "covariances", "opacities", "sh", "rotations", "spanning")
@@ -75,9 +75,9 @@ class BoundSplats:
         worlds: Which worlds; all of them if None. Without a model: which states, the first if None.
         others: Splats behind those of the objects, which `update` leaves where they are: a marker, rigid toys; a list
             with one per world of the model where worlds differ.
-        resident: Objects of which the first soft body of each world may become any, see `choose`; lists in `others`
-            then have one Splats per resident.
-        choice: Which of them each world has, int32, shape (world_count,).
+        resident: Objects of which every soft body of a world may become any, see `choose`; lists in `others` then have
+            one Splats per resident, and follow the first.
+        choice: Which of them each world has, int32, shape (world_count,), or (world_count, objects), -1 for none.
         sh_degree: Highest degree of the colours, 0 to 3; None for that of the splats.
         device: Warp device where there is no model.
 
@@ -98,7 +98,7 @@ class BoundSplats:
         device: wp.DeviceLike = None,
     ) -> None:
         """Upload the splats at rest."""
-        self._choice: Any = choice
+        self._choice: Any = None if choice is None else choice.flatten()  # the same memory
         self._resident = tuple(resident)
         device = device if model is None else model.device
         each = [[thing] if thing is None or isinstance(thing, SoftObject) else list(thing) for thing in objects]
@@ -127,8 +127,13 @@ class BoundSplats:
         parts += [part if isinstance(part, Splats) else [part[w] for w in chosen] for part in others]
         count = len(self._resident) or len(starts)
         arrays = SplatArrays.from_splats(parts, world_count=count, sh_degree=sh_degree, device=device)
+        if self._resident and len(each) > 1:
+            widths = [max(part.count for part in splats) for splats in map(_listed, parts)]
+            arrays = _one_row_each(arrays, count, widths)
         self._table = arrays
-        self.arrays = arrays if choice is None else _rows_of(arrays, np.asarray(choice.numpy(), np.int32))
+        self._slots = len(each) if self._resident else 1
+        rows = None if choice is None else self._choice.numpy()[:: self._slots].astype(np.int32)
+        self.arrays = arrays if rows is None else _rows_of(arrays, rows)
         """The splats as they are, for cameras and rasterisers."""
         self._counts = [[part.count] if isinstance(part, Splats) else [one.count for one in part] for part in parts]
         ends = np.cumsum([max(counts) for counts in self._counts]).tolist()
@@ -137,12 +142,15 @@ class BoundSplats:
         the last columns of a world may be empty."""
         self._skins: list[_Skin] = []
         if self._resident:
-            place = {"start": starts[:, 0], "samples": samples[:, 0]}
-            place = {name: _column(values, device) for name, values in place.items()}
+            places = [
+                {"start": _column(start, device), "samples": _column(first, device)}
+                for start, first in zip(starts.T, samples.T, strict=True)
+            ]
             for thing in self._resident:
                 skin = _skin(thing, device)
-                rows = wp.zeros(len(starts), dtype=int, device=device)
-                self._skins.append(_Skin(skin=skin, rows=rows, first=self.columns[0].start, **place))
+                for place, columns in zip(places, self.columns, strict=False):
+                    rows = wp.zeros(len(starts), dtype=int, device=device)
+                    self._skins.append(_Skin(skin=skin, rows=rows, first=columns.start, **place))
             self.choose(wp.ones(len(starts), dtype=wp.bool, device=device))
             return
         for o, columns in zip(self.indices, self.columns, strict=False):
@@ -158,14 +166,16 @@ class BoundSplats:
                 self._skins.append(_Skin(skin=skin, rows=rows, first=columns.start, **place))
 
     def choose(self, world_mask: wp.array) -> None:
-        """Show the object that `choice` says in the masked worlds, shape (world_count,) bool; capturable."""
+        """Show the objects that `choice` says in the masked worlds, shape (world_count,) bool; capturable."""
         if self._choice is None:
             return
+        slots, worlds = self._slots, world_mask.shape[0]
+        widths = [columns.stop - columns.start for columns in self.columns[:slots]]
         for table, array in self.per_object:
-            rows, worlds = words_of(table, len(self._resident)), words_of(array, len(self._choice))
-            launch(self._choice.device, kernels.copy_rows, worlds.shape, rows, self._choice, world_mask, worlds)
-        for k, one in enumerate(self._skins):
-            launch(self._choice.device, kernels.rows_that_chose, len(self._choice), self._choice, k, one.rows)
+            copy_slots(table, array, self._choice, world_mask, parts=widths if slots > 1 else None)
+        for n, one in enumerate(self._skins):
+            k, slot = divmod(n, slots)
+            launch(self._choice.device, kernels.rows_that_chose, worlds, self._choice, slots, slot, k, one.rows)
 
     @property
     def per_object(self) -> list[tuple[wp.array, wp.array]]:
@@ -191,13 +201,18 @@ class BoundSplats:
             one.skin.launch(q, one.start, *moved, dent=dent, sample_start=one.samples, **where)
 
     def frames(self) -> dict[tuple[int, int], SplatFrame]:
-        """Return the splats as they are by place of the world in `worlds` and object; reads from the device."""
+        """Return the splats as they are by place of the world in `worlds` and object; reads from the device.
+
+        An object that is not there has none.
+        """
         means, covariances = host(self.arrays.means), host(self.arrays.covariances)
-        shown = np.arange(len(means)) if self._choice is None else self._choice.numpy()
+        shown = np.tile(np.arange(len(means))[:, None], len(self.indices))
+        if self._choice is not None:
+            shown = self._choice.numpy().reshape(len(means), self._slots)
         frames: dict[tuple[int, int], SplatFrame] = {}
-        for o, columns, counts in zip(self.indices, self.columns, self._counts, strict=False):
-            for w in range(len(means)):
-                mine = slice(columns.start, columns.start + counts[shown[w] % len(counts)])
+        for k, (o, columns, counts) in enumerate(zip(self.indices, self.columns, self._counts, strict=False)):
+            for w in np.flatnonzero(shown[:, k] >= 0).tolist():
+                mine = slice(columns.start, columns.start + counts[shown[w, k] % len(counts)])
                 frames[w, o] = SplatFrame(means=means[w, mine].copy(), covariances=covariances[w, mine].copy())
         return frames
 
@@ -230,12 +245,39 @@ def splats_of_states(thing: SoftObject, states: ArrayLike, dents: ArrayLike | No
             yield rest.with_covariances(frame.means, frame.covariances, turns[k] if rest.sh_degree else np.eye(3))
 
 
+def _listed(part: Splats | list[Splats]) -> list[Splats]:
+    """Return the splats of a part, a list of one where all worlds show the same."""
+    return [part] if isinstance(part, Splats) else part
+
+
+def _one_row_each(table: SplatArrays, count: int, widths: Sequence[int]) -> SplatArrays:
+    """Return arrays of which every one has a row per choice, so that one that is not there can be hidden.
+
+    Args:
+        table: Arrays of which some have one row for all.
+        count: Number of choices.
+        widths: Columns of each part; a shadow spans some of each, since any of them may be all that is there.
+    """
+    device = table.means.device
+    starts = np.cumsum([0, *widths])
+    spanning = np.concatenate([a + spanning_columns(n) for a, n in zip(starts, widths, strict=False)])
+
+    def repeated(name: str) -> wp.array:
+        array: wp.array = getattr(table, name)
+        if array.shape[0] == count:
+            return array
+        return wp.array(np.repeat(array.numpy(), count, axis=0), dtype=array.dtype, device=device)
+
+    named = {name: repeated(name) for name in ("opacities", "sh")}
+    return replace(table, **named, spanning=wp.array(spanning[None], dtype=wp.int32, device=device))
+
+
 def _rows_of(table: SplatArrays, rows: NDArray[np.int32]) -> SplatArrays:
     """Return arrays with some of the rows of others; those that all rows share stay as they are."""
 
     def chosen(name: str) -> Any:
         array: Any = getattr(table, name)
-        if array is None or array.shape == (1, 1) or (array.shape[0] == 1 and table.means.shape[0] > 1):
+        if array is None or array.shape[0] != table.means.shape[0] or array.shape == (1, 1):
             return array
         return wp.array(array.numpy()[rows], dtype=array.dtype, device=array.device)
 

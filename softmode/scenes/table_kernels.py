@@ -11,7 +11,7 @@ class ObjectBases:
 
     body: wp.array[int]  # (instance_count,) row of each soft object
     function_start: wp.array[int]  # (instance_count,)
-    function_count: wp.array[int]  # (body_count,)
+    function_count: wp.array[int]  # (instance_count,), 0 for an object that is not there
     linear: wp.array3d[wp.float64]  # (body_count, function_max, 4)
     mean: wp.array2d[wp.float64]  # (body_count, function_max)
     stride: int  # soft objects per world
@@ -33,7 +33,7 @@ def place_objects(
     """Set q of every object to the placement x = scale R(yaw) X + position, at rest; clamps hold it so."""
     i, k = wp.tid()
     b = bases.body[i]
-    if not world_mask[i / bases.stride] or k >= bases.function_count[b]:
+    if not world_mask[i / bases.stride] or k >= bases.function_count[i]:
         return
     size = wp.float64(scale[i])
     c = size * wp.cos(yaw[i]) - wp.float64(1.0)
@@ -49,6 +49,31 @@ def place_objects(
 
 
 @wp.kernel
+def park_objects(
+    bases: ObjectBases,
+    world_mask: wp.array[wp.bool],
+    place: wp.vec3,  # [m]
+    particle_start: wp.array[int],  # (instance_count,)
+    room: int,  # surface samples that there is room for
+    # Out:
+    q_out: wp.array[wp.vec3d],
+    qd_out: wp.array[wp.vec3d],
+    particle_q_out: wp.array[wp.vec3],
+    particle_qd_out: wp.array[wp.vec3],
+):
+    """Clear the coordinates of objects that are not there, and put their particles, which nothing reads, aside."""
+    i = wp.tid()
+    if not world_mask[i / bases.stride] or bases.function_count[i] > 0:
+        return
+    for k in range(bases.mean.shape[1]):
+        q_out[bases.function_start[i] + k] = wp.vec3d()
+        qd_out[bases.function_start[i] + k] = wp.vec3d()
+    for s in range(room):
+        particle_q_out[particle_start[i] + s] = place
+        particle_qd_out[particle_start[i] + s] = wp.vec3()
+
+
+@wp.kernel
 def observe_objects(
     bases: ObjectBases,
     # State in:
@@ -58,13 +83,13 @@ def observe_objects(
     position_out: wp.array2d[wp.vec3],
     velocity_out: wp.array2d[wp.vec3],
 ):
-    """Compute position and velocity of the centre of mass: sum_k mean(b_k) q_k."""
+    """Compute position and velocity of the centre of mass: sum_k mean(b_k) q_k, zero where no object is there."""
     i = wp.tid()
     b = bases.body[i]
     start = bases.function_start[i]
     x = wp.vec3d()
     v = wp.vec3d()
-    for k in range(bases.function_count[b]):
+    for k in range(bases.function_count[i]):
         x += bases.mean[b, k] * q[start + k]
         v += bases.mean[b, k] * qd[start + k]
     w = i / bases.stride

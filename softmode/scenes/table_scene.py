@@ -18,8 +18,7 @@ from softmode.deformables.model.authoring import register_custom_attributes, res
 from softmode.deformables.model.compile_ahead import compile_for_building
 from softmode.deformables.model.declare import launch
 from softmode.deformables.model.status import status_reasons
-from softmode.deformables.solver.body_choice import BodyChoice, words_of
-from softmode.deformables.solver.body_choice_kernels import copy_rows
+from softmode.deformables.solver.body_choice import BodyChoice, copy_slots
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.deformables.tools.grips import GripOptions, Grips, add_grip_slots
 from softmode.errors import ConfigError
@@ -46,6 +45,12 @@ from softmode.splats.splats import Splats
 
 GAP = 2.0e-4
 """Height over the table at which objects are put down [m]."""
+TABLE_PLACE = (0.35, 0.0, -0.03)
+"""Centre of the table [m]."""
+TABLE_SIZE = (0.5, 0.6, 0.03)
+"""Half of its edges [m]."""
+PARKED = (0.0, 0.0, -1.0)
+"""Where the surface samples of objects lie that are not there [m]; nothing draws or touches them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +60,7 @@ class TableSceneConfig:
     object: ObjectConfig = field(default_factory=ObjectConfig)
     """The soft object."""
     objects: ObjectSet | None = None
-    """Objects of which each world gets one in place of `object`; those that are named get its build."""
+    """Objects of which each world gets one, or several, in place of `object`; those that are named get its build."""
     others: tuple[ObjectConfig, ...] = ()
     """More soft objects, of the same material."""
     fixtures: tuple[Fixture, ...] = ()
@@ -152,7 +157,7 @@ class TableScene:
                 if len(self.members) == 1 and not self.resampled
                 else [self.members[m] for m in self.member]
             )
-            things = (first, *self.objects[1:])
+            things = (*[first] * self.slots, *self.objects[self.slots :])
             resident = {"resident": self.members, "choice": self.object_index} if self.resampled else {}
             self.splats = BoundSplats(self.model, things, others=() if marker is None else (marker,), **resident)
             if marker is not None:
@@ -176,6 +181,8 @@ class TableScene:
             self.film = FilmCamera(self.model, self.state, columns_of(seen, things), goal, film)
         self._graph: wp.Graph | None = None
         self._camera_graphs: dict[tuple[int, int], wp.Graph] = {}
+        if self.slots > 1:
+            self.use_objects()
         self.reset()
 
     @property
@@ -185,8 +192,13 @@ class TableScene:
 
     @property
     def chosen(self) -> NDArray[np.intp]:
-        """Which object of the set each world has, shape (world_count,); zeros without a set."""
-        return self.object_index.numpy().astype(np.intp) if self.resampled else self._chosen
+        """Which object of the set each world has first, shape (world_count,); zeros without a set."""
+        return self.chosen_of_slots[:, 0] if self.resampled else self._chosen
+
+    @property
+    def chosen_of_slots(self) -> NDArray[np.intp]:
+        """Which objects of the set each world has, shape (world_count, slots), -1 for none."""
+        return self.object_index.numpy().astype(np.intp).reshape(self.world_count, self.slots)
 
     @property
     def member(self) -> NDArray[np.intp]:
@@ -194,8 +206,17 @@ class TableScene:
         return self.chosen if self.resampled else self._member
 
     def objects_of(self, world: int) -> tuple[SoftObject, ...]:
-        """Return the soft objects of a world."""
-        return (self.members[self.member[world]], *self.objects[1:])
+        """Return the soft objects of a world, those that are there."""
+        if self.slots == 1:
+            return (self.members[self.member[world]], *self.objects[1:])
+        return tuple(self.members[m] for m in self.chosen_of_slots[world] if m >= 0)
+
+    def instances_of(self, world: int) -> tuple[int, ...]:
+        """Return the instances of the solver that the soft objects of a world are, in the order of `objects_of`."""
+        first = world * len(self.objects)
+        if self.slots == 1:
+            return tuple(range(first, first + len(self.objects)))
+        return tuple(first + int(s) for s in np.flatnonzero(self.chosen_of_slots[world] >= 0))
 
     def marker_of(self, world: int) -> Splats | None:
         """Return the splats that mark a place in a world, as they were given; None without any."""
@@ -218,6 +239,8 @@ class TableScene:
         chosen: NDArray[np.intp] = np.zeros(self.world_count, dtype=np.intp)
         self.resampled = config.objects is not None and config.objects.resample
         """Whether a world may have another object of the set after a reset."""
+        self.slots = 1 if config.objects is None else config.objects.number_range[1]
+        """How many objects of the set a world has room for."""
         if config.objects is None:
             self.members: tuple[SoftObject, ...] = (loaded_once(config.object, config.material),)
             """What object 0 of the worlds is: one soft object, or those of the set that some world has."""
@@ -239,10 +262,15 @@ class TableScene:
                 own or thing.material or config.material for thing, (_, own) in zip(self.members, kinds, strict=True)
             )
         self._chosen = chosen
-        self.object_index = wp.array(chosen, dtype=int, device=self.device)
-        """Which object of the set each world has, int32, shape (world_count,); zeros without a set."""
+        shown = np.column_stack([chosen, np.full((self.world_count, self.slots - 1), -1)])
+        self._choice_of_slots = wp.array(shown.reshape(-1), dtype=int, device=self.device)
+        self.object_index: wp.array = self._choice_of_slots
+        """Which object of the set each world has, int32, shape (world_count,); zeros without a set. Shape (world_count,
+        slots) where it may have several, -1 for a slot without one."""
+        if self.slots > 1:
+            self.object_index = self._choice_of_slots.reshape((self.world_count, self.slots))
         others = tuple(loaded_once(kind, config.material) for kind in config.others)
-        self.objects: tuple[SoftObject, ...] = (self.members[self._member[0]], *others)
+        self.objects: tuple[SoftObject, ...] = (*[self.members[self._member[0]]] * self.slots, *others)
         """The soft objects of a world, of world 0 where worlds differ (see `objects_of`); their instances follow each
         other, world by world."""
 
@@ -264,12 +292,11 @@ class TableScene:
         config = self.config
         world = newton.ModelBuilder()
         self.arm = config.arm.add_to(world)
-        place, size = (0.35, 0.0, -0.03), (0.5, 0.6, 0.03)
-        slate = (0.42, 0.48, 0.54)
-        table = Fixture(label="table", position=place, size=size, color=slate, friction=config.table_friction)
+        slate, friction = (0.42, 0.48, 0.54), config.table_friction
+        table = Fixture(label="table", position=TABLE_PLACE, size=TABLE_SIZE, color=slate, friction=friction)
         for fixture in (table, *config.fixtures):
             add_fixture(world, fixture)
-        for thing in (first, *self.objects[1:]):
+        for thing in (*[first] * self.slots, *self.objects[self.slots :]):
             placed = Placed(object=thing, position=(*config.object_position, thing.height))
             instance = placed.add_to(world, material=material if thing is first else config.material)
             if config.grip_slots:
@@ -315,8 +342,8 @@ class TableScene:
         if self.resampled:
             self._choice = BodyChoice(self.solver, [thing.body for thing in self.members], self.materials)
             place = {key: row for row, key in enumerate(found)}  # bodies are told apart by identity
-            rows = [place[id(thing.body)] for thing in self.members]
-            self._base_rows = wp.array(np.array(rows)[:, None], dtype=int, device=device)
+            rows = [[place[id(thing.body)]] * self.slots for thing in self.members]
+            self._base_rows = wp.array(np.array(rows), dtype=int, device=device)
         self.world_mask = wp.ones(worlds, dtype=wp.bool, device=device)
         """Which worlds `reset_worlds` resets, shape (world_count,)."""
         self._solver_mask = wp.zeros(worlds + 1, dtype=wp.bool, device=device)
@@ -336,13 +363,12 @@ class TableScene:
         for b, body in enumerate(bodies):
             linear[b, : body.function_count], mean[b, : body.function_count] = body.linear_coordinates, body.mean_basis
         first = np.array([rows[id(thing.body)] for thing in self.members])[self._member]
-        others = np.array([rows[id(thing.body)] for thing in self.objects[1:]], int)
-        body = np.column_stack([first, np.tile(others, (self.world_count, 1))]).reshape(-1)
+        others = np.array([rows[id(thing.body)] for thing in self.objects[self.slots :]], int)
+        body = np.column_stack([*[first] * self.slots, np.tile(others, (self.world_count, 1))]).reshape(-1)
         bases = kernels.ObjectBases()
         bases.body = wp.array(body, dtype=int, device=device)
         bases.function_start = self.model.softmode.function_start
-        counts = [body.function_count for body in bodies]
-        bases.function_count = wp.array(counts, dtype=int, device=device)
+        bases.function_count = self.solver.tables.instances.function_count
         bases.linear = wp.array(linear, dtype=wp.float64, device=device)
         bases.mean = wp.array(mean, dtype=wp.float64, device=device)
         bases.stride = len(self.objects)
@@ -393,12 +419,16 @@ class TableScene:
         dim = (worlds * len(self.objects), self._bases.mean.shape[1])
         launch(self.device, kernels.place_objects, dim, self._bases, *place, *outputs)
         self.solver.update_particles(state)
+        if self.slots > 1:
+            room = (wp.vec3(*PARKED), data.particle_start, self.solver.tables.layout.sample_max)
+            parked = (state.softmode.q, state.softmode.qd, state.particle_q, state.particle_qd)
+            launch(self.device, kernels.park_objects, dim[0], self._bases, self.world_mask, *room, *parked)
         self.controller.reset(state, self.world_mask)
         self.controller.write_targets(self.control)
         self.observe()
 
     def use_objects(self) -> None:
-        """Put the object that `object_index` says into the worlds of `world_mask`; capturable.
+        """Put the objects that `object_index` says into the worlds of `world_mask`; capturable.
 
         Materials, places and the state come after it: set the parameters and call `reset_worlds`.
 
@@ -407,17 +437,24 @@ class TableScene:
         """
         if self._choice is None:
             raise ConfigError("the worlds keep their objects", hint="give objects=ObjectSet([...], resample=True)")
-        self._choice.set(self.object_index, self.world_mask)
-        self.copy_rows(self._base_rows, self._bases.body)
+        self._choice.set(self._choice_of_slots, self.world_mask)
+        bodies = self._bases.body.reshape((self.world_count, self.slots))
+        self.copy_rows(self._base_rows, bodies, every_slot=True)
         if self.splats is not None:
             self.splats.choose(self.world_mask)
         if self._marker_rows is not None:
             self.copy_rows(self._marker_rows, self.marker_points)
 
-    def copy_rows(self, table: wp.array, out: wp.array) -> None:
-        """Copy from a table with a row per object that of its object to each world of `world_mask`; capturable."""
-        rows, worlds = words_of(table, len(self.members)), words_of(out, self.world_count)
-        launch(self.device, copy_rows, worlds.shape, rows, self.object_index, self.world_mask, worlds)
+    def copy_rows(self, table: wp.array, out: wp.array, *, every_slot: bool = False) -> None:
+        """Copy from a table with a row per object that of its object to each world of `world_mask`; capturable.
+
+        Args:
+            table: Shape (members, ...).
+            out: Shape (world_count, ...).
+            every_slot: Whether the second axis has an entry per slot, which follows the object of that slot, and is
+                zero where there is none. Else all follows the first.
+        """
+        copy_slots(table, out, self._choice_of_slots, self.world_mask, parts=[1] * self.slots if every_slot else None)
 
     def _set_stiffness(self, mask: np.ndarray, youngs_modulus: np.ndarray) -> None:
         """Change E in the masked worlds."""
@@ -500,9 +537,13 @@ class TableScene:
 
     @property
     def heights(self) -> NDArray[np.float64]:
-        """Height of the centre of every unscaled object over the table at rest [m], shape (world_count, objects)."""
-        first = np.array([thing.height for thing in self.members])[self.member]
-        others = np.array([thing.height for thing in self.objects[1:]])
+        """Height of the centre of every unscaled object over the table at rest [m], shape (world_count, objects).
+
+        Zero for an object that is not there.
+        """
+        heights = np.array([*(thing.height for thing in self.members), 0.0])
+        first = heights[self.chosen_of_slots] if self.slots > 1 else heights[self.member][:, None]
+        others = np.array([thing.height for thing in self.objects[self.slots :]])
         return np.column_stack([first, np.tile(others, (self.world_count, 1))])
 
     @property

@@ -140,6 +140,9 @@ class TaskSource:
     def __init__(self, task: RecordedTask, world: int, name: str) -> None:
         """Keep the task; ``world`` is the one whose steps count."""
         scene = task.scene
+        if scene.slots > 1:
+            hint = "record an environment of one object per world"
+            raise ConfigError("a recording cannot follow worlds whose number of objects changes", hint=hint)
         self.name, self.model, self.solver = name, scene.model, scene.solver
         self.objects: Sequence[SoftObject | None] = scene.objects_of(world)
         self.control: newton.Control | None = scene.control

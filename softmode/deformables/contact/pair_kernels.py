@@ -146,6 +146,7 @@ def mark_near(
     samples: Samples,
     # Out:
     pairs: Pairs,
+    any_near: wp.array[int],  # (1,), set before to 0
 ):
     """Mark the instances that may touch another one or themselves."""
     i = wp.tid()
@@ -155,6 +156,8 @@ def mark_near(
         if j != i and meets(instances, samples, i, j):
             near = 1
     pairs.near[i] = near
+    if near != 0:
+        wp.atomic_max(any_near, 0, 1)
 
 
 @wp.kernel

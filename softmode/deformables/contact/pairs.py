@@ -76,6 +76,8 @@ class SoftPairs:
             "thickness": np.concatenate([thickness(body) for body in layout.bodies]),
         }
         self.table = allocate(kernels.Pairs, _AXES, sizes, device, given=given)
+        self.any_near = wp.zeros(1, dtype=int, device=device)
+        """Whether any instance may touch another one, or itself, in this step."""
 
     def detect(
         self,
@@ -97,9 +99,29 @@ class SoftPairs:
             constraints: Point constraints of the step.
             dt: Step [s].
         """
+        self.any_near.zero_()
+        near = (self.instances, state, samples, self.table, self.any_near)
+        self._launch(kernels.mark_near, self.layout.instance_count, *near)
+        given = {"motion": motion, "samples": samples, "state": state, "memory": memory, "constraints": constraints}
+        wp.capture_if(self.any_near, on_true=lambda: self._find(**given, dt=dt), on_false=lambda: self._none(constraints))
+
+    def _none(self, constraints: PointConstraints) -> None:
+        """Write that nothing touches."""
+        self.table.count.zero_()
+        constraints.pair_count.zero_()
+
+    def _find(
+        self,
+        motion: Motion,
+        samples: Samples,
+        state: NewtonState,
+        memory: SoftState,
+        constraints: PointConstraints,
+        dt: float,
+    ) -> None:
+        """Find the pairs, where some bodies are near."""
         pairs, instances, basis = self.table, self.instances, self.basis
         every, count, constraint_max = samples.position.shape, self.layout.instance_count, constraints.row.shape[1]
-        self._launch(kernels.mark_near, count, instances, state, samples, pairs)
         self._launch(kernels.place_surface, every, instances, basis, motion, samples, pairs)
         self._launch(kernels.find_pairs, every, instances, basis, state, samples, pairs)
         launch_teams(self.device, kernels.compact_pairs, count, self.team, instances, self.team, pairs, state.status)
@@ -113,8 +135,15 @@ class SoftPairs:
     def remember(self, motion: Motion, state: NewtonState, constraints: PointConstraints, memory: SoftState) -> None:
         """Write what sticks at the end of the step into the state ``memory``; arguments as for :meth:`detect`."""
         tables = (self.instances, self.basis, motion, state, self.table, constraints)
-        out = (memory.stick_partner, memory.stick_slip)
-        self._launch(kernels.remember_pairs, self.table.surface_normal.shape, *tables, *out)
+        out, every = (memory.stick_partner, memory.stick_slip), self.table.surface_normal.shape
+
+        def none() -> None:
+            memory.stick_partner.fill_(wp.vec2i(-1, -1))
+            memory.stick_slip.zero_()
+
+        wp.capture_if(
+            self.any_near, on_true=lambda: self._launch(kernels.remember_pairs, every, *tables, *out), on_false=none
+        )
 
     def leave_dents(self, constraints: PointConstraints, memory: SoftState) -> None:
         """Add the dents that these contacts leave to those in the state ``memory``."""

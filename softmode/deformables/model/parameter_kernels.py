@@ -3,7 +3,7 @@
 import warp as wp
 
 from softmode.deformables.model.declare import struct
-from softmode.deformables.model.struct_kernels import Instances, in_mask
+from softmode.deformables.model.struct_kernels import Instances, exists, in_mask
 
 wp.set_module_options({"enable_backward": False})
 
@@ -73,7 +73,8 @@ def derive_tolerances(
     w = wp.tid()
     least = float(wp.inf)
     for i in range(instance_start[w], instance_start[w + 1]):
-        least = wp.min(least, instances.tolerance[i])
+        if exists(instances, i):
+            least = wp.min(least, instances.tolerance[i])
     rigid_tolerance_out[w] = least
 
 

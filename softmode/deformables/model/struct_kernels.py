@@ -199,6 +199,23 @@ class NewtonState:
 
 
 @wp.func
+def exists(instances: Instances, i: int):
+    """Return whether an instance is a body: one that is none has no functions, points and samples."""
+    return instances.function_count[i] > 0
+
+
+@wp.func
+def instance_end(instances: Instances, instance_start: wp.array[int], w: int):
+    """Return the end of the instances of a world, less the last ones that are no bodies."""
+    end = instance_start[w + 1]
+    while end > instance_start[w]:
+        if exists(instances, end - 1):
+            break
+        end -= 1
+    return end
+
+
+@wp.func
 def has_contacts(instances: Instances, constraints: PointConstraints, i: int):
     """Return whether an instance is near a shape: its constraints are more than its pins."""
     return constraints.count[i] > instances.pin_count[i]

@@ -12,8 +12,10 @@ from softmode.deformables.model.struct_kernels import (
     Instances,
     NewtonState,
     Rigid,
+    exists,
     first_coupled,
 )
+from softmode.deformables.solver.factor_kernels import used_blocks
 from softmode.deformables.solver.iteration_kernels import NewtonStep, add_outer
 
 wp.set_module_options({"enable_backward": False})
@@ -51,9 +53,17 @@ def block_task(task: int, block_count: int):
 
 
 @wp.func
+def left_out(step: NewtonStep, i: int):
+    """Return whether an instance has no place in the system of its world: it is none, and others share the system."""
+    return not exists(step.instances, i) and step.arrays.systems.pattern.shape[1] > 1
+
+
+@wp.func
 def stiffness_block(step: NewtonStep, i: int, chunk: int, task: int):
     """Assemble 8x8 blocks of sum_p grad b^T C grad b over one chunk of the points."""
     if step.state.active[step.instances.world[i]] == 0 or step.state.refresh[step.instances.world[i]] == 0:
+        return
+    if not exists(step.instances, i):
         return
     block_count = step.basis.row.shape[1]
     chunk_count = step.arrays.stiffness.shape[1]
@@ -106,7 +116,7 @@ def assemble_pins(
 @wp.func
 def matrix_row(step: NewtonStep, team: int, i: int, row: int, member: int):
     """Add inertia and pins to the stiffness; driven unknowns stay put."""
-    if step.state.active[step.instances.world[i]] == 0:
+    if step.state.active[step.instances.world[i]] == 0 or left_out(step, i):
         return
     block_count = step.basis.row.shape[1]
     c = row / (LANES * block_count)
@@ -169,7 +179,7 @@ add_contacts = kernel_over(contact_block, "add_contacts", "i", "task")
 @wp.func
 def column_block(step: NewtonStep, i: int, rows: int, j: int):
     """Fill the columns right of K: d2E/dq dr = -sum_e b_k H_e J_e, and -g in column rigid_max."""
-    if step.state.active[step.instances.world[i]] == 0:
+    if step.state.active[step.instances.world[i]] == 0 or left_out(step, i):
         return
     block_count = step.basis.row.shape[1]
     c = rows / block_count
@@ -238,8 +248,7 @@ def condensed_entry(step: NewtonStep, w: int, j: int, l: int):
     ):
         return
     factored = step.arrays.systems.matrix
-    row_count = factored.shape[1]
-    first = row_count / LANES
+    first = factored.shape[1] / LANES
     column = l
     value = -step.rigid.gradient[w, j]
     if l == step.rigid.count[w]:
@@ -247,7 +256,7 @@ def condensed_entry(step: NewtonStep, w: int, j: int, l: int):
     else:
         value = step.rigid.matrix[w, j, l]
     for i in range(step.arrays.system_start[w], step.arrays.system_start[w + 1]):
-        for row in range(row_count):
+        for row in range(LANES * used_blocks(step.arrays.systems.pattern, i, first)):
             y = factored[i, row, first + j / LANES][j % LANES]
             value -= wp.float64(y) * wp.float64(factored[i, row, first + column / LANES][column % LANES])
     if l == step.rigid.count[w]:
@@ -363,7 +372,7 @@ def relate_pairs(
     i = step.state.instance_start[w] + part
     if i >= step.state.instance_start[w + 1]:
         return
-    relation[w, part, part] = 1
+    relation[w, part, part] = wp.where(exists(step.instances, i), 1, 0)
     for e in range(step.constraints.count[i] - step.constraints.pair_count[i], step.constraints.count[i]):
         j = step.constraints.partner[i, e]
         if j >= 0:
@@ -383,13 +392,15 @@ def place_parts(
     instances.system_block[i] = part_blocks * place[w, i - state.instance_start[w]]
 
 
-@wp.kernel
-def assemble_pairs(
+@wp.func
+def pair_block(
     step: NewtonStep,
     relation: wp.array3d[int],  # (world_count, part_count, part_count), its fill included
+    w: int,
+    both: int,
+    task: int,
 ):
     """Fill the 8x8 blocks between two bodies of a world, -sum_e b_i^T H b_j; zero where only the elimination fills."""
-    w, both, task = wp.tid()
     part_count = relation.shape[1]
     part = both / part_count
     other = both % part_count
@@ -423,13 +434,23 @@ def assemble_pairs(
         step.arrays.systems.matrix[w, row + a, column] = block[a]
 
 
-@wp.kernel
-def read_direction(
+assemble_pairs = kernel_over(pair_block, "assemble_pairs", "w", "both", "task")
+
+
+@wp.func
+def direction_entry(
     instances: Instances,
     solution: wp.array2d[vec8],  # (system_count, N / 8)
     # Out:
     direction_out: wp.array2d[vec8],  # (instance_count, 3 block_count)
+    i: int,
+    e: int,
 ):
     """Take each body's part out of the solution of its system."""
-    i, e = wp.tid()
-    direction_out[i, e] = solution[instances.system[i], instances.system_block[i] + e]
+    if exists(instances, i):
+        direction_out[i, e] = solution[instances.system[i], instances.system_block[i] + e]
+    else:
+        direction_out[i, e] = vec8()
+
+
+read_direction = kernel_over(direction_entry, "read_direction", "i", "e")

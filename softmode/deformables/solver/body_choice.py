@@ -11,6 +11,7 @@ import warp as wp
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import body_key
+from softmode.deformables.model.declare import launch
 from softmode.deformables.model.struct_kernels import Motion, PointConstraints, Points, Samples
 from softmode.deformables.model.tables import allocate, starts_of
 from softmode.deformables.solver import body_choice_kernels as kernels
@@ -19,25 +20,25 @@ from softmode.deformables.solver.reduced_solver import ReducedSolver, require_re
 from softmode.deformables.solver.solver_reduced import require_driven_material
 from softmode.errors import ConfigError
 
-_KEPT = ("rate", "volume_ratio", "constraint", "shape", "direction")
-"""Arrays of a step that do not begin with zeros, or that every step writes whole."""
+_KEPT = ("rate", "volume_ratio", "constraint", "shape", "direction", "system_start", "rigid_tolerance")
+"""Arrays of a step that do not begin with zeros, that every step writes whole, or that have a row per world."""
 
 
 class BodyChoice:
-    """Bodies of which the only soft body of each world may be any; all are resident, instances point to theirs.
+    """Bodies of which every soft body of a world may be any, or none; all are resident, instances point to theirs.
 
-    An instance must have room for the largest, see
+    A soft body that is none is inert: it touches nothing, nothing moves it, and it takes no part in the solve. An
+    instance must have room for the largest, see
     :func:`softmode.deformables.model.authoring.reserve_room`: the memory of a world is that of the largest body, and
     the bases of all bodies are stored once.
 
     Args:
-        solver: A solver of soft bodies, with one of them per world.
+        solver: A solver of soft bodies.
         bodies: The bodies, all of them among those of the solver.
         materials: What each is made of; only what :func:`set_parameters` does not set is taken from it.
 
     Raises:
-        ConfigError: If a world has not one soft body, a body is not among the solver's or has pins, or one with exact
-            regions is NEO_HOOKEAN.
+        ConfigError: If a body is not among the solver's or has pins, or one with exact regions is NEO_HOOKEAN.
     """
 
     def __init__(self, solver: ReducedSolver, bodies: Sequence[ReducedBody], materials: Sequence[Material]) -> None:
@@ -45,11 +46,8 @@ class BodyChoice:
         self._solver = require_reduced(solver)
         tables = self._solver.tables
         layout, options, device = tables.layout, tables.options, tables.model.device
-        if not np.array_equal(layout.instance_world, np.arange(layout.world_count)) or layout.pin_max:
-            raise ConfigError(
-                "a body can be chosen in worlds of one soft body without pins only",
-                hint="leave other soft bodies and pins out",
-            )
+        if layout.pin_max:
+            raise ConfigError("bodies can be chosen in worlds without pins only", hint="leave the pins out")
         known = {body_key(body): a for a, body in enumerate(layout.bodies)}
         missing = [body.name for body in bodies if body_key(body) not in known]
         if missing:
@@ -85,21 +83,46 @@ class BodyChoice:
         self._history = _histories(tables)
 
     def set(self, choice: wp.array, world_mask: wp.array) -> None:
-        """Put the chosen body into the masked worlds; reads nothing back and may be captured.
+        """Put the chosen bodies into the masked worlds; reads nothing back and may be captured.
 
         Parameters, places and the state come after it: call ``set_parameters`` and ``solver.reset`` for the same
         worlds.
 
         Args:
-            choice: Which body, int32, shape (world_count,).
+            choice: Which body each instance is, -1 for none, int32, shape (instance_count,).
             world_mask: Which worlds, shape (world_count,) bool.
         """
         tables = self._solver.tables
-        worlds = tables.layout.world_count
         out = (tables.scaled.rest, tables.instances, tables.parameters.body_key)
-        tables.launch(kernels.choose_bodies, worlds, self._rows, choice, world_mask, *out)
+        tables.launch(kernels.choose_bodies, tables.layout.instance_count, self._rows, choice, world_mask, *out)
         for words in self._history:
-            tables.launch(kernels.clear_rows, words.shape, world_mask, words)
+            tables.launch(kernels.clear_rows, words.shape, tables.instances.world, world_mask, words)
+
+
+def copy_slots(
+    table: wp.array, out: wp.array, choice: wp.array, world_mask: wp.array, *, parts: Sequence[int] | None = None
+) -> None:
+    """Copy from a table with a row per choice to a row per world, in the masked worlds; capturable.
+
+    Args:
+        table: A row per choice, of a multiple of 32 bits.
+        out: A row per world, shape (world_count, ...).
+        choice: Which row each slot of a world has, int32, shape (world_count * slots,), -1 for none, which means zeros.
+        world_mask: Which worlds, shape (world_count,) bool.
+        parts: How many entries of the second axis follow each slot; those behind them follow the first, as all do where
+            there are none.
+    """
+    device: Any = out.device
+    worlds = out.shape[0]
+    slots = choice.shape[0] // worlds
+    rows, words = words_of(table, table.shape[0]), words_of(out, worlds)
+    each = words.shape[1] // out.shape[1] if out.ndim > 1 else 1
+    begin = 0
+    followed = [] if parts is None else [each * part for part in parts]
+    for slot, width in [*enumerate(followed), (0, words.shape[1] - sum(followed))]:
+        if width:
+            launch(device, kernels.copy_rows, (worlds, width), rows, choice, slots, slot, begin, world_mask, words)
+        begin += width
 
 
 def words_of(array: wp.array, rows: int) -> wp.array:

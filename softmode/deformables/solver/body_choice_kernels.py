@@ -1,4 +1,8 @@
-"""Device side of bodies that take each other's place: where an instance finds its data, and rows without a history."""
+"""Device side of bodies that take each other's place: where an instance finds its data, and rows without a history.
+
+An instance without a body keeps its room and its parameters, and has no functions, points and samples: what runs over
+these passes it by.
+"""
 
 import warp as wp
 
@@ -36,18 +40,24 @@ class BodyRows:
 @wp.kernel
 def choose_bodies(
     rows: BodyRows,
-    choice: wp.array[int],  # (instance_count,)
+    choice: wp.array[int],  # (instance_count,), -1 for none
     world_mask: wp.array[wp.bool],
     # Out:
     rest: RestQuantities,
     instances: Instances,
     key_out: wp.array[wp.int64],
 ):
-    """Point the instances of masked worlds, one per world, to the body that is chosen."""
+    """Point the instances of masked worlds to the body that is chosen, or to none."""
     i = wp.tid()
-    if not world_mask[i]:
+    if not world_mask[instances.world[i]]:
         return
     b = choice[i]
+    if b < 0:
+        instances.function_count[i] = 0
+        instances.driven_count[i] = 0
+        instances.point_count[i] = 0
+        instances.sample_count[i] = 0
+        return
     instances.asset[i] = rows.asset[b]
     instances.function_count[i] = rows.function_count[b]
     instances.driven_count[i] = rows.driven_count[b]
@@ -73,36 +83,47 @@ def choose_bodies(
 @wp.kernel
 def copy_rows(
     table: wp.array2d[wp.uint32],  # (choices, words)
-    choice: wp.array[int],  # (world_count,)
+    choice: wp.array[int],  # (world_count * slots,), -1 for none
+    slots: int,  # choices of a world
+    slot: int,  # which of them counts
+    first: int,  # first word that is copied
     world_mask: wp.array[wp.bool],
     # Out:
     out: wp.array2d[wp.uint32],  # (world_count, words)
 ):
-    """Copy the row of its choice to every masked world."""
+    """Copy some words from the row of its choice to every masked world, zeros where it has none."""
     w, k = wp.tid()
-    if world_mask[w]:
-        out[w, k] = table[choice[w], k]
+    if not world_mask[w]:
+        return
+    chosen = choice[w * slots + slot]
+    value = wp.uint32(0)
+    if chosen >= 0:
+        value = table[chosen, first + k]
+    out[w, first + k] = value
 
 
 @wp.kernel
 def clear_rows(
+    world: wp.array[int],  # (instance_count,)
     world_mask: wp.array[wp.bool],
     # Out:
-    out: wp.array2d[wp.uint32],  # (world_count, words)
+    out: wp.array2d[wp.uint32],  # (instance_count, words)
 ):
-    """Set the rows of masked worlds to zero."""
-    w, k = wp.tid()
-    if world_mask[w]:
-        out[w, k] = wp.uint32(0)
+    """Set the rows of the instances in masked worlds to zero."""
+    i, k = wp.tid()
+    if world_mask[world[i]]:
+        out[i, k] = wp.uint32(0)
 
 
 @wp.kernel
 def rows_that_chose(
-    choice: wp.array[int],  # (world_count,)
+    choice: wp.array[int],  # (world_count * slots,)
+    slots: int,  # choices of a world
+    slot: int,  # which of them counts
     wanted: int,
     # Out:
     row_out: wp.array[int],  # (world_count,)
 ):
     """Write the worlds that chose something, -1 for the others."""
     w = wp.tid()
-    row_out[w] = wp.where(choice[w] == wanted, w, -1)
+    row_out[w] = wp.where(choice[w * slots + slot] == wanted, w, -1)

@@ -25,10 +25,11 @@ class BlockCholesky:
     ) -> None:
         """Allocate everything once."""
         self.system_count, self.size, self.device = system_world.shape[0], size, device
-        self.pattern = wp.zeros((self.system_count, part_count, part_count), dtype=int, device=device)
-        """Which parts are related where they are placed, upper triangle; the diagonal is not read."""
+        each = np.tile(np.eye(part_count, dtype=np.int32), (self.system_count, 1, 1))
+        self.pattern = wp.array(each, dtype=int, device=device)
+        """Which parts are related where they are placed, upper triangle; the diagonal says which exist, the first."""
         self.relation = wp.zeros_like(self.pattern)
-        """The same by number, symmetric; the diagonal says which parts exist, the first ones. For ``order_parts``."""
+        """The same by number, symmetric; the diagonal says which parts exist. For ``order_parts``."""
         self.place = wp.array(np.tile(np.arange(part_count), (self.system_count, 1)), dtype=int, device=device)
         """Where each part is placed in the system."""
         width = size + pad(column_count)

@@ -7,7 +7,7 @@ substitution of every right-hand side, and the half of a Schur complement, come 
 A system may be made of equal *parts*, the bodies of a world, most of which have nothing to do with each other: a
 pattern says which blocks of parts are not zero, its fill included; the others are neither read nor written. The order
 of the parts is chosen anew for each pattern, by least degree (:func:`order_parts`): half the work of a
-fixed order for a heap of 13 bodies.
+fixed order for a heap of 13 bodies. Parts that do not exist come last and cost nothing.
 
 Rows are stored as 8-wide vectors. Measured on one CPU core (112 x 256 x 112 product, AVX-512): arithmetic on
 ``wp.types.vector(length=8)`` or 16 reaches 50-150 Gflop/s where ``wp.tile_matmul`` reaches 9, because Warp's CPU tiles
@@ -32,7 +32,7 @@ class Systems:
     world: wp.array[int]  # (system_count,)
     matrix: wp.array3d[vec8]  # (system_count, N, (N + M) / 8), of the first N columns the upper triangle
     scalars: wp.array3d[float]  # (system_count, N, N + M), the same memory number by number
-    pattern: wp.array3d[int]  # (system_count, part_count, part_count), which parts are related, upper triangle
+    pattern: wp.array3d[int]  # (system_count, part_count, part_count), related parts, upper triangle; which ones exist
     diagonal: wp.array2d[vec8]  # (system_count, N): diagonal blocks of U with inverse pivots
     bounds: wp.array2d[wp.vec2]  # (system_count, N / 8): least pivots of eight rows, and what rounding may take of them
     indefinite: wp.array[int]  # (system_count,), 1 where a pivot had to be raised by more than rounding
@@ -44,6 +44,17 @@ class Systems:
 def related(pattern: wp.array3d[int], i: int, part: int, other: int):
     """Return whether the block of two parts, or of a part and the right-hand columns behind them, is not zero."""
     return part == other or other >= pattern.shape[1] or pattern[i, part, other] != 0
+
+
+@wp.func
+def used_blocks(pattern: wp.array3d[int], i: int, block_count: int):
+    """Return how many blocks of eight rows the parts that exist have: the first ones."""
+    count = pattern.shape[1]
+    used = int(0)
+    for part in range(count):
+        if pattern[i, part, part] != 0:
+            used += block_count / count
+    return used
 
 
 @wp.func
@@ -78,7 +89,7 @@ def factor_system(
     part_blocks = block_count / pattern.shape[1]
     total = unit.shape[2]
     indefinite = int(0)
-    for block in range(block_count):
+    for block in range(used_blocks(pattern, i, block_count)):
         first = LANES * block
         part = block / part_blocks
         for l in range(first / width + member, total, team):
@@ -160,8 +171,9 @@ def back_substitute(
     """Solve U x = right of system i from the last row up; overwrites ``right`` and ends with a barrier."""
     block_count = solution.shape[1]
     part_blocks = block_count / pattern.shape[1]
-    for step in range(block_count):
-        block = block_count - 1 - step
+    used = used_blocks(pattern, i, block_count)
+    for step in range(used):
+        block = used - 1 - step
         first = LANES * block
         x = vec8()
         for reverse in range(8):
@@ -197,7 +209,7 @@ def solve_system(
     if active[world] == 0:
         return
     block_count = systems.solution.shape[1]
-    for row in range(member, LANES * block_count, team):
+    for row in range(member, LANES * used_blocks(systems.pattern, i, block_count), team):
         value = systems.matrix[i, row, block_count + column / 8][column % 8]
         for j in range(tail_count):
             value -= systems.matrix[i, row, block_count + j / 8][j % 8] * float(tail[world, j])
@@ -244,6 +256,7 @@ def order_parts(
                     if place[i, other] < 0 and relation[i, best, other] != 0:
                         relation[i, part, other] = 1
     for part in range(count):
+        pattern[i, place[i, part], place[i, part]] = relation[i, part, part]
         for other in range(count):
             if place[i, part] < place[i, other]:
                 pattern[i, place[i, part], place[i, other]] = relation[i, part, other]

@@ -12,11 +12,14 @@ import warp as wp
 
 from softmode.deformables.model.declare import Kernel
 from softmode.deformables.model.lane_kernels import LANES, barrier
+from softmode.deformables.model.struct_kernels import instance_end
 from softmode.deformables.solver.assembly_kernels import (
     column_block,
     condensed_entry,
     contact_block,
+    direction_entry,
     matrix_row,
+    pair_block,
     rigid_entry,
     solve_rigid_team,
     stiffness_block,
@@ -49,13 +52,14 @@ BLOCKS = 4
 
 
 @cache
-def newton_kernel(unit_type: Any, size: int = 0, width: int = 0) -> Kernel:
+def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool = False) -> Kernel:
     """Return the kernel that minimises the incremental potential of every world by Newton with a line search.
 
     Args:
         unit_type: What the factorisation takes at a time, ``float`` or ``vec8``.
         size: Unknowns of the systems that are solved in shared memory, one per world; 0 for any in global memory.
         width: Columns of those systems.
+        joined: Whether the bodies of a world, which may touch each other, share a system.
     """
     shared, dynamic = size > 0, dynamic_floats(size, width)
     shared_direction = shared_direction_of(size or 24, width or 32)  # called where ``shared`` says so
@@ -65,6 +69,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0) -> Kernel:
         step: NewtonStep,
         unit: wp.array3d[unit_type],  # the systems in units of ``factor_width`` columns
         team: int,
+        relation: wp.array3d[int],  # (system_count, part_count, part_count), which bodies of a system touch
     ):
         """Minimise the incremental potential of every world by Newton with a line search."""
         w, member = wp.tid()
@@ -72,7 +77,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0) -> Kernel:
             _room = wp.tile_empty(shape=wp.static(dynamic), dtype=float, storage="shared")
         dt = step.options.dt
         begin = step.state.instance_start[w]
-        end = step.state.instance_start[w + 1]
+        end = instance_end(step.instances, step.state.instance_start, w)
         blocks = step.basis.row.shape[1]
         n = step.rigid.count[w]
         tasks = 3 * blocks * blocks + 3 * (blocks * blocks + blocks) / 2
@@ -134,6 +139,11 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0) -> Kernel:
                                 contact_block(step, i, t)
                             for t in range(member, 3 * blocks * columns, team):
                                 column_block(step, i, t / columns, t % columns)
+                    if wp.static(joined):
+                        for both in range(relation.shape[1] * relation.shape[1]):
+                            if relation[w, both / relation.shape[1], both % relation.shape[1]] != 0:
+                                for t in range(member, 9 * blocks * blocks, team):
+                                    pair_block(step, relation, w, both, t)
                     if wp.static(shared):
                         # the padding behind the functions carries inertia alone
                         rate = step.motion.rate[begin] / dt
@@ -177,6 +187,12 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0) -> Kernel:
                                 s,
                                 member,
                             )
+                    if wp.static(joined):
+                        for i in range(begin, end):
+                            for e in range(member, 3 * blocks, team):
+                                direction_entry(
+                                    step.instances, step.arrays.systems.solution, step.arrays.direction, i, e
+                                )
                     barrier()
                     start_line_search(step, team, w, member)
             else:

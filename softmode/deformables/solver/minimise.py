@@ -21,7 +21,7 @@ def minimise(tables: StepTables, dt: float) -> None:
         t.launch_teams(search.reuse_hessians, worlds, step, t.team)
     if t.one_launch:
         team = fused.TEAM if t.model.device.is_cuda else 1
-        t.launch(t.fused_kernel, (worlds, team), step, t.system.unit, team, block_dim=team)
+        t.launch(t.fused_kernel, (worlds, team), step, t.system.unit, team, t.system.relation, block_dim=team)
     else:
         wp.capture_while(t.newton.any_active, _iterate, tables=t, dt=dt)
 

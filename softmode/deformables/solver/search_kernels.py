@@ -13,9 +13,11 @@ from softmode.deformables.model.struct_kernels import (
     Points,
     Rigid,
     blocks_of,
+    exists,
     first_coupled,
     has_contacts,
     hessian_key,
+    instance_end,
     pushes,
 )
 from softmode.deformables.solver.iteration_kernels import NewtonArrays, NewtonOptions, NewtonStep, mat38d
@@ -79,7 +81,7 @@ def potential_share(
     """Return one thread's share of the incremental potential of a world [J], in a fixed order."""
     half = wp.float64(0.5)
     total = wp.float64(0.0)
-    for i in range(instance_start[w], instance_start[w + 1]):
+    for i in range(instance_start[w], instance_end(instances, instance_start, w)):
         c = motion.rate[i]
         inertial = half * instances.mass[i] * c * c / (dt * dt)
         damping = half * instances.mass[i] * wp.float64(instances.mass_damping[i]) * c / dt
@@ -122,7 +124,7 @@ def rigid_excess(
         scale = rigid.inertia[w, j, j] * wp.float64(rigid_tolerance[w])
         for k in range(rigid.count[w]):
             residual += rigid.inertia[w, j, k] * (rigid.r[w, k] - rigid.predicted[w, k])
-        for i in range(instance_start[w], instance_start[w + 1]):
+        for i in range(instance_start[w], instance_end(instances, instance_start, w)):
             for k in range(first_coupled(instances, i), constraints.acting_count[i]):
                 e = constraints.acting[i, k]
                 if j >= constraints.dof_begin[i, e] and j < constraints.dof_end[i, e]:
@@ -181,7 +183,9 @@ def check_convergence(step: NewtonStep, team: int, w: int, member: int):
     done = int(1)
     if step.state.iteration[w] == 0:
         done = 0
-    for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
+    for i in range(step.state.instance_start[w], instance_end(step.instances, step.state.instance_start, w)):
+        if not exists(step.instances, i):
+            continue
         if done == 1 and not pushes(step.instances, step.constraints, i):
             done = step.state.last[w]
         elif done == 1:
@@ -334,7 +338,7 @@ def start_line_search(step: NewtonStep, team: int, w: int, member: int):
     slope = wp.float64(0.0)
     last = int(1)
     unsound = int(0)
-    for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
+    for i in range(step.state.instance_start[w], instance_end(step.instances, step.state.instance_start, w)):
         if step.state.project[w] == 0 and step.arrays.systems.indefinite[step.instances.system[i]] != 0:
             unsound = 1
         moved = wp.float64(0.0)
@@ -405,7 +409,9 @@ def trial_rigid(step: NewtonStep):
 def rounding_of(instances: Instances, instance_start: wp.array[int], potential: wp.float64, w: int):
     """Return what rounding leaves of the potential of a world [J]."""
     total = wp.float64(1.0e-12) * wp.abs(potential)
-    for i in range(instance_start[w], instance_start[w + 1]):
+    for i in range(instance_start[w], instance_end(instances, instance_start, w)):
+        if not exists(instances, i):
+            continue
         volume = instances.mass[i] * wp.float64(instances.size[i] * instances.size[i] / instances.inertia[i])
         total += ENERGY_ROUNDING * wp.float64(instances.youngs_modulus[i]) * volume
     return total
@@ -485,7 +491,7 @@ def reuse_hessians(step: NewtonStep, team: int):
     w, member = wp.tid()
     keep = step.state.cached[w]
     q = step.arrays.q
-    for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
+    for i in range(step.state.instance_start[w], instance_end(step.instances, step.state.instance_start, w)):
         stride = q.shape[1] / 3
         moved = wp.float64(0.0)
         mean = wp.vec3d()
@@ -520,7 +526,7 @@ def accept_step(step: NewtonStep, team: int, w: int, member: int):
     far = int(0)
     away = int(0)
     allowed = int(NEAR_FAILURES)
-    for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
+    for i in range(step.state.instance_start[w], instance_end(step.instances, step.state.instance_start, w)):
         moved = wp.float64(0.0)
         for e in range(member, q.shape[1], team):
             d = vec8d(step.arrays.direction[i, e])

@@ -210,7 +210,7 @@ def find_spin(
     a = step.instances.asset[i]
     n = step.instances.function_count[i]
     start = step.instances.function_start[i]
-    if enabled == 0 or step.instances.driven_count[i] > 0:
+    if enabled == 0 or n == 0 or step.instances.driven_count[i] > 0:
         if member == 0:
             spin.turns[i] = 0
         return

@@ -211,7 +211,8 @@ def allocate_tables(
     system_start, system = join_systems(layout, instances, rigid.count_max + 1, device)
 
     blocks, count, square = layout.block_count, layout.instance_count, 3 * layout.block_count**2
-    one_launch = layout.part_count == 1 and (device.is_cpu or blocks <= ONE_LAUNCH_BLOCKS)
+    joined = layout.part_count > 1
+    one_launch = device.is_cpu or (not joined and blocks <= ONE_LAUNCH_BLOCKS)
     one_each = count == layout.world_count and layout.pin_max == 0
     driven = any(body.driven_count for body in layout.bodies)
     size = (3 * layout.stride, system.scalars.shape[2])
@@ -283,7 +284,7 @@ def allocate_tables(
         every_world=wp.full(layout.world_count + 1, True, dtype=bool, device=device),
         team=sizes["team"],
         one_launch=one_launch,
-        fused_kernel=fused.newton_kernel(system.unit.dtype, *(size if shared else ())),
+        fused_kernel=fused.newton_kernel(system.unit.dtype, *(size if shared else ()), joined=joined and device.is_cpu),
         shared=shared,
     )
 

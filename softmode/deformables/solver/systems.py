@@ -31,13 +31,4 @@ def join_systems(
     instances.system_block.assign(3 * layout.block_count * part)
     system_world = wp.array(np.repeat(np.arange(layout.world_count), np.diff(start)), dtype=int, device=device)
     systems = BlockCholesky(system_world, part_count * size, column_count, device, part_count)
-    # a world of fewer bodies keeps the identity in the place of the others
-    used = np.zeros((systems.system_count, part_count), bool)
-    used[system, part] = True
-    if not used.all():
-        matrix = np.zeros(systems.scalars.shape, np.float32)
-        for w, a in np.argwhere(~used):
-            rows = np.arange(a * size, (a + 1) * size)
-            matrix[w, rows, rows] = 1.0
-        systems.scalars.assign(matrix)
     return wp.array(start, dtype=int, device=device), systems

@@ -4,7 +4,7 @@ from enum import IntEnum
 
 import warp as wp
 
-from softmode.envs.reward_kernels import StepResult, WorldState, count_held, grasped, tool_position, write
+from softmode.envs.reward_kernels import NEAR, StepResult, WorldState, count_held, grasped, tool_position, write
 
 wp.set_module_options({"enable_backward": False})
 
@@ -34,6 +34,7 @@ class Plan:
     drawn: Drawn
     columns: Columns
     rest_height: wp.array[float]  # of the unscaled object's centre [m]
+    radius: wp.array[float]  # from there to its farthest point [m]
     goal_tolerance: float  # [m]
     hold_steps: int
 
@@ -61,6 +62,10 @@ def evaluate(state: WorldState, plan: Plan, result: StepResult):
     w = wp.tid()
     offset = state.object_position[w, 0] - tool_position(state, w)
     held_by_both = grasped(state, w)
+    if state.stride > 1:
+        # fingers may feel another object: only near the first one they hold that one
+        near = plan.radius[w] * state.parameters[w, plan.drawn.scale] + NEAR
+        held_by_both = held_by_both and wp.length(offset) < near
     grasp = wp.where(held_by_both, 1.0, 0.0)
     rise = result.metrics[w, Metric.object_height]
     distance = result.metrics[w, Metric.goal_distance]

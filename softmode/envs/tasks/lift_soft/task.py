@@ -83,9 +83,16 @@ class LiftSoft(Task):
     kernels = kernels
     grasps = True
     takes_sets = True
+    takes_several = True
     any_robot = True
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
+
+    def build(self) -> None:
+        """Measure the objects."""
+        surfaces = [thing.body.surface_points for thing in self.scene.members]
+        self.radius = self.per_object([np.linalg.norm(x, axis=1).max() for x in surfaces])
+        """From the centre of each unscaled object to its farthest point [m], shape (world_count,)."""
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the goal: x, y [m] and how far to rise [m]."""

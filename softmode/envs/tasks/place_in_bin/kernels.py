@@ -5,7 +5,17 @@ from enum import IntEnum
 import warp as wp
 
 from softmode.envs.end_reason import EndReason
-from softmode.envs.reward_kernels import StepResult, WorldState, count_held, grasped, tool_position, touched, write
+from softmode.envs.reward_kernels import (
+    NEAR,
+    StepResult,
+    WorldState,
+    count_held,
+    grasped,
+    is_there,
+    tool_position,
+    touched,
+    write,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -31,7 +41,7 @@ class Columns:
 
 @wp.struct
 class Plan:
-    """Columns, the bin and the toy that is to lie in it, and when the goal is met."""
+    """Columns, the bin and the toys that are to lie in it, and when the goal is met."""
 
     drawn: Drawn
     columns: Columns
@@ -42,8 +52,9 @@ class Plan:
     wall: float  # thickness of the walls [m]
     floor: float  # height of the bin's floor [m]
     highest: float  # height of the centre of what counts as inside [m]
-    rest_height: wp.array[float]  # of the unscaled toy's centre [m], (world_count,)
-    radius: wp.array[float]  # from there to its farthest point [m], (world_count,)
+    heights: wp.array2d[float]  # of the unscaled toys' centres at rest [m], (world_count, objects)
+    radius: wp.array2d[float]  # from there to their farthest points [m], (world_count, slots)
+    dropped: float  # height under which another toy than the first is lost [m]
     clearance: float  # over the rim while carrying [m]
     rest_speed: float  # [m/s]
     hold_steps: int
@@ -57,6 +68,21 @@ def beyond(x: wp.vec3, centre: wp.vec3, half: wp.vec2):
     return wp.sqrt(dx * dx + dy * dy)
 
 
+@wp.func
+def inside_bin(plan: Plan, x: wp.vec3):
+    """Return whether an object with this centre is in the bin."""
+    return beyond(x, plan.rim, plan.half) == 0.0 and x[2] <= plan.highest
+
+
+@wp.func
+def toy_at_hand(state: WorldState, plan: Plan, w: int):
+    """Return the toy whose turn it is: the first that is not in the bin, else the first."""
+    for o in range(state.slots):
+        if is_there(state, w, o) and not inside_bin(plan, state.object_position[w, o]):
+            return o
+    return int(0)
+
+
 @wp.kernel
 def observe(state: WorldState, plan: Plan, result: StepResult):
     """Write the ways to the bin and to the other objects, the distance, and how many of these are inside."""
@@ -66,32 +92,34 @@ def observe(state: WorldState, plan: Plan, result: StepResult):
     write(result.observation, w, plan.columns.goal, rim)
     write(result.observation, w, plan.columns.goal_offset, rim - tool_position(state, w))
     write(result.observation, w, plan.columns.object_goal, rim - x)
+    toy = toy_at_hand(state, plan, w)
     inside = float(0.0)
-    for o in range(1, state.stride):
+    for o in range(state.stride):
         other = state.object_position[w, o]
-        if beyond(other, rim, plan.half) == 0.0 and other[2] <= plan.highest:
+        if o != toy and is_there(state, w, o) and inside_bin(plan, other):
             inside += 1.0
-        write(result.observation, w, plan.other_offsets + 3 * (o - 1), other - x)
-    result.metrics[w, Metric.object_height] = x[2]
-    result.metrics[w, Metric.bin_distance] = beyond(x, rim, plan.half)
+        if o >= state.slots:
+            write(result.observation, w, plan.other_offsets + 3 * (o - state.slots), other - x)
+    now = state.object_position[w, toy]
+    result.metrics[w, Metric.object_height] = now[2]
+    result.metrics[w, Metric.bin_distance] = beyond(now, rim, plan.half)
     result.metrics[w, Metric.others_inside] = inside
 
 
-@wp.kernel
-def evaluate(state: WorldState, plan: Plan, result: StepResult):
-    """Reward grasping, lifting, carrying, lowering, letting go and leaving the object at rest."""
-    w = wp.tid()
+@wp.func
+def add_toy(state: WorldState, plan: Plan, w: int, o: int, share: float, result: StepResult):
+    """Add a toy's share of the reward for grasping, lifting, carrying, lowering and letting go."""
     rim = plan.rim
-    x = state.object_position[w, 0]
+    x = state.object_position[w, o]
     size = state.parameters[w, plan.drawn.scale]
     distance = wp.length(x - tool_position(state, w))
-    inside = result.metrics[w, Metric.bin_distance] == 0.0 and x[2] <= plan.highest
-    # fingers may feel another object: only near the first one they hold that one
-    grip = grasped(state, w) and distance < size * plan.radius[w] + 0.02
-    low = plan.rest_height[w] * size
+    inside = inside_bin(plan, x)
+    # fingers may feel another object: only near this one they hold it
+    grip = grasped(state, w) and distance < size * plan.radius[w, o] + NEAR
+    low = plan.heights[w, o] * size
     carried = rim[2] + low + plan.clearance
     aside = beyond(x, rim, plan.half - wp.vec2(plan.margin, plan.margin))
-    held_or_in = wp.where(grip or inside, 1.0, 0.0)
+    held_or_in = wp.where(grip or inside, share, 0.0)
     lift = wp.clamp((x[2] - low) / (carried - low), 0.0, 1.0)
     lowered = float(0.0)
     if aside == 0.0:
@@ -103,18 +131,41 @@ def evaluate(state: WorldState, plan: Plan, result: StepResult):
         reach = 1.0
         lift = 1.0
         near = 1.0
-    free = inside and not touched(state, w)
-    complete = int(result.metrics[w, Metric.others_inside]) == state.stride - 1
-    resting = free and complete and wp.length(state.object_velocity[w, 0]) <= plan.rest_speed
-    result.terms[w, Term.reach] = reach
-    result.terms[w, Term.grasp] = 0.5 * held_or_in
-    result.terms[w, Term.lift] = lift * held_or_in
-    result.terms[w, Term.carry] = lift * near * held_or_in
-    result.terms[w, Term.lower] = lowered * held_or_in
-    result.terms[w, Term.release] = wp.where(free, 1.0, 0.0)
+    result.terms[w, Term.reach] += share * reach
+    result.terms[w, Term.grasp] += 0.5 * held_or_in
+    result.terms[w, Term.lift] += lift * held_or_in
+    result.terms[w, Term.carry] += lift * near * held_or_in
+    result.terms[w, Term.lower] += lowered * held_or_in
+    if inside and not touched(state, w):
+        result.terms[w, Term.release] += share
+
+
+@wp.kernel
+def evaluate(state: WorldState, plan: Plan, result: StepResult):
+    """Reward grasping, lifting, carrying, lowering, letting go and leaving the toys at rest, one after another."""
+    w = wp.tid()
+    toy = toy_at_hand(state, plan, w)
+    count = int(0)
+    resting = not touched(state, w)
+    for o in range(state.stride):
+        if is_there(state, w, o):
+            resting = resting and inside_bin(plan, state.object_position[w, o])
+            if o < state.slots:
+                count += 1
+                resting = resting and wp.length(state.object_velocity[w, o]) <= plan.rest_speed
+    for term in range(result.terms.shape[1]):
+        result.terms[w, term] = 0.0
+    for o in range(state.slots):
+        # what is in the bin has earned its share, what has to wait none
+        if is_there(state, w, o) and (o == toy or inside_bin(plan, state.object_position[w, o])):
+            add_toy(state, plan, w, o, 1.0 / float(count), result)
     result.terms[w, Term.rest] = wp.where(resting, 2.0, 0.0)
     count_held(resting, plan.hold_steps, result, w)
     walls = plan.half + wp.vec2(plan.wall, plan.wall)
     for o in range(1, state.stride):
-        if not (beyond(state.object_position[w, o], rim, walls) == 0.0):
-            result.failure[w] = EndReason.SPILLED
+        x = state.object_position[w, o]
+        if o >= state.slots:
+            if not (beyond(x, plan.rim, walls) == 0.0):
+                result.failure[w] = EndReason.SPILLED
+        elif is_there(state, w, o) and not (x[2] >= plan.dropped):
+            result.failure[w] = EndReason.DROPPED

@@ -15,7 +15,7 @@ class ScriptedPlace(ScriptedPolicy):
     """Grasp the toy, carry it over the rim to where the bin has most room, lower it, let go, rise.
 
     It is let go as soon as fingers or toy are about to meet what lies in the bin. A toy that slips on the way is
-    grasped again where it comes to rest.
+    grasped again where it comes to rest. Of several toys one is placed after another.
 
     Args:
         env: A PlaceInBin environment, wrapped or not.
@@ -56,6 +56,7 @@ class ScriptedPlace(ScriptedPolicy):
         self._above = self._arrived = False
         self._opening: float | None = None
         self._grip = 0.0
+        self._chosen = False
 
     @property
     def trouble(self) -> str:
@@ -64,6 +65,9 @@ class ScriptedPlace(ScriptedPolicy):
 
     def __call__(self, observation: object = None) -> NDArray[np.float32]:
         """Return the action for the present state."""
+        if not self._chosen:
+            self.target = self._grasp.target = self._next()
+            self._chosen = True
         if self._opening is None:
             action = self._grasp()
             if not self._grasp.holds:
@@ -72,6 +76,18 @@ class ScriptedPlace(ScriptedPolicy):
                 return action
             self._grip = float(action[-1])
         return self._let_go()
+
+    def _is_inside(self, slot: int) -> bool:
+        """Return whether an object of the world is in the bin."""
+        x = self.scene.object_position.numpy()[self.world, slot].astype(float)
+        aside = np.abs(x[:2] - self.task.rim[:2]) - self.task.half
+        return bool((aside <= 0.0).all()) and x[2] <= self.task.highest
+
+    def _next(self) -> int:
+        """Return the first toy that is not in the bin, the first of all if they are."""
+        first = self.world * self.task.state.stride
+        slots = [i - first for i in self.scene.instances_of(self.world)]
+        return next((s for s in slots if s < self.task.slots and not self._is_inside(s)), 0)
 
     def _let_go(self) -> NDArray[np.float32]:
         """Open far enough, then rise; start again if the toy ended up beside the bin."""
@@ -96,7 +112,8 @@ class ScriptedPlace(ScriptedPolicy):
         self._above = self._above or bool(np.linalg.norm(aside) < self.NEAR)
         up = self.task.rim[2] + self.CLEARANCE - lowest
         if self._above:
-            top = max((float(x[:, 2].max()) for x in points[1:]), default=self.task.config.bin.floor)
+            inside = [x for x in points[1:] if self._over_bin(x.mean(axis=0))]
+            top = max((float(x[:, 2].max()) for x in inside), default=self.task.config.bin.floor)
             up = top + self.GAP - lowest
             self._arrived = up > -0.002
         way = np.array([*aside, up])
@@ -107,10 +124,14 @@ class ScriptedPlace(ScriptedPolicy):
     def _roomiest(self) -> Vector:
         """Return the place in the bin that is farthest from the other objects."""
         task = self.task
-        others = self.scene.object_position.numpy()[self.world, 1:, :2].astype(float)
+        others = np.array([x.mean(axis=0)[:2] for x in self.surfaces()[1:] if self._over_bin(x.mean(axis=0))])
         span = [np.linspace(-1.0, 1.0, 9) * max(half - self.WALL, 0.0) for half in task.half]
         grid = np.stack(np.meshgrid(*span), axis=-1).reshape(-1, 2) + np.array(task.rim[:2])
         if not len(others):
             return np.array(task.rim[:2])
         away = np.linalg.norm(grid[:, None] - others[None], axis=2).min(axis=1)
         return grid[away.argmax()]
+
+    def _over_bin(self, x: Vector) -> bool:
+        """Return whether a point lies over the bin, walls included."""
+        return bool((np.abs(x[:2] - self.task.rim[:2]) <= np.array(self.task.half) + self.task.wall).all())

@@ -1,4 +1,4 @@
-"""PlaceInBin: put a soft toy into a bin that holds other soft objects."""
+"""PlaceInBin: put a soft toy, or several, into a bin that may hold other soft objects."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from softmode.checks import require_fields, require_number, require_numbers
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
 from softmode.envs.cameras import square_camera
+from softmode.envs.clutter import Arcs
 from softmode.envs.observation import Segment
 from softmode.envs.parameters import Parameter
 from softmode.envs.presets import RL_SOLVER
 from softmode.envs.soft_env import SoftEnv
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.task import Task
+from softmode.envs.task import FALL, Task
 from softmode.envs.task_config import TaskConfig
 from softmode.envs.tasks.place_in_bin import kernels
 from softmode.errors import ConfigError
@@ -31,6 +32,8 @@ from softmode.splats.pinhole import PinholeCamera
 
 CLEARANCE = 0.015
 """Between the rim and the bottom of what is carried over it [m]."""
+PACKED = 0.6
+"""Most of the bin's volume that the bounding boxes of several toys may take."""
 _BUILD = BuildOptions(mode_count=1, cubature_count=48)
 TOY = ObjectConfig(
     shape="box",
@@ -159,6 +162,9 @@ class PlaceInBin(Task):
     down over the bin), ``release`` (0 or 1, in the bin and no finger touches anything), ``rest`` (0 or 2, and it rests,
     all other objects being in the bin). What is in the bin keeps the first four. Success: all of that for
     ``hold_steps`` steps in a row. Failure: ``spilled``, another object is outside the bin's walls.
+
+    Of several toys (`ObjectSet.per_world`) each earns its share of the terms, those in the bin and the first that is
+    not; the figures are those of the latter. Success: all toys are in.
     """
 
     config: PlaceInBinConfig
@@ -166,6 +172,7 @@ class PlaceInBin(Task):
     kernels = kernels
     grasps = True
     takes_sets = True
+    takes_several = True
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
 
@@ -184,15 +191,18 @@ class PlaceInBin(Task):
         self.highest = given.height + self.config.rim_allowance
         """Height of its centre below which an object is in the bin [m]."""
         toys = [thing.body.surface_points for thing in self.scene.members]
-        others = [thing.body.surface_points for thing in self.scene.objects[1:]]
+        others = [thing.body.surface_points for thing in self.scene.objects[self.slots :]]
         self.wall, self.floor, self.margin, self.clearance = given.wall, given.floor, 0.3 * min(self.half), CLEARANCE
-        self.radius = self.per_object([np.linalg.norm(x, axis=1).max() for x in toys])
-        """From the centre of each unscaled toy to its farthest point [m], shape (world_count,)."""
+        radius = [[np.linalg.norm(x, axis=1).max()] * self.slots for x in toys]
+        self.radius = self.per_object(radius, every_slot=self.slots > 1)
+        """From the centre of each unscaled toy to its farthest point [m], shape (world_count, slots)."""
+        self.heights, self.dropped = self._heights, -FALL
         self.other_offsets = self.column("other_offsets") if self.config.scene.others else 0
         scale = (self.config.scale_range or (1.0, 1.0))[1]
         radii = [[scale * float(np.linalg.norm(x[:, :2], axis=1).max()) for x in each] for each in (toys, others)]
         self._check_room(max(radii[0]), radii[1])
         self._check_widths([scale * np.ptp(x[:, :2], axis=0) for x in toys])
+        self._check_volume(max(float(np.prod(scale * np.ptp(x, axis=0))) for x in toys))
 
     def _check_widths(self, widths: list[NDArray[np.float64]]) -> None:
         """Refuse toys that lie in the bin neither along nor across; their horizontal widths are given [m].
@@ -207,6 +217,29 @@ class PlaceInBin(Task):
                     f"{name} is {width[0]:.3f} m by {width[1]:.3f} m wide and does not fit the bin",
                     hint="give it another size, leave it out of the set, or make bin.inner larger",
                 )
+
+    def _check_volume(self, volume: float) -> None:
+        """Refuse more toys than the bin can hold.
+
+        Args:
+            volume: That of the largest toy's bounding box [m^3].
+        """
+        room = 4.0 * self.half[0] * self.half[1] * (self.highest - self.floor)
+        if self.slots > 1 and self.slots * volume > PACKED * room:
+            raise ConfigError(
+                f"{self.slots} toys of {1.0e6 * volume:.0f} cm^3 do not fit a bin of {1.0e6 * room:.0f} cm^3",
+                hint="make objects.per_world or the toys smaller, or bin.inner larger",
+            )
+
+    def other_arcs(self) -> Arcs:
+        """Return the half of the directions that leads away from the bin, as far as the tool reaches."""
+        away = np.array(self.config.scene.object_position) - self.config.bin.position
+        apart = np.abs(away) - 0.5 * np.array(self.config.bin.inner)
+        axis = int(apart.argmax())
+        middle = (0.5 * np.pi if axis else 0.0) + (np.pi if away[axis] < 0.0 else 0.0)
+        control = self.config.scene.control
+        within = (control.workspace_lower[:2], control.workspace_upper[:2])
+        return Arcs(ranges=((middle - 0.5 * np.pi, middle + 0.5 * np.pi),), within=within)
 
     def _check_room(self, toy: float, others: list[float]) -> None:
         """Refuse objects that may start in each other or in a wall.
@@ -270,8 +303,9 @@ class PlaceInBin(Task):
     def place(self) -> None:
         """Put the toy on the table and the others into the bin."""
         super().place()
-        for k in range(1, len(self.scene.objects)):
-            self.place_object(k, f"other_position_{k}", f"other_yaw_{k}", ground=self.floor)
+        for k in range(len(self.config.scene.others)):
+            name = k + 1
+            self.place_object(self.slots + k, f"other_position_{name}", f"other_yaw_{name}", ground=self.floor)
 
     def front_camera(self, name: str, edge: int) -> PinholeCamera:
         """Return the camera that looks over the rim into the bin, with pictures of `edge` x `edge` pixels."""

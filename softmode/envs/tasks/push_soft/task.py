@@ -13,6 +13,7 @@ from scipy.spatial import ConvexHull
 from softmode.checks import require_fields, require_number, require_range
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.materials.material import Material
+from softmode.envs.clutter import Arcs
 from softmode.envs.markers import dots
 from softmode.envs.observation import Segment
 from softmode.envs.parameters import Parameter
@@ -38,6 +39,8 @@ PUCK = ObjectConfig(
     build=BuildOptions(mode_count=4, cubature_count=64),
 )
 """A soft disc."""
+ASIDE = 0.7
+"""Angle about the object between the ways of object and tool and what lies beside it [rad]."""
 PUCK_MATERIAL = Material(youngs_modulus=1.0e5, density=300.0, friction=0.4)
 """Soft foam that slides: nothing lower than its width over twice its friction topples when it is pushed."""
 
@@ -108,6 +111,7 @@ class PushSoft(Task):
     config_class = PushSoftConfig
     kernels = kernels
     takes_sets = True
+    takes_several = True
     any_robot = True
     term_names = tuple(kernels.Term.__members__)
     metric_names = tuple(kernels.Metric.__members__)
@@ -132,6 +136,11 @@ class PushSoft(Task):
     def push_distance(self) -> NDArray[np.float64]:
         """The same on the host."""
         return self._push_distances[self.scene.member]
+
+    def other_arcs(self) -> Arcs:
+        """Return the directions beside the ways to the goal and beside the tool, which comes from the robot."""
+        low, high = self.config.goal_direction
+        return Arcs(ranges=((high + ASIDE, np.pi - ASIDE), (ASIDE - np.pi, low - ASIDE)), aside=ASIDE)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Add the goal: distance [m] and direction [rad] from the object, and the angle to turn [rad]."""
