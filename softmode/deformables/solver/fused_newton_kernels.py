@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from softmode.deformables.model.declare import Kernel
-from softmode.deformables.model.lane_kernels import LANES, barrier
+from softmode.deformables.model.lane_kernels import LANES, barrier, team_sum
 from softmode.deformables.solver.assembly_kernels import (
     column_block,
     condensed_entry,
@@ -30,6 +30,7 @@ from softmode.deformables.solver.search_kernels import (
     check_convergence,
     check_trial,
     move_functions,
+    potential_share,
     start_line_search,
 )
 from softmode.deformables.solver.step_kernels import (
@@ -101,6 +102,21 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0) -> Kernel:
             for k in range(member, step.rigid.row_count[w], team):
                 evaluate_row(step, step.state.active, r, found, w, k)
             barrier()
+            share = potential_share(
+                step.instances,
+                step.motion,
+                step.points,
+                step.constraints,
+                step.rigid,
+                step.state.instance_start,
+                dt,
+                q,
+                r,
+                w,
+                member,
+                team,
+            )
+            potential = team_sum(share)
             if trial == 0:
                 for i in range(begin, end):
                     list_acting(step, team, i, member)
@@ -117,7 +133,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0) -> Kernel:
                     for e in range(member, 3 * blocks, team):
                         gradient_block(step, i, e)
                 barrier()
-                check_convergence(step, team, w, member)
+                check_convergence(step, potential, team, w, member)
                 barrier()
                 if step.state.active[w] != 0:
                     for i in range(begin, end):
@@ -180,7 +196,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0) -> Kernel:
                     barrier()
                     start_line_search(step, team, w, member)
             else:
-                check_trial(step, team, w, member)
+                check_trial(step, potential, w, member)
             barrier()
             if step.state.active[w] != 0:
                 trial = step.state.searching[w]

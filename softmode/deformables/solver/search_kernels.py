@@ -139,8 +139,8 @@ def rigid_excess(
 
 
 @wp.func
-def check_convergence(step: NewtonStep, team: int, w: int, member: int):
-    """Sum the potential; stop a world whose residual is small, and whose last step was where nothing is touched.
+def check_convergence(step: NewtonStep, potential: wp.float64, team: int, w: int, member: int):
+    """Stop a world whose residual is small, and whose last step was where nothing is touched.
 
     Near contacts the residual decides, of bodies and of joints: it is momentum that the other side receives and this
     one does not. A small step says little there, because within it friction goes from one side of its cone to the
@@ -152,21 +152,6 @@ def check_convergence(step: NewtonStep, team: int, w: int, member: int):
     q = step.arrays.q
     gradient = step.arrays.gradient
     dt = step.options.dt
-    share = potential_share(
-        step.instances,
-        step.motion,
-        step.points,
-        step.constraints,
-        step.rigid,
-        step.state.instance_start,
-        step.options.dt,
-        step.arrays.q,
-        step.rigid.r,
-        w,
-        member,
-        team,
-    )
-    potential = team_sum(share)
     done = int(1)
     if step.state.iteration[w] == 0:
         done = 0
@@ -219,7 +204,30 @@ def check_convergence(step: NewtonStep, team: int, w: int, member: int):
         step.state.status[w] = step.state.status[w] | WORLD_ITERATION_LIMIT
 
 
-check_iterates = kernel_over(check_convergence, "check_iterates", "w", "member")
+@wp.func
+def check_iterate(step: NewtonStep, team: int, w: int, member: int):
+    """Sum the potential of the iterate and check its convergence."""
+    if step.state.active[w] == 0:
+        return
+    share = potential_share(
+        step.instances,
+        step.motion,
+        step.points,
+        step.constraints,
+        step.rigid,
+        step.state.instance_start,
+        step.options.dt,
+        step.arrays.q,
+        step.rigid.r,
+        w,
+        member,
+        team,
+    )
+    potential = team_sum(share)
+    check_convergence(step, potential, team, w, member)
+
+
+check_iterates = kernel_over(check_iterate, "check_iterates", "w", "member")
 
 
 @wp.func
@@ -392,29 +400,12 @@ def rounding_of(instances: Instances, instance_start: wp.array[int], potential: 
 
 
 @wp.func
-def check_trial(step: NewtonStep, team: int, w: int, member: int):
+def check_trial(step: NewtonStep, trial: wp.float64, w: int, member: int):
     """Accept a trial that lowers the potential enough (Armijo, up to rounding) or halve the step; give up if short.
 
     Where a full step has lowered it by more than a quadratic would have, take the better of that and twice the step.
     What has been evaluated of an accepted trial serves the next iteration.
     """
-    if step.state.searching[w] == 0:
-        return
-    share = potential_share(
-        step.instances,
-        step.motion,
-        step.points,
-        step.constraints,
-        step.rigid,
-        step.state.instance_start,
-        step.options.dt,
-        step.arrays.q_trial,
-        step.rigid.trial,
-        w,
-        member,
-        team,
-    )
-    trial = team_sum(share)
     if member != 0:
         return
     potential = step.state.potential[w]
@@ -445,7 +436,30 @@ def check_trial(step: NewtonStep, team: int, w: int, member: int):
     step.state.step_length[w] = alpha
 
 
-check_trials = kernel_over(check_trial, "check_trials", "w", "member")
+@wp.func
+def check_world_trial(step: NewtonStep, team: int, w: int, member: int):
+    """Sum the potential of the trial step of a searching world and check it."""
+    if step.state.searching[w] == 0:
+        return
+    share = potential_share(
+        step.instances,
+        step.motion,
+        step.points,
+        step.constraints,
+        step.rigid,
+        step.state.instance_start,
+        step.options.dt,
+        step.arrays.q_trial,
+        step.rigid.trial,
+        w,
+        member,
+        team,
+    )
+    trial = team_sum(share)
+    check_trial(step, trial, w, member)
+
+
+check_trials = kernel_over(check_world_trial, "check_trials", "w", "member")
 
 
 @wp.func
