@@ -46,6 +46,17 @@ def barrier() -> None:
     """Wait for the other threads of the block; nothing on CPU, where a team is one thread."""
 
 
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    asm volatile(".pragma \\"nounroll\\";");
+#endif
+"""
+)
+def rolled() -> None:
+    """Keep a loop as it is written: on CUDA the compiler does not unroll a loop with this in its body."""
+
+
 @wp.func
 def sum8(v: vec8):
     """Return the sum of the lanes, pairwise."""

@@ -3,7 +3,7 @@
 import warp as wp
 
 from softmode.deformables.model.declare import kernel_over
-from softmode.deformables.model.lane_kernels import barrier, team_sum, vec8d
+from softmode.deformables.model.lane_kernels import barrier, rolled, team_sum, vec8d
 from softmode.deformables.model.status import WORLD_ITERATION_LIMIT, WORLD_NO_DESCENT, WORLD_NOT_FINITE
 from softmode.deformables.model.struct_kernels import (
     Basis,
@@ -80,25 +80,32 @@ def potential_share(
     half = wp.float64(0.5)
     total = wp.float64(0.0)
     for i in range(instance_start[w], instance_start[w + 1]):
+        rolled()
         c = motion.rate[i]
         inertial = half * instances.mass[i] * c * c / (dt * dt)
         damping = half * instances.mass[i] * wp.float64(instances.mass_damping[i]) * c / dt
         for e in range(member, q.shape[1], team):
+            rolled()
             x = q[i, e]
             away = x - motion.q_inertial[i, e]
             moved = x - motion.q_rate[i, e]
             ahead = x - motion.q_start[i, e]
             total += inertial * wp.dot(away, away) + damping * wp.dot(moved, moved) - wp.dot(motion.force[i, e], ahead)
         for p in range(member, instances.point_count[i], team):
+            rolled()
             total += points.energy[i, p]
         for e in range(member, constraints.count[i], team):
+            rolled()
             total += constraints.energy[i, e]
     for j in range(member, rigid.count[w], team):
+        rolled()
         for l in range(rigid.count[w]):
+            rolled()
             total += (
                 half * (r[w, j] - rigid.predicted[w, j]) * rigid.inertia[w, j, l] * (r[w, l] - rigid.predicted[w, l])
             )
     for k in range(member, rigid.row_count[w], team):
+        rolled()
         total += rigid.row_energy[w, k]
     return total
 
@@ -118,18 +125,23 @@ def rigid_excess(
     """Return how many of one thread's joint dofs have a residual above the tolerance of the forces on them."""
     excess = wp.float64(0.0)
     for j in range(member, rigid.count[w], team):
+        rolled()
         residual = wp.float64(0.0)
         scale = rigid.inertia[w, j, j] * wp.float64(rigid_tolerance[w])
         for k in range(rigid.count[w]):
+            rolled()
             residual += rigid.inertia[w, j, k] * (rigid.r[w, k] - rigid.predicted[w, k])
         for i in range(instance_start[w], instance_start[w + 1]):
+            rolled()
             for k in range(first_coupled(instances, i), constraints.acting_count[i]):
+                rolled()
                 e = constraints.acting[i, k]
                 if j >= constraints.dof_begin[i, e] and j < constraints.dof_end[i, e]:
                     force = wp.dot(wp.vec3d(constraints.jacobian[i, e, j]), constraints.force[i, e])
                     residual += force
                     scale += wp.abs(force)
         for k in range(rigid.row_count[w]):
+            rolled()
             force = wp.float64(rigid.row_jacobian[w, k, j]) * rigid.row_force[w, k]
             residual += force
             scale += wp.abs(force)
@@ -156,6 +168,7 @@ def check_convergence(step: NewtonStep, potential: wp.float64, team: int, w: int
     if step.state.iteration[w] == 0:
         done = 0
     for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
+        rolled()
         if done == 1 and not pushes(step.instances, step.constraints, i):
             done = step.state.last[w]
         elif done == 1:
@@ -163,9 +176,11 @@ def check_convergence(step: NewtonStep, potential: wp.float64, team: int, w: int
             external = wp.float64(0.0)
             scale = wp.float64(0.0)
             for e in range(member, q.shape[1], team):
+                rolled()
                 residual += wp.dot(gradient[i, e], gradient[i, e])
                 external += wp.dot(step.motion.force[i, e], step.motion.force[i, e])
             for k in range(member, step.constraints.acting_count[i], team):
+                rolled()
                 scale += wp.length(step.constraints.force[i, step.constraints.acting[i, k]])
             residual = team_sum(residual)
             scale = wp.sqrt(team_sum(external)) + team_sum(scale)
@@ -251,11 +266,13 @@ def find_turn(instances: Instances, basis: Basis, arrays: NewtonArrays, i: int, 
     X = centre_of_mass(basis, arrays.q, a, n, i, member, team)
     shift = wp.vec3d()
     for b in range(member, blocks_of(n), team):
+        rolled()
         shift += direction_block(arrays, i, b) * basis.mean[a, b]
     shift = team_sum3(shift)
     S = wp.mat33d()
     U = wp.mat33d()
     for b in range(member, blocks_of(n), team):
+        rolled()
         rest, one = rest_block(basis, a, b)
         r = unknown_block(arrays.q, i, b) + rest - wp.outer(X, one)
         S += r * wp.transpose(r)
@@ -297,9 +314,11 @@ def move_functions(
     turn = arrays.turn[i]
     if wp.dot(turn, turn) == wp.float64(0.0):
         for e in range(member, q_out.shape[1], team):
+            rolled()
             q_out[i, e] = arrays.q[i, e] + alpha * vec8d(arrays.direction[i, e])
         return
     for b in range(member, stride, team):
+        rolled()
         block = moved_block(instances, basis, arrays, i, b, alpha)
         for axis in range(3):
             q_out[i, axis * stride + b] = block[axis]
@@ -323,10 +342,12 @@ def start_line_search(step: NewtonStep, team: int, w: int, member: int):
     last = int(1)
     unsound = int(0)
     for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
+        rolled()
         if step.state.project[w] == 0 and step.arrays.systems.indefinite[step.instances.system[i]] != 0:
             unsound = 1
         moved = wp.float64(0.0)
         for e in range(member, step.arrays.gradient.shape[1], team):
+            rolled()
             d = vec8d(step.arrays.direction[i, e])
             slope += wp.dot(step.arrays.gradient[i, e], d)
             moved += wp.dot(d, d)
@@ -345,6 +366,7 @@ def start_line_search(step: NewtonStep, team: int, w: int, member: int):
         return
     step.state.searching[w] = 0
     for j in range(step.rigid.count[w]):
+        rolled()
         slope += step.rigid.gradient[w, j] * step.rigid.direction[w, j]
         # dofs that take part are in contact: a light body moves where the soft one stays
         limit = wp.min(wp.float64(step.arrays.rigid_tolerance[w]), wp.float64(0.01) * step.options.stick_range)
@@ -394,6 +416,7 @@ def rounding_of(instances: Instances, instance_start: wp.array[int], potential: 
     """Return what rounding leaves of the potential of a world [J]."""
     total = wp.float64(1.0e-12) * wp.abs(potential)
     for i in range(instance_start[w], instance_start[w + 1]):
+        rolled()
         volume = instances.mass[i] * wp.float64(instances.size[i] * instances.size[i] / instances.inertia[i])
         total += ENERGY_ROUNDING * wp.float64(instances.youngs_modulus[i]) * volume
     return total
@@ -515,8 +538,10 @@ def accept_step(step: NewtonStep, team: int, w: int, member: int):
     away = int(0)
     allowed = int(NEAR_FAILURES)
     for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
+        rolled()
         moved = wp.float64(0.0)
         for e in range(member, q.shape[1], team):
+            rolled()
             d = vec8d(step.arrays.direction[i, e])
             moved += wp.dot(d, d)
             if refreshed != 0:
@@ -533,6 +558,7 @@ def accept_step(step: NewtonStep, team: int, w: int, member: int):
         if alpha * wp.sqrt(moved) > wp.float64(NEAR_DISTANCE * step.instances.size[i]):
             allowed = FAILURES
     for j in range(member, step.rigid.count[w], team):
+        rolled()
         if alpha > wp.float64(0.0):
             step.rigid.r[w, j] = step.rigid.r[w, j] + alpha * step.rigid.direction[w, j]
     barrier()
