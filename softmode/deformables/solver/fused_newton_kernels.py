@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from softmode.deformables.model.declare import Kernel
-from softmode.deformables.model.lane_kernels import LANES, barrier, team_sum
+from softmode.deformables.model.lane_kernels import LANES, barrier, rolled, team_sum
 from softmode.deformables.solver.assembly_kernels import (
     column_block,
     condensed_entry,
@@ -88,8 +88,10 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0) -> Kernel:
             if trial == 0:
                 for i in range(begin, end):
                     for e in range(member, 3 * blocks, team):
+                        rolled()
                         q[i, e] = step.arrays.q[i, e]
                 for j in range(member, n, team):
+                    rolled()
                     r[w, j] = step.rigid.r[w, j]
                 barrier()
             # one copy of this code serves iterates and trials
@@ -199,16 +201,26 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0) -> Kernel:
                 check_trial(step, potential, w, member)
             barrier()
             if step.state.active[w] != 0:
+                # one copy of this code serves trials and accepted steps
                 trial = step.state.searching[w]
-                if trial != 0:
-                    alpha = step.state.step_length[w]
+                alpha = step.state.step_length[w]
+                if trial == 0:
+                    accept_step(step, team, w, member)
+                if alpha > wp.float64(0.0):
                     for i in range(begin, end):
                         move_functions(step.instances, step.basis, step.arrays, alpha, i, member, team, q)
                     for j in range(member, n, team):
+                        rolled()
                         r[w, j] = step.rigid.r[w, j] + alpha * step.rigid.direction[w, j]
-                    barrier()
-                else:
-                    accept_step(step, team, w, member)
+                barrier()
+                if trial == 0 and alpha > wp.float64(0.0):
+                    for i in range(begin, end):
+                        for e in range(member, 3 * blocks, team):
+                            rolled()
+                            step.arrays.q[i, e] = q[i, e]
+                    for j in range(member, n, team):
+                        rolled()
+                        step.rigid.r[w, j] = r[w, j]
                     barrier()
 
     return minimise_worlds

@@ -525,9 +525,10 @@ def reuse_hessians(step: NewtonStep, team: int):
 
 @wp.func
 def accept_step(step: NewtonStep, team: int, w: int, member: int):
-    """Take the accepted step; say whether the stiffness is to be refreshed and how friction is to be linearised.
+    """Say after a step whether the stiffness is to be refreshed and how friction is to be linearised.
 
-    A world that touches nothing is done with a step below the tolerance; near contacts the residual decides.
+    A world that touches nothing is done with a step below the tolerance; near contacts the residual decides. The step
+    itself is taken by ``take_step``, or by the one launch.
     """
     if step.state.active[w] == 0:
         return
@@ -547,8 +548,6 @@ def accept_step(step: NewtonStep, team: int, w: int, member: int):
             if refreshed != 0:
                 step.state.cached_q[i, e] = q[i, e]
         moved = team_sum(moved)
-        if alpha > wp.float64(0.0):
-            move_functions(step.instances, step.basis, step.arrays, alpha, i, member, team, q)
         if alpha * wp.sqrt(moved) > refresh_limit(step.instances, i, step.options):
             far = 1
         if refreshed != 0 and member == 0:
@@ -557,10 +556,6 @@ def accept_step(step: NewtonStep, team: int, w: int, member: int):
             away = 1
         if alpha * wp.sqrt(moved) > wp.float64(NEAR_DISTANCE * step.instances.size[i]):
             allowed = FAILURES
-    for j in range(member, step.rigid.count[w], team):
-        rolled()
-        if alpha > wp.float64(0.0):
-            step.rigid.r[w, j] = step.rigid.r[w, j] + alpha * step.rigid.direction[w, j]
     barrier()
     if member != 0:
         return
@@ -590,4 +585,18 @@ def accept_step(step: NewtonStep, team: int, w: int, member: int):
         wp.atomic_max(step.state.any_active, 0, 1)
 
 
-accept_steps = kernel_over(accept_step, "accept_steps", "w", "member")
+@wp.func
+def take_step(step: NewtonStep, team: int, w: int, member: int):
+    """Take the accepted step of an active world."""
+    if step.state.active[w] == 0:
+        return
+    alpha = step.state.step_length[w]
+    accept_step(step, team, w, member)
+    if alpha > wp.float64(0.0):
+        for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
+            move_functions(step.instances, step.basis, step.arrays, alpha, i, member, team, step.arrays.q)
+        for j in range(member, step.rigid.count[w], team):
+            step.rigid.r[w, j] = step.rigid.r[w, j] + alpha * step.rigid.direction[w, j]
+
+
+accept_steps = kernel_over(take_step, "accept_steps", "w", "member")
