@@ -46,6 +46,17 @@ def barrier() -> None:
     """Wait for the other threads of the block; nothing on CPU, where a team is one thread."""
 
 
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    asm volatile(".pragma \\"nounroll\\";");
+#endif
+"""
+)
+def rolled() -> None:
+    """Keep a loop as it is written: on CUDA the compiler does not unroll a loop with this in its body."""
+
+
 @wp.func
 def sum8(v: vec8):
     """Return the sum of the lanes, pairwise."""
@@ -75,10 +86,12 @@ def free_part(block: Any, driven: int):
     snippet="""
 #if defined(__CUDA_ARCH__)
     __shared__ double partial[32];
+    #pragma unroll 1
     for (int offset = 16; offset > 0; offset >>= 1) value += __shfl_xor_sync(0xffffffff, value, offset);
     if (threadIdx.x % 32 == 0) partial[threadIdx.x / 32] = value;
     __syncthreads();
     double total = partial[0];
+    #pragma unroll 1
     for (int k = 1; k < blockDim.x / 32; ++k) total += partial[k];
     __syncthreads();
     return total;
@@ -102,6 +115,7 @@ def team_sum(value: wp.float64) -> wp.float64:  # pyright: ignore[reportReturnTy
     __syncthreads();
     int before = __popc(mask & ((1u << lane) - 1u));
     int total = 0;
+    #pragma unroll 1
     for (int k = 0; k < blockDim.x / 32; ++k) {
         if (k < threadIdx.x / 32) before += counts[k];
         total += counts[k];

@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from softmode.deformables.model.declare import Kernel
-from softmode.deformables.model.lane_kernels import LANES, barrier
+from softmode.deformables.model.lane_kernels import LANES, barrier, rolled, team_sum
 from softmode.deformables.model.struct_kernels import instance_end
 from softmode.deformables.solver.assembly_kernels import (
     column_block,
@@ -33,6 +33,7 @@ from softmode.deformables.solver.search_kernels import (
     check_convergence,
     check_trial,
     move_functions,
+    potential_share,
     start_line_search,
 )
 from softmode.deformables.solver.step_kernels import (
@@ -92,8 +93,10 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool
             if trial == 0:
                 for i in range(begin, end):
                     for e in range(member, 3 * blocks, team):
+                        rolled()
                         q[i, e] = step.arrays.q[i, e]
                 for j in range(member, n, team):
+                    rolled()
                     r[w, j] = step.rigid.r[w, j]
                 barrier()
             # one copy of this code serves iterates and trials
@@ -106,6 +109,21 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool
             for k in range(member, step.rigid.row_count[w], team):
                 evaluate_row(step, step.state.active, r, found, w, k)
             barrier()
+            share = potential_share(
+                step.instances,
+                step.motion,
+                step.points,
+                step.constraints,
+                step.rigid,
+                step.state.instance_start,
+                dt,
+                q,
+                r,
+                w,
+                member,
+                team,
+            )
+            potential = team_sum(share)
             if trial == 0:
                 for i in range(begin, end):
                     list_acting(step, team, i, member)
@@ -122,7 +140,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool
                     for e in range(member, 3 * blocks, team):
                         gradient_block(step, i, e)
                 barrier()
-                check_convergence(step, team, w, member)
+                check_convergence(step, potential, team, w, member)
                 barrier()
                 if step.state.active[w] != 0:
                     for i in range(begin, end):
@@ -196,19 +214,29 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool
                     barrier()
                     start_line_search(step, team, w, member)
             else:
-                check_trial(step, team, w, member)
+                check_trial(step, potential, w, member)
             barrier()
             if step.state.active[w] != 0:
+                # one copy of this code serves trials and accepted steps
                 trial = step.state.searching[w]
-                if trial != 0:
-                    alpha = step.state.step_length[w]
+                alpha = step.state.step_length[w]
+                if trial == 0:
+                    accept_step(step, team, w, member)
+                if alpha > wp.float64(0.0):
                     for i in range(begin, end):
                         move_functions(step.instances, step.basis, step.arrays, alpha, i, member, team, q)
                     for j in range(member, n, team):
+                        rolled()
                         r[w, j] = step.rigid.r[w, j] + alpha * step.rigid.direction[w, j]
-                    barrier()
-                else:
-                    accept_step(step, team, w, member)
+                barrier()
+                if trial == 0 and alpha > wp.float64(0.0):
+                    for i in range(begin, end):
+                        for e in range(member, 3 * blocks, team):
+                            rolled()
+                            step.arrays.q[i, e] = q[i, e]
+                    for j in range(member, n, team):
+                        rolled()
+                        step.rigid.r[w, j] = r[w, j]
                     barrier()
 
     return minimise_worlds

@@ -129,6 +129,7 @@ _SYSTEM = """
             const int first = 4 * (t - row * quads);
             if (first >= (row & ~7)) {
                 Quad value = *(const Quad*)&K[row * N + first];
+                #pragma unroll 1
                 for (int chunk = 1; chunk < chunks; ++chunk) {
                     const Quad more = *(const Quad*)&K[(size_t)chunk * N * N + row * N + first];
                     value.x += more.x; value.y += more.y; value.z += more.z; value.w += more.w;
@@ -386,6 +387,7 @@ _SYSTEM = """
                 if (l == j) least[j] = lowest[j] > CONDENSED * value ? lowest[j] : CONDENSED * value;
             }
             double part[4] = {0.0, 0.0, 0.0, 0.0};
+            #pragma unroll 1
             for (int first = 0; first < N; first += 8) {
                 const float* here = A + row_of(first);
                 #pragma unroll
@@ -414,6 +416,7 @@ _SYSTEM = """
             }
             SOFTMODE_BARRIER;
             pivot = pivot > least[a] ? pivot : least[a];
+            #pragma unroll 1
             for (int b = a + 1; b < tail; ++b) pivot = pivot > ratio[b] ? pivot : ratio[b];
             const double inverse = 1.0 / wp::sqrt(pivot);
             if (member == 0) S[a * R + a] = inverse;
@@ -441,6 +444,7 @@ _SYSTEM = """
         SOFTMODE_BARRIER;
         for (int row = member; row < N; row += team) {
             float value = A[row_of(row) + N + rigid_max];
+            #pragma unroll 1
             for (int j = 0; j < tail; ++j) value -= A[row_of(row) + N + j] * (float)move[j];
             right[row] = value;
         }

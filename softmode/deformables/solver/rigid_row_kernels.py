@@ -13,6 +13,7 @@ that opens a contact meets nothing once it is open, and one that closes a row wh
 import warp as wp
 
 from softmode.deformables.model.declare import kernel_over, struct
+from softmode.deformables.model.lane_kernels import rolled
 from softmode.deformables.model.struct_kernels import Rigid
 from softmode.deformables.solver.iteration_kernels import ALL, NewtonStep
 
@@ -171,6 +172,7 @@ def displaced(rigid: Rigid, w: int, k: int, r: wp.array2d[wp.float64], dt: wp.fl
     """Return J (r - r*) / dt^2 of a row."""
     change = wp.float64(0.0)
     for j in range(rigid.count[w]):
+        rolled()
         change += wp.float64(rigid.row_jacobian[w, k, j]) * (r[w, j] - rigid.predicted[w, j])
     return change / (dt * dt)
 
@@ -225,6 +227,7 @@ def evaluate_cone(rigid: Rigid, w: int, head: int, r: wp.array2d[wp.float64], dt
     tangent_start = zero
     tangent = zero
     for k in range(head, head + size):
+        rolled()
         change = displaced(rigid, w, k, r, dt)
         rigid.row_change[w, k] = change
         if k > head:
@@ -239,6 +242,7 @@ def evaluate_cone(rigid: Rigid, w: int, head: int, r: wp.array2d[wp.float64], dt
     zone_start = cone_zone(normal_start, tangent_start, mu)
     zone = cone_zone(normal, tangent, mu)
     for k in range(head, head + size):
+        rolled()
         x_start = rigid.row_start[w, k]
         x = x_start + rigid.row_change[w, k]
         D = rigid.row_stiffness[w, k]
@@ -251,15 +255,18 @@ def evaluate_cone(rigid: Rigid, w: int, head: int, r: wp.array2d[wp.float64], dt
     if derivatives == 0:
         return
     for j in range(rigid.count[w]):
+        rolled()
         # z = scaled rows, p = their part along the slip
         z0 = mu * wp.float64(rigid.row_jacobian[w, head, j])
         p = zero
         if zone == 2:
             for k in range(head + 1, head + size):
+                rolled()
                 scale = rigid.row_limit[w, k]
                 x = rigid.row_start[w, k] + rigid.row_change[w, k]
                 p += scale * x / tangent * scale * wp.float64(rigid.row_jacobian[w, k, j])
         for k in range(head, head + size):
+            rolled()
             J = wp.float64(rigid.row_jacobian[w, k, j])
             value = zero
             if zone == 1:
@@ -303,6 +310,7 @@ def evaluate_row(
         step.rigid.row_force[w, k] = slope - slope_start
         if derivatives != 0:
             for j in range(step.rigid.count[w]):
+                rolled()
                 step.rigid.row_coupling[w, k, j] = curvature / (dt * dt) * wp.float64(step.rigid.row_jacobian[w, k, j])
 
 

@@ -3,7 +3,7 @@
 import warp as wp
 
 from softmode.deformables.model.declare import kernel_over
-from softmode.deformables.model.lane_kernels import LANES, barrier, team_sum, vec8, vec8d
+from softmode.deformables.model.lane_kernels import LANES, barrier, rolled, team_sum, vec8, vec8d
 from softmode.deformables.model.status import WORLD_ITERATION_LIMIT, WORLD_NO_DESCENT, WORLD_NOT_FINITE
 from softmode.deformables.model.struct_kernels import (
     Basis,
@@ -82,25 +82,32 @@ def potential_share(
     half = wp.float64(0.5)
     total = wp.float64(0.0)
     for i in range(instance_start[w], instance_end(instances, instance_start, w)):
+        rolled()
         c = motion.rate[i]
         inertial = half * instances.mass[i] * c * c / (dt * dt)
         damping = half * instances.mass[i] * wp.float64(instances.mass_damping[i]) * c / dt
         for e in range(member, q.shape[1], team):
+            rolled()
             x = q[i, e]
             away = x - motion.q_inertial[i, e]
             moved = x - motion.q_rate[i, e]
             ahead = x - motion.q_start[i, e]
             total += inertial * wp.dot(away, away) + damping * wp.dot(moved, moved) - wp.dot(motion.force[i, e], ahead)
         for p in range(member, instances.point_count[i], team):
+            rolled()
             total += points.energy[i, p]
         for e in range(member, constraints.count[i], team):
+            rolled()
             total += constraints.energy[i, e]
     for j in range(member, rigid.count[w], team):
+        rolled()
         for l in range(rigid.count[w]):
+            rolled()
             total += (
                 half * (r[w, j] - rigid.predicted[w, j]) * rigid.inertia[w, j, l] * (r[w, l] - rigid.predicted[w, l])
             )
     for k in range(member, rigid.row_count[w], team):
+        rolled()
         total += rigid.row_energy[w, k]
     return total
 
@@ -120,18 +127,23 @@ def rigid_excess(
     """Return how many of one thread's joint dofs have a residual above the tolerance of the forces on them."""
     excess = wp.float64(0.0)
     for j in range(member, rigid.count[w], team):
+        rolled()
         residual = wp.float64(0.0)
         scale = rigid.inertia[w, j, j] * wp.float64(rigid_tolerance[w])
         for k in range(rigid.count[w]):
+            rolled()
             residual += rigid.inertia[w, j, k] * (rigid.r[w, k] - rigid.predicted[w, k])
         for i in range(instance_start[w], instance_end(instances, instance_start, w)):
+            rolled()
             for k in range(first_coupled(instances, i), constraints.acting_count[i]):
+                rolled()
                 e = constraints.acting[i, k]
                 if j >= constraints.dof_begin[i, e] and j < constraints.dof_end[i, e]:
                     force = wp.dot(wp.vec3d(constraints.jacobian[i, e, j]), constraints.force[i, e])
                     residual += force
                     scale += wp.abs(force)
         for k in range(rigid.row_count[w]):
+            rolled()
             force = wp.float64(rigid.row_jacobian[w, k, j]) * rigid.row_force[w, k]
             residual += force
             scale += wp.abs(force)
@@ -152,8 +164,8 @@ def moves_freely(row: wp.array2d[vec8], r: int, driven: int, function_count: int
 
 
 @wp.func
-def check_convergence(step: NewtonStep, team: int, w: int, member: int):
-    """Sum the potential; stop a world whose residual is small, and whose last step was where nothing is touched.
+def check_convergence(step: NewtonStep, potential: wp.float64, team: int, w: int, member: int):
+    """Stop a world whose residual is small, and whose last step was where nothing is touched.
 
     Near contacts the residual decides, of bodies and of joints: it is momentum that the other side receives and this
     one does not. A small step says little there, because within it friction goes from one side of its cone to the
@@ -165,25 +177,11 @@ def check_convergence(step: NewtonStep, team: int, w: int, member: int):
     q = step.arrays.q
     gradient = step.arrays.gradient
     dt = step.options.dt
-    share = potential_share(
-        step.instances,
-        step.motion,
-        step.points,
-        step.constraints,
-        step.rigid,
-        step.state.instance_start,
-        step.options.dt,
-        step.arrays.q,
-        step.rigid.r,
-        w,
-        member,
-        team,
-    )
-    potential = team_sum(share)
     done = int(1)
     if step.state.iteration[w] == 0:
         done = 0
     for i in range(step.state.instance_start[w], instance_end(step.instances, step.state.instance_start, w)):
+        rolled()
         if not exists(step.instances, i):
             continue
         if done == 1 and not pushes(step.instances, step.constraints, i):
@@ -193,12 +191,14 @@ def check_convergence(step: NewtonStep, team: int, w: int, member: int):
             external = wp.float64(0.0)
             scale = wp.float64(0.0)
             for e in range(member, q.shape[1], team):
+                rolled()
                 residual += wp.dot(gradient[i, e], gradient[i, e])
                 external += wp.dot(step.motion.force[i, e], step.motion.force[i, e])
             driven = step.instances.driven_count[i]
             count = step.instances.function_count[i]
             alone = step.constraints.count[i] - step.constraints.pair_count[i]
             for k in range(member, step.constraints.acting_count[i], team):
+                rolled()
                 at = step.constraints.acting[i, k]
                 # what presses on an exact region is no force on the rest: a foot stuck in a pot meets meganewtons
                 free = int(1)
@@ -243,7 +243,30 @@ def check_convergence(step: NewtonStep, team: int, w: int, member: int):
         step.state.status[w] = step.state.status[w] | WORLD_ITERATION_LIMIT
 
 
-check_iterates = kernel_over(check_convergence, "check_iterates", "w", "member")
+@wp.func
+def check_iterate(step: NewtonStep, team: int, w: int, member: int):
+    """Sum the potential of the iterate and check its convergence."""
+    if step.state.active[w] == 0:
+        return
+    share = potential_share(
+        step.instances,
+        step.motion,
+        step.points,
+        step.constraints,
+        step.rigid,
+        step.state.instance_start,
+        step.options.dt,
+        step.arrays.q,
+        step.rigid.r,
+        w,
+        member,
+        team,
+    )
+    potential = team_sum(share)
+    check_convergence(step, potential, team, w, member)
+
+
+check_iterates = kernel_over(check_iterate, "check_iterates", "w", "member")
 
 
 @wp.func
@@ -267,11 +290,13 @@ def find_turn(instances: Instances, basis: Basis, arrays: NewtonArrays, i: int, 
     X = centre_of_mass(basis, arrays.q, a, n, i, member, team)
     shift = wp.vec3d()
     for b in range(member, blocks_of(n), team):
+        rolled()
         shift += direction_block(arrays, i, b) * basis.mean[a, b]
     shift = team_sum3(shift)
     S = wp.mat33d()
     U = wp.mat33d()
     for b in range(member, blocks_of(n), team):
+        rolled()
         rest, one = rest_block(basis, a, b)
         r = unknown_block(arrays.q, i, b) + rest - wp.outer(X, one)
         S += r * wp.transpose(r)
@@ -313,9 +338,11 @@ def move_functions(
     turn = arrays.turn[i]
     if wp.dot(turn, turn) == wp.float64(0.0):
         for e in range(member, q_out.shape[1], team):
+            rolled()
             q_out[i, e] = arrays.q[i, e] + alpha * vec8d(arrays.direction[i, e])
         return
     for b in range(member, stride, team):
+        rolled()
         block = moved_block(instances, basis, arrays, i, b, alpha)
         for axis in range(3):
             q_out[i, axis * stride + b] = block[axis]
@@ -339,10 +366,12 @@ def start_line_search(step: NewtonStep, team: int, w: int, member: int):
     last = int(1)
     unsound = int(0)
     for i in range(step.state.instance_start[w], instance_end(step.instances, step.state.instance_start, w)):
+        rolled()
         if step.state.project[w] == 0 and step.arrays.systems.indefinite[step.instances.system[i]] != 0:
             unsound = 1
         moved = wp.float64(0.0)
         for e in range(member, step.arrays.gradient.shape[1], team):
+            rolled()
             d = vec8d(step.arrays.direction[i, e])
             slope += wp.dot(step.arrays.gradient[i, e], d)
             moved += wp.dot(d, d)
@@ -361,6 +390,7 @@ def start_line_search(step: NewtonStep, team: int, w: int, member: int):
         return
     step.state.searching[w] = 0
     for j in range(step.rigid.count[w]):
+        rolled()
         slope += step.rigid.gradient[w, j] * step.rigid.direction[w, j]
         # dofs that take part are in contact: a light body moves where the soft one stays
         limit = wp.min(wp.float64(step.arrays.rigid_tolerance[w]), wp.float64(0.01) * step.options.stick_range)
@@ -410,6 +440,7 @@ def rounding_of(instances: Instances, instance_start: wp.array[int], potential: 
     """Return what rounding leaves of the potential of a world [J]."""
     total = wp.float64(1.0e-12) * wp.abs(potential)
     for i in range(instance_start[w], instance_end(instances, instance_start, w)):
+        rolled()
         if not exists(instances, i):
             continue
         volume = instances.mass[i] * wp.float64(instances.size[i] * instances.size[i] / instances.inertia[i])
@@ -418,29 +449,12 @@ def rounding_of(instances: Instances, instance_start: wp.array[int], potential: 
 
 
 @wp.func
-def check_trial(step: NewtonStep, team: int, w: int, member: int):
+def check_trial(step: NewtonStep, trial: wp.float64, w: int, member: int):
     """Accept a trial that lowers the potential enough (Armijo, up to rounding) or halve the step; give up if short.
 
     Where a full step has lowered it by more than a quadratic would have, take the better of that and twice the step.
     What has been evaluated of an accepted trial serves the next iteration.
     """
-    if step.state.searching[w] == 0:
-        return
-    share = potential_share(
-        step.instances,
-        step.motion,
-        step.points,
-        step.constraints,
-        step.rigid,
-        step.state.instance_start,
-        step.options.dt,
-        step.arrays.q_trial,
-        step.rigid.trial,
-        w,
-        member,
-        team,
-    )
-    trial = team_sum(share)
     if member != 0:
         return
     potential = step.state.potential[w]
@@ -471,7 +485,30 @@ def check_trial(step: NewtonStep, team: int, w: int, member: int):
     step.state.step_length[w] = alpha
 
 
-check_trials = kernel_over(check_trial, "check_trials", "w", "member")
+@wp.func
+def check_world_trial(step: NewtonStep, team: int, w: int, member: int):
+    """Sum the potential of the trial step of a searching world and check it."""
+    if step.state.searching[w] == 0:
+        return
+    share = potential_share(
+        step.instances,
+        step.motion,
+        step.points,
+        step.constraints,
+        step.rigid,
+        step.state.instance_start,
+        step.options.dt,
+        step.arrays.q_trial,
+        step.rigid.trial,
+        w,
+        member,
+        team,
+    )
+    trial = team_sum(share)
+    check_trial(step, trial, w, member)
+
+
+check_trials = kernel_over(check_world_trial, "check_trials", "w", "member")
 
 
 @wp.func
@@ -514,9 +551,10 @@ def reuse_hessians(step: NewtonStep, team: int):
 
 @wp.func
 def accept_step(step: NewtonStep, team: int, w: int, member: int):
-    """Take the accepted step; say whether the stiffness is to be refreshed and how friction is to be linearised.
+    """Say after a step whether the stiffness is to be refreshed and how friction is to be linearised.
 
-    A world that touches nothing is done with a step below the tolerance; near contacts the residual decides.
+    A world that touches nothing is done with a step below the tolerance; near contacts the residual decides. The step
+    itself is taken by ``take_step``, or by the one launch.
     """
     if step.state.active[w] == 0:
         return
@@ -527,15 +565,15 @@ def accept_step(step: NewtonStep, team: int, w: int, member: int):
     away = int(0)
     allowed = int(NEAR_FAILURES)
     for i in range(step.state.instance_start[w], instance_end(step.instances, step.state.instance_start, w)):
+        rolled()
         moved = wp.float64(0.0)
         for e in range(member, q.shape[1], team):
+            rolled()
             d = vec8d(step.arrays.direction[i, e])
             moved += wp.dot(d, d)
             if refreshed != 0:
                 step.state.cached_q[i, e] = q[i, e]
         moved = team_sum(moved)
-        if alpha > wp.float64(0.0):
-            move_functions(step.instances, step.basis, step.arrays, alpha, i, member, team, q)
         if alpha * wp.sqrt(moved) > refresh_limit(step.instances, i, step.options):
             far = 1
         if refreshed != 0 and member == 0:
@@ -544,9 +582,6 @@ def accept_step(step: NewtonStep, team: int, w: int, member: int):
             away = 1
         if alpha * wp.sqrt(moved) > wp.float64(NEAR_DISTANCE * step.instances.size[i]):
             allowed = FAILURES
-    for j in range(member, step.rigid.count[w], team):
-        if alpha > wp.float64(0.0):
-            step.rigid.r[w, j] = step.rigid.r[w, j] + alpha * step.rigid.direction[w, j]
     barrier()
     if member != 0:
         return
@@ -576,4 +611,18 @@ def accept_step(step: NewtonStep, team: int, w: int, member: int):
         wp.atomic_max(step.state.any_active, 0, 1)
 
 
-accept_steps = kernel_over(accept_step, "accept_steps", "w", "member")
+@wp.func
+def take_step(step: NewtonStep, team: int, w: int, member: int):
+    """Take the accepted step of an active world."""
+    if step.state.active[w] == 0:
+        return
+    alpha = step.state.step_length[w]
+    accept_step(step, team, w, member)
+    if alpha > wp.float64(0.0):
+        for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
+            move_functions(step.instances, step.basis, step.arrays, alpha, i, member, team, step.arrays.q)
+        for j in range(member, step.rigid.count[w], team):
+            step.rigid.r[w, j] = step.rigid.r[w, j] + alpha * step.rigid.direction[w, j]
+
+
+accept_steps = kernel_over(take_step, "accept_steps", "w", "member")
