@@ -15,6 +15,7 @@ from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from tests import reference
+from tests.deformables.test_driven import held_bar
 from tests.scenes import GRAVITY, Scene, cube
 
 RADIUS, RATIO = 0.05, 0.3
@@ -220,6 +221,14 @@ def test_weights() -> None:
     top = (sheet.surface_normals[:, 2] > 0.9) & (np.abs(sheet.surface_points[:, :2]).max(axis=1) < 0.045)
     found = dent_weights(sheet, sheet.surface_points[top] - [0.002, 0.001, 0.0])
     assert (found.weights * (sheet.surface_normals[found.samples, 2] < 0.9)).sum(axis=1).max() < 0.05
+
+
+def test_exact_regions_do_not_dent() -> None:
+    """Samples of an exact region, which no free function moves, have no dent; all others have."""
+    body = held_bar()
+    held = np.abs(body.surface_basis[:, body.driven_count :]).max(axis=1) < 1e-9
+    assert 0 < held.sum() < body.surface_count
+    np.testing.assert_array_equal(dent_lengths(body) == 0.0, held)
 
 
 def test_skin_stays_out() -> None:

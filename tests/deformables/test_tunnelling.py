@@ -160,6 +160,37 @@ def test_plate_inside_a_body_is_left_on_the_nearer_side():
     assert samples(scene)[:, 2].min() > 0.0
 
 
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+def test_body_bent_around_an_end(friction):
+    """Samples that lie beyond a plate are through it only if they touched it, or if no step led here.
+
+    What a step is told: nothing, that they touched nothing in the step before, and that they touched the plate.
+    """
+    body = cube()
+
+    def populate(world):
+        OBSTACLES["plate"][0](world, -1)
+        material = Material(youngs_modulus=SOFT, friction=friction)
+        add_reduced_body(world, body, material=material, position=(0.0, 0.0, -0.005 - THIN + 0.5 * EDGE))
+
+    for known, touched in ((False, False), (True, False), (True, True)):
+        scene = Scene(populate, [body])
+        beyond = samples(scene)[:, 2] < -THIN
+        memory = scene.state.softmode
+        if known:
+            memory.dt_before.fill_(-scene.dt)
+        if touched:
+            memory.stick_shape.fill_(wp.vec2i(0, -1))
+        scene.step()
+        constraints = scene.reduced.view.constraints
+        count = int(constraints.count.numpy()[0])
+        force = constraints.force.numpy()[0, :count, 2]
+        found = beyond[constraints.row.numpy()[0, :count]]
+        assert beyond.sum() > 10 and (force[found] > 0.0).any() == (touched or not known)
+        remembered = scene.state.softmode.stick_shape.numpy()[beyond, 0] == 0
+        assert remembered.any() == (touched or not known)
+
+
 BESIDE = wp.transform(wp.vec3(0.5 * EDGE + 0.024, 0.0, -0.1), wp.quat_identity())
 """Of shapes of radius 2 cm: 4 mm beside the way of the cube, and 2.4 times its detection margin away."""
 BYSTANDERS = {

@@ -26,9 +26,9 @@ def remember_slip(
     """Write what every sample touches at the end of the step, and where: what of its slip is elastic stays there.
 
     The rest is slid; without friction, or friction that remembers, all of it. A contact that has opened has no friction
-    to hold a displacement, and is forgotten. Shapes with dofs in the solve
-    keep the anchor, to the bit while the contact sticks, so that errors of the solve do not add up; shapes that move as
-    prescribed keep the displacement itself, in their frame, because a belt moves without its pose.
+    to hold a displacement, and is forgotten. Shapes with dofs in the solve keep the anchor, to the bit while the
+    contact sticks, so that errors of the solve do not add up; shapes that move as prescribed keep the displacement
+    itself, in their frame, because a belt moves without its pose.
     """
     i, s = wp.tid()
     if s >= instances.sample_count[i]:

@@ -23,7 +23,7 @@ class SoftState(Protocol):
     """Length of the last step [s], float64 (instance_count,); 0 where there was none, its negative where it was near a
     shape, so that BDF2 starts over."""
     stick_shape: wp.array
-    """Shapes that a surface sample sticks to, vec2i (particle_count,); -1 for none."""
+    """Shapes that a surface sample touches, vec2i (particle_count,); -1 for none."""
     stick_point: wp.array
     """Where it sticks to them [m], 2 x 3 float64 (particle_count,)."""
     stick_partner: wp.array
