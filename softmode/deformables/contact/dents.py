@@ -24,7 +24,7 @@ from scipy.spatial import KDTree
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.contact.pairs import thickness
-from softmode.deformables.model.struct_kernels import PointConstraints
+from softmode.deformables.model.struct_kernels import VANISHING, PointConstraints
 
 Array = NDArray[np.float64]
 
@@ -62,8 +62,7 @@ def dent_lengths(body: ReducedBody) -> Array:
 
     Zero on exact regions, which are where they are driven to, and rigid.
     """
-    size = np.abs(body.surface_basis)
-    free = size[:, body.driven_count :].max(axis=1, initial=0.0) > 1e-6 * size.max()  # what vanishes does to rounding
+    free = (np.abs(body.surface_basis[:, body.driven_count :]) > VANISHING).any(axis=1)
     return np.where(free, DENT_FACTOR * np.minimum(resolved_size(body), WALL_SHARE * thickness(body)), 0.0)
 
 

@@ -15,6 +15,9 @@ from softmode.deformables.model.lane_kernels import sum8d, vec8, vec8d
 OVERLAP = wp.constant(0.05)
 """Deepest gap that a step starts from, as a fraction of the body's size: what overlaps more, as when it was placed
 wrongly, is pushed out by that much a step instead of being thrown out."""
+VANISHING = wp.constant(1.0e-6)
+"""Largest value of a function that counts as none. Their mean square over the body is one; on an exact region rounding
+leaves 1e-15."""
 SLOTS = 2
 """What a surface sample may touch at a time: the deepest two shapes, and the nearest two other soft bodies."""
 vec6 = wp.types.vector(length=6, dtype=float)

@@ -6,6 +6,7 @@ from softmode.deformables.model.declare import kernel_over
 from softmode.deformables.model.lane_kernels import LANES, barrier, team_sum, vec8, vec8d
 from softmode.deformables.model.status import WORLD_ITERATION_LIMIT, WORLD_NO_DESCENT, WORLD_NOT_FINITE
 from softmode.deformables.model.struct_kernels import (
+    VANISHING,
     Basis,
     Instances,
     Motion,
@@ -144,7 +145,7 @@ def moves_freely(row: wp.array2d[vec8], r: int, driven: int, function_count: int
     for b in range(driven / LANES, blocks_of(function_count)):
         values = row[r, b]
         for lane in range(LANES):
-            if LANES * b + lane >= driven and values[lane] != 0.0:
+            if LANES * b + lane >= driven and wp.abs(values[lane]) > VANISHING:
                 return 1
     return 0
 
