@@ -275,7 +275,8 @@ class Potential:
         size = len(system)
         # parts that do not touch are neither read nor written
         parts, part = solver.view.layout.part_count, size // solver.view.layout.part_count
-        related = solver.tables.system.pattern.numpy()[0] + np.eye(parts)
+        related = solver.tables.system.pattern.numpy()[0]
+        assert related.diagonal().tolist() == [1] * parts  # all of them exist
         upper = np.triu(system[:, :size] * np.kron(related, np.ones((part, part))))
         K = (upper + np.triu(upper, 1).T)[np.ix_(index, index)]
         if not solver.tables.rigid.count_max:
