@@ -17,12 +17,12 @@ from PIL import Image
 
 from softmode.deformables import BuildOptions
 from softmode.envs import PlaceInBinConfig, PlaceInBinEnv, scripted_policy
-from softmode.envs.tasks.place_in_bin.task import BALL, DISC, TOY, bin_scene
 from softmode.objects import ObjectConfig, ObjectSet
 
 MOST, STEPS = 4, 900
 BEAR = ObjectConfig(size=0.06, surface_count=160, build=BuildOptions(mode_count=3, cubature_count=128))
-TOYS = (TOY, BALL, DISC, BEAR)
+SCENE = PlaceInBinConfig().scene
+TOYS = (SCENE.object, *SCENE.others, BEAR)
 """A die, a ball, a disc and a bear."""
 
 
@@ -30,7 +30,7 @@ def make_env(edge: int) -> PlaceInBinEnv:
     """Return PlaceInBin with an empty bin and room for several toys on the table."""
     config = PlaceInBinConfig(
         objects=ObjectSet(TOYS, resample=True, per_world=(1, MOST)),
-        scene=replace(bin_scene(), others=()),
+        scene=replace(SCENE, others=()),
         position_range=(0.02, 0.02),
         others_clearance=0.05,
         render_size=edge,

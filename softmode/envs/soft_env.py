@@ -64,7 +64,8 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
     The reward is the sum of ``info["reward_terms"]``. ``info`` also holds ``is_success``, the task's figures,
     ``finger_force`` [N], ``parameters`` (what was drawn at reset), ``solver_status`` (the solver's flags),
     ``solver_reasons`` (their names, such as "contact_overflow") and ``end_reason`` (:class:`EndReason`); with a set of
-    objects (``TaskConfig.objects``) ``object``, which one is there, and ``object_name``. An episode
+    objects (``TaskConfig.objects``) ``object``, which one is there, and ``object_name``, with several per world that of
+    each slot, -1 for none, and a tuple of the names of those that are there. An episode
     terminates only by failure, named by ``failure``, such as "dropped" or "diverged".
 
     ``reset`` takes as ``options`` any of the parameters, such as ``position`` (x, y) [m], ``yaw`` [rad],
