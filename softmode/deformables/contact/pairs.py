@@ -105,14 +105,8 @@ class SoftPairs:
         near = (self.instances, state, samples, self.table, self.any_near)
         self._launch(kernels.mark_near, self.layout.instance_count, *near)
         given = {"motion": motion, "samples": samples, "state": state, "memory": memory, "constraints": constraints}
-<<<<<<< HEAD
         found, none = partial(self._find, **given, dt=dt), partial(self._none, constraints)
         wp.capture_if(self.any_near, on_true=found, on_false=none)
-=======
-        wp.capture_if(
-            self.any_near, on_true=lambda: self._find(**given, dt=dt), on_false=lambda: self._none(constraints)
-        )
->>>>>>> many
 
     def _none(self, constraints: PointConstraints) -> None:
         """Write that nothing touches."""
