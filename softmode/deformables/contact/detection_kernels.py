@@ -10,7 +10,13 @@ contact records are appended by an atomic counter: fixed slots per sample keep t
 
 import warp as wp
 
-from softmode.deformables.contact.penalty_kernels import dent_compliance, dent_depth, stiffness_per_area
+from softmode.deformables.contact.penalty_kernels import (
+    BULK_FACTOR,
+    SHEAR_FACTOR,
+    dent_compliance,
+    dent_depth,
+    stiffness_per_area,
+)
 from softmode.deformables.contact.shape_query_kernels import (
     HEIGHTFIELD,
     PLANE,
@@ -527,12 +533,13 @@ def gather_contacts(
             partner_mass = float(0.0)
             if body >= 0 and prescribed == 0:
                 partner_mass = shapes.body_mass[body]
-            kappa = stiffness_per_area(
-                instances, i, relative_stiffness[row], partner_mass, shape_area(shapes, shape), dt
-            )
+            relative = relative_stiffness[row]
+            partner_area = shape_area(shapes, shape)
+            kappa = stiffness_per_area(instances, i, BULK_FACTOR, relative, partner_mass, partner_area, dt)
+            shear = stiffness_per_area(instances, i, SHEAR_FACTOR, relative, partner_mass, partner_area, dt)
             area = wp.max(sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
             stiffness = wp.float64(kappa * area)
-            compliance = dent_compliance(instances, i, relative_stiffness[row], dent_length[row]) / area
+            compliance = dent_compliance(instances, i, relative, dent_length[row]) / area
             slip, anchor = remembered_slip(
                 shapes,
                 shape,
@@ -546,7 +553,7 @@ def gather_contacts(
             # d enters as offset + displacement, with the gap along the normal and the shape's own motion taken off
             constraints.offset[i, e] = gap * normal + slip - wp.vec3d(drift)
             constraints.anchor[i, e] = anchor
-            constraints.stick[i, e] = stick_ratio * stiffness
+            constraints.stick[i, e] = stick_ratio * wp.float64(shear * area)
             constraints.stiffness[i, e] = stiffness
             constraints.dent_compliance[i, e] = wp.float64(compliance)
             constraints.dent_depth[i, e] = wp.float64(dent_depth(instances, i, dent_length[row]))

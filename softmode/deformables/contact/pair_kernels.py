@@ -25,7 +25,13 @@ whose row is the difference.
 import warp as wp
 
 from softmode.deformables.contact.detection_kernels import rank_contacts
-from softmode.deformables.contact.penalty_kernels import dent_compliance, dent_depth, stiffness_per_area
+from softmode.deformables.contact.penalty_kernels import (
+    BULK_FACTOR,
+    SHEAR_FACTOR,
+    dent_compliance,
+    dent_depth,
+    stiffness_per_area,
+)
 from softmode.deformables.model.declare import struct
 from softmode.deformables.model.deformation_kernels import displacement_gradient
 from softmode.deformables.model.lane_kernels import vec8
@@ -444,6 +450,14 @@ def accept_pairs(
                     constraints.pair_count[j] = constraints.pair_count[j] + 1
 
 
+@wp.func
+def layers_in_series(instances: Instances, i: int, j: int, factor: float, ri: float, rj: float, dt: float):
+    """Return the stiffness per area [Pa/m] of the surfaces of two bodies; see ``stiffness_per_area``."""
+    ki = stiffness_per_area(instances, i, factor, ri, float(instances.mass[j]), instances.area[j], dt)
+    kj = stiffness_per_area(instances, j, factor, rj, float(instances.mass[i]), instances.area[i], dt)
+    return ki * kj / (ki + kj)
+
+
 @wp.kernel
 def write_pairs(
     instances: Instances,
@@ -505,13 +519,14 @@ def write_pairs(
             value = basis.row[own, b] - value
         basis.row[row, b] = value
 
-    ki = stiffness_per_area(instances, i, relative_stiffness[own], float(instances.mass[j]), instances.area[j], dt)
-    kj = stiffness_per_area(instances, j, relative_stiffness[at], float(instances.mass[i]), instances.area[i], dt)
-    # two layers in series; each of the two surfaces brings its samples, so that each counts one half
+    # each of the two surfaces brings its samples, so that each counts one half
     half_area = wp.max(0.5 * sample_area(instances.scale[i], basis.row_area[own]), 1.0e-30)
-    stiffness = wp.float64(ki * kj / (ki + kj) * half_area)
-    wi = dent_compliance(instances, i, relative_stiffness[own], dent_length[own]) / half_area
-    wj = dent_compliance(instances, j, relative_stiffness[at], dent_length[at]) / half_area
+    ri = relative_stiffness[own]
+    rj = relative_stiffness[at]
+    stiffness = wp.float64(layers_in_series(instances, i, j, BULK_FACTOR, ri, rj, dt) * half_area)
+    shear = wp.float64(layers_in_series(instances, i, j, SHEAR_FACTOR, ri, rj, dt) * half_area)
+    wi = dent_compliance(instances, i, ri, dent_length[own]) / half_area
+    wj = dent_compliance(instances, j, rj, dent_length[at]) / half_area
     compliance = wp.float64(wi + wj)
     thick = wp.max(instances.scale[i] * pairs.thickness[own], instances.scale[j] * pairs.thickness[at])
     depth = dent_depth(instances, i, dent_length[own]) + dent_depth(instances, j, dent_length[at])
@@ -547,7 +562,7 @@ def write_pairs(
             constraints.normal[a, e] = direction * n
             constraints.offset[a, e] = direction * offset
             constraints.stiffness[a, e] = stiffness
-            constraints.stick[a, e] = stick_ratio * stiffness
+            constraints.stick[a, e] = stick_ratio * shear
             constraints.dent_compliance[a, e] = compliance
             constraints.dent_depth[a, e] = wp.float64(depth)
             constraints.friction[a, e] = friction

@@ -8,6 +8,8 @@ import warp as wp
 
 from softmode.deformables.contact.detection_kernels import Shapes, shape_area, shape_frame
 from softmode.deformables.contact.penalty_kernels import (
+    BULK_FACTOR,
+    SHEAR_FACTOR,
     contact_potential,
     dent_exponents,
     dented_penalty,
@@ -492,10 +494,13 @@ def accumulate_constraints(
         pin_target_out[pin] = constraints.stiffness[i, e] * L
         sums.pin_stiffness[pin] = sums.pin_stiffness[pin] - wp.dot(L, step.constraint_slip[i, e])
         return
-    # by ln E, nu, ln m and ln s: of the penalty, which k_t follows, and of the dent
+    # by ln E, nu, ln m and ln s: of the penalty, of k_t, and of the dent
     shape = constraints.shape[i, e]
     none = wp.float64(0.0)
-    stiffness_powers = stiffness_exponents(instances, i, relative_stiffness[row], shape_area(shapes, shape), dt)
+    relative = relative_stiffness[row]
+    partner_area = shape_area(shapes, shape)
+    stiffness_powers = stiffness_exponents(instances, i, BULK_FACTOR, relative, partner_area, dt)
+    shear_powers = stiffness_exponents(instances, i, SHEAR_FACTOR, relative, partner_area, dt)
     dent_powers = dent_exponents(instances, i)
     by = step.constraint_gain[i, e]
     normal_gain = by[0] * stiffness_powers + by[1] * dent_powers + wp.vec4d(none, none, none, by[2])
@@ -504,11 +509,11 @@ def accumulate_constraints(
     along = force - wp.dot(constraints.normal[i, e], force) * constraints.normal[i, e]
     limit = constraints.friction[i, e] * wp.length(force - along)
     stuck = constraints.stick[i, e] > none and constraints.stick[i, e] * wp.length(constraints.slip[i, e]) <= limit
-    gain = wp.dot(step.memory[i, e], along) * stiffness_powers
+    gain = wp.dot(step.memory[i, e], along) * shear_powers
     L -= step.memory[i, e]
     gain += wp.dot(L, step.constraint_normal[i, e]) * normal_gain
     if stuck:
-        gain += wp.dot(L, along) * stiffness_powers
+        gain += wp.dot(L, along) * shear_powers
     sums.contact[i, e] = sums.contact[i, e] + gain
     # of x = gap n + slip - drift + d, the gap grows along n as the sample's place at the start does, d falls by as much
     # as that, and the drift of a shape that turns by R within the step grows by R - I of it
