@@ -714,13 +714,13 @@ def test_ring_squeezed_shut(self_contact):
     assert not scene.reduced.status.numpy().any()
 
 
-def shut_ring(dt):
+def shut_ring(dt, friction):
     """Let the tips of a ring fly at each other, and assert that energy does not grow.
 
     Returns:
         Errors of p and L relative to m v and m v R, the largest force [N] and the narrowest opening [m].
     """
-    body, material = ring(), Material(youngs_modulus=4.0e4)
+    body, material = ring(), Material(youngs_modulus=4.0e4, friction=friction)
 
     def populate(world):
         add_reduced_body(world, body, material=material, self_contact=True)
@@ -744,15 +744,19 @@ def shut_ring(dt):
     return np.max(out, axis=0) * (1, 1, 1, -1)
 
 
-def test_momentum_of_a_ring_that_shuts():
-    """Contact with itself is no force on the body: p is kept to 1e-8, L to first order in dt as without contact."""
-    errors = [shut_ring(dt) for dt in (0.001, 0.0005)]
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+def test_momentum_of_a_ring_that_shuts(friction):
+    """Contact with itself is no force on the body: p is kept to 1e-8, L to first order in dt.
+
+    With friction L is kept ten times better than without, to about 1e-4 at both steps: too little to show an order.
+    """
+    errors = [shut_ring(dt, friction) for dt in (0.001, 0.0005)]
     for p, L, force, narrow in errors:
         assert force > 0.1
         assert narrow > -2e-3
         assert p <= 1e-8
-        assert L <= 3e-3
-    assert errors[0][1] / errors[1][1] > 1.5
+        assert L <= (3e-3 if friction == 0.0 else 3e-4)
+    assert friction > 0.0 or errors[0][1] / errors[1][1] > 1.5
 
 
 # -- worlds, graphs, faults --------------------------------------------------------------------------------------------
