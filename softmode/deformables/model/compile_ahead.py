@@ -7,9 +7,11 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import cache
 from types import ModuleType
 from typing import Any
 
+import newton
 import numpy as np
 import warp as wp
 
@@ -24,12 +26,11 @@ WORKERS = 16
 """Most modules that are compiled at a time: each takes up to 1 GB."""
 BLOCK = 256
 """Threads of a block where a launch does not say."""
-_ADJOINT_FREE = "newton._src.sim.articulation", "newton._src.solvers.mujoco.kernels"
+_ADJOINT_FREE = "newton._src.solvers.mujoco.kernels", "newton._src.sim.articulation", "mujoco_warp._src.set_const"
 _BUILDING = (
     *_ADJOINT_FREE,
-    "newton._src.geometry.bvh",
-    "mujoco_warp._src.set_const",
     "mujoco_warp._src.smooth",
+    "newton._src.geometry.bvh",
     "softmode.deformables.model.parameter_kernels",
     "softmode.deformables.solver.step_kernels",
     "softmode.deformables.contact.friction_memory_kernels",
@@ -39,14 +40,15 @@ _BUILDING = (
 def compile_for_building(device: wp.DeviceLike, *others: ModuleType) -> None:
     """Compile the kernels that a model with joints and its solvers launch while they are built, and other modules'.
 
-    Those of Newton are compiled without their adjoints, half of their time, unless they are loaded already. Where a
-    program of its own records them on a tape, `wp.set_module_options` brings the adjoints back; without them the
-    tape's backward pass leaves these kernels out, with a warning of Warp's that names them.
+    Some of Newton's and MuJoCo-Warp's are compiled without adjoints, half of their time, unless they are loaded
+    already. Where a program of its own records them on a tape, `wp.set_module_options` brings the adjoints back;
+    without them the tape's backward pass leaves these kernels out, with a warning of Warp's that names them.
 
     Args:
         device: Warp device.
         others: Modules of Python whose kernels are compiled with them.
     """
+    newton.solvers.SolverMuJoCo.import_mujoco()  # its modules are known only then
     for name in _ADJOINT_FREE:
         if name in sys.modules and not wp.get_module(name).execs:
             wp.set_module_options({"enable_backward": False}, module=sys.modules[name])
@@ -127,7 +129,13 @@ def _load(wanted: Wanted, device: wp.Device) -> None:
     def load(module: wp.Module, block_dim: int | None) -> None:
         wp.force_load(device, [module], block_dim=block_dim)
 
+    pool = _pool(os.getpid())
+    for done in [pool.submit(load, *one) for one in wanted]:
+        done.result()
+
+
+@cache
+def _pool(process: int) -> ThreadPoolExecutor:
+    """Return the threads that compile in a process: always the same ones, since each compiles Warp's headers first."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    with ThreadPoolExecutor(max_workers=min(cores, WORKERS)) as pool:
-        for done in [pool.submit(load, *one) for one in wanted]:
-            done.result()
+    return ThreadPoolExecutor(max_workers=min(cores, WORKERS), thread_name_prefix="compile")

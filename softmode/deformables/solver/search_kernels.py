@@ -35,7 +35,8 @@ from softmode.deformables.solver.spin_kernels import (
 
 wp.set_module_options({"enable_backward": False})
 
-
+PHASES = wp.get_module(f"{__name__}.phases")
+"""What only launches per phase need, see :func:`softmode.deformables.model.declare.kernel_over`."""
 INERTIA_SHARE = wp.constant(0.01)
 """A Hessian serves further iterations while strains have changed it by less than this fraction of the inertia, which
 is all that resists the rotation of a stiff body: beyond, small steps would pass for convergence."""
@@ -244,9 +245,10 @@ def check_convergence(step: NewtonStep, potential: wp.float64, team: int, w: int
         step.state.status[w] = step.state.status[w] | WORLD_ITERATION_LIMIT
 
 
-@wp.func
-def check_iterate(step: NewtonStep, team: int, w: int, member: int):
+@wp.kernel(module=PHASES, enable_backward=False)
+def check_iterates(step: NewtonStep, team: int):
     """Sum the potential of the iterate and check its convergence."""
+    w, member = wp.tid()
     if step.state.active[w] == 0:
         return
     share = potential_share(
@@ -265,9 +267,6 @@ def check_iterate(step: NewtonStep, team: int, w: int, member: int):
     )
     potential = team_sum(share)
     check_convergence(step, potential, team, w, member)
-
-
-check_iterates = kernel_over(check_iterate, "check_iterates", "w", "member")
 
 
 @wp.func
@@ -486,9 +485,10 @@ def check_trial(step: NewtonStep, trial: wp.float64, w: int, member: int):
     step.state.step_length[w] = alpha
 
 
-@wp.func
-def check_world_trial(step: NewtonStep, team: int, w: int, member: int):
+@wp.kernel(module=PHASES, enable_backward=False)
+def check_trials(step: NewtonStep, team: int):
     """Sum the potential of the trial step of a searching world and check it."""
+    w, member = wp.tid()
     if step.state.searching[w] == 0:
         return
     share = potential_share(
@@ -507,9 +507,6 @@ def check_world_trial(step: NewtonStep, team: int, w: int, member: int):
     )
     trial = team_sum(share)
     check_trial(step, trial, w, member)
-
-
-check_trials = kernel_over(check_world_trial, "check_trials", "w", "member")
 
 
 @wp.func
@@ -555,7 +552,7 @@ def accept_step(step: NewtonStep, team: int, w: int, member: int):
     """Say after a step whether the stiffness is to be refreshed and how friction is to be linearised.
 
     A world that touches nothing is done with a step below the tolerance; near contacts the residual decides. The step
-    itself is taken by ``take_step``, or by the one launch.
+    itself is taken by ``accept_steps``, or by the one launch.
     """
     if step.state.active[w] == 0:
         return
@@ -612,9 +609,10 @@ def accept_step(step: NewtonStep, team: int, w: int, member: int):
         wp.atomic_max(step.state.any_active, 0, 1)
 
 
-@wp.func
-def take_step(step: NewtonStep, team: int, w: int, member: int):
+@wp.kernel(module=PHASES, enable_backward=False)
+def accept_steps(step: NewtonStep, team: int):
     """Take the accepted step of an active world."""
+    w, member = wp.tid()
     if step.state.active[w] == 0:
         return
     alpha = step.state.step_length[w]
@@ -624,6 +622,3 @@ def take_step(step: NewtonStep, team: int, w: int, member: int):
             move_functions(step.instances, step.basis, step.arrays, alpha, i, member, team, step.arrays.q)
         for j in range(member, step.rigid.count[w], team):
             step.rigid.r[w, j] = step.rigid.r[w, j] + alpha * step.rigid.direction[w, j]
-
-
-accept_steps = kernel_over(take_step, "accept_steps", "w", "member")
