@@ -184,9 +184,7 @@ def stiffness_per_area(
 
 
 @wp.func
-def stiffness_exponents(
-    instances: Instances, i: int, factor: float, relative: float, partner_area: float, dt: float
-):
+def stiffness_exponents(instances: Instances, i: int, factor: float, relative: float, partner_area: float, dt: float):
     """Return d ln(A kappa) / d(ln E, nu, ln m, ln s) of a contact with what does not yield, s the body's scale.
 
     The sample's area A grows with s^2. Where two sources of the stiffness are equal it has a kink, and no derivative.
