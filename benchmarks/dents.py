@@ -14,7 +14,7 @@ import warp as wp
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
+from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_sphere
 from tests.deformables.test_dents import RADIUS, RATIO, Press, ball, hertz
 
 DEPTHS = (0.01, 0.02, 0.04, 0.08, 0.11)
@@ -36,6 +36,12 @@ def main() -> None:
                 press = Press(body, RADIUS, youngs_modulus=modulus, stiffness=stiffness)
                 row = [press.force(share * RADIUS) / hertz(share * RADIUS, modulus) for share in DEPTHS]
                 print(f"{body.function_count} functions, {samples} samples, E {modulus:g}, {name}:", *shown(row))
+    print("the same of the 48 functions and 800 samples that a body has by default, E 1e5")
+    for ratio in (0.3, 0.45, 0.49):
+        body = default_ball(ratio)
+        press = Press(body, RADIUS, youngs_modulus=1.0e5, poissons_ratio=ratio)
+        row = [press.force(share * RADIUS) / hertz(share * RADIUS, 1.0e5, ratio) for share in DEPTHS[:-1]]
+        print(f"{body.function_count} functions, nu {ratio}:", *shown(row))
     print("two punches, force over that of half spaces, radii of 6, 12 and 18 mm, 1 mm deep (0.4 mm into the pad)")
     print("whole face: plates that squeeze by 4 %, force over E A strain")
     for name, edges in BOXES.items():
@@ -51,6 +57,12 @@ def main() -> None:
             press, depth = Press(body, 0.5 * edges[2], stiffness=stiffness), 0.02 * edges[2]
             whole = press.force(depth) * edges[2] / (1.0e6 * edges[0] * edges[1] * 2.0 * depth)
             print(f"{name}, {body.function_count} functions, {kind}:", *shown(row), "whole face", *shown([whole]))
+
+
+def default_ball(poissons_ratio: float) -> ReducedBody:
+    """Return a sphere with the functions that a body of a Poisson's ratio has by default."""
+    quadrature = quadrature_from_sphere(RADIUS, point_count=3000)
+    return build_body(quadrature, BuildOptions(poissons_ratio=poissons_ratio), name="ball")
 
 
 def rigid(body: ReducedBody, youngs_modulus: float) -> float:

@@ -35,9 +35,9 @@ def ball(mode_count: int = 8, surface_count: int = 1500) -> ReducedBody:
     return build_body(quadrature, options, name="ball")
 
 
-def hertz(depth: float, youngs_modulus: float) -> float:
+def hertz(depth: float, youngs_modulus: float, poissons_ratio: float = RATIO) -> float:
     """Return the force of a sphere pressed by a rigid plane [N]: 4/3 E* sqrt(R) d^(3/2), for a sphere between two."""
-    modulus = youngs_modulus / (1.0 - RATIO**2)
+    modulus = youngs_modulus / (1.0 - poissons_ratio**2)
     return 4.0 / 3.0 * modulus * RADIUS**0.5 * depth**1.5 * float(np.interp(depth / RADIUS, *FINITE))
 
 
@@ -50,6 +50,7 @@ class Press:
         count: How many stand in the row.
         punch: Radius of the cylinders that press [m]; None for plates.
         youngs_modulus: E [Pa].
+        poissons_ratio: nu.
         scale: Of the bodies.
         stiffness: Contact stiffness per area [Pa/m]; None for the one that follows the body.
     """
@@ -62,13 +63,18 @@ class Press:
         count: int = 1,
         punch: float | None = None,
         youngs_modulus: float = 1.0e6,
+        poissons_ratio: float = RATIO,
         scale: float = 1.0,
         stiffness: float | None = None,
     ) -> None:
         """Build the scene."""
         self.half, self.count = scale * half_height, count
         material = Material(
-            youngs_modulus=youngs_modulus, poissons_ratio=RATIO, density=300.0, friction=0.0, mass_damping=50.0
+            youngs_modulus=youngs_modulus,
+            poissons_ratio=poissons_ratio,
+            density=300.0,
+            friction=0.0,
+            mass_damping=50.0,
         )
 
         def populate(world: newton.ModelBuilder) -> None:
