@@ -74,6 +74,8 @@ COLLAPSED_RATIO = wp.constant(0.01)
 """Points whose volume is below this fraction of their rest volume count as collapsed, and"""
 COLLAPSED_SHARE = wp.constant(0.1)
 """a body of which more than this share has collapsed is flagged."""
+RELAXED_AFTER = wp.constant(16)
+"""Iterations after which the normal force that limits friction goes half way only, where `friction_lag` is longer."""
 
 
 @wp.kernel
@@ -429,7 +431,11 @@ def evaluate_constraint(
                 deep = wp.float64(smoothing) - wp.float64(2.0) * gap
                 _psi, most, _curvature = contact_potential(step.constraints, smoothing, deep, i, e)
                 held = wp.min(slope, most)
-            step.constraints.normal_force[i, e] = stiffness * held
+            pressed = stiffness * held
+            if step.state.iteration[w] > RELAXED_AFTER:
+                # the fixed point between normal force and friction may be repelling: a mean of two iterates is not
+                pressed = wp.float64(0.5) * (pressed + step.constraints.normal_force[i, e])
+            step.constraints.normal_force[i, e] = pressed
         normal_force = step.constraints.normal_force[i, e]
         # offset = gap n + memory - drift of the shape: the tangential part is the slip
         t = total - wp.dot(n, total) * n
