@@ -21,7 +21,7 @@ LIMITS = {
     "ShapeSoft": (1.2, 2.0),
     "PlaceInBin": (2.4, 1.2),
 }
-"""Largest force on a rigid body [N] and depth in one besides the dent [mm]: one and a half times those of the episode."""
+"""Largest force on a rigid body [N] and depth in it besides the dent [mm]: 1.5 times those of the episode."""
 
 
 @pytest.mark.parametrize("task", LIMITS)

@@ -254,7 +254,7 @@ def test_every_segment_is_what_the_state_says(name: str) -> None:
 
     random = np.random.default_rng(4)
     for options in EPISODES.get(name, ({},)):
-        env.reset(seed=4, options=options)
+        env.reset(seed=2, options=options)
         check()
         policy = scripted_policy(env)
         for step in range(60):

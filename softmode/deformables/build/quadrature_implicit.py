@@ -16,7 +16,7 @@ from softmode.deformables.build.quadrature_grid import (
     grid_shape,
     sum_pieces,
 )
-from softmode.deformables.build.surface_samples import CANDIDATES_PER_SAMPLE, SURFACE_COUNT, select_surface
+from softmode.deformables.build.surface_samples import FEW_SAMPLES, SURFACE_COUNT, candidate_count, select_surface
 from softmode.errors import AssetError
 
 Array = NDArray[np.float64]
@@ -170,8 +170,11 @@ def _project_surface(
     """Draw points in a thin layer around the zero level, which makes their density uniform, and project them on it."""
     rng = np.random.default_rng(seed)
     layer = 0.5 * float(width.max())
-    cells = _layer_cells(nodes, distance, width, layer)
-    wanted = 3 * CANDIDATES_PER_SAMPLE * surface_count
+    if surface_count < FEW_SAMPLES:
+        cells = nodes[np.abs(distance) < layer + 0.5 * float(np.linalg.norm(width))]
+    else:
+        cells = _layer_cells(nodes, distance, width, layer)
+    wanted = 3 * candidate_count(surface_count)
     pick = rng.permutation(len(cells) * max(1, -(-wanted // max(len(cells), 1))))[:wanted] % len(cells)
     x = cells[pick] + (rng.random((len(pick), 3)) - 0.5) * width
     step = 0.25 * float(width.min())

@@ -20,7 +20,7 @@ from softmode.deformables.build.quadrature_grid import (
     match_moments,
     sum_pieces,
 )
-from softmode.deformables.build.surface_samples import CANDIDATES_PER_SAMPLE, SURFACE_COUNT, select_surface
+from softmode.deformables.build.surface_samples import SURFACE_COUNT, candidate_count, select_surface
 from softmode.errors import AssetError
 
 Array = NDArray[np.float64]
@@ -82,12 +82,12 @@ def quadrature_from_mesh(
     else:
         found = replace(found, points=match_moments(found.points, found.weights, *_mesh_moments(local, volume)))
     rng = np.random.default_rng(seed)
-    candidate_count = CANDIDATES_PER_SAMPLE * surface_count
+    candidates = candidate_count(surface_count)
     pick = np.searchsorted(
         np.cumsum(twice_area),
-        (np.arange(candidate_count) + rng.random(candidate_count)) / candidate_count * twice_area.sum(),
+        (np.arange(candidates) + rng.random(candidates)) / candidates * twice_area.sum(),
     ).clip(0, len(face) - 1)
-    r, t = np.sqrt(rng.random(candidate_count)), rng.random(candidate_count)
+    r, t = np.sqrt(rng.random(candidates)), rng.random(candidates)
     bary = np.stack([1.0 - r, r * (1.0 - t), r * t], axis=1)
     surface = select_surface(
         np.einsum("nk,nki->ni", bary, corner[pick]), normal[pick] / twice_area[pick, None], area, surface_count, seed
