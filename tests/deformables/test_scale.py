@@ -488,7 +488,7 @@ def test_momentum():
         assert scene.momentum(0)[0][0] < 0.5 * np.max(p)  # they have met
         np.testing.assert_allclose(after, p, atol=1e-6 * np.linalg.norm(p))
         drift.append(np.linalg.norm(turned - L) / (EDGE * np.linalg.norm(p)))
-    assert drift[0] < 1e-3
+    assert drift[0] < 1.5e-3  # in a contact that dents they stay together for longer
     assert drift[1] < 0.6 * drift[0]
 
 

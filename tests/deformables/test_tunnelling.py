@@ -66,14 +66,15 @@ SPEEDS = [
 def test_fast_body_does_not_pass(name, speed, dt):
     """A soft cube of 10 cm that hits a plate of 2 mm, a mesh of it or a sphere turns back.
 
-    Off the sphere, which it hits beside the top, it may also glance, with 1 % of its speed left.
+    The sphere it hits by the top: farther beside it glances off.
     """
     body = cube()
     add, top = OBSTACLES[name]
+    beside = (0.005, 0.003) if name == "sphere" else (0.013, 0.007)
 
     def populate(world):
         add(world, -1)
-        position = (0.013, 0.007, top + 0.011 + 0.5 * EDGE)
+        position = (*beside, top + 0.011 + 0.5 * EDGE)
         velocity = (0.0, 0.0, -speed)
         add_reduced_body(world, body, material=Material(youngs_modulus=SOFT), position=position, velocity=velocity)
 
@@ -82,7 +83,7 @@ def test_fast_body_does_not_pass(name, speed, dt):
         scene.step()
         assert scene.centre()[2] > 0.0
     assert_rebound(name, samples(scene), scene.centre())
-    assert scene.momentum()[0][2] > (-0.01 * scene.mass() * speed if name == "sphere" else 0.0)
+    assert scene.momentum()[0][2] > 0.0
 
 
 @pytest.mark.parametrize("name", OBSTACLES)
