@@ -364,11 +364,7 @@ class Task:
         return {name: getattr(material, name) for name in names if getattr(self.config, f"{name}_range") is None}
 
     def other_arcs(self) -> Arcs:
-        """Return the ranges of directions from object 0 [rad] in which others of a set may lie; none for all around.
-
-        With them comes the distance that nothing there is to be nearer than, from the middle of object 0, in radii of
-        the objects with the clearance.
-        """
+        """Return in which directions from object 0 others of a set may lie; all around by default."""
         return Arcs()
 
     def build(self) -> None:
@@ -650,7 +646,7 @@ class Task:
             inputs = [self._choice, self.slots, count, self.column("object_one_hot")]
             self.launch(kernels.observe_kind, inputs, [self.observation], (self.world_count, self.slots * count))
         if self.slots > 1:
-            inputs = [self.state, self._choice, self.column("other_offsets"), self.column("other_present")]
+            inputs = [self.state, self.column("other_offsets"), self.column("other_present")]
             self.launch(kernels.observe_others, inputs, [self.observation], (self.world_count, self.slots - 1))
         self.observe()
         self.launch(kernels.bound_observation, [self._low, self._high], [self.observation, self.finite])
@@ -682,8 +678,7 @@ class Task:
         """
         scene = self.scene
         scale = self.table.values.numpy()[:, self.table.column("scale")]
-        members = [float(np.linalg.norm(thing.body.surface_points, axis=1).max()) for thing in scene.members]
-        radius = np.array(members)[scene.member] * scale
+        radius = np.array([thing.radius for thing in scene.members])[scene.member] * scale
         balls = [(scene.object_position.numpy()[:, 0], radius), (scene.controller.tool_pose.numpy()[:, :3], HAND)]
         if scene.marker is not None:
             balls.append((scene.marker_place.numpy()[:, :3], MARKER))

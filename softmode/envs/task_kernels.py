@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from softmode.envs.end_reason import EndReason
-from softmode.envs.reward_kernels import StepResult, WorldState, surface_point, tool_position, write
+from softmode.envs.reward_kernels import StepResult, WorldState, is_there, surface_point, tool_position, write
 
 wp.set_module_options({"enable_backward": False})
 
@@ -260,7 +260,6 @@ def observe(
 @wp.kernel
 def observe_others(
     state: WorldState,
-    choice: wp.array[int],  # (world_count * objects,), -1 for none
     offsets: int,  # columns
     present: int,
     # Out:
@@ -269,7 +268,7 @@ def observe_others(
     """Write the ways from object 0 to the others and whether these are there; zeros for those that are not."""
     w, k = wp.tid()
     way = wp.vec3()
-    there = choice[w * state.stride + k + 1] >= 0
+    there = is_there(state, w, k + 1)
     if there:
         way = state.object_position[w, k + 1] - state.object_position[w, 0]
     write(observation, w, offsets + 3 * k, way)

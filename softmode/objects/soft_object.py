@@ -96,6 +96,11 @@ class SoftObject:
         return self._averages[1]
 
     @cached_property
+    def radius(self) -> float:
+        """Distance of the farthest surface sample from the origin of the body frame [m]."""
+        return float(np.linalg.norm(self.body.surface_points, axis=1).max())
+
+    @cached_property
     def dents(self) -> DentWeights:
         """How the splats follow the dents of the surface samples."""
         return dent_weights(self.body, self.visible_splats.means)

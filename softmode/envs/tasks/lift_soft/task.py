@@ -90,8 +90,7 @@ class LiftSoft(Task):
 
     def build(self) -> None:
         """Measure the objects."""
-        surfaces = [thing.body.surface_points for thing in self.scene.members]
-        self.radius = self.per_object([np.linalg.norm(x, axis=1).max() for x in surfaces])
+        self.radius = self.per_object([thing.radius for thing in self.scene.members])
         """From the centre of each unscaled object to its farthest point [m], shape (world_count,)."""
 
     def parameters(self) -> tuple[Parameter, ...]:

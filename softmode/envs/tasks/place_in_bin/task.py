@@ -193,7 +193,7 @@ class PlaceInBin(Task):
         toys = [thing.body.surface_points for thing in self.scene.members]
         others = [thing.body.surface_points for thing in self.scene.objects[self.slots :]]
         self.wall, self.floor, self.margin, self.clearance = given.wall, given.floor, 0.3 * min(self.half), CLEARANCE
-        radius = [[np.linalg.norm(x, axis=1).max()] * self.slots for x in toys]
+        radius = [[thing.radius] * self.slots for thing in self.scene.members]
         self.radius = self.per_object(radius, every_slot=self.slots > 1)
         """From the centre of each unscaled toy to its farthest point [m], shape (world_count, slots)."""
         self.heights, self.dropped = self._heights, -FALL
