@@ -21,6 +21,8 @@ vec8 = wp.types.vector(length=LANES, dtype=float)
 vec8d = wp.types.vector(length=LANES, dtype=wp.float64)
 mat88 = wp.types.matrix(shape=(LANES, LANES), dtype=float)
 
+WARP = wp.constant(32)
+"""Threads of a warp on CUDA."""
 TEAM = 32
 """Threads that share one system on CUDA."""
 
@@ -82,26 +84,66 @@ def free_part(block: Any, driven: int):
     return out
 
 
+_TEAM_SUM = """
+#if defined(__CUDA_ARCH__)
+    __shared__ double partial[COUNT * ((WP_TILE_BLOCK_DIM + 31) / 32)];
+    double* x = (double*)&value;
+    #pragma unroll 1
+    for (int offset = 16; offset > 0; offset >>= 1) {
+        #pragma unroll
+        for (int c = 0; c < COUNT; ++c) x[c] += __shfl_xor_sync(0xffffffff, x[c], offset);
+    }
+    if (threadIdx.x % 32 == 0) {
+        #pragma unroll
+        for (int c = 0; c < COUNT; ++c) partial[COUNT * (threadIdx.x / 32) + c] = x[c];
+    }
+    __syncthreads();
+    #pragma unroll
+    for (int c = 0; c < COUNT; ++c) x[c] = partial[c];
+    #pragma unroll 1
+    for (int k = 1; k < blockDim.x / 32; ++k) {
+        #pragma unroll
+        for (int c = 0; c < COUNT; ++c) x[c] += partial[COUNT * k + c];
+    }
+    __syncthreads();
+#endif
+    return value;
+"""
+"""Sum of COUNT numbers of each thread: over a warp, then over the warps of the team, with one pair of barriers."""
+
+
+@wp.func_native(snippet=_TEAM_SUM.replace("COUNT", "1"))
+def team_sum(value: wp.float64) -> wp.float64:  # pyright: ignore[reportReturnType]
+    """Return the sum of the threads' values, in a fixed order, to every thread; every thread must call it."""
+    ...
+
+
+@wp.func_native(snippet=_TEAM_SUM.replace("COUNT", "3"))
+def team_sum3(value: wp.vec3d) -> wp.vec3d:  # pyright: ignore[reportReturnType]
+    """Return the sum of the threads' vectors likewise."""
+    ...
+
+
+@wp.func_native(snippet=_TEAM_SUM.replace("COUNT", "9"))
+def team_sum33(value: wp.mat33d) -> wp.mat33d:  # pyright: ignore[reportReturnType]
+    """Return the sum of the threads' matrices likewise."""
+    ...
+
+
 @wp.func_native(
     snippet="""
 #if defined(__CUDA_ARCH__)
-    __shared__ double partial[32];
     #pragma unroll 1
-    for (int offset = 16; offset > 0; offset >>= 1) value += __shfl_xor_sync(0xffffffff, value, offset);
-    if (threadIdx.x % 32 == 0) partial[threadIdx.x / 32] = value;
-    __syncthreads();
-    double total = partial[0];
-    #pragma unroll 1
-    for (int k = 1; k < blockDim.x / 32; ++k) total += partial[k];
-    __syncthreads();
-    return total;
-#else
-    return value;
+    for (int offset = 16; offset > 0; offset >>= 1) {
+        value.c[0] += __shfl_xor_sync(0xffffffff, value.c[0], offset);
+        value.c[1] += __shfl_xor_sync(0xffffffff, value.c[1], offset);
+    }
 #endif
+    return value;
 """
 )
-def team_sum(value: wp.float64) -> wp.float64:  # pyright: ignore[reportReturnType]
-    """Return the sum of the threads' values, in a fixed order, to every thread; every thread must call it."""
+def warp_sum2(value: wp.vec2d) -> wp.vec2d:  # pyright: ignore[reportReturnType]
+    """Return the sum of the vectors of a warp's threads to each of them; every thread of the warp must call it."""
     ...
 
 

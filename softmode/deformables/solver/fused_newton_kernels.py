@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from softmode.deformables.model.declare import Kernel
-from softmode.deformables.model.lane_kernels import LANES, barrier, rolled, team_sum
+from softmode.deformables.model.lane_kernels import LANES, WARP, barrier, rolled, team_sum
 from softmode.deformables.model.struct_kernels import instance_end
 from softmode.deformables.solver.assembly_kernels import (
     column_block,
@@ -46,9 +46,10 @@ from softmode.deformables.solver.step_kernels import (
 
 wp.set_module_options({"enable_backward": False})
 
-TEAM = 96
+import os
+TEAM = int(os.environ.get("SM_TEAM", "128"))
 """Threads that share a world on CUDA."""
-BLOCKS = 4
+BLOCKS = int(os.environ.get("SM_BLOCKS", "3"))
 """Worlds that a multiprocessor takes at a time: what registers are given out for."""
 
 
@@ -102,10 +103,16 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool
             # one copy of this code serves iterates and trials
             found = ALL + trial
             for i in range(begin, end):
-                for p in range(member, step.instances.point_count[i], team):
-                    evaluate_point(step, step.state.active, q, found, i, p)
-                for e in range(member, step.constraints.count[i], team):
-                    evaluate_constraint(step, step.state.active, q, r, 1 - trial, i, e)
+                # points and constraints at the same time, but not in one warp
+                points = step.instances.point_count[i]
+                first = points
+                if team > 1:
+                    first = (points + WARP - 1) / WARP * WARP
+                for t in range(member, first + step.constraints.count[i], team):
+                    if t < points:
+                        evaluate_point(step, step.state.active, q, found, i, t)
+                    if t >= first:
+                        evaluate_constraint(step, step.state.active, q, r, 1 - trial, i, t - first)
             for k in range(member, step.rigid.row_count[w], team):
                 evaluate_row(step, step.state.active, r, found, w, k)
             barrier()

@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from softmode.deformables.contact.penalty_kernels import contact_potential, slip_potential
-from softmode.deformables.model.lane_kernels import team_sum, vec8d
+from softmode.deformables.model.lane_kernels import team_sum, team_sum3, team_sum33, vec8d
 from softmode.deformables.model.struct_kernels import (
     Instances,
     PointConstraints,

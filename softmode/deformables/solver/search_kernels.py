@@ -3,7 +3,18 @@
 import warp as wp
 
 from softmode.deformables.model.declare import kernel_over
-from softmode.deformables.model.lane_kernels import LANES, barrier, rolled, team_sum, vec8, vec8d
+from softmode.deformables.model.lane_kernels import (
+    LANES,
+    WARP,
+    barrier,
+    rolled,
+    team_sum,
+    team_sum3,
+    team_sum33,
+    vec8,
+    vec8d,
+    warp_sum2,
+)
 from softmode.deformables.model.status import WORLD_ITERATION_LIMIT, WORLD_NO_DESCENT, WORLD_NOT_FINITE
 from softmode.deformables.model.struct_kernels import (
     VANISHING,
@@ -27,8 +38,6 @@ from softmode.deformables.solver.spin_kernels import (
     centre_of_mass,
     rest_block,
     rotation_of,
-    team_sum3,
-    team_sum33,
     tensor_of_inertia,
     unknown_block,
 )
@@ -126,30 +135,38 @@ def rigid_excess(
     member: int,
     team: int,
 ):
-    """Return how many of one thread's joint dofs have a residual above the tolerance of the forces on them."""
+    """Return how many of one thread's joint dofs have a residual above the tolerance of the forces on them.
+
+    A warp adds up the forces on a dof, each thread some of them.
+    """
     excess = wp.float64(0.0)
-    for j in range(member, rigid.count[w], team):
+    lanes = wp.min(team, WARP)
+    lane = member % lanes
+    for j in range(member / lanes, rigid.count[w], team / lanes):
         rolled()
         residual = wp.float64(0.0)
-        scale = rigid.inertia[w, j, j] * wp.float64(rigid_tolerance[w])
-        for k in range(rigid.count[w]):
+        scale = wp.float64(0.0)
+        if lane == 0:
+            scale = rigid.inertia[w, j, j] * wp.float64(rigid_tolerance[w])
+        for k in range(lane, rigid.count[w], lanes):
             rolled()
             residual += rigid.inertia[w, j, k] * (rigid.r[w, k] - rigid.predicted[w, k])
         for i in range(instance_start[w], instance_end(instances, instance_start, w)):
             rolled()
-            for k in range(first_coupled(instances, i), constraints.acting_count[i]):
+            for k in range(first_coupled(instances, i) + lane, constraints.acting_count[i], lanes):
                 rolled()
                 e = constraints.acting[i, k]
                 if j >= constraints.dof_begin[i, e] and j < constraints.dof_end[i, e]:
                     force = wp.dot(wp.vec3d(constraints.jacobian[i, e, j]), constraints.force[i, e])
                     residual += force
                     scale += wp.abs(force)
-        for k in range(rigid.row_count[w]):
+        for k in range(lane, rigid.row_count[w], lanes):
             rolled()
             force = wp.float64(rigid.row_jacobian[w, k, j]) * rigid.row_force[w, k]
             residual += force
             scale += wp.abs(force)
-        if not (wp.abs(residual) <= force_tolerance * scale):
+        sums = warp_sum2(wp.vec2d(residual, scale))
+        if lane == 0 and not (wp.abs(sums[0]) <= force_tolerance * sums[1]):
             excess += wp.float64(1.0)
     return excess
 
@@ -208,8 +225,9 @@ def check_convergence(step: NewtonStep, potential: wp.float64, team: int, w: int
                     free = moves_freely(step.basis.row, step.constraints.row[i, at], driven, count)
                 if free != 0:
                     scale += wp.length(step.constraints.force[i, at])
-            residual = team_sum(residual)
-            scale = wp.sqrt(team_sum(external)) + team_sum(scale)
+            sums = team_sum3(wp.vec3d(residual, external, scale))
+            residual = sums[0]
+            scale = wp.sqrt(sums[1]) + sums[2]
             floor = wp.float64(1.0e-5) * step.instances.mass[i] * wp.float64(step.instances.tolerance[i]) / (dt * dt)
             if not (wp.sqrt(residual) <= step.options.force_tolerance * scale + floor):
                 done = 0

@@ -24,7 +24,7 @@ Sums over the mass are sums over coordinates, since functions are orthonormal in
 import warp as wp
 
 from softmode.deformables.model.declare import struct
-from softmode.deformables.model.lane_kernels import LANES, team_sum, vec8d
+from softmode.deformables.model.lane_kernels import LANES, team_sum, team_sum3, team_sum33, vec8d
 from softmode.deformables.model.struct_kernels import Basis, Motion, blocks_of
 from softmode.deformables.solver.iteration_kernels import NewtonStep, mat38d
 
@@ -164,23 +164,6 @@ def unknown_block(values: wp.array2d[vec8d], i: int, b: int):
     for axis in range(3):
         block[axis] = values[i, axis * stride + b]
     return block
-
-
-@wp.func
-def team_sum3(value: wp.vec3d):
-    """Return the sum of the threads' vectors."""
-    return wp.vec3d(team_sum(value[0]), team_sum(value[1]), team_sum(value[2]))
-
-
-@wp.func
-def team_sum33(value: wp.mat33d):
-    """Return the sum of the threads' matrices."""
-    total = wp.mat33d()
-    for a in range(3):
-        for b in range(3):
-            part = team_sum(value[a, b])
-            total[a, b] = part
-    return total
 
 
 @wp.func

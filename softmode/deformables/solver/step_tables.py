@@ -215,7 +215,7 @@ def allocate_tables(
     one_launch = device.is_cpu or (not joined and blocks <= ONE_LAUNCH_BLOCKS)
     one_each = count == layout.world_count and layout.pin_max == 0
     driven = any(body.driven_count for body in layout.bodies)
-    size = (3 * layout.stride, system.scalars.shape[2])
+    size = (3 * layout.stride, 3 * layout.stride + 4 * -(-(rigid.count_max + 1) // 4))
     shared = device.is_cuda and one_launch and one_each and not driven
     shared = shared and fits_in_shared_memory(device.max_shared_memory_per_block, *size)
 
