@@ -46,27 +46,41 @@ from softmode.deformables.solver.step_kernels import (
 
 wp.set_module_options({"enable_backward": False})
 
-import os
-TEAM = int(os.environ.get("SM_TEAM", "128"))
-"""Threads that share a world on CUDA."""
-BLOCKS = int(os.environ.get("SM_BLOCKS", "3"))
-"""Worlds that a multiprocessor takes at a time: what registers are given out for."""
+SMALL_TEAM = 96
+"""Threads that share a world on CUDA where the points are few and the worlds many,"""
+LARGE_TEAM = 128
+"""elsewhere. Both are measured, see ``docs/performance.md``."""
+FEW_POINTS = 128
+"""Most points that count as few."""
+THREADS = 384
+"""Threads that a multiprocessor takes at a time: what registers are given out for."""
+
+
+def team_of(point_count: int, world_count: int, device: wp.Device) -> int:
+    """Return how many threads share a world on a device."""
+    if device.is_cpu:
+        return 1
+    at_a_time = THREADS // LARGE_TEAM * device.sm_count
+    return SMALL_TEAM if point_count <= FEW_POINTS and world_count > at_a_time else LARGE_TEAM
 
 
 @cache
-def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool = False) -> Kernel:
+def newton_kernel(
+    unit_type: Any, size: int = 0, width: int = 0, *, team: int = LARGE_TEAM, joined: bool = False
+) -> Kernel:
     """Return the kernel that minimises the incremental potential of every world by Newton with a line search.
 
     Args:
         unit_type: What the factorisation takes at a time, ``float`` or ``vec8``.
         size: Unknowns of the systems that are solved in shared memory, one per world; 0 for any in global memory.
         width: Columns of those systems.
+        team: Threads that share a world.
         joined: Whether the bodies of a world, which may touch each other, share a system.
     """
     shared, dynamic = size > 0, dynamic_floats(size, width)
     shared_direction = shared_direction_of(size or 24, width or 32)  # called where ``shared`` says so
 
-    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(TEAM, BLOCKS))
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(team, THREADS // team))
     def minimise_worlds(
         step: NewtonStep,
         unit: wp.array3d[unit_type],  # the systems in units of ``factor_width`` columns

@@ -430,7 +430,7 @@ _SYSTEM = """
                 if (member == 0) S[a * R + a] = inverse;
                 for (int b = a + 1 + member; b < tail; b += lanes) S[b * R + a] *= inverse;
                 SOFTMODE_WARP;
-        }
+            }
         }
         if (member == 0) {
             #pragma unroll 1

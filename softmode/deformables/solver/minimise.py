@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from softmode.deformables.solver import fused_newton_kernels as fused
 from softmode.deformables.solver import rigid_start_kernels
 from softmode.deformables.solver import search_kernels as search
 from softmode.deformables.solver import step_kernels as kernels
@@ -20,7 +19,7 @@ def minimise(tables: StepTables, dt: float) -> None:
     if t.options.carry_stiffness:
         t.launch_teams(search.reuse_hessians, worlds, step, t.team)
     if t.one_launch:
-        team = fused.TEAM if t.model.device.is_cuda else 1
+        team = t.world_team
         t.launch(t.fused_kernel, (worlds, team), step, t.system.unit, team, t.system.relation, block_dim=team)
     else:
         wp.capture_while(t.newton.any_active, _iterate, tables=t, dt=dt)

@@ -29,8 +29,6 @@ from softmode.deformables.solver.spin_kernels import (
     centre_of_mass,
     rest_block,
     rotation_of,
-    team_sum3,
-    team_sum33,
     unknown_block,
 )
 

@@ -24,7 +24,7 @@ Sums over the mass are sums over coordinates, since functions are orthonormal in
 import warp as wp
 
 from softmode.deformables.model.declare import struct
-from softmode.deformables.model.lane_kernels import LANES, team_sum, team_sum3, team_sum33, vec8d
+from softmode.deformables.model.lane_kernels import LANES, team_sum3, team_sum33, vec8d
 from softmode.deformables.model.struct_kernels import Basis, Motion, blocks_of
 from softmode.deformables.solver.iteration_kernels import NewtonStep, mat38d
 

@@ -16,7 +16,7 @@ from softmode.deformables.contact.detection_kernels import Shapes
 from softmode.deformables.contact.pairs import SoftPairs
 from softmode.deformables.contact.shape_tables import candidate_shapes, shape_table
 from softmode.deformables.model.declare import WRENCH, Kernel, launch, launch_teams
-from softmode.deformables.model.lane_kernels import LANES, team_size
+from softmode.deformables.model.lane_kernels import LANES, WARP, team_size
 from softmode.deformables.model.layout import Layout, lay_out, lay_out_bases, lay_out_instances, surface_stiffness
 from softmode.deformables.model.namespaces import SoftModel, soft
 from softmode.deformables.model.rigid_dofs import RigidDofs
@@ -135,6 +135,8 @@ class StepTables:
     """Whether a team of threads, on CPU one, takes a world through all of its Newton iterations in one launch."""
     fused_kernel: Kernel
     """The kernel of that launch."""
+    world_team: int
+    """Threads of that team."""
     shared: bool
     """Whether the systems of that launch are assembled and solved in shared memory."""
 
@@ -215,6 +217,7 @@ def allocate_tables(
     one_launch = device.is_cpu or (not joined and blocks <= ONE_LAUNCH_BLOCKS)
     one_each = count == layout.world_count and layout.pin_max == 0
     driven = any(body.driven_count for body in layout.bodies)
+    world_team = fused.team_of(layout.point_max, layout.world_count, device)
     size = (3 * layout.stride, 3 * layout.stride + 4 * -(-(rigid.count_max + 1) // 4))
     shared = device.is_cuda and one_launch and one_each and not driven
     shared = shared and fits_in_shared_memory(device.max_shared_memory_per_block, *size)
@@ -223,7 +226,7 @@ def allocate_tables(
         """Return into how many parts sums over points are split where a kernel has so many threads, a body tasks."""
         if not device.is_cuda:
             return 1
-        return int(np.clip(fused.TEAM // tasks if one_launch else CUDA_THREADS // threads, 1, 16))
+        return int(np.clip(world_team // tasks if one_launch else CUDA_THREADS // threads, 1, 16))
 
     sizes = {
         "instance": count,
@@ -236,7 +239,7 @@ def allocate_tables(
         "team": team_size(device),
         "constraint": room + layout.pin_max,
         "rigid": rigid.count_max,
-        "gradient_chunk": fused.TEAM // 32 if shared and device.is_cuda else chunks(count * blocks, blocks),
+        "gradient_chunk": world_team // WARP if shared else chunks(count * blocks, blocks),
         "stiffness_chunk": chunks(count * square, square + (square + 3 * blocks) // 2),
         "pin_instance": count if layout.pin_max else 1,
         "pin_row": layout.stride if layout.pin_max else 1,
@@ -284,7 +287,10 @@ def allocate_tables(
         every_world=wp.full(layout.world_count + 1, True, dtype=bool, device=device),
         team=sizes["team"],
         one_launch=one_launch,
-        fused_kernel=fused.newton_kernel(system.unit.dtype, *(size if shared else ()), joined=joined and device.is_cpu),
+        fused_kernel=fused.newton_kernel(
+            system.unit.dtype, *(size if shared else ()), team=world_team, joined=joined and device.is_cpu
+        ),
+        world_team=world_team,
         shared=shared,
     )
 
