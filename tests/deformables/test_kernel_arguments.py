@@ -14,7 +14,8 @@ def handed_on(source: str) -> Iterator[str]:
             continue
         if not any(ast.unparse(decorator).startswith("wp.func") for decorator in function.decorator_list):
             continue
-        steps = {one.arg for one in function.args.args if one.annotation and ast.unparse(one.annotation) == "NewtonStep"}
+        named = [one for one in function.args.args if one.annotation]
+        steps = {one.arg for one in named if ast.unparse(one.annotation) == "NewtonStep"}
         for call in ast.walk(function):
             if isinstance(call, ast.Call) and any(isinstance(one, ast.Name) and one.id in steps for one in call.args):
                 yield f"{function.name}: {ast.unparse(call)}"
