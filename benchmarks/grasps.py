@@ -7,7 +7,8 @@ is compared, where the object is held at its goal: the opening of the gripper, a
 the mean of both. Printed are how many seeds succeed in each, and median and largest difference.
 
 A policy that feels forces may change its mind one control step later where they differ in the last digit. ``--replay``
-gives every variant the reference's actions instead, so that what differs is the solver's.
+gives every variant the reference's actions instead, so that what differs is the solver's. Then the last column compares
+all control steps: the largest difference of a force over the largest force of the episode, median and most.
 
 ``--reference`` names the variant to compare with, by default ``tighter``, ten times tighter in both tolerances. Then
 ``default`` is the error of the default tolerances, and the variants that tighten one say which one makes it.
@@ -52,9 +53,9 @@ class Grasps:
     success: np.ndarray
     """Whether the object was held at the goal, shape (seeds,)."""
     width: np.ndarray
-    """Opening of the gripper in the last step [m], shape (seeds,)."""
+    """Opening of the gripper after each control step [m], shape (seeds, STEPS)."""
     force: np.ndarray
-    """Force on each finger in the last step [N], shape (seeds, 2)."""
+    """Force on each finger then [N], shape (seeds, STEPS, 2)."""
     iterations: np.ndarray
     """Mean Newton iterations of the last substep of each control step, shape (seeds,)."""
     actions: np.ndarray
@@ -95,15 +96,17 @@ def play(task: tuple[str, str, list[int], np.ndarray | None]) -> Grasps:
     for row, seed in enumerate(seeds):
         observation, info = env.reset(seed=seed)
         policy.reset()
-        iterations, done = [], []
+        iterations, done, width, force = [], [], [], []
         for step in range(STEPS):
             done.append(policy(observation) if actions is None else actions[row, step])
             observation, *_, info = env.step(done[-1])
             iterations.append(int(env.scene.solver.reduced.iteration.numpy()[0]))
+            width.append(float(env.scene.controller.opening.numpy()[0]))
+            force.append(np.linalg.norm(env.scene.finger_force.numpy()[0], axis=1))
         found["modulus"].append(float(env.scene.model.softmode.youngs_modulus.numpy()[0]))
         found["success"].append(bool(info["is_success"]))
-        found["width"].append(float(env.scene.controller.opening.numpy()[0]))
-        found["force"].append(np.linalg.norm(env.scene.finger_force.numpy()[0], axis=1))
+        found["width"].append(width)
+        found["force"].append(force)
         found["iterations"].append(float(np.mean(iterations)))
         found["actions"].append(done)
     env.close()
@@ -136,15 +139,17 @@ def play_in_tree(tree: Path, options: argparse.Namespace, actions: np.ndarray | 
 
 
 def report(name: str, found: Grasps, expected: Grasps) -> None:
-    """Print a row: successes, and differences where both hold the object."""
-    held = (found.force.min(axis=1) > 0.5) & (expected.force.min(axis=1) > 0.5)
-    width = 1e3 * np.abs(found.width - expected.width)[held]
-    force = 100 * (np.abs(found.force - expected.force) / expected.force.mean(axis=1, keepdims=True)).max(axis=1)[held]
+    """Print a row: successes, differences where both hold the object, and over the whole way."""
+    last, wanted = found.force[:, -1], expected.force[:, -1]
+    held = (last.min(axis=1) > 0.5) & (wanted.min(axis=1) > 0.5)
+    width = 1e3 * np.abs(found.width - expected.width)[held, -1]
+    force = 100 * (np.abs(last - wanted) / wanted.mean(axis=1, keepdims=True)).max(axis=1)[held]
+    way = 100 * np.abs(found.force - expected.force).max(axis=(1, 2)) / expected.force.max(axis=(1, 2))
     alike = int((found.success == expected.success).sum())
     print(
         f"| {name} | {found.success.sum()} of {len(found.success)} | {alike} | {held.sum()} | "
         f"{np.median(width):.4f} / {width.max():.4f} mm | {np.median(force):.3f} / {force.max():.3f} % | "
-        f"{(force > 0.5).sum()} | {found.iterations.mean():.2f} |",
+        f"{(force > 0.5).sum()} | {found.iterations.mean():.2f} | {np.median(way):.2f} / {way.max():.2f} % |",
         flush=True,
     )
 
@@ -171,7 +176,7 @@ def main() -> None:
     print(f"{options.seeds} grasps of {options.preset}, {'same actions' if options.replay else 'policy'}, E from")
     print(f"{expected.modulus.min():.1e} to {expected.modulus.max():.1e} Pa, against {options.reference}\n")
     titles = ("succeed", "as the reference", "held in both", "widths: median / most", "forces: median / most")
-    print(f"| | {' | '.join(titles)} | above 0.5 % | iterations |\n|{'---|' * 8}")
+    print(f"| | {' | '.join(titles)} | above 0.5 % | iterations | forces on the way |\n|{'---|' * 9}")
     report(options.reference, expected, expected)
     for variant in options.variants:
         report(variant, play_all(variant, options, actions), expected)
