@@ -524,9 +524,9 @@ def _check_build(body: ReducedBody, notes: _Notes) -> None:
         notes.find(
             "note",
             "many functions",
-            f"with {body.function_count} functions a GPU takes a launch for each phase of a Newton iteration; one launch"
-            f" for all of them takes bodies of at most {FAST_FUNCTIONS}",
-            f"where many worlds are to be fast, take fewer (--functions {FAST_FUNCTIONS}); results are the same",
+            f"with {body.function_count} functions a GPU takes a launch for each phase of a Newton iteration;"
+            f" one launch for all of them takes bodies of at most {FAST_FUNCTIONS}",
+            f"where many worlds are to be fast, take fewer (--functions {FAST_FUNCTIONS})",
         )
 
 
