@@ -36,7 +36,7 @@ from softmode.envs.throughput import Actions, _Source
 ENVIRONMENT = "softmode/LiftSoft-v0"
 AXES = {
     "worlds": ([1, 4, 16], [1, 64, 1024, 4096, 16384]),
-    "functions": ([12, 24, 48, 96, 160], [24, 48, 96, 160]),
+    "functions": ([10, 24, 48, 96, 160], [10, 24, 48, 96, 160]),
     "points": ([48, 96, 192, 384], [48, 96, 384]),
     "samples": ([100, 400, 1600], [100, 400, 1600]),
     "bodies": ([1, 2, 4, 8], [1, 2, 4, 8]),
