@@ -70,15 +70,13 @@ def report(worlds: int, device: wp.Device, options: argparse.Namespace) -> None:
 
     compile_launches(control_step, device)
     control_step()
-    graph: Any = None
-    if device.is_cuda:
-        with wp.ScopedCapture(device=device) as capture:
-            control_step()
-        graph = capture.graph
+    with wp.ScopedCapture(device=device) as capture:
+        control_step()
+    graph: Any = capture.graph
 
     def play(count: int) -> None:
         for _ in range(count):
-            wp.capture_launch(graph) if graph else control_step()
+            wp.capture_launch(graph)
         wp.synchronize_device(device)
 
     now = time.perf_counter if device.is_cuda else time.process_time
