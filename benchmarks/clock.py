@@ -1,7 +1,8 @@
-"""Medians of the time that something takes on a device."""
+"""Medians of the time that something takes on a device, and the memory that a process holds there."""
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable
 from typing import Any
@@ -40,3 +41,12 @@ class Clock:
             run()
         graph: Any = capture.graph
         return self.median(lambda: wp.capture_launch(graph))
+
+
+def held(device: wp.Device) -> float:
+    """Return the memory of the arrays that the process holds on a device [bytes]."""
+    if device.is_cuda:
+        return float(wp.get_mempool_used_mem_current(device))
+    gc.collect()
+    arrays = [found for found in gc.get_objects() if type(found) is wp.array and found.device == device]
+    return float(sum({array.ptr: array.capacity for array in arrays if array.ptr and array.deleter}.values()))

@@ -41,6 +41,7 @@ def main() -> None:
     parser.add_argument("--presets", nargs="+", default=["plush", "beam"], help="plush is the default object")
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--warmup", type=int, default=100)
+    parser.add_argument("--poissons-ratio", type=float, nargs=2, default=None, help="range drawn from per world")
     parser.add_argument("--kernels", type=int, default=12, help="kernels to print, the slowest first; 0 for none")
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
@@ -55,7 +56,9 @@ def report(preset: str, count: int, device: wp.Device, options: argparse.Namespa
     """Make an environment, hold the object, print what a step costs."""
     known = config_class(ENVIRONMENT)
     config = known() if preset == "plush" else known.preset(preset)
-    config = replace(config, scene=replace(config.scene, control_hz=30.0, substeps=SUBSTEPS))
+    ratios = None if options.poissons_ratio is None else tuple(options.poissons_ratio)
+    scene = replace(config.scene, control_hz=30.0, substeps=SUBSTEPS)
+    config = replace(config, scene=scene, poissons_ratio_range=ratios)
     given = {"config": config, "obs_type": "state", "output": "torch" if device.is_cuda else "numpy"}
     clock = time.perf_counter()
     env: Any = gym.make_vec(ENVIRONMENT, num_envs=count, device=options.device, **given)

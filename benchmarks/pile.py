@@ -1,6 +1,6 @@
 """Cost of contact between soft bodies: cubes stacked on the ground, resting, per step and world.
 
-Run: ``python benchmarks/pile.py [--bodies 3] [--worlds 1] [--device cpu] [--modes 8]``
+Run: ``python -m benchmarks.pile [--bodies 3] [--worlds 1] [--device cpu] [--modes 8] [--replays 50]``
 """
 
 import argparse
@@ -11,6 +11,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from benchmarks.clock import held
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box
@@ -22,8 +23,23 @@ DT = 0.004
 EDGE = 0.1
 
 
-def pile(body_count: int, world_count: int, mode_count: int, device: str) -> tuple[float, float]:
-    """Return the time of a step [ms] and its mean Newton iterations, after the stack has come to rest."""
+SETTLING = 100
+"""Replays of two steps before the clock starts."""
+
+
+def pile(
+    body_count: int, world_count: int, mode_count: int, device: str, replays: int = 50
+) -> tuple[float, float, float]:
+    """Return the time of a step [ms], its mean Newton iterations and the memory per world [bytes], of a stack at rest.
+
+    Args:
+        body_count: Bodies in a world.
+        world_count: Worlds.
+        mode_count: FreeForm's modes of each body.
+        device: Warp device.
+        replays: Measured replays of two steps, after twice as many in which the stack comes to rest, at most 100.
+    """
+    before = held(wp.get_device(device))
     quadrature = quadrature_from_box((EDGE,) * 3, point_count=2000, surface_count=300)
     body = build_body(quadrature, BuildOptions(mode_count=mode_count, kernel_count=300, cubature_count=256))
     world = newton.ModelBuilder()
@@ -48,16 +64,18 @@ def pile(body_count: int, world_count: int, mode_count: int, device: str) -> tup
     graph: Any = capture.graph
     clock = time.process_time if device == "cpu" else time.perf_counter
     times, iterations = [], []
-    for k in range(150):
+    settling = min(SETTLING, 2 * replays)
+    for k in range(settling + replays):
         wp.synchronize_device(device)
         start = clock()
         wp.capture_launch(graph)
         wp.synchronize_device(device)
-        if k >= 100:
+        if k >= settling:
             times.append(0.5e3 * (clock() - start))
             iterations.append(solver.iteration.numpy().mean())
     assert not solver.status.numpy().any()
-    return float(np.median(times)), float(np.mean(iterations))
+    memory = (held(wp.get_device(device)) - before) / world_count
+    return float(np.median(times)), float(np.mean(iterations)), memory
 
 
 def main() -> None:
@@ -67,12 +85,16 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, nargs="+", default=[1])
     parser.add_argument("--modes", type=int, default=8)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--replays", type=int, default=50, help="measured replays of two steps")
     args = parser.parse_args()
-    print("| bodies | worlds | ms per step | Newton iterations |\n|---|---|---|---|")
+    print("| bodies | worlds | ms per step | Newton iterations | memory per world |\n|---|---|---|---|---|")
     for world_count in args.worlds:
         for body_count in args.bodies:
-            milliseconds, iterations = pile(body_count, world_count, args.modes, args.device)
-            print(f"| {body_count} | {world_count} | {milliseconds:.2f} | {iterations:.1f} |", flush=True)
+            milliseconds, iterations, memory = pile(body_count, world_count, args.modes, args.device, args.replays)
+            print(
+                f"| {body_count} | {world_count} | {milliseconds:.2f} | {iterations:.1f} | {memory / 1e3:,.0f} kB |",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

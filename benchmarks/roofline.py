@@ -20,9 +20,9 @@ import warp as wp
 
 from benchmarks.camera import copy_rate
 from benchmarks.clock import Clock
-from benchmarks.grasp_phases import ENVIRONMENT, SUBSTEPS, time_kernels
+from benchmarks.envs import add_object_options, configuration
+from benchmarks.grasp_phases import ENVIRONMENT, time_kernels
 from benchmarks.step import product_rate
-from softmode.envs.catalogue import config_class
 from softmode.envs.throughput import _Source
 
 
@@ -49,15 +49,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--worlds", type=int, default=1)
-    parser.add_argument("--preset", default="plush")
+    add_object_options(parser)
     parser.add_argument("--warmup", type=int, default=70, help="control steps before the fingers hold the object")
     parser.add_argument("--repeats", type=int, default=5, help="control steps that are timed")
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
     device = wp.get_device(options.device)
-    known = config_class(ENVIRONMENT)
-    config = known() if options.preset == "plush" else known.preset(options.preset)
-    config = replace(config, scene=replace(config.scene, control_hz=30.0, substeps=SUBSTEPS))
+    config = configuration(ENVIRONMENT, options)
     output = "torch" if device.is_cuda else "numpy"
     env: Any = gym.make_vec(
         ENVIRONMENT, num_envs=options.worlds, device=options.device, config=config, obs_type="state", output=output
@@ -73,8 +71,8 @@ def main() -> None:
     flag = wp.zeros(1, dtype=int, device=device)
     least = Clock(device, 20).replay(lambda: [wp.launch(nothing, 1, [flag], device=device) for _ in range(100)]) / 100
     print(
-        f"{device.name or device}, {options.worlds} worlds of {options.preset}: product {product / 1e9:,.0f} Gflop/s, "
-        f"copy {copy / 1e9:,.0f} GB/s, a launch in a graph {1e3 * least:.2f} us\n"
+        f"{device.name or device}, {options.worlds} worlds of {options.preset or 'plush'}: "
+        f"product {product / 1e9:,.0f} Gflop/s, copy {copy / 1e9:,.0f} GB/s, a launch in a graph {1e3 * least:.2f} us\n"
     )
     whole = mean_times(scene, device, options.repeats)
     reduced.tables = replace(tables, one_launch=False, shared=False)
@@ -85,6 +83,7 @@ def main() -> None:
     for name, todo in work(tables).items():
         spent, launches = apart.get(name, (0.0, 0.0))
         if not launches:
+            print(f"| {name} | 0 | | | | | not launched here | |")
             continue
         rate = product / (2.0 if todo.double else 1.0)
         flops, traffic = (1e6 * options.worlds * x for x in (todo.flops / rate, todo.read_written / copy))

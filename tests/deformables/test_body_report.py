@@ -17,7 +17,9 @@ from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.build.quadrature_grid import Quadrature
 from softmode.deformables.build.quadrature_mesh import quadrature_from_mesh
-from softmode.deformables.build.report import BodyReport, object_findings, report_body
+from softmode.deformables.build.report import FAST_FUNCTIONS, BodyReport, object_findings, report_body
+from softmode.deformables.model.lane_kernels import LANES
+from softmode.deformables.solver.step_tables import ONE_LAUNCH_BLOCKS
 from softmode.envs.tasks.place_in_bin import task as place_in_bin
 from softmode.envs.tasks.push_soft import task as push_soft
 from softmode.envs.tasks.shape_soft import config as shape_soft
@@ -55,6 +57,18 @@ def quadrature() -> Quadrature:
 def body(quadrature: Quadrature) -> ReducedBody:
     """Return a good body."""
     return build_body(quadrature, SMALL)
+
+
+def test_many_functions_are_noted(quadrature: Quadrature, body: ReducedBody) -> None:
+    """A body too large for one launch on a GPU is as good as others, with a note; the limit is the solver's own."""
+    assert FAST_FUNCTIONS == LANES * ONE_LAUNCH_BLOCKS
+    large = build_body(quadrature, BuildOptions(mode_count=16, kernel_count=200, cubature_count=384))
+    assert large.function_count > FAST_FUNCTIONS >= body.function_count
+    report = report_body(large, quadrature=quadrature)
+    assert report.severity == 0 and "many functions" in names(report, "note")
+    (finding,) = (finding for finding in report.findings if finding.name == "many functions")
+    assert f"with {large.function_count} functions" in finding.what
+    assert "many functions" not in names(report_body(body, quadrature=quadrature))
 
 
 @pytest.mark.parametrize("name", GOOD)

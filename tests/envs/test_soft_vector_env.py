@@ -13,7 +13,8 @@ from gymnasium.vector import AutoresetMode
 from softmode.deformables.model import status as bits
 from softmode.envs.end_reason import EndReason
 from softmode.envs.soft_vector_env import SoftVectorEnv
-from softmode.envs.tasks.lift_soft.task import LiftSoftConfig
+from softmode.envs.tasks.lift_soft.scripted import ScriptedLift
+from softmode.envs.tasks.lift_soft.task import LiftSoftConfig, LiftSoftEnv
 from softmode.errors import ConfigError
 
 ENV_ID = "softmode/LiftSoft-v0"
@@ -39,6 +40,32 @@ def poison(env: SoftVectorEnv, world: int, part: str) -> None:
     count = len(values) // env.num_envs
     values[world * count : (world + 1) * count] = np.nan
     array.assign(values)
+
+
+def test_each_world_in_a_grasp_has_the_bits_of_the_single_environment() -> None:
+    """Three worlds of other stiffness and Poisson's ratio lift; each equals the environment of its seed alone."""
+    config = LiftSoftConfig(poissons_ratio_range=(0.2, 0.49))
+    env = make(3, config=config)
+    policies = [ScriptedLift(env, world=i) for i in range(3)]
+    observation, _ = env.reset(seed=0)
+    observations, done = [observation], []
+    for _ in range(75):
+        done.append(np.stack([policy() for policy in policies]))
+        observation, *_ = env.step(done[-1])
+        observations.append(observation)
+    forces = np.linalg.norm(env.task.scene.finger_force.numpy(), axis=2)
+    ratios = env.task.scene.model.softmode.poissons_ratio.numpy()
+    env.close()
+    assert (forces > 1.0).all() and len(set(ratios)) == 3
+    single = LiftSoftEnv(config=config)
+    for i in range(3):
+        observation, _ = single.reset(seed=i)
+        for step, action in enumerate(done):
+            np.testing.assert_array_equal(observations[step][i], observation, err_msg=f"world {i}, step {step}")
+            observation, *_ = single.step(action[i])
+        np.testing.assert_array_equal(observations[-1][i], observation)
+        np.testing.assert_array_equal(forces[i], np.linalg.norm(single.scene.finger_force.numpy()[0], axis=1))
+    single.close()
 
 
 @pytest.mark.parametrize("part", ["object", "arm"])

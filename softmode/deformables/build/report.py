@@ -53,6 +53,8 @@ BURIED_SHARE = 0.005
 captures of 20,000 splats have at most 0.0008, a cup that is filled in a few places 0.0085, a filled one 0.09."""
 SIZE_ERROR = 0.05
 """Longest edge that may differ so much from the size that was asked for."""
+FAST_FUNCTIONS = 56
+"""Functions up to which a GPU takes all Newton iterations of a step in one launch, see ``solver.step_tables``."""
 FULL_FUNCTIONS = 100
 """From so many functions on a body wants six cubature points for each."""
 
@@ -517,6 +519,14 @@ def _check_build(body: ReducedBody, notes: _Notes) -> None:
             "cubature",
             f"{body.point_count} cubature points for {body.function_count} functions",
             f"take six for each, --points {6 * body.function_count}",
+        )
+    if body.function_count > FAST_FUNCTIONS:
+        notes.find(
+            "note",
+            "many functions",
+            f"with {body.function_count} functions a GPU takes a launch for each phase of a Newton iteration;"
+            f" one launch for all of them takes bodies of at most {FAST_FUNCTIONS}",
+            f"where many worlds are to be fast, take fewer (--functions {FAST_FUNCTIONS})",
         )
 
 
