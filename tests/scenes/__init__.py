@@ -56,6 +56,7 @@ class Scene:
         dt: Step [s].
         finish: Called with the model before the solver is built, to change what the builder cannot.
         mujoco: Arguments of SolverMuJoCo besides the model, or in place of these defaults.
+        device: Where it lies.
     """
 
     def __init__(
@@ -71,6 +72,7 @@ class Scene:
         dt: float = 0.004,
         finish: Callable[[newton.Model], Any] | None = None,
         mujoco: dict[str, Any] | None = None,
+        device: str = "cpu",
     ) -> None:
         """Build model, solver and states."""
         world = newton.ModelBuilder()
@@ -85,7 +87,7 @@ class Scene:
             builder.add_ground_plane(cfg=newton.ModelBuilder.ShapeConfig(mu=ground))
         self.bodies = list(bodies)
         self.dt = dt
-        self.model: Any = builder.finalize(device="cpu")
+        self.model: Any = builder.finalize(device=device)
         self.model.set_gravity(tuple(gravity))
         if finish is not None:
             finish(self.model)
@@ -116,7 +118,7 @@ class Scene:
 
     def capture(self) -> Callable[[], None]:
         """Record two steps, there and back between the two states, and return what replays them."""
-        with wp.ScopedCapture(device="cpu") as capture:
+        with wp.ScopedCapture(device=self.model.device) as capture:
             self.solver.step(self.state, self.next_state, self.control, None, self.dt)
             self.solver.step(self.next_state, self.state, self.control, None, self.dt)
         self.solver.reset(self.state)

@@ -39,6 +39,7 @@ from softmode.deformables.solver.iteration_kernels import NewtonArrays, NewtonOp
 from softmode.deformables.solver.options import SolverReducedOptions
 from softmode.deformables.solver.spin_kernels import Spin
 from softmode.deformables.solver.systems import join_systems
+from softmode.deformables.solver.tile_kernels import TILE, chunk_count
 
 CUDA_THREADS = 2**16
 """Threads that keep a GPU busy: sums over points are split until there are about so many."""
@@ -137,6 +138,8 @@ class StepTables:
     """The kernel of that launch."""
     shared: bool
     """Whether the systems of that launch are assembled and solved in shared memory."""
+    tiled: bool
+    """Whether elastic stiffness is assembled by tiles of functions, see ``tile_kernels``."""
 
     @property
     def parameters(self) -> SoftModel:
@@ -148,7 +151,9 @@ class StepTables:
         """What keeps Newton's iteration from its fast path on a GPU, a sentence each; none on a CPU."""
         if not self.model.device.is_cuda:
             return ()
-        return newton_notes(self.system.size, one_launch=self.one_launch, shared=self.shared)
+        return newton_notes(
+            self.system.size, one_launch=self.one_launch, shared=self.shared, by_panels=self.system.by_panels
+        )
 
     @property
     def unknowns(self) -> tuple[int, int]:
@@ -218,6 +223,7 @@ def allocate_tables(
     size = (3 * layout.stride, system.scalars.shape[2])
     shared = device.is_cuda and one_launch and one_each and not driven
     shared = shared and fits_in_shared_memory(device.max_shared_memory_per_block, *size)
+    tiled = device.is_cuda and not one_launch and layout.stride >= TILE
 
     def chunks(threads: int, tasks: int) -> int:
         """Return into how many parts sums over points are split where a kernel has so many threads, a body tasks."""
@@ -237,7 +243,9 @@ def allocate_tables(
         "constraint": room + layout.pin_max,
         "rigid": rigid.count_max,
         "gradient_chunk": fused.TEAM // 32 if shared and device.is_cuda else chunks(count * blocks, blocks),
-        "stiffness_chunk": chunks(count * square, square + (square + 3 * blocks) // 2),
+        "stiffness_chunk": chunk_count(count, layout.stride)
+        if tiled
+        else chunks(count * square, square + (square + 3 * blocks) // 2),
         "pin_instance": count if layout.pin_max else 1,
         "pin_row": layout.stride if layout.pin_max else 1,
         "pin_block": blocks if layout.pin_max else 1,
@@ -286,17 +294,21 @@ def allocate_tables(
         one_launch=one_launch,
         fused_kernel=fused.newton_kernel(system.unit.dtype, *(size if shared else ()), joined=joined and device.is_cpu),
         shared=shared,
+        tiled=tiled,
     )
 
 
-def newton_notes(size: int, *, one_launch: bool, shared: bool) -> tuple[str, ...]:
+def newton_notes(size: int, *, one_launch: bool, shared: bool, by_panels: bool = False) -> tuple[str, ...]:
     """Return why systems of ``size`` unknowns are not solved in shared memory, all iterations in one launch."""
     if not one_launch:
         most = LANES * ONE_LAUNCH_BLOCKS
-        return (
+        note = (
             f"systems of {size} unknowns take a launch per phase of each Newton iteration: "
-            f"one launch takes worlds whose bodies do not touch each other and have at most {most} functions",
+            f"one launch takes worlds whose bodies do not touch each other and have at most {most} functions"
         )
+        if by_panels:
+            note += "; the whole device shares a system, panel by panel"
+        return (note,)
     if not shared:
         return (
             f"systems of {size} unknowns are solved in global memory: shared memory takes one body per world, "
