@@ -23,6 +23,7 @@ from tests.scenes import GRAVITY, Scene
 
 CUDA = pytest.param("cuda:0", marks=[pytest.mark.gpu, pytest.mark.skipif(not wp.is_cuda_available(), reason="no GPU")])
 DEVICES = ["cpu", CUDA]
+pytestmark = pytest.mark.filterwarnings("ignore:pins hold")
 SIZE = (0.3, 0.1, 0.1)
 
 
@@ -34,18 +35,17 @@ def block(function_count: int) -> ReducedBody:
     return build_body(quadrature, options, name=f"bar of {function_count}")
 
 
-def scene_of(*counts: int, device: str = "cpu", pinned: bool = True, worlds: int = 1) -> Scene:
-    """Return bars above each other, pinned at one end, that have bent under their weight for some steps."""
+def scene_of(*counts: int, device: str = "cpu", worlds: int = 1) -> Scene:
+    """Return bars above each other, pinned at one end, that bend under their weight."""
     bodies = [block(count) for count in counts]
 
     def populate(world: newton.ModelBuilder) -> None:
         for level, body in enumerate(bodies):
-            instance = add_reduced_body(world, body, position=(0.0, 0.0, 0.3 * level + 0.045))
+            instance = add_reduced_body(world, body, position=(0.0, 0.0, 0.3 * level + 0.051))
             held = body.points[:, 0] < body.bounds[0, 0] + 0.03
-            if pinned:
-                add_pins(world, instance, body.points[held], stiffness=1.0e9 * body.weights[held])
+            add_pins(world, instance, body.points[held], stiffness=1.0e9 * body.weights[held])
 
-    given = {"gravity": (0.0, 0.0, -GRAVITY), "ground": 0.5, "device": device, "world_count": worlds}
+    given = {"gravity": (0.0, 0.0, -GRAVITY), "device": device, "world_count": worlds}
     return Scene(populate, bodies, **given)
 
 
@@ -87,7 +87,8 @@ def test_points_in_chunks(device: str) -> None:
     whole = direction_of(scene, tiled=True, by_panels=False)[0]
     t = scene.reduced.tables
     shape = t.arrays.stiffness.shape
-    t.arrays.stiffness = t.step.arrays.stiffness = wp.zeros((shape[0], 5, *shape[2:]), dtype=t.arrays.stiffness.dtype, device=device)
+    more = wp.zeros((shape[0], 5, *shape[2:]), dtype=t.arrays.stiffness.dtype, device=device)
+    t.arrays.stiffness = t.step.arrays.stiffness = more
     parts = direction_of(scene, tiled=True, by_panels=False)[0]
     np.testing.assert_allclose(parts, whole, atol=2.0e-6 * np.abs(whole).max())
 
@@ -104,7 +105,7 @@ def test_no_capacity_cliff(count: int, device: str) -> None:
         scene.step(12)
         assert not scene.reduced.status.numpy().any()
         tips.append(scene.state.particle_q.numpy())
-    assert np.ptp(tips[0][:, 2]) > 1.01 * SIZE[2]
+    assert np.abs(tips[0] - scene.model.particle_q.numpy()).max() > 5.0e-4
     np.testing.assert_allclose(tips[1], tips[0], atol=1.0e-5 * SIZE[0])
 
 

@@ -64,11 +64,19 @@ class BlockCholesky:
         """All of it, for kernels."""
         self.indefinite = self.table.indefinite
         cuda = wp.get_device(device).is_cuda
-        self.by_panels = cuda and size >= PANEL_UNKNOWNS if by_panels is None else by_panels
-        """Whether the whole device shares the systems."""
-        room = self.system_count if self.by_panels else 1
-        self._corner = wp.zeros((room, PANEL, PANEL), dtype=float, device=device)
         self._panel_threads = (PANEL_TEAM, SOLVE_TEAM) if cuda else (1, 1)
+        self.by_panels = cuda and size >= PANEL_UNKNOWNS if by_panels is None else by_panels
+
+    @property
+    def by_panels(self) -> bool:
+        """Whether the whole device shares the systems; may be set, for comparisons."""
+        return self._by_panels
+
+    @by_panels.setter
+    def by_panels(self, value: bool) -> None:
+        self._by_panels = value
+        room = self.system_count if value else 1
+        self._corner = wp.zeros((room, PANEL, PANEL), dtype=float, device=self.device)
 
     def order_parts(self) -> None:
         """Choose ``place`` for the parts related by ``relation``; complete both that and ``pattern`` by the fill."""

@@ -45,6 +45,10 @@ CUDA_THREADS = 2**16
 """Threads that keep a GPU busy: sums over points are split until there are about so many."""
 ONE_LAUNCH_BLOCKS = 7
 """Blocks of eight functions up to which a body is small enough for a team of threads on CUDA; on CPU any is."""
+FEW_WORLDS = 64
+"""Bodies up to which those of many functions get larger teams, and more and smaller blocks of threads, on CUDA."""
+LARGE_TEAM = 128
+"""Threads of these teams and blocks."""
 RESERVED_BYTES = 2048
 """Shared memory that the one launch needs besides its system, with what CUDA keeps for itself."""
 
@@ -132,6 +136,8 @@ class StepTables:
     """The mask that selects all worlds, bool (world_count + 1,)."""
     team: int
     """Threads that share one system."""
+    block: int
+    """Threads of a block on CUDA where a launch does not say."""
     one_launch: bool
     """Whether a team of threads, on CPU one, takes a world through all of its Newton iterations in one launch."""
     fused_kernel: Kernel
@@ -170,9 +176,9 @@ class StepTables:
         self.step.options.dt, self.step.options.stick_range = dt, self.options.stick_velocity * dt
         return self.step
 
-    def launch(self, kernel: Kernel, dim: int | Sequence[int], *arguments: object, block_dim: int = 256) -> None:
+    def launch(self, kernel: Kernel, dim: int | Sequence[int], *arguments: object, block_dim: int | None = None) -> None:
         """Launch a kernel on the model's device; see :func:`softmode.deformables.model.declare.launch`."""
-        launch(self.model.device, kernel, dim, *arguments, block_dim=block_dim)
+        launch(self.model.device, kernel, dim, *arguments, block_dim=block_dim or self.block)
 
     def launch_teams(self, kernel: Kernel, count: int, *arguments: object) -> None:
         """Launch one team of threads per world or instance, each in a block of its own."""
@@ -224,12 +230,13 @@ def allocate_tables(
     shared = device.is_cuda and one_launch and one_each and not driven
     shared = shared and fits_in_shared_memory(device.max_shared_memory_per_block, *size)
     tiled = device.is_cuda and not one_launch and layout.stride >= TILE
+    few = tiled and count <= FEW_WORLDS
 
     def chunks(threads: int, tasks: int) -> int:
         """Return into how many parts sums over points are split where a kernel has so many threads, a body tasks."""
         if not device.is_cuda:
             return 1
-        return int(np.clip(fused.TEAM // tasks if one_launch else CUDA_THREADS // threads, 1, 16))
+        return int(np.clip(fused.TEAM // tasks if one_launch else CUDA_THREADS // threads, 1, 64 if few else 16))
 
     sizes = {
         "instance": count,
@@ -239,7 +246,7 @@ def allocate_tables(
         "point": layout.point_max,
         "sample": layout.sample_max,
         "slot": SLOTS,
-        "team": team_size(device),
+        "team": LARGE_TEAM if few else team_size(device),
         "constraint": room + layout.pin_max,
         "rigid": rigid.count_max,
         "gradient_chunk": fused.TEAM // 32 if shared and device.is_cuda else chunks(count * blocks, blocks),
@@ -291,6 +298,7 @@ def allocate_tables(
         parameter_flags=wp.zeros(count, dtype=int, device=device),
         every_world=wp.full(layout.world_count + 1, True, dtype=bool, device=device),
         team=sizes["team"],
+        block=LARGE_TEAM if few else 256,
         one_launch=one_launch,
         fused_kernel=fused.newton_kernel(system.unit.dtype, *(size if shared else ()), joined=joined and device.is_cpu),
         shared=shared,
