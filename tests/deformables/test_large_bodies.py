@@ -16,6 +16,7 @@ from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.model.authoring import add_pins, add_reduced_body
+from softmode.deformables.model.compile_ahead import compile_launches
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient, solve
 from softmode.deformables.solver.step_tables import newton_notes
 from softmode.deformables.solver.tile_kernels import TILE, chunk_count, tile_count
@@ -46,7 +47,11 @@ def scene_of(*counts: int, device: str = "cpu", worlds: int = 1) -> Scene:
             add_pins(world, instance, body.points[held], stiffness=1.0e9 * body.weights[held])
 
     given = {"gravity": (0.0, 0.0, -GRAVITY), "device": device, "world_count": worlds}
-    return Scene(populate, bodies, **given)
+    scene = Scene(populate, bodies, **given)
+    if device != "cpu":
+        compile_launches(lambda: scene.step(1), device)
+        scene.restart()
+    return scene
 
 
 def direction_of(scene: Scene, *, tiled: bool, by_panels: bool) -> tuple[np.ndarray, np.ndarray]:
