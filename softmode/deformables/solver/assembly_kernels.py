@@ -59,22 +59,29 @@ def left_out(step: NewtonStep, i: int):
 
 
 @wp.func
-def stiffness_block(step: NewtonStep, i: int, chunk: int, task: int):
-    """Assemble 8x8 blocks of sum_p grad b^T C grad b over one chunk of the points."""
+def stiffness_block(step: NewtonStep, i: int, slab: int, task: int):
+    """Add to 8x8 blocks of sum_p grad b^T C grad b what one slab of the points has; the first of a chunk sets them."""
     if step.state.active[step.instances.world[i]] == 0 or step.state.refresh[step.instances.world[i]] == 0:
         return
     if not exists(step.instances, i):
         return
     block_count = step.basis.row.shape[1]
-    chunk_count = step.arrays.stiffness.shape[1]
+    slabs = step.options.stiffness_slabs
+    chunk = slab / slabs
+    slab_count = slabs * step.arrays.stiffness.shape[1]
     pair, rows, columns = block_task(task, block_count)
     c, d = block_pair(pair)
+    row = LANES * (c * block_count + rows)
+    column = d * block_count + columns
     block = mat88()
+    if slab % slabs != 0:
+        for a in range(LANES):
+            block[a] = step.arrays.stiffness[i, chunk, row + a, column]
     first = step.instances.point_start[i]
     count = step.instances.point_count[i]
     n = step.instances.function_count[i]
     if LANES * rows < n and LANES * columns < n:
-        for p in range(chunk * count / chunk_count, (chunk + 1) * count / chunk_count):
+        for p in range(slab * count / slab_count, (slab + 1) * count / slab_count):
             C = step.points.hessian[i, pair, p]
             gx = step.basis.gradient_across[columns, first + p, 0]
             gy = step.basis.gradient_across[columns, first + p, 1]
@@ -82,13 +89,11 @@ def stiffness_block(step: NewtonStep, i: int, chunk: int, task: int):
             for k in range(3):
                 u = C[k, 0] * gx + C[k, 1] * gy + C[k, 2] * gz
                 block = add_outer(block, step.basis.gradient_across[rows, first + p, k], u)
-    row = LANES * (c * block_count + rows)
-    column = d * block_count + columns
     for a in range(LANES):
         step.arrays.stiffness[i, chunk, row + a, column] = block[a]
 
 
-assemble_stiffness = kernel_over(stiffness_block, "assemble_stiffness", "i", "chunk", "task")
+assemble_stiffness = kernel_over(stiffness_block, "assemble_stiffness", "i", "slab", "task")
 
 
 @wp.kernel

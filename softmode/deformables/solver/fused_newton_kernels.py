@@ -83,7 +83,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool
         n = step.rigid.count[w]
         tasks = 3 * blocks * blocks + 3 * (blocks * blocks + blocks) / 2
         chunks = step.arrays.gradient_chunk.shape[1]
-        stiffness_chunks = step.arrays.stiffness.shape[1]
+        slabs = step.options.stiffness_slabs * step.arrays.stiffness.shape[1]
         rigid_max = step.options.rigid_max
         columns = rigid_max + 1
         q = step.arrays.q_trial
@@ -145,7 +145,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool
                 if step.state.active[w] != 0:
                     for i in range(begin, end):
                         if step.state.refresh[w] != 0:
-                            for t in range(member, stiffness_chunks * tasks, team):
+                            for t in range(member, slabs * tasks, team):
                                 stiffness_block(step, i, t / tasks, t % tasks)
                             barrier()
                         if wp.static(not shared):

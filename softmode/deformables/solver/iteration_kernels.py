@@ -42,6 +42,7 @@ class NewtonOptions:
     refresh_distance: float  # in sizes
     rigid_max: int  # joint dofs that there is room for
     factor_width: int  # columns that a thread of the factorisation takes at a time
+    stiffness_slabs: int  # parts of a chunk of points that stay in the cache (CPU); they follow each other
     dt: wp.float64
 
 

@@ -49,6 +49,8 @@ FEW_WORLDS = 64
 """Bodies up to which those of many functions get larger teams, and more and smaller blocks of threads, on CUDA."""
 LARGE_TEAM = 128
 """Threads of these teams and blocks."""
+CACHED_BYTES = 2**19
+"""Gradients of functions at points that a CPU keeps in its second cache while it assembles the stiffness."""
 RESERVED_BYTES = 2048
 """Shared memory that the one launch needs besides its system, with what CUDA keeps for itself."""
 
@@ -271,6 +273,8 @@ def allocate_tables(
     }
     state = allocate(NewtonState, _NEWTON, sizes, device, given=given)
     constant = _newton_options(options, rigid, system)
+    # on CUDA the threads share the points
+    constant.stiffness_slabs = 1 if device.is_cuda else -(-12 * layout.stride * layout.point_max // CACHED_BYTES)
     step = allocate(
         NewtonStep, "", {}, device, given={**structs, "rigid": rigid.table, "state": state, "options": constant}
     )
