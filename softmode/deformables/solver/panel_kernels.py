@@ -29,10 +29,12 @@ BEGIN = """
 #define SOFTMODE_SHARED __shared__ __align__(16)
 #define SOFTMODE_BARRIER __syncthreads()
 #define SOFTMODE_THREADS(count) 1
+#define SOFTMODE_RSQRT(value) rsqrtf(value)
 #else
 #define SOFTMODE_SHARED alignas(16) static
 #define SOFTMODE_BARRIER
 #define SOFTMODE_THREADS(count) count
+#define SOFTMODE_RSQRT(value) (1.0f / wp::sqrt(value))
 #endif
     struct alignas(16) Quad { float x, y, z, w; };
 """
@@ -40,6 +42,7 @@ END = """
 #undef SOFTMODE_SHARED
 #undef SOFTMODE_BARRIER
 #undef SOFTMODE_THREADS
+#undef SOFTMODE_RSQRT
 """
 _SYSTEM = """
     constexpr int K = 64;
@@ -69,14 +72,23 @@ _FACTOR = """
     constexpr int P = 128;
     const int start = first + rows + 64 * group;
     if (group > 0 && start >= W) return;
-    for (int t = member; t < rows * (P / 4); t += team) {
-        const int row = t / (P / 4);
-        const int at = 4 * (t % (P / 4));
-        const int column = at < K ? first + at : start + at - K;
-        const bool there = at < K ? at < rows && at >= (row & ~7) : column < W;
-        Quad value = {0.0f, 0.0f, 0.0f, 0.0f};
-        if (there && related(first + row, column)) value = *(const Quad*)&M[(size_t)(first + row) * W + column];
-        *(Quad*)&A[row * P + at] = value;
+    // all loads of a thread before its stores, so that they are under way together
+    for (int base = member; base < rows * (P / 4); base += 16 * team) {
+        Quad held[16];
+        #pragma unroll
+        for (int k = 0; k < 16; ++k) {
+            const int row = (base + k * team) / (P / 4);
+            const int at = 4 * ((base + k * team) % (P / 4));
+            const int column = at < K ? first + at : start + at - K;
+            const bool there = row < rows && (at < K ? at < rows && at >= (row & ~7) : column < W);
+            held[k] = Quad{0.0f, 0.0f, 0.0f, 0.0f};
+            if (there && related(first + row, column)) held[k] = *(const Quad*)&M[(size_t)(first + row) * W + column];
+        }
+        #pragma unroll
+        for (int k = 0; k < 16; ++k) {
+            const int t = base + k * team;
+            if (t < rows * (P / 4)) *(Quad*)&A[4 * t] = held[k];
+        }
     }
     SOFTMODE_BARRIER;
     int bad = 0;
@@ -117,7 +129,7 @@ _FACTOR = """
                 for (int b = a; b < 8; ++b) row[b] -= U[s][a] * U[s][b];
             }
             if (!(row[a] >= least)) bad = 1;
-            const float inverse = 1.0f / wp::sqrt(row[a] > floor ? row[a] : floor);
+            const float inverse = SOFTMODE_RSQRT(row[a] > floor ? row[a] : floor);
             #pragma unroll
             for (int b = a; b < 8; ++b) U[a][b] = inverse * row[b];
             U[a][a] = inverse;
@@ -208,17 +220,24 @@ _SUBTRACT = """
             }
         }
     }
-    #pragma unroll 4
-    for (int t = member; t < K * 16; t += team) {
-        const int row = t / 16;
-        const int at = 4 * (t % 16);
-        Quad u = {0.0f, 0.0f, 0.0f, 0.0f};
-        Quad v = {0.0f, 0.0f, 0.0f, 0.0f};
-        const float* given = &M[(size_t)(first + row) * W];
-        if (top + at < used && related(first + row, top + at)) u = *(const Quad*)&given[top + at];
-        if (start + at < W && related(first + row, start + at)) v = *(const Quad*)&given[start + at];
-        *(Quad*)&left[row * 64 + at] = u;
-        *(Quad*)&right[row * 64 + at] = v;
+    for (int base = member; base < K * 16; base += 4 * team) {
+        Quad u[4];
+        Quad v[4];
+        #pragma unroll
+        for (int k = 0; k < 4; ++k) {
+            const int row = first + (base + k * team) / 16;
+            const int at = 4 * ((base + k * team) % 16);
+            const float* given = &M[(size_t)row * W];
+            u[k] = Quad{0.0f, 0.0f, 0.0f, 0.0f};
+            v[k] = Quad{0.0f, 0.0f, 0.0f, 0.0f};
+            if (top + at < used && related(row, top + at)) u[k] = *(const Quad*)&given[top + at];
+            if (start + at < W && related(row, start + at)) v[k] = *(const Quad*)&given[start + at];
+        }
+        #pragma unroll
+        for (int k = 0; k < 4; ++k) {
+            *(Quad*)&left[4 * (base + k * team)] = u[k];
+            *(Quad*)&right[4 * (base + k * team)] = v[k];
+        }
     }
     SOFTMODE_BARRIER;
     #pragma unroll
@@ -250,18 +269,29 @@ _SUBSTITUTE = """
     SOFTMODE_SHARED float A[64 * 65];
     SOFTMODE_SHARED float x[64];
     float* right = (float*)systems.right.data + (size_t)i * N;
-    for (int t = member; t < rows * 16; t += team) {
-        const int row = t / 16;
-        const int at = 4 * (t % 16);
-        const int block = row & ~7;
-        Quad value = {0.0f, 0.0f, 0.0f, 0.0f};
-        if (at >= block && at < block + 8) {
-            value = *(const Quad*)((const float*)systems.diagonal.data + 8 * ((size_t)i * N + first + row) + at - block);
-        } else if (at >= block && at < rows && related(first + row, first + at)) {
-            value = *(const Quad*)&M[(size_t)(first + row) * W + first + at];
+    const float* diagonal = (const float*)systems.diagonal.data + 8 * ((size_t)i * N + first);
+    for (int base = member; base < rows * 16; base += 16 * team) {
+        Quad held[16];
+        #pragma unroll
+        for (int k = 0; k < 16; ++k) {
+            const int row = (base + k * team) / 16;
+            const int at = 4 * ((base + k * team) % 16);
+            const int block = row & ~7;
+            held[k] = Quad{0.0f, 0.0f, 0.0f, 0.0f};
+            if (row >= rows || at < block || at >= rows) continue;
+            if (at < block + 8) {
+                held[k] = *(const Quad*)&diagonal[8 * row + at - block];
+            } else if (related(first + row, first + at)) {
+                held[k] = *(const Quad*)&M[(size_t)(first + row) * W + first + at];
+            }
         }
-        float* out = &A[row * 65 + at];
-        out[0] = value.x; out[1] = value.y; out[2] = value.z; out[3] = value.w;
+        #pragma unroll
+        for (int k = 0; k < 16; ++k) {
+            const int row = (base + k * team) / 16;
+            if (row >= rows) continue;
+            float* out = &A[row * 65 + 4 * ((base + k * team) % 16)];
+            out[0] = held[k].x; out[1] = held[k].y; out[2] = held[k].z; out[3] = held[k].w;
+        }
     }
     for (int t = member; t < rows; t += team) x[t] = right[first + t];
     SOFTMODE_BARRIER;
