@@ -54,9 +54,7 @@ def main() -> None:
         return
     build = BUILD
     if given.all:
-        build = BuildOptions(
-            handles="local", local_count=78, cubature_count=4800, rank_tolerance=given.rank_tolerance
-        )
+        build = BuildOptions(handles="local", local_count=78, cubature_count=4800, rank_tolerance=given.rank_tolerance)
     start = time.process_time()
     plant, places = make_plant(build, given.splats)
     built = time.process_time() - start

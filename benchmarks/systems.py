@@ -32,7 +32,8 @@ def main() -> None:
     wp.config.log_level = wp.LOG_WARNING
     rate = product_rate(given.device)
     print(f"{given.device}: float32 matrix product {rate / 1e12:.3f} Tflop/s in this run")
-    print("unknowns systems | floor ms | panels: factor, solve ms, error | team: factor, solve ms, error | torch ms, error")
+    ways = " | ".join(f"{way}: factor, solve ms, error" for way in ("panels", "team"))
+    print(f"unknowns systems | floor ms | {ways} | torch: factor ms, error")
     for size in given.sizes:
         for count in given.counts:
             if count * size * size <= 2**30:
@@ -53,7 +54,8 @@ def report(size: int, count: int, rate: float, clock: Clock) -> None:
     host[:, :size], host[:, size] = A, b
     full = wp.array(np.tile(host.reshape(1, size, -1, LANES), (count, 1, 1, 1)), dtype=system.matrix.dtype)
     full = full.to(clock.device)
-    on, known = wp.full(count, 1, dtype=int, device=clock.device), wp.zeros((count, 1), dtype=wp.float64, device=clock.device)
+    on = wp.full(count, 1, dtype=int, device=clock.device)
+    known = wp.zeros((count, 1), dtype=wp.float64, device=clock.device)
 
     def restored(run: Callable[[], object]) -> Callable[[], None]:
         def both() -> None:
@@ -67,12 +69,19 @@ def report(size: int, count: int, rate: float, clock: Clock) -> None:
         system.by_panels = by_panels
         factor = clock.replay(restored(lambda: system.factor(on))) - copying
         solve = clock.replay(lambda: system.solve(on, 0, known, 0))
-        row += f" {factor:8.3f} {solve:7.3f} {error_of(system.table.solution.numpy().reshape(count, -1), expected):.1e} |"
+        error = error_of(system.table.solution.numpy().reshape(count, -1), expected)
+        row += f" {factor:8.3f} {solve:7.3f} {error:.1e} |"
     device = torch.device(str(clock.device))
     matrix = torch.tensor(A, dtype=torch.float32, device=device).repeat(count, 1, 1)
     right = torch.tensor(b, dtype=torch.float32, device=device).repeat(count, 1)[:, :, None]
     lower = torch.linalg.cholesky(matrix)
-    spent = clock.median(lambda: (torch.linalg.cholesky(matrix), torch.cuda.synchronize() if device.type == "cuda" else 0))
+
+    def factored() -> None:
+        torch.linalg.cholesky(matrix)
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+
+    spent = clock.median(factored)
     found = torch.cholesky_solve(right, lower)[:, :, 0].cpu().numpy()
     print(row + f" {spent:8.3f} {error_of(found, expected):.1e}", flush=True)
 

@@ -178,7 +178,7 @@ class StepTables:
         self.step.options.dt, self.step.options.stick_range = dt, self.options.stick_velocity * dt
         return self.step
 
-    def launch(self, kernel: Kernel, dim: int | Sequence[int], *arguments: object, block_dim: int | None = None) -> None:
+    def launch(self, kernel: Kernel, dim: int | Sequence[int], *arguments: object, block_dim: int = 0) -> None:
         """Launch a kernel on the model's device; see :func:`softmode.deformables.model.declare.launch`."""
         launch(self.model.device, kernel, dim, *arguments, block_dim=block_dim or self.block)
 
