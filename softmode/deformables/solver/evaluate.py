@@ -63,9 +63,11 @@ def assemble(tables: StepTables, dt: float) -> None:
     if t.tiled:
         team = TILE_TEAM if t.model.device.is_cuda else 1
         t.launch(assemble_tiles, (count, chunks, tile_count(t.layout.stride), team), step, team, block_dim=team)
+    elif t.model.device.is_cuda:
+        t.launch(assembly.assemble_stiffness, (count, chunks, tasks), step, block_dim=128)
     else:
-        slabs = step.options.stiffness_slabs * chunks
-        t.launch(assembly.assemble_stiffness, (count, slabs, tasks), step, block_dim=128)
+        tiles = -(-blocks // assembly.SLAB_BLOCKS)
+        t.launch(assembly.assemble_slabs, (count, step.options.stiffness_slabs * tiles), step)
     t.launch(assembly.assemble_matrix, (count, t.arrays.stiffness.shape[2], columns), step, columns)
     t.launch(assembly.add_contacts, (count, tasks), step, block_dim=128)
     t.launch(assembly.assemble_columns, (count, 3 * blocks, rigid_max + 1), step)

@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from softmode.deformables.model.declare import Kernel
-from softmode.deformables.model.lane_kernels import LANES, barrier, rolled, team_sum
+from softmode.deformables.model.lane_kernels import LANES, barrier, rolled, team_sum, vec8
 from softmode.deformables.model.struct_kernels import instance_end
 from softmode.deformables.solver.assembly_kernels import (
     column_block,
@@ -21,8 +21,10 @@ from softmode.deformables.solver.assembly_kernels import (
     matrix_row,
     pair_block,
     rigid_entry,
+    slab_tiles,
     solve_rigid_team,
     stiffness_block,
+    stiffness_slab,
 )
 from softmode.deformables.solver.factor_kernels import factor_system, solve_system
 from softmode.deformables.solver.fused_system_kernels import dynamic_floats, shared_direction_of, sum_forces_of
@@ -63,6 +65,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool
         joined: Whether the bodies of a world, which may touch each other, share a system.
     """
     shared, dynamic = size > 0, dynamic_floats(size, width)
+    one_thread = unit_type is vec8
     shared_direction = shared_direction_of(size or 24, width or 32)  # called where ``shared`` says so
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=(TEAM, BLOCKS))
@@ -83,7 +86,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool
         n = step.rigid.count[w]
         tasks = 3 * blocks * blocks + 3 * (blocks * blocks + blocks) / 2
         chunks = step.arrays.gradient_chunk.shape[1]
-        slabs = step.options.stiffness_slabs * step.arrays.stiffness.shape[1]
+        stiffness_chunks = step.arrays.stiffness.shape[1]
         rigid_max = step.options.rigid_max
         columns = rigid_max + 1
         q = step.arrays.q_trial
@@ -145,8 +148,12 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool
                 if step.state.active[w] != 0:
                     for i in range(begin, end):
                         if step.state.refresh[w] != 0:
-                            for t in range(member, slabs * tasks, team):
-                                stiffness_block(step, i, t / tasks, t % tasks)
+                            if wp.static(one_thread):
+                                for t in range(step.options.stiffness_slabs * slab_tiles(blocks)):
+                                    stiffness_slab(step, i, t)
+                            else:
+                                for t in range(member, stiffness_chunks * tasks, team):
+                                    stiffness_block(step, i, t / tasks, t % tasks)
                             barrier()
                         if wp.static(not shared):
                             width = 3 * blocks

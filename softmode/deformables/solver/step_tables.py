@@ -33,6 +33,7 @@ from softmode.deformables.model.struct_kernels import (
 )
 from softmode.deformables.model.tables import allocate
 from softmode.deformables.solver import fused_newton_kernels as fused
+from softmode.deformables.solver.assembly_kernels import cache_slabs
 from softmode.deformables.solver.factor import BlockCholesky
 from softmode.deformables.solver.fused_system_kernels import shared_bytes
 from softmode.deformables.solver.iteration_kernels import NewtonArrays, NewtonOptions, NewtonStep
@@ -49,8 +50,6 @@ FEW_WORLDS = 64
 """Bodies up to which those of many functions get larger teams, and more and smaller blocks of threads, on CUDA."""
 LARGE_TEAM = 128
 """Threads of these teams and blocks."""
-CACHED_BYTES = 2**19
-"""Gradients of functions at points that a CPU keeps in its second cache while it assembles the stiffness."""
 RESERVED_BYTES = 2048
 """Shared memory that the one launch needs besides its system, with what CUDA keeps for itself."""
 
@@ -73,6 +72,7 @@ _ARRAYS = {
     "": "instance unknown",
     "gradient_chunk": "instance gradient_chunk unknown",
     "stiffness": "instance stiffness_chunk row unknown",
+    "turned": "16 slab 3",
     "pins": "pin_instance pin_row pin_block",
     "turn turn_centre turn_shift": "instance",
 }
@@ -240,6 +240,7 @@ def allocate_tables(
             return 1
         return int(np.clip(fused.TEAM // tasks if one_launch else CUDA_THREADS // threads, 1, 64 if few else 16))
 
+    slabs = cache_slabs(blocks, layout.point_max)
     sizes = {
         "instance": count,
         "world": layout.world_count,
@@ -255,6 +256,7 @@ def allocate_tables(
         "stiffness_chunk": chunk_count(count, layout.stride)
         if tiled
         else chunks(count * square, square + (square + 3 * blocks) // 2),
+        "slab": 1 if device.is_cuda else -(-layout.point_max // slabs),
         "pin_instance": count if layout.pin_max else 1,
         "pin_row": layout.stride if layout.pin_max else 1,
         "pin_block": blocks if layout.pin_max else 1,
@@ -273,8 +275,7 @@ def allocate_tables(
     }
     state = allocate(NewtonState, _NEWTON, sizes, device, given=given)
     constant = _newton_options(options, rigid, system)
-    # on CUDA the threads share the points
-    constant.stiffness_slabs = 1 if device.is_cuda else -(-12 * layout.stride * layout.point_max // CACHED_BYTES)
+    constant.stiffness_slabs = slabs
     step = allocate(
         NewtonStep, "", {}, device, given={**structs, "rigid": rigid.table, "state": state, "options": constant}
     )
