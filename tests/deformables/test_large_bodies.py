@@ -17,9 +17,10 @@ from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.model.authoring import add_pins, add_reduced_body
 from softmode.deformables.model.compile_ahead import compile_launches
+from softmode.deformables.solver import assembly_kernels as assembly
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient, solve
 from softmode.deformables.solver.step_tables import newton_notes
-from softmode.deformables.solver.tile_kernels import TILE, chunk_count, tile_count
+from softmode.deformables.solver.tile_kernels import TILE, assemble_tiles, chunk_count, tile_count
 from tests.scenes import GRAVITY, Scene
 
 CUDA = pytest.param("cuda:0", marks=[pytest.mark.gpu, pytest.mark.skipif(not wp.is_cuda_available(), reason="no GPU")])
@@ -136,6 +137,33 @@ def test_large_bodies_on_cuda(count: int) -> None:
     scene.restart()
     scene.step(2)
     np.testing.assert_array_equal(captured, scene.state.softmode.q.numpy())
+
+
+def test_slabs_of_points_keep_the_bits() -> None:
+    """However one thread cuts points and columns, each entry has the same sums in the same order, here of 19 blocks."""
+    scene = scene_of(152)
+    scene.step(2)
+    t, found = scene.reduced.tables, []
+    t.newton.active.fill_(1)
+    t.newton.refresh.fill_(1)
+    evaluate(t, scene.dt, derivatives=True)
+    t.arrays.stiffness.fill_(np.nan)
+    blocks = t.layout.block_count
+    assert blocks > assembly.SLAB_BLOCKS and blocks % 2 == 1
+    for slabs in (1, 3):
+        step = t.newton_step(scene.dt)
+        step.options.stiffness_slabs = slabs
+        step.arrays.turned = wp.zeros((17, t.layout.point_max, 3), dtype=step.arrays.turned.dtype, device="cpu")
+        assemble(t, scene.dt)
+        found.append(t.arrays.stiffness.numpy()[0, 0])
+    tasks = tile_count(t.layout.stride)
+    t.launch(assemble_tiles, (1, 1, tasks, 1), t.newton_step(scene.dt), 1)
+    found.append(t.arrays.stiffness.numpy()[0, 0])
+    upper = np.arange(3 * blocks) >= np.arange(24 * blocks)[:, None] // 8
+    one, three, tiles = (K[upper] for K in found)
+    assert np.isfinite(one).all()
+    np.testing.assert_array_equal(three, one)
+    np.testing.assert_allclose(tiles, one, atol=2.0e-6 * np.abs(one).max())
 
 
 def test_tiles_cover_the_upper_triangle() -> None:

@@ -112,7 +112,8 @@ def stiffness_slab(step: NewtonStep, i: int, task: int):
     """Add to the columns of one tile what one slab of the points has of sum_p grad b^T C grad b; the first sets them.
 
     The same sums in the same order as ``stiffness_block``, for one thread: C grad b is formed once for all rows, and
-    stays in the second cache of a CPU, whatever the number of functions and points.
+    stays in the second cache of a CPU, whatever the number of functions and points. Two blocks side by side share what
+    is loaded of the rows.
     """
     if step.state.active[step.instances.world[i]] == 0 or step.state.refresh[step.instances.world[i]] == 0:
         return
@@ -132,7 +133,7 @@ def stiffness_slab(step: NewtonStep, i: int, task: int):
     pairs = int(6)
     for pair in range(pairs):
         c, d = block_pair(pair)
-        for columns in range(low, wp.min(low + wide, used)):
+        for columns in range(low, low + wide):
             for p in range(begin, end):
                 C = step.points.hessian[i, pair, p]
                 gx = step.basis.gradient_across[columns, first + p, 0]
@@ -140,24 +141,32 @@ def stiffness_slab(step: NewtonStep, i: int, task: int):
                 gz = step.basis.gradient_across[columns, first + p, 2]
                 for k in range(3):
                     step.arrays.turned[columns - low, p - begin, k] = C[k, 0] * gx + C[k, 1] * gy + C[k, 2] * gz
-        for t in range(block_count * wide):
-            rows = t / wide
-            columns = low + t % wide
-            if c == d and columns < rows:
-                continue
+        half = (wide + 1) / 2
+        for t in range(block_count * half):
+            rows = t / half
+            columns = low + 2 * (t % half)
+            double = columns + 1 < low + wide
+            if c == d and columns + 1 < rows:
+                continue  # below the diagonal
             row = LANES * (c * block_count + rows)
             column = d * block_count + columns
             block = mat88()
+            beside = mat88()
             if slab > 0:
                 for a in range(LANES):
                     block[a] = step.arrays.stiffness[i, 0, row + a, column]
+                    if double:
+                        beside[a] = step.arrays.stiffness[i, 0, row + a, column + 1]
             if rows < used and columns < used:
                 for p in range(begin, end):
                     for k in range(3):
                         g = step.basis.gradient_across[rows, first + p, k]
                         block = add_outer(block, g, step.arrays.turned[columns - low, p - begin, k])
+                        beside = add_outer(beside, g, step.arrays.turned[columns - low + 1, p - begin, k])
             for a in range(LANES):
                 step.arrays.stiffness[i, 0, row + a, column] = block[a]
+                if double:
+                    step.arrays.stiffness[i, 0, row + a, column + 1] = beside[a]
 
 
 assemble_slabs = kernel_over(stiffness_slab, "assemble_slabs", "i", "task")

@@ -72,7 +72,7 @@ _ARRAYS = {
     "": "instance unknown",
     "gradient_chunk": "instance gradient_chunk unknown",
     "stiffness": "instance stiffness_chunk row unknown",
-    "turned": "16 slab 3",
+    "turned": "17 slab 3",
     "pins": "pin_instance pin_row pin_block",
     "turn turn_centre turn_shift": "instance",
 }
