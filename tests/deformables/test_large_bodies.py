@@ -131,7 +131,6 @@ def test_large_bodies_on_cuda(count: int) -> None:
     np.testing.assert_allclose(places[1], places[0], atol=1.0e-5)
     scene.restart()
     replay = scene.capture()
-    scene.restart()
     replay()
     captured = scene.state.softmode.q.numpy()
     scene.restart()
