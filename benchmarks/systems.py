@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -52,8 +53,8 @@ def report(size: int, count: int, rate: float, clock: Clock) -> None:
     system = BlockCholesky(world, size, 1, clock.device)
     host = np.zeros((size, size + LANES), np.float32)
     host[:, :size], host[:, size] = A, b
-    full = wp.array(np.tile(host.reshape(1, size, -1, LANES), (count, 1, 1, 1)), dtype=system.matrix.dtype)
-    full = full.to(clock.device)
+    every = np.tile(host.reshape(1, size, -1, LANES), (count, 1, 1, 1))
+    full: Any = wp.array(every, dtype=system.matrix.dtype, device=clock.device)
     on = wp.full(count, 1, dtype=int, device=clock.device)
     known = wp.zeros((count, 1), dtype=wp.float64, device=clock.device)
 

@@ -107,7 +107,7 @@ class BlockCholesky:
         """Substitute back panel by panel."""
         team, count = self._panel_threads[1], self.system_count
         begin = (active, column, tail, tail_count, self.table)
-        launch(self.device, panels.begin_substitution, (count, self.size), *begin)
+        launch(self.device, panels.begin_substitution, (count, self.size), *begin, block_dim=team)
         for first in reversed(range(0, self.size, PANEL)):
             groups = max(first // PANEL, 1)
             given = (active, first, team, self.table)
