@@ -155,11 +155,12 @@ def print_launches(scene: Any) -> None:
     wp.launch = noted
     try:
         if device.is_cuda:
-            wp.timing_begin(cuda_filter=wp.TIMING_KERNEL, synchronize=True)
+            wp.timing_begin(cuda_filter=wp.TIMING_ALL, synchronize=True)
         scene._steps()
         if device.is_cuda:
             for result in wp.timing_end(synchronize=True):
-                name = re.sub(r"_[0-9a-f]{8}_cuda_kernel_forward|^forward kernel ", "", result.name)
+                name = re.sub(r"(_[0-9a-f]{8})?_cuda_kernel_forward|^forward kernel ", "", result.name)
+                name = re.sub(r"_[0-9a-f]{8}$", "", name)
                 spent[name] = spent.get(name, 0.0) + result.elapsed
     finally:
         wp.launch = launch

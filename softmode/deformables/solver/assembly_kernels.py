@@ -58,9 +58,9 @@ def block_task(task: int, block_count: int):
 
 
 @wp.func
-def left_out(step: NewtonStep, i: int):
+def left_out(instances: Instances, pattern: wp.array3d[int], i: int):
     """Return whether an instance has no place in the system of its world: it is none, and others share the system."""
-    return not exists(step.instances, i) and step.arrays.systems.pattern.shape[1] > 1
+    return not exists(instances, i) and pattern.shape[1] > 1
 
 
 @wp.func
@@ -197,7 +197,7 @@ def assemble_pins(
 @wp.func
 def matrix_row(step: NewtonStep, team: int, i: int, row: int, member: int):
     """Add inertia and pins to the stiffness; driven unknowns stay put."""
-    if step.state.active[step.instances.world[i]] == 0 or left_out(step, i):
+    if step.state.active[step.instances.world[i]] == 0 or left_out(step.instances, step.arrays.systems.pattern, i):
         return
     block_count = step.basis.row.shape[1]
     c = row / (LANES * block_count)
@@ -260,7 +260,7 @@ add_contacts = kernel_over(contact_block, "add_contacts", "i", "task")
 @wp.func
 def column_block(step: NewtonStep, i: int, rows: int, j: int):
     """Fill the columns right of K: d2E/dq dr = -sum_e b_k H_e J_e, and -g in column rigid_max."""
-    if step.state.active[step.instances.world[i]] == 0 or left_out(step, i):
+    if step.state.active[step.instances.world[i]] == 0 or left_out(step.instances, step.arrays.systems.pattern, i):
         return
     block_count = step.basis.row.shape[1]
     c = rows / block_count
