@@ -293,7 +293,7 @@ _SUBSTITUTE = """
             out[0] = held[k].x; out[1] = held[k].y; out[2] = held[k].z; out[3] = held[k].w;
         }
     }
-    for (int t = member; t < rows; t += team) x[t] = right[first + t];
+    for (int t = member; t < 64; t += team) x[t] = t < rows ? right[first + t] : 0.0f;
     SOFTMODE_BARRIER;
     #pragma unroll 1
     for (int here = rows - 8; here >= 0; here -= 8) {
@@ -302,7 +302,7 @@ _SUBSTITUTE = """
         for (int a = 7; a >= 0; --a) {
             float value = x[here + a];
             #pragma unroll
-            for (int b = a + 1; b < 8; ++b) value -= A[(here + a) * 65 + here + b] * y[b];
+            for (int b = 7; b > a; --b) value -= A[(here + a) * 65 + here + b] * y[b];  // what comes last, last
             y[a] = value * A[(here + a) * 65 + here + a];
         }
         SOFTMODE_BARRIER;
@@ -327,12 +327,18 @@ _SUBSTITUTE = """
         const int row = 64 * group + t;
         if (row >= first) break;
         const float* given = &M[(size_t)row * W + first];
+        Quad held[16];
+        #pragma unroll
+        for (int k = 0; k < 16; ++k) {
+            held[k] = Quad{0.0f, 0.0f, 0.0f, 0.0f};
+            if (4 * k < rows && related(row, first + 4 * k)) held[k] = *(const Quad*)&given[4 * k];
+        }
         float sum[4] = {0.0f, 0.0f, 0.0f, 0.0f};
-        #pragma unroll 8
-        for (int s = 0; s < rows; s += 4) {
-            if (!related(row, first + s)) continue;
-            const Quad u = *(const Quad*)&given[s];
-            sum[0] += u.x * x[s]; sum[1] += u.y * x[s + 1]; sum[2] += u.z * x[s + 2]; sum[3] += u.w * x[s + 3];
+        #pragma unroll
+        for (int k = 0; k < 16; ++k) {
+            const Quad u = held[k];
+            const float* v = &x[4 * k];
+            sum[0] += u.x * v[0]; sum[1] += u.y * v[1]; sum[2] += u.z * v[2]; sum[3] += u.w * v[3];
         }
         right[row] -= (sum[0] + sum[1]) + (sum[2] + sum[3]);
     }
