@@ -21,18 +21,18 @@ class Clock:
         """Remember where and how often."""
         self.device, self.repeats = wp.get_device(device), repeats
 
+    def once(self, run: Callable[[], Any]) -> float:
+        """Return the time of a call, device included [ms]."""
+        now = time.perf_counter if self.device.is_cuda else time.process_time
+        wp.synchronize_device(self.device)
+        start = now()
+        run()
+        wp.synchronize_device(self.device)
+        return 1e3 * (now() - start)
+
     def median(self, run: Callable[[], Any]) -> float:
         """Return the median time of a call, device included [ms]."""
-        now = time.perf_counter if self.device.is_cuda else time.process_time
-        times = []
-        for repeat in range(self.repeats + 2):
-            wp.synchronize_device(self.device)
-            start = now()
-            run()
-            wp.synchronize_device(self.device)
-            if repeat >= 2:
-                times.append(1e3 * (now() - start))
-        return float(np.median(times))
+        return float(np.median([self.once(run) for _ in range(self.repeats + 2)][2:]))
 
     def replay(self, run: Callable[[], Any]) -> float:
         """Return the median time of a captured call [ms]."""

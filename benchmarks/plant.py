@@ -1,16 +1,22 @@
 """PIE-NeRF's plant of 78 kernels: steps and pictures a second, and what a step and a picture spend their time on.
 
-Run: ``OMP_NUM_THREADS=1 python -m benchmarks.plant [--all] [--ranks] [--edge 256] [--splats 14000]``. The plant of
-``examples/swaying_plant.py`` in its wind, two physics steps of 1/60 s for each picture; ``--all`` takes all functions
-of its handles, 2,340 unknowns less those that repeat others, instead of 240. ``--ranks`` prints how many there are that
-add more than some fractions of mass, and nothing else. Processor time of one core. The floor is
-the arithmetic of assembly and factorisation, 27 n^2 P and (3 n)^3 / 3 flops for n functions at P points, in each
-iteration, at the rate of a large float32 matrix product in this run.
+Run: ``OMP_NUM_THREADS=1 python -m benchmarks.plant [--all] [--ranks] [--edge 256] [--splats 14000]``, on a GPU with
+``--device cuda:0 [--one-team] [--launches]``. The plant of ``examples/swaying_plant.py`` in its wind, two physics steps
+of 1/60 s for each picture; ``--all`` takes all functions of its handles, 2,340 unknowns less those that repeat others,
+instead of 240, and ``--rank-tolerance 1e-12`` those too that hardly differ from others. ``--ranks`` prints how many
+there are that add more than some fractions of mass, and nothing else. ``--one-team`` factors the system by one block of
+threads and assembles it without tiles, as smaller systems are. ``--launches`` lists the launches of two steps.
+
+Processor time of one core; on CUDA the wall clock, and torch's products and Cholesky of the same sizes beside it. The
+floor is the arithmetic of assembly and factorisation, 27 n^2 P and (3 n)^3 / 3 flops for n functions at P points, in
+each iteration, at the rate of a large float32 matrix product in this run.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import re
 import time
 from collections.abc import Callable
 from typing import Any
@@ -18,11 +24,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from benchmarks.step import product_rate
+from benchmarks.clock import Clock
+from benchmarks.step import product_rate, report_torch
 from examples.swaying_plant import BUILD, RATE, STEPS, blow, make_plant, make_scene
 from softmode.deformables import BuildOptions
 from softmode.deformables.build.sources import unpack_sources
-from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient, solve
+from softmode.deformables.solver.evaluate import assemble, evaluate, evaluate_trial, gather_gradient
+from softmode.deformables.solver.minimise import accept_step, check_convergence, start_line_search
 
 DT = 1.0 / (RATE * STEPS)
 
@@ -30,8 +38,12 @@ DT = 1.0 / (RATE * STEPS)
 def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
     parser.add_argument("--all", action="store_true", help="all functions of the handles")
+    parser.add_argument("--rank-tolerance", type=float, default=1e-7, help="least mass that a function of --all adds")
     parser.add_argument("--ranks", action="store_true", help="how many of these there are")
+    parser.add_argument("--one-team", action="store_true", help="the paths of smaller systems")
+    parser.add_argument("--launches", action="store_true", help="list the launches of two steps")
     parser.add_argument("--edge", type=int, default=256, help="edge of the picture [px]")
     parser.add_argument("--splats", type=int, default=14000, help="splats of the plant")
     parser.add_argument("--frames", type=int, default=60, help="pictures that are timed")
@@ -40,28 +52,47 @@ def main() -> None:
     if given.ranks:
         print_ranks()
         return
-    build = BuildOptions(handles="local", local_count=78, cubature_count=4800) if given.all else BUILD
+    build = BUILD
+    if given.all:
+        build = BuildOptions(handles="local", local_count=78, cubature_count=4800, rank_tolerance=given.rank_tolerance)
     start = time.process_time()
     plant, places = make_plant(build, given.splats)
     built = time.process_time() - start
-    scene = make_scene(plant, places[0], given.edge)
-    n, points = plant.body.function_count, plant.body.point_count
+    with wp.ScopedDevice(given.device):
+        scene = make_scene(plant, places[0], given.edge)
+        if given.one_team:
+            scene.solver.tables = dataclasses.replace(scene.solver.tables, tiled=False)
+            scene.solver.tables.system.by_panels = False
+        report(scene, built, given)
+
+
+def report(scene: Any, built: float, given: argparse.Namespace) -> None:
+    """Time steps and pictures in the wind, and print what they take."""
+    clock, body = Clock(scene.model.device, 9), scene.objects[0].body
+    n, points = body.function_count, body.point_count
+    rate = product_rate(given.device)
+    print(f"{given.device}: float32 matrix product {rate / 1e12:.3f} Tflop/s; {'; '.join(scene.solver.notes)}")
     print(f"{3 * n} unknowns, {points} points; loaded in {built:.1f} s of processor time")
     steps, pictures, iterations = [], [], []
     for frame in range(given.frames + 2):
         blow(scene, frame / RATE, 6.0)
-        steps.append(timed(scene.step) / STEPS)
-        pictures.append(timed(scene.draw))
+        steps.append(clock.once(scene.step) / STEPS)
+        pictures.append(clock.once(scene.draw))
         iterations.append(int(scene.solver.iteration.numpy().max()))
     step, picture, count = np.median(steps[2:]), np.median(pictures[2:]), np.mean(iterations[2:])
-    floor = 1e3 * count * (27.0 * n**2 * points + (3 * n) ** 3 / 3.0) / product_rate("cpu")
+    floor = 1e3 * count * (27.0 * n**2 * points + (3 * n) ** 3 / 3.0) / rate
     print(f"a step {step:.2f} ms, {1e3 / step:.0f} a second; {count:.1f} iterations, floor {floor:.2f} ms")
     print(f"a picture of {given.edge} px and {given.splats} splats {picture:.2f} ms, {1e3 / picture:.0f} a second")
     both = STEPS * step + picture
-    print(f"two steps and a picture in turn on one core {both:.1f} ms: {1e3 / both:.0f} pictures a second")
-    print(f"status {int(scene.solver.status.numpy().max())}; of an iteration with new stiffness, and of a picture:")
-    for name, milliseconds in stages(scene).items():
-        print(f"    {name:<12}{milliseconds:9.2f} ms")
+    print(f"two steps and a picture in turn {both:.1f} ms: {1e3 / both:.0f} pictures a second")
+    constraints = int(scene.solver.tables.constraints.count.numpy().max())
+    print(f"status {int(scene.solver.status.numpy().max())}, {constraints} constraints; each phase and a picture:")
+    for name, run in stages(scene).items():
+        print(f"    {name:<28}{clock.replay(run):9.3f} ms")
+    if given.launches:
+        print_launches(scene)
+    if scene.model.device.is_cuda:
+        report_torch(body, 1, 25)
 
 
 def print_ranks() -> None:
@@ -75,47 +106,68 @@ def print_ranks() -> None:
     print(f"{raw.shape[1]} functions; above fractions of mass there are {ranks}; the body has {body.function_count}")
 
 
-def stages(scene: Any) -> dict[str, float]:
-    """Return what the stages of an iteration and of a picture take, each recorded on its own [ms]."""
-    tables, progress = scene.solver.tables, scene.solver.tables.newton
+def stages(scene: Any) -> dict[str, Callable[[], None]]:
+    """Return the phases of a step, those of an iteration with a new Hessian, and the parts of a picture."""
+    solver = scene.solver
+    tables, state, (camera,) = solver.tables, solver.tables.newton, scene.cameras.values()
 
-    def stage(run: Callable[[], None]) -> Callable[[], None]:
+    def stage(run: Callable[[], object]) -> Callable[[], None]:
         def prepared() -> None:
-            progress.active.fill_(1)
-            progress.refresh.fill_(1)
+            state.active.fill_(1)
+            state.searching.fill_(1)
+            state.refresh.fill_(1)
+            state.evaluated.zero_()
             run()
 
         return prepared
 
-    def assembled() -> None:
-        evaluate(tables, DT, derivatives=True)
-        gather_gradient(tables, DT)
-        assemble(tables, DT)
-
-    (camera,) = scene.cameras.values()
-    runs = {
-        "assembly": stage(assembled),
-        "solve": stage(lambda: solve(tables)),
-        "warp": lambda: scene.splats.update(scene.state),
-        "draw": lambda: camera.render(scene.state),
+    rigid = tables.rigid.count_max, tables.rigid.table.direction, tables.rigid.count_max
+    return {
+        "four fills, in each row": stage(lambda: None),
+        "predict": stage(lambda: solver.begin(scene.state, scene.control, DT)),
+        "detect": stage(lambda: solver.detect(scene.state, scene.control, DT, prescribed=True)),
+        "evaluate with Hessian": stage(lambda: evaluate(tables, DT, derivatives=True)),
+        "gather gradient": stage(lambda: gather_gradient(tables, DT)),
+        "check convergence": stage(lambda: check_convergence(tables, DT)),
+        "assemble": stage(lambda: assemble(tables, DT)),
+        "factor": stage(lambda: tables.system.factor(state.active)),
+        "solve": stage(lambda: tables.system.solve(state.active, *rigid)),
+        "start line search": stage(lambda: start_line_search(tables, DT)),
+        "evaluate trial": stage(lambda: evaluate_trial(tables, DT)),
+        "accept step": stage(lambda: accept_step(tables, DT)),
+        "finish": stage(lambda: solver.finish(scene.state, DT)),
+        "picture: warp": lambda: scene.splats.update(scene.state),
+        "picture: draw": lambda: camera.render(scene.state),
     }
-    return {name: recorded(run, scene.model.device) for name, run in runs.items()}
 
 
-def recorded(run: Callable[[], None], device: Any) -> float:
-    """Return the median time of a captured call [ms]."""
-    run()
-    with wp.ScopedCapture(device=device) as capture:
-        run()
-    graph: Any = capture.graph
-    return float(np.median([timed(lambda: wp.capture_launch(graph)) for _ in range(9)]))
+def print_launches(scene: Any) -> None:
+    """Print every kernel of two steps, its threads, how often it runs and, on CUDA, how long."""
+    sizes: dict[str, tuple[int, int, int]] = {}
+    launch = wp.launch
 
+    def noted(kernel: Any, dim: Any, *rest: Any, **more: Any) -> Any:
+        threads, times = int(np.prod(dim)), sizes.get(kernel.key, (0, 0, 0))
+        sizes[kernel.key] = max(threads, times[0]), more.get("block_dim", 256), times[2] + 1
+        return launch(kernel, dim, *rest, **more)
 
-def timed(run: Callable[[], object]) -> float:
-    """Return the processor time of a call [ms]."""
-    start = time.process_time()
-    run()
-    return 1e3 * (time.process_time() - start)
+    device, spent = scene.model.device, {}
+    wp.launch = noted
+    try:
+        if device.is_cuda:
+            wp.timing_begin(cuda_filter=wp.TIMING_ALL, synchronize=True)
+        scene._steps()
+        if device.is_cuda:
+            for result in wp.timing_end(synchronize=True):
+                name = re.sub(r"(_[0-9a-f]{8})?_cuda_kernel_forward|^forward kernel ", "", result.name)
+                name = re.sub(r"_[0-9a-f]{8}$", "", name)
+                spent[name] = spent.get(name, 0.0) + result.elapsed
+    finally:
+        wp.launch = launch
+    print("    launches of two steps, eager: most threads, threads of a block, times, ms in all")
+    for name in sorted(sizes, key=lambda name: -spent.get(name, 0.0)):
+        threads, block, times = sizes[name]
+        print(f"    {name:<28}{threads:10d} {min(block, threads):5d} {times:6d} {spent.get(name, np.nan):9.3f}")
 
 
 if __name__ == "__main__":

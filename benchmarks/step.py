@@ -12,6 +12,7 @@ also timed with torch: six batched products per instance and ``torch.linalg.chol
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import time
 from collections.abc import Callable
 from typing import Any
@@ -48,6 +49,7 @@ def main() -> None:
     parser.add_argument("--points", type=int, nargs="+", default=[256])
     parser.add_argument("--bodies", type=int, nargs="+", default=[1])
     parser.add_argument("--stages", action="store_true", help="time every stage of a step too")
+    parser.add_argument("--blocks", action="store_true", help="stiffness of large bodies without tiles (CUDA)")
     parser.add_argument("--repeats", type=int, default=50)
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
@@ -59,7 +61,7 @@ def main() -> None:
             body = beam(modes, points)
             for worlds in options.worlds:
                 for count in options.bodies:
-                    scene = Beam(body, worlds, count, options.device)
+                    scene = Beam(body, worlds, count, options.device, blocks=options.blocks)
                     scene.report(options.repeats, rate)
                     if options.stages:
                         scene.report_stages(options.repeats)
@@ -78,7 +80,9 @@ def beam(mode_count: int, point_count: int) -> ReducedBody:
 class Beam:
     """Replicated clamped beams and two captured steps."""
 
-    def __init__(self, body: ReducedBody, world_count: int, body_count: int, device: str) -> None:
+    def __init__(
+        self, body: ReducedBody, world_count: int, body_count: int, device: str, *, blocks: bool = False
+    ) -> None:
         """Build the model, step until the beam moves, and record a pair of steps."""
         self.body, self.device = body, wp.get_device(device)
         self.world_count = world_count
@@ -101,6 +105,8 @@ class Beam:
         model = builder.finalize(device=device)
         model.set_gravity((0.0, 0.0, -9.81))
         self.solver = SolverReduced(model, [body], options=SolverReducedOptions(contact_max=1))
+        if blocks:
+            self.solver.tables = dataclasses.replace(self.solver.tables, tiled=False)
         self.states = model.state(), model.state()
         self.control = model.control()
         self.memory = self._memory() - before

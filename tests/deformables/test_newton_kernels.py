@@ -113,14 +113,22 @@ def test_one_launch_on_cuda(shared: bool) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs the CUDA compiler of Warp's wheel")
-def test_no_thread_copies_the_tables(tmp_path: Path) -> None:
-    """Compiled for CUDA, no kernel of the line search has the 8 kB of the step's struct in its threads' own memory."""
-    name = "softmode.deformables.solver.search_kernels"
+@pytest.mark.parametrize(
+    "module, entries",
+    [
+        ("search_kernels", ("check_iterates", "reuse_hessians")),
+        ("assembly_kernels", ("assemble_matrix", "assemble_columns", "assemble_pins")),
+        ("tile_kernels", ("assemble_tiles",)),
+    ],
+)
+def test_no_thread_copies_the_tables(module: str, entries: tuple[str, ...], tmp_path: Path) -> None:
+    """Compiled for CUDA, no kernel has the 8 kB of the step's struct in its threads' own memory."""
+    name = f"softmode.deformables.solver.{module}"
     for part in (name, f"{name}.phases"):
-        wp.compile_aot_module(wp.get_module(part), arch=90, module_dir=tmp_path, use_ptx=True)
-    texts = [code.read_text(errors="replace") for code in tmp_path.glob("*.ptx")]
-    text = "".join(texts)
-    assert len(texts) == 2 and ".entry check_iterates" in text and ".entry reuse_hessians" in text
+        if wp.get_module(part).kernels:
+            wp.compile_aot_module(wp.get_module(part), arch=90, module_dir=tmp_path, use_ptx=True)
+    text = "".join(code.read_text(errors="replace") for code in tmp_path.glob("*.ptx"))
+    assert all(f".entry {entry}" in text for entry in entries)
     assert max([int(size) for size in re.findall(r"__local_depot\d+\[(\d+)\];", text)], default=0) < 1000
 
 

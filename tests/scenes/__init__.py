@@ -118,7 +118,7 @@ class Scene:
 
     def capture(self) -> Callable[[], None]:
         """Record two steps, there and back between the two states, and return what replays them."""
-        with wp.ScopedCapture(device="cpu") as capture:
+        with wp.ScopedCapture(device=self.model.device) as capture:
             self.solver.step(self.state, self.next_state, self.control, None, self.dt)
             self.solver.step(self.next_state, self.state, self.control, None, self.dt)
         self.solver.reset(self.state)

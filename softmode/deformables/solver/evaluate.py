@@ -7,6 +7,7 @@ from softmode.deformables.solver import step_kernels as kernels
 from softmode.deformables.solver.iteration_kernels import ALL, ENERGIES, TRIAL
 from softmode.deformables.solver.rigid_row_kernels import evaluate_rows
 from softmode.deformables.solver.step_tables import StepTables
+from softmode.deformables.solver.tile_kernels import TILE_TEAM, assemble_tiles, tile_count
 
 
 def evaluate(tables: StepTables, dt: float, *, derivatives: bool) -> None:
@@ -58,7 +59,15 @@ def assemble(tables: StepTables, dt: float) -> None:
     tasks = 3 * blocks * blocks + 3 * (blocks * blocks + blocks) // 2  # 8x8 blocks of the upper triangle
     columns = 3 * blocks if t.model.device.is_cuda else 1  # threads that share a row of the matrix
     # more than 100 registers per thread: larger blocks leave half of a multiprocessor idle
-    t.launch(assembly.assemble_stiffness, (count, t.arrays.stiffness.shape[1], tasks), step, block_dim=128)
+    chunks = t.arrays.stiffness.shape[1]
+    if t.tiled:
+        team = TILE_TEAM if t.model.device.is_cuda else 1
+        t.launch(assemble_tiles, (count, chunks, tile_count(t.layout.stride), team), step, team, block_dim=team)
+    elif t.model.device.is_cuda:
+        t.launch(assembly.assemble_stiffness, (count, chunks, tasks), step, block_dim=128)
+    else:
+        tiles = -(-blocks // assembly.SLAB_BLOCKS)
+        t.launch(assembly.assemble_slabs, (count, step.options.stiffness_slabs * tiles), step)
     t.launch(assembly.assemble_matrix, (count, t.arrays.stiffness.shape[2], columns), step, columns)
     t.launch(assembly.add_contacts, (count, tasks), step, block_dim=128)
     t.launch(assembly.assemble_columns, (count, 3 * blocks, rigid_max + 1), step)

@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from softmode.deformables.model.declare import Kernel
-from softmode.deformables.model.lane_kernels import LANES, WARP, barrier, rolled, team_sum
+from softmode.deformables.model.lane_kernels import LANES, WARP, barrier, rolled, team_sum, vec8
 from softmode.deformables.model.struct_kernels import instance_end
 from softmode.deformables.solver.assembly_kernels import (
     column_block,
@@ -21,8 +21,10 @@ from softmode.deformables.solver.assembly_kernels import (
     matrix_row,
     pair_block,
     rigid_entry,
+    slab_tiles,
     solve_rigid_team,
     stiffness_block,
+    stiffness_slab,
 )
 from softmode.deformables.solver.factor_kernels import factor_system, solve_system
 from softmode.deformables.solver.fused_system_kernels import dynamic_floats, shared_direction_of, sum_forces_of
@@ -48,7 +50,7 @@ wp.set_module_options({"enable_backward": False})
 
 SMALL_TEAM = 96
 """Threads that share a world on CUDA where the points are few and the worlds many,"""
-LARGE_TEAM = 128
+TEAM = 128
 """elsewhere. Both are measured, see ``docs/performance.md``."""
 FEW_POINTS = 128
 """Most points that count as few."""
@@ -60,14 +62,12 @@ def team_of(point_count: int, world_count: int, device: wp.Device) -> int:
     """Return how many threads share a world on a device."""
     if device.is_cpu:
         return 1
-    at_a_time = THREADS // LARGE_TEAM * device.sm_count
-    return SMALL_TEAM if point_count <= FEW_POINTS and world_count > at_a_time else LARGE_TEAM
+    at_a_time = THREADS // TEAM * device.sm_count
+    return SMALL_TEAM if point_count <= FEW_POINTS and world_count > at_a_time else TEAM
 
 
 @cache
-def newton_kernel(
-    unit_type: Any, size: int = 0, width: int = 0, *, team: int = LARGE_TEAM, joined: bool = False
-) -> Kernel:
+def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = TEAM, joined: bool = False) -> Kernel:
     """Return the kernel that minimises the incremental potential of every world by Newton with a line search.
 
     Args:
@@ -78,6 +78,7 @@ def newton_kernel(
         joined: Whether the bodies of a world, which may touch each other, share a system.
     """
     shared, dynamic = size > 0, dynamic_floats(size, width)
+    one_thread = unit_type is vec8
     shared_direction = shared_direction_of(size or 24, width or 32)  # called where ``shared`` says so
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=(team, THREADS // team))
@@ -166,8 +167,12 @@ def newton_kernel(
                 if step.state.active[w] != 0:
                     for i in range(begin, end):
                         if step.state.refresh[w] != 0:
-                            for t in range(member, stiffness_chunks * tasks, team):
-                                stiffness_block(step, i, t / tasks, t % tasks)
+                            if wp.static(one_thread):
+                                for t in range(step.options.stiffness_slabs * slab_tiles(blocks)):
+                                    stiffness_slab(step, i, t)
+                            else:
+                                for t in range(member, stiffness_chunks * tasks, team):
+                                    stiffness_block(step, i, t / tasks, t % tasks)
                             barrier()
                         if wp.static(not shared):
                             width = 3 * blocks

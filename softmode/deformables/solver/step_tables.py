@@ -33,17 +33,23 @@ from softmode.deformables.model.struct_kernels import (
 )
 from softmode.deformables.model.tables import allocate
 from softmode.deformables.solver import fused_newton_kernels as fused
+from softmode.deformables.solver.assembly_kernels import cache_slabs
 from softmode.deformables.solver.factor import BlockCholesky
 from softmode.deformables.solver.fused_system_kernels import shared_bytes
 from softmode.deformables.solver.iteration_kernels import NewtonArrays, NewtonOptions, NewtonStep
 from softmode.deformables.solver.options import SolverReducedOptions
 from softmode.deformables.solver.spin_kernels import Spin
 from softmode.deformables.solver.systems import join_systems
+from softmode.deformables.solver.tile_kernels import TILE, chunk_count
 
 CUDA_THREADS = 2**16
 """Threads that keep a GPU busy: sums over points are split until there are about so many."""
 ONE_LAUNCH_BLOCKS = 7
 """Blocks of eight functions up to which a body is small enough for a team of threads on CUDA; on CPU any is."""
+FEW_WORLDS = 64
+"""Bodies up to which those of many functions get larger teams, and more and smaller blocks of threads, on CUDA."""
+LARGE_TEAM = 128
+"""Threads of these teams and blocks."""
 RESERVED_BYTES = 2048
 """Shared memory that the one launch needs besides its system, with what CUDA keeps for itself."""
 
@@ -66,6 +72,7 @@ _ARRAYS = {
     "": "instance unknown",
     "gradient_chunk": "instance gradient_chunk unknown",
     "stiffness": "instance stiffness_chunk row unknown",
+    "turned": "17 slab 3",
     "pins": "pin_instance pin_row pin_block",
     "turn turn_centre turn_shift": "instance",
 }
@@ -131,6 +138,8 @@ class StepTables:
     """The mask that selects all worlds, bool (world_count + 1,)."""
     team: int
     """Threads that share one system."""
+    block: int
+    """Threads of a block on CUDA where a launch does not say."""
     one_launch: bool
     """Whether a team of threads, on CPU one, takes a world through all of its Newton iterations in one launch."""
     fused_kernel: Kernel
@@ -139,6 +148,8 @@ class StepTables:
     """Threads of that team."""
     shared: bool
     """Whether the systems of that launch are assembled and solved in shared memory."""
+    tiled: bool
+    """Whether elastic stiffness is assembled by tiles of functions, see ``tile_kernels``."""
 
     @property
     def parameters(self) -> SoftModel:
@@ -150,7 +161,9 @@ class StepTables:
         """What keeps Newton's iteration from its fast path on a GPU, a sentence each; none on a CPU."""
         if not self.model.device.is_cuda:
             return ()
-        return newton_notes(self.system.size, one_launch=self.one_launch, shared=self.shared)
+        return newton_notes(
+            self.system.size, one_launch=self.one_launch, shared=self.shared, by_panels=self.system.by_panels
+        )
 
     @property
     def unknowns(self) -> tuple[int, int]:
@@ -167,9 +180,9 @@ class StepTables:
         self.step.options.dt, self.step.options.stick_range = dt, self.options.stick_velocity * dt
         return self.step
 
-    def launch(self, kernel: Kernel, dim: int | Sequence[int], *arguments: object, block_dim: int = 256) -> None:
+    def launch(self, kernel: Kernel, dim: int | Sequence[int], *arguments: object, block_dim: int = 0) -> None:
         """Launch a kernel on the model's device; see :func:`softmode.deformables.model.declare.launch`."""
-        launch(self.model.device, kernel, dim, *arguments, block_dim=block_dim)
+        launch(self.model.device, kernel, dim, *arguments, block_dim=block_dim or self.block)
 
     def launch_teams(self, kernel: Kernel, count: int, *arguments: object) -> None:
         """Launch one team of threads per world or instance, each in a block of its own."""
@@ -221,13 +234,16 @@ def allocate_tables(
     size = (3 * layout.stride, 3 * layout.stride + 4 * -(-(rigid.count_max + 1) // 4))
     shared = device.is_cuda and one_launch and one_each and not driven
     shared = shared and fits_in_shared_memory(device.max_shared_memory_per_block, *size)
+    tiled = device.is_cuda and not one_launch and layout.stride >= TILE
+    few = tiled and count <= FEW_WORLDS
 
     def chunks(threads: int, tasks: int) -> int:
         """Return into how many parts sums over points are split where a kernel has so many threads, a body tasks."""
         if not device.is_cuda:
             return 1
-        return int(np.clip(world_team // tasks if one_launch else CUDA_THREADS // threads, 1, 16))
+        return int(np.clip(world_team // tasks if one_launch else CUDA_THREADS // threads, 1, 64 if few else 16))
 
+    slabs = cache_slabs(blocks, layout.point_max)
     sizes = {
         "instance": count,
         "world": layout.world_count,
@@ -236,11 +252,14 @@ def allocate_tables(
         "point": layout.point_max,
         "sample": layout.sample_max,
         "slot": SLOTS,
-        "team": team_size(device),
+        "team": LARGE_TEAM if few else team_size(device),
         "constraint": room + layout.pin_max,
         "rigid": rigid.count_max,
         "gradient_chunk": world_team // WARP if shared else chunks(count * blocks, blocks),
-        "stiffness_chunk": chunks(count * square, square + (square + 3 * blocks) // 2),
+        "stiffness_chunk": chunk_count(count, layout.stride)
+        if tiled
+        else chunks(count * square, square + (square + 3 * blocks) // 2),
+        "slab": 1 if device.is_cuda else -(-layout.point_max // slabs),
         "pin_instance": count if layout.pin_max else 1,
         "pin_row": layout.stride if layout.pin_max else 1,
         "pin_block": blocks if layout.pin_max else 1,
@@ -259,6 +278,7 @@ def allocate_tables(
     }
     state = allocate(NewtonState, _NEWTON, sizes, device, given=given)
     constant = _newton_options(options, rigid, system)
+    constant.stiffness_slabs = slabs
     step = allocate(
         NewtonStep, "", {}, device, given={**structs, "rigid": rigid.table, "state": state, "options": constant}
     )
@@ -286,23 +306,28 @@ def allocate_tables(
         parameter_flags=wp.zeros(count, dtype=int, device=device),
         every_world=wp.full(layout.world_count + 1, True, dtype=bool, device=device),
         team=sizes["team"],
+        block=LARGE_TEAM if few else 256,
         one_launch=one_launch,
         fused_kernel=fused.newton_kernel(
             system.unit.dtype, *(size if shared else ()), team=world_team, joined=joined and device.is_cpu
         ),
         world_team=world_team,
         shared=shared,
+        tiled=tiled,
     )
 
 
-def newton_notes(size: int, *, one_launch: bool, shared: bool) -> tuple[str, ...]:
+def newton_notes(size: int, *, one_launch: bool, shared: bool, by_panels: bool = False) -> tuple[str, ...]:
     """Return why systems of ``size`` unknowns are not solved in shared memory, all iterations in one launch."""
     if not one_launch:
         most = LANES * ONE_LAUNCH_BLOCKS
-        return (
+        note = (
             f"systems of {size} unknowns take a launch per phase of each Newton iteration: "
-            f"one launch takes worlds whose bodies do not touch each other and have at most {most} functions",
+            f"one launch takes worlds whose bodies do not touch each other and have at most {most} functions"
         )
+        if by_panels:
+            note += "; the whole device shares a system, panel by panel"
+        return (note,)
     if not shared:
         return (
             f"systems of {size} unknowns are solved in global memory: shared memory takes one body per world, "
