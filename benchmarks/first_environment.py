@@ -2,8 +2,9 @@
 
 Run: ``python -m benchmarks.first_environment [--environment softmode/LiftSoft-v0] [--device cpu] [--modules 20]``.
 Kernels go to an empty folder that is removed afterwards; bodies come from the cache, so run it twice to leave out the
-build. Two versions compare with the same script: ``PYTHONPATH=<the other tree> python benchmarks/first_environment.py``. With
-``--warm`` the same process is started a second time on the folder of the first: what a later start takes.
+build. Two versions compare with the same script: ``PYTHONPATH=<the other tree> python
+benchmarks/first_environment.py``. With ``--warm`` the same process is started a second time on the folder of the first:
+what a later start takes.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import sys
 import tempfile
 import threading
 import time
+from typing import Any
 
 
 def main() -> None:
@@ -41,16 +43,17 @@ def start(options: argparse.Namespace) -> None:
     import warp as wp
 
     spent: dict[str, tuple[float, str]] = {}
-    load = wp.Module.load
+    warp_module: Any = wp.Module
+    load = warp_module.load
 
-    def timed(module: wp.Module, *rest: object, **given: object) -> object:
+    def timed(module: Any, *rest: Any, **given: Any) -> Any:
         before = time.thread_time()
         found = load(module, *rest, **given)
         seconds, thread = spent.get(module.name, (0.0, threading.current_thread().name))
         spent[module.name] = seconds + time.thread_time() - before, thread
         return found
 
-    wp.Module.load = timed
+    warp_module.load = timed
     wp.config.log_level = wp.LOG_WARNING
     import gymnasium as gym
 

@@ -82,8 +82,10 @@ def compiling_aside(device: wp.DeviceLike) -> Iterator[None]:
 
     def compiled(launch: Callable[..., Any]) -> Callable[..., Any]:
         def compile_and_launch(kernel: Any, *rest: Any, **given: Any) -> Any:
+            dim = given["dim"] if "dim" in given else rest[0]
             key = kernel.module, (given.get("block_dim") or BLOCK) if own.is_cuda else None
-            if key not in seen and not kernel.is_generic and wp.get_device(given.get("device")) == own:
+            wanted = key not in seen and not kernel.is_generic and np.min(dim) > 0
+            if wanted and wp.get_device(given.get("device")) == own:
                 seen.add(key)
                 _load({key: None}, own)
             return launch(kernel, *rest, **given)
