@@ -195,7 +195,7 @@ class Task:
             }
             self.plan = filled(self.kernels.Plan, self, config, config.scene.control, self.scene.soft, **columns)
             """What the task's own kernels know beside the state."""
-        compile_launches(self.scene.control_step, self.device)
+        compile_launches(self._launches, self.device)
         self.reset()
         self.graph = capture_graph(self._step, self.device)
         """The step as a captured graph."""
@@ -714,6 +714,14 @@ class Task:
                 self.restart(self._fresh)
                 self.write_observation()
         self.draw_pictures()
+
+    def _launches(self) -> None:
+        """Launch what a step launches, for the kernels to be compiled: all of them, so that none is compiled twice."""
+        self.before_step()
+        self.scene.control_step()
+        self.write_observation()
+        self.finish(self.never)
+        self.clear()
 
     def restart(self, mask: wp.array) -> None:
         """Start new episodes in the worlds of the mask."""

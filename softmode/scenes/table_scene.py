@@ -15,7 +15,7 @@ from softmode.deformables.coupling.rigid_solver import mujoco_warnings
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import register_custom_attributes, reserve_room
-from softmode.deformables.model.compile_ahead import compile_for_building
+from softmode.deformables.model.compile_ahead import compile_for_building, compiling_aside
 from softmode.deformables.model.declare import launch
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.body_choice import BodyChoice, copy_slots
@@ -137,8 +137,9 @@ class TableScene:
         self.dt = 1.0 / (config.control_hz * config.substeps)
         self._load(progress)
         compile_for_building(self.device, control_kernels, kernels)
-        self._build_model()
-        self._build_solver()
+        with compiling_aside(self.device):
+            self._build_model()
+            self._build_solver()
         self.marker_place = wp.zeros(world_count, dtype=wp.transform, device=self.device)
         """Where the marker is drawn, transform, shape (world_count,)."""
         self.marker_place.fill_(wp.transform_identity())

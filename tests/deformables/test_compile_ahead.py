@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.model.compile_ahead import compile_launches
+from softmode.deformables.model.compile_ahead import compile_launches, compiling_aside
 from softmode.quiet import listening
 
 
@@ -65,6 +66,28 @@ def test_without_it_launches_compile(told: Callable[[Callable[[], None]], list[s
     """The lines that the other test counts are those of kernels that were not compiled before."""
     numbers, flag = wp.zeros(8, dtype=int, device="cpu"), wp.zeros(1, dtype=int, device="cpu")
     assert len(told(launches_of(numbers, flag, 200))) == 2
+
+
+def test_other_threads_compile_what_is_launched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Modules are loaded by threads that compile, before launches that then act; without it, by the thread of ours."""
+    loaded: list[str] = []
+    load: Any = wp.Module.load
+
+    def noted(module: Any, *rest: Any, **given: Any) -> Any:
+        if not module.execs:
+            loaded.append(threading.current_thread().name)
+        return load(module, *rest, **given)
+
+    monkeypatch.setattr(wp.Module, "load", noted)
+    numbers = wp.zeros(8, dtype=int, device="cpu")
+    with compiling_aside("cpu"):
+        wp.launch(adder(300), numbers.shape, [numbers], device="cpu")
+        wp.launch(adder(301), 0, [numbers], device="cpu")
+        wp.launch_tiled(adder(302), dim=numbers.shape, inputs=[numbers], device="cpu", block_dim=32)
+    np.testing.assert_array_equal(numbers.numpy(), 300 + 302)
+    assert len(loaded) == 2 and all(name.startswith("compile") for name in loaded)
+    wp.launch(adder(303), numbers.shape, [numbers], device="cpu")
+    assert loaded[2:] == [threading.current_thread().name]
 
 
 def test_warp_is_itself_again() -> None:

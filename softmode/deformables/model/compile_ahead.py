@@ -69,6 +69,39 @@ def compile_launches(launches: Callable[[], None], device: wp.DeviceLike) -> Non
 
 
 @contextmanager
+def compiling_aside(device: wp.DeviceLike) -> Iterator[None]:
+    """Let the threads that compile do so for launches that cannot be collected, since what they find is read between.
+
+    The thread that launches would compile Warp's headers once more for its first module, 1.6 s on a CPU.
+
+    Args:
+        device: Warp device.
+    """
+    own, seen = wp.get_device(device), set()
+    before: dict[str, Any] = {name: getattr(wp, name) for name in ("launch", "launch_tiled")}
+
+    def compiled(launch: Callable[..., Any]) -> Callable[..., Any]:
+        def compile_and_launch(kernel: Any, *rest: Any, **given: Any) -> Any:
+            dim = given["dim"] if "dim" in given else rest[0]
+            key = kernel.module, (given.get("block_dim") or BLOCK) if own.is_cuda else None
+            wanted = key not in seen and not kernel.is_generic and np.min(dim) > 0
+            if wanted and wp.get_device(given.get("device")) == own:
+                seen.add(key)
+                _load({key: None}, own)
+            return launch(kernel, *rest, **given)
+
+        return compile_and_launch
+
+    for name, launch in before.items():
+        setattr(wp, name, compiled(launch))
+    try:
+        yield
+    finally:
+        for name, launch in before.items():
+            setattr(wp, name, launch)
+
+
+@contextmanager
 def _collecting(device: wp.Device) -> Iterator[Wanted]:
     """Collect what launches on a device need instead of launching; branches and loops are gone through once.
 
