@@ -106,6 +106,30 @@ def pose_of(
     return transform[shape]
 
 
+@wp.func
+def beyond(distance: float, rate: float, radius: float, slope: float) -> bool:
+    """Return whether a ball is behind a plane and stays there on its way along the light.
+
+    Its middle is `distance` before the plane and comes nearer by `rate`, both in units of the length of (1, slope).
+    """
+    return rate <= 0.0 and distance < -radius * wp.sqrt(1.0 + slope * slope)
+
+
+@wp.func
+def outside(p: wp.vec3, radius: float, ahead: wp.vec3, lens: wp.vec4, size: wp.vec2i) -> bool:
+    """Return whether a ball in the frame of the camera is outside of the picture on all of its way along `ahead`."""
+    if beyond(p[2], ahead[2], radius, 0.0):
+        return True
+    for axis in range(2):
+        low = (-1.0 - lens[2 + axis]) / lens[axis]
+        high = (float(size[axis]) + 1.0 - lens[2 + axis]) / lens[axis]
+        if beyond(p[axis] - low * p[2], ahead[axis] - low * ahead[2], radius, low):
+            return True
+        if beyond(high * p[2] - p[axis], high * ahead[2] - ahead[axis], radius, high):
+            return True
+    return False
+
+
 @wp.kernel
 def place_shapes(
     faces: Faces,
@@ -116,20 +140,36 @@ def place_shapes(
     body: wp.array[int],
     # State in:
     body_q: wp.array[wp.transform],
+    # Boxes:
+    kind: wp.array[int],  # (world_count,)
+    center: wp.array2d[wp.vec3],  # (kinds, slots) middle of each shape in its frame [m]
+    half: wp.array2d[wp.vec3],  # half of its extent [m]
+    size: wp.vec2i,  # of the picture [px]
+    frame: wp.mat33,  # rows: two axes across the light, the light's direction
     # Out:
     to_camera_out: wp.array2d[wp.mat44],  # (view_count, slots) shape to camera; below, the camera in the shape's frame
+    casts_out: wp.array2d[wp.bool],  # (view_count, slots) whether its shadow can be in the picture
 ):
-    """Bring every shape to every camera; a hidden one gets no last one."""
+    """Bring every shape to every camera; one that is hidden or outside of the picture gets no last one."""
     view, slot = wp.tid()
-    shape = faces.shape[views.world[view], slot]
+    world = views.world[view]
+    shape = faces.shape[world, slot]
     if shape < 0 or (flags[shape] & VISIBLE) == 0:
         to_camera_out[view, slot] = wp.mat44()
+        casts_out[view, slot] = False
         return
     pose = pose_of(shape, transform, body, body_q)
     matrix = views.world_to_camera[view]
     turn = rotation_of(matrix)
     r = turn * wp.quat_to_matrix(wp.transform_get_rotation(pose))
     t = turn * wp.transform_get_translation(pose) + wp.vec3(matrix[0, 3], matrix[1, 3], matrix[2, 3])
+    middle = r * center[kind[world], slot] + t
+    radius = wp.length(half[kind[world], slot])
+    lens = views.intrinsics[view]
+    casts_out[view, slot] = not outside(middle, radius, turn * wp.vec3(frame[2, 0], frame[2, 1], frame[2, 2]), lens, size)
+    if outside(middle, radius, wp.vec3(), lens, size):
+        to_camera_out[view, slot] = wp.mat44()
+        return
     to_camera_out[view, slot] = rows_of(r, t, -(wp.transpose(r) * t))
 
 
@@ -163,22 +203,25 @@ def light_shapes(
 
 @wp.kernel
 def bound_casters(
+    views: Views,
+    casts: wp.array2d[wp.bool],  # (view_count, slots)
+    to_light: wp.array2d[wp.mat44],
     kind: wp.array[int],  # (world_count,)
     center: wp.array2d[wp.vec3],  # (kinds, slots) middle of each shape in its frame [m]
     half: wp.array2d[wp.vec3],  # half of its extent [m], 0 along z for a sheet
-    to_light: wp.array2d[wp.mat44],
     cells: int,
     # Out:
-    grid_out: wp.array[wp.vec3],  # (world_count,) lowest corner across the light [m], cells per metre, 0 for no shadow
+    grid_out: wp.array[wp.vec3],  # (view_count,) lowest corner across the light [m], cells per metre, 0 for no shadow
 ):
     """Find where across the light shapes are that cast shadows; a sheet that faces the light does not."""
-    world = wp.tid()
+    view = wp.tid()
+    world = views.world[view]
     low = wp.vec2(1.0e30, 1.0e30)
     high = wp.vec2(-1.0e30, -1.0e30)
     for slot in range(to_light.shape[1]):
         m = to_light[world, slot]
         h = half[kind[world], slot]
-        if m[3, 3] > 0.0 and h[0] + h[1] > 0.0 and not (h[2] == 0.0 and m[2, 2] <= 0.0):
+        if casts[view, slot] and h[0] + h[1] > 0.0 and not (h[2] == 0.0 and m[2, 2] <= 0.0):
             p = wp.transform_point(m, center[kind[world], slot])
             for axis in range(2):
                 extent = wp.abs(m[axis, 0]) * h[0] + wp.abs(m[axis, 1]) * h[1] + wp.abs(m[axis, 2]) * h[2]
@@ -189,7 +232,7 @@ def bound_casters(
     if width > 0.0:
         rate = float(cells) / (1.001 * width)
         low = low - wp.vec2(0.0005 * width, 0.0005 * width)
-    grid_out[world] = wp.vec3(low[0], low[1], rate)
+    grid_out[view] = wp.vec3(low[0], low[1], rate)
 
 
 @wp.func
@@ -215,7 +258,7 @@ def fill_samples(
     key_out: wp.array2d[wp.uint64],  # (view_count, height * width * samples)
 ):
     """Keep the nearest triangle in every sample; a thread has one triangle in one tile of the picture."""
-    view, tile, i = wp.tid()
+    view, i, tile = wp.tid()
     own = span[views.world[view]]
     if i >= own[1]:
         return
@@ -295,7 +338,7 @@ def list_points(
     view, row, part = wp.tid()
     world = views.world[view]
     lens = views.intrinsics[view]
-    own = grid[world]
+    own = grid[view]
     samples = spots.shape[0]
     for column in range(part * span, wp.min((part + 1) * span, size[0])):
         place = (row * size[0] + column) * samples
@@ -341,6 +384,7 @@ def cast_shadows(
     faces: Faces,
     span: wp.array[wp.vec2i],  # (world_count,) first triangle and number of triangles
     views: Views,
+    casts: wp.array2d[wp.bool],
     to_light: wp.array2d[wp.mat44],
     grid: wp.array[wp.vec3],
     cells: int,
@@ -350,15 +394,18 @@ def cast_shadows(
     points: Points,
 ):
     """Darken the listed points behind a triangle that faces away from the light; not those on the triangle itself."""
-    view, tile, i = wp.tid()
+    view, i, tile = wp.tid()
     world = views.world[view]
     own = span[world]
     if i >= own[1]:
         return
     f = own[0] + i
-    m = to_light[world, faces.slot[f]]
+    slot = faces.slot[f]
+    if not casts[view, slot]:
+        return
+    m = to_light[world, slot]
     n = faces.plane[f]
-    if m[2, 0] * n[0] + m[2, 1] * n[1] + m[2, 2] * n[2] <= 1.0e-6 or grid[world][2] == 0.0:
+    if m[2, 0] * n[0] + m[2, 1] * n[1] + m[2, 2] * n[2] <= 1.0e-6:
         return
     v0 = wp.transform_point(m, faces.corner[f, 0])
     v1 = wp.transform_point(m, faces.corner[f, 1])
@@ -368,8 +415,8 @@ def cast_shadows(
     area = a[0] * b[1] - a[1] * b[0]
     if area == 0.0:
         return
-    low = cell_of(grid[world], cells, wp.min(v0[0], wp.min(v1[0], v2[0])), wp.min(v0[1], wp.min(v1[1], v2[1])))
-    high = cell_of(grid[world], cells, wp.max(v0[0], wp.max(v1[0], v2[0])), wp.max(v0[1], wp.max(v1[1], v2[1])))
+    low = cell_of(grid[view], cells, wp.min(v0[0], wp.min(v1[0], v2[0])), wp.min(v0[1], wp.min(v1[1], v2[1])))
+    high = cell_of(grid[view], cells, wp.max(v0[0], wp.max(v1[0], v2[0])), wp.max(v0[1], wp.max(v1[1], v2[1])))
     window = window_in(tile, edge, cells, cells)
     nearest = wp.min(v0[2], wp.min(v1[2], v2[2]))
     per_area = 1.0 / area

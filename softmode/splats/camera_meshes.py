@@ -131,7 +131,8 @@ class MeshImages:
         self._to_camera = wp.zeros((views, slots), dtype=wp.mat44, device=device)
         self._to_light = wp.zeros((worlds, slots), dtype=wp.mat44, device=device)
         self._albedo = wp.zeros((worlds, slots), dtype=wp.vec3, device=device)
-        self._grid = wp.zeros(worlds, dtype=wp.vec3, device=device)
+        self._casts = wp.zeros((views, slots), dtype=wp.bool, device=device)
+        self._grid = wp.zeros(views, dtype=wp.vec3, device=device)
         count = width * height * samples
         self._key = wp.full((views, count), value=NOTHING, dtype=wp.uint64, device=device)
         points = kernels.Points()
@@ -156,17 +157,18 @@ class MeshImages:
         rows = (count, height, width // span)
         if self._ranges:
             shapes = (model.shape_flags, model.shape_transform, model.shape_body)
-            placed = (self._to_camera, self._to_light)
-            launch(device, kernels.place_shapes, placed[0].shape, faces, views, *shapes, state.body_q, placed[0])
-            given = (*shapes, model.shape_color, state.body_q)
+            boxes = (self._kind, self._center, self._half)
             launch(
-                device, kernels.light_shapes, placed[1].shape,
-                faces, self._frame, *given, placed[1], self._albedo,
+                device, kernels.place_shapes, self._to_camera.shape,
+                faces, views, *shapes, state.body_q, *boxes, size, self._frame, self._to_camera, self._casts,
             )  # fmt: skip
+            given = (*shapes, model.shape_color, state.body_q)
+            placed = (self._to_light, self._albedo)
+            launch(device, kernels.light_shapes, self._to_light.shape, faces, self._frame, *given, *placed)
             for number, part, edge in self._ranges:
-                dim = (count, -(-width // edge) * -(-height // edge), number)
-                lens = (self._spots, self._reach, edge, size)
-                launch(device, kernels.fill_samples, dim, faces, part, views, placed[0], *lens, self._key)
+                dim = (count, number, -(-width // edge) * -(-height // edge))
+                lens = (self._to_camera, self._spots, self._reach, edge, size)
+                launch(device, kernels.fill_samples, dim, faces, part, views, *lens, self._key)
             self._cast(rows, size, span)
         drawn = (variation.horizon, variation.zenith, variation.light_gain, self._shape_segment)
         splats = self._no_shadow if shadow is None else shadow.map
@@ -181,15 +183,15 @@ class MeshImages:
         device, faces, views, points, cells = self.device, self._faces, self._views, self._points, self._cells
         if self._options.shadows:
             points.first.fill_(-1)
-            place = (self._kind, self._center, self._half, self._to_light, cells)
-            launch(device, kernels.bound_casters, self._grid.shape[0], *place, self._grid)
+            place = (self._casts, self._to_light, self._kind, self._center, self._half, cells)
+            launch(device, kernels.bound_casters, self._grid.shape[0], views, *place, self._grid)
         seen = (self._to_camera, self._to_light, self._grid, cells, self._spots, size, span, self._key)
         launch(device, kernels.list_points, rows, faces, views, *seen, points)
         if not self._options.shadows:
             return
         for number, part, edge in self._ranges:
-            dim = (rows[0], (-(-cells // edge)) ** 2, number)
-            place = (self._to_light, self._grid, cells, edge, self._key)
+            dim = (rows[0], number, (-(-cells // edge)) ** 2)
+            place = (self._casts, self._to_light, self._grid, cells, edge, self._key)
             launch(device, kernels.cast_shadows, dim, faces, part, views, *place, points)
 
 
