@@ -166,7 +166,9 @@ def place_shapes(
     middle = r * center[kind[world], slot] + t
     radius = wp.length(half[kind[world], slot])
     lens = views.intrinsics[view]
-    casts_out[view, slot] = not outside(middle, radius, turn * wp.vec3(frame[2, 0], frame[2, 1], frame[2, 2]), lens, size)
+    casts_out[view, slot] = not outside(
+        middle, radius, turn * wp.vec3(frame[2, 0], frame[2, 1], frame[2, 2]), lens, size
+    )
     if outside(middle, radius, wp.vec3(), lens, size):
         to_camera_out[view, slot] = wp.mat44()
         return
@@ -361,9 +363,7 @@ def list_points(
                 area = wp.dot(wp.cross(a, b), n)
                 s = wp.clamp(wp.dot(wp.cross(q - corner, b), n) / area, 0.0, 1.0)
                 t = wp.clamp(wp.dot(wp.cross(a, q - corner), n) / area, 0.0, 1.0 - s)
-                n = wp.normalize(
-                    (1.0 - s - t) * faces.normal[f, 0] + s * faces.normal[f, 1] + t * faces.normal[f, 2]
-                )
+                n = wp.normalize((1.0 - s - t) * faces.normal[f, 0] + s * faces.normal[f, 1] + t * faces.normal[f, 2])
                 light = to_light[world, slot]
                 toward = -(light[2, 0] * n[0] + light[2, 1] * n[1] + light[2, 2] * n[2])
                 at = wp.transform_point(light, q + OFF * n)
@@ -486,9 +486,7 @@ def shade_pixels(
                     depth = points.depth[view, lit]
                     left = float(SHADOW_LIGHT)
                     if depth > DARK:
-                        left = 1.0 - (1.0 - SHADOW_LIGHT) * covered_share(
-                            splats, world, points.place[view, lit], depth
-                        )
+                        left = 1.0 - (1.0 - SHADOW_LIGHT) * covered_share(splats, world, points.place[view, lit], depth)
                     light += (facing[0] * left) * look.sun
                 radiance += wp.cw_mul(albedo[world, slot], light)
         color = wp.vec3()

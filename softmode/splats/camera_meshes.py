@@ -6,7 +6,6 @@ shape; poses, colours and the flag VISIBLE of the shapes are read anew by every 
     place shapes -> triangles into samples -> points across the light -> shadows -> light
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,9 +19,10 @@ from softmode.deformables.model.declare import launch
 from softmode.splats import camera_mesh_kernels as kernels
 from softmode.splats.camera_options import CameraOptions
 from softmode.splats.camera_randomization import ViewVariation
+from softmode.splats.light import encoded_light, light_frame
 from softmode.splats.rasterizer import ViewArrays
-from softmode.splats.scan_kernels import ENCODED, NOTHING
-from softmode.splats.shadow import SplatShadow, light_frame, no_shadow
+from softmode.splats.scan_kernels import NOTHING
+from softmode.splats.shadow import SplatShadow, no_shadow
 from softmode.splats.shape_triangles import shape_triangles
 
 PLANE_EXTENT = 2000.0
@@ -93,7 +93,7 @@ class MeshImages:
         self._views.world_to_camera, self._views.intrinsics = views.world_to_camera, views.intrinsics
         self._views.world = views.world
         self._frame = wp.mat33(*light_frame(options.light_direction).ravel())
-        self._look = look(options, device)
+        self._look = _look(options, device)
         self._no_shadow = no_shadow(device)
         spots = np.array(SPOTS[options.mesh_samples], np.float32) - 0.5
         self._spots, self._reach = wp.array(spots, dtype=wp.vec2, device=device), float(np.abs(spots).max())
@@ -195,20 +195,13 @@ class MeshImages:
             launch(device, kernels.cast_shadows, dim, faces, part, views, *place, points)
 
 
-def look(options: CameraOptions, device: wp.Device) -> Any:
+def _look(options: CameraOptions, device: wp.Device) -> Any:
     """Return the light that is alike in all worlds, as kernels take it."""
     made = kernels.Look()
     made.above, made.below = (wp.vec3(*radiance) for radiance in options.ambient)
     made.sun = wp.vec3(*options.light_color)
     made.encoded = encoded_light(device)
     return made
-
-
-def encoded_light(device: wp.Device) -> wp.array:
-    """Return the sRGB of linear light 0..1 in equal steps, shape (ENCODED + 1,)."""
-    light = np.linspace(0.0, 1.0, ENCODED + 1)
-    table = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
-    return wp.array(table.astype(np.float32), dtype=wp.float32, device=device)
 
 
 def _kinds(model: newton.Model, segments: int) -> _Kinds:
@@ -259,7 +252,7 @@ def _shown(model: newton.Model) -> NDArray[np.int64]:
 def _faces_of(
     model: newton.Model, shapes: NDArray[np.int64], types: Any, scales: Any, segments: int
 ) -> tuple[Any, Any, Any, Any, Any, Any, int]:
-    """Return planes, corners, normals, slots, middles and half extents of the triangles of shapes, and how many are small."""
+    """Return planes, corners, normals and slots of triangles, middles and half extents of shapes, and the small ones."""
     parts = [(np.zeros((0, 4)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), np.zeros(0, np.int32))]
     middle, half = np.zeros((2, len(shapes), 3))
     for slot, shape in enumerate(shapes.tolist()):

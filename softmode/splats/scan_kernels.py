@@ -49,6 +49,22 @@ def reached(box: wp.vec4, lens: wp.vec4, a: wp.vec3, b: wp.vec3) -> wp.vec4:
 @wp.func
 def box_of(lens: wp.vec4, v0: wp.vec3, v1: wp.vec3, v2: wp.vec3) -> wp.vec4:
     """Return the box of what is visible of a triangle in the frame of the camera [px]."""
+    if wp.min(v0[2], wp.min(v1[2], v2[2])) > NEAR:  # most triangles
+        d0 = 1.0 / v0[2]
+        d1 = 1.0 / v1[2]
+        d2 = 1.0 / v2[2]
+        x0 = v0[0] * d0
+        x1 = v1[0] * d1
+        x2 = v2[0] * d2
+        y0 = v0[1] * d0
+        y1 = v1[1] * d1
+        y2 = v2[1] * d2
+        return wp.vec4(
+            lens[0] * wp.min(x0, wp.min(x1, x2)) + lens[2],
+            lens[1] * wp.min(y0, wp.min(y1, y2)) + lens[3],
+            lens[0] * wp.max(x0, wp.max(x1, x2)) + lens[2],
+            lens[1] * wp.max(y0, wp.max(y1, y2)) + lens[3],
+        )
     box = wp.vec4(1.0e30, 1.0e30, -1.0e30, -1.0e30)
     box = reached(box, lens, v0, v1)
     box = reached(box, lens, v1, v2)

@@ -1,15 +1,13 @@
 """The shadow that splats cast on meshes: a small orthographic depth map along the light, one per world."""
 
-from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from softmode.deformables.model.declare import launch
 from softmode.splats import shadow_kernels as kernels
 from softmode.splats.camera_options import CameraOptions, ShadowOptions
+from softmode.splats.light import light_frame
 from softmode.splats.rasterizer import SplatArrays, spanning_columns
 
 
@@ -64,14 +62,6 @@ class SplatShadow:
         launch(device, kernels.bound_map, self.world_count, *cast, self._frame, spanning, self._bounds)
         place = (self._bounds, self._frame, options.margin)
         launch(device, kernels.fill_map, (self.world_count, count), *cast, *place, self._map)
-
-
-def light_frame(direction: Sequence[float]) -> NDArray[np.float64]:
-    """Return two axes across a light and its direction as rows, shape (3, 3)."""
-    ahead = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
-    first = np.cross(ahead, [1.0, 0.0, 0.0] if abs(ahead[0]) < 0.9 else [0.0, 1.0, 0.0])
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(ahead, first), ahead])
 
 
 def no_shadow(device: wp.Device) -> Any:
