@@ -58,9 +58,10 @@ class Points:
 
     place: wp.array2d[wp.vec2]  # (view_count, samples) across the light [m]
     depth: wp.array2d[float]  # along the light [m], DARK in the shadow
-    facing: wp.array2d[wp.vec2]  # cosines to the light and to the zenith
+    facing: wp.array2d[wp.vec2]  # cosines to the light and to the zenith; the first is -1 where no point is
     following: wp.array2d[int]  # next sample in the cell, -1 for none
     first: wp.array2d[int]  # (view_count, cells^2) first sample in a cell, -1 for none
+    width: int  # of the picture [px]
 
 
 @wp.struct
@@ -287,7 +288,7 @@ def fill_samples(
     bottom = wp.min(int(wp.floor(wp.min(box[3] - 0.5 + margin, float(size[1])))), window[3])
     if left > right or top > bottom:
         return
-    plane = (-(1.0 - COPLANAR * float(slot)) / height) * (rotation_of(m) * n)
+    plane = (-farther(slot) / height) * (rotation_of(m) * n)
     scan(
         wp.cross(v2, v1), wp.cross(v0, v2), wp.cross(v1, v0), plane,
         lens, wp.vec4i(left, top, right, bottom), 1, size[0], spots, reach, view, f, key_out,
@@ -302,6 +303,12 @@ def cell_of(grid: wp.vec3, cells: int, x: float, y: float) -> wp.vec2i:
         int(wp.clamp(wp.floor((x - grid[0]) * grid[2]), 0.0, last)),
         int(wp.clamp(wp.floor((y - grid[1]) * grid[2]), 0.0, last)),
     )
+
+
+@wp.func
+def farther(slot: int) -> float:
+    """Return the factor on 1 / z by which a shape counts as farther than it is."""
+    return 1.0 - COPLANAR * float(slot)
 
 
 @wp.func
@@ -347,6 +354,7 @@ def list_points(
         for sample in range(samples):
             k = key[view, place + sample]
             slot = slot_of(faces, k)
+            points.facing[view, place + sample] = wp.vec2(-1.0, 0.0)
             if slot >= 0 and seen_before(faces, key, view, place, sample, slot) == sample:
                 f = int(wp.uint32(k))
                 x = (float(column) + 0.5 + spots[sample][0] - lens[2]) / lens[0]
@@ -474,7 +482,7 @@ def shade_pixels(
             slot = slot_of(faces, k)
             if slot >= 0:
                 covered += 1.0
-                near = inverse_depth(k) / (1.0 - COPLANAR * float(slot))
+                near = inverse_depth(k) / farther(slot)
                 if near > nearest:
                     nearest = near
                     nearest_slot = slot

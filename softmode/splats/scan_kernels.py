@@ -72,6 +72,12 @@ def box_of(lens: wp.vec4, v0: wp.vec3, v1: wp.vec3, v2: wp.vec3) -> wp.vec4:
 
 
 @wp.func
+def key_at(near: float, id: int) -> wp.uint64:
+    """Return the key of a triangle at 1 / z = near [1/m]; less is nearer."""
+    return (wp.uint64(~wp.cast(near, wp.uint32)) << wp.uint64(32)) | wp.uint64(id)
+
+
+@wp.func
 def scan(
     e0: wp.vec3,
     e1: wp.vec3,
@@ -102,7 +108,6 @@ def scan(
     # Where the middle of a pixel is so far inside, all of its samples are.
     inside = (reach + SLACK) * extent
     samples = spots.shape[0]
-    bits_of_id = wp.uint64(id)
     for row in range(window[1], window[3] + 1, step):
         begin = window[0]
         end = window[2]
@@ -126,8 +131,7 @@ def scan(
                         hit = e[0] >= -slack[0] and e[1] >= -slack[1] and e[2] >= -slack[2]
                     near = at[3] + spot[0] * dx[3] + spot[1] * dy[3]
                     if hit and near > 0.0 and near < 1.0 / NEAR:
-                        bits = wp.uint64(~wp.cast(near, wp.uint32))
-                        wp.atomic_min(key_out, view, place + sample, (bits << wp.uint64(32)) | bits_of_id)
+                        wp.atomic_min(key_out, view, place + sample, key_at(near, id))
             place += samples
 
 
