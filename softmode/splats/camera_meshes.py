@@ -28,7 +28,7 @@ from softmode.splats.shadow import SplatShadow, no_shadow
 
 SEGMENTS = ((160, 24), (1 << 30, 48))
 """Facets around what is round, by the largest edge of the picture [px]."""
-RAYS = 0.5
+RAYS = 0.25
 """Triangles of a mesh for each pixel from which it is met by rays, whose cost hardly grows with them."""
 TILES = (128, 8)
 """Edge of a tile of a thread on CUDA, for small triangles and for large ones [px]."""

@@ -6,7 +6,6 @@ import dataclasses
 
 import newton
 import numpy as np
-import pytest
 import warp as wp
 from numpy.typing import NDArray
 
