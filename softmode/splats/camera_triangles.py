@@ -39,7 +39,8 @@ class Kind:
         self.rays: list[tuple[int, int]] = []
         """Slot of each shape that rays meet, and where its triangles begin."""
         for slot, shape in enumerate(shapes.tolist()):
-            kind, source, scale = GeoType(int(types[shape])), model.shape_source[shape], scales[shape]
+            kind, scale = GeoType(int(types[shape])), scales[shape]
+            source: Any = model.shape_source[shape]
             many = kind == GeoType.MESH and len(source.indices) > 3 * most and bool((scale > 0.0).all())
             corner, normal = _corners(kind, source, scale, segments, many)
             if not len(corner):
@@ -92,7 +93,8 @@ def world_kinds(model: newton.Model, segments: int, most: int) -> WorldKinds:
     """
     worlds = max(int(model.world_count), 1)
     shown = _shown(model)
-    types, scales = (x.numpy() if model.shape_count else np.zeros(0) for x in (model.shape_type, model.shape_scale))
+    given: Any = (model.shape_type, model.shape_scale)
+    types, scales = (x.numpy() if model.shape_count else np.zeros(0) for x in given)
     sources = np.array([id(source) for source in model.shape_source], np.int64)
     owner = np.zeros(0, np.int64) if model.shape_world is None else model.shape_world.numpy()[shown]
     starts = np.argsort(owner, kind="stable")
@@ -127,9 +129,8 @@ def _shown(model: newton.Model) -> NDArray[np.int64]:
 
 def _no_triangles() -> Triangles:
     """Return none."""
-    none = np.zeros(0)
-    shapes = ((0, 4), (0, 3, 3), (0, 3, 3))
-    return Triangles(*(none.reshape(shape) for shape in shapes), none.astype(np.int32), none.astype(bool))
+    corner = np.zeros((0, 3, 3), np.float32)
+    return Triangles(np.zeros((0, 4), np.float32), corner, corner, np.zeros(0, np.int32), np.zeros(0, bool))
 
 
 def _join(parts: list[Triangles]) -> Triangles:
