@@ -7,7 +7,7 @@ Newton keeps for every mesh, and only where the ball around a mesh is in the pic
 import warp as wp
 
 from softmode.splats.camera_mesh_kernels import DARK, Faces, Points, Views, farther, last_row, rotation_of
-from softmode.splats.scan_kernels import NEAR, inverse_depth, key_at
+from softmode.splats.scan_kernels import NEAR, NOTHING, inverse_depth, key_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -41,6 +41,18 @@ def covered_span(c: float, z: float, radius: float, focal: float, middle: float,
     )
 
 
+@wp.func
+def meets_box(off: wp.vec3, ahead: wp.vec3, half: wp.vec3) -> bool:
+    """Return whether a line, `off` from the middle of a box, meets it: no axis across both parts them."""
+    a = wp.cross(off, ahead)
+    slack = 1.001
+    return (
+        wp.abs(a[0]) <= slack * (half[1] * wp.abs(ahead[2]) + half[2] * wp.abs(ahead[1]))
+        and wp.abs(a[1]) <= slack * (half[2] * wp.abs(ahead[0]) + half[0] * wp.abs(ahead[2]))
+        and wp.abs(a[2]) <= slack * (half[0] * wp.abs(ahead[1]) + half[1] * wp.abs(ahead[0]))
+    )
+
+
 @wp.kernel
 def trace_samples(
     faces: Faces,
@@ -71,28 +83,33 @@ def trace_samples(
                 shape = faces.shape[world, slot]
                 scale = rays.scale[shape]
                 turn = wp.transpose(rotation_of(m))
-                eye = wp.cw_div(last_row(m), scale)
+                eye = last_row(m)
+                start = wp.cw_div(eye, scale)
+                box = rays.half[kind, slot]
+                off = eye - rays.center[kind, slot]
                 begin = wp.max(across[0], part * span)
                 for column in range(begin, wp.min(across[1], (part + 1) * span - 1) + 1):
                     for sample in range(samples):
                         x = (float(column) + 0.5 + spots[sample][0] - lens[2]) / lens[0]
                         y = (float(row) + 0.5 + spots[sample][1] - lens[3]) / lens[1]
-                        ray = wp.cw_div(turn * wp.vec3(x, y, 1.0), scale)
-                        place = (row * size[0] + column) * samples + sample
-                        known = key_out[view, place]
-                        farthest = float(1.0e3)
-                        if slot_known(known):
-                            farthest = 1.001 / inverse_depth(known)
-                        hit = wp.mesh_query_ray(rays.mesh[shape], eye, ray, farthest)
-                        if hit.result and hit.t > NEAR and wp.dot(ray, hit.normal) < 0.0:
-                            found = key_at(farther(slot) / hit.t, rays.first[kind, h] + hit.face)
-                            key_out[view, place] = wp.min(known, found)
+                        ahead = turn * wp.vec3(x, y, 1.0)
+                        if meets_box(off, ahead, box):
+                            ray = wp.cw_div(ahead, scale)
+                            place = (row * size[0] + column) * samples + sample
+                            known = key_out[view, place]
+                            farthest = float(1.0e3)
+                            if slot_known(known):
+                                farthest = 1.001 / inverse_depth(known)
+                            hit = wp.mesh_query_ray(rays.mesh[shape], start, ray, farthest)
+                            if hit.result and hit.t > NEAR and wp.dot(ray, hit.normal) < 0.0:
+                                found = key_at(farther(slot) / hit.t, rays.first[kind, h] + hit.face)
+                                key_out[view, place] = wp.min(known, found)
 
 
 @wp.func
 def slot_known(key: wp.uint64) -> bool:
     """Return whether a sample has a triangle."""
-    return wp.uint32(key >> wp.uint64(32)) != wp.uint32(0xFFFFFFFF)
+    return key != wp.uint64(wp.static(NOTHING))
 
 
 @wp.kernel
@@ -126,9 +143,12 @@ def trace_shadows(
                     y = at[1] - middle[1]
                     if x * x + y * y < radius * radius and depth > middle[2] - radius:
                         shape = faces.shape[world, slot]
-                        off = wp.vec3(at[0] - m[0, 3], at[1] - m[1, 3], depth - m[2, 3])
-                        start = wp.cw_div(wp.transpose(rotation_of(m)) * off, rays.scale[shape])
-                        ray = wp.cw_div(-wp.vec3(m[2, 0], m[2, 1], m[2, 2]), rays.scale[shape])
-                        if wp.mesh_query_ray_anyhit(rays.mesh[shape], start, ray, 1.0e8):
-                            depth = DARK
+                        from_origin = wp.vec3(at[0] - m[0, 3], at[1] - m[1, 3], depth - m[2, 3])
+                        here = wp.transpose(rotation_of(m)) * from_origin
+                        ahead = -wp.vec3(m[2, 0], m[2, 1], m[2, 2])
+                        if meets_box(here - rays.center[kind, slot], ahead, rays.half[kind, slot]):
+                            start = wp.cw_div(here, rays.scale[shape])
+                            ray = wp.cw_div(ahead, rays.scale[shape])
+                            if wp.mesh_query_ray_anyhit(rays.mesh[shape], start, ray, 1.0e8):
+                                depth = DARK
             points.depth[view, place] = depth
