@@ -1,4 +1,4 @@
-"""Processor time of a film of LiftSoft: drawing a picture as films do and as a ray tracer does, and encoding it.
+"""Processor time of a film of LiftSoft: drawing a picture as films do and as policies see it, and encoding it.
 
 Run: ``OMP_NUM_THREADS=1 python -m benchmarks.film [--edges 256 512]``.
 """
@@ -49,7 +49,7 @@ def main() -> None:
     """Print a row per size."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--edges", type=int, nargs="+", default=[256, 512], help="edge of each of the two views [px]")
-    print("two views of | traced, ms | film, ms | ratio | encoding 150, s | film of 150, s")
+    print("two views of | of policies, ms | film, ms | ratio | encoding 150, s | film of 150, s")
     for edge in parser.parse_args().edges:
         config = LiftSoftConfig(render_size=edge, mesh_samples=4)
         env = gym.make("softmode/LiftSoft-v0", render_mode="rgb_array", config=config)
@@ -58,11 +58,11 @@ def main() -> None:
         for _ in range(6):
             env.step(env.action_space.sample())
             pictures.append(env.render())
-        traced, drawn = least(functools.partial(task.scene.render, (edge, edge)), 4), least(task.draw_film, 8)
+        seen, drawn = least(functools.partial(task.scene.render, (edge, edge)), 4), least(task.draw_film, 8)
         encoded = encoding(pictures)
         total = FRAMES * drawn + encoded
         print(
-            f"{edge} px | {1e3 * traced:.0f} | {1e3 * drawn:.1f} | {traced / drawn:.1f} | {encoded:.1f} | {total:.1f}",
+            f"{edge} px | {1e3 * seen:.0f} | {1e3 * drawn:.1f} | {seen / drawn:.1f} | {encoded:.1f} | {total:.1f}",
             flush=True,
         )
         env.close()

@@ -1,6 +1,6 @@
 """`SplatCamera`: deforming splats and the meshes of a Newton model in one picture, for all worlds at once.
 
-Meshes (robot, table) come from Newton's `SensorCamera`, splats from `SplatRasterizer`; the two meet by forward depth.
+Meshes (robot, table) come from `MeshImages`, splats from `SplatRasterizer`; the two meet by forward depth.
 Cameras are pinholes with the OpenCV frame, see `softmode.splats.pinhole`.
 """
 
@@ -97,7 +97,7 @@ class SplatCamera:
         randomization: CameraRandomization | None = None,
         overlay: Overlay | None = None,
     ) -> None:
-        """Allocate images and build the mesh sensor."""
+        """Upload the meshes and allocate the images."""
         self.model, self.splats, self.cameras, self.overlay = model, splats, tuple(cameras), overlay
         self.options = options if options is not None else CameraOptions()
         self.device = model.device
@@ -135,17 +135,16 @@ class SplatCamera:
             background=wp.array([self.options.sky[0]], dtype=wp.vec3, device=self.device),
             splat_gain=self.variation.splat_gain,
         )
-        self._sensor_pose = wp.zeros(views, dtype=wp.transform, device=self.device)
-        self._meshes = MeshImages(
-            model,
-            self.cameras,
-            self.options,
-            lens_per_world=self.options.lens_per_world or self.variation.randomization.changes_lens,
-            surface=splats is not None and self.options.splat_shadow is not None,
-        )
+        count = 0 if splats is None else int(splats.object_index.numpy().max()) + 1
+        table, self.labels = segmentation_table(model, tuple(f"splats/{i}" for i in range(count)))
+        """Label of each id of `segmentation`: splat objects, "splats/0" and on, then shapes, "body/shape"."""
+        segment = table if self.options.segmentation else None
+        self._meshes = MeshImages(model, self.views, self.width, self.height, self.options, segment=segment)
         shape = (views, self.height, self.width)
-        self._mesh_rgb = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         self.rgb = wp.zeros((*shape, 3), dtype=wp.uint8, device=self.device)
+        self._segmentation: wp.array | None = None
+        if self.options.segmentation:
+            self._segmentation = wp.full(shape, value=-1, dtype=wp.int32, device=self.device)
         self.rasterizer: SplatRasterizer | None = None
         self._shadow: SplatShadow | None = None
         if splats is not None:
@@ -157,17 +156,6 @@ class SplatCamera:
             )
             if self.options.splat_shadow is not None:
                 self._shadow = SplatShadow(worlds, self.options, self.options.splat_shadow, device=self.device)
-        self._init_segmentation()
-
-    def _init_segmentation(self) -> None:
-        """Name all ids and allocate their image."""
-        count = 0 if self.splats is None else int(self.splats.object_index.numpy().max()) + 1
-        table, self.labels = segmentation_table(self.model, tuple(f"splats/{i}" for i in range(count)))
-        """Label of each id of `segmentation`: splat objects, "splats/0" and on, then shapes, "body/shape"."""
-        self._segmentation: wp.array | None = None
-        if self.options.segmentation:
-            self._shape_segment = wp.array(table, dtype=wp.int32, device=self.device)
-            self._segmentation = wp.full(self._mesh_rgb.shape, value=-1, dtype=wp.int32, device=self.device)
 
     @property
     def depth(self) -> wp.array:
@@ -220,7 +208,7 @@ class SplatCamera:
     def intrinsics(self, name: str) -> wp.array:
         """Return fx, fy, cx, cy [px] of a camera, vec4, shape (world_count,); no copy.
 
-        Write to it for lenses of your own; meshes follow with `CameraOptions.lens_per_world` only.
+        Write to it for lenses of your own.
         """
         return self._part(self.variation.intrinsics, name)
 
@@ -270,7 +258,7 @@ class SplatCamera:
 
         With `mesh_depth`, `views` and `rasterizer` it is what `AdjointRasterizer` needs for gradients of the frame.
         """
-        return self._mesh_rgb
+        return self._meshes.rgb
 
     @property
     def mesh_depth(self) -> wp.array:
@@ -301,31 +289,22 @@ class SplatCamera:
         Args:
             state: Where the bodies are.
         """
-        views, meshes, variation, pose = self.views, self._meshes, self.variation, self._sensor_pose
-        size, placed = self._mesh_rgb.shape, (views.world_to_camera, pose)
+        views, meshes, splats, variation = self.views, self._meshes, self.splats, self.variation
         given = (self._poses, variation.offset, self._body, state.body_q)
-        launch(self.device, kernels.place_cameras, self.view_count, *given, *placed)
-        meshes.render(state, pose, views.intrinsics)
-        launch(
-            self.device, kernels.unpack_meshes, size,
-            meshes.packed, meshes.depth, meshes.active, meshes.lens_per_world,
-            views.world, pose, views.intrinsics,
-            variation.horizon, variation.zenith, variation.light_gain,
-            self._mesh_rgb, meshes.depth,
-        )  # fmt: skip
-        rgb, alpha, object_id = self._mesh_rgb, None, None
-        if self.rasterizer is not None and self.splats is not None:
-            if self._shadow is not None and meshes.active:
-                self._shadow.cast(self.splats, views, pose, meshes, self._mesh_rgb)
-            self.rasterizer.render(self.splats, views, mesh_rgb=self._mesh_rgb, mesh_depth=meshes.depth)
+        launch(self.device, kernels.place_cameras, self.view_count, *given, views.world_to_camera)
+        if self._shadow is not None and splats is not None:
+            self._shadow.draw(splats)
+        meshes.render(state, variation, self._shadow)
+        rgb, alpha, object_id = meshes.rgb, None, None
+        if self.rasterizer is not None and splats is not None:
+            self.rasterizer.render(splats, views, mesh_rgb=meshes.rgb, mesh_depth=meshes.depth)
             rgb, alpha, object_id = self.rasterizer.rgb, self.rasterizer.alpha, self.rasterizer.object_id
         if self.overlay is not None:
-            given = {"mesh_rgb": self._mesh_rgb, "mesh_depth": meshes.depth}
-            self.overlay.draw(views, **given, rgb=rgb, depth=self.depth, alpha=alpha)
-        launch(self.device, kernels.pack_bytes, size, rgb, self.rgb)
+            seen = {"mesh_rgb": meshes.rgb, "mesh_depth": meshes.depth}
+            self.overlay.draw(views, **seen, rgb=rgb, depth=self.depth, alpha=alpha)
+        launch(self.device, kernels.pack_bytes, rgb.shape, rgb, self.rgb)
         if self._segmentation is not None:
-            shapes = (meshes.shape_index, self._shape_segment)
-            launch(self.device, kernels.segment, size, alpha, object_id, *shapes, self._segmentation)
+            launch(self.device, kernels.segment, rgb.shape, alpha, object_id, meshes.segment, self._segmentation)
 
 
 def _carriers(model: newton.Model, camera: PinholeCamera) -> np.ndarray:

@@ -1,141 +1,203 @@
-"""Pictures of the meshes of a Newton model for many views, by Newton's `SensorCamera`.
+"""Pictures of the meshes of a Newton model for all views at once, by rasterising their triangles.
 
-The sensor takes one bundle of rays per call and one pose per view. Where all worlds share a camera's lens, its rays
-are computed once and every world is a view. Where each world has its own lens, every *pixel* is a view of one by one
-pixel: its pose turns the one ray to where the pixel looks, and `world_indices` says which world it sees. Both are one
-launch per camera for all worlds; the second keeps a pose and a world of 32 B per pixel of a camera.
+A view is one camera in one world. The triangles of worlds with equal shapes are stored once, each in the frame of its
+shape; poses, colours and the flag VISIBLE of the shapes are read anew by every frame. A frame is a fixed sequence:
+
+    place shapes -> triangles into samples -> points across the light -> shadows -> light
+
+A mesh of more triangles than the picture can show is met by rays instead, see `camera_ray_kernels`.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import newton
 import numpy as np
 import warp as wp
-from newton.sensors import SensorCamera
 from numpy.typing import NDArray
 
 from softmode.deformables.model.declare import launch
-from softmode.splats import camera_kernels as kernels
+from softmode.splats import camera_mesh_kernels as kernels
+from softmode.splats import camera_ray_kernels as ray_kernels
 from softmode.splats.camera_options import CameraOptions
-from softmode.splats.pinhole import PinholeCamera
+from softmode.splats.camera_randomization import ViewVariation
+from softmode.splats.camera_triangles import WorldKinds, world_kinds
+from softmode.splats.light import encoded_light, light_frame
+from softmode.splats.rasterizer import ViewArrays
+from softmode.splats.scan_kernels import NOTHING
+from softmode.splats.shadow import SplatShadow, no_shadow
+
+SEGMENTS = ((160, 24), (1 << 30, 48))
+"""Facets around what is round, by the largest edge of the picture [px]."""
+RAYS = 0.25
+"""Triangles of a mesh for each pixel from which it is met by rays, whose cost hardly grows with them."""
+TILES = (128, 8)
+"""Edge of a tile of a thread on CUDA, for small triangles and for large ones [px]."""
+MAX_CELLS = 512
+"""Most cells across the light along each side."""
+SPOTS = {1: ((0.5, 0.5),), 4: ((0.5, 0.5), (0.17, 0.33), (0.67, 0.17), (0.83, 0.72))}
+"""Samples of a pixel by their number; a shape is lit at the first one that shows it."""
 
 
 class MeshImages:
     """Colour, forward depth and shape of the visible meshes in every view; views are ordered by camera, then world.
 
     Args:
-        model: The model; what its shape BVH holds is drawn.
-        cameras: The cameras, all of one size.
-        options: Light and sampling, and whether to write which shape is seen.
-        lens_per_world: Worlds have intrinsics of their own.
-        surface: Write albedo and normal of what is seen.
+        model: The model; what is visible now is drawn.
+        views: The cameras.
+        width: Image width [px].
+        height: Image height [px].
+        options: Light and sampling.
+        segment: Id of each shape of the model, shape (shape_count,); None writes none.
     """
 
     def __init__(
         self,
         model: newton.Model,
-        cameras: Sequence[PinholeCamera],
+        views: ViewArrays,
+        width: int,
+        height: int,
         options: CameraOptions,
         *,
-        lens_per_world: bool,
-        surface: bool,
+        segment: NDArray[np.int32] | None,
     ) -> None:
-        """Allocate the images and build Newton's sensor."""
-        self.model, self.lens_per_world = model, lens_per_world
-        self._worlds, device = max(int(model.world_count), 1), model.device
-        shape = (len(cameras) * self._worlds, cameras[0].height, cameras[0].width)
-        self.packed = wp.zeros(shape, dtype=wp.uint32, device=device)
-        """Colours RGBA, 8 bit each, sRGB."""
+        """Upload the triangles and allocate the images."""
+        self.model, self.device, self._options = model, model.device, options
+        self._size, device = (width, height), model.device
+        shape = (views.world_to_camera.shape[0], height, width)
+        self.rgb = wp.zeros(shape, dtype=wp.vec3, device=device)
+        """Meshes, sky and shadows, vec3 0..1, shape (view_count, height, width)."""
         self.depth = wp.zeros(shape, dtype=wp.float32, device=device)
-        """Depth [m], 0 where no mesh is: along the axis of the camera, or of each pixel with `lens_per_world`."""
-        self.shape_index = wp.full(
-            shape if options.segmentation else (1, 1, 1), value=0xFFFFFFFF, dtype=wp.uint32, device=device
-        )
-        """Shape per pixel, 0xFFFFFFFF where none is."""
-        part = shape if surface else (1, 1, 1)
-        self.albedo = wp.zeros(part, dtype=wp.uint32, device=device)
-        """Colours without light RGBA, 8 bit each, sRGB."""
-        self.normal = wp.zeros(part, dtype=wp.vec3, device=device)
-        """Surface normals in the world."""
-        self._wants_shape, self._wants_surface = options.segmentation, surface
-        self._sensor: SensorCamera | None = None
-        if model.shape_count == 0 or model.bvh_shapes is None:
-            return
-        self._sensor = SensorCamera(model, load_textures=False)
-        direction = wp.vec3f(*(np.asarray(options.light_direction) / np.linalg.norm(options.light_direction)))
-        self._sensor.create_default_light(
-            enable_shadows=options.shadows, direction=direction, color=options.light_color
-        )
-        self._sensor.set_ambient_light(*options.ambient)
-        self._config = SensorCamera.RenderConfig(
-            enable_particles=False,
-            enable_shadows=options.shadows,
-            anti_aliasing=SensorCamera.AntiAliasing.NONE
-            if options.mesh_samples == 1
-            else SensorCamera.AntiAliasing.MSAA,
-        )
-        # The first sample of a bundle sits in the middle: the sensor shades there.
-        spread = [(0.5, 0.5)] if options.mesh_samples == 1 else [(0.5, 0.5), (0.17, 0.33), (0.67, 0.17), (0.83, 0.72)]
-        self._rays: list[Any] = [
-            wp.array(_rays(camera, np.asarray(spread), lens_per_world), dtype=wp.vec3, device=device)
-            for camera in cameras
+        """Forward depth [m], 0 where no mesh is, shape (view_count, height, width)."""
+        named = segment is not None
+        self.segment = wp.full(shape if named else (1, 1, 1), value=-1, dtype=wp.int32, device=device)
+        """Id of the shape, -1 for the sky, shape (view_count, height, width)."""
+        self._shape_segment = wp.array(segment if named else np.zeros(0), dtype=wp.int32, device=device)
+        self._views = kernels.Views()
+        self._views.world_to_camera, self._views.intrinsics = views.world_to_camera, views.intrinsics
+        self._views.world = views.world
+        self._frame = wp.mat33(*light_frame(options.light_direction).ravel())
+        self._look = _look(options, device)
+        self._no_shadow = no_shadow(device)
+        spots = np.array(SPOTS[options.mesh_samples], np.float32) - 0.5
+        self._spots, self._reach = wp.array(spots, dtype=wp.vec2, device=device), float(np.abs(spots).max())
+        segments = next(count for edge, count in SEGMENTS if max(width, height) <= edge)
+        self._load(world_kinds(model, segments, int(RAYS * width * height)))
+        self._allocate(shape[0], len(spots))
+
+    def _load(self, kinds: WorldKinds) -> None:
+        """Upload the triangles."""
+        device, drawn = self.device, kinds.triangles
+        faces = kernels.Faces()
+        faces.plane = wp.array(drawn.plane, dtype=wp.vec4, device=device)
+        faces.corner = wp.array(drawn.corner, dtype=wp.vec3, device=device)
+        faces.normal = wp.array(drawn.normal, dtype=wp.vec3, device=device)
+        faces.slot = wp.array(drawn.slot, dtype=wp.int32, device=device)
+        faces.shape = wp.array(kinds.shape, dtype=wp.int32, device=device)
+        self._faces = faces
+        self._kind = wp.array(kinds.of_world, dtype=wp.int32, device=device)
+        self._center, self._half = (wp.array(x, dtype=wp.vec3, device=device) for x in (kinds.center, kinds.half))
+        self._rays = None
+        if kinds.ray_count.any():
+            rays = ray_kernels.Rays()
+            rays.count, rays.slot, rays.first = (
+                wp.array(x, dtype=wp.int32, device=device) for x in (kinds.ray_count, kinds.ray_slot, kinds.ray_first)
+            )
+            rays.center, rays.half, rays.kind = self._center, self._half, self._kind
+            rays.mesh, rays.scale = self.model.shape_source_ptr, self.model.shape_scale
+            self._rays = rays
+        ranges = [(kinds.small, TILES[0]), (kinds.large, TILES[1])]
+        if device.is_cpu:  # one thread anyway
+            ranges = [(kinds.both, max(*self._size, MAX_CELLS))]
+        self._ranges = [
+            (int(part[:, 1].max()), wp.array(part[kinds.of_world], dtype=wp.vec2i, device=device), edge)
+            for part, edge in ranges
+            if part[:, 1].any()
         ]
-        if lens_per_world:
-            pixels = shape[1] * shape[2]
-            world = np.repeat(np.arange(self._worlds, dtype=np.int32), pixels)
-            self._pixel_world = wp.array(world, dtype=wp.int32, device=device)
-            self._pixel_pose = wp.zeros((self._worlds, *shape[1:]), dtype=wp.transform, device=device)
+        """Number of triangles, those of each world, and the edge of a tile, of each launch over triangles."""
 
-    @property
-    def active(self) -> bool:
-        """Whether the model has meshes to draw."""
-        return self._sensor is not None
+    def _allocate(self, views: int, samples: int) -> None:
+        """Allocate what a frame writes on its way."""
+        device, (width, height) = self.device, self._size
+        worlds, slots = self._faces.shape.shape
+        self._cells = min(max(width, height), MAX_CELLS)
+        self._to_camera = wp.zeros((views, slots), dtype=wp.mat44, device=device)
+        self._to_light = wp.zeros((worlds, slots), dtype=wp.mat44, device=device)
+        self._albedo = wp.zeros((worlds, slots), dtype=wp.vec3, device=device)
+        self._casts = wp.zeros((views, slots), dtype=wp.bool, device=device)
+        self._grid = wp.zeros(views, dtype=wp.vec3, device=device)
+        count = width * height * samples
+        self._key = wp.full((views, count), value=NOTHING, dtype=wp.uint64, device=device)
+        points = kernels.Points()
+        points.width = width
+        points.place = wp.zeros((views, count), dtype=wp.vec2, device=device)
+        points.depth = wp.zeros((views, count), dtype=wp.float32, device=device)
+        points.facing = wp.zeros((views, count), dtype=wp.vec2, device=device)
+        points.following = wp.zeros((views, count), dtype=wp.int32, device=device)
+        points.first = wp.zeros((views, self._cells**2), dtype=wp.int32, device=device)
+        self._points = points
 
-    def render(self, state: newton.State, sensor_pose: wp.array, intrinsics: wp.array) -> None:
+    def render(self, state: newton.State, variation: ViewVariation, shadow: SplatShadow | None) -> None:
         """Draw the meshes of all views; capturable.
 
         Args:
             state: Where the bodies are.
-            sensor_pose: Camera to world with OpenGL axes, transform, shape (view_count,).
-            intrinsics: fx, fy, cx, cy [px], vec4, shape (view_count,); read only with `lens_per_world`.
+            variation: Sky and light of the worlds.
+            shadow: The map of the splats' shadow.
         """
-        if self._sensor is None:
+        device, faces, views, points, model = self.device, self._faces, self._views, self._points, self.model
+        count, height, width = self.rgb.shape
+        size, span = wp.vec2i(width, height), width if device.is_cpu else 1
+        rows = (count, height, width // span)
+        if self._ranges or self._rays is not None:
+            shapes = (model.shape_flags, model.shape_transform, model.shape_body)
+            boxes = (self._kind, self._center, self._half)
+            launch(
+                device, kernels.place_shapes, self._to_camera.shape,
+                faces, views, *shapes, state.body_q, *boxes, size, self._frame, self._to_camera, self._casts,
+            )  # fmt: skip
+            given = (*shapes, model.shape_color, state.body_q)
+            placed = (self._to_light, self._albedo)
+            launch(device, kernels.light_shapes, self._to_light.shape, faces, self._frame, *given, *placed)
+            for number, part, edge in self._ranges:
+                dim = (count, number, -(-width // edge) * -(-height // edge))
+                lens = (self._to_camera, self._spots, self._reach, edge, size)
+                launch(device, kernels.fill_samples, dim, faces, part, views, *lens, self._key)
+            if self._rays is not None:
+                given = (faces, self._rays, views, self._to_camera, self._spots, size, span)
+                launch(device, ray_kernels.trace_samples, rows, *given, self._key)
+            self._cast(rows, size, span)
+        drawn = (variation.horizon, variation.zenith, variation.light_gain, self._shape_segment)
+        splats = self._no_shadow if shadow is None else shadow.map
+        launch(
+            device, kernels.shade_pixels, rows,
+            faces, views, points, self._albedo, self._look, splats, *drawn, self._spots.shape[0], span, self._key,
+            self.rgb, self.depth, self.segment,
+        )  # fmt: skip
+
+    def _cast(self, rows: tuple[int, int, int], size: Any, span: int) -> None:
+        """Find what the samples show, and which of it stands in the shadow of a mesh."""
+        device, faces, views, points, cells = self.device, self._faces, self._views, self._points, self._cells
+        if self._options.shadows:
+            points.first.fill_(-1)
+            place = (self._casts, self._to_light, self._kind, self._center, self._half, cells)
+            launch(device, kernels.bound_casters, self._grid.shape[0], views, *place, self._grid)
+        seen = (self._to_camera, self._to_light, self._grid, cells, self._spots, size, span, self._key)
+        launch(device, kernels.list_points, rows, faces, views, *seen, points)
+        if not self._options.shadows:
             return
-        self.model.bvh_refit_shapes(state)
-        for index, rays in enumerate(self._rays):
-            part = slice(index * self._worlds, (index + 1) * self._worlds)
-            pose, worlds = _part(sensor_pose, part), None
-            wanted = (True, True, self._wants_shape, self._wants_surface, self._wants_surface)
-            images = (self.packed, self.depth, self.shape_index, self.albedo, self.normal)
-            images = [_part(image, part) if write else None for image, write in zip(images, wanted, strict=True)]
-            if self.lens_per_world:
-                lens, device = _part(intrinsics, part), self.model.device
-                launch(device, kernels.aim_pixels, self._pixel_pose.shape, pose, lens, self._pixel_pose)
-                count = self._pixel_world.shape[0]
-                pose, worlds = self._pixel_pose.flatten(), self._pixel_world
-                images = [None if image is None else image.reshape((count, 1, 1)) for image in images]
-            names = ("color", "forward_depth", "shape_index", "albedo", "normal")
-            outputs: dict[str, Any] = {f"{name}_image": image for name, image in zip(names, images, strict=True)}
-            self._sensor.update(state, pose, rays, **outputs, world_indices=worlds, render_config=self._config)
+        for number, part, edge in self._ranges:
+            dim = (rows[0], number, (-(-cells // edge)) ** 2)
+            place = (self._casts, self._to_light, self._grid, cells, edge, self._key)
+            launch(device, kernels.cast_shadows, dim, faces, part, views, *place, points)
+        if self._rays is not None:
+            given = (faces, self._rays, views, self._casts, self._to_light, self._spots.shape[0], span)
+            launch(device, ray_kernels.trace_shadows, rows, *given, points)
 
 
-def _part(array: wp.array, part: slice) -> Any:
-    """Return a slice of the leading axis; shares memory."""
-    return array[part]
-
-
-def _rays(camera: PinholeCamera, offset: NDArray[np.float64], per_pixel: bool) -> NDArray[np.float32]:
-    """Return origins and directions with OpenGL axes, shape (rows, columns, samples, 2, 3).
-
-    Per pixel there is one row and column, about the axis: the pixel's pose does the rest. The samples then spread as in
-    the middle of the described lens.
-    """
-    height, width = (1, 1) if per_pixel else (camera.height, camera.width)
-    cx, cy = (0.5, 0.5) if per_pixel else (camera.cx, camera.cy)
-    rays = np.zeros((height, width, len(offset), 2, 3), dtype=np.float32)
-    rays[..., 1, 0] = (np.arange(width)[None, :, None] + offset[:, 0] - cx) / camera.fx
-    rays[..., 1, 1] = -(np.arange(height)[:, None, None] + offset[:, 1] - cy) / camera.fy
-    rays[..., 1, 2] = -1.0
-    rays[..., 1, :] /= np.linalg.norm(rays[..., 1, :], axis=-1, keepdims=True)
-    return rays
+def _look(options: CameraOptions, device: wp.Device) -> Any:
+    """Return the light that is alike in all worlds, as kernels take it."""
+    made = kernels.Look()
+    made.above, made.below = (wp.vec3(*radiance) for radiance in options.ambient)
+    made.sun = wp.vec3(*options.light_color)
+    made.encoded = encoded_light(device)
+    return made

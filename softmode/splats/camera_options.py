@@ -45,11 +45,9 @@ class CameraOptions:
     splat_shadow: ShadowOptions | None = field(default_factory=ShadowOptions)
     """Shadow that the splats cast on the meshes; None for none."""
     mesh_samples: int = 1
-    """Rays per pixel for the meshes: 1, or 4 for smooth edges at about twice the cost."""
+    """Samples per pixel for the meshes: 1, or 4 for smooth edges."""
     segmentation: bool = False
     """Write which object or shape is seen."""
-    lens_per_world: bool = False
-    """Meshes follow intrinsics that differ between worlds (`SplatCamera.intrinsics`); a randomised lens implies it."""
 
     def __post_init__(self) -> None:
         """Check the numbers."""

@@ -1,7 +1,7 @@
 """Pictures of triangle meshes by rasterising them, with shadows of soft edges: what a film shows behind its splats.
 
-Newton's `SensorCamera` traces a ray per sample and light. Here a pixel has four samples, the triangles that fall on one
-are compared by depth, and each smooth patch of a pixel is lit once.
+A pixel has four samples, the triangles that fall on one are compared by depth, and each smooth patch of a pixel is lit
+once. The pictures of policies are drawn by `camera_meshes`, with sharp shadows and without layers.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ from scipy.sparse.csgraph import connected_components
 from softmode.deformables.model.declare import launch
 from softmode.splats import mesh_raster_kernels as kernels
 from softmode.splats.camera_options import CameraOptions
+from softmode.splats.light import encoded_light, light_frame, linear_light
 from softmode.splats.rasterizer import SplatArrays, SplatRasterizer, ViewArrays
+from softmode.splats.scan_kernels import NOTHING
 
 CELLS = 640
 """Cells of the map of shadows along each side."""
@@ -94,7 +96,7 @@ class MeshRaster:
         t.body = wp.array(meshes.bodies, dtype=wp.int32, device=device)
         t.face = wp.array(meshes.faces[order], dtype=wp.vec3i, device=device)
         first = 1.0 - COPLANAR * meshes.shapes[order, None]
-        t.color = wp.array(np.hstack([meshes.colors[order] ** 2.2, first]), dtype=wp.vec4, device=device)
+        t.color = wp.array(np.hstack([linear_light(meshes.colors[order]), first]), dtype=wp.vec4, device=device)
         t.patch = wp.array(patches[order], dtype=wp.int32, device=device)
         t.closed = wp.array(meshes.closed[order], dtype=wp.bool, device=device)
         t.body_start = wp.array(body_start, dtype=wp.int32, device=device)
@@ -107,7 +109,8 @@ class MeshRaster:
         self._shadow, self._still_shadow = (wp.full(cells, FAR, dtype=wp.float32, device=device) for _ in range(2))
         self._still_known = False
         samples = (view_count, height * width * kernels.SAMPLES)
-        self._key = wp.full(samples, value=kernels.NOTHING, dtype=wp.uint64, device=device)
+        self._key = wp.full(samples, value=NOTHING, dtype=wp.uint64, device=device)
+        self._spots = wp.array(kernels.SPOTS, dtype=wp.vec2, device=device)
         self.rgb = wp.zeros(shape, dtype=wp.vec3, device=device)
         self.depth = wp.zeros(shape, dtype=wp.float32, device=device)
         self._near = wp.zeros(shape, dtype=kernels.layer, device=device)
@@ -137,7 +140,7 @@ class MeshRaster:
         rows = (count, height, width // span)
         launch(
             device, kernels.fill_samples, (count, faces, bands),
-            triangles, corner, seen, wp.vec2i(width, height), bands, self._key,
+            triangles, corner, seen, self._spots, wp.vec2i(width, height), bands, self._key,
         )  # fmt: skip
         images = self._no_plate if plate is None else (plate.rgb, plate.alpha, plate.median_depth)
         launch(
@@ -179,11 +182,7 @@ class MeshRaster:
 
 def _light(options: CameraOptions, center: NDArray[np.float64], radius: float, device: wp.Device) -> Any:
     """Return what the kernels know of the light, the map of shadows about a centre [m]."""
-    ahead = np.asarray(options.light_direction, dtype=np.float64)
-    ahead /= np.linalg.norm(ahead)
-    first = np.cross(ahead, [1.0, 0.0, 0.0] if abs(ahead[0]) < 0.9 else [0.0, 1.0, 0.0])
-    first /= np.linalg.norm(first)
-    frame = np.stack([first, np.cross(ahead, first), ahead])
+    frame = light_frame(options.light_direction)
     light = kernels.Light()
     light.frame = wp.mat33(*frame.ravel())
     light.corner = wp.vec2(*(frame[:2] @ center - radius))
@@ -191,8 +190,7 @@ def _light(options: CameraOptions, center: NDArray[np.float64], radius: float, d
     light.above, light.below = (wp.vec3(*radiance) for radiance in options.ambient)
     light.sun = wp.vec3(*options.light_color)
     light.horizon, light.zenith = (wp.vec3(*color) for color in options.sky)
-    table = np.linspace(0.0, 1.0, kernels.ENCODED + 1, dtype=np.float32) ** (1.0 / 2.2)
-    light.encoded = wp.array(table, dtype=wp.float32, device=device)
+    light.encoded = encoded_light(device)
     return light
 
 

@@ -1,38 +1,37 @@
-"""Device code of `mesh_raster`: triangles into pixels and into a map of shadows, light, and the layers of a pixel.
-
-A sample of a pixel keeps its nearest triangle as one number, depth above and triangle below, by an atomic minimum, so
-that the order of the threads does not matter. Edges are tested in homogeneous form (Olano and Greer 1997, "Triangle
-scan conversion using 2D homogeneous coordinates"), which needs no clipping at the near plane.
-"""
+"""Device code of `mesh_raster`: a map of shadows with soft edges, light, and the layers of a pixel."""
 
 import warp as wp
 
 from softmode.splats.rasterizer_kernels import vec6
+from softmode.splats.scan_kernels import (
+    NEAR,
+    NOTHING,
+    SHADOW_LIGHT,
+    box_of,
+    encode,
+    inverse_depth,
+    scan,
+    sky_color,
+)
 
 wp.set_module_options({"enable_backward": False})
 
 SAMPLES = 4
 """Samples of a pixel."""
-NOTHING = 0xFFFFFFFFFFFFFFFF
-"""A sample without a triangle."""
-NEAR = wp.constant(0.01)
-"""Nearest visible forward depth [m]."""
+REACHED = wp.constant(0.375)
+"""How far a sample is from the middle of its pixel at most, along an axis [px]."""
 LAYER = wp.constant(0.008)
 """Depth between samples of a pixel from which they are of two layers [m]."""
 REACH = wp.constant(2)
 """Cells of the map of shadows to each side that soften an edge."""
 OFF = wp.constant(3.5)
 """How far off a surface its shadow is looked up [cells], so that it does not shade itself."""
-SHADOW_LIGHT = wp.constant(0.3)
-"""Share of the sunlight that is left in the shadow, as in Newton's sensor."""
 SOLID = wp.constant(0.3)
 """Least opacity of a splat that casts a shadow."""
 WIDEST = wp.constant(8.0)
 """Largest half width of a splat in the map of shadows [cells]."""
-WIDE = wp.constant(16)
-"""Pixels across a triangle from which the ends of its rows are found before its pixels are tested."""
-ENCODED = 1024
-"""Steps of the table of gamma-encoded light."""
+SPOTS = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
+"""Where the samples are from the middle of their pixel; no two share a row or a column."""
 
 layer = wp.types.vector(length=4, dtype=float)
 
@@ -63,7 +62,7 @@ class Light:
     sun: wp.vec3
     horizon: wp.vec3  # sRGB
     zenith: wp.vec3
-    encoded: wp.array[float]  # (ENCODED + 1,) light 0..1, gamma-encoded
+    encoded: wp.array[float]  # (ENCODED + 1,) sRGB of linear light 0..1
 
 
 @wp.struct
@@ -73,14 +72,6 @@ class Views:
     world_to_camera: wp.array[wp.mat44]
     intrinsics: wp.array[wp.vec4]  # fx, fy, cx, cy [px]
     world: wp.array[int]
-
-
-@wp.func
-def sample_place(sample: int) -> wp.vec2:
-    """Return where a sample is from the middle of its pixel; no two share a row or a column."""
-    x = wp.vec4(-0.125, 0.375, -0.375, 0.125)
-    y = wp.vec4(-0.375, -0.125, 0.125, 0.375)
-    return wp.vec2(x[sample], y[sample])
 
 
 @wp.kernel
@@ -104,34 +95,12 @@ def move_corners(
     normal_out[world, i] = n
 
 
-@wp.func
-def reached(box: wp.vec4, lens: wp.vec4, a: wp.vec3, b: wp.vec3) -> wp.vec4:
-    """Return a box of pixels (left, top, right, bottom) that also holds what is visible of an edge's start and cut."""
-    if a[2] <= NEAR and b[2] <= NEAR:
-        return box
-    p = a
-    q = a
-    if (a[2] > NEAR) != (b[2] > NEAR):
-        q = a + ((NEAR - a[2]) / (b[2] - a[2])) * (b - a)
-        if a[2] <= NEAR:
-            p = q
-    x = lens[0] * p[0] / p[2] + lens[2]
-    y = lens[1] * p[1] / p[2] + lens[3]
-    u = lens[0] * q[0] / q[2] + lens[2]
-    v = lens[1] * q[1] / q[2] + lens[3]
-    return wp.vec4(
-        wp.min(box[0], wp.min(x, u)),
-        wp.min(box[1], wp.min(y, v)),
-        wp.max(box[2], wp.max(x, u)),
-        wp.max(box[3], wp.max(y, v)),
-    )
-
-
 @wp.kernel
 def fill_samples(
     triangles: Triangles,
     corner: wp.array2d[wp.vec3],
     views: Views,
+    spots: wp.array[wp.vec2],
     size: wp.vec2i,
     bands: int,
     # Out:
@@ -153,55 +122,19 @@ def fill_samples(
     if wp.abs(det) < 1.0e-20 or (det > 0.0 and triangles.closed[f]):
         return
     lens = views.intrinsics[view]
-    box = wp.vec4(1.0e30, 1.0e30, -1.0e30, -1.0e30)
-    box = reached(box, lens, v0, v1)
-    box = reached(box, lens, v1, v2)
-    box = reached(box, lens, v2, v0)
+    box = box_of(lens, v0, v1, v2)
     if box[0] > float(size[0]) or box[1] > float(size[1]) or box[2] < 0.0 or box[3] < 0.0:
         return
     left = int(wp.max(box[0], 0.0))
     right = int(wp.min(box[2], float(size[0] - 1)))
     top = int(wp.max(box[1], 0.0))
     bottom = int(wp.min(box[3], float(size[1] - 1)))
-    # Of the ray d = (x, y, 1): edge i is e_i . d, positive inside; the plane is 1 / z = plane . d.
     sign = wp.sign(det)
-    e0 = sign * wp.cross(v1, v2)
-    e1 = sign * wp.cross(v2, v0)
-    e2 = sign * wp.cross(v0, v1)
-    plane = (triangles.color[f][3] / det) * n
-    dx = wp.vec4(e0[0], e1[0], e2[0], plane[0]) / lens[0]
-    dy = wp.vec4(e0[1], e1[1], e2[1], plane[1]) / lens[1]
-    origin = wp.vec4(e0[2], e1[2], e2[2], plane[2]) - lens[2] * dx - lens[3] * dy
-    # Where the middle of a pixel is so far inside, all of its samples are.
-    inside = wp.vec3(wp.abs(dx[0]) + wp.abs(dy[0]), wp.abs(dx[1]) + wp.abs(dy[1]), wp.abs(dx[2]) + wp.abs(dy[2]))
-    inside = 0.376 * inside
-    id = wp.uint64(f)
-    for row in range(top + (band - top % bands + bands) % bands, bottom + 1, bands):
-        begin = left
-        end = right
-        if right - left > WIDE:
-            for edge in range(3):
-                across = (-inside[edge] - origin[edge] - (float(row) + 0.5) * dy[edge]) / dx[edge] - 0.5
-                if dx[edge] > 0.0:
-                    begin = int(wp.clamp(wp.floor(across), float(begin), float(right)))
-                if dx[edge] < 0.0:
-                    end = int(wp.clamp(wp.ceil(across), float(left), float(end)))
-        place = (row * size[0] + begin) * wp.static(SAMPLES)
-        for column in range(begin, end + 1):
-            at = origin + (float(column) + 0.5) * dx + (float(row) + 0.5) * dy
-            if at[0] >= -inside[0] and at[1] >= -inside[1] and at[2] >= -inside[2]:
-                full = at[0] >= inside[0] and at[1] >= inside[1] and at[2] >= inside[2]
-                for sample in range(wp.static(SAMPLES)):
-                    spot = sample_place(sample)
-                    hit = full
-                    if not full:
-                        e = at + spot[0] * dx + spot[1] * dy
-                        hit = e[0] >= 0.0 and e[1] >= 0.0 and e[2] >= 0.0
-                    near = at[3] + spot[0] * dx[3] + spot[1] * dy[3]
-                    if hit and near > 0.0 and near < 1.0 / NEAR:
-                        bits = wp.uint64(~wp.cast(near, wp.uint32))
-                        wp.atomic_min(key_out, view, place + sample, (bits << wp.uint64(32)) | id)
-            place += wp.static(SAMPLES)
+    start = top + (band - top % bands + bands) % bands
+    scan(
+        sign * wp.cross(v1, v2), sign * wp.cross(v2, v0), sign * wp.cross(v0, v1), (triangles.color[f][3] / det) * n,
+        lens, wp.vec4i(left, start, right, bottom), bands, size[0], spots, REACHED, view, f, key_out,
+    )  # fmt: skip
 
 
 @wp.kernel
@@ -324,17 +257,6 @@ def shaded(light: Light, depth: wp.array3d[float], world: int, p: wp.vec3) -> fl
 
 
 @wp.func
-def encode(light: Light, radiance: wp.vec3) -> wp.vec3:
-    """Return gamma-encoded colour of linear light."""
-    color = wp.vec3()
-    for channel in range(3):
-        x = wp.clamp(radiance[channel], 0.0, 1.0) * float(wp.static(ENCODED))
-        i = wp.min(int(x), wp.static(ENCODED - 1))
-        color[channel] = wp.lerp(light.encoded[i], light.encoded[i + 1], x - float(i))
-    return color
-
-
-@wp.func
 def shade(
     triangles: Triangles,
     corner: wp.array2d[wp.vec3],
@@ -372,13 +294,7 @@ def shade(
         left = 1.0 - (1.0 - SHADOW_LIGHT) * shaded(light, shadow, world, p)
         received += toward * left * light.sun
     color = triangles.color[f]
-    return encode(light, wp.cw_mul(wp.vec3(color[0], color[1], color[2]), received))
-
-
-@wp.func
-def depth_of(key: wp.uint64) -> float:
-    """Return the forward depth of a sample that has a triangle [m]."""
-    return 1.0 / wp.cast(~wp.uint32(key >> wp.uint64(32)), wp.float32)
+    return encode(light.encoded, wp.cw_mul(wp.vec3(color[0], color[1], color[2]), received))
 
 
 @wp.func
@@ -387,12 +303,6 @@ def patch_of(triangles: Triangles, key: wp.uint64) -> int:
     if key == wp.uint64(wp.static(NOTHING)):
         return -1
     return triangles.patch[int(wp.uint32(key))]
-
-
-@wp.func
-def sky_color(light: Light, ray: wp.vec3) -> wp.vec3:
-    """Return the colour of the sky along a ray."""
-    return wp.lerp(light.horizon, light.zenith, wp.clamp(2.0 * ray[2] / wp.length(ray), 0.0, 1.0))
 
 
 @wp.kernel
@@ -446,10 +356,10 @@ def shade_pixels(
             color = wp.vec3()
             z = float(0.0)
             if patch < 0:
-                color = sky_color(light, ray)
+                color = sky_color(light.horizon, light.zenith, ray)
             else:
                 color = shade(triangles, corner, normal, light, shadow, world, int(wp.uint32(k)), eye, ray)
-                z = depth_of(k)
+                z = 1.0 / inverse_depth(k)
             rgb_out[view, row, column] = color
             depth_out[view, row, column] = z
             near_out[view, row, column] = layer()
@@ -465,8 +375,8 @@ def shade_pixels(
                 k = key[view, place + sample]
                 depths[sample] = behind
                 patch = patch_of(triangles, k)
-                if patch >= 0 and (behind <= 0.0 or depth_of(k) < behind):
-                    depths[sample] = depth_of(k)
+                if patch >= 0 and (behind <= 0.0 or (1.0 / inverse_depth(k)) < behind):
+                    depths[sample] = 1.0 / inverse_depth(k)
                     patches[sample] = patch
                 if depths[sample] > 0.0:
                     nearest = wp.min(nearest, depths[sample])
@@ -486,7 +396,7 @@ def shade_pixels(
                         face = int(wp.uint32(key[view, place + sample]))
                         color = shade(triangles, corner, normal, light, shadow, world, face, eye, ray)
                     else:
-                        color = sky_color(light, ray)
+                        color = sky_color(light.horizon, light.zenith, ray)
                         if has_plate:
                             color = plate_rgb[view, row, column] + (1.0 - plate_alpha[view, row, column]) * color
                     weighted = same * layer(color[0], color[1], color[2], 1.0)

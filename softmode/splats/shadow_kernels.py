@@ -1,16 +1,12 @@
-"""Device code of `shadow`: a depth map along the light and the meshes it darkens."""
+"""Device code of `shadow`: a depth map along the light, and how much of the light it keeps from a point."""
 
 import warp as wp
-
-from softmode.splats.camera_kernels import to_linear, to_srgb, unpack_rgb
 
 wp.set_module_options({"enable_backward": False})
 
 
 SOLID = wp.constant(0.3)
 """Least opacity of a splat that casts a shadow."""
-SHADOW_LIGHT = wp.constant(0.3)
-"""Share of the sunlight that Newton's sensor leaves in the shadow of a mesh."""
 
 
 @wp.func
@@ -71,71 +67,42 @@ def fill_map(
         wp.atomic_min(depth_out, world, y, x, p[2])
 
 
-@wp.kernel
-def darken(
-    # Map:
-    bounds: wp.array[wp.vec4],  # (world_count,) [m]
-    frame: wp.mat33,
-    margin: float,
-    map_depth: wp.array3d[float],  # (world_count, cells, cells) [m]
-    # Views:
-    view_world: wp.array[int],
-    intrinsics: wp.array[wp.vec4],
-    sensor_pose: wp.array[wp.transform],  # camera to world, OpenGL axes
-    # Meshes:
-    mesh_depth: wp.array3d[float],  # (view_count, height, width) [m]
-    packed: wp.array3d[wp.uint32],  # RGBA, sRGB, as lit
-    albedo: wp.array3d[wp.uint32],  # RGBA, sRGB
-    normal: wp.array3d[wp.vec3],
-    ambient_above: wp.vec3,  # linear radiance
-    ambient_below: wp.vec3,
-    sun: wp.vec3,
-    # Options:
-    strength: float,
-    softness: float,
-    # Out:
-    rgb_out: wp.array3d[wp.vec3],
-):
-    """Take the sunlight from mesh pixels that lie behind the splats as the light sees them.
+@wp.struct
+class SplatMap:
+    """The map of a shadow, as what receives it reads it."""
 
-    What would be left of the lit colour in the shadow of a mesh is found from albedo and normal, channel by channel;
-    where a mesh keeps the sun off already, that is all of it.
+    bounds: wp.array[wp.vec4]  # (world_count,) [m]
+    depth: wp.array3d[float]  # (world_count, cells, cells) [m]; of size zero without a shadow
+    margin: float
+    strength: float
+    softness: float
+
+
+@wp.func
+def covered_share(splats: SplatMap, world: int, place: wp.vec2, depth: float) -> float:
+    """Return how much of the light the splats keep from a point, 0..1.
+
+    The point has its place across the light and its depth along it [m].
     """
-    view, row, column = wp.tid()
-    z = mesh_depth[view, row, column]
-    if z <= 0.0:
-        return
-    lens = intrinsics[view]
-    local = wp.vec3((float(column) + 0.5 - lens[2]) / lens[0], -(float(row) + 0.5 - lens[3]) / lens[1], -1.0)
-    world = view_world[view]
-    p = frame * wp.transform_point(sensor_pose[view], z * local)
-    cells = map_depth.shape[1]
-    place = map_place(bounds[world], cells, margin)
-    x = (p[0] - place[0]) / place[2] - 0.5
-    y = (p[1] - place[1]) / place[2] - 0.5
+    cells = splats.depth.shape[1]
+    if cells == 0:
+        return 0.0
+    corner = map_place(splats.bounds[world], cells, splats.margin)
+    x = (place[0] - corner[0]) / corner[2] - 0.5
+    y = (place[1] - corner[1]) / corner[2] - 0.5
+    softness = splats.softness
     reach = float(cells) + softness
-    if x < -softness or y < -softness or x > reach or y > reach:
-        return
-    covered = wp.float32(0.0)
-    total = wp.float32(0.0)
+    if not (x >= -softness and y >= -softness and x <= reach and y <= reach):
+        return 0.0
+    covered = float(0.0)
+    total = float(0.0)
     for j in range(int(wp.ceil(y - softness)), int(wp.floor(y + softness)) + 1):
         for i in range(int(wp.ceil(x - softness)), int(wp.floor(x + softness)) + 1):
             weight = (softness + 0.2 - wp.abs(float(i) - x)) * (softness + 0.2 - wp.abs(float(j) - y))
             total += weight
             if i >= 0 and j >= 0 and i < cells and j < cells:
-                if map_depth[world, j, i] < p[2]:
+                if splats.depth[world, j, i] < depth:
                     covered += weight
     if covered <= 0.0:
-        return
-    up = 0.5 * (normal[view, row, column][2] + 1.0)
-    ahead = wp.vec3(frame[2, 0], frame[2, 1], frame[2, 2])
-    sunlight = SHADOW_LIGHT * wp.max(-wp.dot(normal[view, row, column], ahead), 0.0) * sun
-    light = up * ambient_above + (1.0 - up) * ambient_below + sunlight
-    lit = to_linear(unpack_rgb(packed[view, row, column]))
-    dark = wp.cw_mul(to_linear(unpack_rgb(albedo[view, row, column])), light)
-    taken = strength * covered / total
-    left = wp.vec3()
-    for channel in range(3):
-        share = wp.min(dark[channel] / wp.max(lit[channel], 1.0e-6), 1.0)
-        left[channel] = 1.0 - taken * (1.0 - share)
-    rgb_out[view, row, column] = wp.cw_mul(rgb_out[view, row, column], to_srgb(left))
+        return 0.0
+    return splats.strength * covered / total

@@ -1,4 +1,4 @@
-"""Pictures for people: meshes as the sensor sees them, soft shadows, a goal that hides nothing, a room by depth."""
+"""Pictures for people: meshes as policies see them, soft shadows, a goal that hides nothing, a room by depth."""
 
 from __future__ import annotations
 
@@ -57,16 +57,16 @@ def picture(camera: FilmCamera, model: newton.Model) -> NDArray[np.float64]:
     return camera.render(model.state()).numpy()[0] / 255.0
 
 
-def test_meshes_look_as_the_sensor_sees_them(model: newton.Model) -> None:
-    """Away from edges of things and of shadows, colours are within two levels of those of rays, and depths within 2 %.
+def test_meshes_look_as_policies_see_them(model: newton.Model) -> None:
+    """Away from edges of things and of shadows, colours are within two levels of what policies see, depths within 2 %.
 
     That much the slab's depth changes in a pixel, somewhere in which either of the two looks.
     """
     camera = film(model, cloud(*FAR_AWAY))
     drawn = picture(camera, model)
-    traced = SplatCamera(model, None, [CAMERA], options=CameraOptions(mesh_samples=4))
-    traced.render(model.state())
-    rgb, depth = traced.rgb.numpy()[0] / 255.0, traced.depth.numpy()[0]
+    seen = SplatCamera(model, None, [CAMERA], options=CameraOptions(mesh_samples=4))
+    seen.render(model.state())
+    rgb, depth = seen.rgb.numpy()[0] / 255.0, seen.depth.numpy()[0]
     near = camera._meshes.depth.numpy()[0]
     assert (np.abs(near - depth) <= 0.02 * depth).mean() > 0.95
     difference = np.abs(drawn - rgb).max(axis=2)
