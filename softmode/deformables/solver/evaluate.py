@@ -3,6 +3,7 @@
 import warp as wp
 
 from softmode.deformables.solver import assembly_kernels as assembly
+from softmode.deformables.solver import point_cpu_kernels as eights
 from softmode.deformables.solver import step_kernels as kernels
 from softmode.deformables.solver.iteration_kernels import ALL, ENERGIES, TRIAL
 from softmode.deformables.solver.rigid_row_kernels import evaluate_rows
@@ -37,7 +38,8 @@ def _evaluate(
 ) -> None:
     """Evaluate the selected worlds at (q, r): of points and rows what ``found`` says, of contacts forces or not."""
     step = t.newton_step(dt)
-    t.launch(kernels.evaluate_points, t.points.energy.shape, step, selected, q, found)
+    points = kernels.evaluate_points if t.model.device.is_cuda else eights.evaluate_eights
+    t.launch(points, t.point_tasks, step, selected, q, found)
     t.launch(kernels.evaluate_constraints, t.constraints.row.shape, step, selected, q, r, int(forces))
     if t.rigid.row_max:
         t.launch(evaluate_rows, (t.layout.world_count, t.rigid.row_max), step, selected, r, found)
@@ -57,6 +59,8 @@ def assemble(tables: StepTables, dt: float) -> None:
     blocks, count, worlds = t.layout.block_count, t.layout.instance_count, t.layout.world_count
     tasks = 3 * blocks * blocks + 3 * (blocks * blocks + blocks) // 2  # 8x8 blocks of the upper triangle
     columns = 3 * blocks if t.model.device.is_cuda else 1  # threads that share a row of the matrix
+    if not t.model.device.is_cuda:
+        t.launch(eights.differentiate_eights, t.point_tasks, step)
     # more than 100 registers per thread: larger blocks leave half of a multiprocessor idle
     t.launch(assembly.assemble_stiffness, (count, t.arrays.stiffness.shape[1], tasks), step, block_dim=128)
     t.launch(assembly.assemble_matrix, (count, t.arrays.stiffness.shape[2], columns), step, columns)

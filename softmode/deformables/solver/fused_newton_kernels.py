@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from softmode.deformables.model.declare import Kernel
-from softmode.deformables.model.lane_kernels import LANES, barrier, rolled, team_sum
+from softmode.deformables.model.lane_kernels import LANES, barrier, rolled, team_sum, vec8
 from softmode.deformables.model.struct_kernels import instance_end
 from softmode.deformables.solver.assembly_kernels import (
     column_block,
@@ -27,6 +27,7 @@ from softmode.deformables.solver.assembly_kernels import (
 from softmode.deformables.solver.factor_kernels import factor_system, solve_system
 from softmode.deformables.solver.fused_system_kernels import dynamic_floats, shared_direction_of, sum_forces_of
 from softmode.deformables.solver.iteration_kernels import ALL, NewtonStep
+from softmode.deformables.solver.point_cpu_kernels import differentiate_eight, evaluate_eight
 from softmode.deformables.solver.rigid_row_kernels import evaluate_row
 from softmode.deformables.solver.search_kernels import (
     accept_step,
@@ -57,12 +58,13 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool
     """Return the kernel that minimises the incremental potential of every world by Newton with a line search.
 
     Args:
-        unit_type: What the factorisation takes at a time, ``float`` or ``vec8``.
+        unit_type: What the factorisation takes at a time, ``float`` or, on CPU, ``vec8``; there points too are
+            evaluated eight at a time.
         size: Unknowns of the systems that are solved in shared memory, one per world; 0 for any in global memory.
         width: Columns of those systems.
         joined: Whether the bodies of a world, which may touch each other, share a system.
     """
-    shared, dynamic = size > 0, dynamic_floats(size, width)
+    shared, dynamic, lanes = size > 0, dynamic_floats(size, width), unit_type == vec8
     shared_direction = shared_direction_of(size or 24, width or 32)  # called where ``shared`` says so
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=(TEAM, BLOCKS))
@@ -102,8 +104,12 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool
             # one copy of this code serves iterates and trials
             found = ALL + trial
             for i in range(begin, end):
-                for p in range(member, step.instances.point_count[i], team):
-                    evaluate_point(step, step.state.active, q, found, i, p)
+                if wp.static(lanes):
+                    for t in range(member, (step.instances.point_count[i] + LANES - 1) / LANES, team):
+                        evaluate_eight(step, step.state.active, q, found, i, t)
+                else:
+                    for p in range(member, step.instances.point_count[i], team):
+                        evaluate_point(step, step.state.active, q, found, i, p)
                 for e in range(member, step.constraints.count[i], team):
                     evaluate_constraint(step, step.state.active, q, r, 1 - trial, i, e)
             for k in range(member, step.rigid.row_count[w], team):
@@ -145,6 +151,10 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool
                 if step.state.active[w] != 0:
                     for i in range(begin, end):
                         if step.state.refresh[w] != 0:
+                            if wp.static(lanes):
+                                for t in range(member, (step.instances.point_count[i] + LANES - 1) / LANES, team):
+                                    differentiate_eight(step, i, t)
+                                barrier()
                             for t in range(member, stiffness_chunks * tasks, team):
                                 stiffness_block(step, i, t / tasks, t % tasks)
                             barrier()

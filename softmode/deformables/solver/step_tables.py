@@ -156,6 +156,12 @@ class StepTables:
         return self.layout.instance_count, 3 * self.layout.block_count
 
     @property
+    def point_tasks(self) -> tuple[int, int]:
+        """Shape of a launch over the points: on CPU a thread takes eight of them."""
+        count = self.layout.point_max
+        return self.layout.instance_count, count if self.model.device.is_cuda else -(-count // LANES)
+
+    @property
     def pin_arrays(self) -> tuple[wp.array | None, wp.array | None]:
         """Which rigid bodies the pins follow and how stiffly, None where there are no pins."""
         return getattr(self.parameters, "pin_body", None), getattr(self.parameters, "pin_stiffness", None)
