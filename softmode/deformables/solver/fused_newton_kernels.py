@@ -13,6 +13,7 @@ import warp as wp
 from softmode.deformables.model.declare import Kernel
 from softmode.deformables.model.lane_kernels import LANES, barrier, rolled, team_sum, vec8
 from softmode.deformables.model.struct_kernels import instance_end
+from softmode.deformables.solver.assembly_cpu_kernels import columns_of, condense_world, forces_of, stiffness_of
 from softmode.deformables.solver.assembly_kernels import (
     column_block,
     condensed_entry,
@@ -139,6 +140,8 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool
                         sum_forces_of(
                             step.instances, step.basis, step.points, step.constraints, step.arrays, i, member, team
                         )
+                    elif wp.static(lanes):
+                        forces_of(step, step.state.active, i)
                     else:
                         for t in range(member, chunks * blocks, team):
                             sum_force_block(step, step.state.active, i, t / blocks, t % blocks)
@@ -154,19 +157,24 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool
                             if wp.static(lanes):
                                 for t in range(member, (step.instances.point_count[i] + LANES - 1) / LANES, team):
                                     differentiate_eight(step, i, t)
-                                barrier()
-                            for t in range(member, stiffness_chunks * tasks, team):
-                                stiffness_block(step, i, t / tasks, t % tasks)
+                                stiffness_of(step, i)
+                            else:
+                                for t in range(member, stiffness_chunks * tasks, team):
+                                    stiffness_block(step, i, t / tasks, t % tasks)
                             barrier()
                         if wp.static(not shared):
-                            width = 3 * blocks
-                            for t in range(member, LANES * width * width, team):
+                            # on CPU one thread has a whole row: what the row has in common is found once
+                            width = wp.where(wp.static(lanes), 1, 3 * blocks)
+                            for t in range(member, LANES * 3 * blocks * width, team):
                                 matrix_row(step, width, i, t / width, t % width)
                             barrier()
                             for t in range(member, tasks, team):
                                 contact_block(step, i, t)
-                            for t in range(member, 3 * blocks * columns, team):
-                                column_block(step, i, t / columns, t % columns)
+                            if wp.static(lanes):
+                                columns_of(step, i)
+                            else:
+                                for t in range(member, 3 * blocks * columns, team):
+                                    column_block(step, i, t / columns, t % columns)
                     if wp.static(joined):
                         for both in range(relation.shape[1] * relation.shape[1]):
                             if relation[w, both / relation.shape[1], both % relation.shape[1]] != 0:
@@ -199,8 +207,11 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool
                             )
                         barrier()
                         if n > 0:
-                            for t in range(member, n * (n + 1), team):
-                                condensed_entry(step, w, t / (n + 1), t % (n + 1))
+                            if wp.static(lanes):
+                                condense_world(step, w)
+                            else:
+                                for t in range(member, n * (n + 1), team):
+                                    condensed_entry(step, w, t / (n + 1), t % (n + 1))
                             barrier()
                             solve_rigid_team(step.state.active, team, step.rigid, w, member)
                             barrier()
