@@ -148,7 +148,7 @@ _SINGULAR_VALUES = """
             }
             return ~first | (absolute(s) > 1.0e-7);
         }
-        static void orthogonal_columns(const lanes* A, lanes* B, lanes* V) {  // columns of six: A V on top of V
+        __attribute__((noinline)) static void orthogonal_columns(const lanes* A, lanes* B, lanes* V) {  // columns of six: A V on top of V
             lanes column[3][6];
             for (int c = 0; c < 3; ++c)
                 for (int k = 0; k < 3; ++k) {
@@ -168,7 +168,7 @@ _SINGULAR_VALUES = """
                     V[3 * k + c] = column[c][3 + k];
                 }
         }
-        static void singular_values(const lanes* F, lanes* U, lanes* sigma, lanes* V) {
+        __attribute__((noinline)) static void singular_values(const lanes* F, lanes* U, lanes* sigma, lanes* V) {
             FUSED
             lanes B[9], x[3], y[3], z[3], u[3], w[3], n[3];
             orthogonal_columns(F, B, V);
@@ -320,7 +320,7 @@ _HESSIAN = """
                 }
             }
         }
-        static void hessian_of_singular_values(int model, lanes mu, lanes lam, double rate, const lanes* G,
+        __attribute__((noinline)) static void hessian_of_singular_values(int model, lanes mu, lanes lam, double rate, const lanes* G,
                                                const lanes* F, const lanes* viscous, int project, float* out) {
             FUSED
             lanes U[9], sigma[3], V[9], twist[3], flip[3], S[9], direct[9], exchange[9];

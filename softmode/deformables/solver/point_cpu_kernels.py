@@ -1,8 +1,7 @@
-"""Device side of the cubature points on CPU: eight points of an instance at a time, one in each lane.
+"""Device side of cubature points and samples on CPU: eight of an instance at a time, one in each lane.
 
-The functions of a row are in lanes in memory. Their sums for eight points are transposed as they are added up, so that
-from the deformation gradient on a lane is a point; results are written point by point, where the per-point kernels of
-CUDA have theirs. The last eight are fewer where the count is no multiple of eight: the idle lanes repeat the last point.
+Results are written point by point, where the per-point kernels of CUDA have theirs. The last eight are fewer where the
+count is no multiple of eight: the idle lanes repeat the last point.
 """
 
 import warp as wp
@@ -15,72 +14,12 @@ from softmode.deformables.materials.material_cpu_kernels import (
     mat98d,
 )
 from softmode.deformables.model.declare import kernel_over
+from softmode.deformables.model.interpolation_cpu_kernels import elastic_gradients, interpolate_state
 from softmode.deformables.model.lane_kernels import LANES, vec8, vec8d
-from softmode.deformables.model.struct_kernels import Instances, Points
+from softmode.deformables.model.struct_kernels import Basis, Instances, Points
 from softmode.deformables.solver.iteration_kernels import ALL, ENERGIES, NewtonStep
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.func_native(
-    snippet="""{
-    #pragma clang fp contract(fast)
-    typedef float floats __attribute__((ext_vector_type(8)));
-    typedef double lanes __attribute__((ext_vector_type(8)));
-    const size_t by_block = gradient.strides[0], by_point = gradient.strides[1], by_axis = gradient.strides[2];
-    const int stride = q.shape[1] / 3;
-    const int blocks = (function_count + 7) / 8;
-    const lanes* Q = (const lanes*)((const char*)q.data + (size_t)i * q.strides[0]);
-    const char* first = (const char*)gradient.data + (size_t)point * by_point;
-    lanes G[9];
-    for (int c = 0; c < 3; ++c) {
-        lanes sum[3][8] = {};
-        for (int b = 0; b < blocks; ++b) {
-            lanes x[3];
-            for (int axis = 0; axis < 3; ++axis) __builtin_memcpy(x + axis, Q + axis * stride + b, sizeof(lanes));
-            const char* at = first + b * by_block + c * by_axis;
-            #pragma unroll
-            for (int k = 0; k < 8; ++k) {
-                floats g;
-                __builtin_memcpy(&g, at + (k < count ? k : count - 1) * by_point, sizeof(g));
-                const lanes wide = __builtin_convertvector(g, lanes);
-                for (int axis = 0; axis < 3; ++axis) sum[axis][k] += x[axis] * wide;
-            }
-        }
-        for (int axis = 0; axis < 3; ++axis) {
-            lanes four[4], two[2];
-            for (int k = 0; k < 4; ++k) {
-                const lanes a = sum[axis][2 * k], b = sum[axis][2 * k + 1];
-                four[k] = __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11)
-                    + __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15);
-            }
-            for (int k = 0; k < 2; ++k) {
-                const lanes a = four[2 * k], b = four[2 * k + 1];
-                two[k] = __builtin_shufflevector(a, b, 0, 1, 4, 5, 8, 9, 12, 13)
-                    + __builtin_shufflevector(a, b, 2, 3, 6, 7, 10, 11, 14, 15);
-            }
-            G[3 * axis + c] = __builtin_shufflevector(two[0], two[1], 0, 2, 4, 6, 8, 10, 12, 14)
-                + __builtin_shufflevector(two[0], two[1], 1, 3, 5, 7, 9, 11, 13, 15);
-        }
-    }
-    if (scale != 1.0)
-        for (int k = 0; k < 9; ++k) G[k] = 1.0 / scale * (k % 4 == 0 ? G[k] - (scale - 1.0) : G[k]);
-    wp::mat_t<9, 8, wp::float64> out;
-    __builtin_memcpy(&out, G, sizeof(out));
-    return out;
-}"""
-)
-def elastic_gradients(
-    gradient: wp.array3d[vec8],
-    q: wp.array2d[vec8d],
-    i: int,
-    point: int,
-    count: int,
-    function_count: int,
-    scale: wp.float64,
-) -> mat98d:  # pyright: ignore[reportReturnType]
-    """Return F / s - I at ``count`` points from ``point`` on; see ``deformation_kernels.elastic_gradient``."""
-    ...
 
 
 @wp.func_native(
@@ -258,3 +197,31 @@ def start_eight(step: NewtonStep, i: int, eight: int):
 evaluate_eights = kernel_over(evaluate_eight, "evaluate_eights", "i", "eight")
 differentiate_eights = kernel_over(differentiate_eight, "differentiate_eights", "i", "eight")
 start_eights = kernel_over(start_eight, "start_eights", "i", "eight")
+
+
+@wp.kernel
+def skin_eights(
+    instances: Instances,
+    basis: Basis,
+    # State in:
+    q: wp.array[wp.vec3d],
+    qd: wp.array[wp.vec3d],
+    dent: wp.array[wp.vec3],
+    # Out:
+    particle_q_out: wp.array[wp.vec3],
+    particle_qd_out: wp.array[wp.vec3],
+):
+    """Write positions and velocities of eight samples as Newton particles; see ``step_kernels.skin_samples``."""
+    i, eight = wp.tid()
+    s = LANES * eight
+    if s >= instances.sample_count[i]:
+        return
+    count = wp.min(LANES, instances.sample_count[i] - s)
+    row = instances.row_start[i] + s
+    begin = instances.function_start[i]
+    found = interpolate_state(basis.row, row, count, q, qd, begin, instances.function_count[i])
+    first = instances.particle_start[i] + s
+    for k in range(count):
+        x = basis.row_point[row + k] + wp.vec3d(found[0, k], found[1, k], found[2, k])
+        particle_q_out[first + k] = wp.vec3(x + wp.vec3d(dent[first + k]))
+        particle_qd_out[first + k] = wp.vec3(wp.vec3d(found[3, k], found[4, k], found[5, k]))

@@ -50,7 +50,7 @@ RESERVED_BYTES = 2048
 _POINTS = {"": "instance point", "hessian": "instance 6 point"}
 _MOTION = {"": "instance unknown", "rate": "instance"}
 _SAMPLES = {
-    "position drift": "instance sample",
+    "position drift near": "instance sample",
     "shape gap normal constraint": "instance sample slot",
     "lower upper drift_lower drift_upper": "instance",
     "reach": "instance team 4",
@@ -158,7 +158,14 @@ class StepTables:
     @property
     def point_tasks(self) -> tuple[int, int]:
         """Shape of a launch over the points: on CPU a thread takes eight of them."""
-        count = self.layout.point_max
+        return self._tasks(self.layout.point_max)
+
+    @property
+    def sample_tasks(self) -> tuple[int, int]:
+        """Shape of a launch that evaluates the functions at the samples: on CPU a thread takes eight of them."""
+        return self._tasks(self.layout.sample_max)
+
+    def _tasks(self, count: int) -> tuple[int, int]:
         return self.layout.instance_count, count if self.model.device.is_cuda else -(-count // LANES)
 
     @property
@@ -270,7 +277,7 @@ def allocate_tables(
         options=options,
         layout=layout,
         scaled=scaled,
-        samples=allocate(Samples, _SAMPLES, sizes, device, fill={"constraint": -1}),
+        samples=allocate(Samples, _SAMPLES, sizes, device, fill={"constraint": -1, "near": -1}),
         **structs,
         spin=allocate(Spin, "instance", sizes, device),
         newton=state,
