@@ -225,6 +225,115 @@ def columns_of(step: NewtonStep, i: int):
 
 @wp.func_native(
     snippet="""{
+    typedef float floats __attribute__((ext_vector_type(8)));
+    const int blocks = basis.row.shape[1], width = 3 * blocks, chunks = arrays.stiffness.shape[1];
+    const int driven = instances.driven_count.data[i], first = instances.system_block.data[i];
+    const bool pinned = instances.pin_count.data[i] > 0;
+    const size_t chunk = (size_t)24 * blocks * width, columns = arrays.systems.matrix.shape[2];
+    const floats* stiffness = (const floats*)arrays.stiffness.data + i * chunks * chunk;
+    const floats* pins = (const floats*)arrays.pins.data + (pinned ? (size_t)i * 8 * blocks * blocks : 0);
+    floats* matrix = (floats*)arrays.systems.matrix.data;
+    matrix += (size_t)instances.system.data[i] * arrays.systems.matrix.shape[1] * columns;
+    for (int row = 0; row < 24 * blocks; ++row) {
+        const int k = row % (8 * blocks);
+        floats* out = matrix + (8 * first + row) * columns + first;
+        for (int column = row / 8; column < width; ++column) {
+            floats value, more;
+            __builtin_memcpy(&value, stiffness + row * width + column, sizeof(value));
+            for (int c = 1; c < chunks; ++c) {
+                __builtin_memcpy(&more, stiffness + c * chunk + row * width + column, sizeof(more));
+                value += more;
+            }
+            const int b = column % blocks;
+            if (pinned && column / blocks == row / (8 * blocks)) {
+                __builtin_memcpy(&more, pins + k * blocks + b, sizeof(more));
+                value += more;
+            }
+            if (k < driven || 8 * b < driven)
+                for (int lane = 0; lane < 8; ++lane) value[lane] = k < driven || 8 * b + lane < driven ? 0.0f : value[lane];
+            if (column == row / 8) value[row % 8] += inertia;
+            __builtin_memcpy(out + column, &value, sizeof(value));
+        }
+    }
+}"""
+)
+def sum_matrix(instances: Instances, basis: Basis, arrays: NewtonArrays, inertia: float, i: int) -> None:
+    """Add inertia and pins to the stiffness of an instance; see ``assembly_kernels.matrix_row``."""
+
+
+@wp.func
+def matrix_of(step: NewtonStep, i: int):
+    """Add inertia and pins to the stiffness of an instance; driven unknowns stay put."""
+    if step.state.active[step.instances.world[i]] == 0 or left_out(step, i):
+        return
+    rate = step.motion.rate[i] / step.options.dt
+    inertia = float(step.instances.mass[i] * rate * (rate + wp.float64(step.instances.mass_damping[i])))
+    sum_matrix(step.instances, step.basis, step.arrays, inertia, i)
+
+
+@wp.func_native(
+    snippet="""{
+    const int n = rigid.count.data[world], room = rigid.inertia.shape[1];
+    double* matrix = (double*)rigid.matrix.data + (size_t)world * room * room;
+    double* gradient = (double*)rigid.gradient.data + (size_t)world * room;
+    const double* inertia = (const double*)rigid.inertia.data + (size_t)world * room * room;
+    const double* r = (const double*)rigid.r.data + (size_t)world * room;
+    const double* predicted = (const double*)rigid.predicted.data + (size_t)world * room;
+    for (int j = 0; j < n; ++j) {
+        double g = 0.0;
+        for (int l = 0; l < n; ++l) g += inertia[j * room + l] * (r[l] - predicted[l]);
+        gradient[j] = g;
+        for (int l = 0; l <= j; ++l) matrix[j * room + l] = inertia[j * room + l];
+    }
+    const size_t width = constraints.jacobian.shape[2];
+    for (int i = begin; i < end; ++i) {
+        const size_t own = (size_t)i * constraints.row.shape[1];
+        const int* acting = (const int*)constraints.acting.data + own;
+        const int pins = instances.link_pin_count.data[i] > 0 ? 0 : instances.pin_count.data[i];
+        for (int k = pins; k < constraints.acting_count.data[i]; ++k) {
+            const size_t e = own + acting[k];
+            const float* J = (const float*)constraints.jacobian.data + 3 * e * width;
+            const float* C = (const float*)constraints.coupling.data + 3 * e * width;
+            const double* f = (const double*)constraints.force.data + 3 * e;
+            const int first = constraints.dof_begin.data[e], last = constraints.dof_end.data[e];
+            for (int j = first; j < last && j < n; ++j) {
+                const float *a = J + 3 * j, *c = C + 3 * first;
+                for (int l = first; l <= j; ++l, c += 3)
+                    matrix[j * room + l] += (double)(a[0] * c[0] + a[1] * c[1] + a[2] * c[2]);
+                gradient[j] += a[0] * f[0] + a[1] * f[1] + a[2] * f[2];
+            }
+        }
+    }
+    for (int k = 0; k < rigid.row_count.data[world]; ++k) {
+        const size_t row = (size_t)world * rigid.row_jacobian.shape[1] + k;
+        const float* J = (const float*)rigid.row_jacobian.data + row * room;
+        const double* C = (const double*)rigid.row_coupling.data + row * room;
+        const double f = ((const double*)rigid.row_force.data)[row];
+        for (int j = 0; j < n; ++j) {
+            for (int l = 0; l <= j; ++l) matrix[j * room + l] += (double)J[j] * C[l];
+            gradient[j] += (double)J[j] * f;
+        }
+    }
+    for (int j = 0; j < n; ++j)
+        for (int l = 0; l < j; ++l) matrix[l * room + j] = matrix[j * room + l];
+}"""
+)
+def sum_rigid(instances: Instances, constraints: PointConstraints, rigid: Rigid, begin: int, end: int, world: int) -> None:
+    """Compute gradient and Hessian of the rigid dofs of a world; see ``assembly_kernels.rigid_entry``."""
+
+
+@wp.func
+def rigid_of(step: NewtonStep, w: int):
+    """Compute gradient and Hessian of the rigid dofs of a world."""
+    if step.state.active[w] == 0 or step.rigid.count[w] == 0:
+        return
+    begin = step.state.instance_start[w]
+    end = step.state.instance_start[w + 1]
+    sum_rigid(step.instances, step.constraints, step.rigid, begin, end, w)
+
+
+@wp.func_native(
+    snippet="""{
     #pragma clang fp contract(fast)
     typedef float floats __attribute__((ext_vector_type(8)));
     typedef double lanes __attribute__((ext_vector_type(8)));
@@ -275,5 +384,7 @@ def condense_world(step: NewtonStep, w: int):
 
 assemble_stiffness = kernel_over(stiffness_of, "assemble_stiffness", "i")
 sum_forces = kernel_over(forces_of, "sum_forces", "i")
+assemble_matrix = kernel_over(matrix_of, "assemble_matrix", "i")
+assemble_rigid = kernel_over(rigid_of, "assemble_rigid", "w")
 assemble_columns = kernel_over(columns_of, "assemble_columns", "i")
 condense = kernel_over(condense_world, "condense", "w")

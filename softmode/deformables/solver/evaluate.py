@@ -66,11 +66,12 @@ def assemble(tables: StepTables, dt: float) -> None:
     if t.model.device.is_cuda:
         # more than 100 registers per thread: larger blocks leave half of a multiprocessor idle
         t.launch(assembly.assemble_stiffness, (count, t.arrays.stiffness.shape[1], tasks), step, block_dim=128)
+        columns = 3 * blocks  # threads that share a row of the matrix
+        t.launch(assembly.assemble_matrix, (count, t.arrays.stiffness.shape[2], columns), step, columns)
     else:
         t.launch(eights.differentiate_eights, t.point_tasks, step)
         t.launch(assembly_cpu.assemble_stiffness, count, step)
-    columns = 3 * blocks if t.model.device.is_cuda else 1  # threads that share a row of the matrix
-    t.launch(assembly.assemble_matrix, (count, t.arrays.stiffness.shape[2], columns), step, columns)
+        t.launch(assembly_cpu.assemble_matrix, count, step)
     t.launch(assembly.add_contacts, (count, tasks), step, block_dim=128)
     if t.model.device.is_cuda:
         t.launch(assembly.assemble_columns, (count, 3 * blocks, rigid_max + 1), step)
@@ -79,8 +80,10 @@ def assemble(tables: StepTables, dt: float) -> None:
     if t.layout.part_count > 1:
         dim = (worlds, t.layout.part_count**2, 9 * blocks * blocks)
         t.launch(assembly.assemble_pairs, dim, step, t.system.relation, block_dim=128)
-    if rigid_max:
+    if rigid_max and t.model.device.is_cuda:
         t.launch(assembly.assemble_rigid, (worlds, rigid_max, rigid_max), step)
+    elif rigid_max:
+        t.launch(assembly_cpu.assemble_rigid, worlds, step)
 
 
 def solve(tables: StepTables) -> None:

@@ -13,7 +13,14 @@ import warp as wp
 from softmode.deformables.model.declare import Kernel
 from softmode.deformables.model.lane_kernels import LANES, barrier, rolled, team_sum, vec8
 from softmode.deformables.model.struct_kernels import instance_end
-from softmode.deformables.solver.assembly_cpu_kernels import columns_of, condense_world, forces_of, stiffness_of
+from softmode.deformables.solver.assembly_cpu_kernels import (
+    columns_of,
+    condense_world,
+    forces_of,
+    matrix_of,
+    rigid_of,
+    stiffness_of,
+)
 from softmode.deformables.solver.assembly_kernels import (
     column_block,
     condensed_entry,
@@ -163,10 +170,12 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool
                                     stiffness_block(step, i, t / tasks, t % tasks)
                             barrier()
                         if wp.static(not shared):
-                            # on CPU one thread has a whole row: what the row has in common is found once
-                            width = wp.where(wp.static(lanes), 1, 3 * blocks)
-                            for t in range(member, LANES * 3 * blocks * width, team):
-                                matrix_row(step, width, i, t / width, t % width)
+                            if wp.static(lanes):
+                                matrix_of(step, i)
+                            else:
+                                width = 3 * blocks
+                                for t in range(member, LANES * width * width, team):
+                                    matrix_row(step, width, i, t / width, t % width)
                             barrier()
                             for t in range(member, tasks, team):
                                 contact_block(step, i, t)
@@ -198,8 +207,11 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, joined: bool
                             team,
                         )
                     if wp.static(not shared):
-                        for t in range(member, n * n, team):
-                            rigid_entry(step, w, t / n, t % n)
+                        if wp.static(lanes):
+                            rigid_of(step, w)
+                        else:
+                            for t in range(member, n * n, team):
+                                rigid_entry(step, w, t / n, t % n)
                         barrier()
                         for s in range(step.arrays.system_start[w], step.arrays.system_start[w + 1]):
                             factor_system(
