@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import newton
 import numpy as np
 import pytest
@@ -155,7 +157,7 @@ def crowd(seed: int) -> Scene:
     rng = np.random.default_rng(seed)
     mesh = newton.Mesh.create_box(0.02, 0.03, 0.04)
 
-    def populate(world: newton.ModelBuilder) -> None:
+    def populate(world: Any) -> None:
         add_reduced_body(world, cube(), position=(0.0, 0.0, 0.0))
         for k in range(int(CULLED) + 6):
             turn = wp.quat_from_matrix(wp.mat33(*random_rotation(rng).ravel()))
@@ -165,16 +167,17 @@ def crowd(seed: int) -> Scene:
                 body = world.add_body(xform=pose)
                 pose = wp.transform(rng.uniform(-0.02, 0.02, 3), wp.quat_identity())
             a, b, c = (float(x) for x in rng.uniform(0.01, 0.03, 3))
-            add = (
-                lambda p, i: world.add_shape_box(i, xform=p, hx=a, hy=b, hz=c),
-                lambda p, i: world.add_shape_sphere(i, xform=p, radius=a),
-                lambda p, i: world.add_shape_capsule(i, xform=p, radius=a, half_height=b),
-                lambda p, i: world.add_shape_cylinder(i, xform=p, radius=a, half_height=b),
-                lambda p, i: world.add_shape_cone(i, xform=p, radius=a, half_height=b),
-                lambda p, i: world.add_shape_ellipsoid(i, xform=p, rx=a, ry=b, rz=c),
-                lambda p, i: world.add_shape_mesh(i, xform=p, mesh=mesh),
+            kinds = (
+                (world.add_shape_box, {"hx": a, "hy": b, "hz": c}),
+                (world.add_shape_sphere, {"radius": a}),
+                (world.add_shape_capsule, {"radius": a, "half_height": b}),
+                (world.add_shape_cylinder, {"radius": a, "half_height": b}),
+                (world.add_shape_cone, {"radius": a, "half_height": b}),
+                (world.add_shape_ellipsoid, {"rx": a, "ry": b, "rz": c}),
+                (world.add_shape_mesh, {"mesh": mesh}),
             )
-            add[k % len(add)](pose, body)
+            add, given = kinds[k % len(kinds)]
+            add(body, xform=pose, **given)
 
     return Scene(populate, [cube()], ground=0.5)
 
@@ -185,13 +188,13 @@ def test_culled_shapes_touch_nothing(fresh: bool) -> None:
     scene = crowd(1)
     rng = np.random.default_rng(2)
     t, dt, memory = scene.reduced.tables, scene.dt, scene.state.softmode
-    scene.state.body_qd.assign(rng.normal(size=scene.state.body_qd.shape[:1] + (6,)))
-    memory.qd.assign(0.3 * rng.normal(size=memory.qd.shape + (3,)))
-    memory.stick_shape.assign(rng.integers(-1, scene.model.shape_count, size=memory.stick_shape.shape + (2,)))
+    scene.state.body_qd.assign(rng.normal(size=(*scene.state.body_qd.shape[:1], 6)))
+    memory.qd.assign(0.3 * rng.normal(size=(*memory.qd.shape, 3)))
+    memory.stick_shape.assign(rng.integers(-1, scene.model.shape_count, size=(*memory.stick_shape.shape, 2)))
     for _ in range(2):  # the first step allocates what detection reads
         scene.solver.step(scene.state, scene.next_state, scene.control, None, dt)
     memory.dt_before.fill_(0.0 if fresh else dt)
-    memory.stick_shape.assign(rng.integers(-1, scene.model.shape_count, size=memory.stick_shape.shape + (2,)))
+    memory.stick_shape.assign(rng.integers(-1, scene.model.shape_count, size=(*memory.stick_shape.shape, 2)))
     before = (memory.stick_shape, memory.dt_before)
     shapes = (t.candidate, t.near, t.shapes, float(dt))
     t.samples.near.zero_()

@@ -27,12 +27,14 @@ DT = 0.01
 
 WAYS = {"point": (evaluate_materials, 1), "lanes": (evaluate_materials_in_lanes, LANES)}
 """Kernels that evaluate a material, and the points of a thread."""
+CHOSEN = {"way": "point"}
+"""The one that :func:`evaluate` takes."""
 
 
 @pytest.fixture(autouse=True, params=WAYS)
 def way(request, monkeypatch):
     """Test the device code of a point, and that of eight points at a time, which CPU takes."""
-    monkeypatch.setattr(evaluate, "way", request.param)
+    monkeypatch.setitem(CHOSEN, "way", request.param)
 
 
 class Evaluation(NamedTuple):
@@ -50,7 +52,7 @@ class Evaluation(NamedTuple):
 
 def evaluate(model, F, nu=0.3, *, F_start=None, viscosity=0.0, G=None, dF=None, project=True):
     """Evaluate the device code at F (N, 3, 3), or at G = F - I where F itself would round it away."""
-    kernel, lanes = WAYS[evaluate.way]
+    kernel, lanes = WAYS[CHOSEN["way"]]
     G = np.asarray(F, float).reshape(-1, 3, 3) - np.eye(3) if G is None else G
     start = G if F_start is None else np.asarray(F_start, float).reshape(-1, 3, 3) - np.eye(3)
     direction = np.zeros_like(G) if dF is None else np.broadcast_to(dF, G.shape)
@@ -65,9 +67,6 @@ def evaluate(model, F, nu=0.3, *, F_start=None, viscosity=0.0, G=None, dF=None, 
         wp.launch(kernel, dim=-(-len(G) // lanes), inputs=[*inputs, int(project)], outputs=out)
     energy, stress, derivative, blocks = (array.numpy() for array in out)
     return Evaluation(energy, stress, derivative, unpack(blocks))
-
-
-evaluate.way = "point"
 
 
 def unpack(blocks):

@@ -47,7 +47,10 @@ def _cull_snippet() -> str:
     const int checked = candidate_max < CULLED ? candidate_max : CULLED;
     const int* own = (const int*)candidate.data + (size_t)i * candidate_max;
     const int* close = (const int*)near.data + (size_t)i * candidate_max;
-    struct Frame { double turn[9], origin[3], lower[3], upper[3], linear[3], angular[3], centre[3], thick, slack; int shape, bit; };
+    struct Frame {
+        double turn[9], origin[3], lower[3], upper[3], linear[3], angular[3], centre[3], thick, slack;
+        int shape, bit;
+    };
     Frame frames[CULLED];
     int frame_count = 0, passed = 0;
     for (int c = 0; c < checked; ++c) {

@@ -148,8 +148,8 @@ _SINGULAR_VALUES = """
             }
             return ~first | (absolute(s) > 1.0e-7);
         }
-        __attribute__((noinline)) static void orthogonal_columns(const lanes* A, lanes* B, lanes* V) {  // columns of six: A V on top of V
-            lanes column[3][6];
+        NOINLINE static void orthogonal_columns(const lanes* A, lanes* B, lanes* V) {
+            lanes column[3][6];  // of A V, on top of those of V
             for (int c = 0; c < 3; ++c)
                 for (int k = 0; k < 3; ++k) {
                     column[c][k] = A[3 * k + c];
@@ -168,7 +168,7 @@ _SINGULAR_VALUES = """
                     V[3 * k + c] = column[c][3 + k];
                 }
         }
-        __attribute__((noinline)) static void singular_values(const lanes* F, lanes* U, lanes* sigma, lanes* V) {
+        NOINLINE static void singular_values(const lanes* F, lanes* U, lanes* sigma, lanes* V) {
             FUSED
             lanes B[9], x[3], y[3], z[3], u[3], w[3], n[3];
             orthogonal_columns(F, B, V);
@@ -320,7 +320,8 @@ _HESSIAN = """
                 }
             }
         }
-        __attribute__((noinline)) static void hessian_of_singular_values(int model, lanes mu, lanes lam, double rate, const lanes* G,
+        NOINLINE
+        static void hessian_of_singular_values(int model, lanes mu, lanes lam, double rate, const lanes* G,
                                                const lanes* F, const lanes* viscous, int project, float* out) {
             FUSED
             lanes U[9], sigma[3], V[9], twist[3], flip[3], S[9], direct[9], exchange[9];
@@ -407,7 +408,7 @@ def _snippet(parts: str, body: str) -> str:
     """Return native code whose functions stand in a local struct, as a function's body has no other place for them."""
     models = ", ".join(f"{model.name} = {int(model)}" for model in MaterialModel)
     text = f"{{\n    FUSED\n{_TYPES}    struct Eight {{\n        enum Model {{ {models} }};\n{parts}    }};\n{body}}}"
-    return text.replace("FUSED", FUSED)
+    return text.replace("FUSED", FUSED).replace("NOINLINE", "__attribute__((noinline))")
 
 
 _LOADS = """

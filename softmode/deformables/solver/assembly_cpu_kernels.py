@@ -250,7 +250,8 @@ def columns_of(step: NewtonStep, i: int):
                 value += more;
             }
             if (k < driven || 8 * b < driven)
-                for (int lane = 0; lane < 8; ++lane) value[lane] = k < driven || 8 * b + lane < driven ? 0.0f : value[lane];
+                for (int lane = 0; lane < 8; ++lane)
+                    if (k < driven || 8 * b + lane < driven) value[lane] = 0.0f;
             if (column == row / 8) value[row % 8] += inertia;
             __builtin_memcpy(out + column, &value, sizeof(value));
         }
@@ -318,7 +319,9 @@ def matrix_of(step: NewtonStep, i: int):
         for (int l = 0; l < j; ++l) matrix[l * room + j] = matrix[j * room + l];
 }"""
 )
-def sum_rigid(instances: Instances, constraints: PointConstraints, rigid: Rigid, begin: int, end: int, world: int) -> None:
+def sum_rigid(
+    instances: Instances, constraints: PointConstraints, rigid: Rigid, begin: int, end: int, world: int
+) -> None:
     """Compute gradient and Hessian of the rigid dofs of a world; see ``assembly_kernels.rigid_entry``."""
 
 
