@@ -122,7 +122,7 @@ def work(tables: Any) -> dict[str, Work]:
 
     With n functions, P points, E contacts of which A act, N = 3 n unknowns, padded to blocks of eight as they are
     computed, and c columns of the rigid dofs. Numbers per point and contact that are guessed, such as 1,200 flops of a
-    material, are those of the code's size.
+    material, are those of the code's size. On CPU *eights* evaluate points eight at a time, the Hessian by itself.
     """
     constraints, rigid = tables.constraints, tables.rigid.count_max
     n, points = float(tables.layout.stride), float(tables.instances.point_count.numpy().mean())
@@ -133,9 +133,11 @@ def work(tables: Any) -> dict[str, Work]:
     stiffness = Work(27 * n * n * points, basis + 216 * points + 4 * triangle)
     return {
         "evaluate_points": Work(18 * n * points + 1200 * points, basis + 300 * points, double=True),
+        "evaluate_eights": Work(18 * n * points + 600 * points, basis + 160 * points, double=True),
+        "differentiate_eights": Work(18 * n * points + 600 * points, basis + 290 * points, double=True),
         "evaluate_constraints": Work(6 * n * near + 200 * near, 4 * n * near + 400 * near, double=True),
         "sum_forces": Work(18 * n * points + 6 * n * acting, basis + 72 * points + 4 * n * acting, double=True),
-        **dict.fromkeys(("assemble_stiffness", "assemble_slabs", "assemble_tiles"), stiffness),  # one of them runs
+        **dict.fromkeys(("assemble_stiffness", "assemble_tiles"), stiffness),  # one of them runs
         "assemble_matrix": Work(triangle, 8 * triangle),
         "add_contacts": Work(2 * acting * triangle, 8 * triangle + (4 * n + 40) * acting),
         "assemble_columns": Work(6 * n * acting * rigid, 4 * unknowns * columns + (4 * n + 12 * rigid) * acting),

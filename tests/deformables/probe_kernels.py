@@ -5,6 +5,7 @@ import warp as wp
 from softmode.deformables.contact import penalty_kernels as contact
 from softmode.deformables.contact import shape_query_kernels as shape_queries
 from softmode.deformables.materials.hessian_kernels import HessianBlocks, hessian, stress_derivative
+from softmode.deformables.materials.material_cpu_kernels import LANES, energy_and_stress, hessian_lanes, mat98d, vec8d
 from softmode.deformables.materials.material_kernels import MaterialParameters, energy, stress
 from softmode.deformables.materials.singular_value_kernels import positive_part, singular_values
 
@@ -31,6 +32,55 @@ def evaluate_materials(
     stress_out[i] = stress(parameters, G[i], G_start[i], dt)
     derivative_out[i] = stress_derivative(parameters, G[i], G_start[i], dt, direction[i])
     hessian_out[i] = hessian(parameters, G[i], G_start[i], dt, project)
+
+
+@wp.func
+def in_lanes(G: wp.array[wp.mat33d], first: int):
+    """Return eight matrices from ``first`` on; the last one stands for those behind it."""
+    out = mat98d()
+    for lane in range(LANES):
+        M = G[wp.min(first + lane, G.shape[0] - 1)]
+        for k in range(9):
+            out[k, lane] = M[k / 3, k % 3]
+    return out
+
+
+@wp.kernel
+def evaluate_materials_in_lanes(
+    parameters: MaterialParameters,
+    G: wp.array[wp.mat33d],
+    G_start: wp.array[wp.mat33d],
+    direction: wp.array[wp.mat33d],
+    dt: wp.float64,
+    project: int,
+    # Out:
+    energy_out: wp.array[wp.float64],
+    stress_out: wp.array[wp.mat33d],
+    derivative_out: wp.array[wp.mat33d],
+    hessian_out: wp.array[HessianBlocks],
+):
+    """Do the same, eight at a time; what has no form in lanes comes from the functions of a point."""
+    first = LANES * wp.tid()
+    one = vec8d(wp.float64(1.0))
+    mu = parameters.mu * one
+    lam = parameters.lam * one
+    rate = parameters.viscosity / dt
+    place = in_lanes(G, first)
+    start = in_lanes(G_start, first)
+    found = energy_and_stress(parameters.model, mu, lam, rate, place, start)
+    C = hessian_lanes(parameters.model, mu, lam, rate, place, start, project)
+    for lane in range(wp.min(LANES, G.shape[0] - first)):
+        i = first + lane
+        energy_out[i] = found[0, lane]
+        P = wp.mat33d()
+        for k in range(9):
+            P[k / 3, k % 3] = found[1 + k, lane]
+        stress_out[i] = P
+        derivative_out[i] = stress_derivative(parameters, G[i], G_start[i], dt, direction[i])
+        blocks = HessianBlocks()
+        for k in range(54):
+            blocks[k / 3, k % 3] = C[k, lane]
+        hessian_out[i] = blocks
 
 
 @wp.kernel

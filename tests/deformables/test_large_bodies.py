@@ -17,7 +17,6 @@ from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.model.authoring import add_pins, add_reduced_body
 from softmode.deformables.model.compile_ahead import compile_launches
-from softmode.deformables.solver import assembly_kernels as assembly
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient, solve
 from softmode.deformables.solver.step_tables import newton_notes
 from softmode.deformables.solver.tile_kernels import TILE, assemble_tiles, chunk_count, tile_count
@@ -139,7 +138,7 @@ def test_large_bodies_on_cuda(count: int) -> None:
 
 
 def test_slabs_of_points_keep_the_bits() -> None:
-    """However one thread cuts points and columns, each entry has the same sums in the same order, here of 19 blocks."""
+    """However one thread cuts points, each entry has the same sums in the same order, here of 19 blocks."""
     scene = scene_of(152)
     scene.step(2)
     t, found = scene.reduced.tables, []
@@ -148,11 +147,9 @@ def test_slabs_of_points_keep_the_bits() -> None:
     evaluate(t, scene.dt, derivatives=True)
     t.arrays.stiffness.fill_(np.nan)
     blocks = t.layout.block_count
-    assert blocks > assembly.SLAB_BLOCKS and blocks % 2 == 1
     for slabs in (1, 3):
         step = t.newton_step(scene.dt)
         step.options.stiffness_slabs = slabs
-        step.arrays.turned = wp.zeros((17, t.layout.point_max, 3), dtype=step.arrays.turned.dtype, device="cpu")
         assemble(t, scene.dt)
         found.append(t.arrays.stiffness.numpy()[0, 0])
     tasks = tile_count(t.layout.stride)

@@ -8,10 +8,11 @@ import warp as wp
 
 from softmode.deformables.materials.hessian_kernels import HessianBlocks
 from softmode.deformables.materials.material import Material
+from softmode.deformables.materials.material_cpu_kernels import LANES
 from softmode.deformables.materials.material_kernels import MaterialModel, MaterialParameters
 from softmode.errors import MaterialError
 from tests import reference
-from tests.deformables.probe_kernels import decompose, evaluate_materials
+from tests.deformables.probe_kernels import decompose, evaluate_materials, evaluate_materials_in_lanes
 from tests.scenes import random_rotation
 
 MODELS = list(MaterialModel)
@@ -22,6 +23,18 @@ NUS = (-0.5, 0.0, 0.3, 0.49)
 FLOAT32 = float(np.finfo(np.float32).eps)
 FLOAT64 = float(np.finfo(np.float64).eps)
 DT = 0.01
+
+
+WAYS = {"point": (evaluate_materials, 1), "lanes": (evaluate_materials_in_lanes, LANES)}
+"""Kernels that evaluate a material, and the points of a thread."""
+CHOSEN = {"way": "point"}
+"""The one that :func:`evaluate` takes."""
+
+
+@pytest.fixture(autouse=True, params=WAYS)
+def way(request, monkeypatch):
+    """Test the device code of a point, and that of eight points at a time, which CPU takes."""
+    monkeypatch.setitem(CHOSEN, "way", request.param)
 
 
 class Evaluation(NamedTuple):
@@ -39,6 +52,7 @@ class Evaluation(NamedTuple):
 
 def evaluate(model, F, nu=0.3, *, F_start=None, viscosity=0.0, G=None, dF=None, project=True):
     """Evaluate the device code at F (N, 3, 3), or at G = F - I where F itself would round it away."""
+    kernel, lanes = WAYS[CHOSEN["way"]]
     G = np.asarray(F, float).reshape(-1, 3, 3) - np.eye(3) if G is None else G
     start = G if F_start is None else np.asarray(F_start, float).reshape(-1, 3, 3) - np.eye(3)
     direction = np.zeros_like(G) if dF is None else np.broadcast_to(dF, G.shape)
@@ -50,7 +64,7 @@ def evaluate(model, F, nu=0.3, *, F_start=None, viscosity=0.0, G=None, dF=None, 
         out = [wp.zeros(len(G), dtype=dtype) for dtype in (wp.float64, wp.mat33d, wp.mat33d, HessianBlocks)]
         gradients = [wp.array(values, dtype=wp.mat33d) for values in (G, start, direction)]
         inputs = [parameters, *gradients, wp.float64(DT)]
-        wp.launch(evaluate_materials, dim=len(G), inputs=[*inputs, int(project)], outputs=out)
+        wp.launch(kernel, dim=-(-len(G) // lanes), inputs=[*inputs, int(project)], outputs=out)
     energy, stress, derivative, blocks = (array.numpy() for array in out)
     return Evaluation(energy, stress, derivative, unpack(blocks))
 

@@ -52,6 +52,8 @@ from softmode.deformables.model.struct_kernels import (
 wp.set_module_options({"enable_backward": False})
 
 
+CULLED = wp.constant(31)
+"""Candidate shapes that samples may be culled against, a bit each; further ones are all looked at."""
 OPPOSED = wp.constant(0.3)
 """Cosine beyond which a direction counts as against a normal."""
 
@@ -293,7 +295,7 @@ def find_contacts(
     row = instances.row_start[i] + s
     stuck = stick_shape[instances.particle_start[i] + s]
     for c in range(candidate.shape[1]):
-        if near[i, c] == 0:
+        if near[i, c] == 0 or (c < CULLED and (samples.near[i, s] >> c) & 1 == 0):
             continue
         shape = candidate[i, c]
         pose = shapes.transform[shape]
@@ -323,11 +325,11 @@ def find_contacts(
         back = int(0)
         depth = instances.scale[i] * float(wp.length(basis.inner_point[row]))
         travel = wp.length(drift)
-        if query.distance < 2.0 * depth:
+        touched = stuck[0] == shape or stuck[1] == shape or dt_before[i] == wp.float64(0.0)
+        if query.distance <= 0.0 or (touched and query.distance < 2.0 * depth):
             bent = interpolate(basis.inner_row, row, motion.q_start, i, instances.function_count[i])
             inner = wp.quat_rotate_inv(turn, wp.vec3(basis.inner_point[row] + bent))
             depth = wp.length(inner)
-            touched = stuck[0] == shape or stuck[1] == shape or dt_before[i] == wp.float64(0.0)
             near_back = query.distance <= 0.0 or (touched and query.distance < depth)
             if near_back and wp.dot(query.normal, inner) < -OPPOSED * depth:
                 # the nearest surface faces away from the body's inside: the sample must go back to it

@@ -313,6 +313,7 @@ class Samples:
 
     position: wp.array2d[wp.vec3d]  # [m]
     drift: wp.array2d[wp.vec3]  # dt v [m]
+    near: wp.array2d[int]  # a bit per candidate shape that it may touch, of the first 31; all where nothing is culled
     shape: wp.array3d[int]  # (..., SLOTS), -1 where empty
     gap: wp.array3d[wp.float64]  # (..., SLOTS) [m]
     normal: wp.array3d[wp.vec3]  # (..., SLOTS)

@@ -12,7 +12,6 @@ from softmode.deformables.model.struct_kernels import (
     Instances,
     NewtonState,
     Rigid,
-    blocks_of,
     exists,
     first_coupled,
 )
@@ -21,10 +20,6 @@ from softmode.deformables.solver.iteration_kernels import NewtonStep, add_outer
 
 wp.set_module_options({"enable_backward": False})
 
-SLAB_BLOCKS = wp.constant(16)
-"""Blocks of eight functions, the columns of a tile that a CPU assembles at a time, and"""
-SLAB_ROWS = wp.constant(5120)
-"""these times the points of a slab: 480 kB of gradients, which stay in the second cache."""
 CONDENSED_ROUNDING = wp.constant(wp.float64(1.0e-6))
 """Rounding of a condensed diagonal entry as a fraction of the entry before: the bodies are factored in float32."""
 
@@ -94,82 +89,6 @@ def stiffness_block(step: NewtonStep, i: int, chunk: int, task: int):
 
 
 assemble_stiffness = kernel_over(stiffness_block, "assemble_stiffness", "i", "chunk", "task")
-
-
-def cache_slabs(block_count: int, point_count: int) -> int:
-    """Return into how many slabs the points of a body are cut on a CPU, see ``stiffness_slab``."""
-    return max(-(-point_count * min(block_count, SLAB_BLOCKS) // SLAB_ROWS), 1)
-
-
-@wp.func
-def slab_tiles(block_count: int):
-    """Return into how many tiles the columns are cut there."""
-    return (block_count + SLAB_BLOCKS - 1) / SLAB_BLOCKS
-
-
-@wp.func
-def stiffness_slab(step: NewtonStep, i: int, task: int):
-    """Add to the columns of one tile what one slab of the points has of sum_p grad b^T C grad b; the first sets them.
-
-    The same sums in the same order as ``stiffness_block``, for one thread: C grad b is formed once for all rows, and
-    stays in the second cache of a CPU, whatever the number of functions and points. Two blocks side by side share what
-    is loaded of the rows.
-    """
-    if step.state.active[step.instances.world[i]] == 0 or step.state.refresh[step.instances.world[i]] == 0:
-        return
-    if not exists(step.instances, i):
-        return
-    block_count = step.basis.row.shape[1]
-    tiles = slab_tiles(block_count)
-    slabs = step.options.stiffness_slabs
-    slab = task / tiles
-    low = (task % tiles) * block_count / tiles
-    wide = (task % tiles + 1) * block_count / tiles - low
-    first = step.instances.point_start[i]
-    count = step.instances.point_count[i]
-    begin = slab * count / slabs
-    end = (slab + 1) * count / slabs
-    used = blocks_of(step.instances.function_count[i])
-    pairs = int(6)
-    for pair in range(pairs):
-        c, d = block_pair(pair)
-        for columns in range(low, low + wide):
-            for p in range(begin, end):
-                C = step.points.hessian[i, pair, p]
-                gx = step.basis.gradient_across[columns, first + p, 0]
-                gy = step.basis.gradient_across[columns, first + p, 1]
-                gz = step.basis.gradient_across[columns, first + p, 2]
-                for k in range(3):
-                    step.arrays.turned[columns - low, p - begin, k] = C[k, 0] * gx + C[k, 1] * gy + C[k, 2] * gz
-        half = (wide + 1) / 2
-        for t in range(block_count * half):
-            rows = t / half
-            columns = low + 2 * (t % half)
-            double = columns + 1 < low + wide
-            if c == d and columns + 1 < rows:
-                continue  # below the diagonal
-            row = LANES * (c * block_count + rows)
-            column = d * block_count + columns
-            block = mat88()
-            beside = mat88()
-            if slab > 0:
-                for a in range(LANES):
-                    block[a] = step.arrays.stiffness[i, 0, row + a, column]
-                    if double:
-                        beside[a] = step.arrays.stiffness[i, 0, row + a, column + 1]
-            if rows < used and columns < used:
-                for p in range(begin, end):
-                    for k in range(3):
-                        g = step.basis.gradient_across[rows, first + p, k]
-                        block = add_outer(block, g, step.arrays.turned[columns - low, p - begin, k])
-                        beside = add_outer(beside, g, step.arrays.turned[columns - low + 1, p - begin, k])
-            for a in range(LANES):
-                step.arrays.stiffness[i, 0, row + a, column] = block[a]
-                if double:
-                    step.arrays.stiffness[i, 0, row + a, column + 1] = beside[a]
-
-
-assemble_slabs = kernel_over(stiffness_slab, "assemble_slabs", "i", "task")
 
 
 @wp.kernel

@@ -4,6 +4,7 @@ import newton
 import warp as wp
 
 from softmode.deformables.contact import detection_kernels as kernels
+from softmode.deformables.contact import sample_cpu_kernels as eights
 from softmode.deformables.model.namespaces import SoftControl, soft
 from softmode.deformables.solver import assembly_kernels as assembly
 from softmode.deformables.solver.step_kernels import fall_back_to_euler
@@ -25,8 +26,8 @@ def detect(tables: StepTables, state: newton.State, control: SoftControl, dt: fl
     if t.layout.pin_max:
         _gather_pins(t, control, dt, prescribed)
     if t.model.shape_count or t.pairs is not None:
-        every = t.samples.position.shape
-        t.launch(kernels.place_samples, every, t.instances, t.basis, t.motion, t.samples)
+        place = kernels.place_samples if t.model.device.is_cuda else eights.place_eights
+        t.launch(place, t.sample_tasks, t.instances, t.basis, t.motion, t.samples)
         t.launch_teams(kernels.bound_samples, t.layout.instance_count, t.instances, t.team, t.samples)
     if t.model.shape_count:
         _find_contacts(t, state, dt, prescribed)
@@ -72,8 +73,11 @@ def _find_contacts(t: StepTables, state: newton.State, dt: float, prescribed: bo
     memory, candidate = soft(state), t.candidate
     culled = (t.instances, candidate, t.shapes, t.samples, *t.pin_arrays, float(dt), t.near, t.newton.status)
     t.launch(kernels.cull_shapes, candidate.shape, *culled)
-    known = (t.instances, t.basis, t.motion, candidate, t.near, t.shapes, float(dt))
     before = (memory.stick_shape, memory.dt_before)
+    if not t.model.device.is_cuda:
+        shapes = (candidate, t.near, t.shapes, float(dt))
+        t.launch(eights.cull_samples, t.layout.instance_count, t.instances, t.basis, *shapes, *before, t.samples)
+    known = (t.instances, t.basis, t.motion, candidate, t.near, t.shapes, float(dt))
     t.launch(kernels.find_contacts, t.samples.position.shape, *known, *before, t.samples)
     stick = (int(prescribed), wp.float64(t.options.stick_ratio), t.team, float(dt))
     t.launch_teams(

@@ -2,7 +2,9 @@
 
 import warp as wp
 
+from softmode.deformables.solver import assembly_cpu_kernels as assembly_cpu
 from softmode.deformables.solver import assembly_kernels as assembly
+from softmode.deformables.solver import point_cpu_kernels as eights
 from softmode.deformables.solver import step_kernels as kernels
 from softmode.deformables.solver.iteration_kernels import ALL, ENERGIES, TRIAL
 from softmode.deformables.solver.rigid_row_kernels import evaluate_rows
@@ -38,7 +40,8 @@ def _evaluate(
 ) -> None:
     """Evaluate the selected worlds at (q, r): of points and rows what ``found`` says, of contacts forces or not."""
     step = t.newton_step(dt)
-    t.launch(kernels.evaluate_points, t.points.energy.shape, step, selected, q, found)
+    points = kernels.evaluate_points if t.model.device.is_cuda else eights.evaluate_eights
+    t.launch(points, t.point_tasks, step, selected, q, found)
     t.launch(kernels.evaluate_constraints, t.constraints.row.shape, step, selected, q, r, int(forces))
     if t.rigid.row_max:
         t.launch(evaluate_rows, (t.layout.world_count, t.rigid.row_max), step, selected, r, found)
@@ -47,8 +50,12 @@ def _evaluate(
 def gather_gradient(tables: StepTables, dt: float) -> None:
     """Gather the gradient of the potential with respect to q, and what holds the driven functions."""
     t, step = tables, tables.newton_step(dt)
-    dim = (t.layout.instance_count, t.arrays.gradient_chunk.shape[1], t.layout.block_count)
-    t.launch(kernels.sum_forces, dim, step, t.newton.active)
+    count = t.layout.instance_count
+    if t.model.device.is_cuda:
+        dim = (count, t.arrays.gradient_chunk.shape[1], t.layout.block_count)
+        t.launch(kernels.sum_forces, dim, step, t.newton.active)
+    else:
+        t.launch(assembly_cpu.sum_forces, count, step, t.newton.active)
     t.launch(kernels.sum_gradient, t.unknowns, step)
 
 
@@ -57,25 +64,34 @@ def assemble(tables: StepTables, dt: float) -> None:
     t, step, rigid_max = tables, tables.newton_step(dt), tables.rigid.count_max
     blocks, count, worlds = t.layout.block_count, t.layout.instance_count, t.layout.world_count
     tasks = 3 * blocks * blocks + 3 * (blocks * blocks + blocks) // 2  # 8x8 blocks of the upper triangle
-    columns = 3 * blocks if t.model.device.is_cuda else 1  # threads that share a row of the matrix
-    # more than 100 registers per thread: larger blocks leave half of a multiprocessor idle
     chunks = t.arrays.stiffness.shape[1]
+    if t.model.device.is_cpu:
+        t.launch(eights.differentiate_eights, t.point_tasks, step)
     if t.tiled:
         team = TILE_TEAM if t.model.device.is_cuda else 1
         t.launch(assemble_tiles, (count, chunks, tile_count(t.layout.stride), team), step, team, block_dim=team)
     elif t.model.device.is_cuda:
+        # more than 100 registers per thread: larger blocks leave half of a multiprocessor idle
         t.launch(assembly.assemble_stiffness, (count, chunks, tasks), step, block_dim=128)
     else:
-        tiles = -(-blocks // assembly.SLAB_BLOCKS)
-        t.launch(assembly.assemble_slabs, (count, step.options.stiffness_slabs * tiles), step)
-    t.launch(assembly.assemble_matrix, (count, t.arrays.stiffness.shape[2], columns), step, columns)
+        t.launch(assembly_cpu.assemble_stiffness, count, step)
+    if t.model.device.is_cuda:
+        columns = 3 * blocks  # threads that share a row of the matrix
+        t.launch(assembly.assemble_matrix, (count, t.arrays.stiffness.shape[2], columns), step, columns)
+    else:
+        t.launch(assembly_cpu.assemble_matrix, count, step)
     t.launch(assembly.add_contacts, (count, tasks), step, block_dim=128)
-    t.launch(assembly.assemble_columns, (count, 3 * blocks, rigid_max + 1), step)
+    if t.model.device.is_cuda:
+        t.launch(assembly.assemble_columns, (count, 3 * blocks, rigid_max + 1), step)
+    else:
+        t.launch(assembly_cpu.assemble_columns, count, step)
     if t.layout.part_count > 1:
         dim = (worlds, t.layout.part_count**2, 9 * blocks * blocks)
         t.launch(assembly.assemble_pairs, dim, step, t.system.relation, block_dim=128)
-    if rigid_max:
+    if rigid_max and t.model.device.is_cuda:
         t.launch(assembly.assemble_rigid, (worlds, rigid_max, rigid_max), step)
+    elif rigid_max:
+        t.launch(assembly_cpu.assemble_rigid, worlds, step)
 
 
 def solve(tables: StepTables) -> None:
@@ -84,7 +100,10 @@ def solve(tables: StepTables) -> None:
     worlds, count = t.layout.world_count, rigid.count_max
     system.factor(active)
     if count:
-        t.launch(assembly.condense, (worlds, count, count + 1), t.step)
+        if t.model.device.is_cuda:
+            t.launch(assembly.condense, (worlds, count, count + 1), t.step)
+        else:
+            t.launch(assembly_cpu.condense, worlds, t.step)
         t.launch_teams(assembly.solve_rigid, worlds, active, t.team, rigid.table)
     solution = system.solve(active, count, rigid.table.direction, count)
     if t.layout.part_count > 1:

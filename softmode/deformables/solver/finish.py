@@ -6,7 +6,7 @@ import warp as wp
 from softmode.deformables.contact import dent_kernels, penalty_kernels
 from softmode.deformables.contact import friction_memory_kernels as memory_kernels
 from softmode.deformables.model.namespaces import soft
-from softmode.deformables.solver import attachment_kernels, spin_kernels
+from softmode.deformables.solver import attachment_kernels, point_cpu_kernels, spin_kernels
 from softmode.deformables.solver import step_kernels as kernels
 from softmode.deformables.solver.step_tables import StepTables
 
@@ -42,9 +42,8 @@ def move_particles(tables: StepTables, state: newton.State) -> None:
     """Move the surface particles of ``state`` to where its reduced coordinates and its dents put them."""
     t, data = tables, soft(state)
     particles = (state.particle_q, state.particle_qd)
-    t.launch(
-        kernels.skin_samples, t.samples.position.shape, t.instances, t.basis, data.q, data.qd, data.dent, *particles
-    )
+    skin = kernels.skin_samples if t.model.device.is_cuda else point_cpu_kernels.skin_eights
+    t.launch(skin, t.sample_tasks, t.instances, t.basis, data.q, data.qd, data.dent, *particles)
 
 
 def reset(tables: StepTables, state: newton.State, world_mask: wp.array, flags: newton.StateFlags | int) -> None:

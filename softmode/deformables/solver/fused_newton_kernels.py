@@ -13,6 +13,14 @@ import warp as wp
 from softmode.deformables.model.declare import Kernel
 from softmode.deformables.model.lane_kernels import LANES, WARP, barrier, rolled, team_sum, vec8
 from softmode.deformables.model.struct_kernels import instance_end
+from softmode.deformables.solver.assembly_cpu_kernels import (
+    columns_of,
+    condense_world,
+    forces_of,
+    matrix_of,
+    rigid_of,
+    stiffness_of,
+)
 from softmode.deformables.solver.assembly_kernels import (
     column_block,
     condensed_entry,
@@ -21,14 +29,13 @@ from softmode.deformables.solver.assembly_kernels import (
     matrix_row,
     pair_block,
     rigid_entry,
-    slab_tiles,
     solve_rigid_team,
     stiffness_block,
-    stiffness_slab,
 )
 from softmode.deformables.solver.factor_kernels import factor_system, solve_system
 from softmode.deformables.solver.fused_system_kernels import dynamic_floats, shared_direction_of, sum_forces_of
 from softmode.deformables.solver.iteration_kernels import ALL, NewtonStep
+from softmode.deformables.solver.point_cpu_kernels import differentiate_eight, evaluate_eight
 from softmode.deformables.solver.rigid_row_kernels import evaluate_row
 from softmode.deformables.solver.search_kernels import (
     accept_step,
@@ -71,14 +78,14 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
     """Return the kernel that minimises the incremental potential of every world by Newton with a line search.
 
     Args:
-        unit_type: What the factorisation takes at a time, ``float`` or ``vec8``.
+        unit_type: What the factorisation takes at a time, ``float`` or, on CPU, ``vec8``; there points too are
+            evaluated eight at a time.
         size: Unknowns of the systems that are solved in shared memory, one per world; 0 for any in global memory.
         width: Columns of those systems.
         team: Threads that share a world.
         joined: Whether the bodies of a world, which may touch each other, share a system.
     """
-    shared, dynamic = size > 0, dynamic_floats(size, width)
-    one_thread = unit_type is vec8
+    shared, dynamic, lanes = size > 0, dynamic_floats(size, width), unit_type == vec8
     shared_direction = shared_direction_of(size or 24, width or 32)  # called where ``shared`` says so
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=(team, THREADS // team))
@@ -118,16 +125,22 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
             # one copy of this code serves iterates and trials
             found = ALL + trial
             for i in range(begin, end):
-                # points and constraints at the same time, but not in one warp
-                points = step.instances.point_count[i]
-                first = points
-                if team > 1:
-                    first = (points + WARP - 1) / WARP * WARP
-                for t in range(member, first + step.constraints.count[i], team):
-                    if t < points:
-                        evaluate_point(step, step.state.active, q, found, i, t)
-                    if t >= first:
-                        evaluate_constraint(step, step.state.active, q, r, 1 - trial, i, t - first)
+                if wp.static(lanes):
+                    for t in range(member, (step.instances.point_count[i] + LANES - 1) / LANES, team):
+                        evaluate_eight(step, step.state.active, q, found, i, t)
+                    for e in range(member, step.constraints.count[i], team):
+                        evaluate_constraint(step, step.state.active, q, r, 1 - trial, i, e)
+                else:
+                    # points and constraints at the same time, but not in one warp
+                    points = step.instances.point_count[i]
+                    first = points
+                    if team > 1:
+                        first = (points + WARP - 1) / WARP * WARP
+                    for t in range(member, first + step.constraints.count[i], team):
+                        if t < points:
+                            evaluate_point(step, step.state.active, q, found, i, t)
+                        if t >= first:
+                            evaluate_constraint(step, step.state.active, q, r, 1 - trial, i, t - first)
             for k in range(member, step.rigid.row_count[w], team):
                 evaluate_row(step, step.state.active, r, found, w, k)
             barrier()
@@ -155,6 +168,8 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
                         sum_forces_of(
                             step.instances, step.basis, step.points, step.constraints, step.arrays, i, member, team
                         )
+                    elif wp.static(lanes):
+                        forces_of(step, step.state.active, i)
                     else:
                         for t in range(member, chunks * blocks, team):
                             sum_force_block(step, step.state.active, i, t / blocks, t % blocks)
@@ -167,22 +182,29 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
                 if step.state.active[w] != 0:
                     for i in range(begin, end):
                         if step.state.refresh[w] != 0:
-                            if wp.static(one_thread):
-                                for t in range(step.options.stiffness_slabs * slab_tiles(blocks)):
-                                    stiffness_slab(step, i, t)
+                            if wp.static(lanes):
+                                for t in range(member, (step.instances.point_count[i] + LANES - 1) / LANES, team):
+                                    differentiate_eight(step, i, t)
+                                stiffness_of(step, i)
                             else:
                                 for t in range(member, stiffness_chunks * tasks, team):
                                     stiffness_block(step, i, t / tasks, t % tasks)
                             barrier()
                         if wp.static(not shared):
-                            width = 3 * blocks
-                            for t in range(member, LANES * width * width, team):
-                                matrix_row(step, width, i, t / width, t % width)
+                            if wp.static(lanes):
+                                matrix_of(step, i)
+                            else:
+                                width = 3 * blocks
+                                for t in range(member, LANES * width * width, team):
+                                    matrix_row(step, width, i, t / width, t % width)
                             barrier()
                             for t in range(member, tasks, team):
                                 contact_block(step, i, t)
-                            for t in range(member, 3 * blocks * columns, team):
-                                column_block(step, i, t / columns, t % columns)
+                            if wp.static(lanes):
+                                columns_of(step, i)
+                            else:
+                                for t in range(member, 3 * blocks * columns, team):
+                                    column_block(step, i, t / columns, t % columns)
                     if wp.static(joined):
                         for both in range(relation.shape[1] * relation.shape[1]):
                             if relation[w, both / relation.shape[1], both % relation.shape[1]] != 0:
@@ -206,8 +228,11 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
                             team,
                         )
                     if wp.static(not shared):
-                        for t in range(member, n * n, team):
-                            rigid_entry(step, w, t / n, t % n)
+                        if wp.static(lanes):
+                            rigid_of(step, w)
+                        else:
+                            for t in range(member, n * n, team):
+                                rigid_entry(step, w, t / n, t % n)
                         barrier()
                         for s in range(step.arrays.system_start[w], step.arrays.system_start[w + 1]):
                             factor_system(
@@ -215,8 +240,11 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
                             )
                         barrier()
                         if n > 0:
-                            for t in range(member, n * (n + 1), team):
-                                condensed_entry(step, w, t / (n + 1), t % (n + 1))
+                            if wp.static(lanes):
+                                condense_world(step, w)
+                            else:
+                                for t in range(member, n * (n + 1), team):
+                                    condensed_entry(step, w, t / (n + 1), t % (n + 1))
                             barrier()
                             solve_rigid_team(step.state.active, team, step.rigid, w, member)
                             barrier()

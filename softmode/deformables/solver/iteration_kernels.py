@@ -56,7 +56,6 @@ class NewtonArrays:
     reaction: wp.array2d[vec8d]  # [N]; what holds the driven functions, zero for the others
     gradient_chunk: wp.array3d[vec8d]  # (instance_count, chunk_count, 3 block_count) [N]
     stiffness: wp.array4d[vec8]  # (instance_count, chunk_count, 3 stride, 3 block_count), upper triangle
-    turned: wp.array3d[vec8]  # (17, slab, 3): C grad b of the functions and points at hand, of one thread
     pins: wp.array3d[vec8]  # (instance_count, stride, block_count), upper triangle
     rigid_tolerance: wp.array[float]  # (world_count,) [m or rad]
     system_start: wp.array[int]  # (world_count + 1,)

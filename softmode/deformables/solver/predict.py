@@ -5,6 +5,7 @@ import newton
 from softmode.deformables.model.namespaces import SoftControl, soft
 from softmode.deformables.solver import spin_kernels
 from softmode.deformables.solver import step_kernels as kernels
+from softmode.deformables.solver.point_cpu_kernels import start_eights
 from softmode.deformables.solver.step_tables import StepTables
 
 
@@ -26,4 +27,4 @@ def predict(tables: StepTables, state: newton.State, control: SoftControl, dt: f
     bdf2 = int(tables.options.integrator == "bdf2")
     given = (control.q_driven, tables.parameters.density, tables.parameters.scale, tables.spin, bdf2)
     tables.launch(kernels.begin_step, (count, blocks), step, tables.model.gravity, *before, *given)
-    tables.launch(kernels.start_points, tables.points.energy.shape, step)
+    tables.launch(kernels.start_points if tables.model.device.is_cuda else start_eights, tables.point_tasks, step)

@@ -33,7 +33,7 @@ from softmode.deformables.model.struct_kernels import (
 )
 from softmode.deformables.model.tables import allocate
 from softmode.deformables.solver import fused_newton_kernels as fused
-from softmode.deformables.solver.assembly_kernels import cache_slabs
+from softmode.deformables.solver.assembly_cpu_kernels import cache_slabs
 from softmode.deformables.solver.factor import BlockCholesky
 from softmode.deformables.solver.fused_system_kernels import shared_bytes
 from softmode.deformables.solver.iteration_kernels import NewtonArrays, NewtonOptions, NewtonStep
@@ -56,7 +56,7 @@ RESERVED_BYTES = 2048
 _POINTS = {"": "instance point", "hessian": "instance 6 point"}
 _MOTION = {"": "instance unknown", "rate": "instance"}
 _SAMPLES = {
-    "position drift": "instance sample",
+    "position drift near": "instance sample",
     "shape gap normal constraint": "instance sample slot",
     "lower upper drift_lower drift_upper": "instance",
     "reach": "instance team 4",
@@ -72,7 +72,6 @@ _ARRAYS = {
     "": "instance unknown",
     "gradient_chunk": "instance gradient_chunk unknown",
     "stiffness": "instance stiffness_chunk row unknown",
-    "turned": "17 slab 3",
     "pins": "pin_instance pin_row pin_block",
     "turn turn_centre turn_shift": "instance",
 }
@@ -171,6 +170,19 @@ class StepTables:
         return self.layout.instance_count, 3 * self.layout.block_count
 
     @property
+    def point_tasks(self) -> tuple[int, int]:
+        """Shape of a launch over the points: on CPU a thread takes eight of them."""
+        return self._tasks(self.layout.point_max)
+
+    @property
+    def sample_tasks(self) -> tuple[int, int]:
+        """Shape of a launch that evaluates the functions at the samples: on CPU a thread takes eight of them."""
+        return self._tasks(self.layout.sample_max)
+
+    def _tasks(self, count: int) -> tuple[int, int]:
+        return self.layout.instance_count, count if self.model.device.is_cuda else -(-count // LANES)
+
+    @property
     def pin_arrays(self) -> tuple[wp.array | None, wp.array | None]:
         """Which rigid bodies the pins follow and how stiffly, None where there are no pins."""
         return getattr(self.parameters, "pin_body", None), getattr(self.parameters, "pin_stiffness", None)
@@ -243,7 +255,6 @@ def allocate_tables(
             return 1
         return int(np.clip(world_team // tasks if one_launch else CUDA_THREADS // threads, 1, 64 if few else 16))
 
-    slabs = cache_slabs(blocks, layout.point_max)
     sizes = {
         "instance": count,
         "world": layout.world_count,
@@ -259,7 +270,6 @@ def allocate_tables(
         "stiffness_chunk": chunk_count(count, layout.stride)
         if tiled
         else chunks(count * square, square + (square + 3 * blocks) // 2),
-        "slab": 1 if device.is_cuda else -(-layout.point_max // slabs),
         "pin_instance": count if layout.pin_max else 1,
         "pin_row": layout.stride if layout.pin_max else 1,
         "pin_block": blocks if layout.pin_max else 1,
@@ -278,7 +288,7 @@ def allocate_tables(
     }
     state = allocate(NewtonState, _NEWTON, sizes, device, given=given)
     constant = _newton_options(options, rigid, system)
-    constant.stiffness_slabs = slabs
+    constant.stiffness_slabs = cache_slabs(blocks, layout.point_max)
     step = allocate(
         NewtonStep, "", {}, device, given={**structs, "rigid": rigid.table, "state": state, "options": constant}
     )
@@ -287,7 +297,7 @@ def allocate_tables(
         options=options,
         layout=layout,
         scaled=scaled,
-        samples=allocate(Samples, _SAMPLES, sizes, device, fill={"constraint": -1}),
+        samples=allocate(Samples, _SAMPLES, sizes, device, fill={"constraint": -1, "near": -1}),
         **structs,
         spin=allocate(Spin, "instance", sizes, device),
         newton=state,

@@ -1,0 +1,215 @@
+"""Device code that takes eight points or samples at a time on CPU, against the kernels that take one, as CUDA does."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+
+from softmode.deformables.contact import detection_kernels, sample_cpu_kernels
+from softmode.deformables.contact.detection_kernels import CULLED
+from softmode.deformables.materials.material_kernels import MaterialModel
+from softmode.deformables.model.authoring import add_reduced_body
+from softmode.deformables.solver import assembly_cpu_kernels, assembly_kernels, point_cpu_kernels, step_kernels
+from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient, solve
+from softmode.deformables.solver.iteration_kernels import ALL
+from tests.deformables.test_fused_system import loaded
+from tests.scenes import Scene, cube, random_rotation
+
+DOUBLE, SINGLE = 1.0e-12, 4.0e-7
+"""Relative rounding of sums in double precision in another order, and of results that are kept in single precision."""
+
+
+def pressed(mode_count: int, model: MaterialModel = MaterialModel.STABLE_NEO_HOOKEAN_LOG) -> Scene:
+    """Return a cube under a box at an iterate, of another scale than 1, with points of different stiffness."""
+    scene = loaded(mode_count)
+    t = scene.reduced.tables
+    points = t.layout.point_max
+    t.basis.stiffness_scale.assign(np.linspace(0.5, 2.0, points))
+    t.instances.material_model.fill_(int(model))
+    t.instances.viscosity.fill_(0.002)
+    t.instances.scale.fill_(1.02)
+    t.newton.active.fill_(1)
+    t.newton.refresh.fill_(1)
+    t.newton.project.fill_(1)
+    t.newton.evaluated.zero_()
+    q = t.arrays.q.numpy()
+    used = np.abs(q) > 0.0
+    t.arrays.q.assign(q + 2.0e-4 * used * np.random.default_rng(mode_count).normal(size=q.shape))
+    return scene
+
+
+def agree(found: np.ndarray, expected: np.ndarray, rounding: float) -> None:
+    """Assert that arrays agree up to rounding of their largest number, which is not zero."""
+    size = np.abs(expected).max()
+    assert 0.0 < size < np.inf
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=rounding * size)
+
+
+@pytest.mark.parametrize("project", [0, 1])
+@pytest.mark.parametrize("model", MaterialModel)
+def test_points(model: MaterialModel, project: int) -> None:
+    """Energy, stress, J and Hessian of each point, and where it was: 125 points, so that three lanes idle."""
+    t = pressed(4, model).reduced.tables
+    t.instances.point_count.fill_(125)
+    t.newton.project.fill_(project)
+    step, one, eight = t.newton_step(0.004), (1, 125), (1, 16)
+    t.launch(step_kernels.start_points, one, step)
+    start = t.points.start.numpy().copy()
+    t.launch(step_kernels.evaluate_points, one, step, t.newton.active, t.arrays.q, int(ALL))
+    names = {"energy": DOUBLE, "stress": DOUBLE, "volume_ratio": SINGLE, "hessian": SINGLE}
+    expected = {name: getattr(t.points, name).numpy().copy() for name in names}
+    for name in (*names, "start"):
+        getattr(t.points, name).fill_(7.0)
+    t.launch(point_cpu_kernels.start_eights, eight, step)
+    t.launch(point_cpu_kernels.evaluate_eights, eight, step, t.newton.active, t.arrays.q, int(ALL))
+    t.launch(point_cpu_kernels.differentiate_eights, eight, step)
+    agree(t.points.start.numpy()[:, :125], start[:, :125], DOUBLE)
+    for name, rounding in names.items():
+        found = getattr(t.points, name).numpy()
+        points = (slice(None),) * (2 if name == "hessian" else 1)
+        agree(found[(*points, slice(125))], expected[name][(*points, slice(125))], rounding)
+        assert (found[(*points, slice(125, None))] == 7.0).all()  # idle lanes write nothing
+
+
+@pytest.mark.parametrize("mode_count", [1, 2, 4, 6, 11])
+def test_sums(mode_count: int) -> None:
+    """Forces, stiffness, columns and the condensed rigid system, of one to six blocks of functions."""
+    scene = pressed(mode_count)
+    t, dt = scene.reduced.tables, scene.dt
+    evaluate(t, dt, derivatives=True)
+    gather_gradient(t, dt)
+    assemble(t, dt)
+    solve(t)
+    step, blocks, rigid = t.newton_step(dt), t.layout.block_count, t.rigid.table
+    tasks, n = 3 * blocks * blocks + 3 * (blocks * blocks + blocks) // 2, t.rigid.count_max
+    right = t.system.scalars.numpy()[:, :, t.system.size : t.system.size + n + 1].copy()
+    upper = np.triu(np.ones((3 * blocks, 3 * blocks), dtype=bool)).repeat(8, axis=0)
+    forces, stiffness = t.arrays.gradient_chunk.numpy().copy(), t.arrays.stiffness.numpy()[0, 0][upper]
+    t.arrays.gradient_chunk.zero_()
+    t.arrays.stiffness.zero_()
+    t.launch(step_kernels.sum_forces, (1, 1, blocks), step, t.newton.active)
+    agree(forces, t.arrays.gradient_chunk.numpy(), DOUBLE)
+    t.launch(assembly_kernels.assemble_stiffness, (1, 1, tasks), step)
+    agree(stiffness, t.arrays.stiffness.numpy()[0, 0][upper], SINGLE)
+
+    matrices = []
+    for kernel, given in (
+        (assembly_kernels.assemble_matrix, ((1, 24 * blocks, 1), step, 1)),
+        (assembly_cpu_kernels.assemble_matrix, (1, step)),
+    ):
+        t.system.scalars.zero_()
+        t.launch(kernel, *given)
+        matrices.append(t.system.scalars.numpy().copy())
+    assert np.abs(matrices[0]).max() > 0.0
+    np.testing.assert_array_equal(matrices[1], matrices[0])
+    t.launch(assembly_kernels.assemble_rigid, (1, n, n), step)
+    apart = [rigid.matrix.numpy().copy(), rigid.gradient.numpy().copy()]
+    t.launch(assembly_cpu_kernels.assemble_rigid, 1, step)
+    agree(rigid.matrix.numpy(), apart[0], SINGLE)
+    agree(rigid.gradient.numpy(), apart[1], 1.0e-9)
+    assemble(t, dt)
+    solve(t)
+
+    condensed = []
+    for kernel, dim in ((assembly_kernels.condense, (1, n, n + 1)), (assembly_cpu_kernels.condense, 1)):
+        t.launch(assembly_kernels.assemble_rigid, (1, n, n), step)
+        t.launch(kernel, dim, step)
+        arrays = (rigid.matrix, rigid.direction, rigid.pivot_min)
+        condensed.append([array.numpy().copy() for array in arrays])
+        condensed[-1][0] = np.tril(condensed[-1][0])
+    for expected, found in zip(*condensed, strict=True):
+        agree(found, expected, 1.0e-9)  # of what is left of larger numbers
+
+    t.launch(assembly_cpu_kernels.assemble_columns, 1, step)
+    columns = t.system.scalars.numpy()[:, :, t.system.size : t.system.size + n + 1].copy()
+    t.launch(assembly_kernels.assemble_columns, (1, 3 * blocks, n + 1), step)
+    agree(columns, t.system.scalars.numpy()[:, :, t.system.size : t.system.size + n + 1], SINGLE)
+    assert not np.array_equal(columns, right)  # which the factorisation has overwritten
+
+
+def test_samples() -> None:
+    """Positions and drifts at the start of a step, and particles at its end: 150 samples, so that two lanes idle."""
+    scene = pressed(4)
+    t, data = scene.reduced.tables, scene.state.softmode
+    particles = (scene.state.particle_q, scene.state.particle_qd)
+    assert t.layout.sample_max % 8 != 0
+    one, eight = t.samples.position.shape, t.sample_tasks
+    found = []
+    for place, skin, dim in (
+        (detection_kernels.place_samples, step_kernels.skin_samples, one),
+        (sample_cpu_kernels.place_eights, point_cpu_kernels.skin_eights, eight),
+    ):
+        for array in (t.samples.position, t.samples.drift, *particles):
+            array.fill_(7.0)
+        t.launch(place, dim, t.instances, t.basis, t.motion, t.samples)
+        t.launch(skin, dim, t.instances, t.basis, data.q, data.qd, data.dent, *particles)
+        found.append([array.numpy().copy() for array in (t.samples.position, t.samples.drift, *particles)])
+    for (expected, lanes), rounding in zip(zip(*found, strict=True), (DOUBLE, SINGLE, SINGLE, SINGLE), strict=True):
+        agree(lanes, expected, rounding)
+
+
+def crowd(seed: int) -> Scene:
+    """Return a cube among shapes of all kinds, on moving bodies and fixed, more than can be culled."""
+    rng = np.random.default_rng(seed)
+    mesh = newton.Mesh.create_box(0.02, 0.03, 0.04)
+
+    def populate(world: Any) -> None:
+        add_reduced_body(world, cube(), position=(0.0, 0.0, 0.0))
+        for k in range(int(CULLED) + 6):
+            turn = wp.quat_from_matrix(wp.mat33(*random_rotation(rng).ravel()))
+            pose = wp.transform(rng.uniform(-0.09, 0.09, 3), turn)
+            body = -1
+            if k % 3 == 0:
+                body = world.add_body(xform=pose)
+                pose = wp.transform(rng.uniform(-0.02, 0.02, 3), wp.quat_identity())
+            a, b, c = (float(x) for x in rng.uniform(0.01, 0.03, 3))
+            kinds = (
+                (world.add_shape_box, {"hx": a, "hy": b, "hz": c}),
+                (world.add_shape_sphere, {"radius": a}),
+                (world.add_shape_capsule, {"radius": a, "half_height": b}),
+                (world.add_shape_cylinder, {"radius": a, "half_height": b}),
+                (world.add_shape_cone, {"radius": a, "half_height": b}),
+                (world.add_shape_ellipsoid, {"rx": a, "ry": b, "rz": c}),
+                (world.add_shape_mesh, {"mesh": mesh}),
+            )
+            add, given = kinds[k % len(kinds)]
+            add(body, xform=pose, **given)
+
+    return Scene(populate, [cube()], ground=0.5)
+
+
+@pytest.mark.parametrize("fresh", [True, False])
+def test_culled_shapes_touch_nothing(fresh: bool) -> None:
+    """Contacts are the same to the bit whether shapes out of a sample's reach are looked at or not."""
+    scene = crowd(1)
+    rng = np.random.default_rng(2)
+    t, dt, memory = scene.reduced.tables, scene.dt, scene.state.softmode
+    scene.state.body_qd.assign(rng.normal(size=(*scene.state.body_qd.shape[:1], 6)))
+    memory.qd.assign(0.3 * rng.normal(size=(*memory.qd.shape, 3)))
+    memory.stick_shape.assign(rng.integers(-1, scene.model.shape_count, size=(*memory.stick_shape.shape, 2)))
+    for _ in range(2):  # the first step allocates what detection reads
+        scene.solver.step(scene.state, scene.next_state, scene.control, None, dt)
+    memory.dt_before.fill_(0.0 if fresh else dt)
+    memory.stick_shape.assign(rng.integers(-1, scene.model.shape_count, size=(*memory.stick_shape.shape, 2)))
+    before = (memory.stick_shape, memory.dt_before)
+    shapes = (t.candidate, t.near, t.shapes, float(dt))
+    t.samples.near.zero_()
+    t.launch(sample_cpu_kernels.cull_samples, 1, t.instances, t.basis, *shapes, *before, t.samples)
+    culled = t.samples.near.numpy().copy()
+    kept = sum((culled >> c) & 1 for c in range(int(CULLED)))
+    assert 0.0 < kept.mean() < 0.7 * t.near.numpy()[0, : int(CULLED)].sum()
+    found = []
+    for mask in (culled, np.full_like(culled, -1)):
+        t.samples.near.assign(mask)
+        known = (t.instances, t.basis, t.motion, t.candidate, t.near, t.shapes, float(dt))
+        t.launch(detection_kernels.find_contacts, t.samples.position.shape, *known, *before, t.samples)
+        found.append([array.numpy().copy() for array in (t.samples.shape, t.samples.gap, t.samples.normal)])
+    touched = found[0][0] >= 0
+    assert touched.sum() > 50
+    for few, every in zip(*found, strict=True):
+        np.testing.assert_array_equal(few[touched], every[touched])
+    np.testing.assert_array_equal(found[0][0], found[1][0])
