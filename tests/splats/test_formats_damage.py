@@ -259,7 +259,8 @@ def test_endless_usd_is_stopped(tmp_path: Path, count: int) -> None:
     entry = data.index(b"TOKENS", contents)
     tokens = int.from_bytes(data[entry + 16 : entry + 24], "little")
     data[tokens : tokens + 8] = count.to_bytes(8, "little")
-    before, memory = processor_time(), max(*peak_memory(), MEMORY_LIMIT)
+    # a child starts with its parent's memory, which may be more than the limit, and a few pages of its own
+    before, memory = processor_time(), max(*peak_memory(), MEMORY_LIMIT) + 2**20
     assert not read_damaged(tmp_path / "damaged.usdc", bytes(data))
     assert processor_time() - before < TIME_LIMIT
     assert peak_memory()[1] <= memory
