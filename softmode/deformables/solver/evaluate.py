@@ -6,7 +6,7 @@ from softmode.deformables.solver import assembly_cpu_kernels as assembly_cpu
 from softmode.deformables.solver import assembly_kernels as assembly
 from softmode.deformables.solver import point_cpu_kernels as eights
 from softmode.deformables.solver import step_kernels as kernels
-from softmode.deformables.solver.iteration_kernels import ALL, ENERGIES, TRIAL
+from softmode.deformables.solver.iteration_kernels import ALL, ENERGIES, TRIAL, NewtonStep
 from softmode.deformables.solver.rigid_row_kernels import evaluate_rows
 from softmode.deformables.solver.step_tables import StepTables
 from softmode.deformables.solver.tile_kernels import TILE_TEAM, assemble_tiles, tile_count
@@ -61,37 +61,46 @@ def gather_gradient(tables: StepTables, dt: float) -> None:
 
 def assemble(tables: StepTables, dt: float) -> None:
     """Assemble the Hessian into the block systems [K | C | -g] and the rigid part."""
-    t, step, rigid_max = tables, tables.newton_step(dt), tables.rigid.count_max
+    t, step = tables, tables.newton_step(dt)
     blocks, count, worlds = t.layout.block_count, t.layout.instance_count, t.layout.world_count
     tasks = 3 * blocks * blocks + 3 * (blocks * blocks + blocks) // 2  # 8x8 blocks of the upper triangle
-    chunks = t.arrays.stiffness.shape[1]
     if t.model.device.is_cpu:
         t.launch(eights.differentiate_eights, t.point_tasks, step)
     if t.tiled:
         team = TILE_TEAM if t.model.device.is_cuda else 1
-        t.launch(assemble_tiles, (count, chunks, tile_count(t.layout.stride), team), step, team, block_dim=team)
+        dim = (count, t.arrays.stiffness.shape[1], tile_count(t.layout.stride), team)
+        t.launch(assemble_tiles, dim, step, team, block_dim=team)
     elif t.model.device.is_cuda:
         # more than 100 registers per thread: larger blocks leave half of a multiprocessor idle
-        t.launch(assembly.assemble_stiffness, (count, chunks, tasks), step, block_dim=128)
+        t.launch(assembly.assemble_stiffness, (count, t.arrays.stiffness.shape[1], tasks), step, block_dim=128)
     else:
         t.launch(assembly_cpu.assemble_stiffness, count, step)
     if t.model.device.is_cuda:
-        columns = 3 * blocks  # threads that share a row of the matrix
-        t.launch(assembly.assemble_matrix, (count, t.arrays.stiffness.shape[2], columns), step, columns)
+        _assemble_by_entries(t, step)
     else:
-        t.launch(assembly_cpu.assemble_matrix, count, step)
+        _assemble_by_bodies(t, step)
     t.launch(assembly.add_contacts, (count, tasks), step, block_dim=128)
-    if t.model.device.is_cuda:
-        t.launch(assembly.assemble_columns, (count, 3 * blocks, rigid_max + 1), step)
-    else:
-        t.launch(assembly_cpu.assemble_columns, count, step)
     if t.layout.part_count > 1:
         dim = (worlds, t.layout.part_count**2, 9 * blocks * blocks)
         t.launch(assembly.assemble_pairs, dim, step, t.system.relation, block_dim=128)
-    if rigid_max and t.model.device.is_cuda:
-        t.launch(assembly.assemble_rigid, (worlds, rigid_max, rigid_max), step)
-    elif rigid_max:
-        t.launch(assembly_cpu.assemble_rigid, worlds, step)
+
+
+def _assemble_by_entries(t: StepTables, step: NewtonStep) -> None:
+    """Assemble matrix, columns and rigid part, a thread for a few entries of each."""
+    blocks, count, rigid_max = t.layout.block_count, t.layout.instance_count, t.rigid.count_max
+    columns = 3 * blocks  # threads that share a row of the matrix
+    t.launch(assembly.assemble_matrix, (count, t.arrays.stiffness.shape[2], columns), step, columns)
+    t.launch(assembly.assemble_columns, (count, 3 * blocks, rigid_max + 1), step)
+    if rigid_max:
+        t.launch(assembly.assemble_rigid, (t.layout.world_count, rigid_max, rigid_max), step)
+
+
+def _assemble_by_bodies(t: StepTables, step: NewtonStep) -> None:
+    """Assemble them on a CPU, a thread for a body or a world."""
+    t.launch(assembly_cpu.assemble_matrix, t.layout.instance_count, step)
+    t.launch(assembly_cpu.assemble_columns, t.layout.instance_count, step)
+    if t.rigid.count_max:
+        t.launch(assembly_cpu.assemble_rigid, t.layout.world_count, step)
 
 
 def solve(tables: StepTables) -> None:

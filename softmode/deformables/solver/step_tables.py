@@ -287,8 +287,7 @@ def allocate_tables(
         "arrays": allocate(NewtonArrays, _ARRAYS, sizes, device, given=of_system),
     }
     state = allocate(NewtonState, _NEWTON, sizes, device, given=given)
-    constant = _newton_options(options, rigid, system)
-    constant.stiffness_slabs = cache_slabs(blocks, layout.point_max)
+    constant = _newton_options(options, rigid, system, slabs=cache_slabs(blocks, layout.point_max))
     step = allocate(
         NewtonStep, "", {}, device, given={**structs, "rigid": rigid.table, "state": state, "options": constant}
     )
@@ -351,11 +350,14 @@ def fits_in_shared_memory(room: int, size: int, width: int) -> bool:
     return shared_bytes(size, width) + RESERVED_BYTES <= room
 
 
-def _newton_options(options: SolverReducedOptions, rigid: RigidDofs, system: BlockCholesky) -> NewtonOptions:
+def _newton_options(
+    options: SolverReducedOptions, rigid: RigidDofs, system: BlockCholesky, *, slabs: int
+) -> NewtonOptions:
     """Return the options of Newton's iteration that do not depend on the length of a step."""
     given = NewtonOptions()
     for name in ("iteration_max", "force_tolerance", "step_length_min"):
         setattr(given, name, getattr(options, name))
     given.refresh_interval, given.refresh_distance = options.stiffness_renewal, options.renewal_distance
     given.rigid_max, given.factor_width = rigid.count_max, system.width
+    given.stiffness_slabs = slabs
     return given
