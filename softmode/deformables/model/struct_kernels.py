@@ -180,6 +180,7 @@ class NewtonState:
     instance_start: wp.array[int]  # (world_count + 1,)
     active: wp.array[int]
     searching: wp.array[int]
+    solving: wp.array[int]  # whether a direction is to be found in this round of launches
     evaluated: wp.array[int]  # whether the iterate is the last trial: what does not depend on friction is evaluated
     last: wp.array[int]  # whether every body moves less than its tolerance in this iteration
     in_contact: wp.array[int]  # whether a body of the world is near a shape

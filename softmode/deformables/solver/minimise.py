@@ -4,6 +4,7 @@ import warp as wp
 
 from softmode.deformables.solver import rigid_start_kernels
 from softmode.deformables.solver import search_kernels as search
+from softmode.deformables.solver import staged_newton_kernels as staged
 from softmode.deformables.solver import step_kernels as kernels
 from softmode.deformables.solver.evaluate import assemble, evaluate, evaluate_trial, gather_gradient, solve
 from softmode.deformables.solver.step_tables import StepTables
@@ -18,7 +19,10 @@ def minimise(tables: StepTables, dt: float) -> None:
         t.launch_teams(rigid_start_kernels.start_rigidly, t.layout.instance_count, step, t.samples, t.team)
     if t.options.carry_stiffness:
         t.launch_teams(search.reuse_hessians, worlds, step, t.team)
-    if t.one_launch:
+    if t.staged:
+        t.launch(staged.start_trials, (worlds, max(3 * t.layout.block_count, t.rigid.count_max)), step)
+        wp.capture_while(t.newton.any_active, staged.iterate, tables=t, dt=dt)
+    elif t.one_launch:
         team = t.world_team
         t.launch(t.fused_kernel, (worlds, team), step, t.system.unit, team, t.system.relation, block_dim=team)
     else:

@@ -39,6 +39,7 @@ from softmode.deformables.solver.fused_system_kernels import shared_bytes
 from softmode.deformables.solver.iteration_kernels import NewtonArrays, NewtonOptions, NewtonStep
 from softmode.deformables.solver.options import SolverReducedOptions
 from softmode.deformables.solver.spin_kernels import Spin
+from softmode.deformables.solver.staged_newton_kernels import CHECK_TEAM
 from softmode.deformables.solver.systems import join_systems
 from softmode.deformables.solver.tile_kernels import TILE, chunk_count
 
@@ -145,6 +146,8 @@ class StepTables:
     """The kernel of that launch."""
     world_team: int
     """Threads of that team."""
+    staged: bool
+    """Whether Newton's iteration takes the five launches of ``staged_newton_kernels`` instead."""
     shared: bool
     """Whether the systems of that launch are assembled and solved in shared memory."""
     tiled: bool
@@ -248,11 +251,14 @@ def allocate_tables(
     shared = shared and fits_in_shared_memory(device.max_shared_memory_per_block, *size)
     tiled = device.is_cuda and not one_launch and layout.stride >= TILE
     few = tiled and count <= FEW_WORLDS
+    staged = shared
 
     def chunks(threads: int, tasks: int) -> int:
         """Return into how many parts sums over points are split where a kernel has so many threads, a body tasks."""
         if not device.is_cuda:
             return 1
+        if staged:
+            return int(np.clip(CUDA_THREADS // threads, 1, 4))
         return int(np.clip(world_team // tasks if one_launch else CUDA_THREADS // threads, 1, 64 if few else 16))
 
     sizes = {
@@ -266,7 +272,7 @@ def allocate_tables(
         "team": LARGE_TEAM if few else team_size(device),
         "constraint": room + layout.pin_max,
         "rigid": rigid.count_max,
-        "gradient_chunk": world_team // WARP if shared else chunks(count * blocks, blocks),
+        "gradient_chunk": CHECK_TEAM // WARP if staged else world_team // WARP if shared else chunks(count * blocks, blocks),
         "stiffness_chunk": chunk_count(count, layout.stride)
         if tiled
         else chunks(count * square, square + (square + 3 * blocks) // 2),
@@ -322,6 +328,7 @@ def allocate_tables(
         ),
         world_team=world_team,
         shared=shared,
+        staged=staged,
         tiled=tiled,
     )
 

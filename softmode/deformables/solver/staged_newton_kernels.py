@@ -1,0 +1,296 @@
+"""Device side of Newton's iteration in five launches, for worlds of one small body on CUDA.
+
+A round of the launches is an iteration of every world whose trial step is accepted:
+
+1. ``evaluate_trials``: a thread for each point, contact and row: energies and stress at the trial of every world;
+2. ``check_worlds``: a team for each world: accept the trial or shorten it; where it is accepted, forces, gradient and
+   convergence;
+3. ``differentiate_points`` and 4. ``assemble_stiffness``: where the elastic Hessian is renewed;
+5. ``direct_worlds``: a team for each world: its system in shared memory, the direction, the next trial.
+
+Worlds do not wait for each other within an iteration: one may try a shorter step while another takes the next. The
+functions are those of the one launch of ``fused_newton_kernels``. That launch has several times more code than the
+instruction cache holds, and its threads as many registers as its hungriest phase; here every launch has its own.
+"""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from softmode.deformables.materials.hessian_kernels import hessian
+from softmode.deformables.model.declare import Kernel
+from softmode.deformables.model.deformation_kernels import elastic_gradient
+from softmode.deformables.model.lane_kernels import WARP, barrier, rolled, team_sum
+from softmode.deformables.solver.assembly_kernels import stiffness_block
+from softmode.deformables.solver.fused_system_kernels import dynamic_floats, shared_direction_of, sum_forces_of
+from softmode.deformables.solver.iteration_kernels import TRIAL, NewtonStep
+from softmode.deformables.solver.rigid_row_kernels import evaluate_row
+from softmode.deformables.solver.search_kernels import (
+    accept_step,
+    check_convergence,
+    check_trial,
+    move_functions,
+    potential_share,
+    start_line_search,
+)
+from softmode.deformables.solver.step_kernels import (
+    evaluate_constraint,
+    evaluate_point,
+    gradient_block,
+    list_acting,
+    material_of,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+CHECK_TEAM = 64
+"""Threads that share a world in ``check_worlds``,"""
+DIRECT_TEAM = 96
+"""and in ``direct_worlds``."""
+BLOCK = 128
+"""Threads of a block of the other launches."""
+
+
+@wp.kernel
+def start_trials(step: NewtonStep):
+    """Let the first trial of every world be where Newton starts."""
+    w, e = wp.tid()
+    i = step.state.instance_start[w]
+    if e < step.arrays.q.shape[1]:
+        step.arrays.q_trial[i, e] = step.arrays.q[i, e]
+    if e < step.rigid.count[w]:
+        step.rigid.trial[w, e] = step.rigid.r[w, e]
+    if e == 0:
+        step.state.searching[w] = 0
+
+
+@wp.kernel(launch_bounds=(BLOCK, 4))
+def evaluate_trials(step: NewtonStep, points: int, constraints: int):
+    """Evaluate points and rows at the trials, contacts where a step is searched for; see ``tasks`` for the threads."""
+    w, t = wp.tid()
+    if step.state.active[w] == 0:
+        return
+    i = step.state.instance_start[w]
+    q = step.arrays.q_trial
+    r = step.rigid.trial
+    if t < points:
+        evaluate_point(step, step.state.active, q, int(TRIAL), i, t)
+    elif t < points + constraints:
+        if step.state.searching[w] != 0:
+            evaluate_constraint(step, step.state.active, q, r, 0, i, t - points)
+    else:
+        evaluate_row(step, step.state.active, r, int(TRIAL), w, t - points - constraints)
+
+
+@wp.kernel(launch_bounds=(BLOCK, 3))
+def differentiate_points(step: NewtonStep):
+    """Evaluate the Hessian at the points of the worlds that renew it."""
+    w, p = wp.tid()
+    if w == 0 and p == 0:
+        step.state.any_active[0] = 0
+    i = step.state.instance_start[w]
+    if step.state.solving[w] == 0 or step.state.refresh[w] == 0 or p >= step.instances.point_count[i]:
+        return
+    dt = step.options.dt
+    point = step.instances.point_start[i] + p
+    parameters = material_of(step.instances, step.basis, i, point)
+    s = wp.float64(step.instances.scale[i])
+    G = elastic_gradient(step.basis.gradient, step.arrays.q_trial, i, point, step.instances.function_count[i], s)
+    G_start = G
+    if step.instances.viscosity[i] > 0.0:
+        G_start = step.points.start[i, p]
+    weight = s * step.basis.point_weight[point]
+    C = float(weight) * hessian(parameters, G, G_start, dt, step.state.project[w])
+    for pair in range(6):
+        r = 3 * pair
+        step.points.hessian[i, pair, p] = wp.mat33(
+            C[r, 0], C[r, 1], C[r, 2], C[r + 1, 0], C[r + 1, 1], C[r + 1, 2], C[r + 2, 0], C[r + 2, 1], C[r + 2, 2]
+        )
+
+
+@wp.kernel
+def assemble_stiffness(step: NewtonStep):
+    """Assemble the stiffness of these worlds."""
+    w, chunk, task = wp.tid()
+    if step.state.solving[w] != 0:
+        stiffness_block(step, step.state.instance_start[w], chunk, task)
+
+
+@cache
+def check_kernel(team: int = CHECK_TEAM) -> Kernel:
+    """Return the kernel that checks the trials of the worlds, a team of so many threads for each."""
+
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(team, 512 // team))
+    def check_worlds(step: NewtonStep, team: int):
+        """Accept the trial of each world or shorten it; where it is accepted find the gradient, and whether it is done.
+
+        Says in ``solving`` which worlds need a direction.
+        """
+        w, member = wp.tid()
+        if step.state.active[w] == 0:
+            return
+        i = step.state.instance_start[w]
+        dt = step.options.dt
+        q = step.arrays.q_trial
+        r = step.rigid.trial
+        n = step.rigid.count[w]
+        width = step.arrays.q.shape[1]
+        found = int(1)
+        # a second round for the potential with the normal force that friction goes by
+        rounds = int(1) + step.state.searching[w]
+        potential = wp.float64(0.0)
+        for k in range(2 - rounds, 2):
+            rolled()
+            if k == 1:
+                for e in range(member, step.constraints.count[i], team):
+                    rolled()
+                    evaluate_constraint(step, step.state.active, q, r, 1, i, e)
+                barrier()
+            share = potential_share(
+                step.instances,
+                step.motion,
+                step.points,
+                step.constraints,
+                step.rigid,
+                step.state.instance_start,
+                dt,
+                q,
+                r,
+                w,
+                member,
+                team,
+            )
+            potential = team_sum(share)
+            if k == 0:
+                check_trial(step, potential, w, member)
+                barrier()
+                searching = step.state.searching[w]
+                alpha = step.state.step_length[w]
+                found = step.state.evaluated[w]
+                if searching == 0:
+                    accept_step(step, team, w, member)
+                    barrier()
+                if found == 0:
+                    if alpha > wp.float64(0.0):
+                        move_functions(step.instances, step.basis, step.arrays, alpha, i, member, team, q)
+                    else:
+                        for e in range(member, width, team):
+                            rolled()
+                            q[i, e] = step.arrays.q[i, e]
+                    for j in range(member, n, team):
+                        rolled()
+                        r[w, j] = step.rigid.r[w, j] + alpha * step.rigid.direction[w, j]
+                    barrier()
+                if searching == 0:
+                    for e in range(member, width, team):
+                        rolled()
+                        step.arrays.q[i, e] = q[i, e]
+                    for j in range(member, n, team):
+                        rolled()
+                        step.rigid.r[w, j] = r[w, j]
+                if found == 0 or step.state.active[w] == 0:
+                    if member == 0:
+                        step.state.solving[w] = 0
+                    return
+        list_acting(step, team, i, member)
+        barrier()
+        sum_forces_of(step.instances, step.basis, step.points, step.constraints, step.arrays, i, member, team)
+        barrier()
+        for e in range(member, width, team):
+            rolled()
+            gradient_block(step, i, e)
+        barrier()
+        check_convergence(step, potential, team, w, member)
+        if member == 0:
+            step.state.solving[w] = step.state.active[w]
+
+    return check_worlds
+
+
+@cache
+def direct_kernel(size: int, width: int, team: int = DIRECT_TEAM) -> Kernel:
+    """Return the kernel that finds the directions of the worlds and their next trials, a team of threads for each.
+
+    Args:
+        size: Unknowns of the systems.
+        width: Their columns.
+        team: Threads that share a world.
+    """
+    dynamic = dynamic_floats(size, width)
+    shared_direction = shared_direction_of(size, width)
+
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(team, 512 // team))
+    def direct_worlds(step: NewtonStep, team: int):
+        """Assemble and solve the system of each world, and start its line search."""
+        w, member = wp.tid()
+        if wp.static(dynamic > 0):
+            _room = wp.tile_empty(shape=wp.static(dynamic), dtype=float, storage="shared")
+        if step.state.active[w] == 0:
+            return
+        if step.state.solving[w] != 0:
+            i = step.state.instance_start[w]
+            q = step.arrays.q_trial
+            r = step.rigid.trial
+            # the padding behind the functions carries inertia alone
+            rate = step.motion.rate[i] / step.options.dt
+            damping = wp.float64(step.instances.mass_damping[i])
+            inertia = float(step.instances.mass[i] * rate * (rate + damping))
+            shared_direction(
+                inertia,
+                step.options.rigid_max,
+                step.basis,
+                step.constraints,
+                step.rigid,
+                step.arrays,
+                i,
+                w,
+                member,
+                team,
+            )
+            barrier()
+            start_line_search(step, team, w, member)
+            barrier()
+            searching = step.state.searching[w]
+            alpha = step.state.step_length[w]
+            if searching == 0:
+                accept_step(step, team, w, member)
+            if alpha > wp.float64(0.0):
+                move_functions(step.instances, step.basis, step.arrays, alpha, i, member, team, q)
+                for j in range(member, step.rigid.count[w], team):
+                    rolled()
+                    r[w, j] = step.rigid.r[w, j] + alpha * step.rigid.direction[w, j]
+                barrier()
+                if searching == 0:
+                    for e in range(member, step.arrays.q.shape[1], team):
+                        rolled()
+                        step.arrays.q[i, e] = q[i, e]
+                    for j in range(member, step.rigid.count[w], team):
+                        rolled()
+                        step.rigid.r[w, j] = r[w, j]
+            barrier()
+        if member == 0 and step.state.active[w] != 0:
+            step.state.any_active[0] = 1
+
+    return direct_worlds
+
+
+def tasks(point_max: int, constraint_max: int, row_max: int) -> tuple[int, int, int]:
+    """Return the threads of a world in ``evaluate_trials``: for points, for constraints, all; each in warps of its own."""
+    points, constraints, rows = (-(-count // WARP) * WARP for count in (point_max, constraint_max, row_max))
+    return points, constraints, points + constraints + rows
+
+
+def iterate(tables: Any, dt: float) -> None:
+    """Take one round in every world that is not done."""
+    t, step = tables, tables.newton_step(dt)
+    worlds, blocks = t.layout.world_count, t.layout.block_count
+    points, constraints, count = tasks(t.layout.point_max, t.constraints.row.shape[1], t.rigid.row_max)
+    t.launch(evaluate_trials, (worlds, count), step, points, constraints, block_dim=BLOCK)
+    check, direct = (CHECK_TEAM, DIRECT_TEAM) if t.model.device.is_cuda else (1, 1)
+    t.launch(check_kernel(), (worlds, check), step, check, block_dim=check)
+    t.launch(differentiate_points, (worlds, t.layout.point_max), step, block_dim=BLOCK)
+    of = 3 * blocks * blocks + 3 * (blocks * blocks + blocks) // 2
+    t.launch(assemble_stiffness, (worlds, t.arrays.stiffness.shape[1], of), step, block_dim=BLOCK)
+    kernel = direct_kernel(t.system.size, t.system.scalars.shape[2])
+    t.launch(kernel, (worlds, direct), step, direct, block_dim=direct)
