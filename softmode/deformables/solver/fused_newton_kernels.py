@@ -111,7 +111,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
         columns = rigid_max + 1
         q = step.arrays.q_trial
         r = step.rigid.trial
-        trial = int(0)
+        trial = step.state.searching[w]
         while step.state.active[w] != 0:
             if trial == 0:
                 for i in range(begin, end):

@@ -22,8 +22,8 @@ from softmode.deformables.model.struct_kernels import Basis, Instances, PointCon
 from softmode.deformables.solver.assembly_kernels import CONDENSED_ROUNDING
 from softmode.deformables.solver.iteration_kernels import NewtonArrays
 
-STATIC_BYTES = 44 * 1024
-"""Shared memory that a kernel may have without asking: 48 kB, less the scratch of sums over a team."""
+STATIC_BYTES = 40 * 1024
+"""Shared memory that a kernel may have without asking: 48 kB, less the scratch of sums over a team and of forces."""
 
 
 CONTACTS = 16
@@ -55,8 +55,8 @@ def _contact_bytes(size: int, columns: int) -> int:
 
 
 def _rigid_doubles(columns: int) -> int:
-    """Return how many numbers the rigid unknowns take: their matrix, its least pivots, ratios, right-hand side."""
-    return columns * columns + 3 * columns
+    """Return how many numbers the rigid unknowns take: their matrix, its least pivots, ratios, scales, right-hand side."""
+    return columns * columns + 4 * columns
 
 
 _BEGIN = """
@@ -65,11 +65,22 @@ _BEGIN = """
 #define SOFTMODE_BARRIER __syncthreads()
 #define SOFTMODE_WARP __syncwarp()
 #define SOFTMODE_RSQRT(x) rsqrtf(x)  // to 2 units in the last place, in a tenth of the instructions
+#define SOFTMODE_RSQRT_DOUBLE(x) rsqrt(x)
 #else
 #define SOFTMODE_SHARED alignas(16) static
 #define SOFTMODE_BARRIER
 #define SOFTMODE_WARP
 #define SOFTMODE_RSQRT(x) (1.0f / wp::sqrt(x))
+#define SOFTMODE_RSQRT_DOUBLE(x) (1.0 / wp::sqrt(x))
+#endif
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+// 16 bytes into shared memory; a thread goes on, and waits for all of its own at once
+#define SOFTMODE_FETCH(to, from) asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" \
+    :: "r"((unsigned)__cvta_generic_to_shared(to)), "l"(from) : "memory")
+#define SOFTMODE_FETCHED asm volatile("cp.async.wait_all;" ::: "memory")
+#else
+#define SOFTMODE_FETCH(to, from) *(Quad*)(to) = *(const Quad*)(from)
+#define SOFTMODE_FETCHED
 #endif
     struct alignas(16) Quad { float x, y, z, w; };
 """
@@ -78,6 +89,9 @@ _END = """
 #undef SOFTMODE_BARRIER
 #undef SOFTMODE_WARP
 #undef SOFTMODE_RSQRT
+#undef SOFTMODE_RSQRT_DOUBLE
+#undef SOFTMODE_FETCH
+#undef SOFTMODE_FETCHED
 """
 _STATIC = """
     SOFTMODE_SHARED float room[BYTES / 4];
@@ -99,7 +113,8 @@ _SYSTEM = """
     double* S = (double*)(right + N);  // (R, R): the rigid unknowns' matrix, then its factor with inverse pivots
     double* least = S + R * R;
     double* ratio = least + R;
-    double* move = ratio + R;
+    double* scale = ratio + R;
+    double* move = scale + R;
     // of some contacts: force, row of the basis, Hessian, motion of the shape, Hessian times motion
     double* near_force = move + R;
     float* near_values = (float*)(near_force + 3 * TILE);
@@ -133,20 +148,7 @@ _SYSTEM = """
         for (int t = member; t < N * quads; t += team) {
             const int row = t / quads;
             const int first = 4 * (t - row * quads);
-            if (first >= (row & ~7)) {
-                Quad value = *(const Quad*)&K[row * N + first];
-                #pragma unroll 1
-                for (int chunk = 1; chunk < chunks; ++chunk) {
-                    const Quad more = *(const Quad*)&K[(size_t)chunk * N * N + row * N + first];
-                    value.x += more.x; value.y += more.y; value.z += more.z; value.w += more.w;
-                }
-                const int at = row - first;
-                if (at == 0) value.x += inertia;
-                if (at == 1) value.y += inertia;
-                if (at == 2) value.z += inertia;
-                if (at == 3) value.w += inertia;
-                *(Quad*)&A[row_of(row) + first] = value;
-            }
+            if (first >= (row & ~7)) SOFTMODE_FETCH(&A[row_of(row) + first], &K[row * N + first]);
         }
         // right of K: -g in column rigid_max; the contacts' -sum_e b_k H_e J_e comes on top
         const double* g = (const double*)arrays.gradient.data + (size_t)i * N;
@@ -184,6 +186,20 @@ _SYSTEM = """
                 S[j * R + l] = value;
             }
         }
+        SOFTMODE_FETCHED;
+        #pragma unroll 1
+        for (int chunk = 1; chunk < chunks; ++chunk) {
+            #pragma unroll 4
+            for (int t = member; t < N * quads; t += team) {
+                const int row = t / quads;
+                const int first = 4 * (t - row * quads);
+                if (first >= (row & ~7)) {
+                    const Quad more = *(const Quad*)&K[(size_t)chunk * N * N + row * N + first];
+                    Quad* value = (Quad*)&A[row_of(row) + first];
+                    value->x += more.x; value->y += more.y; value->z += more.z; value->w += more.w;
+                }
+            }
+        }
         // contacts, some at a time: fetched once by all threads, then read from shared memory by every sum
         for (int start = 0; start == 0 || start < acting_count; start += TILE) {
             const int held = acting_count - start < TILE ? acting_count - start : TILE;
@@ -191,16 +207,19 @@ _SYSTEM = """
                 const int s = t / (2 * blocks);
                 const int k = 4 * (t - s * 2 * blocks);
                 const float* given = values + (size_t)rows[acting[start + s]] * 8 * blocks;
-                *(Quad*)&near_values[s * 8 * blocks + k] = *(const Quad*)&given[k];
+                SOFTMODE_FETCH(&near_values[s * 8 * blocks + k], &given[k]);
             }
             for (int t = member; t < held * tail * 3; t += team) {
                 const int s = t / (3 * tail);
                 const int at = t - s * 3 * tail;
                 const int j = at / 3;
                 const int e = acting[start + s];
+                // loaded together, whether needed or not: one wait instead of two
+                const float motion = J[e * dofs * 3 + at];
+                const float coupling = HJ[e * dofs * 3 + at];
                 const bool moves = j >= begins[e] && j < ends[e];
-                near_jacobian[s * 3 * R + at] = moves ? J[e * dofs * 3 + at] : 0.0f;
-                near_coupling[s * 3 * R + at] = moves ? HJ[e * dofs * 3 + at] : 0.0f;
+                near_jacobian[s * 3 * R + at] = moves ? motion : 0.0f;
+                near_coupling[s * 3 * R + at] = moves ? coupling : 0.0f;
             }
             for (int t = member; t < held * 9; t += team) {
                 const int s = t / 9;
@@ -210,6 +229,7 @@ _SYSTEM = """
                 const int s = t / 3;
                 near_force[t] = F[3 * acting[start + s] + t - 3 * s];
             }
+            SOFTMODE_FETCHED;
             SOFTMODE_BARRIER;
             for (int t = member; t < 3 * blocks * tail; t += team) {
                 const int j = t / (3 * blocks);
@@ -312,7 +332,7 @@ _SYSTEM = """
             for (int l = first + member; l < W; l += team) {
                 float r[8];
                 #pragma unroll
-                for (int a = 0; a < 8; ++a) r[a] = here[a * stride + l];
+                for (int a = 0; a < 8; ++a) r[a] = here[a * stride + l] + (l - first == a ? inertia : 0.0f);
                 #pragma unroll 1
                 for (int above = 0; above < first; above += 8) {
                     const float* rows_above = A + row_of(above);
@@ -406,48 +426,52 @@ _SYSTEM = """
             else S[j * R + l] = value;
         }
         SOFTMODE_BARRIER;
-        // as ``assembly_kernels.factor_rigid``, by one warp: its threads wait for no others
+        // as ``assembly_kernels.factor_rigid``, by one warp: its threads wait for no others. What is left of the matrix
+        // and of the right-hand side is updated column by column, since a sum of its own for every entry waits longer
         if (member < 32) {
             const int lanes = team < 32 ? team : 32;
+            for (int b = member; b < tail; b += lanes) {
+                scale[b] = 1.0 / (S[b * R + b] > least[b] ? S[b * R + b] : least[b]);
+            }
+            SOFTMODE_WARP;
             #pragma unroll 1
             for (int a = 0; a < tail; ++a) {
-                double pivot = S[a * R + a];
-                #pragma unroll 1
-                for (int s = 0; s < a; ++s) pivot -= S[a * R + s] * S[a * R + s];
                 for (int b = a + 1 + member; b < tail; b += lanes) {
-                    double value = S[b * R + a];
-                    #pragma unroll 1
-                    for (int s = 0; s < a; ++s) value -= S[b * R + s] * S[a * R + s];
-                    S[b * R + a] = value;
-                    const double diagonal = S[b * R + b] > least[b] ? S[b * R + b] : least[b];
-                    ratio[b] = value * value / diagonal;
+                    ratio[b] = S[b * R + a] * S[b * R + a] * scale[b];
                 }
                 SOFTMODE_WARP;
-                pivot = pivot > least[a] ? pivot : least[a];
-                #pragma unroll 1
+                double pivot = S[a * R + a] > least[a] ? S[a * R + a] : least[a];
+                #pragma unroll 4
                 for (int b = a + 1; b < tail; ++b) pivot = pivot > ratio[b] ? pivot : ratio[b];
-                const double inverse = 1.0 / wp::sqrt(pivot);
-                if (member == 0) S[a * R + a] = inverse;
-                for (int b = a + 1 + member; b < tail; b += lanes) S[b * R + a] *= inverse;
+                const double inverse = SOFTMODE_RSQRT_DOUBLE(pivot);
+                const double moved = inverse * move[a];
                 SOFTMODE_WARP;
-            }
-        }
-        if (member == 0) {
-            #pragma unroll 1
-            for (int a = 0; a < tail; ++a) {
-                double value = move[a];
-                #pragma unroll 1
-                for (int s = 0; s < a; ++s) value -= S[a * R + s] * move[s];
-                move[a] = value * S[a * R + a];
+                for (int b = a + 1 + member; b < tail; b += lanes) {
+                    S[b * R + a] *= inverse;
+                    move[b] -= S[b * R + a] * moved;
+                }
+                if (member == 0) {
+                    S[a * R + a] = inverse;
+                    move[a] = moved;
+                }
+                SOFTMODE_WARP;
+                for (int b = a + 1 + member; b < tail; b += lanes) {
+                    #pragma unroll 4
+                    for (int c = a + 1; c <= b; ++c) S[b * R + c] -= S[b * R + a] * S[c * R + a];
+                }
+                SOFTMODE_WARP;
             }
             double* out = (double*)rigid.direction.data + (size_t)world * dofs;
             #pragma unroll 1
             for (int a = tail - 1; a >= 0; --a) {
-                double value = move[a];
-                #pragma unroll 1
-                for (int s = a + 1; s < tail; ++s) value -= S[s * R + a] * move[s];
-                move[a] = value * S[a * R + a];
-                out[a] = move[a];
+                const double moved = S[a * R + a] * move[a];
+                SOFTMODE_WARP;
+                for (int b = member; b < a; b += lanes) move[b] -= S[a * R + b] * moved;
+                if (member == 0) {
+                    move[a] = moved;
+                    out[a] = moved;
+                }
+                SOFTMODE_WARP;
             }
         }
         SOFTMODE_BARRIER;
@@ -535,39 +559,73 @@ def shared_direction_of(size: int, width: int) -> Any:
     const double* F = (const double*)constraints.force.data + (size_t)i * constraints.force.shape[1] * 3;
     const int* rows = (const int*)constraints.row.data + (size_t)i * constraints.row.shape[1];
     const float* values = (const float*)basis.row.data;
-    // a group of threads per part, a thread per function
+    // a warp per part, a thread per function; what all of a part's threads read is fetched into shared memory
+    constexpr int held = 16;
+#if defined(__CUDA_ARCH__)
+    __shared__ double fetched[(WP_TILE_BLOCK_DIM + 31) / 32 * 9 * held];
+    __shared__ int fetched_row[(WP_TILE_BLOCK_DIM + 31) / 32 * held];
+#define SOFTMODE_WARP __syncwarp()
+#else
+    double fetched[9 * held];
+    int fetched_row[held];
+#define SOFTMODE_WARP
+#endif
     const int parts = arrays.gradient_chunk.shape[1];
     const int lanes = team / parts;
     const int part = member / lanes;
+    const int lane = member - part * lanes;
+    double* here = fetched + part * 9 * held;
+    int* here_row = fetched_row + part * held;
     const char* start = (const char*)basis.gradient_across.data;
     start += (size_t)instances.point_start.data[i] * by_point;
     double* out = (double*)arrays.gradient_chunk.data + ((size_t)i * parts + part) * 3 * n;
-    for (int k = member - part * lanes; k < n; k += lanes) {
+    for (int base = 0; base < n; base += lanes) {
+        const int k = base + lane < n ? base + lane : n - 1;
         const char* G = start + (k / 8) * by_block + (k % 8) * sizeof(float);
         double x = 0.0, y = 0.0, z = 0.0;
-        #pragma unroll 4
-        for (int p = part * point_count / parts; p < (part + 1) * point_count / parts; ++p) {
-            const char* at = G + (size_t)p * by_point;
-            const double* stress = P + 9 * p;
-            const double a = *(const float*)at;
-            const double b = *(const float*)(at + by_axis);
-            const double c = *(const float*)(at + 2 * by_axis);
-            x += stress[0] * a; x += stress[1] * b; x += stress[2] * c;
-            y += stress[3] * a; y += stress[4] * b; y += stress[5] * c;
-            z += stress[6] * a; z += stress[7] * b; z += stress[8] * c;
+        const int last = (part + 1) * point_count / parts;
+        for (int first = part * point_count / parts; first < last; first += held) {
+            const int count = last - first < held ? last - first : held;
+            for (int t = lane; t < 9 * count; t += lanes) here[t] = P[9 * first + t];
+            SOFTMODE_WARP;
+            #pragma unroll 8
+            for (int p = 0; p < count; ++p) {
+                const char* at = G + (size_t)(first + p) * by_point;
+                const double* stress = here + 9 * p;
+                const double a = *(const float*)at;
+                const double b = *(const float*)(at + by_axis);
+                const double c = *(const float*)(at + 2 * by_axis);
+                x += stress[0] * a; x += stress[1] * b; x += stress[2] * c;
+                y += stress[3] * a; y += stress[4] * b; y += stress[5] * c;
+                z += stress[6] * a; z += stress[7] * b; z += stress[8] * c;
+            }
+            SOFTMODE_WARP;
         }
-        #pragma unroll 4
-        for (int s = part * acting_count / parts; s < (part + 1) * acting_count / parts; ++s) {
-            const int e = acting[s];
-            const double b = values[(size_t)rows[e] * n + k];
-            x -= F[3 * e] * b;
-            y -= F[3 * e + 1] * b;
-            z -= F[3 * e + 2] * b;
+        const int end = (part + 1) * acting_count / parts;
+        for (int first = part * acting_count / parts; first < end; first += held) {
+            const int count = end - first < held ? end - first : held;
+            for (int t = lane; t < 3 * count; t += lanes) {
+                const int e = acting[first + t / 3];
+                here[t] = F[3 * e + t % 3];
+                here_row[t / 3] = rows[e];
+            }
+            SOFTMODE_WARP;
+            #pragma unroll 8
+            for (int s = 0; s < count; ++s) {
+                const double b = values[(size_t)here_row[s] * n + k];
+                x -= here[3 * s] * b;
+                y -= here[3 * s + 1] * b;
+                z -= here[3 * s + 2] * b;
+            }
+            SOFTMODE_WARP;
         }
-        out[k] = x;
-        out[n + k] = y;
-        out[2 * n + k] = z;
+        if (base + lane < n) {
+            out[k] = x;
+            out[n + k] = y;
+            out[2 * n + k] = z;
+        }
     }
+#undef SOFTMODE_WARP
 """
 )
 def sum_forces_of(

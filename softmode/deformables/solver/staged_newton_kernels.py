@@ -44,10 +44,6 @@ from softmode.deformables.solver.step_kernels import (
 
 wp.set_module_options({"enable_backward": False})
 
-CHECK_TEAM = 64
-"""Threads that share a world in ``check_worlds``,"""
-DIRECT_TEAM = 96
-"""and in ``direct_worlds``."""
 BLOCK = 128
 """Threads of a block of the other launches."""
 
@@ -61,8 +57,6 @@ def start_trials(step: NewtonStep):
         step.arrays.q_trial[i, e] = step.arrays.q[i, e]
     if e < step.rigid.count[w]:
         step.rigid.trial[w, e] = step.rigid.r[w, e]
-    if e == 0:
-        step.state.searching[w] = 0
 
 
 @wp.kernel(launch_bounds=(BLOCK, 4))
@@ -87,8 +81,6 @@ def evaluate_trials(step: NewtonStep, points: int, constraints: int):
 def differentiate_points(step: NewtonStep):
     """Evaluate the Hessian at the points of the worlds that renew it."""
     w, p = wp.tid()
-    if w == 0 and p == 0:
-        step.state.any_active[0] = 0
     i = step.state.instance_start[w]
     if step.state.solving[w] == 0 or step.state.refresh[w] == 0 or p >= step.instances.point_count[i]:
         return
@@ -118,7 +110,7 @@ def assemble_stiffness(step: NewtonStep):
 
 
 @cache
-def check_kernel(team: int = CHECK_TEAM) -> Kernel:
+def check_kernel(team: int) -> Kernel:
     """Return the kernel that checks the trials of the worlds, a team of so many threads for each."""
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=(team, 512 // team))
@@ -209,7 +201,7 @@ def check_kernel(team: int = CHECK_TEAM) -> Kernel:
 
 
 @cache
-def direct_kernel(size: int, width: int, team: int = DIRECT_TEAM) -> Kernel:
+def direct_kernel(size: int, width: int, team: int) -> Kernel:
     """Return the kernel that finds the directions of the worlds and their next trials, a team of threads for each.
 
     Args:
@@ -226,9 +218,7 @@ def direct_kernel(size: int, width: int, team: int = DIRECT_TEAM) -> Kernel:
         w, member = wp.tid()
         if wp.static(dynamic > 0):
             _room = wp.tile_empty(shape=wp.static(dynamic), dtype=float, storage="shared")
-        if step.state.active[w] == 0:
-            return
-        if step.state.solving[w] != 0:
+        if step.state.active[w] != 0 and step.state.solving[w] != 0:
             i = step.state.instance_start[w]
             q = step.arrays.q_trial
             r = step.rigid.trial
@@ -268,9 +258,6 @@ def direct_kernel(size: int, width: int, team: int = DIRECT_TEAM) -> Kernel:
                     for j in range(member, step.rigid.count[w], team):
                         rolled()
                         step.rigid.r[w, j] = r[w, j]
-            barrier()
-        if member == 0 and step.state.active[w] != 0:
-            step.state.any_active[0] = 1
 
     return direct_worlds
 
@@ -287,10 +274,10 @@ def iterate(tables: Any, dt: float) -> None:
     worlds, blocks = t.layout.world_count, t.layout.block_count
     points, constraints, count = tasks(t.layout.point_max, t.constraints.row.shape[1], t.rigid.row_max)
     t.launch(evaluate_trials, (worlds, count), step, points, constraints, block_dim=BLOCK)
-    check, direct = (CHECK_TEAM, DIRECT_TEAM) if t.model.device.is_cuda else (1, 1)
-    t.launch(check_kernel(), (worlds, check), step, check, block_dim=check)
+    team = t.world_team
+    t.launch(check_kernel(team), (worlds, team), step, team, block_dim=team)
     t.launch(differentiate_points, (worlds, t.layout.point_max), step, block_dim=BLOCK)
     of = 3 * blocks * blocks + 3 * (blocks * blocks + blocks) // 2
     t.launch(assemble_stiffness, (worlds, t.arrays.stiffness.shape[1], of), step, block_dim=BLOCK)
-    kernel = direct_kernel(t.system.size, t.system.scalars.shape[2])
-    t.launch(kernel, (worlds, direct), step, direct, block_dim=direct)
+    kernel = direct_kernel(t.system.size, t.system.scalars.shape[2], team)
+    t.launch(kernel, (worlds, team), step, team, block_dim=team)

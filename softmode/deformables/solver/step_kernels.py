@@ -273,6 +273,7 @@ def begin_newton(step: NewtonStep):
             in_contact = 1
     step.state.in_contact[w] = in_contact
     step.state.active[w] = 1
+    step.state.searching[w] = 0
     step.state.evaluated[w] = 0
     step.state.refresh[w] = 1
     step.state.project[w] = 0

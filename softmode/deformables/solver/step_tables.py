@@ -39,7 +39,6 @@ from softmode.deformables.solver.fused_system_kernels import shared_bytes
 from softmode.deformables.solver.iteration_kernels import NewtonArrays, NewtonOptions, NewtonStep
 from softmode.deformables.solver.options import SolverReducedOptions
 from softmode.deformables.solver.spin_kernels import Spin
-from softmode.deformables.solver.staged_newton_kernels import CHECK_TEAM
 from softmode.deformables.solver.systems import join_systems
 from softmode.deformables.solver.tile_kernels import TILE, chunk_count
 
@@ -51,7 +50,7 @@ FEW_WORLDS = 64
 """Bodies up to which those of many functions get larger teams, and more and smaller blocks of threads, on CUDA."""
 LARGE_TEAM = 128
 """Threads of these teams and blocks."""
-RESERVED_BYTES = 2048
+RESERVED_BYTES = 7168
 """Shared memory that the one launch needs besides its system, with what CUDA keeps for itself."""
 
 _POINTS = {"": "instance point", "hessian": "instance 6 point"}
@@ -272,7 +271,7 @@ def allocate_tables(
         "team": LARGE_TEAM if few else team_size(device),
         "constraint": room + layout.pin_max,
         "rigid": rigid.count_max,
-        "gradient_chunk": CHECK_TEAM // WARP if staged else world_team // WARP if shared else chunks(count * blocks, blocks),
+        "gradient_chunk": world_team // WARP if shared else chunks(count * blocks, blocks),
         "stiffness_chunk": chunk_count(count, layout.stride)
         if tiled
         else chunks(count * square, square + (square + 3 * blocks) // 2),
