@@ -21,7 +21,7 @@ CLOSE = np.array([0.0, 0.0, -1.0, 0.0, 1.0], np.float32)
 
 
 def grasp(
-    device: str, *, one_launch: bool, shared: bool = False, worlds: int = 2, eager: bool = False
+    device: str, *, one_launch: bool, shared: bool = False, rounds: int = 0, worlds: int = 2, eager: bool = False
 ) -> dict[str, np.ndarray]:
     """Lower the open gripper over the object, close it until both fingers press, and return where everything is.
 
@@ -29,6 +29,7 @@ def grasp(
         device: Where.
         one_launch: Whether all Newton iterations of a world are one launch.
         shared: Whether that solves in shared memory.
+        rounds: Rounds of launches before it.
         worlds: How many.
         eager: Whether one more step is taken without a graph at the end.
     """
@@ -37,7 +38,8 @@ def grasp(
     system = reduced.tables.system
     size = (system.size, system.scalars.shape[2]) if shared else ()
     kernel = newton_kernel(system.unit.dtype, *size)
-    reduced.tables = dataclasses.replace(reduced.tables, one_launch=one_launch, shared=shared, fused_kernel=kernel)
+    ways = {"one_launch": one_launch, "shared": shared, "rounds": rounds, "fused_kernel": kernel}
+    reduced.tables = dataclasses.replace(reduced.tables, **ways)
     for step in range(32):
         height = scene.controller.target_position.numpy()[0, 2]
         down = np.clip((scene.soft.height - height) / 0.015, -1.0, 1.0)
@@ -100,13 +102,22 @@ def test_packed_system_grasps_as_the_launches_do() -> None:
     np.testing.assert_allclose(packed["force"], apart["force"], atol=1.0e-5 * np.abs(apart["force"]).max())
 
 
+@pytest.mark.parametrize("rounds", [1, 40])
+def test_rounds_of_launches_grasp_as_the_one_launch_does(rounds: int) -> None:
+    """Worlds go on in the one launch from wherever a round left them, or end in the rounds; sums have another order."""
+    alone, after = (grasp("cpu", one_launch=True, rounds=count) for count in (0, rounds))
+    for name in ("q", "joint_q"):
+        np.testing.assert_allclose(after[name], alone[name], atol=1.0e-8)
+    np.testing.assert_allclose(after["force"], alone["force"], atol=1.0e-6 * np.abs(alone["force"]).max())
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a GPU")
-@pytest.mark.parametrize("shared", [False, True])
-def test_one_launch_on_cuda(shared: bool) -> None:
+@pytest.mark.parametrize("shared, rounds", [(False, 0), (True, 0), (True, 1), (True, 5), (True, 40)])
+def test_one_launch_on_cuda(shared: bool, rounds: int) -> None:
     """Sums have another order: coordinates agree within the solve's tolerance, 1e-4 of 0.1 m, forces within 1e-3."""
     apart = grasp("cuda:0", one_launch=False)
-    at_once = grasp("cuda:0", one_launch=True, shared=shared)
+    at_once = grasp("cuda:0", one_launch=True, shared=shared, rounds=rounds)
     for name in ("q", "joint_q"):
         np.testing.assert_allclose(at_once[name], apart[name], atol=1.0e-5)
     np.testing.assert_allclose(at_once["force"], apart["force"], atol=1.0e-3 * np.abs(apart["force"]).max())
@@ -119,6 +130,7 @@ def test_one_launch_on_cuda(shared: bool) -> None:
         ("search_kernels", ("check_iterates", "reuse_hessians")),
         ("assembly_kernels", ("assemble_matrix", "assemble_columns", "assemble_pins")),
         ("tile_kernels", ("assemble_tiles",)),
+        ("newton_round_kernels", ("evaluate_trials", "differentiate_points", "assemble_stiffness")),
     ],
 )
 def test_no_thread_copies_the_tables(module: str, entries: tuple[str, ...], tmp_path: Path) -> None:

@@ -180,7 +180,8 @@ class NewtonState:
     instance_start: wp.array[int]  # (world_count + 1,)
     active: wp.array[int]
     searching: wp.array[int]
-    solving: wp.array[int]  # whether a direction is to be found in this round of launches
+    solving: wp.array[int]  # whether this round of launches is to find a direction
+    extends: wp.array[int]  # whether steps longer than the full one are tried: until one was none the better
     evaluated: wp.array[int]  # whether the iterate is the last trial: what does not depend on friction is evaluated
     last: wp.array[int]  # whether every body moves less than its tolerance in this iteration
     in_contact: wp.array[int]  # whether a body of the world is near a shape

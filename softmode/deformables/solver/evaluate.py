@@ -59,11 +59,16 @@ def gather_gradient(tables: StepTables, dt: float) -> None:
     t.launch(kernels.sum_gradient, t.unknowns, step)
 
 
+def stiffness_tasks(blocks: int) -> int:
+    """Return how many 8x8 blocks the upper triangle of a stiffness of so many blocks of functions has."""
+    return 3 * blocks * blocks + 3 * (blocks * blocks + blocks) // 2
+
+
 def assemble(tables: StepTables, dt: float) -> None:
     """Assemble the Hessian into the block systems [K | C | -g] and the rigid part."""
     t, step = tables, tables.newton_step(dt)
     blocks, count, worlds = t.layout.block_count, t.layout.instance_count, t.layout.world_count
-    tasks = 3 * blocks * blocks + 3 * (blocks * blocks + blocks) // 2  # 8x8 blocks of the upper triangle
+    tasks = stiffness_tasks(blocks)
     if t.model.device.is_cpu:
         t.launch(eights.differentiate_eights, t.point_tasks, step)
     if t.tiled:

@@ -55,7 +55,7 @@ def _contact_bytes(size: int, columns: int) -> int:
 
 
 def _rigid_doubles(columns: int) -> int:
-    """Return how many numbers the rigid unknowns take: their matrix, its least pivots, ratios, scales, right-hand side."""
+    """Return how many numbers the rigid unknowns take: their matrix, least pivots, ratios, scales, right-hand side."""
     return columns * columns + 4 * columns
 
 

@@ -1,14 +1,19 @@
 """Third phase of a step: minimise the incremental potential of every world by Newton with a line search."""
 
-import os
-
 import warp as wp
 
+from softmode.deformables.solver import newton_round_kernels as rounds
 from softmode.deformables.solver import rigid_start_kernels
 from softmode.deformables.solver import search_kernels as search
-from softmode.deformables.solver import staged_newton_kernels as staged
 from softmode.deformables.solver import step_kernels as kernels
-from softmode.deformables.solver.evaluate import assemble, evaluate, evaluate_trial, gather_gradient, solve
+from softmode.deformables.solver.evaluate import (
+    assemble,
+    evaluate,
+    evaluate_trial,
+    gather_gradient,
+    solve,
+    stiffness_tasks,
+)
 from softmode.deformables.solver.step_tables import StepTables
 
 
@@ -21,15 +26,28 @@ def minimise(tables: StepTables, dt: float) -> None:
         t.launch_teams(rigid_start_kernels.start_rigidly, t.layout.instance_count, step, t.samples, t.team)
     if t.options.carry_stiffness:
         t.launch_teams(search.reuse_hessians, worlds, step, t.team)
-    if t.staged:
-        t.launch(staged.start_trials, (worlds, max(3 * t.layout.block_count, t.rigid.count_max)), step)
-        for _ in range(int(os.environ.get("ROUNDS", "5"))):
-            staged.iterate(t, dt)
+    if t.rounds:
+        t.launch(rounds.start_trials, (worlds, max(3 * t.layout.block_count, t.rigid.count_max)), step)
+        for _ in range(t.rounds):
+            _take_round(t, dt)
     if t.one_launch:
         team = t.world_team
         t.launch(t.fused_kernel, (worlds, team), step, t.system.unit, team, t.system.relation, block_dim=team)
     else:
         wp.capture_while(t.newton.any_active, _iterate, tables=t, dt=dt)
+
+
+def _take_round(tables: StepTables, dt: float) -> None:
+    """Check the trials of all worlds that are not done, and find directions and next trials where they are accepted."""
+    t, step, worlds, team = tables, tables.newton_step(dt), tables.layout.world_count, tables.world_team
+    points, constraints, threads = rounds.tasks(t.layout.point_max, t.constraints.row.shape[1], t.rigid.row_max)
+    t.launch(rounds.evaluate_trials, (worlds, threads), step, points, constraints, block_dim=rounds.BLOCK)
+    t.launch(rounds.check_kernel(team), (worlds, team), step, team, block_dim=team)
+    t.launch(rounds.differentiate_points, (worlds, t.layout.point_max), step, block_dim=rounds.BLOCK)
+    dim = (worlds, t.arrays.stiffness.shape[1], stiffness_tasks(t.layout.block_count))
+    t.launch(rounds.assemble_stiffness, dim, step, block_dim=rounds.BLOCK)
+    kernel = rounds.direct_kernel(t.system.size, t.system.scalars.shape[2], team)
+    t.launch(kernel, (worlds, team), step, team, block_dim=team)
 
 
 def _iterate(tables: StepTables, dt: float) -> None:

@@ -471,6 +471,8 @@ def check_trial(step: NewtonStep, trial: wp.float64, w: int, member: int):
     """Accept a trial that lowers the potential enough (Armijo, up to rounding) or halve the step; give up if short.
 
     Where a full step has lowered it by more than a quadratic would have, take the better of that and twice the step.
+    That helps in the onset of contact, from the first iterations on until it does not; friction that gives way looks
+    the same.
     What has been evaluated of an accepted trial serves the next iteration.
     """
     if member != 0:
@@ -484,12 +486,16 @@ def check_trial(step: NewtonStep, trial: wp.float64, w: int, member: int):
         if not (trial < step.state.reached[w]):
             step.state.step_length[w] = wp.float64(1.0)
             step.state.evaluated[w] = 0
+            step.state.extends[w] = 0
         return
-    if alpha == wp.float64(1.0) and trial < potential + EXTENDED_DECREASE * step.state.slope[w] - rounding:
+    longer = trial < potential + EXTENDED_DECREASE * step.state.slope[w] - rounding
+    if alpha == wp.float64(1.0) and longer and step.state.extends[w] != 0:
         step.state.reached[w] = trial
         step.state.step_length[w] = wp.float64(2.0)
         wp.atomic_max(step.state.any_searching, 0, 1)
         return
+    if step.state.iteration[w] > 0:
+        step.state.extends[w] = 0
     if trial <= potential + SUFFICIENT_DECREASE * alpha * step.state.slope[w] + rounding:
         step.state.searching[w] = 0
         step.state.evaluated[w] = 1

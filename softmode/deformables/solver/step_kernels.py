@@ -275,6 +275,7 @@ def begin_newton(step: NewtonStep):
     step.state.active[w] = 1
     step.state.searching[w] = 0
     step.state.evaluated[w] = 0
+    step.state.extends[w] = 1
     step.state.refresh[w] = 1
     step.state.project[w] = 0
     step.state.failures[w] = 0

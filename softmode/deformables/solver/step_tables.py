@@ -46,6 +46,10 @@ CUDA_THREADS = 2**16
 """Threads that keep a GPU busy: sums over points are split until there are about so many."""
 ONE_LAUNCH_BLOCKS = 7
 """Blocks of eight functions up to which a body is small enough for a team of threads on CUDA; on CPU any is."""
+ROUNDS = 5
+"""Rounds of launches before the one launch where worlds are many: measured, see ``docs/performance.md``."""
+ROUND_WORLDS = 12
+"""Worlds for each multiprocessor from which on they are many."""
 FEW_WORLDS = 64
 """Bodies up to which those of many functions get larger teams, and more and smaller blocks of threads, on CUDA."""
 LARGE_TEAM = 128
@@ -145,8 +149,8 @@ class StepTables:
     """The kernel of that launch."""
     world_team: int
     """Threads of that team."""
-    staged: bool
-    """Whether Newton's iteration takes the five launches of ``staged_newton_kernels`` instead."""
+    rounds: int
+    """Rounds of launches before it, which take all worlds through their first iterations; 0 where there are none."""
     shared: bool
     """Whether the systems of that launch are assembled and solved in shared memory."""
     tiled: bool
@@ -250,14 +254,14 @@ def allocate_tables(
     shared = shared and fits_in_shared_memory(device.max_shared_memory_per_block, *size)
     tiled = device.is_cuda and not one_launch and layout.stride >= TILE
     few = tiled and count <= FEW_WORLDS
-    staged = shared
+    rounds = ROUNDS if shared and layout.world_count >= ROUND_WORLDS * device.sm_count else 0
 
     def chunks(threads: int, tasks: int) -> int:
         """Return into how many parts sums over points are split where a kernel has so many threads, a body tasks."""
         if not device.is_cuda:
             return 1
-        if staged:
-            return int(np.clip(CUDA_THREADS // threads, 1, 4))
+        if rounds:
+            return 1
         return int(np.clip(world_team // tasks if one_launch else CUDA_THREADS // threads, 1, 64 if few else 16))
 
     sizes = {
@@ -327,7 +331,7 @@ def allocate_tables(
         ),
         world_team=world_team,
         shared=shared,
-        staged=staged,
+        rounds=rounds,
         tiled=tiled,
     )
 

@@ -1,20 +1,20 @@
-"""Device side of Newton's iteration in five launches, for worlds of one small body on CUDA.
+"""Device side of Newton's iteration in rounds of five launches, for many worlds of one small body each on CUDA.
 
-A round of the launches is an iteration of every world whose trial step is accepted:
+A round takes every world through an iteration, where its trial step is accepted:
 
-1. ``evaluate_trials``: a thread for each point, contact and row: energies and stress at the trial of every world;
-2. ``check_worlds``: a team for each world: accept the trial or shorten it; where it is accepted, forces, gradient and
-   convergence;
+1. ``evaluate_trials``: a thread for each point, contact and row: energies and stress at the trial;
+2. ``check_worlds``: a team for each world accepts the trial or shortens it; where it is accepted, contact forces,
+   gradient and convergence;
 3. ``differentiate_points`` and 4. ``assemble_stiffness``: where the elastic Hessian is renewed;
 5. ``direct_worlds``: a team for each world: its system in shared memory, the direction, the next trial.
 
-Worlds do not wait for each other within an iteration: one may try a shorter step while another takes the next. The
-functions are those of the one launch of ``fused_newton_kernels``. That launch has several times more code than the
-instruction cache holds, and its threads as many registers as its hungriest phase; here every launch has its own.
+Within a round one world may try a shorter step while another takes the next. The functions are those of the one launch
+of ``fused_newton_kernels``. That launch has several times more code than the instruction cache holds, and as many
+registers as its hungriest phase; a launch of a round has its own. A round with few worlds left is slow, though: so the
+first rounds do most of the work, and the one launch takes each of the worlds that are left to its end.
 """
 
 from functools import cache
-from typing import Any
 
 import warp as wp
 
@@ -45,7 +45,7 @@ from softmode.deformables.solver.step_kernels import (
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 128
-"""Threads of a block of the other launches."""
+"""Threads of a block where threads do not work as a team."""
 
 
 @wp.kernel
@@ -263,21 +263,6 @@ def direct_kernel(size: int, width: int, team: int) -> Kernel:
 
 
 def tasks(point_max: int, constraint_max: int, row_max: int) -> tuple[int, int, int]:
-    """Return the threads of a world in ``evaluate_trials``: for points, for constraints, all; each in warps of its own."""
+    """Return the threads of a world in ``evaluate_trials``: for points, for constraints, all, in warps of their own."""
     points, constraints, rows = (-(-count // WARP) * WARP for count in (point_max, constraint_max, row_max))
     return points, constraints, points + constraints + rows
-
-
-def iterate(tables: Any, dt: float) -> None:
-    """Take one round in every world that is not done."""
-    t, step = tables, tables.newton_step(dt)
-    worlds, blocks = t.layout.world_count, t.layout.block_count
-    points, constraints, count = tasks(t.layout.point_max, t.constraints.row.shape[1], t.rigid.row_max)
-    t.launch(evaluate_trials, (worlds, count), step, points, constraints, block_dim=BLOCK)
-    team = t.world_team
-    t.launch(check_kernel(team), (worlds, team), step, team, block_dim=team)
-    t.launch(differentiate_points, (worlds, t.layout.point_max), step, block_dim=BLOCK)
-    of = 3 * blocks * blocks + 3 * (blocks * blocks + blocks) // 2
-    t.launch(assemble_stiffness, (worlds, t.arrays.stiffness.shape[1], of), step, block_dim=BLOCK)
-    kernel = direct_kernel(t.system.size, t.system.scalars.shape[2], team)
-    t.launch(kernel, (worlds, team), step, team, block_dim=team)
