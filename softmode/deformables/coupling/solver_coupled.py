@@ -247,6 +247,8 @@ class SolverCoupledReduced(ReducedSolver):
         t.launch(kernels.effective_inertia, dim, table.count, self._inertia, *start, *out)
         t.launch(rows.gather_rows, (worlds, dofs.row_max), self._mujoco, self._turned, state.joint_q, table)
         differentiate_constraints(t)
+        if dofs.row_max:
+            t.launch_teams(rows.damp_rows, worlds, self._damping, wp.float64(dt), t.team, table)
 
     def _find_pushed(self) -> None:
         """Mark the worlds in which a soft body pushes a rigid one."""
