@@ -329,8 +329,8 @@ def find_contacts(
 ):
     """Keep the deepest contacts of each sample within margin plus twice the relative motion of the step.
 
-    A sample in a shape, or one that touched it in the step before, whose body lies behind the nearest surface is brought
-    back if it ``came_through``.
+    A sample in a shape, or one that touched it in the step before, is brought back if its body lies behind the nearest
+    surface and it ``came_through``.
     """
     i, s = wp.tid()
     if s >= instances.sample_count[i]:
@@ -374,7 +374,8 @@ def find_contacts(
         depth = instances.scale[i] * float(wp.length(basis.inner_point[row]))
         travel = wp.length(drift)
         returned = int(0)
-        touched = touched_shape(stuck[0]) == shape or touched_shape(stuck[1]) == shape or dt_before[i] == wp.float64(0.0)
+        before = dt_before[i]
+        touched = touched_shape(stuck[0]) == shape or touched_shape(stuck[1]) == shape or before == wp.float64(0.0)
         if query.distance <= 0.0 or (touched and query.distance < 2.0 * depth):
             bent = interpolate(basis.inner_row, row, motion.q_start, i, instances.function_count[i])
             inner = wp.quat_rotate_inv(turn, wp.vec3(basis.inner_point[row] + bent))
@@ -382,7 +383,6 @@ def find_contacts(
             near_back = query.distance <= 0.0 or (touched and query.distance < depth)
             if near_back and wp.dot(query.normal, inner) < -OPPOSED * depth:
                 # the nearest surface faces away from the body's inside: what came through must go back to it
-                before = dt_before[i]
                 through = came_through(
                     instances, basis, motion, shapes, shape, x, local, query, stuck, before, far, i, row
                 )

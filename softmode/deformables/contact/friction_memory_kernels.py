@@ -43,27 +43,28 @@ def remember_slip(
         if not (constraints.normal_force[i, e] > wp.float64(0.0)):
             continue
         # the normal force of friction may be that of an earlier iterate
-        if wp.dot(constraints.normal[i, e], constraints.offset[i, e] + constraints.displacement[i, e]) >= wp.float64(0.0):
+        total = constraints.offset[i, e] + constraints.displacement[i, e]
+        if wp.dot(constraints.normal[i, e], total) >= wp.float64(0.0):
             continue
         limit = constraints.friction[i, e] * constraints.normal_force[i, e]
         shape = constraints.shape[i, e]
         origin, rotation = shape_frame(shapes, shape)
-        total = constraints.slip[i, e]
-        stretch = constraints.stick[i, e] * wp.length(total)
+        slip = constraints.slip[i, e]
+        stretch = constraints.stick[i, e] * wp.length(slip)
         if not wp.isfinite(stretch + limit):
             continue
         elastic = wp.vec3d()
         if stretch > limit:
-            elastic = limit / stretch * total
+            elastic = limit / stretch * slip
         elif stretch > wp.float64(0.0):
-            elastic = total
+            elastic = slip
         point = constraints.anchor[i, e]
         if prescribed != 0:
             point = wp.quat_rotate_inv(rotation, elastic)
         elif stretch > limit or constraints.stick[i, e] == wp.float64(0.0):
             n = constraints.normal[i, e]
             before = constraints.offset[i, e] - wp.dot(n, constraints.offset[i, e]) * n
-            slid = samples.position[i, s] - before + total - elastic
+            slid = samples.position[i, s] - before + slip - elastic
             point = wp.quat_rotate_inv(rotation, slid - origin)
         stuck[slot] = wp.where(samples.returned[i, s, slot] != 0, -2 - shape, shape)
         points[slot] = point
