@@ -16,9 +16,10 @@ Where no soft body is near a rigid one that moves, the joint dofs stay out of th
 prediction is the step: on the CPU the second MuJoCo step is taken only if some world needs it, and a world that does
 not need it is left as the prediction has it.
 
-What step 3 neglects of MuJoCo's answer to the forces: the implicit integrator damps after the constraints are solved,
-(M + dt C)^-1 M (M + J^T D J)^-1 instead of (M + dt C + J^T D J)^-1, which differ by the cross term dt J^T D J M^-1 C on
-dofs that are both damped and constrained; and contacts that MuJoCo will only detect in the next step.
+MuJoCo's integrator damps after the constraints are solved: it answers forces by (M + dt C)^-1 M (M + J^T D J)^-1. The
+solve has (M + dt C + J^T D' J)^-1, D' such that both are the same for one row and a force along it (see
+``rigid_row_kernels.damp_rows``). What step 3 neglects: that several rows at once, or a force across them, see other
+ratios of M + dt C to M; and contacts that MuJoCo will only detect in the next step.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -247,6 +248,8 @@ class SolverCoupledReduced(ReducedSolver):
         t.launch(kernels.effective_inertia, dim, table.count, self._inertia, *start, *out)
         t.launch(rows.gather_rows, (worlds, dofs.row_max), self._mujoco, self._turned, state.joint_q, table)
         differentiate_constraints(t)
+        if dofs.row_max:
+            t.launch_teams(rows.damp_rows, worlds, self._damping, wp.float64(dt), t.team, table)
 
     def _find_pushed(self) -> None:
         """Mark the worlds in which a soft body pushes a rigid one."""

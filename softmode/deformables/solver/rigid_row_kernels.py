@@ -8,13 +8,18 @@ the potential over r = dt * joint velocity as what s adds to its own tangent,
 
 whose gradient is zero in the prediction: without soft forces nothing moves, a small force meets J^T s'' J, a force
 that opens a contact meets nothing once it is open, and one that closes a row which the prediction left open meets it.
+
+MuJoCo's integrator damps after the constraints are solved: the rows see the acceleration that M leaves of a force, the
+dofs move by what M_eff = M + dt C leaves of it. A row along which M_eff is c times M is therefore c times as stiff
+against r as D says, and x* counts 1/c of what it is (see ``damp_rows``).
 """
 
 import warp as wp
 
 from softmode.deformables.model.declare import kernel_over, struct
-from softmode.deformables.model.lane_kernels import rolled
+from softmode.deformables.model.lane_kernels import barrier, rolled
 from softmode.deformables.model.struct_kernels import Rigid
+from softmode.deformables.solver.assembly_kernels import factor_rigid
 from softmode.deformables.solver.iteration_kernels import ALL, NewtonStep
 
 wp.set_module_options({"enable_backward": False})
@@ -152,6 +157,62 @@ def gather_rows(
     rigid.row_limit[w, k] = wp.float64(limit)
     rigid.row_stiffness[w, k] = wp.float64(mujoco.D[w, k])
     rigid.row_start[w, k] = value
+
+
+@wp.func
+def mobility(rigid: Rigid, w: int, k: int):
+    """Return J X^-1 J^T of a row, the lower Cholesky factor of X being in ``matrix``; overwrites the row's coupling."""
+    total = wp.float64(0.0)
+    for a in range(rigid.count[w]):
+        value = wp.float64(rigid.row_jacobian[w, k, a])
+        for s in range(a):
+            value -= rigid.matrix[w, a, s] * rigid.row_coupling[w, k, s]
+        value /= rigid.matrix[w, a, a]
+        rigid.row_coupling[w, k, a] = value
+        total += value * value
+    return total
+
+
+@wp.kernel
+def damp_rows(
+    damping: wp.array[float],  # (joint_dof_count,), D + K_d
+    dt: wp.float64,
+    team: int,
+    # In and out: its ``matrix`` holds the Cholesky factor of M_eff / dt^2 and is overwritten
+    rigid: Rigid,
+):
+    """Let rows answer forces as MuJoCo's do, whose integrator damps after the constraints are solved.
+
+    With a = J M^-1 J^T and b = J M_eff^-1 J^T, dt^2 C = dt^2 (M_eff - M) the damping of the step, one row answers a
+    force along it in MuJoCo by (M + dt C)^-1 M (M + J^T D J)^-1, which is (M_eff + J^T D' J)^-1 for D' b = D a. The
+    rows of a cone share what its first row has, since their stiffnesses go together.
+    """
+    w, member = wp.tid()
+    n = rigid.count[w]
+    count = rigid.row_count[w]
+    if n == 0 or count == 0:
+        return
+    for k in range(member, count, team):
+        rigid.row_change[w, k] = mobility(rigid, w, k)
+    barrier()
+    for a in range(member, n, team):
+        for b in range(a + 1):
+            rigid.matrix[w, a, b] = rigid.inertia[w, a, b]
+        undamped = rigid.inertia[w, a, a] - wp.float64(damping[rigid.dof_start[w] + a]) / dt
+        rigid.matrix[w, a, a] = undamped
+        rigid.pivot_min[w, a] = wp.float64(1.0e-12) * undamped
+    barrier()
+    factor_rigid(rigid.matrix, rigid.pivot_min, w, n, member, team)
+    for k in range(member, count, team):
+        damped = rigid.row_change[w, k]
+        if rigid.row_kind[w, k] != MEMBER and damped > wp.float64(0.0):
+            ratio = wp.max(mobility(rigid, w, k) / damped, wp.float64(1.0))
+            size = int(1)
+            if rigid.row_kind[w, k] == ELLIPTIC:
+                size = wp.min(rigid.row_size[w, k], count - k)
+            for row in range(k, k + size):
+                rigid.row_stiffness[w, row] = rigid.row_stiffness[w, row] * ratio
+                rigid.row_start[w, row] = rigid.row_start[w, row] / ratio
 
 
 @wp.func
