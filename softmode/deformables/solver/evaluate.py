@@ -4,6 +4,7 @@ import warp as wp
 
 from softmode.deformables.solver import assembly_cpu_kernels as assembly_cpu
 from softmode.deformables.solver import assembly_kernels as assembly
+from softmode.deformables.solver import constraint_cpu_kernels as constraint_cpu
 from softmode.deformables.solver import point_cpu_kernels as eights
 from softmode.deformables.solver import step_kernels as kernels
 from softmode.deformables.solver.iteration_kernels import ALL, ENERGIES, TRIAL, NewtonStep
@@ -40,9 +41,12 @@ def _evaluate(
 ) -> None:
     """Evaluate the selected worlds at (q, r): of points and rows what ``found`` says, of contacts forces or not."""
     step = t.newton_step(dt)
-    points = kernels.evaluate_points if t.model.device.is_cuda else eights.evaluate_eights
-    t.launch(points, t.point_tasks, step, selected, q, found)
-    t.launch(kernels.evaluate_constraints, t.constraints.row.shape, step, selected, q, r, int(forces))
+    if t.model.device.is_cuda:
+        t.launch(kernels.evaluate_points, t.point_tasks, step, selected, q, found)
+        t.launch(kernels.evaluate_constraints, t.constraints.row.shape, step, selected, q, r, int(forces))
+    else:
+        t.launch(eights.evaluate_eights, t.point_tasks, step, selected, q, found)
+        t.launch(constraint_cpu.evaluate_constraints, t.layout.instance_count, step, selected, q, r, int(forces))
     if t.rigid.row_max:
         t.launch(evaluate_rows, (t.layout.world_count, t.rigid.row_max), step, selected, r, found)
 

@@ -32,6 +32,7 @@ from softmode.deformables.solver.assembly_kernels import (
     solve_rigid_team,
     stiffness_block,
 )
+from softmode.deformables.solver.constraint_cpu_kernels import evaluate_constraints_of
 from softmode.deformables.solver.factor_kernels import factor_system, solve_system
 from softmode.deformables.solver.fused_system_kernels import dynamic_floats, shared_direction_of, sum_forces_of
 from softmode.deformables.solver.iteration_kernels import ALL, NewtonStep
@@ -128,8 +129,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
                 if wp.static(lanes):
                     for t in range(member, (step.instances.point_count[i] + LANES - 1) / LANES, team):
                         evaluate_eight(step, step.state.active, q, found, i, t)
-                    for e in range(member, step.constraints.count[i], team):
-                        evaluate_constraint(step, step.state.active, q, r, 1 - trial, i, e)
+                    evaluate_constraints_of(step, step.state.active, q, r, 1 - trial, i)
                 else:
                     # points and constraints at the same time, but not in one warp
                     points = step.instances.point_count[i]
