@@ -193,16 +193,14 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
                         if wp.static(not shared):
                             if wp.static(lanes):
                                 matrix_of(step, i)
+                                columns_of(step, i)
                             else:
                                 width = 3 * blocks
                                 for t in range(member, LANES * width * width, team):
                                     matrix_row(step, width, i, t / width, t % width)
-                            barrier()
-                            for t in range(member, tasks, team):
-                                contact_block(step, i, t)
-                            if wp.static(lanes):
-                                columns_of(step, i)
-                            else:
+                                barrier()
+                                for t in range(member, tasks, team):
+                                    contact_block(step, i, t)
                                 for t in range(member, 3 * blocks * columns, team):
                                     column_block(step, i, t / columns, t % columns)
                     if wp.static(joined):
