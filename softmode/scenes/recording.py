@@ -64,8 +64,8 @@ class _Tape:
 
     Warp has no public way to read what a graph holds. This listens to the functions of Warp's library through which
     each operation of a capture goes, and then compares their number with that of the graph. Where they differ, or where
-    a version of Warp has no such functions, :meth:`complete` says so, and Warp replays the graph. A public hook would be
-    a graph's operations with their addresses, or a replay that resolves them once.
+    a version of Warp has no such functions, :meth:`complete` says so, and Warp replays the graph. A public hook would
+    be a graph's operations with their addresses, or a replay that resolves them once.
     """
 
     def __init__(self, device: wp.Device) -> None:
@@ -119,8 +119,8 @@ class _Tape:
 
         return noted
 
-    def _add(self, kind: Operation, *numbers: int, operation: bool = True) -> int:
-        self.rows.append((int(kind), *numbers, *(0,) * (3 - len(numbers))))
+    def _add(self, kind: Operation, first: int = 0, second: int = 0, third: int = 0, *, operation: bool = True) -> int:
+        self.rows.append((int(kind), first, second, third))
         self._top += operation
         return len(self.rows) - 1
 
@@ -180,6 +180,7 @@ class _Tape:
 
             def noted(name: str, body: Callable[..., Any]) -> Callable[..., Any]:
                 def run(**handed: Any) -> None:
+                    leave = 0
                     if name == "on_false":  # behind the other branch, if there is one
                         leave = self._add(Operation.GO_ON, operation=False)
                         self.rows[test] = (int(Operation.UNLESS), self.rows[test][1], leave + 1, 0)

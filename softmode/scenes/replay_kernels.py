@@ -1,4 +1,4 @@
-"""Device side of a replayed recording on CPU: its operations one after another, launches as calls of their addresses."""
+"""Device side of a replayed recording on CPU: its operations one after another, launches as calls of addresses."""
 
 from enum import IntEnum
 

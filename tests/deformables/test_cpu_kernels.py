@@ -104,7 +104,10 @@ def test_sums(mode_count: int) -> None:
 
     matrices = []
     for launches in (
-        ((assembly_kernels.assemble_matrix, (1, 24 * blocks, 1), step, 1), (assembly_kernels.add_contacts, (1, tasks), step)),
+        (
+            (assembly_kernels.assemble_matrix, (1, 24 * blocks, 1), step, 1),
+            (assembly_kernels.add_contacts, (1, tasks), step),
+        ),
         ((assembly_cpu_kernels.assemble_matrix, 1, step),),
     ):
         t.system.scalars.zero_()
@@ -149,7 +152,9 @@ def test_constraints(iteration: int, memory: str, pins: int) -> None:
     normal = rng.normal(size=(*shape, 3))
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     length = float(t.instances.smoothing.numpy()[0])
-    stick = rng.uniform(1.0, 100.0, shape) * {"with memory": 1.0, "without": 0.0, "mixed": rng.random(shape) < 0.5}[memory]
+    stick = (
+        rng.uniform(1.0, 100.0, shape) * {"with memory": 1.0, "without": 0.0, "mixed": rng.random(shape) < 0.5}[memory]
+    )
     values = {
         "count": [count],
         "pair_count": [0],
@@ -171,7 +176,10 @@ def test_constraints(iteration: int, memory: str, pins: int) -> None:
     t.newton.iteration.fill_(iteration)
     t.newton.friction_lag = 20
     t.newton.exact.fill_(iteration % 2)
-    step, names = t.newton_step(0.004), ("energy", "force", "displacement", "slip", "normal_force", "hessian", "coupling")
+    step, names = (
+        t.newton_step(0.004),
+        ("energy", "force", "displacement", "slip", "normal_force", "hessian", "coupling"),
+    )
     step.state.friction_lag = 20
     r = wp.array(1.0e-4 * rng.normal(size=t.rigid.table.r.shape), dtype=wp.float64, device="cpu")
     for derivatives, evaluated in ((0, 0), (1, 0), (1, 1)):

@@ -120,8 +120,10 @@ _EVALUATE = """
         const double* const unknown = (const double*)((const char*)r.data + (size_t)w * r.strides[0]);
         for (int k = 0; k < count; ++k) {
             double change[3] = {d[0][k], d[1][k], d[2][k]};
-            for (int j = begin[k]; j < end[k]; ++j)
-                for (int axis = 0; axis < 3; ++axis) change[axis] -= unknown[j] * (double)jacobian[3 * (k * width + j) + axis];
+            for (int j = begin[k]; j < end[k]; ++j) {
+                const float* const J = jacobian + 3 * (k * width + j);
+                for (int axis = 0; axis < 3; ++axis) change[axis] -= unknown[j] * (double)J[axis];
+            }
             for (int axis = 0; axis < 3; ++axis) {
                 d[axis][k] = change[axis];
                 displacement[3 * k + axis] = change[axis];
@@ -197,7 +199,8 @@ _EVALUATE = """
     const float* const jacobian = (const float*)constraints.jacobian.data + 3 * own * width;
     float* const coupling = (float*)constraints.coupling.data + 3 * own * width;
     for (int k = 0; k < count; ++k) {
-        const float h[6] = {(float)H[0][k], (float)H[1][k], (float)H[2][k], (float)H[3][k], (float)H[4][k], (float)H[5][k]};
+        float h[6];
+        for (int m = 0; m < 6; ++m) h[m] = (float)H[m][k];
         const float full[9] = {h[0], h[1], h[2], h[1], h[3], h[4], h[2], h[4], h[5]};
         for (int m = 0; m < 9; ++m) hessians[9 * k + m] = full[m];
         for (int j = begin[k]; j < end[k]; ++j) {
