@@ -53,7 +53,7 @@ def main() -> None:
     env = held_by_arm(given.device, given.samples)
     steps = {"hand": hand.scene.steps_per_frame, "arm": env.config.scene.substeps}
     arm = capture_graph(env.scene.control_step, env.scene.device)
-    frames = {"hand": hand.scene.step, "arm": lambda: wp.capture_launch(arm)}
+    frames = {"hand": hand.scene.step, "arm": arm.launch}
     clock = time.process_time if given.device == "cpu" else time.perf_counter
     spent: dict[str, list[float]] = {name: [] for name in frames}
     for _ in range(5):

@@ -688,7 +688,7 @@ class Task:
 
     def step(self) -> None:
         """Advance all worlds by one control step with the actions in `scene.actions`."""
-        wp.capture_launch(self.graph)
+        self.graph.launch()
 
     def _step(self) -> None:
         """Simulate, judge, start the episodes that are due, observe."""

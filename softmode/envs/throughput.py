@@ -206,7 +206,7 @@ def stage_times(task: Task, repeats: int = 20) -> dict[str, float]:
         for name, graph in graphs.items():
             wp.synchronize_device(task.device)
             clock = time.perf_counter()
-            wp.capture_launch(graph)
+            graph.launch()
             wp.synchronize_device(task.device)
             spent[name].append(1e3 * (time.perf_counter() - clock))
     return {name: float(np.median(times[2:])) for name, times in spent.items()}

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from softmode.scenes.fixture import Fixture, add_fixture
     from softmode.scenes.meshes import SceneMesh, scene_meshes, scene_poses
     from softmode.scenes.motion import Motion, motion_of, set_motion
+    from softmode.scenes.recording import Recording
     from softmode.scenes.scene import Scene
     from softmode.scenes.splat_scene import Record, SplatScene
     from softmode.scenes.table_scene import TableScene, TableSceneConfig
@@ -24,6 +25,7 @@ __all__ = [
     "Fixture",
     "Motion",
     "Record",
+    "Recording",
     "Scene",
     "SceneMesh",
     "SplatFrame",

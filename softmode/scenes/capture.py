@@ -9,13 +9,14 @@ import warp as wp
 
 from softmode.deformables.model.compile_ahead import compile_launches
 from softmode.errors import ConfigError
+from softmode.scenes.recording import Recording
 
 if TYPE_CHECKING:
     from softmode.scenes.scene import Scene
 
 
-def capture_graph(launches: Callable[[], None], device: wp.DeviceLike) -> wp.Graph:
-    """Return launches as a graph for `wp.capture_launch`.
+def capture_graph(launches: Callable[[], None], device: wp.DeviceLike) -> Recording:
+    """Return launches as a recording, whose `launch` repeats them.
 
     They run once before, which compiles kernels and allocates what they need.
 
@@ -24,14 +25,11 @@ def capture_graph(launches: Callable[[], None], device: wp.DeviceLike) -> wp.Gra
         device: Warp device.
     """
     launches()
-    with wp.ScopedCapture(device=device) as capture:
-        launches()
-    assert capture.graph is not None
-    return capture.graph
+    return Recording(launches, device)
 
 
-def capture_step(scene: Scene, step: Callable[[], None]) -> wp.Graph:
-    """Return the step of a scene as a graph; its state stays as it was, and the solver forgets the trial.
+def capture_step(scene: Scene, step: Callable[[], None]) -> Recording:
+    """Return the step of a scene as a recording; its state stays as it was, and the solver forgets the trial.
 
     Args:
         scene: The scene.

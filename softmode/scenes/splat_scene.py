@@ -30,6 +30,7 @@ from softmode.radiance.march import MarchOptions, RadianceMarch
 from softmode.scenes.binding import BoundSplats
 from softmode.scenes.capture import capture_graph, capture_step, require_even
 from softmode.scenes.fixture import Fixture, add_fixture
+from softmode.scenes.recording import Recording
 from softmode.scenes.scene import cameras_by_size
 from softmode.splats.camera import CameraOptions, SplatCamera
 from softmode.splats.pinhole import PinholeCamera
@@ -176,8 +177,8 @@ class SplatScene:
             self.cameras = cameras_by_size(
                 self.model, self.splats, cameras, options=camera_options, overlay=self.fields
             )
-        self._step_graph: wp.Graph | None = None
-        self._draw_graph: wp.Graph | None = None
+        self._step_graph: Recording | None = None
+        self._draw_graph: Recording | None = None
 
     # -- time and pictures --------------------------------------------------------------------------------------------
 
@@ -185,7 +186,7 @@ class SplatScene:
         """Take the physics steps of one frame."""
         if self._step_graph is None:
             self._step_graph = capture_step(self, self._steps)
-        wp.capture_launch(self._step_graph)
+        self._step_graph.launch()
 
     def _steps(self) -> None:
         """Step there and back between the two states."""
@@ -230,7 +231,7 @@ class SplatScene:
             raise ConfigError(f"no camera {name!r}, there are {sorted(known)}")
         if self._draw_graph is None:
             self._draw_graph = capture_graph(self._draw, self.model.device)
-        wp.capture_launch(self._draw_graph)
+        self._draw_graph.launch()
         return known[name].images(name).numpy()[0].copy()
 
     def _draw(self) -> None:

@@ -37,6 +37,7 @@ from softmode.scenes.binding import BoundSplats
 from softmode.scenes.capture import capture_graph, capture_step, require_even
 from softmode.scenes.film_camera import FilmCamera, columns_of
 from softmode.scenes.fixture import Fixture, add_fixture
+from softmode.scenes.recording import Recording
 from softmode.scenes.scene import cameras_by_size
 from softmode.splats.camera import CameraOptions, SplatCamera
 from softmode.splats.camera_randomization import CameraRandomization
@@ -180,8 +181,8 @@ class TableScene:
             things = slice(0, columns[len(self.splats.indices) - 1].stop)
             goal = None if marker is None else columns_of(seen, columns[-1])
             self.film = FilmCamera(self.model, self.state, columns_of(seen, things), goal, film)
-        self._graph: wp.Graph | None = None
-        self._camera_graphs: dict[tuple[int, int], wp.Graph] = {}
+        self._graph: Recording | None = None
+        self._camera_graphs: dict[tuple[int, int], Recording] = {}
         if self.slots > 1:
             self.use_objects()
         self.reset()
@@ -477,7 +478,7 @@ class TableScene:
         if self._graph is None:
             self._graph = capture_step(self, self.control_step)
             self.controller.reset(self.state)
-        wp.capture_launch(self._graph)
+        self._graph.launch()
 
     def control_step(self) -> None:
         """Move the command by `actions`, run the substeps, observe; capturable."""
@@ -506,7 +507,7 @@ class TableScene:
         camera = self.cameras[size]
         if size not in self._camera_graphs:
             self._camera_graphs[size] = capture_graph(lambda: self.draw(camera), self.device)
-        wp.capture_launch(self._camera_graphs[size])
+        self._camera_graphs[size].launch()
         return camera
 
     def draw(self, camera: SplatCamera) -> None:

@@ -13,7 +13,13 @@ from softmode.deformables.contact import detection_kernels, sample_cpu_kernels
 from softmode.deformables.contact.detection_kernels import CULLED
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model.authoring import add_reduced_body
-from softmode.deformables.solver import assembly_cpu_kernels, assembly_kernels, point_cpu_kernels, step_kernels
+from softmode.deformables.solver import (
+    assembly_cpu_kernels,
+    assembly_kernels,
+    constraint_cpu_kernels,
+    point_cpu_kernels,
+    step_kernels,
+)
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient, solve
 from softmode.deformables.solver.iteration_kernels import ALL
 from tests.deformables.test_fused_system import loaded
@@ -97,15 +103,18 @@ def test_sums(mode_count: int) -> None:
     agree(stiffness, t.arrays.stiffness.numpy()[0, 0][upper], SINGLE)
 
     matrices = []
-    for kernel, given in (
-        (assembly_kernels.assemble_matrix, ((1, 24 * blocks, 1), step, 1)),
-        (assembly_cpu_kernels.assemble_matrix, (1, step)),
+    for launches in (
+        (
+            (assembly_kernels.assemble_matrix, (1, 24 * blocks, 1), step, 1),
+            (assembly_kernels.add_contacts, (1, tasks), step),
+        ),
+        ((assembly_cpu_kernels.assemble_matrix, 1, step),),
     ):
         t.system.scalars.zero_()
-        t.launch(kernel, *given)
+        for kernel, *given in launches:
+            t.launch(kernel, *given)
         matrices.append(t.system.scalars.numpy().copy())
-    assert np.abs(matrices[0]).max() > 0.0
-    np.testing.assert_array_equal(matrices[1], matrices[0])
+    agree(matrices[1], matrices[0], SINGLE)
     t.launch(assembly_kernels.assemble_rigid, (1, n, n), step)
     apart = [rigid.matrix.numpy().copy(), rigid.gradient.numpy().copy()]
     t.launch(assembly_cpu_kernels.assemble_rigid, 1, step)
@@ -129,6 +138,71 @@ def test_sums(mode_count: int) -> None:
     t.launch(assembly_kernels.assemble_columns, (1, 3 * blocks, n + 1), step)
     agree(columns, t.system.scalars.numpy()[:, :, t.system.size : t.system.size + n + 1], SINGLE)
     assert not np.array_equal(columns, right)  # which the factorisation has overwritten
+
+
+@pytest.mark.parametrize("pins", [0, 3])
+@pytest.mark.parametrize("memory", ["with memory", "without", "mixed"])
+@pytest.mark.parametrize("iteration", [0, 1, 17])
+def test_constraints(iteration: int, memory: str, pins: int) -> None:
+    """Pins and contacts, deep, shallow, apart, sticking and sliding: 29 of them, so that three lanes idle."""
+    scene = pressed(4)
+    t, count = scene.reduced.tables, 29
+    c, rng, shape = t.constraints, np.random.default_rng(iteration), t.constraints.row.shape
+    assert shape[1] >= count and t.rigid.count_max == 6
+    normal = rng.normal(size=(*shape, 3))
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    length = float(t.instances.smoothing.numpy()[0])
+    stick = (
+        rng.uniform(1.0, 100.0, shape) * {"with memory": 1.0, "without": 0.0, "mixed": rng.random(shape) < 0.5}[memory]
+    )
+    values = {
+        "count": [count],
+        "pair_count": [0],
+        "row": rng.integers(0, t.layout.sample_max, shape),
+        "partner": np.full(shape, -1),
+        "normal": normal,
+        "offset": normal * rng.uniform(-6.0, 3.0, (*shape, 1)) * length + rng.normal(size=(*shape, 3)) * length,
+        "stiffness": rng.uniform(10.0, 1000.0, shape),
+        "dent_compliance": rng.uniform(0.0, 0.1, shape) * (rng.random(shape) < 0.7),
+        "dent_depth": rng.uniform(0.0, 2.0 * length, shape),
+        "friction": rng.uniform(0.0, 1.0, shape) * (rng.random(shape) < 0.8),
+        "stick": stick,
+        "normal_force": rng.uniform(0.0, 0.1, shape),
+        "dof_begin": rng.integers(0, 3, shape),
+        "dof_end": rng.integers(2, 7, shape),
+        "jacobian": rng.normal(size=(*shape, 6, 3)),
+    }
+    t.instances.pin_count.fill_(pins)
+    t.newton.iteration.fill_(iteration)
+    t.newton.friction_lag = 20
+    t.newton.exact.fill_(iteration % 2)
+    step, names = (
+        t.newton_step(0.004),
+        ("energy", "force", "displacement", "slip", "normal_force", "hessian", "coupling"),
+    )
+    step.state.friction_lag = 20
+    r = wp.array(1.0e-4 * rng.normal(size=t.rigid.table.r.shape), dtype=wp.float64, device="cpu")
+    for derivatives, evaluated in ((0, 0), (1, 0), (1, 1)):
+        found = []
+        for kernel, dim in (
+            (step_kernels.evaluate_constraints, shape),
+            (constraint_cpu_kernels.evaluate_constraints, 1),
+        ):
+            for name in names:
+                getattr(c, name).fill_(7.0)
+            c.displacement.assign(1.0e-3 * np.random.default_rng(3).normal(size=(*shape, 3)))
+            for name, value in values.items():
+                getattr(c, name).assign(np.asarray(value))
+            t.newton.evaluated.fill_(evaluated)
+            t.launch(kernel, dim, step, t.newton.active, t.arrays.q, r, derivatives)
+            found.append({name: getattr(c, name).numpy().copy() for name in names})
+        expected, lanes = found
+        for name in names:
+            rounding = SINGLE if name in ("hessian", "coupling") else DOUBLE
+            agree(lanes[name][:, :count], expected[name][:, :count], rounding)
+            np.testing.assert_array_equal(lanes[name][:, count:], expected[name][:, count:])  # which are left alone
+        forces = np.abs(expected["force"][0, pins:count]).max(-1)
+        assert 0 < (forces > 0.0).sum() < count - pins
 
 
 def test_samples() -> None:

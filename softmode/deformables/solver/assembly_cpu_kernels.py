@@ -134,24 +134,38 @@ def stiffness_of(step: NewtonStep, i: int):
     out += ((size_t)instances.system.data[i] * unknowns + 8 * instances.system_block.data[i]) * columns + unknowns;
     for (int axis = 0; axis < 3; ++axis)
         for (int b = 0; b < blocks; ++b) {
-            const int driven = instances.driven_count.data[i] - 8 * b;
-            float* at = out + 8 * (size_t)(axis * blocks + b) * columns;
+            float* const at = out + 8 * (size_t)(axis * blocks + b) * columns;
             for (int a = 0; a < 8; ++a) {
-                for (int j = 0; j < rigid_max; ++j) at[a * columns + j] = 0.0f;
+                for (int j = rigid_count; j < rigid_max; ++j) at[a * columns + j] = 0.0f;
                 at[a * columns + rigid_max] = (float)-gradient[8 * (axis * blocks + b) + a];
             }
-            for (int j = 0; j < rigid_count; ++j) {
-                floats sum = 0.0f;
-                for (int k = first; k < acting_count; ++k) {
-                    const int e = acting[k];
-                    if (j < begin[e] || j >= end[e]) continue;
-                    floats row;
-                    __builtin_memcpy(&row, (const float*)basis.row.data + ((size_t)rows[e] * blocks + b) * 8, 32);
-                    sum = sum - coupling[3 * ((size_t)e * room + j) + axis] * row;
-                }
-                for (int a = 0; a < 8; ++a) at[a * columns + j] = a < driven ? 0.0f : sum[a];
-            }
         }
+    for (int b = 0; b < blocks; ++b) {
+        const int driven = instances.driven_count.data[i] - 8 * b;
+        for (int group = 0; group < rigid_count; group += 3) {
+            const int many = rigid_count - group < 3 ? rigid_count - group : 3;
+            floats sum[9] = {};  // three dofs with three axes each
+            for (int k = first; k < acting_count; ++k) {
+                const int e = acting[k];
+                const int low = begin[e] > group ? begin[e] - group : 0;
+                const int high = end[e] - group < many ? end[e] - group : many;
+                if (low >= high) continue;
+                const float* const C = coupling + 3 * ((size_t)e * room + group);
+                floats row;
+                __builtin_memcpy(&row, (const float*)basis.row.data + ((size_t)rows[e] * blocks + b) * 8, 32);
+                #pragma unroll
+                for (int j = 0; j < 3; ++j)
+                    if (j >= low && j < high)
+                        for (int axis = 0; axis < 3; ++axis) sum[3 * j + axis] -= C[3 * j + axis] * row;
+            }
+            #pragma unroll
+            for (int j = 0; j < 3; ++j)
+                for (int axis = 0; axis < 3 && j < many; ++axis) {
+                    float* const at = out + 8 * (size_t)(axis * blocks + b) * columns + group + j;
+                    for (int a = 0; a < 8; ++a) at[a * columns] = a < driven ? 0.0f : sum[3 * j + axis][a];
+                }
+        }
+    }
 }"""
 )
 def sum_columns(
@@ -239,53 +253,95 @@ def columns_of(step: NewtonStep, i: int):
     sum_columns(step.instances, step.basis, step.constraints, step.rigid, step.arrays, rigid_max, first, w, i)
 
 
+_MATRIX_TILE = """
+            case ROWS: {
+                floats sum[8 * ROWS] = {};
+                for (int k = pins; k < acting_count; ++k) {
+                    const int e = acting[k];
+                    const float* const at = functions + 8 * (size_t)rows[e] * blocks;
+                    floats u;
+                    __builtin_memcpy(&u, at + 8 * column, sizeof(u));
+                    u = hessian[9 * e + 3 * c + d] * u;
+                    #pragma unroll
+                    for (int a = 0; a < 8 * ROWS; ++a) sum[a] += at[8 * row + a] * u;
+                }
+                #pragma unroll
+                for (int a = 0; a < 8 * ROWS; ++a) {
+                    floats value, more;
+                    __builtin_memcpy(&value, from + a * width, sizeof(value));
+                    if (pinned && c == d) {
+                        __builtin_memcpy(&more, pin + a * blocks, sizeof(more));
+                        value += more;
+                    }
+                    if (driven > 0)
+                        for (int lane = 0; lane < 8; ++lane)
+                            if (8 * row + a < driven || 8 * column + lane < driven) value[lane] = sum[a][lane] = 0.0f;
+                    if (c == d && row + a / 8 == column) value[a % 8] += inertia;
+                    value += sum[a];
+                    __builtin_memcpy(out + a * columns, &value, sizeof(value));
+                }
+                break;
+            }
+"""
+
+
 @wp.func_native(
     snippet="""{
+    #pragma clang fp contract(fast)
     typedef float floats __attribute__((ext_vector_type(8)));
-    const int blocks = basis.row.shape[1], width = 3 * blocks, chunks = arrays.stiffness.shape[1];
+    const int blocks = basis.row.shape[1], width = 3 * blocks;
     const int driven = instances.driven_count.data[i], first = instances.system_block.data[i];
-    const bool pinned = instances.pin_count.data[i] > 0;
-    const size_t chunk = (size_t)24 * blocks * width, columns = arrays.systems.matrix.shape[2];
-    const floats* stiffness = (const floats*)arrays.stiffness.data + i * chunks * chunk;
-    const floats* pins = (const floats*)arrays.pins.data + (pinned ? (size_t)i * 8 * blocks * blocks : 0);
+    const int pins = instances.pin_count.data[i], acting_count = constraints.acting_count.data[i];
+    const bool pinned = pins > 0;
+    const size_t columns = arrays.systems.matrix.shape[2], own = (size_t)i * constraints.row.shape[1];
+    const int* const acting = (const int*)constraints.acting.data + own;
+    const int* const rows = (const int*)constraints.row.data + own;
+    const float* const hessian = (const float*)constraints.hessian.data + 9 * own;
+    const float* const functions = (const float*)basis.row.data;
+    const floats* stiffness = (const floats*)((const char*)arrays.stiffness.data + i * arrays.stiffness.strides[0]);
+    const floats* pin_matrix = (const floats*)arrays.pins.data + (pinned ? (size_t)i * 8 * blocks * blocks : 0);
     floats* matrix = (floats*)arrays.systems.matrix.data;
-    matrix += (size_t)instances.system.data[i] * arrays.systems.matrix.shape[1] * columns;
-    for (int row = 0; row < 24 * blocks; ++row) {
-        const int k = row % (8 * blocks);
-        floats* out = matrix + (8 * first + row) * columns + first;
-        for (int column = row / 8; column < width; ++column) {
-            floats value, more;
-            __builtin_memcpy(&value, stiffness + row * width + column, sizeof(value));
-            for (int c = 1; c < chunks; ++c) {
-                __builtin_memcpy(&more, stiffness + c * chunk + row * width + column, sizeof(more));
-                value += more;
+    matrix += ((size_t)instances.system.data[i] * arrays.systems.matrix.shape[1] + 8 * first) * columns + first;
+    for (int c = 0; c < 3; ++c)
+        for (int d = c; d < 3; ++d)
+            for (int column = 0; column < blocks; ++column) {
+                const int end = c == d ? column + 1 : blocks;
+                #if defined(__AVX512VL__)
+                const int tiles = (end + TILE - 1) / TILE;
+                #else
+                const int tiles = end;
+                #endif
+                for (int tile = 0; tile < tiles; ++tile) {
+                    const int row = tile * end / tiles;
+                    const floats* const from = stiffness + 8 * (c * blocks + row) * width + d * blocks + column;
+                    const floats* const pin = pin_matrix + 8 * row * blocks + column;
+                    floats* const out = matrix + 8 * (c * blocks + row) * columns + d * blocks + column;
+                    switch ((tile + 1) * end / tiles - row) {
+CASES
+                    }
+                }
             }
-            const int b = column % blocks;
-            if (pinned && column / blocks == row / (8 * blocks)) {
-                __builtin_memcpy(&more, pins + k * blocks + b, sizeof(more));
-                value += more;
-            }
-            if (k < driven || 8 * b < driven)
-                for (int lane = 0; lane < 8; ++lane)
-                    if (k < driven || 8 * b + lane < driven) value[lane] = 0.0f;
-            if (column == row / 8) value[row % 8] += inertia;
-            __builtin_memcpy(out + column, &value, sizeof(value));
-        }
-    }
-}"""
+}""".replace("CASES", "".join(_MATRIX_TILE.replace("ROWS", str(rows + 1)) for rows in range(TILE))).replace(
+        "TILE", str(TILE)
+    )
 )
-def sum_matrix(instances: Instances, basis: Basis, arrays: NewtonArrays, inertia: float, i: int) -> None:
-    """Add inertia and pins to the stiffness of an instance; see ``assembly_kernels.matrix_row``."""
+def sum_matrix(
+    instances: Instances, basis: Basis, constraints: PointConstraints, arrays: NewtonArrays, inertia: float, i: int
+) -> None:
+    """Add inertia, pins and contacts to the stiffness of an instance, in one part as it is on CPU.
+
+    See ``assembly_kernels.matrix_row`` and ``contact_block``.
+    """
 
 
 @wp.func
 def matrix_of(step: NewtonStep, i: int):
-    """Add inertia and pins to the stiffness of an instance; driven unknowns stay put."""
+    """Add inertia, pins and contacts to the stiffness of an instance; driven unknowns stay put."""
     if step.state.active[step.instances.world[i]] == 0 or left_out(step.instances, step.arrays.systems.pattern, i):
         return
     rate = step.motion.rate[i] / step.options.dt
     inertia = float(step.instances.mass[i] * rate * (rate + wp.float64(step.instances.mass_damping[i])))
-    sum_matrix(step.instances, step.basis, step.arrays, inertia, i)
+    sum_matrix(step.instances, step.basis, step.constraints, step.arrays, inertia, i)
 
 
 @wp.func_native(

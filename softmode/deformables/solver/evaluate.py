@@ -4,6 +4,7 @@ import warp as wp
 
 from softmode.deformables.solver import assembly_cpu_kernels as assembly_cpu
 from softmode.deformables.solver import assembly_kernels as assembly
+from softmode.deformables.solver import constraint_cpu_kernels as constraint_cpu
 from softmode.deformables.solver import point_cpu_kernels as eights
 from softmode.deformables.solver import step_kernels as kernels
 from softmode.deformables.solver.iteration_kernels import ALL, ENERGIES, TRIAL, NewtonStep
@@ -40,9 +41,12 @@ def _evaluate(
 ) -> None:
     """Evaluate the selected worlds at (q, r): of points and rows what ``found`` says, of contacts forces or not."""
     step = t.newton_step(dt)
-    points = kernels.evaluate_points if t.model.device.is_cuda else eights.evaluate_eights
-    t.launch(points, t.point_tasks, step, selected, q, found)
-    t.launch(kernels.evaluate_constraints, t.constraints.row.shape, step, selected, q, r, int(forces))
+    if t.model.device.is_cuda:
+        t.launch(kernels.evaluate_points, t.point_tasks, step, selected, q, found)
+        t.launch(kernels.evaluate_constraints, t.constraints.row.shape, step, selected, q, r, int(forces))
+    else:
+        t.launch(eights.evaluate_eights, t.point_tasks, step, selected, q, found)
+        t.launch(constraint_cpu.evaluate_constraints, t.layout.instance_count, step, selected, q, r, int(forces))
     if t.rigid.row_max:
         t.launch(evaluate_rows, (t.layout.world_count, t.rigid.row_max), step, selected, r, found)
 
@@ -81,20 +85,20 @@ def assemble(tables: StepTables, dt: float) -> None:
     else:
         t.launch(assembly_cpu.assemble_stiffness, count, step)
     if t.model.device.is_cuda:
-        _assemble_by_entries(t, step)
+        _assemble_by_entries(t, step, tasks)
     else:
         _assemble_by_bodies(t, step)
-    t.launch(assembly.add_contacts, (count, tasks), step, block_dim=128)
     if t.layout.part_count > 1:
         dim = (worlds, t.layout.part_count**2, 9 * blocks * blocks)
         t.launch(assembly.assemble_pairs, dim, step, t.system.relation, block_dim=128)
 
 
-def _assemble_by_entries(t: StepTables, step: NewtonStep) -> None:
-    """Assemble matrix, columns and rigid part, a thread for a few entries of each."""
+def _assemble_by_entries(t: StepTables, step: NewtonStep, tasks: int) -> None:
+    """Assemble matrix, columns and rigid part, a thread for a few entries or one of ``tasks`` blocks of each."""
     blocks, count, rigid_max = t.layout.block_count, t.layout.instance_count, t.rigid.count_max
     columns = 3 * blocks  # threads that share a row of the matrix
     t.launch(assembly.assemble_matrix, (count, t.arrays.stiffness.shape[2], columns), step, columns)
+    t.launch(assembly.add_contacts, (count, tasks), step, block_dim=128)
     t.launch(assembly.assemble_columns, (count, 3 * blocks, rigid_max + 1), step)
     if rigid_max:
         t.launch(assembly.assemble_rigid, (t.layout.world_count, rigid_max, rigid_max), step)

@@ -32,6 +32,7 @@ from softmode.deformables.solver.assembly_kernels import (
     solve_rigid_team,
     stiffness_block,
 )
+from softmode.deformables.solver.constraint_cpu_kernels import evaluate_constraints_of
 from softmode.deformables.solver.factor_kernels import factor_system, solve_system
 from softmode.deformables.solver.fused_system_kernels import dynamic_floats, shared_direction_of, sum_forces_of
 from softmode.deformables.solver.iteration_kernels import ALL, NewtonStep
@@ -128,8 +129,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
                 if wp.static(lanes):
                     for t in range(member, (step.instances.point_count[i] + LANES - 1) / LANES, team):
                         evaluate_eight(step, step.state.active, q, found, i, t)
-                    for e in range(member, step.constraints.count[i], team):
-                        evaluate_constraint(step, step.state.active, q, r, 1 - trial, i, e)
+                    evaluate_constraints_of(step, step.state.active, q, r, 1 - trial, i)
                 else:
                     # points and constraints at the same time, but not in one warp
                     points = step.instances.point_count[i]
@@ -193,16 +193,14 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
                         if wp.static(not shared):
                             if wp.static(lanes):
                                 matrix_of(step, i)
+                                columns_of(step, i)
                             else:
                                 width = 3 * blocks
                                 for t in range(member, LANES * width * width, team):
                                     matrix_row(step, width, i, t / width, t % width)
-                            barrier()
-                            for t in range(member, tasks, team):
-                                contact_block(step, i, t)
-                            if wp.static(lanes):
-                                columns_of(step, i)
-                            else:
+                                barrier()
+                                for t in range(member, tasks, team):
+                                    contact_block(step, i, t)
                                 for t in range(member, 3 * blocks * columns, team):
                                     column_block(step, i, t / columns, t % columns)
                     if wp.static(joined):
