@@ -132,11 +132,9 @@ def test_functions_out_of_line(monkeypatch: pytest.MonkeyPatch, capfd: pytest.Ca
     options = [kernel.module.options["extra_build_options"] for kernel in (inline, outlined, own)]
     assert options[0] is None and options[2] is mine
     assert "noinline" in options[1].extra_cpu_preamble
-    monkeypatch.setattr(compile_ahead, "_OUTLINED", ())
-    again = turner(5)
-    assert again.module.options["extra_build_options"] is None
     wp.launch(outlined, 64, [vectors[1]], device="cpu")
-    wp.launch(again, 64, [vectors[2]], device="cpu")
+    wp.set_module_options({"extra_build_options": None}, outlined.module)
+    wp.launch(outlined, 64, [vectors[2]], device="cpu")
     np.testing.assert_array_equal(vectors[1].numpy(), vectors[2].numpy())
     assert np.isfinite(vectors[1].numpy()).all() and (vectors[1].numpy() != given).all()
 
