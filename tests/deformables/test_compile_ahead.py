@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.model import compile_ahead
 from softmode.deformables.model.compile_ahead import compile_launches, compiling_aside
 from softmode.quiet import listening
 
@@ -24,27 +23,6 @@ def adder(amount: int) -> Any:
         wp.atomic_add(numbers, i, wp.static(amount))
 
     return add
-
-
-@wp.func
-def crossed(a: wp.vec3, b: wp.vec3, times: int):
-    """Return a turned around b several times."""
-    for _ in range(times):
-        a = wp.cross(a, b)
-    return a
-
-
-def turner(times: int) -> Any:
-    """Return a kernel in a module of its own that calls a function at two places."""
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def turn(vectors: wp.array[wp.vec3]):
-        i = wp.tid()
-        vectors[i] = crossed(vectors[i], wp.vec3(1.0, 2.0, 3.0), wp.static(times)) - crossed(
-            wp.vec3(0.1, 0.2, 0.3), vectors[i], wp.static(times + 1)
-        )
-
-    return turn
 
 
 def launches_of(numbers: wp.array, flag: wp.array, first: int) -> Callable[[], None]:
@@ -110,33 +88,6 @@ def test_other_threads_compile_what_is_launched(monkeypatch: pytest.MonkeyPatch)
     assert len(loaded) == 2 and all(name.startswith("compile") for name in loaded)
     wp.launch(adder(303), numbers.shape, [numbers], device="cpu")
     assert loaded[2:] == [threading.current_thread().name]
-
-
-def test_functions_out_of_line(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
-    """Modules of listed files get the build option, silently, unless they are loaded or have one; bits are the same."""
-    given = np.random.default_rng(0).normal(size=(64, 3)).astype(np.float32)
-    vectors = [wp.array(given, dtype=wp.vec3, device="cpu") for _ in range(3)]
-    inline, outlined, own = turner(4), turner(5), turner(6)
-    wp.launch(inline, 64, [vectors[0]], device="cpu")
-    mine = wp.ModuleBuildOptions(extra_cpu_preamble="// mine\n")
-    wp.set_module_options({"extra_build_options": mine}, own.module)
-    monkeypatch.setattr(compile_ahead, "_OUTLINED", (__name__,))
-
-    def launches() -> None:
-        for kernel in (inline, outlined, own):
-            wp.launch(kernel, 64, [vectors[1]], device="cpu")
-
-    capfd.readouterr()
-    compile_launches(launches, "cpu")
-    assert "warning" not in capfd.readouterr().err
-    options = [kernel.module.options["extra_build_options"] for kernel in (inline, outlined, own)]
-    assert options[0] is None and options[2] is mine
-    assert "noinline" in options[1].extra_cpu_preamble
-    wp.launch(outlined, 64, [vectors[1]], device="cpu")
-    wp.set_module_options({"extra_build_options": None}, outlined.module)
-    wp.launch(outlined, 64, [vectors[2]], device="cpu")
-    np.testing.assert_array_equal(vectors[1].numpy(), vectors[2].numpy())
-    assert np.isfinite(vectors[1].numpy()).all() and (vectors[1].numpy() != given).all()
 
 
 def test_warp_is_itself_again() -> None:

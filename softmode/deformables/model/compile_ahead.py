@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
@@ -36,18 +36,6 @@ _BUILDING = (
     "softmode.deformables.contact.friction_memory_kernels",
 )
 _BUILDING_CPU = ("softmode.deformables.solver.point_cpu_kernels",)
-_OUTLINED = (
-    *_ADJOINT_FREE,
-    "mujoco_warp._src.collision_convex",
-    "mujoco_warp._src.derivative",
-    "newton._src.geometry.bvh",
-    "newton._src.geometry.inertia",
-)
-"""Files whose kernels no control step spends its time in: see `_keep_out_of_line`."""
-_OUT_OF_LINE = """#pragma clang diagnostic ignored "-Wignored-attributes"
-#define static static __attribute__((noinline))
-"""
-"""Put before the source of a module for CPU: Warp declares all functions that it writes static."""
 
 
 def compile_for_building(device: wp.DeviceLike, *others: ModuleType) -> None:
@@ -172,8 +160,6 @@ def _collecting(device: wp.Device) -> Iterator[Wanted]:
 
 def _load(wanted: Wanted, device: wp.Device) -> None:
     """Load modules, several at a time; Warp compiles those that its cache does not hold."""
-    if device.is_cpu:
-        _keep_out_of_line(module for module, _ in wanted)
 
     def load(module: wp.Module, block_dim: int | None) -> None:
         wp.force_load(device, [module], block_dim=block_dim)
@@ -181,19 +167,6 @@ def _load(wanted: Wanted, device: wp.Device) -> None:
     pool = _pool(os.getpid())
     for done in [pool.submit(load, *one) for one in wanted]:
         done.result()
-
-
-def _keep_out_of_line(modules: Iterable[wp.Module]) -> None:
-    """Let functions of modules that are not loaded yet be compiled once each on CPU, not into each of their callers.
-
-    Only those of `_OUTLINED`, where nobody else has set build options, from Warp 1.19 on. The results are the same.
-    """
-    options_class = getattr(wp, "ModuleBuildOptions", None)
-    for module in modules:
-        outlined = {kernel.func.__module__ for kernel in module.kernels.values()} <= {*_OUTLINED}
-        if outlined and options_class and not module.execs and module.options["extra_build_options"] is None:
-            given = {"extra_build_options": options_class(extra_cpu_preamble=_OUT_OF_LINE)}
-            wp.set_module_options(given, module)
 
 
 @cache
