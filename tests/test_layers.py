@@ -12,7 +12,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     "softmode errors",
-    "files checks lazy quiet versions",
+    "files checks lazy pause quiet versions",
     "deformables stages",
     "splats robots mpm",
     "radiance",

@@ -38,6 +38,7 @@ from softmode.envs.task import Task
 from softmode.envs.task_config import ObservationType, TaskConfig
 from softmode.envs.tensors import map_tree
 from softmode.errors import ConfigError
+from softmode.pause import collector_paused
 from softmode.robots.description import RobotDescription
 from softmode.robots.table_robot import TableRobot
 
@@ -126,13 +127,14 @@ class SoftEnv(gym.Env, gym.utils.EzPickle):
         self.config = checked_config(self.task_class.config_class, config, given, self.task_class.any_robot)
         self.obs_type, self.render_mode = obs_type, render_mode
         self.metadata = {**self.metadata, "render_fps": round(self.config.scene.control_hz)}
-        self.task = self.task_class(
-            self.config,
-            obs_type=obs_type,
-            render=render_mode is not None,
-            device=checked_device(device),
-            progress=progress,
-        )
+        with collector_paused():
+            self.task = self.task_class(
+                self.config,
+                obs_type=obs_type,
+                render=render_mode is not None,
+                device=checked_device(device),
+                progress=progress,
+            )
         self.scene, self.device = self.task.scene, self.task.device
         self._object_names = () if self.config.object_set is None else self.config.object_set.names
         self.action_space = self.task.action_space

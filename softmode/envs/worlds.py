@@ -20,6 +20,7 @@ from softmode.envs.results import host_view, info_arrays, observation_arrays, wr
 from softmode.envs.task import Task
 from softmode.envs.tensors import map_tree
 from softmode.errors import SoftmodeError, WorkerError
+from softmode.pause import collector_paused
 
 ANSWERED = ("reset", "step", "set_state")
 """Calls whose answer is the result of all worlds."""
@@ -35,7 +36,8 @@ class LocalWorlds:
 
     def __init__(self, task_class: type[Task], arguments: dict[str, Any]) -> None:
         """Build the task."""
-        self.task = task_class(**arguments)
+        with collector_paused():
+            self.task = task_class(**arguments)
         self._result: dict[str, Any] | None = None
         self._actions = host_view(self.task.scene.actions)
         self.parameters = self.task.reset_options

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from inspect import getsource
 from pathlib import Path
 
 import numpy as np
@@ -36,9 +37,9 @@ from softmode.objects.primitives import (
 from softmode.radiance.bake import splats_from_radiance
 from softmode.radiance.formats import read_radiance
 from softmode.radiance.grid import RadianceGrid
+from softmode.splats import plush
 from softmode.splats.colored_mesh import ColoredMesh
 from softmode.splats.formats import read_splats
-from softmode.splats.plush import make_plush
 from softmode.splats.point_cloud import is_point_cloud, read_points
 from softmode.splats.splats import Splats, up_rotation
 from softmode.stages import tokens
@@ -261,17 +262,22 @@ def upright_field(config: ObjectConfig, given: str | Path | RadianceGrid) -> Rad
 
 def baked_splats(key: tuple[object, ...], grid: RadianceGrid, count: int) -> Splats:
     """Return the splats baked of a field, from the cache if they are there."""
+    return _cached_splats(key, grid.name, lambda: splats_from_radiance(grid, count=count).splats)
+
+
+def _cached_splats(key: tuple[object, ...], name: str, make: Callable[[], Splats]) -> Splats:
+    """Return splats from the cache, or make them if they are not there."""
     fields = ("means", "quats", "scales", "opacities", "sh")
 
     def read(path: Path) -> Splats:
-        return Splats(**read_archive(path, "softmode.baked", 1)[1], name=grid.name)
+        return Splats(**read_archive(path, "softmode.baked", 1)[1], name=name)
 
     def write(splats: Splats, path: Path) -> None:
         write_archive(
             path, {"format": "softmode.baked", "version": 1}, {name: getattr(splats, name) for name in fields}
         )
 
-    return cached("baked", key, lambda: splats_from_radiance(grid, count=count).splats, read, write)
+    return cached("baked", key, make, read, write)
 
 
 def _laid_down(splats: Splats, turn: NDArray[np.float64]) -> Splats:
@@ -316,7 +322,7 @@ def _upright_splats(config: ObjectConfig) -> tuple[Splats, dict[str, str | int |
     """Return the object's splats upright, standing on z = 0, scaled; what else there was; the name of the object."""
     capture: dict[str, str | int | float] = {}
     if config.splat is None:
-        splats = make_plush()
+        splats = _cached_splats(("plush", getsource(plush)), "plush", plush.make_plush)
         name, stray, given = "plush", 0.0, splats.count
     else:
         cropped, name = _cropped_splats(config, config.splat)

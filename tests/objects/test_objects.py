@@ -14,7 +14,7 @@ from softmode.objects import ObjectConfig, load, loader
 from softmode.objects.parts import Part, choose_part
 from softmode.objects.pose import stable_rotation
 from softmode.objects.source import object_source
-from softmode.splats import Splats, make_plush, write_ply
+from softmode.splats import Splats, make_plush, plush, write_ply
 from softmode.splats.point_cloud import splats_from_points
 
 
@@ -261,3 +261,14 @@ def test_options_out_of_range_are_refused(given: dict) -> None:
     """Every option is checked when the configuration is made, before any file is read."""
     with pytest.raises(ConfigError, match=next(iter(given))):
         ObjectConfig(**given)
+
+
+def test_plush_comes_from_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plush is made once; what the cache returns has the same bits."""
+    monkeypatch.setenv("SOFTMODE_CACHE", str(tmp_path))
+    first = object_source(ObjectConfig()).splats
+    monkeypatch.setattr(plush, "make_plush", lambda: pytest.fail("made again"))
+    second = object_source(ObjectConfig()).splats
+    assert first.name == second.name
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        assert getattr(first, name).tobytes() == getattr(second, name).tobytes()

@@ -35,6 +35,7 @@ _BUILDING = (
     "softmode.deformables.solver.step_kernels",
     "softmode.deformables.contact.friction_memory_kernels",
 )
+_BUILDING_CPU = ("softmode.deformables.solver.point_cpu_kernels",)
 
 
 def compile_for_building(device: wp.DeviceLike, *others: ModuleType) -> None:
@@ -52,8 +53,9 @@ def compile_for_building(device: wp.DeviceLike, *others: ModuleType) -> None:
     for name in _ADJOINT_FREE:
         if name in sys.modules and not wp.get_module(name).execs:
             wp.set_module_options({"enable_backward": False}, module=sys.modules[name])
-    names = [*_BUILDING, *(other.__name__ for other in others)]
-    _load({(wp.get_module(name), None): None for name in names if name in sys.modules}, wp.get_device(device))
+    own = wp.get_device(device)
+    names = [*_BUILDING, *(_BUILDING_CPU if own.is_cpu else ()), *(other.__name__ for other in others)]
+    _load({(wp.get_module(name), None): None for name in names if name in sys.modules}, own)
 
 
 def compile_launches(launches: Callable[[], None], device: wp.DeviceLike) -> None:
