@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -76,6 +77,23 @@ _FAST = {
 }
 """Tests of `make test-fast`: quick ones of every room, by file; all of a file where none is named."""
 
+_LONGEST = (
+    *("test_examples.py", "documentation/test_site.py"),
+    *("deformables/test_elastic_functions.py", "deformables/test_cut.py", "deformables/test_cubature.py"),
+    *("test_cli_objects.py", "documentation/test_snippets.py", "envs/test_lift_soft.py", "envs/test_env_state.py"),
+    *("envs/test_vector_contract.py", "envs/test_object_sets.py", "test_cli_body.py", "envs/test_object_resets.py"),
+    *("test_cli.py", "deformables/test_body_report.py", "test_cli_new.py", "test_packaging.py", "test_quiet.py"),
+)
+"""Files that take more than 20 s, in the order in which they start, before all others: a long one that started last
+would leave the other processes waiting. The first compiles what an environment needs, the next four next to nothing, so
+that two processes do not compile the same kernels at the same time."""
+
+_WITHOUT_ADJOINTS = (
+    *("newton._src.solvers.mujoco.kernels", "newton._src.sim.articulation", "mujoco_warp._src.set_const"),
+    "newton._src.viewer.kernels",
+)
+"""Modules of Newton that no test differentiates through: 10 s of compilation instead of 26."""
+
 
 def _is_fast(item: pytest.Item) -> bool:
     """Return whether `make test-fast` runs a test; slow parameters of one are left out.
@@ -113,10 +131,12 @@ def playbot() -> Path:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of `make test-fast`; skip tests marked `gpu` where no CUDA device is found."""
-    gone = [file for file in _FAST if not (_TESTS / file).is_file()]
+    """Sort the files, mark the tests of `make test-fast`, skip tests marked `gpu` where no CUDA device is found."""
+    gone = [file for file in (*_FAST, *_LONGEST) if not (_TESTS / file).is_file()]
     if gone:
         raise pytest.UsageError(f"tests/conftest.py names files that are not there: {', '.join(gone)}")
+    rank = {_TESTS / file: k for k, file in enumerate(_LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path, len(rank)))
     for item in items:
         if _is_fast(item):
             item.add_marker("fast")
@@ -128,3 +148,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if not wp.is_cuda_available():
         for item in marked:
             item.add_marker(pytest.mark.skip(reason="no CUDA device"))
+
+
+def pytest_collection_finish() -> None:
+    """Have modules of Newton compiled without adjoints, as environments do: else both kinds would be compiled."""
+    if "warp" in sys.modules:
+        import warp as wp
+
+        for name in _WITHOUT_ADJOINTS:
+            if name in sys.modules and not wp.get_module(name).execs:
+                wp.set_module_options({"enable_backward": False}, module=sys.modules[name])

@@ -1,6 +1,6 @@
 """Run many programs from one start of Python: a fork for each, as `python file arguments` would run it in a folder.
 
-The simulator is imported once, which takes seconds, and not initialised: no thread, no device, no kernel is there when a
+The simulator is imported once, which takes seconds, and not initialised: there is no thread, device or kernel yet when a
 program's process begins. A line of JSON on the standard input asks for a program, one on the standard output answers.
 """
 
