@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
+
+from tests.compile_once import compile_once
+
+gc.disable()  # until all tests are collected: it takes a quarter of the time, and imports leave next to no garbage
 
 # Before the first import of warp: the cache lies in the checkout, so that a run leaves nothing outside it.
 _TESTS = Path(__file__).resolve().parent
@@ -151,10 +156,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Have modules of Newton compiled without adjoints, as environments do: else both kinds would be compiled."""
+    """Have kernels compiled once, and modules of Newton without adjoints, as environments do."""
     if "warp" in sys.modules:
         import warp as wp
 
         for name in _WITHOUT_ADJOINTS:
             if name in sys.modules and not wp.get_module(name).execs:
                 wp.set_module_options({"enable_backward": False}, module=sys.modules[name])
+        compile_once()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtestloop() -> None:
+    """Collect garbage again, but never look at what the imports have left."""
+    gc.freeze()
+    gc.enable()

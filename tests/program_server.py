@@ -1,12 +1,14 @@
 """Run many programs from one start of Python: a fork for each, as `python file arguments` would run it in a folder.
 
-The simulator is imported once, which takes seconds, and not initialised: there is no thread, device or kernel yet when a
-program's process begins. A line of JSON on the standard input asks for a program, one on the standard output answers.
+The simulator is imported once, which takes seconds, and not initialised: there is no thread, device or kernel yet when
+the process of a program begins. A line of JSON on the standard input asks for a program, one on the standard output
+answers.
 """
 
 from __future__ import annotations
 
 import atexit
+import gc
 import importlib
 import json
 import os
@@ -19,6 +21,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
+
+from tests.compile_once import compile_once
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -91,8 +95,12 @@ def _become(request: dict[str, Any]) -> int:
 
 def main() -> None:
     """Import the modules that the arguments name, then answer until the standard input ends."""
+    gc.disable()
     for name in sys.argv[1:]:
         importlib.import_module(name)
+    gc.freeze()
+    gc.enable()
+    compile_once()
     assert threading.active_count() == 1, threading.enumerate()
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what an import prints is no answer

@@ -217,7 +217,7 @@ def test_responses_of_eigenmodes_are_refused(options: dict[str, object]) -> None
         BuildOptions(**options)
 
 
-@pytest.mark.parametrize("name", ["star", "hollow sphere"])
+@pytest.mark.parametrize("name", [pytest.param("star", marks=pytest.mark.slow), "hollow sphere"])
 def test_clusters(name: str) -> None:
     """Symmetric bodies have functions that contribute alike: accuracy takes all of them, the report tells of cuts."""
     quadrature = SHAPES[name].quadrature(point_count=3000)
