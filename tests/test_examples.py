@@ -36,10 +36,13 @@ IMPORTED = (
 )
 """What nearly all of them import at last: 12 of the 21 s of processor time that an example takes on its own."""
 
+SLOW = {"train_own_toy"}
+"""It checks, trains, evaluates and films by four commands, as test_cli_objects.py does one at a time: 80 s."""
+
 
 def test_there_are_examples():
-    """The folder is where this file looks for it."""
-    assert EXAMPLES
+    """The folder is where this file looks for it, and so are those that it names."""
+    assert {path.stem for path in EXAMPLES} >= {*NEEDS, *NEWTONS, *SLOW}
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
@@ -65,7 +68,11 @@ def server() -> Iterator[ProgramServer]:
         yield started
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, marks=[pytest.mark.slow] if path.stem in SLOW else []) for path in EXAMPLES],
+    ids=lambda path: path.stem,
+)
 def test_example_runs(path: Path, server: ProgramServer, tmp_path: Path):
     """The short version ends without error; its test_final asserts the physics."""
     if path.stem in NEEDS:
