@@ -93,12 +93,6 @@ _LONGEST = (
 would leave the other processes waiting. The first compiles what an environment needs, the next four next to nothing, so
 that two processes do not compile the same kernels at the same time."""
 
-_WITHOUT_ADJOINTS = (
-    *("newton._src.solvers.mujoco.kernels", "newton._src.sim.articulation", "mujoco_warp._src.set_const"),
-    "newton._src.viewer.kernels",
-)
-"""Modules of Newton that no test differentiates through: 10 s of compilation instead of 26."""
-
 
 def _is_fast(item: pytest.Item) -> bool:
     """Return whether `make test-fast` runs a test; slow parameters of one are left out.
@@ -156,13 +150,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Have kernels compiled once, and modules of Newton without adjoints, as environments do."""
+    """Have processes compile a kernel once; an import of Warp that no test needs is not made for it."""
     if "warp" in sys.modules:
-        import warp as wp
-
-        for name in _WITHOUT_ADJOINTS:
-            if name in sys.modules and not wp.get_module(name).execs:
-                wp.set_module_options({"enable_backward": False}, module=sys.modules[name])
         compile_once()
 
 
