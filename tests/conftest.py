@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import gc
 import os
+import sys
 from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
+
+from tests.compile_once import compile_once
+
+gc.disable()  # until all tests are collected: it takes a quarter of the time, and imports leave next to no garbage
 
 # Before the first import of warp: the cache lies in the checkout, so that a run leaves nothing outside it.
 _TESTS = Path(__file__).resolve().parent
@@ -76,6 +82,21 @@ _FAST = {
 }
 """Tests of `make test-fast`: quick ones of every room, by file; all of a file where none is named."""
 
+_LONGEST = (
+    *("test_examples.py", "documentation/test_site.py", "oracle/test_modes.py", "deformables/test_quadrature.py"),
+    *("deformables/test_cut.py", "deformables/test_elastic_functions.py", "deformables/test_cubature.py"),
+    *("testing/test_plugin.py", "test_cli_objects.py", "documentation/test_snippets.py", "envs/test_lift_soft.py"),
+    *("envs/test_env_state.py", "usd/test_import_scene.py", "envs/test_vector_contract.py", "mpm/test_planner.py"),
+    *("usd/test_import_newton.py", "envs/test_object_sets.py", "test_cli_body.py", "envs/test_object_resets.py"),
+    *("robots/test_grasp_planner.py", "test_cli.py", "deformables/test_body_report.py", "test_cli_new.py"),
+    *("usd/test_damage.py", "deformables/test_grasps.py", "mpm/test_follow.py", "viz/test_morph_film.py"),
+    *("deformables/test_pairs.py", "test_packaging.py", "viz/test_rerun_logger.py", "test_quiet.py"),
+    "envs/test_robot_tasks.py",
+)
+"""Files that take more than 20 s, in the order in which they start, before all others: a long one that started last
+would leave the other processes waiting. The first compiles what an environment needs, the next six next to nothing, so
+that two processes do not compile the same kernels at the same time."""
+
 
 def _is_fast(item: pytest.Item) -> bool:
     """Return whether `make test-fast` runs a test; slow parameters of one are left out.
@@ -113,10 +134,12 @@ def playbot() -> Path:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of `make test-fast`; skip tests marked `gpu` where no CUDA device is found."""
-    gone = [file for file in _FAST if not (_TESTS / file).is_file()]
+    """Sort the files, mark the tests of `make test-fast`, skip tests marked `gpu` where no CUDA device is found."""
+    gone = [file for file in (*_FAST, *_LONGEST) if not (_TESTS / file).is_file()]
     if gone:
         raise pytest.UsageError(f"tests/conftest.py names files that are not there: {', '.join(gone)}")
+    rank = {_TESTS / file: k for k, file in enumerate(_LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path, len(rank)))
     for item in items:
         if _is_fast(item):
             item.add_marker("fast")
@@ -128,3 +151,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if not wp.is_cuda_available():
         for item in marked:
             item.add_marker(pytest.mark.skip(reason="no CUDA device"))
+
+
+def pytest_collection_finish() -> None:
+    """Have processes compile a kernel once; an import of Warp that no test needs is not made for it."""
+    if "warp" in sys.modules:
+        compile_once()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtestloop() -> None:
+    """Collect garbage again, but never look at what the imports have left."""
+    gc.freeze()
+    gc.enable()

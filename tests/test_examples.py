@@ -1,14 +1,15 @@
-"""Every example runs: each file of examples/ in its own process."""
+"""Every example runs: each file of examples/ in its own process, forked from one that has imported the simulator."""
 
 from __future__ import annotations
 
 import ast
-import os
-import subprocess
-import sys
+import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from tests.program_server import ProgramServer
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -28,9 +29,20 @@ NEWTONS = {"newton_example": ("--viewer", "null", "--test", "--num-frames", "180
 """Examples in the shape of Newton's own, which ``newton.examples.run`` runs; the others take ``--short``."""
 
 
+IMPORTED = (
+    *("newton", "mujoco_warp", "networkx", "PIL.Image"),
+    *("softmode.scenes.splat_scene", "softmode.scenes.table_scene", "softmode.objects.loader", "softmode.viz.film"),
+    *("softmode.envs.soft_vector_env", "softmode.envs.scripted", "softmode.envs.tasks.lift_soft.task"),
+)
+"""What nearly all of them import at last: 12 of the 21 s of processor time that an example takes on its own."""
+
+SLOW = {"train_own_toy"}
+"""It checks, trains, evaluates and films by four commands, as test_cli_objects.py does one at a time: 80 s."""
+
+
 def test_there_are_examples():
-    """The folder is where this file looks for it."""
-    assert EXAMPLES
+    """The folder is where this file looks for it, and so are those that it names."""
+    assert {path.stem for path in EXAMPLES} >= {*NEEDS, *NEWTONS, *SLOW}
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
@@ -45,21 +57,26 @@ def test_example_reads_well(path: Path):
     assert all(isinstance(node, allowed) for node in tree.body)
     guards = [ast.unparse(node.test) for node in tree.body if isinstance(node, ast.If)]
     assert guards == ["__name__ == '__main__'"]
+    # the process that runs it has registered the environments already
+    assert "gym.make" not in text or re.search(r"^(?:import|from) softmode", text, re.MULTILINE)
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_example_runs(path: Path, tmp_path: Path):
+@pytest.fixture(scope="module")
+def server() -> Iterator[ProgramServer]:
+    """Return what runs programs."""
+    with ProgramServer(*IMPORTED) as started:
+        yield started
+
+
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, marks=[pytest.mark.slow] if path.stem in SLOW else []) for path in EXAMPLES],
+    ids=lambda path: path.stem,
+)
+def test_example_runs(path: Path, server: ProgramServer, tmp_path: Path):
     """The short version ends without error; its test_final asserts the physics."""
     if path.stem in NEEDS:
         pytest.importorskip(NEEDS[path.stem])
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        [sys.executable, str(path), *NEWTONS.get(path.stem, ("--short",))],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = server.run(path, NEWTONS.get(path.stem, ("--short",)), tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.strip()

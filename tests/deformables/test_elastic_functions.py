@@ -26,6 +26,8 @@ from tests.oracle.solids import eigenvalues
 from tests.shapes import SHAPES, box, together
 
 ALL = {"cubature_count": None, "kernel_count": 200}
+FEW = {"surface_count": 32}
+"""Samples of the surface, which these tests do not look at: most of the time of a quadrature."""
 SIZE = (0.12, 0.05, 0.03)
 LEFT = Region(name="left", box=((-1.0, -1.0, -1.0), (-0.04, 1.0, 1.0)))
 RIGHT = Region(name="right", box=((0.04, -1.0, -1.0), (1.0, 1.0, 1.0)))
@@ -35,7 +37,9 @@ OTHER = Region(name="other", box=((-1.0, -1.0, -1.0), (-0.03, 1.0, 0.0)), stiffn
 
 def built(**options: object) -> ReducedBody:
     """Return a box with all of its points and few kernels."""
-    return build_body(quadrature_from_box(SIZE, point_count=1500), BuildOptions(**{**ALL, **options}), progress=False)
+    return build_body(
+        quadrature_from_box(SIZE, point_count=1500, **FEW), BuildOptions(**{**ALL, **options}), progress=False
+    )
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +77,7 @@ def test_affine_motion_is_exact(bodies: dict[int, ReducedBody]) -> None:
 
 def test_functions_are_orthonormal_in_mass() -> None:
     """Also with a density that varies, and only the first has a mean."""
-    quadrature = quadrature_from_box(SIZE, point_count=1500)
+    quadrature = quadrature_from_box(SIZE, point_count=1500, **FEW)
     density = np.where(quadrature.points[:, 0] > 0.0, 3.0, 1.0)
     body = build_body(quadrature, BuildOptions(function_count=40, **ALL), density_scale=density, progress=False)
     value = body.evaluate(quadrature.points - body.offset)[0]
@@ -101,7 +105,7 @@ def test_accuracy_chooses_the_count(bodies: dict[int, ReducedBody]) -> None:
 def test_accuracy_out_of_reach_is_refused() -> None:
     """The message says what the most functions reach."""
     with pytest.raises(ConfigError, match="120 functions reach"):
-        build_body(quadrature_from_sphere(0.05, point_count=3000), BuildOptions(accuracy=1e-7), progress=False)
+        build_body(quadrature_from_sphere(0.05, point_count=3000, **FEW), BuildOptions(accuracy=1e-7), progress=False)
 
 
 def test_the_space_grows_where_it_must() -> None:
@@ -109,7 +113,7 @@ def test_the_space_grows_where_it_must() -> None:
     wide = 10 * (min(SPACE_MODE_COUNTS) + 1)
     assert float(str(built().provenance["space_functions"])) <= wide
     tube = trimesh.creation.annulus(0.015, 0.025, 0.12, sections=96)
-    quadrature = quadrature_from_mesh(tube.vertices, tube.faces, point_count=2000)
+    quadrature = quadrature_from_mesh(tube.vertices, tube.faces, point_count=2000, **FEW)
     options = BuildOptions(cubature_count=None, poissons_ratio=0.3)
     body = build_body(quadrature, options, progress=False)
     assert float(str(body.provenance["space_functions"])) > wide
@@ -164,7 +168,7 @@ def test_detached_parts_move_against_each_other() -> None:
 def held(count: int | None = None, regions: tuple[Region, ...] = (LEFT,), **options: object) -> ReducedBody:
     """Return the box held in regions, with all of its points and few kernels."""
     given = BuildOptions(**{**ALL, "kernel_count": 120, "function_count": count, **options})
-    return build_body(quadrature_from_box(SIZE, point_count=1500), given, regions=regions, progress=False)
+    return build_body(quadrature_from_box(SIZE, point_count=1500, **FEW), given, regions=regions, progress=False)
 
 
 @pytest.mark.parametrize("regions", [(LEFT,), (LEFT, RIGHT), (LEFT, SOFT), (SOFT,), (SOFT, OTHER)])
@@ -217,10 +221,10 @@ def test_responses_of_eigenmodes_are_refused(options: dict[str, object]) -> None
         BuildOptions(**options)
 
 
-@pytest.mark.parametrize("name", ["star", "hollow sphere"])
+@pytest.mark.parametrize("name", [pytest.param("star", marks=pytest.mark.slow), "hollow sphere"])
 def test_clusters(name: str) -> None:
     """Symmetric bodies have functions that contribute alike: accuracy takes all of them, the report tells of cuts."""
-    quadrature = SHAPES[name].quadrature(point_count=3000)
+    quadrature = SHAPES[name].quadrature(point_count=3000, **FEW)
     whole = build_body(quadrature, BuildOptions(accuracy=0.1, kernel_count=300), progress=False)
     assert whole.provenance["complete_functions"] == whole.function_count
     cut = build_body(quadrature, BuildOptions(function_count=46, kernel_count=300), progress=False)

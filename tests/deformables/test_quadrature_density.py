@@ -19,6 +19,8 @@ from softmode.errors import AssetError, ConfigError
 BOX = np.array([[-0.07, -0.07, -0.05], [0.07, 0.07, 0.05]])
 SIGMA = 2.0e3
 """Density of what is opaque over millimetres [1/m]."""
+FEW = {"surface_count": 16}
+"""Samples of the surface, which these tests do not look at."""
 
 
 def opaque(inside):
@@ -41,7 +43,7 @@ SOLIDS = {
 def test_total_mass(name, sampling):
     """The weights sum to the volume within 1 %, and the centroid of a symmetric solid lies in its middle."""
     sigma, volume = SOLIDS[name]
-    found = quadrature_from_density(sigma, BOX, sampling=sampling, point_count=2000)
+    found = quadrature_from_density(sigma, BOX, sampling=sampling, point_count=2000, **FEW)
     assert found.weights.sum() == pytest.approx(volume, rel=0.01)
     assert abs(len(found.points) / 2000 - 1.0) < 0.3
     scatter = 0.1 / np.sqrt(2000) if sampling == "poisson" else 1.5e-4
@@ -51,8 +53,10 @@ def test_total_mass(name, sampling):
 
 def test_soft_density():
     """A Gaussian haze has the volume of its occupancy over the 95th percentile, whatever the unit of length."""
-    small = quadrature_from_density(lambda x: 100.0 * np.exp(-((x / 0.02) ** 2).sum(axis=1)), BOX)
-    large = quadrature_from_density(lambda x: 100.0 / 128.0 * np.exp(-((x / 2.56) ** 2).sum(axis=1)), 128.0 * BOX)
+    small = quadrature_from_density(lambda x: 100.0 * np.exp(-((x / 0.02) ** 2).sum(axis=1)), BOX, **FEW)
+    large = quadrature_from_density(
+        lambda x: 100.0 / 128.0 * np.exp(-((x / 2.56) ** 2).sum(axis=1)), 128.0 * BOX, **FEW
+    )
     assert large.volume == pytest.approx(128.0**3 * small.volume, rel=1e-6)
     np.testing.assert_allclose(large.points, 128.0 * small.points, atol=1e-6)
 
@@ -63,18 +67,18 @@ def test_voids_and_parts():
     def shell(x):
         return (np.abs(np.linalg.norm(x, axis=1) - 0.035) < 0.005) | (np.linalg.norm(x - 0.045, axis=1) < 0.005)
 
-    filled = quadrature_from_density(opaque(shell), BOX)
+    filled = quadrature_from_density(opaque(shell), BOX, **FEW)
     assert filled.volume == pytest.approx(4.0 / 3.0 * np.pi * 0.04**3, rel=0.01)
     assert filled.report["filled_share"] == pytest.approx((0.03 / 0.04) ** 3, rel=0.05)
     assert 1e-3 < filled.report["detached_share"] < 1e-2
-    hollow = quadrature_from_density(opaque(shell), BOX, fill_voids=False)
+    hollow = quadrature_from_density(opaque(shell), BOX, fill_voids=False, **FEW)
     assert hollow.volume == pytest.approx(4.0 / 3.0 * np.pi * (0.04**3 - 0.03**3), rel=0.01)
 
 
 def test_disks_keep_apart():
     """No point lies in the disk of another: |x - y| >= max(r(x), r(y)) >= the least radius; a seed gives its bits."""
     found, again = (
-        quadrature_from_density(SOLIDS["sphere"][0], BOX, sampling="poisson", point_count=800) for _ in range(2)
+        quadrature_from_density(SOLIDS["sphere"][0], BOX, sampling="poisson", point_count=800, **FEW) for _ in range(2)
     )
     np.testing.assert_array_equal(found.points, again.points)
     apart = squareform(pdist(found.points)) + np.eye(len(found.points))
@@ -88,7 +92,7 @@ def test_disks_keep_apart():
 def test_printed_volumes_are_too_large():
     """Equation 4, V = 4/3 pi r^3, weighs a filled solid half as much again and more: balls overlap."""
     for sigma, _ in SOLIDS.values():
-        found = quadrature_from_density(sigma, BOX, sampling="poisson", point_count=1000)
+        found = quadrature_from_density(sigma, BOX, sampling="poisson", point_count=1000, **FEW)
         assert found.report["ball_volume"] > 1.5
 
 
@@ -103,7 +107,7 @@ def test_printed_radius_depends_on_the_unit():
 
 def test_integrator_points_keep_moments():
     """Volume, centroid and second moments are those of the fine points; the uncentred C of the paper moves along."""
-    fine = quadrature_from_box((0.2, 0.05, 0.04))
+    fine = quadrature_from_box((0.2, 0.05, 0.04), **FEW)
     coarse = with_integrator_points(fine, 60)
     for power in (lambda x: np.ones(len(x)), lambda x: x.T, lambda x: np.einsum("ni,nj->ijn", x, x)):
         exact, found = (power(q.points) @ q.weights for q in (fine, coarse))
@@ -115,7 +119,7 @@ def test_integrator_points_keep_moments():
 
 def test_one_point_per_cell_loses_rank():
     """Monomials of degree two in 8 cells: one point each sees 8 of 10 functions, eight points all; equation 11."""
-    coarse = with_integrator_points(quadrature_from_box((1.0, 0.8, 0.6)), 8)
+    coarse = with_integrator_points(quadrature_from_box((1.0, 0.8, 0.6), **FEW), 8)
     x = coarse.points - coarse.points.mean(axis=0)
 
     def mass(points):
@@ -131,10 +135,10 @@ def test_one_point_per_cell_loses_rank():
 def test_bodies_of_both_kinds():
     """A bar of disks and one of integrator points bend about as the grid's: sampling is no dead end."""
     sigma = opaque(lambda x: (np.abs(x) < [0.06, 0.015, 0.015]).all(axis=1))
-    grid = quadrature_from_density(sigma, BOX, point_count=3000)
+    grid = quadrature_from_density(sigma, BOX, point_count=3000, **FEW)
     options = BuildOptions(cubature_count=None, function_count=20, kernel_count=100)
     least = []
-    for quadrature in (grid, quadrature_from_density(sigma, BOX, sampling="poisson", point_count=3000),
+    for quadrature in (grid, quadrature_from_density(sigma, BOX, sampling="poisson", point_count=3000, **FEW),
                        with_integrator_points(grid, 200)):  # fmt: skip
         body = build_body(quadrature, options)
         assert body.volume == pytest.approx(0.12 * 0.03 * 0.03, rel=0.01)
