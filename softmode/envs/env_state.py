@@ -27,7 +27,7 @@ _OBJECT = "task.object"
 Parts = int | NDArray[Any]
 """How the worlds lie in an array, see `_parts`."""
 _SHAPES = "state.softmode.stick_shape"
-"""Indices of the shapes that surfaces stick to, k or -2 - k, which a state counts within the world."""
+"""Indices of the shapes that surfaces stick to, which a state counts within the world."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -273,9 +273,9 @@ def _parts(task: Task) -> Iterator[tuple[str, Any, Parts]]:
 
 
 def _shifted(task: Task, shapes: NDArray[Any], sign: int) -> NDArray[Any]:
-    """Return indices of shapes (world_count, N), k or -2 - k, -1 for none, less (-1) or plus (1) the world's first."""
-    first = sign * task.scene.model.shape_world_start.numpy()[: task.world_count, None]
-    return np.where(shapes == -1, shapes, np.where(shapes < 0, shapes - first, shapes + first))
+    """Return indices of shapes (world_count, N), -1 for none, less (-1) or plus (1) the first of their world."""
+    first = task.scene.model.shape_world_start.numpy()[: task.world_count, None]
+    return np.where(shapes < 0, shapes, shapes + sign * first)
 
 
 def _starts(task: Task) -> tuple[NDArray[Any], NDArray[Any]]:

@@ -15,7 +15,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from softmode.quiet import quieten_warp
 from softmode.scenes.replay_kernels import Operation, replay
+
+quieten_warp()
 
 _HOOKS = ("wp_cpu_launch_kernel", "wp_memcpy_h2h", "wp_memset_host", "wp_memtile_host")
 _ALIGNMENT = 64

@@ -220,8 +220,7 @@ def march(
 
     The way is marched by distances to the shape grown by ``thick``. To the body's inside (``back``), for a sample past
     the middle of a thin plate or through it: where the way leaves the shape, else what is ``nearest`` to x. The way of
-    a fast sample: where it first meets the shape, or else passes nearest. The third value says whether a way back was
-    taken.
+    a fast sample: where it first meets the shape, or else passes nearest.
     """
     kind = shapes.kind[shape]
     scale = shapes.scale[shape]
@@ -230,7 +229,6 @@ def march(
     out = query
     at = float(0.0)
     out_at = float(0.0)
-    returned = int(0)
     inside = query.distance <= 0.0
     depth = 0.5 * end
     least = 1.0e-3 * end
@@ -248,7 +246,6 @@ def march(
                 if wp.dot(query.normal, along) > OPPOSED:
                     out = query
                     out_at = at
-                    returned = 1
                 break
             if not inside and at > depth:
                 break
@@ -264,52 +261,7 @@ def march(
     out.distance -= out_at * slope
     if back == 0 and not inside:
         out.distance = wp.max(out.distance, -end * slope)  # a way that misses the shape misses its half-space
-    return out, returned
-
-
-@wp.func
-def touched_shape(entry: int):
-    """Return the shape of an entry of a sample's memory, -1 for none; see ``came_through``."""
-    return wp.where(entry < -1, -2 - entry, entry)
-
-
-@wp.func
-def came_through(
-    instances: Instances,
-    basis: Basis,
-    motion: Motion,
-    shapes: Shapes,
-    shape: int,
-    x: wp.vec3d,
-    local: wp.vec3,
-    nearest: SurfaceQuery,
-    stuck: wp.vec2i,
-    dt_before: wp.float64,
-    far: float,
-    i: int,
-    row: int,
-):
-    """Return whether a sample whose body lies behind the surface that is ``nearest`` came there through the shape.
-
-    Where no step led here, that is assumed. A sample that is on its way back (the memory has -2 - shape) goes on. Else
-    it is through if the surface that was nearest to it in the step before faced the other way. Otherwise the body is
-    bent around an end of the shape, or has turned: what a finger presses in beside a rim, the rim lies beside.
-    """
-    if dt_before == wp.float64(0.0) or stuck[0] == -2 - shape or stuck[1] == -2 - shape:
-        return True
-    pose = shapes.transform[shape]
-    body = shapes.body[shape]
-    before = wp.abs(float(dt_before))
-    moved = before * wp.vec3(interpolate(basis.row, row, motion.qd_start, i, instances.function_count[i]))
-    if body >= 0:
-        pose = shapes.body_q[body] * pose
-        moved -= before * point_velocity(shapes.body_q[body], shapes.body_qd[body], shapes.body_com[body], wp.vec3(x))
-    y = local - wp.quat_rotate_inv(wp.transform_get_rotation(pose), moved)
-    reach = far + wp.length(moved)
-    query = query_shape(shapes.kind[shape], shapes.scale[shape], shapes.source[shape], y, reach)
-    if shapes.kind[shape] == HEIGHTFIELD:
-        query = query_heightfield(y, shapes.fields, shapes.fields.index[shape], reach)
-    return wp.dot(query.normal, nearest.normal) < -OPPOSED
+    return out
 
 
 @wp.kernel
@@ -329,8 +281,8 @@ def find_contacts(
 ):
     """Keep the deepest contacts of each sample within margin plus twice the relative motion of the step.
 
-    A sample in a shape, or one that touched it in the step before, is brought back if its body lies behind the nearest
-    surface and it ``came_through``.
+    A sample outside of a shape that lies between it and the inside of its body has gone through, unless it did not
+    touch that shape in the step before: then the body is bent around an end of the shape.
     """
     i, s = wp.tid()
     if s >= instances.sample_count[i]:
@@ -373,29 +325,23 @@ def find_contacts(
         back = int(0)
         depth = instances.scale[i] * float(wp.length(basis.inner_point[row]))
         travel = wp.length(drift)
-        returned = int(0)
-        before = dt_before[i]
-        touched = touched_shape(stuck[0]) == shape or touched_shape(stuck[1]) == shape or before == wp.float64(0.0)
+        touched = stuck[0] == shape or stuck[1] == shape or dt_before[i] == wp.float64(0.0)
         if query.distance <= 0.0 or (touched and query.distance < 2.0 * depth):
             bent = interpolate(basis.inner_row, row, motion.q_start, i, instances.function_count[i])
             inner = wp.quat_rotate_inv(turn, wp.vec3(basis.inner_point[row] + bent))
             depth = wp.length(inner)
             near_back = query.distance <= 0.0 or (touched and query.distance < depth)
             if near_back and wp.dot(query.normal, inner) < -OPPOSED * depth:
-                # the nearest surface faces away from the body's inside: what came through must go back to it
-                through = came_through(
-                    instances, basis, motion, shapes, shape, x, local, query, stuck, before, far, i, row
-                )
-                if through:
-                    along = inner / depth
-                    end = 2.0 * depth
-                    back = 1
+                # the nearest surface faces away from the body's inside: the sample must go back to it
+                along = inner / depth
+                end = 2.0 * depth
+                back = 1
         if end == 0.0 and query.distance > 0.0 and travel > instances.margin[i] and travel > query.distance:
             # a half-space at the start would also stop fast samples that fly past a small shape
             along = wp.quat_rotate_inv(turn, drift) / travel
             end = travel
         if end > 0.0:
-            query, returned = march(shapes, shape, local, query, along, end, back, thick, far)
+            query = march(shapes, shape, local, query, along, end, back, thick, far)
         gap = wp.float64(query.distance)
         if gap < wp.float64(reach) and gap < samples.gap[i, s, 1]:
             normal = wp.quat_rotate(turn, query.normal)
@@ -404,10 +350,8 @@ def find_contacts(
                 samples.shape[i, s, 1] = samples.shape[i, s, 0]
                 samples.gap[i, s, 1] = samples.gap[i, s, 0]
                 samples.normal[i, s, 1] = samples.normal[i, s, 0]
-                samples.returned[i, s, 1] = samples.returned[i, s, 0]
                 slot = 0
             samples.shape[i, s, slot] = shape
-            samples.returned[i, s, slot] = returned
             samples.gap[i, s, slot] = gap
             samples.normal[i, s, slot] = normal
 
@@ -464,7 +408,7 @@ def remembered_slip(
     anchor = wp.quat_rotate_inv(rotation, x - origin)
     slip = wp.vec3d()
     for k in range(SLOTS):
-        if touched_shape(stick_shape[particle][k]) == shape:
+        if stick_shape[particle][k] == shape:
             point = stick_point[particle][k]
             slip = wp.quat_rotate(rotation, point)
             if prescribed == 0:

@@ -28,8 +28,7 @@ def remember_slip(
     The rest is slid; without friction, or friction that remembers, all of it. A contact that has opened has no friction
     to hold a displacement, and is forgotten. Shapes with dofs in the solve keep the anchor, to the bit while the
     contact sticks, so that errors of the solve do not add up; shapes that move as prescribed keep the displacement
-    itself, in their frame, because a belt moves without its pose. A sample that is on its way back through a shape
-    remembers -2 - shape (see ``detection_kernels.came_through``).
+    itself, in their frame, because a belt moves without its pose.
     """
     i, s = wp.tid()
     if s >= instances.sample_count[i]:
@@ -42,31 +41,27 @@ def remember_slip(
             continue
         if not (constraints.normal_force[i, e] > wp.float64(0.0)):
             continue
-        # the normal force of friction may be that of an earlier iterate
-        total = constraints.offset[i, e] + constraints.displacement[i, e]
-        if wp.dot(constraints.normal[i, e], total) >= wp.float64(0.0):
-            continue
         limit = constraints.friction[i, e] * constraints.normal_force[i, e]
         shape = constraints.shape[i, e]
         origin, rotation = shape_frame(shapes, shape)
-        slip = constraints.slip[i, e]
-        stretch = constraints.stick[i, e] * wp.length(slip)
+        total = constraints.slip[i, e]
+        stretch = constraints.stick[i, e] * wp.length(total)
         if not wp.isfinite(stretch + limit):
             continue
         elastic = wp.vec3d()
         if stretch > limit:
-            elastic = limit / stretch * slip
+            elastic = limit / stretch * total
         elif stretch > wp.float64(0.0):
-            elastic = slip
+            elastic = total
         point = constraints.anchor[i, e]
         if prescribed != 0:
             point = wp.quat_rotate_inv(rotation, elastic)
         elif stretch > limit or constraints.stick[i, e] == wp.float64(0.0):
             n = constraints.normal[i, e]
             before = constraints.offset[i, e] - wp.dot(n, constraints.offset[i, e]) * n
-            slid = samples.position[i, s] - before + slip - elastic
+            slid = samples.position[i, s] - before + total - elastic
             point = wp.quat_rotate_inv(rotation, slid - origin)
-        stuck[slot] = wp.where(samples.returned[i, s, slot] != 0, -2 - shape, shape)
+        stuck[slot] = shape
         points[slot] = point
     particle = instances.particle_start[i] + s
     stick_shape_out[particle] = stuck

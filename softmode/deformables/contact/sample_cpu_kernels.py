@@ -104,10 +104,7 @@ def _cull_snippet() -> str:
         words stuck[2];
         for (int lane = 0; lane < 8; ++lane) {
             const int sample = s + lane < sample_count ? s + lane : sample_count - 1, at = 3 * sample;
-            for (int k = 0; k < 2; ++k) {
-                const int entry = memory[2 * sample + k];
-                stuck[k][lane] = entry < -1 ? -2 - entry : entry;  // see detection_kernels.touched_shape
-            }
+            for (int k = 0; k < 2; ++k) stuck[k][lane] = memory[2 * sample + k];
             for (int k = 0; k < 3; ++k) {
                 x[k][lane] = position[at + k];
                 move[k][lane] = drift[at + k];

@@ -61,6 +61,8 @@ NEAR_FAILURES = wp.constant(5)
 TURN_LEAST = wp.constant(wp.float64(1.0e-4))
 """Size of a Newton step, over that of the body (rms), from which on its rotation is a finite one: below, the strain of
 a linear one is far less than the tolerance."""
+SHORT_STEP = wp.constant(wp.float64(0.0625))
+"""Step length below which Newton's own Hessian is given up for the projected one: such steps lead nowhere."""
 PROJECTED_ITERATIONS = wp.constant(8)
 """Iterations before which a small step with the projected Hessian does not count as convergence."""
 ENERGY_ROUNDING = wp.constant(wp.float64(2.0e-17))
@@ -615,8 +617,14 @@ def accept_step(step: NewtonStep, team: int, w: int, member: int):
     slow = step.state.iteration[w] >= 2 * step.options.refresh_interval
     if slow or step.state.iteration[w] % step.options.refresh_interval == 0 or alpha == wp.float64(0.0):
         step.state.refresh[w] = 1
+    # it is not friction's curvature that throws the step off, so Newton's own Hessian is all but indefinite
+    astray = step.state.project[w] == 0 and step.state.exact[w] == 0 and alpha < SHORT_STEP
     if alpha == wp.float64(0.0) or (slow and away == 1):
         step.state.project[w] = 1
+    elif astray:
+        step.state.project[w] = 1
+        step.state.refresh[w] = 1
+        step.state.failures[w] = step.state.failures[w] + 1
     elif step.state.project[w] != 0 and away == 0 and step.state.failures[w] < allowed:
         step.state.project[w] = 0
         step.state.refresh[w] = 1
