@@ -84,6 +84,7 @@ def report(preset: str, count: int, device: wp.Device, options: argparse.Namespa
     found = np.concatenate(iterations)
     way = "one launch" if tables.one_launch else "a launch per phase"
     way += ", shared memory" if tables.shared else ""
+    way += f", after {tables.rounds} rounds" if tables.rounds else ""
     print(
         f"{preset}, {count} worlds, {3 * tables.layout.stride} unknowns, {way}: "
         f"{count * options.steps / seconds:,.0f} env-steps/s, "
