@@ -12,8 +12,9 @@ from softmode.learning.environments import make_vector_env
 from softmode.learning.policy import evaluate, load_policy
 
 FOLDER = Path(__file__).parents[2] / "policies"
-LEAST = {"lift_soft": (18, 20), "press_soft": (18, 20), "push_soft": (15, 20), "lift_soft_pixels": (8, 10)}
-"""Fewest successes in as many episodes."""
+LEAST = {"lift_soft": (18, 20), "press_soft": (17, 20), "push_soft": (15, 20), "lift_soft_pixels": (8, 10)}
+"""Fewest successes in as many episodes. PressSoft's policy had 18, 19, 18 and 15 of 20 with seeds 0 to 3 before rows
+answered beside damping as MuJoCo's do, 17, 19, 18 and 15 since: one episode in eighty changed, with the seed below."""
 
 
 def test_all_are_tested():
