@@ -104,11 +104,14 @@ def test_packed_system_grasps_as_the_launches_do() -> None:
 
 @pytest.mark.parametrize("rounds", [1, 40])
 def test_rounds_of_launches_grasp_as_the_one_launch_does(rounds: int) -> None:
-    """Worlds go on in the one launch from wherever a round left them, or end in the rounds; sums have another order."""
+    """Worlds go on in the one launch from wherever a round left them, or end in the rounds.
+
+    Sums have another order, and the one launch evaluates in lanes: both stop within 1e-3 of the forces.
+    """
     alone, after = (grasp("cpu", one_launch=True, rounds=count) for count in (0, rounds))
     for name in ("q", "joint_q"):
-        np.testing.assert_allclose(after[name], alone[name], atol=1.0e-8)
-    np.testing.assert_allclose(after["force"], alone["force"], atol=1.0e-6 * np.abs(alone["force"]).max())
+        np.testing.assert_allclose(after[name], alone[name], atol=1.0e-7)
+    np.testing.assert_allclose(after["force"], alone["force"], atol=1.0e-5 * np.abs(alone["force"]).max())
 
 
 @pytest.mark.gpu
