@@ -16,7 +16,7 @@ from softmode.deformables.model.struct_kernels import (
     exists,
     first_coupled,
 )
-from softmode.deformables.solver.assembly_kernels import CONDENSED_ROUNDING, left_out
+from softmode.deformables.solver.assembly_kernels import CONDENSED_ROUNDING, inertia_of, left_out
 from softmode.deformables.solver.factor_kernels import used_blocks
 from softmode.deformables.solver.iteration_kernels import NewtonArrays, NewtonStep
 
@@ -339,8 +339,7 @@ def matrix_of(step: NewtonStep, i: int):
     """Add inertia, pins and contacts to the stiffness of an instance; driven unknowns stay put."""
     if step.state.active[step.instances.world[i]] == 0 or left_out(step.instances, step.arrays.systems.pattern, i):
         return
-    rate = step.motion.rate[i] / step.options.dt
-    inertia = float(step.instances.mass[i] * rate * (rate + wp.float64(step.instances.mass_damping[i])))
+    inertia = inertia_of(step.instances, step.motion, step.options.dt, i)
     sum_matrix(step.instances, step.basis, step.constraints, step.arrays, inertia, i)
 
 

@@ -10,6 +10,7 @@ from softmode.deformables.model.lane_kernels import LANES, barrier, free_part, m
 from softmode.deformables.model.struct_kernels import (
     Basis,
     Instances,
+    Motion,
     NewtonState,
     Rigid,
     exists,
@@ -114,6 +115,13 @@ def assemble_pins(
 
 
 @wp.func
+def inertia_of(instances: Instances, motion: Motion, dt: wp.float64, i: int):
+    """Return m c/dt (c/dt + alpha) of an instance [N/m], what inertia and mass damping add to the diagonal."""
+    rate = motion.rate[i] / dt
+    return float(instances.mass[i] * rate * (rate + wp.float64(instances.mass_damping[i])))
+
+
+@wp.func
 def matrix_row(step: NewtonStep, team: int, i: int, row: int, member: int):
     """Add inertia and pins to the stiffness; driven unknowns stay put."""
     if step.state.active[step.instances.world[i]] == 0 or left_out(step.instances, step.arrays.systems.pattern, i):
@@ -135,8 +143,7 @@ def matrix_row(step: NewtonStep, team: int, i: int, row: int, member: int):
             value = free_part(value, wp.where(k < driven, LANES, driven - LANES * columns))
             if row / LANES == column:
                 # the padding behind the functions carries inertia alone
-                rate = step.motion.rate[i] / step.options.dt
-                inertia = float(step.instances.mass[i] * rate * (rate + wp.float64(step.instances.mass_damping[i])))
+                inertia = inertia_of(step.instances, step.motion, step.options.dt, i)
                 for lane in range(LANES):
                     if lane == row % LANES:
                         value[lane] = value[lane] + inertia

@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from softmode.deformables.model.declare import Kernel
-from softmode.deformables.model.lane_kernels import LANES, WARP, barrier, rolled, team_sum, vec8
+from softmode.deformables.model.lane_kernels import LANES, WARP, barrier, rolled, vec8
 from softmode.deformables.model.struct_kernels import instance_end
 from softmode.deformables.solver.assembly_cpu_kernels import (
     columns_of,
@@ -26,6 +26,7 @@ from softmode.deformables.solver.assembly_kernels import (
     condensed_entry,
     contact_block,
     direction_entry,
+    inertia_of,
     matrix_row,
     pair_block,
     rigid_entry,
@@ -43,8 +44,8 @@ from softmode.deformables.solver.search_kernels import (
     check_convergence,
     check_trial,
     move_functions,
-    potential_share,
     start_line_search,
+    world_potential,
 )
 from softmode.deformables.solver.step_kernels import (
     evaluate_constraint,
@@ -100,7 +101,6 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
         w, member = wp.tid()
         if wp.static(dynamic > 0):
             _room = wp.tile_empty(shape=wp.static(dynamic), dtype=float, storage="shared")
-        dt = step.options.dt
         begin = step.state.instance_start[w]
         end = instance_end(step.instances, step.state.instance_start, w)
         blocks = step.basis.row.shape[1]
@@ -144,21 +144,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
             for k in range(member, step.rigid.row_count[w], team):
                 evaluate_row(step, step.state.active, r, found, w, k)
             barrier()
-            share = potential_share(
-                step.instances,
-                step.motion,
-                step.points,
-                step.constraints,
-                step.rigid,
-                step.state.instance_start,
-                dt,
-                q,
-                r,
-                w,
-                member,
-                team,
-            )
-            potential = team_sum(share)
+            potential = world_potential(step, q, r, w, member, team)
             if trial == 0:
                 for i in range(begin, end):
                     list_acting(step, team, i, member)
@@ -210,9 +196,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
                                     pair_block(step, relation, w, both, t)
                     if wp.static(shared):
                         # the padding behind the functions carries inertia alone
-                        rate = step.motion.rate[begin] / dt
-                        damping = wp.float64(step.instances.mass_damping[begin])
-                        inertia = float(step.instances.mass[begin] * rate * (rate + damping))
+                        inertia = inertia_of(step.instances, step.motion, step.options.dt, begin)
                         shared_direction(
                             inertia,
                             rigid_max,

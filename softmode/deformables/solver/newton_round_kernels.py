@@ -21,8 +21,8 @@ import warp as wp
 from softmode.deformables.materials.hessian_kernels import hessian
 from softmode.deformables.model.declare import Kernel
 from softmode.deformables.model.deformation_kernels import elastic_gradient
-from softmode.deformables.model.lane_kernels import WARP, barrier, rolled, team_sum
-from softmode.deformables.solver.assembly_kernels import stiffness_block
+from softmode.deformables.model.lane_kernels import WARP, barrier, rolled
+from softmode.deformables.solver.assembly_kernels import inertia_of, stiffness_block
 from softmode.deformables.solver.fused_system_kernels import dynamic_floats, shared_direction_of, sum_forces_of
 from softmode.deformables.solver.iteration_kernels import TRIAL, NewtonStep
 from softmode.deformables.solver.rigid_row_kernels import evaluate_row
@@ -31,8 +31,8 @@ from softmode.deformables.solver.search_kernels import (
     check_convergence,
     check_trial,
     move_functions,
-    potential_share,
     start_line_search,
+    world_potential,
 )
 from softmode.deformables.solver.step_kernels import (
     evaluate_constraint,
@@ -40,6 +40,7 @@ from softmode.deformables.solver.step_kernels import (
     gradient_block,
     list_acting,
     material_of,
+    store_hessian,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -94,11 +95,7 @@ def differentiate_points(step: NewtonStep):
         G_start = step.points.start[i, p]
     weight = s * step.basis.point_weight[point]
     C = float(weight) * hessian(parameters, G, G_start, dt, step.state.project[w])
-    for pair in range(6):
-        r = 3 * pair
-        step.points.hessian[i, pair, p] = wp.mat33(
-            C[r, 0], C[r, 1], C[r, 2], C[r + 1, 0], C[r + 1, 1], C[r + 1, 2], C[r + 2, 0], C[r + 2, 1], C[r + 2, 2]
-        )
+    store_hessian(C, i, p, step.points.hessian)
 
 
 @wp.kernel
@@ -123,7 +120,6 @@ def check_kernel(team: int) -> Kernel:
         if step.state.active[w] == 0:
             return
         i = step.state.instance_start[w]
-        dt = step.options.dt
         q = step.arrays.q_trial
         r = step.rigid.trial
         n = step.rigid.count[w]
@@ -139,21 +135,7 @@ def check_kernel(team: int) -> Kernel:
                     rolled()
                     evaluate_constraint(step, step.state.active, q, r, 1, i, e)
                 barrier()
-            share = potential_share(
-                step.instances,
-                step.motion,
-                step.points,
-                step.constraints,
-                step.rigid,
-                step.state.instance_start,
-                dt,
-                q,
-                r,
-                w,
-                member,
-                team,
-            )
-            potential = team_sum(share)
+            potential = world_potential(step, q, r, w, member, team)
             if k == 0:
                 check_trial(step, potential, w, member)
                 barrier()
@@ -223,9 +205,7 @@ def direct_kernel(size: int, width: int, team: int) -> Kernel:
             q = step.arrays.q_trial
             r = step.rigid.trial
             # the padding behind the functions carries inertia alone
-            rate = step.motion.rate[i] / step.options.dt
-            damping = wp.float64(step.instances.mass_damping[i])
-            inertia = float(step.instances.mass[i] * rate * (rate + damping))
+            inertia = inertia_of(step.instances, step.motion, step.options.dt, i)
             shared_direction(
                 inertia,
                 step.options.rigid_max,

@@ -126,6 +126,26 @@ def potential_share(
 
 
 @wp.func
+def world_potential(step: NewtonStep, q: wp.array2d[vec8d], r: wp.array2d[wp.float64], w: int, member: int, team: int):
+    """Return the incremental potential of a world at (q, r) [J] to each of its threads; every one must call it."""
+    share = potential_share(
+        step.instances,
+        step.motion,
+        step.points,
+        step.constraints,
+        step.rigid,
+        step.state.instance_start,
+        step.options.dt,
+        q,
+        r,
+        w,
+        member,
+        team,
+    )
+    return team_sum(share)
+
+
+@wp.func
 def rigid_excess(
     instances: Instances,
     constraints: PointConstraints,
@@ -271,21 +291,7 @@ def check_iterates(step: NewtonStep, team: int):
     w, member = wp.tid()
     if step.state.active[w] == 0:
         return
-    share = potential_share(
-        step.instances,
-        step.motion,
-        step.points,
-        step.constraints,
-        step.rigid,
-        step.state.instance_start,
-        step.options.dt,
-        step.arrays.q,
-        step.rigid.r,
-        w,
-        member,
-        team,
-    )
-    potential = team_sum(share)
+    potential = world_potential(step, step.arrays.q, step.rigid.r, w, member, team)
     check_convergence(step, potential, team, w, member)
 
 
@@ -517,21 +523,7 @@ def check_trials(step: NewtonStep, team: int):
     w, member = wp.tid()
     if step.state.searching[w] == 0:
         return
-    share = potential_share(
-        step.instances,
-        step.motion,
-        step.points,
-        step.constraints,
-        step.rigid,
-        step.state.instance_start,
-        step.options.dt,
-        step.arrays.q_trial,
-        step.rigid.trial,
-        w,
-        member,
-        team,
-    )
-    trial = team_sum(share)
+    trial = world_potential(step, step.arrays.q_trial, step.rigid.trial, w, member, team)
     check_trial(step, trial, w, member)
 
 

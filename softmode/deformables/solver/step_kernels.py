@@ -18,6 +18,8 @@ In a step of implicit Euler q_inertial and the velocity at the end turn with the
 Precision: basis data float32; q, energy and residual float64; the Newton direction float32.
 """
 
+from typing import Any
+
 import warp as wp
 
 from softmode.deformables.contact.penalty_kernels import contact_potential, slip_potential
@@ -331,6 +333,16 @@ def material_of(instances: Instances, basis: Basis, i: int, point: int):
 
 
 @wp.func
+def store_hessian(C: Any, i: int, p: int, hessian_out: wp.array3d[wp.mat33]):
+    """Store the blocks of the Hessian of a point, see ``Points.hessian``."""
+    for pair in range(6):
+        r = 3 * pair
+        hessian_out[i, pair, p] = wp.mat33(
+            C[r, 0], C[r, 1], C[r, 2], C[r + 1, 0], C[r + 1, 1], C[r + 1, 2], C[r + 2, 0], C[r + 2, 1], C[r + 2, 2]
+        )
+
+
+@wp.func
 def evaluate_point(
     step: NewtonStep,
     # State in:
@@ -366,11 +378,7 @@ def evaluate_point(
         step.points.volume_ratio[i, p] = float(wp.float64(1.0) + determinant_minus_one(G))
     if derivatives == ALL and step.state.refresh[w] != 0:
         C = float(weight) * hessian(parameters, G, G_start, dt, step.state.project[w])
-        for pair in range(6):
-            r = 3 * pair
-            step.points.hessian[i, pair, p] = wp.mat33(
-                C[r, 0], C[r, 1], C[r, 2], C[r + 1, 0], C[r + 1, 1], C[r + 1, 2], C[r + 2, 0], C[r + 2, 1], C[r + 2, 2]
-            )
+        store_hessian(C, i, p, step.points.hessian)
 
 
 evaluate_points = kernel_over(evaluate_point, "evaluate_points", "i", "p")

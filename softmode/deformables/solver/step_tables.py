@@ -258,9 +258,7 @@ def allocate_tables(
 
     def chunks(threads: int, tasks: int) -> int:
         """Return into how many parts sums over points are split where a kernel has so many threads, a body tasks."""
-        if not device.is_cuda:
-            return 1
-        if rounds:
+        if rounds or not device.is_cuda:
             return 1
         return int(np.clip(world_team // tasks if one_launch else CUDA_THREADS // threads, 1, 64 if few else 16))
 
