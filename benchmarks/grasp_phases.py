@@ -3,7 +3,8 @@
 Run: ``python benchmarks/grasp_phases.py --device cuda:0`` or, on one core, ``python benchmarks/grasp_phases.py``. Two
 versions of softmode compare with the same script: ``PYTHONPATH=<the other tree> python benchmarks/grasp_phases.py``.
 
-Protocol of ``benchmarks/envs.py --actions grasp``: LiftSoft with states, 4 steps of 1/120 s per control step. The rate
+Protocol of ``benchmarks/envs.py --actions grasp``: LiftSoft with states, 4 steps of 1/120 s per control step;
+``--actions random`` for comparison. The rate
 is of replayed graphs, by the wall clock on CUDA and by processor time on CPU. Iterations are those of the last step of
 each control step. Kernels are then timed in one control step launched eagerly, by CUDA events or processor time, so
 their sum is more than a replayed step takes.
@@ -41,6 +42,7 @@ def main() -> None:
     parser.add_argument("--presets", nargs="+", default=["plush", "beam"], help="plush is the default object")
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--warmup", type=int, default=100)
+    parser.add_argument("--actions", choices=("random", "grasp"), default="grasp")
     parser.add_argument("--poissons-ratio", type=float, nargs=2, default=None, help="range drawn from per world")
     parser.add_argument("--kernels", type=int, default=12, help="kernels to print, the slowest first; 0 for none")
     options = parser.parse_args()
@@ -64,7 +66,7 @@ def report(preset: str, count: int, device: wp.Device, options: argparse.Namespa
     env: Any = gym.make_vec(ENVIRONMENT, num_envs=count, device=options.device, **given)
     made = time.perf_counter() - clock
     tables = env.task.scene.solver.reduced.tables
-    source = _Source(env, "grasp", 0)
+    source = _Source(env, options.actions, 0)
     env.reset(seed=0)
     for step in range(options.warmup):
         env.step(source(step))
