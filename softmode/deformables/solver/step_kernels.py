@@ -34,7 +34,7 @@ from softmode.deformables.materials.material_kernels import (
 )
 from softmode.deformables.model.declare import kernel_over
 from softmode.deformables.model.deformation_kernels import elastic_gradient
-from softmode.deformables.model.lane_kernels import LANES, team_rank, team_sum, vec8d
+from softmode.deformables.model.lane_kernels import LANES, team_rank, team_sum, team_sum3, vec8d
 from softmode.deformables.model.status import (
     PARAMETER_BITS,
     WORLD_COLLAPSED,
@@ -48,6 +48,7 @@ from softmode.deformables.model.struct_kernels import (
     blocks_of,
     has_contacts,
     in_mask,
+    instance_end,
     interpolate_change,
     p_wave_modulus,
     pushes,
@@ -143,7 +144,7 @@ def begin_step(
     qd_in: wp.array[wp.vec3d],  # (function_total,) [m/s]
     q_before: wp.array[wp.vec3d],  # q_(n-1)
     qd_before: wp.array[wp.vec3d],  # v_(n-1)
-    dt_before: wp.array[wp.float64],  # (instance_count,) [s], 0 where there was no step before
+    dt_before: wp.array[wp.float64],  # (instance_count,) [s], 0: there was no step before, below 0: it was near a shape
     q_driven: wp.array[wp.vec3d],  # (function_total,), where the driven functions are to be at the end of the step
     density: wp.array[float],  # (instance_count,) [kg/m^3], as the model has them, which may not be in use yet
     scale: wp.array[float],
@@ -165,6 +166,7 @@ def begin_step(
     first = step.instances.function_start[i] + LANES * b
     driven = step.instances.driven_count[i] - LANES * b
     again = wp.abs(dt_before[i] - dt) < wp.float64(1.0e-6) * dt
+    touched = wp.abs(dt_before[i] + dt) < wp.float64(1.0e-6) * dt
     c = wp.float64(1.0)
     if again and bdf2 != 0:
         c = wp.float64(1.5)
@@ -190,7 +192,7 @@ def begin_step(
                     q_rate[lane] += third * (q[lane] - q_before[first + lane][axis])
                     qd_rate[lane] += third * (qd[lane] - qd_before[first + lane][axis])
                 start[lane] = q[lane] + ahead * dt * qd[lane]
-                if again:
+                if again or touched:
                     change[lane] = ahead * dt * (qd[lane] - qd_before[first + lane][axis])
                 if lane < driven:
                     start[lane] = q_driven[first + lane][axis]
@@ -204,6 +206,8 @@ def begin_step(
         step.motion.change[i, e] = change
         step.arrays.q[i, e] = start
     step.motion.rate[i] = c
+    if b == 0:
+        step.motion.touched[i] = int(touched)
     if c == wp.float64(1.0) and spin.turns[i] != 0:
         rest, one = rest_block(step.basis, step.instances.asset[i], b)
         turned, r = turned_block(spin, i, unknown_block(step.motion.q_start, i, b), rest, one)
@@ -212,6 +216,8 @@ def begin_step(
         outward = ahead * (spin.centrifugal[i] * r)
         begin = turned + ahead * (target - turned) - outward
         onward = mat38d()
+        if touched:
+            onward = unknown_block(step.motion.change, i, b)
         if again:
             gain = wp.outer(ahead * dt * spin.gain[i], one)
             onward = gain + spin.onward[i] * (unknown_block(step.motion.change, i, b) - gain) + outward
@@ -287,25 +293,50 @@ def begin_newton(step: NewtonStep):
 
 
 @wp.kernel
-def extrapolate(step: NewtonStep):
-    """Let a body that touches nothing start Newton with the acceleration of the step before as well.
+def start_iterates(step: NewtonStep, team: int):
+    """Place the first iterate of every world by what the step before has shown of its motion.
 
-    Only where velocities change by less than half in a step: a jerky motion would be thrown from one valley of the
-    potential into another, step by step. And not a body so stiff that a step's rotation meets little else than its
+    It stands at the motion that goes on. A body that touches nothing is given the acceleration of the step before as
+    well. Only where velocities change by less than half in a step: a jerky motion would be thrown from one valley of
+    the potential into another, step by step. And not a body so stiff that a step's rotation meets little else than its
     inertia: there a start up the elastic valley costs more iterations than it saves.
+
+    A body that chatters between sticking and slipping does not go on as it moved. So bodies in contact, and the joints
+    with them, start with the share of the motion that would have been right in the step before, between 0 and 1.
     """
+    w, member = wp.tid()
+    zero = wp.float64(0.0)
     dt = step.options.dt
-    i, e = wp.tid()
-    if has_contacts(step.instances, step.constraints, i):
+    along = zero
+    before = zero
+    for i in range(step.state.instance_start[w], instance_end(step.instances, step.state.instance_start, w)):
+        touches = has_contacts(step.instances, step.constraints, i)
+        sums = wp.vec3d()
+        for e in range(member, step.arrays.q.shape[1], team):
+            moved = dt * step.motion.qd_start[i, e]
+            change = step.motion.change[i, e]
+            sums += wp.vec3d(wp.dot(moved, moved), wp.dot(moved, change), wp.dot(change, change))
+        sums = team_sum3(sums)
+        if touches:
+            # moved - change is where the step before started from
+            along += step.instances.mass[i] * (sums[0] - sums[1])
+            before += step.instances.mass[i] * (sums[0] - wp.float64(2.0) * sums[1] + sums[2])
+        else:
+            inertia = wp.float64(step.instances.inertia[i]) / (dt * dt * wp.float64(step.instances.youngs_modulus[i]))
+            free = step.motion.touched[i] == 0 and inertia > EXTRAPOLATION_INERTIA
+            if free and sums[2] < wp.float64(0.25) * sums[0]:
+                for e in range(member, step.arrays.q.shape[1], team):
+                    step.arrays.q[i, e] = step.arrays.q[i, e] + step.motion.change[i, e]
+    if not (along < before):
         return
-    change = wp.float64(0.0)
-    moved = wp.float64(0.0)
-    for k in range(step.arrays.q.shape[1]):
-        change += wp.dot(step.motion.change[i, k], step.motion.change[i, k])
-        moved += wp.dot(step.motion.qd_start[i, k], step.motion.qd_start[i, k])
-    inertia = wp.float64(step.instances.inertia[i]) / (dt * dt * wp.float64(step.instances.youngs_modulus[i]))
-    if inertia > EXTRAPOLATION_INERTIA and change < wp.float64(0.25) * dt * dt * moved:
-        step.arrays.q[i, e] = step.arrays.q[i, e] + step.motion.change[i, e]
+    share = wp.max(along, zero) / before
+    for i in range(step.state.instance_start[w], instance_end(step.instances, step.state.instance_start, w)):
+        if has_contacts(step.instances, step.constraints, i) and step.instances.driven_count[i] == 0:
+            for e in range(member, step.arrays.q.shape[1], team):
+                start = step.motion.q_start[i, e]
+                step.arrays.q[i, e] = start + share * (step.arrays.q[i, e] - start)
+    for j in range(member, step.rigid.count[w], team):
+        step.rigid.r[w, j] = share * step.rigid.r[w, j]
 
 
 @wp.kernel
@@ -385,6 +416,43 @@ evaluate_points = kernel_over(evaluate_point, "evaluate_points", "i", "p")
 
 
 @wp.func
+def displacement_of(
+    instances: Instances,
+    basis: Basis,
+    constraints: PointConstraints,
+    q_start: wp.array2d[vec8d],
+    # State in:
+    q: wp.array2d[vec8d],
+    r: wp.array2d[wp.float64],
+    i: int,
+    e: int,
+):
+    """Return d = sum_k b_k (q_k - q_nk) - J r of a constraint, less that of a soft partner."""
+    d = interpolate_change(basis.row, constraints.row[i, e], q, q_start, i, instances.function_count[i])
+    if e >= constraints.count[i] - constraints.pair_count[i]:
+        j = constraints.partner[i, e]
+        if j >= 0:
+            row = constraints.partner_row[i, e]
+            d -= interpolate_change(basis.row, row, q, q_start, j, instances.function_count[j])
+    for k in range(constraints.dof_begin[i, e], constraints.dof_end[i, e]):
+        d -= r[instances.world[i], k] * wp.vec3d(constraints.jacobian[i, e, k])
+    return d
+
+
+@wp.func
+def pair_share(instances: Instances, constraints: PointConstraints, i: int, e: int):
+    """Return the range of the onset of a contact [m], and which share of its energy is that of this constraint."""
+    smoothing = instances.smoothing[i]
+    share = wp.float64(1.0)
+    if e >= constraints.count[i] - constraints.pair_count[i]:
+        j = constraints.partner[i, e]
+        if j >= 0:
+            smoothing = wp.min(smoothing, instances.smoothing[j])
+            share = wp.float64(0.5)
+    return smoothing, share
+
+
+@wp.func
 def evaluate_constraint(
     step: NewtonStep,
     # State in:
@@ -402,26 +470,11 @@ def evaluate_constraint(
     w = step.instances.world[i]
     if selected[w] == 0 or e >= step.constraints.count[i]:
         return
-    row = step.constraints.row[i, e]
-    known = derivatives != 0 and step.state.evaluated[w] != 0
     d = step.constraints.displacement[i, e]
-    if not known:
-        d = interpolate_change(step.basis.row, row, q, step.motion.q_start, i, step.instances.function_count[i])
-    smoothing = step.instances.smoothing[i]
-    share = wp.float64(1.0)
-    if e >= step.constraints.count[i] - step.constraints.pair_count[i]:
-        j = step.constraints.partner[i, e]
-        if j >= 0:
-            if not known:
-                row = step.constraints.partner_row[i, e]
-                count = step.instances.function_count[j]
-                d -= interpolate_change(step.basis.row, row, q, step.motion.q_start, j, count)
-            smoothing = wp.min(smoothing, step.instances.smoothing[j])
-            share = wp.float64(0.5)
-    if not known:
-        for k in range(step.constraints.dof_begin[i, e], step.constraints.dof_end[i, e]):
-            d -= r[w, k] * wp.vec3d(step.constraints.jacobian[i, e, k])
+    if derivatives == 0 or step.state.evaluated[w] == 0:
+        d = displacement_of(step.instances, step.basis, step.constraints, step.motion.q_start, q, r, i, e)
         step.constraints.displacement[i, e] = d
+    smoothing, share = pair_share(step.instances, step.constraints, i, e)
     stiffness = step.constraints.stiffness[i, e]
     identity = wp.identity(n=3, dtype=wp.float64)
     H = stiffness * identity
