@@ -10,7 +10,7 @@ start and its value at the end.
 import warp as wp
 
 from softmode.deformables.contact.penalty_kernels import contact_potential, slip_potential
-from softmode.deformables.model.lane_kernels import rolled, team_sum, team_sum3
+from softmode.deformables.model.lane_kernels import rolled, team_sum3
 from softmode.deformables.model.struct_kernels import Instances, PointConstraints, instance_end
 from softmode.deformables.solver.iteration_kernels import NewtonStep
 from softmode.deformables.solver.step_kernels import displacement_of, pair_share
@@ -56,49 +56,50 @@ def shorten_step(step: NewtonStep, trial: wp.float64, team: int, w: int, member:
         return
     begin = step.state.instance_start[w]
     end = instance_end(step.instances, step.state.instance_start, w)
-    range_ = step.options.stick_range
-    sums = wp.vec3d()
-    for i in range(begin, end):
-        rolled()
-        for e in range(member, step.constraints.count[i], team):
-            rolled()
-            d = displacement_of(
-                step.instances,
-                step.basis,
-                step.constraints,
-                step.motion.q_start,
-                step.arrays.q,
-                step.rigid.r,
-                i,
-                e,
-            )
-            # room until the shorter step is evaluated
-            step.constraints.slip[i, e] = d
-            far = step.constraints.displacement[i, e]
-            energy, force = constraint_at(step.instances, step.constraints, range_, d, i, e)
-            energy_far, _force = constraint_at(step.instances, step.constraints, range_, far, i, e)
-            sums += wp.vec3d(energy, energy_far, -wp.dot(force, far - d))
-    sums = team_sum3(sums)
-    steepness = step.state.slope[w] - sums[2]
-    bend = trial - sums[1] - step.state.potential[w] + sums[0] - steepness
+    steepness = step.state.slope[w]
+    bend = trial - step.state.potential[w] - steepness
+    alpha = wp.float64(0.0)
     low = wp.float64(0.0)
     high = wp.float64(1.0)
-    for _k in range(BISECTIONS):
+    # one copy of this code serves the start of the step, its end, and the lengths between
+    for k in range(BISECTIONS + 2):
         rolled()
-        alpha = wp.float64(0.5) * (low + high)
-        share = wp.float64(0.0)
+        sums = wp.vec3d()
         for i in range(begin, end):
             rolled()
             for e in range(member, step.constraints.count[i], team):
                 rolled()
+                if k == 0:
+                    # room for it until the shorter step is evaluated
+                    step.constraints.slip[i, e] = displacement_of(
+                        step.instances,
+                        step.basis,
+                        step.constraints,
+                        step.motion.q_start,
+                        step.arrays.q,
+                        step.rigid.r,
+                        i,
+                        e,
+                    )
                 d = step.constraints.slip[i, e]
                 way = step.constraints.displacement[i, e] - d
-                _energy, force = constraint_at(step.instances, step.constraints, range_, d + alpha * way, i, e)
-                share -= wp.dot(force, way)
-        slope = team_sum(share) + steepness + wp.float64(2.0) * alpha * bend
-        if slope < wp.float64(0.0):
-            low = alpha
+                energy, force = constraint_at(
+                    step.instances, step.constraints, step.options.stick_range, d + alpha * way, i, e
+                )
+                sums += wp.vec3d(energy, -wp.dot(force, way), wp.float64(0.0))
+        sums = team_sum3(sums)
+        if k == 0:
+            # of the potential without the constraints: its slope at the start, and half of its second derivative
+            steepness -= sums[1]
+            bend += sums[0] + sums[1]
+            alpha = high
         else:
-            high = alpha
+            if k == 1:
+                bend -= sums[0]
+            elif sums[1] + steepness + wp.float64(2.0) * alpha * bend < wp.float64(0.0):
+                low = alpha
+            else:
+                high = alpha
+            alpha = wp.float64(0.5) * (low + high)
     if member == 0 and wp.isfinite(bend):
-        step.state.step_length[w] = wp.float64(0.5) * (low + high)
+        step.state.step_length[w] = alpha
