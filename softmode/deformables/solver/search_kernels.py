@@ -481,9 +481,9 @@ def rounding_of(instances: Instances, instance_start: wp.array[int], potential: 
 def check_trial(step: NewtonStep, trial: wp.float64, w: int, member: int):
     """Accept a trial that lowers the potential enough (Armijo, up to rounding) or halve the step; give up if short.
 
-    The first shorter step is found by ``length_kernels.shorten_step``. Where a full step has lowered it by more than a quadratic would have, take the better of that and twice the step.
-    That helps in the onset of contact, from the first iterations on until it does not; friction that gives way looks
-    the same.
+    The first shorter step is found by ``length_kernels.shorten_step``. Where a full step has lowered the potential by
+    more than a quadratic would have, take the better of that and twice the step. That helps in the onset of contact,
+    from the first iterations on until it does not; friction that gives way looks the same.
     What has been evaluated of an accepted trial serves the next iteration.
     """
     if member != 0:
