@@ -4,10 +4,9 @@ Run: ``python benchmarks/grasp_phases.py --device cuda:0`` or, on one core, ``py
 versions of softmode compare with the same script: ``PYTHONPATH=<the other tree> python benchmarks/grasp_phases.py``.
 
 Protocol of ``benchmarks/envs.py --actions grasp``: LiftSoft with states, 4 steps of 1/120 s per control step;
-``--actions random`` for comparison. The rate
-is of replayed graphs, by the wall clock on CUDA and by processor time on CPU. Iterations are those of the last step of
-each control step. Kernels are then timed in one control step launched eagerly, by CUDA events or processor time, so
-their sum is more than a replayed step takes.
+``--actions random`` for comparison. The rate is of replayed graphs, by the wall clock on CUDA and by processor time on CPU. Iterations are those of the last step of
+each control step. Kernels are then timed in control steps launched eagerly, by CUDA events or processor time, so their
+sum is more than a replayed step takes.
 """
 
 from __future__ import annotations
@@ -44,6 +43,7 @@ def main() -> None:
     parser.add_argument("--warmup", type=int, default=100)
     parser.add_argument("--actions", choices=("random", "grasp"), default="grasp")
     parser.add_argument("--poissons-ratio", type=float, nargs=2, default=None, help="range drawn from per world")
+    parser.add_argument("--kernel-steps", type=int, default=8, help="control steps in which kernels are timed")
     parser.add_argument("--kernels", type=int, default=12, help="kernels to print, the slowest first; 0 for none")
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
@@ -96,31 +96,32 @@ def report(preset: str, count: int, device: wp.Device, options: argparse.Namespa
         flush=True,
     )
     if options.kernels:
-        times = time_kernels(env.task.scene, device)
+        times = time_kernels(env.task.scene, device, options.kernel_steps)
         total = sum(spent for spent, _ in times.values())
-        print(f"  eager control step: {total:.2f} ms in {sum(n for _, n in times.values())} launches")
+        print(f"  eager control step: {total:.2f} ms in {sum(n for _, n in times.values()):.0f} launches")
         for name in sorted(times, key=lambda name: -times[name][0])[: options.kernels]:
             spent, launches = times[name]
-            print(f"  {spent:9.3f} ms {spent / total:6.1%} {launches:5d} x  {name}")
+            print(f"  {spent:9.3f} ms {spent / total:6.1%} {launches:7.1f} x  {name}")
     env.close()
 
 
-def time_kernels(scene: Any, device: wp.Device) -> dict[str, tuple[float, int]]:
-    """Return time [ms] and launches of every kernel in an eager control step."""
+def time_kernels(scene: Any, device: wp.Device, steps: int) -> dict[str, tuple[float, float]]:
+    """Return time [ms] and launches of every kernel in an eager control step, the mean of several."""
     spent: dict[str, float] = defaultdict(float)
     launches: dict[str, int] = defaultdict(int)
     scene.control_step()
-    if device.is_cuda:
-        wp.timing_begin(cuda_filter=wp.TIMING_ALL, synchronize=True)
-        scene.control_step()
-        for result in wp.timing_end(synchronize=True):
-            name = re.sub(r"_[0-9a-f]{8}_cuda_kernel_forward|^forward kernel ", "", result.name)
-            spent[name] += result.elapsed
-            launches[name] += 1
-    else:
-        with timed_launches(spent, launches):
+    for _ in range(steps):
+        if device.is_cuda:
+            wp.timing_begin(cuda_filter=wp.TIMING_ALL, synchronize=True)
             scene.control_step()
-    return {name: (spent[name], launches[name]) for name in spent}
+            for result in wp.timing_end(synchronize=True):
+                name = re.sub(r"_[0-9a-f]{8}_cuda_kernel_forward|^forward kernel ", "", result.name)
+                spent[name] += result.elapsed
+                launches[name] += 1
+        else:
+            with timed_launches(spent, launches):
+                scene.control_step()
+    return {name: (spent[name] / steps, launches[name] / steps) for name in spent}
 
 
 @contextmanager
