@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from softmode.deformables.contact.penalty_kernels import contact_potential, slip_potential
-from softmode.deformables.model.lane_kernels import rolled, team_sum, team_sum3, team_sum33, vec8d
+from softmode.deformables.model.lane_kernels import team_sum, team_sum3, team_sum33, vec8d
 from softmode.deformables.model.struct_kernels import (
     Instances,
     PointConstraints,
@@ -41,9 +41,7 @@ IMPACT_MOTION = wp.constant(wp.float64(0.02))
 """Least motion of a step, over the size of the body (rms), for which a start is looked for: slower ones do well."""
 ITERATIONS = 20
 """Steps of the rigid body at most."""
-NINE = 9
-"""Lengths of a step that are tried at a time."""
-HALVINGS = 18
+HALVINGS = 16
 """Lengths of such a step that are tried: out of contact it would go centimetres, and what stops it sets in within the
 range of the onset, a thousandth of the body."""
 GAIN_LEAST = wp.constant(wp.float64(1.0e-3))
@@ -146,20 +144,29 @@ def rigid_share(weight: wp.float64, away: wp.vec3d, C: wp.mat33d, t: wp.vec3d, R
 
 
 @wp.func
-def contact_share(
-    step: NewtonStep, samples: Samples, i: int, X: wp.vec3d, t: wp.vec3d, R: wp.mat33d, member: int, team: int
+def rigid_potential(
+    step: NewtonStep,
+    samples: Samples,
+    i: int,
+    X: wp.vec3d,
+    away: wp.vec3d,
+    C: wp.mat33d,
+    t: wp.vec3d,
+    R: wp.mat33d,
+    member: int,
+    team: int,
 ):
-    """Return one thread's share of the energy of the contacts after the motion by t and R [J]."""
+    """Return the potential of the motion by t and R [J], with away = X - X* and C = sum (m/dt^2 r* + f) r^T."""
     share = wp.float64(0.0)
     for e in range(member, step.constraints.count[i] - step.constraints.pair_count[i], team):
-        rolled()
         r = contact_arm(step.instances, step.constraints, step.rigid, samples, X, i, e)
         total = step.constraints.offset[i, e] + step.constraints.displacement[i, e]
         value, _f, _H = contact_at(
             step.constraints, step.instances.smoothing[i], step.options.stick_range, total + t + R * r - r, i, e, 0
         )
         share += value
-    return share
+    weight = step.instances.mass[i] / (step.options.dt * step.options.dt)
+    return team_sum(share) + rigid_share(weight, away, C, t, R)
 
 
 @wp.kernel
@@ -209,8 +216,6 @@ def start_rigidly(step: NewtonStep, samples: Samples, team: int):
         C += (weight * aim + unknown_block(step.motion.force, i, b)) * wp.transpose(arms)
     C = team_sum33(C)
 
-    nine = int(NINE)
-    parts = int(wp.static(HALVINGS // NINE))
     t = wp.vec3d()
     R = wp.identity(n=3, dtype=wp.float64)
     for _k in range(ITERATIONS):
@@ -259,34 +264,16 @@ def start_rigidly(step: NewtonStep, samples: Samples, team: int):
         x = solve_six(H, g)
         alpha = wp.float64(1.0)
         before = potential
-        found = int(0)
-        for _part in range(parts):
-            rolled()
-            if found == 0:
-                # nine lengths for one sum over the team
-                shares = wp.mat33d()
-                length = alpha
-                for k in range(nine):
-                    rolled()
-                    shift = t + length * wp.vec3d(x[0], x[1], x[2])
-                    turned = rotation_of(length * wp.vec3d(x[3], x[4], x[5])) * R
-                    shares[k / 3, k % 3] = contact_share(step, samples, i, X, shift, turned, member, team)
-                    length *= wp.float64(0.5)
-                shares = team_sum33(shares)
-                start = t
-                base = R
-                for k in range(nine):
-                    rolled()
-                    if found == 0:
-                        shift = start + alpha * wp.vec3d(x[0], x[1], x[2])
-                        turned = rotation_of(alpha * wp.vec3d(x[3], x[4], x[5])) * base
-                        value = shares[k / 3, k % 3] + rigid_share(weight, away, C, shift, turned)
-                        if value < potential:
-                            potential = value
-                            t = shift
-                            R = turned
-                            found = int(1)
-                    alpha *= wp.float64(0.5)
+        for _trial in range(HALVINGS):
+            shift = t + alpha * wp.vec3d(x[0], x[1], x[2])
+            turned = rotation_of(alpha * wp.vec3d(x[3], x[4], x[5])) * R
+            value = rigid_potential(step, samples, i, X, away, C, shift, turned, member, team)
+            if value < potential:
+                potential = value
+                t = shift
+                R = turned
+                break
+            alpha *= wp.float64(0.5)
         promised = wp.float64(-0.5) * wp.dot(g, x)
         if not (promised > GAIN_LEAST * wp.abs(potential) and before > potential):
             break
