@@ -17,7 +17,7 @@ from softmode.deformables.body.rkpm import sample_farthest
 from softmode.deformables.build.build_body import Progress
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model import status as bits
-from softmode.deformables.model.compile_ahead import compile_launches
+from softmode.deformables.model.compile_ahead import compile_launches, compiling_aside
 from softmode.deformables.model.structs import filled
 from softmode.deformables.solver.parameters import set_parameters
 from softmode.envs import task_kernels as kernels
@@ -149,17 +149,27 @@ class Task:
             cameras += self.render_cameras()  # for recorders, in fixed places
         labelled = "segmentation" in config.image_outputs
         options = CameraOptions(mesh_samples=config.mesh_samples, segmentation=labelled)
-        self.scene = TableScene(
-            self.scene_config(),
-            world_count=world_count,
-            cameras=cameras,
-            film=self.render_cameras() if render else (),
-            camera_options=options,
-            camera_randomization=config.camera_randomization,
-            marker=self.marker() if cameras else None,
-            device=device,
-            progress=progress,
-        )
+        with compiling_aside(device):
+            self.scene = TableScene(
+                self.scene_config(),
+                world_count=world_count,
+                cameras=cameras,
+                film=self.render_cameras() if render else (),
+                camera_options=options,
+                camera_randomization=config.camera_randomization,
+                marker=self.marker() if cameras else None,
+                device=device,
+                progress=progress,
+            )
+            self._lay_out()
+            compile_launches(self._launches, self.device)
+        self.reset()
+        self.graph = capture_graph(self._step, self.device)
+        """The step as a captured graph."""
+
+    def _lay_out(self) -> None:
+        """Lay out observations and parameters, and allocate what a step writes."""
+        config, world_count = self.config, self.world_count
         self._follow = FollowCamera(self.render_cameras()[0], world_count)
         self.device = self.scene.device
         self._check_objects()
@@ -195,10 +205,6 @@ class Task:
             }
             self.plan = filled(self.kernels.Plan, self, config, config.scene.control, self.scene.soft, **columns)
             """What the task's own kernels know beside the state."""
-        compile_launches(self._launches, self.device)
-        self.reset()
-        self.graph = capture_graph(self._step, self.device)
-        """The step as a captured graph."""
 
     @property
     def member_names(self) -> tuple[str, ...]:
@@ -716,9 +722,8 @@ class Task:
         self.draw_pictures()
 
     def _launches(self) -> None:
-        """Launch what a step launches, for the kernels to be compiled: all of them, so that none is compiled twice."""
+        """Launch what a step launches beside the scene's, whose kernels the scene began to compile itself."""
         self.before_step()
-        self.scene.control_step()
         self.write_observation()
         self.finish(self.never)
         self.clear()

@@ -11,11 +11,11 @@ from newton.solvers import SolverMuJoCo
 from numpy.typing import NDArray
 
 from softmode.checks import require_number
-from softmode.deformables.coupling.rigid_solver import mujoco_warnings
+from softmode.deformables.coupling.rigid_solver import RigidSolver, mujoco_warnings
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import register_custom_attributes, reserve_room
-from softmode.deformables.model.compile_ahead import compile_for_building, compiling_aside
+from softmode.deformables.model.compile_ahead import begin_compiling, compile_for_building, compiling_aside
 from softmode.deformables.model.declare import launch
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.body_choice import BodyChoice, copy_slots
@@ -137,10 +137,11 @@ class TableScene:
         self.device = wp.get_device(device)
         self.dt = 1.0 / (config.control_hz * config.substeps)
         self._load(progress)
-        compile_for_building(self.device, control_kernels, kernels)
         with compiling_aside(self.device):
+            compile_for_building(self.device, control_kernels, kernels)
             self._build_model()
             self._build_solver()
+            begin_compiling(self.control_step, self.device)
         self.marker_place = wp.zeros(world_count, dtype=wp.transform, device=self.device)
         """Where the marker is drawn, transform, shape (world_count,)."""
         self.marker_place.fill_(wp.transform_identity())
@@ -313,7 +314,7 @@ class TableScene:
         """Make the coupled solver, the controller and the buffers of a control step."""
         config, model, worlds = self.config, self.model, self.world_count
         with mujoco_warnings():
-            rigid = SolverMuJoCo(model, njmax=config.constraint_max, nconmax=config.rigid_contact_max)
+            rigid = RigidSolver(model, njmax=config.constraint_max, nconmax=config.rigid_contact_max)
         found = {id(thing.body): thing.body for thing in (*self.members, *self.objects)}
         distinct = list(found.values())
         self.solver = SolverCoupledReduced(model, distinct, options=config.solver, rigid=rigid)

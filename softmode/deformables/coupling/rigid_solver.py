@@ -6,7 +6,34 @@ from collections.abc import Callable, Generator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
+import newton
 from newton.solvers import SolverMuJoCo
+
+from softmode.deformables.model.compile_ahead import begin_compiling
+
+
+class RigidSolver(SolverMuJoCo):
+    """``SolverMuJoCo`` whose kernels begin to be compiled while it is built, as soon as MuJoCo's model is there.
+
+    Newton launches one after another what it needs to build it. Without this, on a GPU, those kernels are compiled one
+    after another, and those of a step after them. To be built within `compile_ahead.compiling_aside`.
+    """
+
+    _begun = False
+
+    def notify_model_changed(self, flags: newton.ModelFlags | int) -> None:
+        """Update MuJoCo's model; the first time, within the constructor, begin to compile what it and a step launch."""
+        if not self._begun and not self.use_mujoco_cpu:
+            self._begun = True
+            begin_compiling(self._launches, self.model.device)
+        super().notify_model_changed(flags)
+
+    def _launches(self) -> None:
+        """Launch what completes MuJoCo's model, and a step of its own."""
+        import mujoco_warp
+
+        mujoco_warp.set_const(self.mjw_model, self.mjw_data)
+        mujoco_warp.step(self.mjw_model, self.mjw_data)
 
 
 @contextmanager

@@ -1,11 +1,19 @@
-"""Compiling the kernels of a step side by side, before it runs: one after another they take minutes on a GPU."""
+"""Compiling the kernels of a step side by side, before it runs: one after another they take minutes on a GPU.
+
+A module is compiled by one of a process's compiling threads as soon as its launch is known: at best while a scene is
+still being built. A launch waits for its own module alone. Warp's code generation holds a lock, as does the front end
+of CUDA's compiler: a tenth of the time each module takes. The rest runs side by side in threads.
+"""
 
 from __future__ import annotations
 
+import itertools
 import os
+import queue
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
 from types import ModuleType
@@ -19,13 +27,24 @@ from softmode.quiet import quieten_warp
 
 quieten_warp()
 
-Wanted = dict[tuple[wp.Module, int | None], None]
+Key = tuple[wp.Module, int | None]
+Wanted = dict[Key, None]
 """Modules with the threads of a block that they are compiled for, in order."""
 
 WORKERS = 16
 """Most modules that are compiled at a time: each takes up to 1 GB."""
 BLOCK = 256
 """Threads of a block where a launch does not say."""
+AWAITED, LONG, USUAL = range(3)
+"""Which modules are compiled first: those that a launch waits for, then those that take longest."""
+_LONGEST = (
+    "minimise_worlds",
+    "ccd_kernel_builder",
+    "newton._src.sim.articulation",
+    "softmode.robots.control_kernels",
+    "direct_worlds",
+)
+"""Parts of the names of modules that take longest to compile for a GPU, the longest first."""
 _ADJOINT_FREE = "newton._src.solvers.mujoco.kernels", "newton._src.sim.articulation", "mujoco_warp._src.set_const"
 _BUILDING = (
     *_ADJOINT_FREE,
@@ -35,15 +54,18 @@ _BUILDING = (
     "softmode.deformables.solver.step_kernels",
     "softmode.deformables.contact.friction_memory_kernels",
 )
-_BUILDING_CPU = ("softmode.deformables.solver.point_cpu_kernels",)
+_BUILDING_CUDA = (("newton._src.sim.articulation", 8),)
+"""What is launched with other blocks: Newton's forward kinematics of more than four joints."""
+_BUILDING_CPU = "softmode.deformables.solver.point_cpu_kernels", "softmode.scenes.replay_kernels"
 
 
 def compile_for_building(device: wp.DeviceLike, *others: ModuleType) -> None:
-    """Compile the kernels that a model with joints and its solvers launch while they are built, and other modules'.
+    """Begin to compile the kernels that a model with joints and its solvers launch while they are built, and others'.
 
     Some of Newton's and MuJoCo-Warp's are compiled without adjoints, half of their time, unless they are loaded
     already. Where a program of its own records them on a tape, `wp.set_module_options` brings the adjoints back;
     without them the tape's backward pass leaves these kernels out, with a warning of Warp's that names them.
+    To be called within `compiling_aside`.
 
     Args:
         device: Warp device.
@@ -55,11 +77,13 @@ def compile_for_building(device: wp.DeviceLike, *others: ModuleType) -> None:
             wp.set_module_options({"enable_backward": False}, module=sys.modules[name])
     own = wp.get_device(device)
     names = [*_BUILDING, *(_BUILDING_CPU if own.is_cpu else ()), *(other.__name__ for other in others)]
-    _load({(wp.get_module(name), None): None for name in names if name in sys.modules}, own)
+    launched = [(name, BLOCK) for name in names] + [*_BUILDING_CUDA]
+    keys = [(name, block if own.is_cuda else None) for name, block in launched if name in sys.modules]
+    _compilers(os.getpid()).begin([(wp.get_module(name), block) for name, block in dict.fromkeys(keys)], own)
 
 
-def compile_launches(launches: Callable[[], None], device: wp.DeviceLike) -> None:
-    """Compile the kernels that launches need. They do not run, but what they copy and fill is copied and filled.
+def begin_compiling(launches: Callable[[], None], device: wp.DeviceLike) -> None:
+    """Begin to compile the kernels that launches need, see `compile_launches`; to be called within `compiling_aside`.
 
     Args:
         launches: Launches, without anything that reads from the device.
@@ -67,18 +91,42 @@ def compile_launches(launches: Callable[[], None], device: wp.DeviceLike) -> Non
     """
     with _collecting(wp.get_device(device)) as wanted:
         launches()
-    _load(wanted, wp.get_device(device))
+    _compilers(os.getpid()).begin(wanted, wp.get_device(device))
+
+
+def compile_launches(launches: Callable[[], None], device: wp.DeviceLike) -> None:
+    """Compile the kernels that launches need. They do not run, but what they copy and fill is copied and filled.
+
+    What is being compiled since before is waited for too.
+
+    Args:
+        launches: Launches, without anything that reads from the device.
+        device: Warp device.
+    """
+    with _collecting(wp.get_device(device)) as wanted:
+        launches()
+    compilers = _compilers(os.getpid())
+    compilers.begin(wanted, wp.get_device(device))
+    compilers.wait_for_all()
+    compilers.begin(wanted, wp.get_device(device))  # modules that got another kernel while they were compiled
+    compilers.wait_for_all()
 
 
 @contextmanager
 def compiling_aside(device: wp.DeviceLike) -> Iterator[None]:
-    """Let the threads that compile do so for launches that cannot be collected, since what they find is read between.
+    """Let launches wait for the threads that compile: for their own module, the other ones are compiled meanwhile.
 
-    The thread that launches would compile Warp's headers once more for its first module, 1.6 s on a CPU.
+    So launches that cannot be collected, since what they find is read between, do not hold up the rest. The thread that
+    launches would also compile Warp's headers once more for its first module, 1.6 s on a CPU. At the end everything is
+    compiled that was begun; after an error, nothing more is begun. One such context within another adds nothing.
 
     Args:
         device: Warp device.
     """
+    compilers = _compilers(os.getpid())
+    if compilers.aside:
+        yield
+        return
     own, seen = wp.get_device(device), set()
     before: dict[str, Any] = {name: getattr(wp, name) for name in ("launch", "launch_tiled")}
 
@@ -89,16 +137,21 @@ def compiling_aside(device: wp.DeviceLike) -> Iterator[None]:
             wanted = key not in seen and not kernel.is_generic and np.min(dim) > 0
             if wanted and wp.get_device(given.get("device")) == own:
                 seen.add(key)
-                _load({key: None}, own)
+                for done in compilers.begin([key], own, awaited=True):
+                    done.result()
             return launch(kernel, *rest, **given)
 
         return compile_and_launch
 
+    compilers.aside = True
     for name, launch in before.items():
         setattr(wp, name, compiled(launch))
     try:
         yield
+        compilers.wait_for_all()
     finally:
+        compilers.aside = False
+        compilers.drop()
         for name, launch in before.items():
             setattr(wp, name, launch)
 
@@ -155,22 +208,89 @@ def _collecting(device: wp.Device) -> Iterator[Wanted]:
     finally:
         for name in names:
             setattr(wp, name, before[name])
-    wanted |= own | others  # softmode's own first: the longest is among them
+    wanted |= own | others
 
 
-def _load(wanted: Wanted, device: wp.Device) -> None:
-    """Load modules, several at a time; Warp compiles those that its cache does not hold."""
+class _Compilers:
+    """The threads that compile in a process: always the same ones, since each compiles Warp's headers first.
 
-    def load(module: wp.Module, block_dim: int | None) -> None:
+    Args:
+        workers: How many.
+    """
+
+    def __init__(self, workers: int) -> None:
+        """Nothing is compiled yet."""
+        self.aside = False
+        """Whether launches wait for these threads."""
+        self._pool = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="compile")
+        self._waiting: queue.PriorityQueue[tuple[int, int, int]] = queue.PriorityQueue()
+        self._numbers = itertools.count()
+        self._modules: dict[int, tuple[str, wp.Module, int | None, Future[None]]] = {}
+        self._under_way: dict[tuple[str, wp.Module, int | None], tuple[int, Future[None]]] = {}
+        self._taking = threading.Lock()
+
+    def begin(self, wanted: Iterable[Key], device: wp.Device, *, awaited: bool = False) -> list[Future[None]]:
+        """Have modules loaded, which compiles those that Warp's cache does not hold; return what tells of the end.
+
+        A module that is waiting already, or being compiled, is not begun again; one that someone waits for moves up.
+        """
+        return [self._begin(module, block_dim, device.alias, awaited) for module, block_dim in wanted]
+
+    def _begin(self, module: wp.Module, block_dim: int | None, device: str, awaited: bool) -> Future[None]:
+        number, done = self._under_way.get((device, module, block_dim), (-1, None))
+        if done is None or done.done():
+            number, done = next(self._numbers), Future[None]()
+            self._under_way[device, module, block_dim] = number, done
+            self._modules[number] = device, module, block_dim, done
+        elif not awaited:
+            return done
+        length = next((k for k, name in enumerate(_LONGEST) if name in module.name), None)
+        rank = AWAITED if awaited else USUAL if length is None else LONG
+        self._waiting.put((rank, length or 0, number))
+        self._pool.submit(self._take_one)
+        return done
+
+    def wait_for_all(self) -> None:
+        """Wait until everything is compiled that was begun; raise what failed."""
+        while self._under_way:
+            _, (_, done) = self._under_way.popitem()
+            done.result()
+
+    def drop(self) -> None:
+        """Forget what waits to be compiled, and wait for what is being compiled."""
+        with self._taking:
+            for *_, done in self._modules.values():
+                done.cancel()
+            self._modules.clear()
+        wait([done for _, done in self._under_way.values() if done.running()])
+        self._under_way.clear()
+
+    def _take_one(self) -> None:
+        """Load the module that is most wanted; one that moved up was there twice."""
+        _, _, number = self._waiting.get()
+        with self._taking:
+            if number not in self._modules:
+                return
+            device, module, block_dim, done = self._modules.pop(number)
+            done.set_running_or_notify_cancel()
+        try:
+            _load(device, module, block_dim)
+        except BaseException as error:
+            done.set_exception(error)
+        else:
+            done.set_result(None)
+
+
+def _load(device: str, module: wp.Module, block_dim: int | None) -> None:
+    """Load a module. Where it gets a kernel meanwhile, Warp forgets what it was about to look up: once more then."""
+    try:
         wp.force_load(device, [module], block_dim=block_dim)
-
-    pool = _pool(os.getpid())
-    for done in [pool.submit(load, *one) for one in wanted]:
-        done.result()
+    except KeyError:
+        wp.force_load(device, [module], block_dim=block_dim)
 
 
 @cache
-def _pool(process: int) -> ThreadPoolExecutor:
-    """Return the threads that compile in a process: always the same ones, since each compiles Warp's headers first."""
+def _compilers(process: int) -> _Compilers:
+    """Return the threads that compile in a process; a forked one has none of its parent's."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return ThreadPoolExecutor(max_workers=min(cores, WORKERS), thread_name_prefix="compile")
+    return _Compilers(min(cores, WORKERS))
