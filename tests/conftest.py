@@ -86,12 +86,14 @@ _LONGEST = (
     *("test_examples.py", "documentation/test_site.py", "oracle/test_modes.py", "deformables/test_quadrature.py"),
     *("deformables/test_cut.py", "deformables/test_elastic_functions.py", "deformables/test_cubature.py"),
     *("testing/test_plugin.py", "test_cli_objects.py", "documentation/test_snippets.py", "envs/test_lift_soft.py"),
-    *("envs/test_env_state.py", "usd/test_import_scene.py", "envs/test_vector_contract.py", "mpm/test_planner.py"),
+    *("envs/test_env_state.py", "view/test_app.py", "view/test_prepare_browser.py", "envs/test_scripted.py"),
+    *("usd/test_import_scene.py", "envs/test_vector_contract.py", "mpm/test_planner.py", "view/test_session.py"),
     *("usd/test_import_newton.py", "envs/test_object_sets.py", "test_cli_body.py", "envs/test_object_resets.py"),
     *("robots/test_grasp_planner.py", "test_cli.py", "deformables/test_body_report.py", "test_cli_new.py"),
     *("usd/test_damage.py", "deformables/test_grasps.py", "mpm/test_follow.py", "viz/test_morph_film.py"),
     *("deformables/test_pairs.py", "test_packaging.py", "viz/test_rerun_logger.py", "test_quiet.py"),
-    "envs/test_robot_tasks.py",
+    *("envs/test_robot_tasks.py", "envs/test_soft_vector_env.py", "envs/test_several_objects.py"),
+    *("view/test_prepare.py", "view/test_browser.py"),
 )
 """Files that take more than 20 s, in the order in which they start, before all others: a long one that started last
 would leave the other processes waiting. The first compiles what an environment needs, the next six next to nothing, so

@@ -113,7 +113,7 @@ def solved(scene: Scene, *, one_launch: bool, shared: bool) -> dict[str, np.ndar
     tables = scene.reduced.tables
     system = tables.system
     size = (3 * tables.layout.stride, system.scalars.shape[2]) if shared else ()
-    kernel = newton_kernel(system.unit.dtype, *size)
+    kernel = newton_kernel(system.unit.dtype, *size, team=tables.world_team)  # as the solver compiles it
     scene.reduced.tables = dataclasses.replace(tables, one_launch=one_launch, shared=shared, fused_kernel=kernel)
     if scene.model.device.is_cuda:
         compile_launches(lambda: scene.step(1), scene.model.device)

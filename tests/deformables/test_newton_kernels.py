@@ -37,7 +37,7 @@ def grasp(
     reduced = scene.solver.reduced
     system = reduced.tables.system
     size = (system.size, system.scalars.shape[2]) if shared else ()
-    kernel = newton_kernel(system.unit.dtype, *size)
+    kernel = newton_kernel(system.unit.dtype, *size, team=reduced.tables.world_team)  # as the solver compiles it
     ways = {"one_launch": one_launch, "shared": shared, "rounds": rounds, "fused_kernel": kernel}
     reduced.tables = dataclasses.replace(reduced.tables, **ways)
     for step in range(32):

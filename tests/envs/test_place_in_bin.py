@@ -11,7 +11,7 @@ import pytest
 
 import softmode  # noqa: F401  (registers the environments)
 from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.model.status import WORLD_COLLAPSED, WORLD_ITERATION_LIMIT
+from softmode.deformables.model.status import WORLD_COLLAPSED, WORLD_ITERATION_LIMIT, WORLD_PENETRATION
 from softmode.envs.end_reason import EndReason
 from softmode.envs.scripted import scripted_policy
 from softmode.envs.tasks.place_in_bin.scripted import ScriptedPlace
@@ -234,13 +234,34 @@ def test_script_places_plush_toys(soft_env: MakeEnv, episode: Episodes) -> None:
     assert_success(episode(soft_env("softmode/PlaceInBin-v0", preset="plush")))
 
 
+def through_walls(env: Any, points: np.ndarray) -> bool:
+    """Return whether walls of the bin stand in an object: samples below the rim lie inside of them and beyond.
+
+    What hangs bent over a rim may do so 5 mm down.
+    """
+    task = env.task
+    over = np.abs(points[:, :2] - task.rim[:2]) - task.half
+    low = points[:, 2] < task.rim[2] - 5e-3
+    return bool((low & (over < 0.0).all(1)).any() and (low & (over > task.wall).any(1)).any())
+
+
 @pytest.mark.slow
 def test_rough_play_breaks_nothing() -> None:
-    """2,000 steps of poking into the bin and at the toy, in four worlds: finite, no overflow, only known ends."""
+    """2,000 steps of poking into the bin and at the toy, in four worlds: finite, no overflow, only known ends.
+
+    Fingers of 6 and 9 mm are driven at up to 1 m/s into toys that lie on a table and whose samples stand up to 10 mm
+    apart. A toy folds around the tip: one or two samples touch a side of the finger whose other side has their body,
+    and are brought back through it. This way, of 4 to 14 mm, is more than 5 % of the toy and sets the bit "penetration"
+    in 0.9, 1.3 and 1.2 % of the control steps (0.4, 0.5 and 0.5 % of the world steps; seeds 0, 1, 2), although half of
+    the samples are less than 0.7 mm deep in the nearest side. So the bit may come, but seldom, only while a finger
+    touches or in the control step after (0.03 s), and toys stay whole and where walls and table keep them.
+    """
     envs: Any = gym.make_vec(ENV_ID, num_envs=4)
     envs.reset(seed=0)
     scene, random = envs.task.scene, np.random.default_rng(1)
-    rows, rough = 0, WORLD_ITERATION_LIMIT | WORLD_COLLAPSED  # toys are squeezed flat between fingers and table
+    rough = WORLD_ITERATION_LIMIT | WORLD_COLLAPSED | WORLD_PENETRATION  # toys are squeezed flat on the table
+    rows, deep, let_go = 0, 0, np.zeros(4, int)
+    counts = np.cumsum([thing.body.surface_count for _ in range(4) for thing in scene.objects])
     for k in range(2000):
         if k % 15 == 0:
             at_bin = random.random((4, 1)) < 0.8
@@ -254,7 +275,15 @@ def test_rough_play_breaks_nothing() -> None:
         assert not (infos["solver_status"] & ~rough).any()
         assert set(infos["end_reason"]) <= {EndReason.RUNNING, EndReason.TIME_LIMIT, EndReason.SPILLED}
         rows = max(rows, int(scene.solver.rigid.mjw_data.nefc.numpy().max()))
+        penetrates = (infos["solver_status"] & WORLD_PENETRATION) != 0
+        deep += int(penetrates.sum())
+        let_go = np.where(scene.finger_force.numpy().any((1, 2)), 0, let_go + 1)
+        assert not (penetrates & (let_go > 1)).any()
+        points = scene.state.particle_q.numpy()
+        assert points[:, 2].min() > -5e-3
+        assert not any(through_walls(envs, x) for x in np.split(points, counts[:-1]))
     assert rows < scene.config.constraint_max
+    assert 0 < deep < 0.02 * 4 * 2000
 
 
 def test_script_needs_its_own_environment() -> None:
