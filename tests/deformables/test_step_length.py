@@ -9,20 +9,12 @@ import warp as wp
 from softmode.deformables.solver import minimise
 from softmode.deformables.solver import search_kernels as search
 from softmode.deformables.solver import step_kernels as kernels
-from softmode.deformables.solver.iteration_kernels import NewtonStep
 from softmode.deformables.solver.step_tables import StepTables
 from softmode.envs.presets import rl_scene
 from softmode.scenes.table_scene import TableScene
+from tests.deformables import probe_kernels
 
 LENGTHS = np.array([0.9, 0.75, 0.6, 0.5, 0.4, 0.3, 0.25, 0.2, 0.125, 0.0625, 0.03125, 0.015625])
-
-
-@wp.kernel(enable_backward=False)
-def sum_trials(step: NewtonStep, potential_out: wp.array[wp.float64]):
-    """Sum the potential of the trial of each world that searches."""
-    w = wp.tid()
-    if step.state.searching[w] != 0:
-        potential_out[w] = search.world_potential(step, step.arrays.q_trial, step.rigid.trial, w, 0, 1)
 
 
 def potentials_at(t: StepTables, dt: float, lengths: np.ndarray) -> np.ndarray:
@@ -33,7 +25,7 @@ def potentials_at(t: StepTables, dt: float, lengths: np.ndarray) -> np.ndarray:
     t.launch(search.trial_functions, (t.layout.instance_count, 1), step, 1)
     t.launch(search.trial_rigid, (worlds, t.rigid.count_max), step)
     minimise.evaluate_trial(t, dt)
-    t.launch(sum_trials, worlds, step, found)
+    t.launch(probe_kernels.sum_trials, worlds, step, found)
     return found.numpy()
 
 
@@ -91,7 +83,7 @@ def test_start_in_contact_is_the_share_that_was_right(gain: float, share: float)
         scene.step(np.zeros(5, np.float32))
     reduced, state = scene.solver.reduced, scene.state
     tables, own = reduced.tables, scene.state.softmode
-    velocity = np.random.default_rng(0).uniform(-0.1, 0.1, own.qd.shape + (3,))
+    velocity = np.random.default_rng(0).uniform(-0.1, 0.1, (*own.qd.shape, 3))
     own.qd_before.assign(velocity)
     own.qd.assign(gain * velocity)
     assert own.dt_before.numpy()[0] < 0.0  # the step before was one in contact
