@@ -115,7 +115,7 @@ def time_kernels(scene: Any, device: wp.Device, steps: int) -> dict[str, tuple[f
             wp.timing_begin(cuda_filter=wp.TIMING_ALL, synchronize=True)
             scene.control_step()
             for result in wp.timing_end(synchronize=True):
-                name = re.sub(r"_[0-9a-f]{8}_cuda_kernel_forward|^forward kernel ", "", result.name)
+                name = re.sub(r"_[0-9a-f]{8}(_cuda_kernel_forward)?$|^forward kernel ", "", result.name)
                 spent[name] += result.elapsed
                 launches[name] += 1
         else:

@@ -109,7 +109,7 @@ def mean_times(scene: Any, device: wp.Device, repeats: int) -> dict[str, tuple[f
     """Return time [ms] and launches of every kernel in an eager control step, means of several."""
     found: dict[str, list[tuple[float, int]]] = {}
     for _ in range(repeats):
-        for name, pair in time_kernels(scene, device).items():
+        for name, pair in time_kernels(scene, device, 1).items():
             found.setdefault(name, []).append(pair)
     return {
         name: (sum(spent for spent, _ in pairs) / repeats, sum(count for _, count in pairs) / repeats)
