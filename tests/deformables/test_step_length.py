@@ -1,4 +1,4 @@
-"""How Newton starts and how far it steps: at what contact and friction make of the motion, not by trial alone."""
+"""How far Newton steps: to where contact and friction stop the motion, not by trial alone."""
 
 import dataclasses
 
@@ -8,7 +8,6 @@ import warp as wp
 
 from softmode.deformables.solver import minimise
 from softmode.deformables.solver import search_kernels as search
-from softmode.deformables.solver import step_kernels as kernels
 from softmode.deformables.solver.step_tables import StepTables
 from softmode.envs.presets import rl_scene
 from softmode.scenes.table_scene import TableScene
@@ -73,24 +72,3 @@ def test_refused_step_goes_to_the_minimum_along_it(monkeypatch: pytest.MonkeyPat
         scene.control_step()
     assert len(shares) >= 20
     assert min(shares) > 0.8, sorted(shares)[:5]
-
-
-@pytest.mark.parametrize("gain, share", [(0.4, 0.4), (2.0, 1.0), (-0.5, 0.0)])
-def test_start_in_contact_is_the_share_that_was_right(gain: float, share: float) -> None:
-    """Velocities that became ``gain`` times as large: the first iterate goes that share of them, from none to all."""
-    scene = TableScene(rl_scene())
-    for _ in range(3):
-        scene.step(np.zeros(5, np.float32))
-    reduced, state = scene.solver.reduced, scene.state
-    tables, own = reduced.tables, scene.state.softmode
-    velocity = np.random.default_rng(0).uniform(-0.1, 0.1, (*own.qd.shape, 3))
-    own.qd_before.assign(velocity)
-    own.qd.assign(gain * velocity)
-    assert own.dt_before.numpy()[0] < 0.0  # the step before was one in contact
-    reduced.begin(state, None, scene.dt)
-    reduced.detect(state, None, scene.dt, prescribed=True)
-    assert tables.constraints.count.numpy()[0] > 0
-    q, start = tables.arrays.q.numpy().copy(), tables.step.motion.q_start.numpy()
-    tables.launch_teams(kernels.start_iterates, 1, tables.newton_step(scene.dt), tables.team)
-    np.testing.assert_allclose(tables.arrays.q.numpy(), start + share * (q - start), atol=1.0e-12)
-    assert np.abs(q - start).max() > 1.0e-5

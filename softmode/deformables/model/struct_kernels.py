@@ -92,7 +92,6 @@ class Motion:
     change: wp.array2d[vec8d]  # dt (v_n - v_(n-1)), 0 where there was no step before [m]
     force: wp.array2d[vec8d]  # gravity and external forces [N]
     rate: wp.array[wp.float64]  # (instance_count,), c: 1 implicit Euler, 3/2 BDF2
-    touched: wp.array[int]  # (instance_count,), whether the step before was one near a shape
 
 
 @struct

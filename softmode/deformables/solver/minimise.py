@@ -21,7 +21,7 @@ def minimise(tables: StepTables, dt: float) -> None:
     """Find the coordinates, and the rigid unknowns, at the end of a step of ``dt`` [s]."""
     t, worlds, step = tables, tables.layout.world_count, tables.newton_step(dt)
     t.launch(kernels.begin_newton, worlds, step)
-    t.launch_teams(kernels.start_iterates, worlds, step, t.team)
+    t.launch(kernels.extrapolate, t.unknowns, step)
     if t.model.shape_count:
         t.launch_teams(rigid_start_kernels.start_rigidly, t.layout.instance_count, step, t.samples, t.team)
     if t.options.carry_stiffness:

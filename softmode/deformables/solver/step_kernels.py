@@ -34,7 +34,7 @@ from softmode.deformables.materials.material_kernels import (
 )
 from softmode.deformables.model.declare import kernel_over
 from softmode.deformables.model.deformation_kernels import elastic_gradient
-from softmode.deformables.model.lane_kernels import LANES, team_rank, team_sum, team_sum3, vec8d
+from softmode.deformables.model.lane_kernels import LANES, team_rank, team_sum, vec8d
 from softmode.deformables.model.status import (
     PARAMETER_BITS,
     WORLD_COLLAPSED,
@@ -48,7 +48,6 @@ from softmode.deformables.model.struct_kernels import (
     blocks_of,
     has_contacts,
     in_mask,
-    instance_end,
     interpolate_change,
     p_wave_modulus,
     pushes,
@@ -144,7 +143,7 @@ def begin_step(
     qd_in: wp.array[wp.vec3d],  # (function_total,) [m/s]
     q_before: wp.array[wp.vec3d],  # q_(n-1)
     qd_before: wp.array[wp.vec3d],  # v_(n-1)
-    dt_before: wp.array[wp.float64],  # (instance_count,) [s], 0: there was no step before, below 0: it was near a shape
+    dt_before: wp.array[wp.float64],  # (instance_count,) [s], 0 where there was no step before
     q_driven: wp.array[wp.vec3d],  # (function_total,), where the driven functions are to be at the end of the step
     density: wp.array[float],  # (instance_count,) [kg/m^3], as the model has them, which may not be in use yet
     scale: wp.array[float],
@@ -166,7 +165,6 @@ def begin_step(
     first = step.instances.function_start[i] + LANES * b
     driven = step.instances.driven_count[i] - LANES * b
     again = wp.abs(dt_before[i] - dt) < wp.float64(1.0e-6) * dt
-    touched = wp.abs(dt_before[i] + dt) < wp.float64(1.0e-6) * dt
     c = wp.float64(1.0)
     if again and bdf2 != 0:
         c = wp.float64(1.5)
@@ -192,7 +190,7 @@ def begin_step(
                     q_rate[lane] += third * (q[lane] - q_before[first + lane][axis])
                     qd_rate[lane] += third * (qd[lane] - qd_before[first + lane][axis])
                 start[lane] = q[lane] + ahead * dt * qd[lane]
-                if again or touched:
+                if again:
                     change[lane] = ahead * dt * (qd[lane] - qd_before[first + lane][axis])
                 if lane < driven:
                     start[lane] = q_driven[first + lane][axis]
@@ -206,8 +204,6 @@ def begin_step(
         step.motion.change[i, e] = change
         step.arrays.q[i, e] = start
     step.motion.rate[i] = c
-    if b == 0:
-        step.motion.touched[i] = int(touched)
     if c == wp.float64(1.0) and spin.turns[i] != 0:
         rest, one = rest_block(step.basis, step.instances.asset[i], b)
         turned, r = turned_block(spin, i, unknown_block(step.motion.q_start, i, b), rest, one)
@@ -216,8 +212,6 @@ def begin_step(
         outward = ahead * (spin.centrifugal[i] * r)
         begin = turned + ahead * (target - turned) - outward
         onward = mat38d()
-        if touched:
-            onward = unknown_block(step.motion.change, i, b)
         if again:
             gain = wp.outer(ahead * dt * spin.gain[i], one)
             onward = gain + spin.onward[i] * (unknown_block(step.motion.change, i, b) - gain) + outward
@@ -293,50 +287,25 @@ def begin_newton(step: NewtonStep):
 
 
 @wp.kernel
-def start_iterates(step: NewtonStep, team: int):
-    """Place the first iterate of every world by what the step before has shown of its motion.
+def extrapolate(step: NewtonStep):
+    """Let a body that touches nothing start Newton with the acceleration of the step before as well.
 
-    It stands at the motion that goes on. A body that touches nothing is given the acceleration of the step before as
-    well. Only where velocities change by less than half in a step: a jerky motion would be thrown from one valley of
-    the potential into another, step by step. And not a body so stiff that a step's rotation meets little else than its
+    Only where velocities change by less than half in a step: a jerky motion would be thrown from one valley of the
+    potential into another, step by step. And not a body so stiff that a step's rotation meets little else than its
     inertia: there a start up the elastic valley costs more iterations than it saves.
-
-    A body that chatters between sticking and slipping does not go on as it moved. So bodies in contact, and the joints
-    with them, start with the share of the motion that would have been right in the step before, between 0 and 1.
     """
-    w, member = wp.tid()
-    zero = wp.float64(0.0)
     dt = step.options.dt
-    along = zero
-    before = zero
-    for i in range(step.state.instance_start[w], instance_end(step.instances, step.state.instance_start, w)):
-        touches = has_contacts(step.instances, step.constraints, i)
-        sums = wp.vec3d()
-        for e in range(member, step.arrays.q.shape[1], team):
-            moved = dt * step.motion.qd_start[i, e]
-            change = step.motion.change[i, e]
-            sums += wp.vec3d(wp.dot(moved, moved), wp.dot(moved, change), wp.dot(change, change))
-        sums = team_sum3(sums)
-        if touches:
-            # moved - change is where the step before started from
-            along += step.instances.mass[i] * (sums[0] - sums[1])
-            before += step.instances.mass[i] * (sums[0] - wp.float64(2.0) * sums[1] + sums[2])
-        else:
-            inertia = wp.float64(step.instances.inertia[i]) / (dt * dt * wp.float64(step.instances.youngs_modulus[i]))
-            free = step.motion.touched[i] == 0 and inertia > EXTRAPOLATION_INERTIA
-            if free and sums[2] < wp.float64(0.25) * sums[0]:
-                for e in range(member, step.arrays.q.shape[1], team):
-                    step.arrays.q[i, e] = step.arrays.q[i, e] + step.motion.change[i, e]
-    if not (along < before):
+    i, e = wp.tid()
+    if has_contacts(step.instances, step.constraints, i):
         return
-    share = wp.max(along, zero) / before
-    for i in range(step.state.instance_start[w], instance_end(step.instances, step.state.instance_start, w)):
-        if has_contacts(step.instances, step.constraints, i) and step.instances.driven_count[i] == 0:
-            for e in range(member, step.arrays.q.shape[1], team):
-                start = step.motion.q_start[i, e]
-                step.arrays.q[i, e] = start + share * (step.arrays.q[i, e] - start)
-    for j in range(member, step.rigid.count[w], team):
-        step.rigid.r[w, j] = share * step.rigid.r[w, j]
+    change = wp.float64(0.0)
+    moved = wp.float64(0.0)
+    for k in range(step.arrays.q.shape[1]):
+        change += wp.dot(step.motion.change[i, k], step.motion.change[i, k])
+        moved += wp.dot(step.motion.qd_start[i, k], step.motion.qd_start[i, k])
+    inertia = wp.float64(step.instances.inertia[i]) / (dt * dt * wp.float64(step.instances.youngs_modulus[i]))
+    if inertia > EXTRAPOLATION_INERTIA and change < wp.float64(0.25) * dt * dt * moved:
+        step.arrays.q[i, e] = step.arrays.q[i, e] + step.motion.change[i, e]
 
 
 @wp.kernel

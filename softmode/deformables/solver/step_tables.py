@@ -58,7 +58,7 @@ RESERVED_BYTES = 7168
 """Shared memory that the one launch needs besides its system, with what CUDA keeps for itself."""
 
 _POINTS = {"": "instance point", "hessian": "instance 6 point"}
-_MOTION = {"": "instance unknown", "rate touched": "instance"}
+_MOTION = {"": "instance unknown", "rate": "instance"}
 _SAMPLES = {
     "position drift near": "instance sample",
     "shape gap normal constraint": "instance sample slot",
