@@ -10,7 +10,7 @@ start and its value at the end.
 import warp as wp
 
 from softmode.deformables.contact.penalty_kernels import contact_potential, slip_potential
-from softmode.deformables.model.lane_kernels import LANES, rolled, team_sum33, vec8d
+from softmode.deformables.model.lane_kernels import rolled, team_sum3
 from softmode.deformables.model.struct_kernels import Instances, PointConstraints, instance_end
 from softmode.deformables.solver.iteration_kernels import NewtonStep
 from softmode.deformables.solver.step_kernels import displacement_of, pair_share
@@ -19,8 +19,8 @@ wp.set_module_options({"enable_backward": False})
 
 HALVED = wp.constant(wp.float64(0.5))
 """What ``check_trial`` makes of a full step that it refuses."""
-LENGTHS = wp.constant(vec8d(0.0, 0.0625, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0))
-"""Lengths at which the constraints are looked at; between two of them the slope is taken as linear."""
+BISECTIONS = 8
+"""Bisections of the step, after which its length is known to a five-hundredth."""
 
 
 @wp.func
@@ -56,56 +56,50 @@ def shorten_step(step: NewtonStep, trial: wp.float64, team: int, w: int, member:
         return
     begin = step.state.instance_start[w]
     end = instance_end(step.instances, step.state.instance_start, w)
-    # slopes of the constraints' energy at all lengths but the last, its values at the first and at the last
-    sums = wp.mat33d()
-    lengths = LENGTHS
-    count = int(LANES)  # no constant: the loop is not to be unrolled
-    for i in range(begin, end):
-        rolled()
-        for e in range(member, step.constraints.count[i], team):
-            rolled()
-            d = displacement_of(
-                step.instances,
-                step.basis,
-                step.constraints,
-                step.motion.q_start,
-                step.arrays.q,
-                step.rigid.r,
-                i,
-                e,
-            )
-            way = step.constraints.displacement[i, e] - d
-            for k in range(count):
-                rolled()
-                energy, force = constraint_at(
-                    step.instances, step.constraints, step.options.stick_range, d + lengths[k] * way, i, e
-                )
-                if k < LANES - 1:
-                    sums[k / 3, k % 3] = sums[k / 3, k % 3] - wp.dot(force, way)
-                if k == 0:
-                    sums[2, 1] = sums[2, 1] + energy
-                if k == LANES - 1:
-                    sums[2, 2] = sums[2, 2] + energy
-    sums = team_sum33(sums)
-    if member != 0:
-        return
-    # of the potential without the constraints: its slope at the start, and half of its second derivative
-    fall = step.state.slope[w]
-    steepness = fall - sums[0, 0]
-    bend = trial - sums[2, 2] - step.state.potential[w] + sums[2, 1] - steepness
+    steepness = step.state.slope[w]
+    bend = trial - step.state.potential[w] - steepness
+    alpha = wp.float64(0.0)
     low = wp.float64(0.0)
-    high = wp.float64(0.0)
-    for k in range(1, count - 1):
+    high = wp.float64(1.0)
+    # one copy of this code serves the start of the step, its end, and the lengths between
+    for k in range(BISECTIONS + 2):
         rolled()
-        if high == wp.float64(0.0):
-            alpha = lengths[k]
-            rise = sums[k / 3, k % 3] + steepness + wp.float64(2.0) * alpha * bend
-            if rise < wp.float64(0.0):
+        sums = wp.vec3d()
+        for i in range(begin, end):
+            rolled()
+            for e in range(member, step.constraints.count[i], team):
+                rolled()
+                if k == 0:
+                    # room for it until the shorter step is evaluated
+                    step.constraints.slip[i, e] = displacement_of(
+                        step.instances,
+                        step.basis,
+                        step.constraints,
+                        step.motion.q_start,
+                        step.arrays.q,
+                        step.rigid.r,
+                        i,
+                        e,
+                    )
+                d = step.constraints.slip[i, e]
+                way = step.constraints.displacement[i, e] - d
+                energy, force = constraint_at(
+                    step.instances, step.constraints, step.options.stick_range, d + alpha * way, i, e
+                )
+                sums += wp.vec3d(energy, -wp.dot(force, way), wp.float64(0.0))
+        sums = team_sum3(sums)
+        if k == 0:
+            # of the potential without the constraints: its slope at the start, and half of its second derivative
+            steepness -= sums[1]
+            bend += sums[0] + sums[1]
+            alpha = high
+        else:
+            if k == 1:
+                bend -= sums[0]
+            elif sums[1] + steepness + wp.float64(2.0) * alpha * bend < wp.float64(0.0):
                 low = alpha
-                fall = rise
             else:
-                high = low + (alpha - low) * fall / (fall - rise)
-    if high == wp.float64(0.0):
-        high = wp.float64(0.5) * (low + wp.float64(1.0))
-    if high > step.options.step_length_min and high < wp.float64(1.0):
-        step.state.step_length[w] = high
+                high = alpha
+            alpha = wp.float64(0.5) * (low + high)
+    if member == 0 and wp.isfinite(bend):
+        step.state.step_length[w] = alpha
