@@ -8,8 +8,6 @@ from softmode.deformables.materials.hessian_kernels import HessianBlocks, hessia
 from softmode.deformables.materials.material_cpu_kernels import LANES, energy_and_stress, hessian_lanes, mat98d, vec8d
 from softmode.deformables.materials.material_kernels import MaterialParameters, energy, stress
 from softmode.deformables.materials.singular_value_kernels import positive_part, singular_values
-from softmode.deformables.solver.iteration_kernels import NewtonStep
-from softmode.deformables.solver.search_kernels import world_potential
 
 wp.set_module_options({"enable_backward": False})
 
@@ -154,11 +152,3 @@ def evaluate_stick(
     i = wp.tid()
     energy, secant, tangent = contact.stick_potential(x[i], limit, stiffness)
     out[i] = wp.vec3d(energy, secant, tangent)
-
-
-@wp.kernel
-def sum_trials(step: NewtonStep, potential_out: wp.array[wp.float64]):
-    """Sum the potential of the trial of each world that searches [J]."""
-    w = wp.tid()
-    if step.state.searching[w] != 0:
-        potential_out[w] = world_potential(step, step.arrays.q_trial, step.rigid.trial, w, 0, 1)

@@ -37,7 +37,6 @@ from softmode.deformables.solver.constraint_cpu_kernels import evaluate_constrai
 from softmode.deformables.solver.factor_kernels import factor_system, solve_system
 from softmode.deformables.solver.fused_system_kernels import dynamic_floats, shared_direction_of, sum_forces_of
 from softmode.deformables.solver.iteration_kernels import ALL, NewtonStep
-from softmode.deformables.solver.length_kernels import shorten_step
 from softmode.deformables.solver.point_cpu_kernels import differentiate_eight, evaluate_eight
 from softmode.deformables.solver.rigid_row_kernels import evaluate_row
 from softmode.deformables.solver.search_kernels import (
@@ -252,8 +251,6 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
                     start_line_search(step, team, w, member)
             else:
                 check_trial(step, potential, w, member)
-                barrier()
-                shorten_step(step, potential, team, w, member)
             barrier()
             if step.state.active[w] != 0:
                 # one copy of this code serves trials and accepted steps

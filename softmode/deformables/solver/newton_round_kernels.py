@@ -25,7 +25,6 @@ from softmode.deformables.model.lane_kernels import WARP, barrier, rolled
 from softmode.deformables.solver.assembly_kernels import inertia_of, stiffness_block
 from softmode.deformables.solver.fused_system_kernels import dynamic_floats, shared_direction_of, sum_forces_of
 from softmode.deformables.solver.iteration_kernels import TRIAL, NewtonStep
-from softmode.deformables.solver.length_kernels import shorten_step
 from softmode.deformables.solver.rigid_row_kernels import evaluate_row
 from softmode.deformables.solver.search_kernels import (
     accept_step,
@@ -139,8 +138,6 @@ def check_kernel(team: int) -> Kernel:
             potential = world_potential(step, q, r, w, member, team)
             if k == 0:
                 check_trial(step, potential, w, member)
-                barrier()
-                shorten_step(step, potential, team, w, member)
                 barrier()
                 searching = step.state.searching[w]
                 alpha = step.state.step_length[w]

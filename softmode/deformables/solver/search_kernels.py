@@ -33,7 +33,6 @@ from softmode.deformables.model.struct_kernels import (
     pushes,
 )
 from softmode.deformables.solver.iteration_kernels import NewtonArrays, NewtonOptions, NewtonStep, mat38d
-from softmode.deformables.solver.length_kernels import shorten_step
 from softmode.deformables.solver.spin_kernels import (
     axial,
     centre_of_mass,
@@ -72,8 +71,6 @@ errors of its points differ in sign."""
 SUFFICIENT_DECREASE = wp.constant(wp.float64(0.25))
 """Least decrease of the potential over that of its tangent. A quadratic has 0.5; with little less than that asked for,
 friction between sticking and slipping is crossed back and forth for many iterations."""
-LEAST_DECREASE = wp.constant(wp.float64(1.0e-4))
-"""The same of a step that was shortened to the minimum along its direction."""
 EXTENDED_DECREASE = wp.constant(wp.float64(0.54))
 """Decrease beyond which twice the full step is tried. In the onset of contact the potential is cubic (0.58): there
 Newton's steps halve the penetration, and double ones end it."""
@@ -481,9 +478,9 @@ def rounding_of(instances: Instances, instance_start: wp.array[int], potential: 
 def check_trial(step: NewtonStep, trial: wp.float64, w: int, member: int):
     """Accept a trial that lowers the potential enough (Armijo, up to rounding) or halve the step; give up if short.
 
-    The first shorter step is found by ``length_kernels.shorten_step``. Where a full step has lowered the potential by
-    more than a quadratic would have, take the better of that and twice the step. That helps in the onset of contact,
-    from the first iterations on until it does not; friction that gives way looks the same.
+    Where a full step has lowered it by more than a quadratic would have, take the better of that and twice the step.
+    That helps in the onset of contact, from the first iterations on until it does not; friction that gives way looks
+    the same.
     What has been evaluated of an accepted trial serves the next iteration.
     """
     if member != 0:
@@ -507,10 +504,7 @@ def check_trial(step: NewtonStep, trial: wp.float64, w: int, member: int):
         return
     if step.state.iteration[w] > 0:
         step.state.extends[w] = 0
-    sufficient = SUFFICIENT_DECREASE
-    if alpha < wp.float64(1.0):
-        sufficient = LEAST_DECREASE
-    if trial <= potential + sufficient * alpha * step.state.slope[w] + rounding:
+    if trial <= potential + SUFFICIENT_DECREASE * alpha * step.state.slope[w] + rounding:
         step.state.searching[w] = 0
         step.state.evaluated[w] = 1
         return
@@ -531,8 +525,6 @@ def check_trials(step: NewtonStep, team: int):
         return
     trial = world_potential(step, step.arrays.q_trial, step.rigid.trial, w, member, team)
     check_trial(step, trial, w, member)
-    barrier()
-    shorten_step(step, trial, team, w, member)
 
 
 @wp.func

@@ -385,43 +385,6 @@ evaluate_points = kernel_over(evaluate_point, "evaluate_points", "i", "p")
 
 
 @wp.func
-def displacement_of(
-    instances: Instances,
-    basis: Basis,
-    constraints: PointConstraints,
-    q_start: wp.array2d[vec8d],
-    # State in:
-    q: wp.array2d[vec8d],
-    r: wp.array2d[wp.float64],
-    i: int,
-    e: int,
-):
-    """Return d = sum_k b_k (q_k - q_nk) - J r of a constraint, less that of a soft partner."""
-    d = interpolate_change(basis.row, constraints.row[i, e], q, q_start, i, instances.function_count[i])
-    if e >= constraints.count[i] - constraints.pair_count[i]:
-        j = constraints.partner[i, e]
-        if j >= 0:
-            row = constraints.partner_row[i, e]
-            d -= interpolate_change(basis.row, row, q, q_start, j, instances.function_count[j])
-    for k in range(constraints.dof_begin[i, e], constraints.dof_end[i, e]):
-        d -= r[instances.world[i], k] * wp.vec3d(constraints.jacobian[i, e, k])
-    return d
-
-
-@wp.func
-def pair_share(instances: Instances, constraints: PointConstraints, i: int, e: int):
-    """Return the range of the onset of a contact [m], and which share of its energy is that of this constraint."""
-    smoothing = instances.smoothing[i]
-    share = wp.float64(1.0)
-    if e >= constraints.count[i] - constraints.pair_count[i]:
-        j = constraints.partner[i, e]
-        if j >= 0:
-            smoothing = wp.min(smoothing, instances.smoothing[j])
-            share = wp.float64(0.5)
-    return smoothing, share
-
-
-@wp.func
 def evaluate_constraint(
     step: NewtonStep,
     # State in:
@@ -439,11 +402,26 @@ def evaluate_constraint(
     w = step.instances.world[i]
     if selected[w] == 0 or e >= step.constraints.count[i]:
         return
+    row = step.constraints.row[i, e]
+    known = derivatives != 0 and step.state.evaluated[w] != 0
     d = step.constraints.displacement[i, e]
-    if derivatives == 0 or step.state.evaluated[w] == 0:
-        d = displacement_of(step.instances, step.basis, step.constraints, step.motion.q_start, q, r, i, e)
+    if not known:
+        d = interpolate_change(step.basis.row, row, q, step.motion.q_start, i, step.instances.function_count[i])
+    smoothing = step.instances.smoothing[i]
+    share = wp.float64(1.0)
+    if e >= step.constraints.count[i] - step.constraints.pair_count[i]:
+        j = step.constraints.partner[i, e]
+        if j >= 0:
+            if not known:
+                row = step.constraints.partner_row[i, e]
+                count = step.instances.function_count[j]
+                d -= interpolate_change(step.basis.row, row, q, step.motion.q_start, j, count)
+            smoothing = wp.min(smoothing, step.instances.smoothing[j])
+            share = wp.float64(0.5)
+    if not known:
+        for k in range(step.constraints.dof_begin[i, e], step.constraints.dof_end[i, e]):
+            d -= r[w, k] * wp.vec3d(step.constraints.jacobian[i, e, k])
         step.constraints.displacement[i, e] = d
-    smoothing, share = pair_share(step.instances, step.constraints, i, e)
     stiffness = step.constraints.stiffness[i, e]
     identity = wp.identity(n=3, dtype=wp.float64)
     H = stiffness * identity
