@@ -74,9 +74,9 @@ def main() -> None:
         f"{device.name or device}, {options.worlds} worlds of {options.preset or 'plush'}: "
         f"product {product / 1e9:,.0f} Gflop/s, copy {copy / 1e9:,.0f} GB/s, a launch in a graph {1e3 * least:.2f} us\n"
     )
-    whole = mean_times(scene, device, options.repeats)
+    whole = time_kernels(scene, device, options.repeats)
     reduced.tables = replace(tables, one_launch=False, shared=False, rounds=0)
-    apart = mean_times(scene, device, options.repeats)
+    apart = time_kernels(scene, device, options.repeats)
     print("| phase | launches | Mflop | kB | floor of flops | of bytes | measured, a launch | over the floor |")
     print("|---|---|---|---|---|---|---|---|")
     total = {"floor": 0.0, "measured": 0.0}
@@ -103,18 +103,6 @@ def main() -> None:
         f"{least * count:.2f} ms at least as a graph."
     )
     env.close()
-
-
-def mean_times(scene: Any, device: wp.Device, repeats: int) -> dict[str, tuple[float, float]]:
-    """Return time [ms] and launches of every kernel in an eager control step, means of several."""
-    found: dict[str, list[tuple[float, int]]] = {}
-    for _ in range(repeats):
-        for name, pair in time_kernels(scene, device, 1).items():
-            found.setdefault(name, []).append(pair)
-    return {
-        name: (sum(spent for spent, _ in pairs) / repeats, sum(count for _, count in pairs) / repeats)
-        for name, pairs in found.items()
-    }
 
 
 def work(tables: Any) -> dict[str, Work]:
