@@ -115,13 +115,18 @@ def time_kernels(scene: Any, device: wp.Device, steps: int) -> dict[str, tuple[f
             wp.timing_begin(cuda_filter=wp.TIMING_ALL, synchronize=True)
             scene.control_step()
             for result in wp.timing_end(synchronize=True):
-                name = re.sub(r"_[0-9a-f]{8}(_cuda_kernel_forward)?$|^forward kernel ", "", result.name)
+                name = kernel_name(result)
                 spent[name] += result.elapsed
                 launches[name] += 1
         else:
             with timed_launches(spent, launches):
                 scene.control_step()
     return {name: (spent[name] / steps, launches[name] / steps) for name in spent}
+
+
+def kernel_name(result: Any) -> str:
+    """Return the name of the kernel of a timing, without its hash."""
+    return re.sub(r"(_[0-9a-f]{8})?(_cuda_kernel_forward)?$|^forward kernel ", "", result.name)
 
 
 @contextmanager

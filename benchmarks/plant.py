@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import re
 import time
 from collections.abc import Callable
 from typing import Any
@@ -25,6 +24,7 @@ import numpy as np
 import warp as wp
 
 from benchmarks.clock import Clock
+from benchmarks.grasp_phases import kernel_name
 from benchmarks.step import product_rate, report_torch
 from examples.swaying_plant import BUILD, RATE, STEPS, blow, make_plant, make_scene
 from softmode.deformables import BuildOptions
@@ -159,8 +159,7 @@ def print_launches(scene: Any) -> None:
         scene._steps()
         if device.is_cuda:
             for result in wp.timing_end(synchronize=True):
-                name = re.sub(r"(_[0-9a-f]{8})?_cuda_kernel_forward|^forward kernel ", "", result.name)
-                name = re.sub(r"_[0-9a-f]{8}$", "", name)
+                name = kernel_name(result)
                 spent[name] = spent.get(name, 0.0) + result.elapsed
     finally:
         wp.launch = launch

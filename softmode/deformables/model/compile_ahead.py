@@ -28,6 +28,7 @@ from softmode.quiet import quieten_warp
 quieten_warp()
 
 Key = tuple[wp.Module, int | None]
+_Load = tuple[str, wp.Module, int | None]
 Wanted = dict[Key, None]
 """Modules with the threads of a block that they are compiled for, in order."""
 
@@ -223,10 +224,9 @@ class _Compilers:
         self.aside = False
         """Whether launches wait for these threads."""
         self._pool = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="compile")
-        self._waiting: queue.PriorityQueue[tuple[int, int, int]] = queue.PriorityQueue()
-        self._numbers = itertools.count()
-        self._modules: dict[int, tuple[str, wp.Module, int | None, Future[None]]] = {}
-        self._under_way: dict[tuple[str, wp.Module, int | None], tuple[int, Future[None]]] = {}
+        self._waiting: queue.PriorityQueue[tuple[int, int, int, _Load, Future[None]]] = queue.PriorityQueue()
+        self._numbers = itertools.count()  # what is equally wanted comes in order
+        self._under_way: dict[_Load, Future[None]] = {}
         self._taking = threading.Lock()
 
     def begin(self, wanted: Iterable[Key], device: wp.Device, *, awaited: bool = False) -> list[Future[None]]:
@@ -234,47 +234,43 @@ class _Compilers:
 
         A module that is waiting already, or being compiled, is not begun again; one that someone waits for moves up.
         """
-        return [self._begin(module, block_dim, device.alias, awaited) for module, block_dim in wanted]
+        return [self._begin((device.alias, *key), awaited=awaited) for key in wanted]
 
-    def _begin(self, module: wp.Module, block_dim: int | None, device: str, awaited: bool) -> Future[None]:
-        number, done = self._under_way.get((device, module, block_dim), (-1, None))
+    def _begin(self, load: _Load, *, awaited: bool) -> Future[None]:
+        done = self._under_way.get(load)
         if done is None or done.done():
-            number, done = next(self._numbers), Future[None]()
-            self._under_way[device, module, block_dim] = number, done
-            self._modules[number] = device, module, block_dim, done
+            done = self._under_way[load] = Future[None]()
         elif not awaited:
             return done
-        length = next((k for k, name in enumerate(_LONGEST) if name in module.name), None)
+        length = next((k for k, name in enumerate(_LONGEST) if name in load[1].name), None)
         rank = AWAITED if awaited else USUAL if length is None else LONG
-        self._waiting.put((rank, length or 0, number))
+        self._waiting.put((rank, length or 0, next(self._numbers), load, done))
         self._pool.submit(self._take_one)
         return done
 
     def wait_for_all(self) -> None:
         """Wait until everything is compiled that was begun; raise what failed."""
-        while self._under_way:
-            _, (_, done) = self._under_way.popitem()
+        for done in self._under_way.values():
             done.result()
+        self._under_way.clear()
 
     def drop(self) -> None:
         """Forget what waits to be compiled, and wait for what is being compiled."""
         with self._taking:
-            for *_, done in self._modules.values():
+            for done in self._under_way.values():
                 done.cancel()
-            self._modules.clear()
-        wait([done for _, done in self._under_way.values() if done.running()])
+        wait([done for done in self._under_way.values() if done.running()])
         self._under_way.clear()
 
     def _take_one(self) -> None:
-        """Load the module that is most wanted; one that moved up was there twice."""
-        _, _, number = self._waiting.get()
+        """Load the module that is most wanted, unless it was dropped; one that moved up was there twice."""
+        *_, load, done = self._waiting.get()
         with self._taking:
-            if number not in self._modules:
+            if done.running() or done.done():
                 return
-            device, module, block_dim, done = self._modules.pop(number)
             done.set_running_or_notify_cancel()
         try:
-            _load(device, module, block_dim)
+            _load(*load)
         except BaseException as error:
             done.set_exception(error)
         else:
