@@ -172,14 +172,14 @@ _SYSTEM = """
             if (l > j && l < tail) continue;
             double value = 0.0;
             if (l == tail) {
-                #pragma unroll 1
+                #pragma unroll 4
                 for (int k = 0; k < tail; ++k) value += M[j * dofs + k] * (r[k] - predicted[k]);
-                #pragma unroll 1
+                #pragma unroll 4
                 for (int k = 0; k < row_count; ++k) value += (double)row_jacobian[k * dofs + j] * row_force[k];
                 move[j] = value;
             } else {
                 value = M[j * dofs + l];
-                #pragma unroll 1
+                #pragma unroll 4
                 for (int k = 0; k < row_count; ++k) {
                     value += (double)row_jacobian[k * dofs + j] * row_coupling[k * dofs + l];
                 }
@@ -560,7 +560,7 @@ def shared_direction_of(size: int, width: int) -> Any:
     const int* rows = (const int*)constraints.row.data + (size_t)i * constraints.row.shape[1];
     const float* values = (const float*)basis.row.data;
     // a warp per part, a thread per function; what all of a part's threads read is fetched into shared memory
-    constexpr int held = 16;
+    constexpr int held = WP_TILE_BLOCK_DIM > 128 ? 8 : 16;
 #if defined(__CUDA_ARCH__)
     __shared__ double fetched[(WP_TILE_BLOCK_DIM + 31) / 32 * 9 * held];
     __shared__ int fetched_row[(WP_TILE_BLOCK_DIM + 31) / 32 * held];
@@ -571,14 +571,15 @@ def shared_direction_of(size: int, width: int) -> Any:
 #define SOFTMODE_WARP
 #endif
     const int parts = arrays.gradient_chunk.shape[1];
-    const int lanes = team / parts;
-    const int part = member / lanes;
-    const int lane = member - part * lanes;
-    double* here = fetched + part * 9 * held;
-    int* here_row = fetched_row + part * held;
+    const int lanes = team < 32 ? team : 32;
+    const int warp = member / lanes;
+    const int lane = member - warp * lanes;
+    double* here = fetched + warp * 9 * held;
+    int* here_row = fetched_row + warp * held;
     const char* start = (const char*)basis.gradient_across.data;
     start += (size_t)instances.point_start.data[i] * by_point;
-    double* out = (double*)arrays.gradient_chunk.data + ((size_t)i * parts + part) * 3 * n;
+    #pragma unroll 1
+    for (int part = warp; part < parts; part += team / lanes)
     for (int base = 0; base < n; base += lanes) {
         const int k = base + lane < n ? base + lane : n - 1;
         const char* G = start + (k / 8) * by_block + (k % 8) * sizeof(float);
@@ -619,6 +620,7 @@ def shared_direction_of(size: int, width: int) -> Any:
             }
             SOFTMODE_WARP;
         }
+        double* out = (double*)arrays.gradient_chunk.data + ((size_t)i * parts + part) * 3 * n;
         if (base + lane < n) {
             out[k] = x;
             out[n + k] = y;

@@ -21,7 +21,7 @@ import warp as wp
 from softmode.deformables.materials.hessian_kernels import hessian
 from softmode.deformables.model.declare import Kernel
 from softmode.deformables.model.deformation_kernels import elastic_gradient
-from softmode.deformables.model.lane_kernels import WARP, barrier, rolled
+from softmode.deformables.model.lane_kernels import LANES, WARP, barrier, copy_blocks, rolled, team_sum
 from softmode.deformables.solver.assembly_kernels import inertia_of, stiffness_block
 from softmode.deformables.solver.fused_system_kernels import dynamic_floats, shared_direction_of, sum_forces_of
 from softmode.deformables.solver.iteration_kernels import TRIAL, NewtonStep
@@ -37,7 +37,7 @@ from softmode.deformables.solver.search_kernels import (
 from softmode.deformables.solver.step_kernels import (
     evaluate_constraint,
     evaluate_point,
-    gradient_block,
+    gradient_number,
     list_acting,
     material_of,
     store_hessian,
@@ -50,9 +50,11 @@ BLOCK = 128
 
 
 @wp.kernel
-def start_trials(step: NewtonStep):
-    """Let the first trial of every world be where Newton starts."""
+def start_trials(step: NewtonStep, rounds: int):
+    """Let the first trial of every world be where Newton starts, and ``rounds`` the most that may be taken."""
     w, e = wp.tid()
+    if w == 0 and e == 0:
+        step.state.rounds_left[0] = rounds
     i = step.state.instance_start[w]
     if e < step.arrays.q.shape[1]:
         step.arrays.q_trial[i, e] = step.arrays.q[i, e]
@@ -149,17 +151,13 @@ def check_kernel(team: int) -> Kernel:
                     if alpha > wp.float64(0.0):
                         move_functions(step.instances, step.basis, step.arrays, alpha, i, member, team, q)
                     else:
-                        for e in range(member, width, team):
-                            rolled()
-                            q[i, e] = step.arrays.q[i, e]
+                        copy_blocks(step.arrays.q, q, i, member, team)
                     for j in range(member, n, team):
                         rolled()
                         r[w, j] = step.rigid.r[w, j] + alpha * step.rigid.direction[w, j]
                     barrier()
                 if searching == 0:
-                    for e in range(member, width, team):
-                        rolled()
-                        step.arrays.q[i, e] = q[i, e]
+                    copy_blocks(q, step.arrays.q, i, member, team)
                     for j in range(member, n, team):
                         rolled()
                         step.rigid.r[w, j] = r[w, j]
@@ -171,9 +169,9 @@ def check_kernel(team: int) -> Kernel:
         barrier()
         sum_forces_of(step.instances, step.basis, step.points, step.constraints, step.arrays, i, member, team)
         barrier()
-        for e in range(member, width, team):
+        for k in range(member, LANES * width, team):
             rolled()
-            gradient_block(step, i, e)
+            gradient_number(step, i, k)
         barrier()
         check_convergence(step, potential, team, w, member)
         if member == 0:
@@ -232,14 +230,26 @@ def direct_kernel(size: int, width: int, team: int) -> Kernel:
                     r[w, j] = step.rigid.r[w, j] + alpha * step.rigid.direction[w, j]
                 barrier()
                 if searching == 0:
-                    for e in range(member, step.arrays.q.shape[1], team):
-                        rolled()
-                        step.arrays.q[i, e] = q[i, e]
+                    copy_blocks(q, step.arrays.q, i, member, team)
                     for j in range(member, step.rigid.count[w], team):
                         rolled()
                         step.rigid.r[w, j] = r[w, j]
 
     return direct_worlds
+
+
+@wp.kernel
+def count_left(step: NewtonStep, worlds: int, held: int, team: int):
+    """Say after a round whether another one is worth it: while more than ``held`` worlds are not done."""
+    _all, member = wp.tid()
+    count = wp.float64(0.0)
+    for w in range(member, worlds, team):
+        count += wp.float64(step.state.active[w])
+    count = team_sum(count)
+    if member == 0:
+        left = step.state.rounds_left[0] - 1
+        step.state.rounds_left[0] = left
+        step.state.any_left[0] = wp.where(count > wp.float64(held) and left > 0, 1, 0)
 
 
 def tasks(point_max: int, constraint_max: int, row_max: int) -> tuple[int, int, int]:

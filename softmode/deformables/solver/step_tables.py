@@ -57,6 +57,7 @@ LARGE_TEAM = 128
 RESERVED_BYTES = 7168
 """Shared memory that the one launch needs besides its system, with what CUDA keeps for itself."""
 
+TRY: dict[str, int] = {}
 _POINTS = {"": "instance point", "hessian": "instance 6 point"}
 _MOTION = {"": "instance unknown", "rate": "instance"}
 _SAMPLES = {
@@ -71,7 +72,7 @@ _CONSTRAINTS = {
     "count pair_count acting_count": "instance",
     "jacobian coupling": "instance constraint rigid",
 }
-_NEWTON = {"": "world", "cached_q": "instance unknown", "cached_key": "instance", "any_active any_searching": "1"}
+_NEWTON = {"": "world", "cached_q": "instance unknown", "cached_key": "instance", "any_active any_searching any_left rounds_left": "1"}
 _ARRAYS = {
     "": "instance unknown",
     "gradient_chunk": "instance gradient_chunk unknown",
@@ -149,6 +150,8 @@ class StepTables:
     """The kernel of that launch."""
     world_team: int
     """Threads of that team."""
+    round_team: int
+    """Threads that share a world in rounds."""
     rounds: int
     """Rounds of launches before it, which take all worlds through their first iterations; 0 where there are none."""
     shared: bool
@@ -249,6 +252,9 @@ def allocate_tables(
     one_each = count == layout.world_count and layout.pin_max == 0
     driven = any(body.driven_count for body in layout.bodies)
     world_team = fused.team_of(layout.point_max, layout.world_count, device)
+    round_team = TRY.get("round") or world_team
+    if device.is_cuda and TRY.get("one"):
+        world_team = TRY["one"]
     size = (3 * layout.stride, 3 * layout.stride + 4 * -(-(rigid.count_max + 1) // 4))
     shared = device.is_cuda and one_launch and one_each and not driven
     shared = shared and fits_in_shared_memory(device.max_shared_memory_per_block, *size)
@@ -259,7 +265,7 @@ def allocate_tables(
     def chunks(threads: int, tasks: int) -> int:
         """Return into how many parts sums over points are split where a kernel has so many threads, a body tasks."""
         if rounds or not device.is_cuda:
-            return 1
+            return TRY.get("chunks", 1)
         return int(np.clip(world_team // tasks if one_launch else CUDA_THREADS // threads, 1, 64 if few else 16))
 
     sizes = {
@@ -273,7 +279,7 @@ def allocate_tables(
         "team": LARGE_TEAM if few else team_size(device),
         "constraint": room + layout.pin_max,
         "rigid": rigid.count_max,
-        "gradient_chunk": world_team // WARP if shared else chunks(count * blocks, blocks),
+        "gradient_chunk": (TRY.get("parts") or world_team // WARP) if shared else chunks(count * blocks, blocks),
         "stiffness_chunk": chunk_count(count, layout.stride)
         if tiled
         else chunks(count * square, square + (square + 3 * blocks) // 2),
@@ -328,6 +334,7 @@ def allocate_tables(
             system.unit.dtype, *(size if shared else ()), team=world_team, joined=joined and device.is_cpu
         ),
         world_team=world_team,
+        round_team=round_team,
         shared=shared,
         rounds=rounds,
         tiled=tiled,
