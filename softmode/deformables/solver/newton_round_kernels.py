@@ -100,7 +100,7 @@ def differentiate_points(step: NewtonStep):
     store_hessian(C, i, p, step.points.hessian)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(BLOCK, 4))
 def assemble_stiffness(step: NewtonStep):
     """Assemble the stiffness of these worlds."""
     w, chunk, task = wp.tid()
