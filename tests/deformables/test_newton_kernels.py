@@ -38,7 +38,7 @@ def grasp(
     system = reduced.tables.system
     size = (system.size, system.scalars.shape[2]) if shared else ()
     kernel = newton_kernel(system.unit.dtype, *size, team=reduced.tables.world_team)  # as the solver compiles it
-    ways = {"one_launch": one_launch, "shared": shared, "rounds": rounds, "fused_kernel": kernel}
+    ways = {"one_launch": one_launch, "shared": shared, "rounds": rounds, "held": 0, "fused_kernel": kernel}
     reduced.tables = dataclasses.replace(reduced.tables, **ways)
     for step in range(32):
         height = scene.controller.target_position.numpy()[0, 2]
@@ -104,7 +104,7 @@ def test_packed_system_grasps_as_the_launches_do() -> None:
 
 @pytest.mark.parametrize("rounds", [1, 40])
 def test_rounds_of_launches_grasp_as_the_one_launch_does(rounds: int) -> None:
-    """Worlds go on in the one launch from wherever a round left them, or end in the rounds.
+    """Worlds go on in the one launch from wherever a round left them, or, since it holds none here, end in the rounds.
 
     Sums have another order, and the one launch evaluates in lanes: both stop within 1e-3 of the forces.
     """

@@ -60,8 +60,10 @@ wp.set_module_options({"enable_backward": False})
 
 SMALL_TEAM = 96
 """Threads that share a world on CUDA where the points are few and the worlds many,"""
+LARGE_TEAM = 256
+"""where every world has a multiprocessor to itself,"""
 TEAM = 128
-"""elsewhere. Both are measured, see ``docs/performance.md``."""
+"""and elsewhere. All are measured, see ``docs/performance.md``."""
 FEW_POINTS = 128
 """Most points that count as few."""
 THREADS = 384
@@ -72,8 +74,15 @@ def team_of(point_count: int, world_count: int, device: wp.Device) -> int:
     """Return how many threads share a world on a device."""
     if device.is_cpu:
         return 1
-    at_a_time = THREADS // TEAM * device.sm_count
-    return SMALL_TEAM if point_count <= FEW_POINTS and world_count > at_a_time else TEAM
+    if world_count <= device.sm_count:
+        return LARGE_TEAM
+    many = world_count > held_at_a_time(TEAM, device)
+    return SMALL_TEAM if point_count <= FEW_POINTS and many else TEAM
+
+
+def held_at_a_time(team: int, device: wp.Device) -> int:
+    """Return how many worlds a device takes at a time through Newton's iteration in one launch."""
+    return THREADS // team * device.sm_count if device.is_cuda else 1
 
 
 @cache

@@ -15,7 +15,7 @@ from softmode.deformables.solver.evaluate import (
     solve,
     stiffness_tasks,
 )
-from softmode.deformables.solver.step_tables import TRY, StepTables
+from softmode.deformables.solver.step_tables import StepTables
 
 
 def minimise(tables: StepTables, dt: float) -> None:
@@ -28,11 +28,11 @@ def minimise(tables: StepTables, dt: float) -> None:
     if t.options.carry_stiffness:
         t.launch_teams(search.reuse_hessians, worlds, step, t.team)
     if t.rounds:
-        t.launch(rounds.start_trials, (worlds, max(3 * t.layout.block_count, t.rigid.count_max)), step, TRY.get("most", 5) - t.rounds + 1)
-        for _ in range(t.rounds - 1):
+        t.launch(rounds.start_trials, (worlds, max(3 * t.layout.block_count, t.rigid.count_max)), step, t.rounds)
+        for _ in range(min(t.rounds, rounds.ALWAYS)):
             _take_round(t, dt)
-        _take_last_round(t, dt)
-        wp.capture_while(t.newton.any_left, _take_last_round, tables=t, dt=dt)
+        _count_left(t, dt)
+        wp.capture_while(t.newton.any_left, _take_another_round, tables=t, dt=dt)
     if t.one_launch:
         team = t.world_team
         t.launch(t.fused_kernel, (worlds, team), step, t.system.unit, team, t.system.relation, block_dim=team)
@@ -42,7 +42,7 @@ def minimise(tables: StepTables, dt: float) -> None:
 
 def _take_round(tables: StepTables, dt: float) -> None:
     """Check the trials of all worlds that are not done, and find directions and next trials where they are accepted."""
-    t, step, worlds, team = tables, tables.newton_step(dt), tables.layout.world_count, tables.round_team
+    t, step, worlds, team = tables, tables.newton_step(dt), tables.layout.world_count, tables.world_team
     points, constraints, threads = rounds.tasks(t.layout.point_max, t.constraints.row.shape[1], t.rigid.row_max)
     t.launch(rounds.evaluate_trials, (worlds, threads), step, points, constraints, block_dim=rounds.BLOCK)
     t.launch(rounds.check_kernel(team), (worlds, team), step, team, block_dim=team)
@@ -53,12 +53,17 @@ def _take_round(tables: StepTables, dt: float) -> None:
     t.launch(kernel, (worlds, team), step, team, block_dim=team)
 
 
-def _take_last_round(tables: StepTables, dt: float) -> None:
-    """Take a round, and say whether another one is worth it."""
+def _take_another_round(tables: StepTables, dt: float) -> None:
+    """Take a round where another one is worth it."""
     _take_round(tables, dt)
-    t, team = tables, 256 if tables.model.device.is_cuda else 1
-    held = TRY.get("held", 1) * t.model.device.sm_count if tables.model.device.is_cuda else 0
-    launch_teams(t.model.device, rounds.count_left, 1, team, t.newton_step(dt), t.layout.world_count, held, team)
+    _count_left(tables, dt)
+
+
+def _count_left(tables: StepTables, dt: float) -> None:
+    """Say whether another round is worth it: while the one launch cannot hold all worlds that are left at a time."""
+    t, device = tables, tables.model.device
+    team = rounds.BLOCK if device.is_cuda else 1
+    launch_teams(device, rounds.count_left, 1, team, t.newton_step(dt), t.layout.world_count, t.held, team)
 
 
 def _iterate(tables: StepTables, dt: float) -> None:

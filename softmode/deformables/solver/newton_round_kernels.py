@@ -10,8 +10,8 @@ A round takes every world through an iteration, where its trial step is accepted
 
 Within a round one world may try a shorter step while another takes the next. The functions are those of the one launch
 of ``fused_newton_kernels``. That launch has several times more code than the instruction cache holds, and as many
-registers as its hungriest phase; a launch of a round has its own. A round with few worlds left is slow, though: so the
-first rounds do most of the work, and the one launch takes each of the worlds that are left to its end.
+registers as its hungriest phase; a launch of a round has its own. A round with few worlds left is slow, though: so
+rounds go on while more worlds are left than the one launch holds at a time, and it takes each of those to its end.
 """
 
 from functools import cache
@@ -49,12 +49,19 @@ BLOCK = 128
 """Threads of a block where threads do not work as a team."""
 
 
+TEAMS = 672
+"""Threads of teams that a multiprocessor takes at a time: what registers are given out for. All measured, see
+``docs/performance.md``."""
+ALWAYS = 2
+"""Rounds that are taken however few worlds are left."""
+
+
 @wp.kernel
 def start_trials(step: NewtonStep, rounds: int):
-    """Let the first trial of every world be where Newton starts, and ``rounds`` the most that may be taken."""
+    """Let the first trial of every world be where Newton starts; ``rounds`` is how many may be taken."""
     w, e = wp.tid()
     if w == 0 and e == 0:
-        step.state.rounds_left[0] = rounds
+        step.state.rounds_left[0] = rounds - ALWAYS
     i = step.state.instance_start[w]
     if e < step.arrays.q.shape[1]:
         step.arrays.q_trial[i, e] = step.arrays.q[i, e]
@@ -100,7 +107,7 @@ def differentiate_points(step: NewtonStep):
     store_hessian(C, i, p, step.points.hessian)
 
 
-@wp.kernel(launch_bounds=(BLOCK, 4))
+@wp.kernel
 def assemble_stiffness(step: NewtonStep):
     """Assemble the stiffness of these worlds."""
     w, chunk, task = wp.tid()
@@ -112,7 +119,7 @@ def assemble_stiffness(step: NewtonStep):
 def check_kernel(team: int) -> Kernel:
     """Return the kernel that checks the trials of the worlds, a team of so many threads for each."""
 
-    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(team, 512 // team))
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(team, TEAMS // team))
     def check_worlds(step: NewtonStep, team: int):
         """Accept the trial of each world or shorten it; where it is accepted find the gradient, and whether it is done.
 
@@ -192,7 +199,7 @@ def direct_kernel(size: int, width: int, team: int) -> Kernel:
     dynamic = dynamic_floats(size, width)
     shared_direction = shared_direction_of(size, width)
 
-    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(team, 512 // team))
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(team, TEAMS // team))
     def direct_worlds(step: NewtonStep, team: int):
         """Assemble and solve the system of each world, and start its line search."""
         w, member = wp.tid()
@@ -240,16 +247,16 @@ def direct_kernel(size: int, width: int, team: int) -> Kernel:
 
 @wp.kernel
 def count_left(step: NewtonStep, worlds: int, held: int, team: int):
-    """Say after a round whether another one is worth it: while more than ``held`` worlds are not done."""
+    """Say after the first rounds, and after each one, whether another is worth it: more than ``held`` worlds are left."""
     _all, member = wp.tid()
     count = wp.float64(0.0)
     for w in range(member, worlds, team):
         count += wp.float64(step.state.active[w])
     count = team_sum(count)
     if member == 0:
-        left = step.state.rounds_left[0] - 1
-        step.state.rounds_left[0] = left
-        step.state.any_left[0] = wp.where(count > wp.float64(held) and left > 0, 1, 0)
+        rounds = step.state.rounds_left[0]
+        step.state.rounds_left[0] = rounds - 1
+        step.state.any_left[0] = wp.where(count > wp.float64(held) and rounds > 0, 1, 0)
 
 
 def tasks(point_max: int, constraint_max: int, row_max: int) -> tuple[int, int, int]:

@@ -46,18 +46,17 @@ CUDA_THREADS = 2**16
 """Threads that keep a GPU busy: sums over points are split until there are about so many."""
 ONE_LAUNCH_BLOCKS = 7
 """Blocks of eight functions up to which a body is small enough for a team of threads on CUDA; on CPU any is."""
-ROUNDS = 5
-"""Rounds of launches before the one launch where worlds are many: measured, see ``docs/performance.md``."""
+ROUNDS = 10
+"""Most rounds of launches before the one launch where worlds are many: measured, see ``docs/performance.md``."""
 ROUND_WORLDS = 12
 """Worlds for each multiprocessor from which on they are many."""
 FEW_WORLDS = 64
 """Bodies up to which those of many functions get larger teams, and more and smaller blocks of threads, on CUDA."""
 LARGE_TEAM = 128
 """Threads of these teams and blocks."""
-RESERVED_BYTES = 7168
+RESERVED_BYTES = 12 * 1024
 """Shared memory that the one launch needs besides its system, with what CUDA keeps for itself."""
 
-TRY: dict[str, int] = {}
 _POINTS = {"": "instance point", "hessian": "instance 6 point"}
 _MOTION = {"": "instance unknown", "rate": "instance"}
 _SAMPLES = {
@@ -150,10 +149,10 @@ class StepTables:
     """The kernel of that launch."""
     world_team: int
     """Threads of that team."""
-    round_team: int
-    """Threads that share a world in rounds."""
     rounds: int
-    """Rounds of launches before it, which take all worlds through their first iterations; 0 where there are none."""
+    """Most rounds of launches before it, which take all worlds through their first iterations; 0 where there are none."""
+    held: int
+    """Worlds that the one launch takes at a time: no more rounds where no more worlds are left."""
     shared: bool
     """Whether the systems of that launch are assembled and solved in shared memory."""
     tiled: bool
@@ -252,9 +251,6 @@ def allocate_tables(
     one_each = count == layout.world_count and layout.pin_max == 0
     driven = any(body.driven_count for body in layout.bodies)
     world_team = fused.team_of(layout.point_max, layout.world_count, device)
-    round_team = TRY.get("round") or world_team
-    if device.is_cuda and TRY.get("one"):
-        world_team = TRY["one"]
     size = (3 * layout.stride, 3 * layout.stride + 4 * -(-(rigid.count_max + 1) // 4))
     shared = device.is_cuda and one_launch and one_each and not driven
     shared = shared and fits_in_shared_memory(device.max_shared_memory_per_block, *size)
@@ -265,7 +261,7 @@ def allocate_tables(
     def chunks(threads: int, tasks: int) -> int:
         """Return into how many parts sums over points are split where a kernel has so many threads, a body tasks."""
         if rounds or not device.is_cuda:
-            return TRY.get("chunks", 1)
+            return 1
         return int(np.clip(world_team // tasks if one_launch else CUDA_THREADS // threads, 1, 64 if few else 16))
 
     sizes = {
@@ -279,7 +275,7 @@ def allocate_tables(
         "team": LARGE_TEAM if few else team_size(device),
         "constraint": room + layout.pin_max,
         "rigid": rigid.count_max,
-        "gradient_chunk": (TRY.get("parts") or world_team // WARP) if shared else chunks(count * blocks, blocks),
+        "gradient_chunk": world_team // WARP if shared else chunks(count * blocks, blocks),
         "stiffness_chunk": chunk_count(count, layout.stride)
         if tiled
         else chunks(count * square, square + (square + 3 * blocks) // 2),
@@ -334,9 +330,9 @@ def allocate_tables(
             system.unit.dtype, *(size if shared else ()), team=world_team, joined=joined and device.is_cpu
         ),
         world_team=world_team,
-        round_team=round_team,
         shared=shared,
         rounds=rounds,
+        held=fused.held_at_a_time(world_team, device),
         tiled=tiled,
     )
 
