@@ -79,8 +79,8 @@ def main() -> None:
     reduced.tables = replace(tables, one_launch=False, shared=False, rounds=0)
     apart = time_kernels(scene, device, options.repeats)
     iterations = float(tables.newton.iteration.numpy().mean()) * apart["begin_newton"][1]
-    print("| phase | launches | needed by | Mflop | kB | floor of flops | of bytes | measured, a launch | over the floor |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    titles = ("phase", "launches", "needed by", "Mflop", "kB", "floor of flops", "of bytes", "measured, a launch")
+    print(f"| {' | '.join(titles)} | over the floor |\n{'|---' * (len(titles) + 1)}|")
     total = {"floor": 0.0, "measured": 0.0}
     for name, todo in work(tables).items():
         spent, launches = apart.get(name, (0.0, 0.0))
@@ -96,16 +96,16 @@ def main() -> None:
         total["floor"] += launches * floor
         total["measured"] += launches * measured
         print(
-            f"| {name} | {launches:.0f} | {needed:.0%} | {todo.flops / 1e6:.3f} | {todo.read_written / 1e3:.0f} | {flops:.1f} us | "
-            f"{traffic:.1f} us | {measured:.1f} us | {measured / max(floor, 1e3 * least):.1f} x |"
+            f"| {name} | {launches:.0f} | {needed:.0%} | {todo.flops / 1e6:.3f} | {todo.read_written / 1e3:.0f} | "
+            f"{flops:.1f} us | {traffic:.1f} us | {measured:.1f} us | {measured / max(floor, 1e3 * least):.1f} x |"
         )
     one = sum(spent for name, (spent, _) in whole.items() if is_newton(name))
     count = sum(launches for name, (_, launches) in whole.items() if not is_newton(name))
     floor, measured = (1e-3 * total[name] for name in ("floor", "measured"))
     print(
         f"\nAll phases of a control step: floor {floor:.3f} ms, measured apart {measured:.3f} ms, "
-        f"as rounds and one launch {one:.3f} ms ({one / floor:.1f} x the floor). All else is {count:.0f} launches, which cost "
-        f"{least * count:.2f} ms at least as a graph."
+        f"as rounds and one launch {one:.3f} ms ({one / floor:.1f} x the floor). "
+        f"All else is {count:.0f} launches, which cost {least * count:.2f} ms at least as a graph."
     )
     env.close()
 

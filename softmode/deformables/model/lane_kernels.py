@@ -78,7 +78,7 @@ def here(value: int) -> int:  # pyright: ignore[reportReturnType]
 
 @wp.func_native(
     snippet="""
-#if defined(__CUDA_ARCH__)
+#if defined(__CUDA_ARCH__) || defined(SOFTMODE_ONE_BY_ONE)
     return 0;
 #else
     return 1;
@@ -88,7 +88,8 @@ def here(value: int) -> int:  # pyright: ignore[reportReturnType]
 def by_eights() -> int:  # pyright: ignore[reportReturnType]
     """Return 1 on CPU, where a thread takes eight numbers at a time, 0 on CUDA, where threads take one each.
 
-    The compiler knows, so that code for the other device is left out.
+    The compiler knows, so that code for the other device is left out. A test defines ``SOFTMODE_ONE_BY_ONE`` to run the
+    code for CUDA.
     """
     ...
 

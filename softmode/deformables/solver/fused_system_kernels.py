@@ -50,7 +50,7 @@ def shared_bytes(size: int, width: int) -> int:
 
 
 def _contact_bytes(size: int, columns: int) -> int:
-    """Return what a contact takes: a force in double precision, row of the basis, Hessian, motions of its shape, names."""
+    """Return what a contact takes: a force (doubles), a row of the basis, a Hessian, motions of its shape, indices."""
     return 8 * 3 + 4 * (size // 3 + 9 + 2 * 3 * columns + 2)
 
 
@@ -121,8 +121,8 @@ _SYSTEM = """
     float* near_hessian = near_values + 8 * (N / 24) * TILE;
     float* near_jacobian = near_hessian + 9 * TILE;
     float* near_coupling = near_jacobian + 3 * R * TILE;
-    int* near_name = (int*)(near_coupling + 3 * R * TILE);
-    int* near_row = near_name + TILE;
+    int* near_index = (int*)(near_coupling + 3 * R * TILE);
+    int* near_row = near_index + TILE;
     // column 0 of row r, were it there
     const auto row_of = [](int r) {
         const int b = r / 8;
@@ -153,7 +153,7 @@ _SYSTEM = """
             if (first >= (row & ~7)) SOFTMODE_FETCH(&A[row_of(row) + first], &K[row * N + first]);
         }
         for (int t = member; t < TILE && t < acting_count; t += team) {
-            near_name[t] = acting[t];
+            near_index[t] = acting[t];
             near_row[t] = rows[acting[t]];
         }
         // right of K: -g in column rigid_max; the contacts' -sum_e b_k H_e J_e comes on top
@@ -225,7 +225,7 @@ _SYSTEM = """
                 const int s = t / (3 * tail);
                 const int at = t - s * 3 * tail;
                 const int j = at / 3;
-                const int e = near_name[s];
+                const int e = near_index[s];
                 // loaded together, whether needed or not: one wait instead of two
                 const float motion = J[e * dofs * 3 + at];
                 const float coupling = HJ[e * dofs * 3 + at];
@@ -236,18 +236,18 @@ _SYSTEM = """
             #pragma unroll 2
             for (int t = member; t < held * 9; t += team) {
                 const int s = t / 9;
-                near_hessian[t] = H[9 * near_name[s] + t - 9 * s];
+                near_hessian[t] = H[9 * near_index[s] + t - 9 * s];
             }
             for (int t = member; t < held * 3; t += team) {
                 const int s = t / 3;
-                near_force[t] = F[3 * near_name[s] + t - 3 * s];
+                near_force[t] = F[3 * near_index[s] + t - 3 * s];
             }
             SOFTMODE_FETCHED;
             SOFTMODE_BARRIER;
             // by the last threads, which have the least to do
             const int next = acting_count - start - TILE < TILE ? acting_count - start - TILE : TILE;
             for (int t = team - 1 - member; t < next; t += team) {
-                near_name[t] = acting[start + TILE + t];
+                near_index[t] = acting[start + TILE + t];
                 near_row[t] = rows[acting[start + TILE + t]];
             }
             for (int t = member; t < 3 * blocks * tail; t += team) {

@@ -247,7 +247,7 @@ def direct_kernel(size: int, width: int, team: int) -> Kernel:
 
 @wp.kernel
 def count_left(step: NewtonStep, worlds: int, held: int, team: int):
-    """Say after the first rounds, and after each one, whether another is worth it: more than ``held`` worlds are left."""
+    """Say after a round whether another one is worth it: whether more than ``held`` worlds are left."""
     _all, member = wp.tid()
     count = wp.float64(0.0)
     for w in range(member, worlds, team):

@@ -108,8 +108,8 @@ def potential_share(
                 away = x - motion.q_inertial[i, e]
                 moved = x - motion.q_rate[i, e]
                 ahead = x - motion.q_start[i, e]
-                total += inertial * wp.dot(away, away) + damping * wp.dot(moved, moved)
-                total -= wp.dot(motion.force[i, e], ahead)
+                kinetic = inertial * wp.dot(away, away) + damping * wp.dot(moved, moved)
+                total += kinetic - wp.dot(motion.force[i, e], ahead)
         else:
             for k in range(member, LANES * q.shape[1], team):
                 rolled()

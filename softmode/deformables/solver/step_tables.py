@@ -71,7 +71,12 @@ _CONSTRAINTS = {
     "count pair_count acting_count": "instance",
     "jacobian coupling": "instance constraint rigid",
 }
-_NEWTON = {"": "world", "cached_q": "instance unknown", "cached_key": "instance", "any_active any_searching any_left rounds_left": "1"}
+_NEWTON = {
+    "": "world",
+    "cached_q": "instance unknown",
+    "cached_key": "instance",
+    "any_active any_searching any_left rounds_left": "1",
+}
 _ARRAYS = {
     "": "instance unknown",
     "gradient_chunk": "instance gradient_chunk unknown",
@@ -150,7 +155,7 @@ class StepTables:
     world_team: int
     """Threads of that team."""
     rounds: int
-    """Most rounds of launches before it, which take all worlds through their first iterations; 0 where there are none."""
+    """Most rounds of launches before it, which take worlds through their first iterations; 0 where there are none."""
     held: int
     """Worlds that the one launch takes at a time: no more rounds where no more worlds are left."""
     shared: bool
