@@ -53,6 +53,9 @@ def main() -> None:
     wp.config.log_level = wp.LOG_WARNING
     for name in [name for name in sys.modules if name.startswith("newton._src.")]:
         wp.set_module_options({"enable_backward": False}, module=sys.modules[name])
+    surface = importlib.import_module("newton._src.geometry.soft_contacts_sdf")
+    for kernel in (surface.create_soft_edge_contacts, surface.create_soft_face_contacts):
+        kernel.module.options["enable_backward"] = False  # modules of their own: minutes of compilation with adjoints
     wp.set_device(options.device)
     device = wp.get_device(options.device)
     print(f"{device.name or device}: Newton {newton.__version__}")

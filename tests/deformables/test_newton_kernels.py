@@ -1,16 +1,18 @@
 """Newton's iteration in one launch does what the launches per phase do; a carried stiffness only saves time."""
 
 import dataclasses
+import functools
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import warp as wp
 
 from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.solver import minimise
+from softmode.deformables.solver import minimise, newton_round_kernels
 from softmode.deformables.solver.fused_newton_kernels import newton_kernel
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.deformables.solver.step_tables import StepTables
@@ -38,7 +40,7 @@ def grasp(
     system = reduced.tables.system
     size = (system.size, system.scalars.shape[2]) if shared else ()
     kernel = newton_kernel(system.unit.dtype, *size, team=reduced.tables.world_team)  # as the solver compiles it
-    ways = {"one_launch": one_launch, "shared": shared, "rounds": rounds, "fused_kernel": kernel}
+    ways = {"one_launch": one_launch, "shared": shared, "rounds": rounds, "held": 0, "fused_kernel": kernel}
     reduced.tables = dataclasses.replace(reduced.tables, **ways)
     for step in range(32):
         height = scene.controller.target_position.numpy()[0, 2]
@@ -104,7 +106,7 @@ def test_packed_system_grasps_as_the_launches_do() -> None:
 
 @pytest.mark.parametrize("rounds", [1, 40])
 def test_rounds_of_launches_grasp_as_the_one_launch_does(rounds: int) -> None:
-    """Worlds go on in the one launch from wherever a round left them, or end in the rounds.
+    """Worlds go on in the one launch from wherever a round left them, or, since it holds none here, end in the rounds.
 
     Sums have another order, and the one launch evaluates in lanes: both stop within 1e-3 of the forces.
     """
@@ -112,6 +114,38 @@ def test_rounds_of_launches_grasp_as_the_one_launch_does(rounds: int) -> None:
     for name in ("q", "joint_q"):
         np.testing.assert_allclose(after[name], alone[name], atol=1.0e-7)
     np.testing.assert_allclose(after["force"], alone["force"], atol=1.0e-5 * np.abs(alone["force"]).max())
+
+
+@pytest.mark.slow
+def test_numbers_one_by_one_grasp_as_eights_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The code for CUDA, where a thread takes one number or one function, by one thread on CPU, in all rounds.
+
+    Sums have another order: places within 1e-6 of 0.1 m, forces within 1e-5.
+    """
+    eights = grasp("cpu", one_launch=True)
+    options = {"extra_build_options": wp.ModuleBuildOptions(extra_cpu_preamble="#define SOFTMODE_ONE_BY_ONE")}
+    for make in (newton_round_kernels.check_kernel, newton_round_kernels.direct_kernel):
+        monkeypatch.setattr(newton_round_kernels, make.__name__, one_by_one(make, options))
+    wp.set_module_options(options, module=newton_round_kernels)
+    try:
+        ones = grasp("cpu", one_launch=True, rounds=40)
+    finally:
+        wp.set_module_options({"extra_build_options": None}, module=newton_round_kernels)
+    for name in ("q", "joint_q"):
+        np.testing.assert_allclose(ones[name], eights[name], atol=1.0e-7)
+    np.testing.assert_allclose(ones["force"], eights["force"], atol=1.0e-5 * np.abs(eights["force"]).max())
+
+
+def one_by_one(make: Any, options: dict[str, Any]) -> Any:
+    """Return a function that makes kernels as ``make`` does, not those that others have, with options of a module."""
+
+    @functools.cache
+    def made(*sizes: int) -> Any:
+        kernel = make.__wrapped__(*sizes)
+        kernel.module.options.update(options)
+        return kernel
+
+    return made
 
 
 @pytest.mark.gpu

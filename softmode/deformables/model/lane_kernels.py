@@ -59,6 +59,84 @@ def rolled() -> None:
     """Keep a loop as it is written: on CUDA the compiler does not unroll a loop with this in its body."""
 
 
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    asm volatile("" : "+r"(value));
+#endif
+    return value;
+"""
+)
+def here(value: int) -> int:  # pyright: ignore[reportReturnType]
+    """Return the value, such that the CUDA compiler takes it for another one.
+
+    It computes an address that does not change in a loop before the loop, and keeps it. Where a kernel goes through
+    hundreds of arrays in a loop, there are not enough registers for that, and all of them end in memory.
+    """
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__) || defined(SOFTMODE_ONE_BY_ONE)
+    return 0;
+#else
+    return 1;
+#endif
+"""
+)
+def by_eights() -> int:  # pyright: ignore[reportReturnType]
+    """Return 1 on CPU, where a thread takes eight numbers at a time, 0 on CUDA, where threads take one each.
+
+    The compiler knows, so that code for the other device is left out. A test defines ``SOFTMODE_ONE_BY_ONE`` to run the
+    code for CUDA.
+    """
+    ...
+
+
+@wp.func_native(snippet="return ((const double*)((const char*)values.data + (size_t)i * values.strides[0]))[k];")
+def number_of(values: wp.array2d[vec8d], i: int, k: int) -> wp.float64:  # pyright: ignore[reportReturnType]
+    """Return number ``k`` of row ``i`` of an array of blocks."""
+    ...
+
+
+@wp.func_native(snippet="return ((const float*)((const char*)values.data + (size_t)i * values.strides[0]))[k];")
+def single_of(values: wp.array2d[vec8], i: int, k: int) -> float:  # pyright: ignore[reportReturnType]
+    """Return number ``k`` of row ``i`` of an array of blocks in single precision."""
+    ...
+
+
+@wp.func_native(snippet="return ((const double*)((const char*)values.data + (size_t)row * values.strides[1]))[k];")
+def chunk_number(values: wp.array3d[vec8d], row: int, k: int) -> wp.float64:  # pyright: ignore[reportReturnType]
+    """Return number ``k`` of a row of an array of parts of blocks, in which rows of all parts are counted."""
+    ...
+
+
+@wp.func_native(snippet="((double*)((char*)values.data + (size_t)i * values.strides[0]))[k] = value;")
+def set_number(values: wp.array2d[vec8d], i: int, k: int, value: wp.float64) -> None:
+    """Set number ``k`` of row ``i`` of an array of blocks."""
+    ...
+
+
+@wp.func
+def column_of(values: wp.array2d[vec8d], i: int, k: int):
+    """Return the three coordinates of function ``k`` in row ``i``."""
+    n = LANES * (values.shape[1] / 3)
+    return wp.vec3d(number_of(values, i, k), number_of(values, i, n + k), number_of(values, i, 2 * n + k))
+
+
+@wp.func
+def copy_blocks(values: wp.array2d[vec8d], values_out: wp.array2d[vec8d], i: int, member: int, team: int):
+    """Copy row ``i``, each thread some of it."""
+    if by_eights() != 0:
+        for e in range(member, values.shape[1], team):
+            values_out[i, e] = values[i, e]
+    else:
+        for k in range(member, LANES * values.shape[1], team):
+            rolled()
+            set_number(values_out, i, k, number_of(values, i, k))
+
+
 @wp.func
 def sum8(v: vec8):
     """Return the sum of the lanes, pairwise."""

@@ -10,7 +10,7 @@ from typing import Any
 import warp as wp
 
 from softmode.deformables.model.declare import struct
-from softmode.deformables.model.lane_kernels import sum8d, vec8, vec8d
+from softmode.deformables.model.lane_kernels import by_eights, sum8d, vec8, vec8d
 
 OVERLAP = wp.constant(0.05)
 """Deepest gap that a step starts from, as a fraction of the body's size: what overlaps more, as when it was placed
@@ -194,6 +194,7 @@ class NewtonState:
     potential: wp.array[wp.float64]  # [J]
     slope: wp.array[wp.float64]  # [J]
     step_length: wp.array[wp.float64]
+    rounding: wp.array[wp.float64]  # what rounding leaves of the elastic energy [J]
     reached: wp.array[wp.float64]  # potential after a full step, while a longer one is tried [J]
     cached: wp.array[int]  # whether the elastic Hessian in memory is Newton's own, of some iterate
     cached_q: wp.array2d[vec8d]  # (instance_count, 3 block_count), that iterate [m], and
@@ -201,6 +202,8 @@ class NewtonState:
     friction_lag: int  # iterations during which the normal force of friction follows the contact
     any_active: wp.array[int]  # (1,)
     any_searching: wp.array[int]  # (1,)
+    any_left: wp.array[int]  # (1,), whether another round of launches is worth it
+    rounds_left: wp.array[int]  # (1,), how many more there may be
 
 
 @wp.func
@@ -292,11 +295,47 @@ def interpolate(row: wp.array2d[vec8], r: int, q: wp.array2d[vec8d], i: int, fun
     return wp.vec3d(sum8d(x), sum8d(y), sum8d(z))
 
 
+@wp.func_native(
+    snippet="""
+    const int stride = 8 * row.shape[1];
+    const double* x = (const double*)((const char*)q.data + (size_t)i * q.strides[0]);
+    const double* from = (const double*)((const char*)q_from.data + (size_t)i * q_from.strides[0]);
+    const char* values = (const char*)row.data + (size_t)r * row.strides[0];
+    struct alignas(16) Four { float v[4]; };
+    struct alignas(16) Two { double v[2]; };
+    double sum[6] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
+    #pragma unroll 2
+    for (int k = 0; k < function_count; k += 4) {
+        const Four b = *(const Four*)(values + k * sizeof(float));
+        #pragma unroll
+        for (int axis = 0; axis < 3; ++axis) {
+            #pragma unroll
+            for (int half = 0; half < 4; half += 2) {
+                const int at = axis * stride + k + half;
+                const Two here = *(const Two*)(x + at);
+                const Two there = *(const Two*)(from + at);
+                sum[axis] += b.v[half] * (here.v[0] - there.v[0]);
+                sum[3 + axis] += b.v[half + 1] * (here.v[1] - there.v[1]);
+            }
+        }
+    }
+    return wp::vec_t<3, double>(sum[0] + sum[3], sum[1] + sum[4], sum[2] + sum[5]);
+"""
+)
+def interpolate_change_by_fours(
+    row: wp.array2d[vec8], r: int, q: wp.array2d[vec8d], q_from: wp.array2d[vec8d], i: int, function_count: int
+) -> wp.vec3d:  # pyright: ignore[reportReturnType]
+    """Return the same as ``interpolate_change``, with few registers, of functions four at a time."""
+    ...
+
+
 @wp.func
 def interpolate_change(
     row: wp.array2d[vec8], r: int, q: wp.array2d[vec8d], q_from: wp.array2d[vec8d], i: int, function_count: int
 ):
     """Return sum_k b_k (q_k - q_from_k) at a row."""
+    if by_eights() == 0:
+        return interpolate_change_by_fours(row, r, q, q_from, i, function_count)
     stride = row.shape[1]
     x = vec8d()
     y = vec8d()

@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from softmode.deformables.model.declare import Kernel
-from softmode.deformables.model.lane_kernels import LANES, WARP, barrier, rolled, vec8
+from softmode.deformables.model.lane_kernels import LANES, WARP, barrier, copy_blocks, here, rolled, vec8
 from softmode.deformables.model.struct_kernels import instance_end
 from softmode.deformables.solver.assembly_cpu_kernels import (
     columns_of,
@@ -51,6 +51,7 @@ from softmode.deformables.solver.step_kernels import (
     evaluate_constraint,
     evaluate_point,
     gradient_block,
+    gradient_number,
     list_acting,
     sum_force_block,
 )
@@ -59,8 +60,10 @@ wp.set_module_options({"enable_backward": False})
 
 SMALL_TEAM = 96
 """Threads that share a world on CUDA where the points are few and the worlds many,"""
+LARGE_TEAM = 256
+"""where every world has a multiprocessor to itself,"""
 TEAM = 128
-"""elsewhere. Both are measured, see ``docs/performance.md``."""
+"""and elsewhere. All are measured, see ``docs/performance.md``."""
 FEW_POINTS = 128
 """Most points that count as few."""
 THREADS = 384
@@ -71,8 +74,15 @@ def team_of(point_count: int, world_count: int, device: wp.Device) -> int:
     """Return how many threads share a world on a device."""
     if device.is_cpu:
         return 1
-    at_a_time = THREADS // TEAM * device.sm_count
-    return SMALL_TEAM if point_count <= FEW_POINTS and world_count > at_a_time else TEAM
+    if world_count <= device.sm_count:
+        return LARGE_TEAM
+    many = world_count > held_at_a_time(TEAM, device)
+    return SMALL_TEAM if point_count <= FEW_POINTS and many else TEAM
+
+
+def held_at_a_time(team: int, device: wp.Device) -> int:
+    """Return how many worlds a device takes at a time through Newton's iteration in one launch."""
+    return THREADS // team * device.sm_count if device.is_cuda else 1
 
 
 @cache
@@ -114,11 +124,13 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
         r = step.rigid.trial
         trial = step.state.searching[w]
         while step.state.active[w] != 0:
+            w = here(w)
+            member = here(member)
+            begin = here(begin)
+            end = here(end)
             if trial == 0:
                 for i in range(begin, end):
-                    for e in range(member, 3 * blocks, team):
-                        rolled()
-                        q[i, e] = step.arrays.q[i, e]
+                    copy_blocks(step.arrays.q, q, i, member, team)
                 for j in range(member, n, team):
                     rolled()
                     r[w, j] = step.rigid.r[w, j]
@@ -160,8 +172,13 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
                         for t in range(member, chunks * blocks, team):
                             sum_force_block(step, step.state.active, i, t / blocks, t % blocks)
                     barrier()
-                    for e in range(member, 3 * blocks, team):
-                        gradient_block(step, i, e)
+                    if wp.static(lanes):
+                        for e in range(member, 3 * blocks, team):
+                            gradient_block(step, i, e)
+                    else:
+                        for k in range(member, 3 * LANES * blocks, team):
+                            rolled()
+                            gradient_number(step, i, k)
                 barrier()
                 check_convergence(step, potential, team, w, member)
                 barrier()
@@ -267,9 +284,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
                 barrier()
                 if trial == 0 and alpha > wp.float64(0.0):
                     for i in range(begin, end):
-                        for e in range(member, 3 * blocks, team):
-                            rolled()
-                            step.arrays.q[i, e] = q[i, e]
+                        copy_blocks(q, step.arrays.q, i, member, team)
                     for j in range(member, n, team):
                         rolled()
                         step.rigid.r[w, j] = r[w, j]

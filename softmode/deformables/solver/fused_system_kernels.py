@@ -22,7 +22,7 @@ from softmode.deformables.model.struct_kernels import Basis, Instances, PointCon
 from softmode.deformables.solver.assembly_kernels import CONDENSED_ROUNDING
 from softmode.deformables.solver.iteration_kernels import NewtonArrays
 
-STATIC_BYTES = 40 * 1024
+STATIC_BYTES = 36 * 1024
 """Shared memory that a kernel may have without asking: 48 kB, less the scratch of sums over a team and of forces."""
 
 
@@ -50,8 +50,8 @@ def shared_bytes(size: int, width: int) -> int:
 
 
 def _contact_bytes(size: int, columns: int) -> int:
-    """Return what a contact takes: a force in double precision, a row of the basis, a Hessian, motions of its shape."""
-    return 8 * 3 + 4 * (size // 3 + 9 + 2 * 3 * columns)
+    """Return what a contact takes: a force (doubles), a row of the basis, a Hessian, motions of its shape, indices."""
+    return 8 * 3 + 4 * (size // 3 + 9 + 2 * 3 * columns + 2)
 
 
 def _rigid_doubles(columns: int) -> int:
@@ -121,6 +121,8 @@ _SYSTEM = """
     float* near_hessian = near_values + 8 * (N / 24) * TILE;
     float* near_jacobian = near_hessian + 9 * TILE;
     float* near_coupling = near_jacobian + 3 * R * TILE;
+    int* near_index = (int*)(near_coupling + 3 * R * TILE);
+    int* near_row = near_index + TILE;
     // column 0 of row r, were it there
     const auto row_of = [](int r) {
         const int b = r / 8;
@@ -150,6 +152,10 @@ _SYSTEM = """
             const int first = 4 * (t - row * quads);
             if (first >= (row & ~7)) SOFTMODE_FETCH(&A[row_of(row) + first], &K[row * N + first]);
         }
+        for (int t = member; t < TILE && t < acting_count; t += team) {
+            near_index[t] = acting[t];
+            near_row[t] = rows[acting[t]];
+        }
         // right of K: -g in column rigid_max; the contacts' -sum_e b_k H_e J_e comes on top
         const double* g = (const double*)arrays.gradient.data + (size_t)i * N;
         for (int t = member; t < N * R; t += team) {
@@ -172,14 +178,14 @@ _SYSTEM = """
             if (l > j && l < tail) continue;
             double value = 0.0;
             if (l == tail) {
-                #pragma unroll 1
+                #pragma unroll 4
                 for (int k = 0; k < tail; ++k) value += M[j * dofs + k] * (r[k] - predicted[k]);
-                #pragma unroll 1
+                #pragma unroll 4
                 for (int k = 0; k < row_count; ++k) value += (double)row_jacobian[k * dofs + j] * row_force[k];
                 move[j] = value;
             } else {
                 value = M[j * dofs + l];
-                #pragma unroll 1
+                #pragma unroll 4
                 for (int k = 0; k < row_count; ++k) {
                     value += (double)row_jacobian[k * dofs + j] * row_coupling[k * dofs + l];
                 }
@@ -187,33 +193,39 @@ _SYSTEM = """
             }
         }
         SOFTMODE_FETCHED;
-        #pragma unroll 1
-        for (int chunk = 1; chunk < chunks; ++chunk) {
-            #pragma unroll 4
+        if (chunks > 1) {
+            #pragma unroll 2
             for (int t = member; t < N * quads; t += team) {
                 const int row = t / quads;
                 const int first = 4 * (t - row * quads);
                 if (first >= (row & ~7)) {
-                    const Quad more = *(const Quad*)&K[(size_t)chunk * N * N + row * N + first];
-                    Quad* value = (Quad*)&A[row_of(row) + first];
-                    value->x += more.x; value->y += more.y; value->z += more.z; value->w += more.w;
+                    Quad value = *(const Quad*)&A[row_of(row) + first];
+                    #pragma unroll 4
+                    for (int chunk = 1; chunk < chunks; ++chunk) {
+                        const Quad more = *(const Quad*)&K[(size_t)chunk * N * N + row * N + first];
+                        value.x += more.x; value.y += more.y; value.z += more.z; value.w += more.w;
+                    }
+                    *(Quad*)&A[row_of(row) + first] = value;
                 }
             }
         }
-        // contacts, some at a time: fetched once by all threads, then read from shared memory by every sum
+        SOFTMODE_BARRIER;
+        // contacts, some at a time: fetched once by all threads, then read from shared memory by every sum. A load that
+        // waits for another takes twice as long, so which contacts come next is known before
         for (int start = 0; start == 0 || start < acting_count; start += TILE) {
             const int held = acting_count - start < TILE ? acting_count - start : TILE;
             for (int t = member; t < held * 2 * blocks; t += team) {
                 const int s = t / (2 * blocks);
                 const int k = 4 * (t - s * 2 * blocks);
-                const float* given = values + (size_t)rows[acting[start + s]] * 8 * blocks;
+                const float* given = values + (size_t)near_row[s] * 8 * blocks;
                 SOFTMODE_FETCH(&near_values[s * 8 * blocks + k], &given[k]);
             }
+            #pragma unroll 4
             for (int t = member; t < held * tail * 3; t += team) {
                 const int s = t / (3 * tail);
                 const int at = t - s * 3 * tail;
                 const int j = at / 3;
-                const int e = acting[start + s];
+                const int e = near_index[s];
                 // loaded together, whether needed or not: one wait instead of two
                 const float motion = J[e * dofs * 3 + at];
                 const float coupling = HJ[e * dofs * 3 + at];
@@ -221,16 +233,23 @@ _SYSTEM = """
                 near_jacobian[s * 3 * R + at] = moves ? motion : 0.0f;
                 near_coupling[s * 3 * R + at] = moves ? coupling : 0.0f;
             }
+            #pragma unroll 2
             for (int t = member; t < held * 9; t += team) {
                 const int s = t / 9;
-                near_hessian[t] = H[9 * acting[start + s] + t - 9 * s];
+                near_hessian[t] = H[9 * near_index[s] + t - 9 * s];
             }
             for (int t = member; t < held * 3; t += team) {
                 const int s = t / 3;
-                near_force[t] = F[3 * acting[start + s] + t - 3 * s];
+                near_force[t] = F[3 * near_index[s] + t - 3 * s];
             }
             SOFTMODE_FETCHED;
             SOFTMODE_BARRIER;
+            // by the last threads, which have the least to do
+            const int next = acting_count - start - TILE < TILE ? acting_count - start - TILE : TILE;
+            for (int t = team - 1 - member; t < next; t += team) {
+                near_index[t] = acting[start + TILE + t];
+                near_row[t] = rows[acting[start + TILE + t]];
+            }
             for (int t = member; t < 3 * blocks * tail; t += team) {
                 const int j = t / (3 * blocks);
                 const int first = 8 * (t - j * 3 * blocks);

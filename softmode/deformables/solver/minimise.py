@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from softmode.deformables.model.declare import launch_teams
 from softmode.deformables.solver import newton_round_kernels as rounds
 from softmode.deformables.solver import rigid_start_kernels
 from softmode.deformables.solver import search_kernels as search
@@ -27,9 +28,11 @@ def minimise(tables: StepTables, dt: float) -> None:
     if t.options.carry_stiffness:
         t.launch_teams(search.reuse_hessians, worlds, step, t.team)
     if t.rounds:
-        t.launch(rounds.start_trials, (worlds, max(3 * t.layout.block_count, t.rigid.count_max)), step)
-        for _ in range(t.rounds):
+        t.launch(rounds.start_trials, (worlds, max(3 * t.layout.block_count, t.rigid.count_max)), step, t.rounds)
+        for _ in range(min(t.rounds, rounds.ALWAYS)):
             _take_round(t, dt)
+        _count_left(t, dt)
+        wp.capture_while(t.newton.any_left, _take_another_round, tables=t, dt=dt)
     if t.one_launch:
         team = t.world_team
         t.launch(t.fused_kernel, (worlds, team), step, t.system.unit, team, t.system.relation, block_dim=team)
@@ -48,6 +51,19 @@ def _take_round(tables: StepTables, dt: float) -> None:
     t.launch(rounds.assemble_stiffness, dim, step, block_dim=rounds.BLOCK)
     kernel = rounds.direct_kernel(t.system.size, t.system.scalars.shape[2], team)
     t.launch(kernel, (worlds, team), step, team, block_dim=team)
+
+
+def _take_another_round(tables: StepTables, dt: float) -> None:
+    """Take a round where another one is worth it."""
+    _take_round(tables, dt)
+    _count_left(tables, dt)
+
+
+def _count_left(tables: StepTables, dt: float) -> None:
+    """Say whether another round is worth it: while the one launch cannot hold all worlds that are left at a time."""
+    t, device = tables, tables.model.device
+    team = rounds.BLOCK if device.is_cuda else 1
+    launch_teams(device, rounds.count_left, 1, team, t.newton_step(dt), t.layout.world_count, t.held, team)
 
 
 def _iterate(tables: StepTables, dt: float) -> None:

@@ -10,8 +10,8 @@ A round takes every world through an iteration, where its trial step is accepted
 
 Within a round one world may try a shorter step while another takes the next. The functions are those of the one launch
 of ``fused_newton_kernels``. That launch has several times more code than the instruction cache holds, and as many
-registers as its hungriest phase; a launch of a round has its own. A round with few worlds left is slow, though: so the
-first rounds do most of the work, and the one launch takes each of the worlds that are left to its end.
+registers as its hungriest phase; a launch of a round has its own. A round with few worlds left is slow, though: so
+rounds go on while more worlds are left than the one launch holds at a time, and it takes each of those to its end.
 """
 
 from functools import cache
@@ -21,7 +21,7 @@ import warp as wp
 from softmode.deformables.materials.hessian_kernels import hessian
 from softmode.deformables.model.declare import Kernel
 from softmode.deformables.model.deformation_kernels import elastic_gradient
-from softmode.deformables.model.lane_kernels import WARP, barrier, rolled
+from softmode.deformables.model.lane_kernels import LANES, WARP, barrier, copy_blocks, rolled, team_sum
 from softmode.deformables.solver.assembly_kernels import inertia_of, stiffness_block
 from softmode.deformables.solver.fused_system_kernels import dynamic_floats, shared_direction_of, sum_forces_of
 from softmode.deformables.solver.iteration_kernels import TRIAL, NewtonStep
@@ -37,7 +37,7 @@ from softmode.deformables.solver.search_kernels import (
 from softmode.deformables.solver.step_kernels import (
     evaluate_constraint,
     evaluate_point,
-    gradient_block,
+    gradient_number,
     list_acting,
     material_of,
     store_hessian,
@@ -49,10 +49,19 @@ BLOCK = 128
 """Threads of a block where threads do not work as a team."""
 
 
+TEAMS = 672
+"""Threads of teams that a multiprocessor takes at a time: what registers are given out for. All measured, see
+``docs/performance.md``."""
+ALWAYS = 2
+"""Rounds that are taken however few worlds are left."""
+
+
 @wp.kernel
-def start_trials(step: NewtonStep):
-    """Let the first trial of every world be where Newton starts."""
+def start_trials(step: NewtonStep, rounds: int):
+    """Let the first trial of every world be where Newton starts; ``rounds`` is how many may be taken."""
     w, e = wp.tid()
+    if w == 0 and e == 0:
+        step.state.rounds_left[0] = rounds - ALWAYS
     i = step.state.instance_start[w]
     if e < step.arrays.q.shape[1]:
         step.arrays.q_trial[i, e] = step.arrays.q[i, e]
@@ -110,7 +119,7 @@ def assemble_stiffness(step: NewtonStep):
 def check_kernel(team: int) -> Kernel:
     """Return the kernel that checks the trials of the worlds, a team of so many threads for each."""
 
-    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(team, 512 // team))
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(team, TEAMS // team))
     def check_worlds(step: NewtonStep, team: int):
         """Accept the trial of each world or shorten it; where it is accepted find the gradient, and whether it is done.
 
@@ -149,17 +158,13 @@ def check_kernel(team: int) -> Kernel:
                     if alpha > wp.float64(0.0):
                         move_functions(step.instances, step.basis, step.arrays, alpha, i, member, team, q)
                     else:
-                        for e in range(member, width, team):
-                            rolled()
-                            q[i, e] = step.arrays.q[i, e]
+                        copy_blocks(step.arrays.q, q, i, member, team)
                     for j in range(member, n, team):
                         rolled()
                         r[w, j] = step.rigid.r[w, j] + alpha * step.rigid.direction[w, j]
                     barrier()
                 if searching == 0:
-                    for e in range(member, width, team):
-                        rolled()
-                        step.arrays.q[i, e] = q[i, e]
+                    copy_blocks(q, step.arrays.q, i, member, team)
                     for j in range(member, n, team):
                         rolled()
                         step.rigid.r[w, j] = r[w, j]
@@ -171,9 +176,9 @@ def check_kernel(team: int) -> Kernel:
         barrier()
         sum_forces_of(step.instances, step.basis, step.points, step.constraints, step.arrays, i, member, team)
         barrier()
-        for e in range(member, width, team):
+        for k in range(member, LANES * width, team):
             rolled()
-            gradient_block(step, i, e)
+            gradient_number(step, i, k)
         barrier()
         check_convergence(step, potential, team, w, member)
         if member == 0:
@@ -194,7 +199,7 @@ def direct_kernel(size: int, width: int, team: int) -> Kernel:
     dynamic = dynamic_floats(size, width)
     shared_direction = shared_direction_of(size, width)
 
-    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(team, 512 // team))
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(team, TEAMS // team))
     def direct_worlds(step: NewtonStep, team: int):
         """Assemble and solve the system of each world, and start its line search."""
         w, member = wp.tid()
@@ -232,14 +237,26 @@ def direct_kernel(size: int, width: int, team: int) -> Kernel:
                     r[w, j] = step.rigid.r[w, j] + alpha * step.rigid.direction[w, j]
                 barrier()
                 if searching == 0:
-                    for e in range(member, step.arrays.q.shape[1], team):
-                        rolled()
-                        step.arrays.q[i, e] = q[i, e]
+                    copy_blocks(q, step.arrays.q, i, member, team)
                     for j in range(member, step.rigid.count[w], team):
                         rolled()
                         step.rigid.r[w, j] = r[w, j]
 
     return direct_worlds
+
+
+@wp.kernel
+def count_left(step: NewtonStep, worlds: int, held: int, team: int):
+    """Say after a round whether another one is worth it: whether more than ``held`` worlds are left."""
+    _all, member = wp.tid()
+    count = wp.float64(0.0)
+    for w in range(member, worlds, team):
+        count += wp.float64(step.state.active[w])
+    count = team_sum(count)
+    if member == 0:
+        rounds = step.state.rounds_left[0]
+        step.state.rounds_left[0] = rounds - 1
+        step.state.any_left[0] = wp.where(count > wp.float64(held) and rounds > 0, 1, 0)
 
 
 def tasks(point_max: int, constraint_max: int, row_max: int) -> tuple[int, int, int]:

@@ -7,7 +7,13 @@ from softmode.deformables.model.lane_kernels import (
     LANES,
     WARP,
     barrier,
+    by_eights,
+    column_of,
+    copy_blocks,
+    number_of,
     rolled,
+    set_number,
+    single_of,
     team_sum,
     team_sum3,
     team_sum33,
@@ -65,9 +71,6 @@ SHORT_STEP = wp.constant(wp.float64(0.0625))
 """Step length below which Newton's own Hessian is given up for the projected one: such steps lead nowhere."""
 PROJECTED_ITERATIONS = wp.constant(8)
 """Iterations before which a small step with the projected Hessian does not count as convergence."""
-ENERGY_ROUNDING = wp.constant(wp.float64(2.0e-17))
-"""What rounding leaves of the elastic energy of a body that has turned, over E V: a tenth of float64's unit, since the
-errors of its points differ in sign."""
 SUFFICIENT_DECREASE = wp.constant(wp.float64(0.25))
 """Least decrease of the potential over that of its tangent. A quadratic has 0.5; with little less than that asked for,
 friction between sticking and slipping is crossed back and forth for many iterations."""
@@ -99,26 +102,34 @@ def potential_share(
         c = motion.rate[i]
         inertial = half * instances.mass[i] * c * c / (dt * dt)
         damping = half * instances.mass[i] * wp.float64(instances.mass_damping[i]) * c / dt
-        for e in range(member, q.shape[1], team):
-            rolled()
-            x = q[i, e]
-            away = x - motion.q_inertial[i, e]
-            moved = x - motion.q_rate[i, e]
-            ahead = x - motion.q_start[i, e]
-            total += inertial * wp.dot(away, away) + damping * wp.dot(moved, moved) - wp.dot(motion.force[i, e], ahead)
+        if by_eights() != 0:
+            for e in range(member, q.shape[1], team):
+                x = q[i, e]
+                away = x - motion.q_inertial[i, e]
+                moved = x - motion.q_rate[i, e]
+                ahead = x - motion.q_start[i, e]
+                kinetic = inertial * wp.dot(away, away) + damping * wp.dot(moved, moved)
+                total += kinetic - wp.dot(motion.force[i, e], ahead)
+        else:
+            for k in range(member, LANES * q.shape[1], team):
+                rolled()
+                at = number_of(q, i, k)
+                from_target = at - number_of(motion.q_inertial, i, k)
+                from_rate = at - number_of(motion.q_rate, i, k)
+                total += inertial * from_target * from_target + damping * from_rate * from_rate
+                total -= number_of(motion.force, i, k) * (at - number_of(motion.q_start, i, k))
         for p in range(member, instances.point_count[i], team):
             rolled()
             total += points.energy[i, p]
         for e in range(member, constraints.count[i], team):
             rolled()
             total += constraints.energy[i, e]
-    for j in range(member, rigid.count[w], team):
+    n = rigid.count[w]
+    for t in range(member, n * n, team):
         rolled()
-        for l in range(rigid.count[w]):
-            rolled()
-            total += (
-                half * (r[w, j] - rigid.predicted[w, j]) * rigid.inertia[w, j, l] * (r[w, l] - rigid.predicted[w, l])
-            )
+        j = t / n
+        l = t % n
+        total += half * (r[w, j] - rigid.predicted[w, j]) * rigid.inertia[w, j, l] * (r[w, l] - rigid.predicted[w, l])
     for k in range(member, rigid.row_count[w], team):
         rolled()
         total += rigid.row_energy[w, k]
@@ -143,6 +154,51 @@ def world_potential(step: NewtonStep, q: wp.array2d[vec8d], r: wp.array2d[wp.flo
         team,
     )
     return team_sum(share)
+
+
+@wp.func
+def square_share(values: wp.array2d[vec8d], i: int, member: int, team: int):
+    """Return one thread's share of the squared length of row ``i``."""
+    total = wp.float64(0.0)
+    if by_eights() != 0:
+        for e in range(member, values.shape[1], team):
+            total += wp.dot(values[i, e], values[i, e])
+    else:
+        for k in range(member, LANES * values.shape[1], team):
+            rolled()
+            value = number_of(values, i, k)
+            total += value * value
+    return total
+
+
+@wp.func
+def step_share(arrays: NewtonArrays, i: int, member: int, team: int):
+    """Return one thread's share of the squared length of a body's direction."""
+    total = wp.float64(0.0)
+    if by_eights() != 0:
+        for e in range(member, arrays.direction.shape[1], team):
+            d = vec8d(arrays.direction[i, e])
+            total += wp.dot(d, d)
+    else:
+        for k in range(member, LANES * arrays.direction.shape[1], team):
+            rolled()
+            value = wp.float64(single_of(arrays.direction, i, k))
+            total += value * value
+    return total
+
+
+@wp.func
+def slope_share(arrays: NewtonArrays, i: int, member: int, team: int):
+    """Return one thread's share of gradient . direction of a body [J]."""
+    total = wp.float64(0.0)
+    if by_eights() != 0:
+        for e in range(member, arrays.gradient.shape[1], team):
+            total += wp.dot(arrays.gradient[i, e], vec8d(arrays.direction[i, e]))
+    else:
+        for k in range(member, LANES * arrays.gradient.shape[1], team):
+            rolled()
+            total += number_of(arrays.gradient, i, k) * wp.float64(single_of(arrays.direction, i, k))
+    return total
 
 
 @wp.func
@@ -215,8 +271,6 @@ def check_convergence(step: NewtonStep, potential: wp.float64, team: int, w: int
     """
     if step.state.active[w] == 0:
         return
-    q = step.arrays.q
-    gradient = step.arrays.gradient
     dt = step.options.dt
     done = int(1)
     if step.state.iteration[w] == 0:
@@ -228,13 +282,9 @@ def check_convergence(step: NewtonStep, potential: wp.float64, team: int, w: int
         if done == 1 and not pushes(step.instances, step.constraints, i):
             done = step.state.last[w]
         elif done == 1:
-            residual = wp.float64(0.0)
-            external = wp.float64(0.0)
+            residual = square_share(step.arrays.gradient, i, member, team)
+            external = square_share(step.motion.force, i, member, team)
             scale = wp.float64(0.0)
-            for e in range(member, q.shape[1], team):
-                rolled()
-                residual += wp.dot(gradient[i, e], gradient[i, e])
-                external += wp.dot(step.motion.force[i, e], step.motion.force[i, e])
             driven = step.instances.driven_count[i]
             count = step.instances.function_count[i]
             alone = step.constraints.count[i] - step.constraints.pair_count[i]
@@ -306,6 +356,14 @@ def direction_block(arrays: NewtonArrays, i: int, b: int):
 
 
 @wp.func
+def direction_column(arrays: NewtonArrays, i: int, k: int):
+    """Return the three coordinates of function ``k`` of the direction."""
+    n = LANES * (arrays.direction.shape[1] / 3)
+    d = arrays.direction
+    return wp.vec3d(wp.vec3(single_of(d, i, k), single_of(d, i, n + k), single_of(d, i, 2 * n + k)))
+
+
+@wp.func
 def find_turn(instances: Instances, basis: Basis, arrays: NewtonArrays, i: int, member: int, team: int):
     """Find the rigid part of the direction: motion of the centre of mass, and the rotation with its angular momentum.
 
@@ -313,26 +371,43 @@ def find_turn(instances: Instances, basis: Basis, arrays: NewtonArrays, i: int, 
     """
     a = instances.asset[i]
     n = instances.function_count[i]
-    X = centre_of_mass(basis, arrays.q, a, n, i, member, team)
+    X = wp.vec3d()
     shift = wp.vec3d()
-    for b in range(member, blocks_of(n), team):
-        rolled()
-        shift += direction_block(arrays, i, b) * basis.mean[a, b]
-    shift = team_sum3(shift)
     S = wp.mat33d()
-    U = wp.mat33d()
-    for b in range(member, blocks_of(n), team):
-        rolled()
-        rest, one = rest_block(basis, a, b)
-        r = unknown_block(arrays.q, i, b) + rest - wp.outer(X, one)
-        S += r * wp.transpose(r)
-        U += r * wp.transpose(direction_block(arrays, i, b))
+    moment = wp.vec3d()
+    if by_eights() != 0:
+        X = centre_of_mass(basis, arrays.q, a, n, i, member, team)
+        for b in range(member, blocks_of(n), team):
+            shift += direction_block(arrays, i, b) * basis.mean[a, b]
+        shift = team_sum3(shift)
+        U = wp.mat33d()
+        for b in range(member, blocks_of(n), team):
+            rest, one = rest_block(basis, a, b)
+            r = unknown_block(arrays.q, i, b) + rest - wp.outer(X, one)
+            S += r * wp.transpose(r)
+            U += r * wp.transpose(direction_block(arrays, i, b))
+        moment = axial(U)
+    else:
+        for k in range(member, n, team):
+            rolled()
+            c = basis.linear[a, k]
+            mean = number_of(basis.mean, a, k)
+            X += mean * (column_of(arrays.q, i, k) + wp.vec3d(c[0], c[1], c[2]))
+            shift += mean * direction_column(arrays, i, k)
+        X = team_sum3(X)
+        shift = team_sum3(shift)
+        for k in range(member, n, team):
+            rolled()
+            c = basis.linear[a, k]
+            arm = column_of(arrays.q, i, k) + wp.vec3d(c[0], c[1], c[2]) - c[3] * X
+            S += wp.outer(arm, arm)
+            moment += wp.cross(arm, direction_column(arrays, i, k))
     S = team_sum33(S)
-    U = team_sum33(U)
+    moment = team_sum3(moment)
     if member == 0:
         arrays.turn_centre[i] = X
         arrays.turn_shift[i] = shift
-        arrays.turn[i] = wp.inverse(tensor_of_inertia(S, instances.size[i])) * axial(U)
+        arrays.turn[i] = wp.inverse(tensor_of_inertia(S, instances.size[i])) * moment
 
 
 @wp.func
@@ -345,6 +420,19 @@ def moved_block(instances: Instances, basis: Basis, arrays: NewtonArrays, i: int
     bent = direction_block(arrays, i, b) - wp.outer(shift, one) - wp.skew(turn) * r
     centre = arrays.turn_centre[i] + alpha * shift
     return rotation_of(alpha * turn) * (r + alpha * bent) + wp.outer(centre, one) - rest
+
+
+@wp.func
+def moved_column(instances: Instances, basis: Basis, arrays: NewtonArrays, i: int, k: int, alpha: wp.float64):
+    """Return the coordinates of one function likewise."""
+    c = basis.linear[instances.asset[i], k]
+    rest = wp.vec3d(c[0], c[1], c[2])
+    shift = arrays.turn_shift[i]
+    turn = arrays.turn[i]
+    r = column_of(arrays.q, i, k) + rest - c[3] * arrays.turn_centre[i]
+    bent = direction_column(arrays, i, k) - c[3] * shift - wp.cross(turn, r)
+    centre = arrays.turn_centre[i] + alpha * shift
+    return rotation_of(alpha * turn) * (r + alpha * bent) + c[3] * centre - rest
 
 
 @wp.func
@@ -362,16 +450,28 @@ def move_functions(
     """Move the coordinates of an instance by alpha times the direction."""
     stride = q_out.shape[1] / 3
     turn = arrays.turn[i]
-    if wp.dot(turn, turn) == wp.float64(0.0):
-        for e in range(member, q_out.shape[1], team):
-            rolled()
-            q_out[i, e] = arrays.q[i, e] + alpha * vec8d(arrays.direction[i, e])
+    if by_eights() != 0:
+        if wp.dot(turn, turn) == wp.float64(0.0):
+            for e in range(member, q_out.shape[1], team):
+                q_out[i, e] = arrays.q[i, e] + alpha * vec8d(arrays.direction[i, e])
+            return
+        for b in range(member, stride, team):
+            block = moved_block(instances, basis, arrays, i, b, alpha)
+            for axis in range(3):
+                q_out[i, axis * stride + b] = block[axis]
         return
-    for b in range(member, stride, team):
+    if wp.dot(turn, turn) == wp.float64(0.0):
+        for k in range(member, LANES * q_out.shape[1], team):
+            rolled()
+            set_number(q_out, i, k, number_of(arrays.q, i, k) + alpha * wp.float64(single_of(arrays.direction, i, k)))
+        return
+    n = LANES * stride
+    for k in range(member, instances.function_count[i], team):
         rolled()
-        block = moved_block(instances, basis, arrays, i, b, alpha)
-        for axis in range(3):
-            q_out[i, axis * stride + b] = block[axis]
+        moved = moved_column(instances, basis, arrays, i, k, alpha)
+        set_number(q_out, i, k, moved[0])
+        set_number(q_out, i, n + k, moved[1])
+        set_number(q_out, i, 2 * n + k, moved[2])
 
 
 @wp.func
@@ -395,12 +495,8 @@ def start_line_search(step: NewtonStep, team: int, w: int, member: int):
         rolled()
         if step.state.project[w] == 0 and step.arrays.systems.indefinite[step.instances.system[i]] != 0:
             unsound = 1
-        moved = wp.float64(0.0)
-        for e in range(member, step.arrays.gradient.shape[1], team):
-            rolled()
-            d = vec8d(step.arrays.direction[i, e])
-            slope += wp.dot(step.arrays.gradient[i, e], d)
-            moved += wp.dot(d, d)
+        slope += slope_share(step.arrays, i, member, team)
+        moved = step_share(step.arrays, i, member, team)
         moved = team_sum(moved)
         limit = wp.float64(step.instances.tolerance[i])
         if has_contacts(step.instances, step.constraints, i):
@@ -411,18 +507,21 @@ def start_line_search(step: NewtonStep, team: int, w: int, member: int):
             find_turn(step.instances, step.basis, step.arrays, i, member, team)
         elif member == 0:
             step.arrays.turn[i] = wp.vec3d()
-    slope = team_sum(slope)
-    if member != 0:
-        return
-    step.state.searching[w] = 0
-    for j in range(step.rigid.count[w]):
+    far = wp.float64(0.0)
+    # dofs that take part are in contact: a light body moves where the soft one stays
+    limit = wp.min(wp.float64(step.arrays.rigid_tolerance[w]), wp.float64(0.01) * step.options.stick_range)
+    for j in range(member, step.rigid.count[w], team):
         rolled()
         slope += step.rigid.gradient[w, j] * step.rigid.direction[w, j]
-        # dofs that take part are in contact: a light body moves where the soft one stays
-        limit = wp.min(wp.float64(step.arrays.rigid_tolerance[w]), wp.float64(0.01) * step.options.stick_range)
         if not (wp.abs(step.rigid.direction[w, j]) <= limit):
-            last = 0
-    step.state.slope[w] = slope
+            far += wp.float64(1.0)
+    sums = team_sum3(wp.vec3d(slope, far, wp.float64(0.0)))
+    if member != 0:
+        return
+    if sums[1] > wp.float64(0.0):
+        last = 0
+    step.state.searching[w] = 0
+    step.state.slope[w] = sums[0]
     step.state.step_length[w] = wp.float64(1.0)
     small_again = wp.where(step.state.iteration[w] > 0, step.state.last[w], 0)
     step.state.last[w] = last
@@ -462,19 +561,6 @@ def trial_rigid(step: NewtonStep):
 
 
 @wp.func
-def rounding_of(instances: Instances, instance_start: wp.array[int], potential: wp.float64, w: int):
-    """Return what rounding leaves of the potential of a world [J]."""
-    total = wp.float64(1.0e-12) * wp.abs(potential)
-    for i in range(instance_start[w], instance_end(instances, instance_start, w)):
-        rolled()
-        if not exists(instances, i):
-            continue
-        volume = instances.mass[i] * wp.float64(instances.size[i] * instances.size[i] / instances.inertia[i])
-        total += ENERGY_ROUNDING * wp.float64(instances.youngs_modulus[i]) * volume
-    return total
-
-
-@wp.func
 def check_trial(step: NewtonStep, trial: wp.float64, w: int, member: int):
     """Accept a trial that lowers the potential enough (Armijo, up to rounding) or halve the step; give up if short.
 
@@ -486,7 +572,7 @@ def check_trial(step: NewtonStep, trial: wp.float64, w: int, member: int):
     if member != 0:
         return
     potential = step.state.potential[w]
-    rounding = rounding_of(step.instances, step.state.instance_start, potential, w)
+    rounding = wp.float64(1.0e-12) * wp.abs(potential) + step.state.rounding[w]
     alpha = step.state.step_length[w]
     if alpha > wp.float64(1.0):
         step.state.searching[w] = 0
@@ -575,21 +661,16 @@ def accept_step(step: NewtonStep, team: int, w: int, member: int):
     if step.state.active[w] == 0:
         return
     alpha = step.state.step_length[w]
-    q = step.arrays.q
     refreshed = step.state.refresh[w]
     far = int(0)
     away = int(0)
     allowed = int(NEAR_FAILURES)
     for i in range(step.state.instance_start[w], instance_end(step.instances, step.state.instance_start, w)):
         rolled()
-        moved = wp.float64(0.0)
-        for e in range(member, q.shape[1], team):
-            rolled()
-            d = vec8d(step.arrays.direction[i, e])
-            moved += wp.dot(d, d)
-            if refreshed != 0:
-                step.state.cached_q[i, e] = q[i, e]
+        moved = step_share(step.arrays, i, member, team)
         moved = team_sum(moved)
+        if refreshed != 0:
+            copy_blocks(step.arrays.q, step.state.cached_q, i, member, team)
         if alpha * wp.sqrt(moved) > refresh_limit(step.instances, i, step.options):
             far = 1
         if refreshed != 0 and member == 0:

@@ -34,7 +34,15 @@ from softmode.deformables.materials.material_kernels import (
 )
 from softmode.deformables.model.declare import kernel_over
 from softmode.deformables.model.deformation_kernels import elastic_gradient
-from softmode.deformables.model.lane_kernels import LANES, team_rank, team_sum, vec8d
+from softmode.deformables.model.lane_kernels import (
+    LANES,
+    chunk_number,
+    number_of,
+    set_number,
+    team_rank,
+    team_sum,
+    vec8d,
+)
 from softmode.deformables.model.status import (
     PARAMETER_BITS,
     WORLD_COLLAPSED,
@@ -46,6 +54,7 @@ from softmode.deformables.model.struct_kernels import (
     Instances,
     PointConstraints,
     blocks_of,
+    exists,
     has_contacts,
     in_mask,
     interpolate_change,
@@ -69,6 +78,9 @@ EXTRAPOLATION_INERTIA = wp.constant(wp.float64(0.01))
 """Least rho L^2 / (E dt^2) of a body whose acceleration is carried on."""
 NEEDS_FEASIBLE_START = wp.constant(int(MaterialModel.NEO_HOOKEAN))
 """The material that forbids inversion: a step starts where the last one ended."""
+ENERGY_ROUNDING = wp.constant(wp.float64(2.0e-17))
+"""What rounding leaves of the elastic energy of a body that has turned, over E V: a tenth of float64's unit, since the
+errors of its points differ in sign."""
 PIVOT_ROUNDING = wp.constant(1.0e-4)
 """What rounding may take of a pivot of the Hessian, over the stiffness P V / L^2 of a body: its rotations have no more
 than their inertia left when all else is eliminated."""
@@ -261,6 +273,7 @@ def begin_newton(step: NewtonStep):
     """Start Newton's iteration in every world."""
     w = wp.tid()
     in_contact = int(0)
+    rounding = wp.float64(0.0)
     for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
         rate = step.motion.rate[i] / step.options.dt
         mass = float(step.instances.mass[i])
@@ -273,7 +286,12 @@ def begin_newton(step: NewtonStep):
             )
         if pushes(step.instances, step.constraints, i):
             in_contact = 1
+        if exists(step.instances, i):
+            size = step.instances.size[i]
+            volume = step.instances.mass[i] * wp.float64(size * size / step.instances.inertia[i])
+            rounding += ENERGY_ROUNDING * wp.float64(step.instances.youngs_modulus[i]) * volume
     step.state.in_contact[w] = in_contact
+    step.state.rounding[w] = rounding
     step.state.active[w] = 1
     step.state.searching[w] = 0
     step.state.evaluated[w] = 0
@@ -557,6 +575,29 @@ def gradient_block(step: NewtonStep, i: int, e: int):
             g[lane] = wp.float64(0.0)
     step.arrays.gradient[i, e] = g
     step.arrays.reaction[i, e] = reaction
+
+
+@wp.func
+def gradient_number(step: NewtonStep, i: int, k: int):
+    """Compute number ``k`` of the same, of an active world."""
+    dt = step.options.dt
+    function = k % (LANES * step.basis.row.shape[1])
+    if function >= step.instances.function_count[i]:
+        return
+    rate = step.motion.rate[i] / dt
+    damping = wp.float64(step.instances.mass_damping[i])
+    q = number_of(step.arrays.q, i, k)
+    g = rate * (q - number_of(step.motion.q_inertial, i, k)) + damping * (q - number_of(step.motion.q_rate, i, k))
+    g = step.instances.mass[i] * rate * g - number_of(step.motion.force, i, k)
+    row = i * step.arrays.gradient_chunk.shape[1]
+    for part in range(step.arrays.gradient_chunk.shape[1]):
+        g = g + chunk_number(step.arrays.gradient_chunk, row + part, k)
+    reaction = wp.float64(0.0)
+    if function < step.instances.driven_count[i]:
+        reaction = g
+        g = wp.float64(0.0)
+    set_number(step.arrays.gradient, i, k, g)
+    set_number(step.arrays.reaction, i, k, reaction)
 
 
 sum_gradient = kernel_over(gradient_block, "sum_gradient", "i", "e")

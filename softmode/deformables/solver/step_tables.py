@@ -46,15 +46,15 @@ CUDA_THREADS = 2**16
 """Threads that keep a GPU busy: sums over points are split until there are about so many."""
 ONE_LAUNCH_BLOCKS = 7
 """Blocks of eight functions up to which a body is small enough for a team of threads on CUDA; on CPU any is."""
-ROUNDS = 5
-"""Rounds of launches before the one launch where worlds are many: measured, see ``docs/performance.md``."""
+ROUNDS = 10
+"""Most rounds of launches before the one launch where worlds are many: measured, see ``docs/performance.md``."""
 ROUND_WORLDS = 12
 """Worlds for each multiprocessor from which on they are many."""
 FEW_WORLDS = 64
 """Bodies up to which those of many functions get larger teams, and more and smaller blocks of threads, on CUDA."""
 LARGE_TEAM = 128
 """Threads of these teams and blocks."""
-RESERVED_BYTES = 7168
+RESERVED_BYTES = 12 * 1024
 """Shared memory that the one launch needs besides its system, with what CUDA keeps for itself."""
 
 _POINTS = {"": "instance point", "hessian": "instance 6 point"}
@@ -71,7 +71,12 @@ _CONSTRAINTS = {
     "count pair_count acting_count": "instance",
     "jacobian coupling": "instance constraint rigid",
 }
-_NEWTON = {"": "world", "cached_q": "instance unknown", "cached_key": "instance", "any_active any_searching": "1"}
+_NEWTON = {
+    "": "world",
+    "cached_q": "instance unknown",
+    "cached_key": "instance",
+    "any_active any_searching any_left rounds_left": "1",
+}
 _ARRAYS = {
     "": "instance unknown",
     "gradient_chunk": "instance gradient_chunk unknown",
@@ -150,7 +155,9 @@ class StepTables:
     world_team: int
     """Threads of that team."""
     rounds: int
-    """Rounds of launches before it, which take all worlds through their first iterations; 0 where there are none."""
+    """Most rounds of launches before it, which take worlds through their first iterations; 0 where there are none."""
+    held: int
+    """Worlds that the one launch takes at a time: no more rounds where no more worlds are left."""
     shared: bool
     """Whether the systems of that launch are assembled and solved in shared memory."""
     tiled: bool
@@ -330,6 +337,7 @@ def allocate_tables(
         world_team=world_team,
         shared=shared,
         rounds=rounds,
+        held=fused.held_at_a_time(world_team, device),
         tiled=tiled,
     )
 
