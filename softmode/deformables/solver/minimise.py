@@ -3,6 +3,7 @@
 import warp as wp
 
 from softmode.deformables.model.declare import launch_teams
+from softmode.deformables.model.lane_kernels import LANES
 from softmode.deformables.solver import newton_round_kernels as rounds
 from softmode.deformables.solver import rigid_start_kernels
 from softmode.deformables.solver import search_kernels as search
@@ -93,7 +94,7 @@ def start_line_search(tables: StepTables, dt: float) -> None:
 def _try_step(tables: StepTables, dt: float) -> None:
     """Evaluate one trial step in every searching world and accept or halve it."""
     t, step = tables, tables.newton_step(dt)
-    threads = t.layout.block_count if t.model.device.is_cuda else 1
+    threads = LANES * t.layout.block_count if t.model.device.is_cuda else 1  # one for each function
     t.launch(search.trial_functions, (t.layout.instance_count, threads), step, threads)
     if t.rigid.count_max:
         t.launch(search.trial_rigid, (t.layout.world_count, t.rigid.count_max), step)

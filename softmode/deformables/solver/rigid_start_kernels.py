@@ -24,6 +24,7 @@ from softmode.deformables.model.struct_kernels import (
     interpolate_change,
 )
 from softmode.deformables.solver.iteration_kernels import NewtonStep
+from softmode.deformables.solver.search_kernels import square_share
 from softmode.deformables.solver.spin_kernels import (
     axial,
     centre_of_mass,
@@ -183,9 +184,7 @@ def start_rigidly(step: NewtonStep, samples: Samples, team: int):
     n = step.instances.function_count[i]
     blocks = blocks_of(n)
     weight = step.instances.mass[i] / (dt * dt)
-    moved = wp.float64(0.0)
-    for e in range(member, step.arrays.q.shape[1], team):
-        moved += wp.dot(step.motion.qd_start[i, e], step.motion.qd_start[i, e])
+    moved = square_share(step.motion.qd_start, i, member, team)
     moved = dt * dt * team_sum(moved)
     least = IMPACT_MOTION * wp.float64(step.instances.size[i])
     if moved < least * least:

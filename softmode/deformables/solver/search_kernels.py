@@ -172,33 +172,22 @@ def square_share(values: wp.array2d[vec8d], i: int, member: int, team: int):
 
 
 @wp.func
-def step_share(arrays: NewtonArrays, i: int, member: int, team: int):
-    """Return one thread's share of the squared length of a body's direction."""
-    total = wp.float64(0.0)
+def step_shares(arrays: NewtonArrays, i: int, member: int, team: int):
+    """Return one thread's shares of gradient . direction of a body [J] and of the direction's squared length [m^2]."""
+    slope = wp.float64(0.0)
+    squared = wp.float64(0.0)
     if by_eights() != 0:
         for e in range(member, arrays.direction.shape[1], team):
             d = vec8d(arrays.direction[i, e])
-            total += wp.dot(d, d)
+            slope += wp.dot(arrays.gradient[i, e], d)
+            squared += wp.dot(d, d)
     else:
         for k in range(member, LANES * arrays.direction.shape[1], team):
             rolled()
             value = wp.float64(single_of(arrays.direction, i, k))
-            total += value * value
-    return total
-
-
-@wp.func
-def slope_share(arrays: NewtonArrays, i: int, member: int, team: int):
-    """Return one thread's share of gradient . direction of a body [J]."""
-    total = wp.float64(0.0)
-    if by_eights() != 0:
-        for e in range(member, arrays.gradient.shape[1], team):
-            total += wp.dot(arrays.gradient[i, e], vec8d(arrays.direction[i, e]))
-    else:
-        for k in range(member, LANES * arrays.gradient.shape[1], team):
-            rolled()
-            total += number_of(arrays.gradient, i, k) * wp.float64(single_of(arrays.direction, i, k))
-    return total
+            slope += number_of(arrays.gradient, i, k) * value
+            squared += value * value
+    return slope, squared
 
 
 @wp.func
@@ -495,8 +484,8 @@ def start_line_search(step: NewtonStep, team: int, w: int, member: int):
         rolled()
         if step.state.project[w] == 0 and step.arrays.systems.indefinite[step.instances.system[i]] != 0:
             unsound = 1
-        slope += slope_share(step.arrays, i, member, team)
-        moved = step_share(step.arrays, i, member, team)
+        along, moved = step_shares(step.arrays, i, member, team)
+        slope += along
         moved = team_sum(moved)
         limit = wp.float64(step.instances.tolerance[i])
         if has_contacts(step.instances, step.constraints, i):
@@ -667,7 +656,7 @@ def accept_step(step: NewtonStep, team: int, w: int, member: int):
     allowed = int(NEAR_FAILURES)
     for i in range(step.state.instance_start[w], instance_end(step.instances, step.state.instance_start, w)):
         rolled()
-        moved = step_share(step.arrays, i, member, team)
+        _slope, moved = step_shares(step.arrays, i, member, team)
         moved = team_sum(moved)
         if refreshed != 0:
             copy_blocks(step.arrays.q, step.state.cached_q, i, member, team)
