@@ -264,7 +264,7 @@ def march(
     return out
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(256, 2))
 def find_contacts(
     instances: Instances,
     basis: Basis,

@@ -22,8 +22,8 @@ solve has (M + dt C + J^T D' J)^-1, D' such that both are the same for one row a
 ratios of M + dt C to M; and contacts that MuJoCo will only detect in the next step.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import newton
@@ -33,7 +33,7 @@ from newton.solvers import SolverBase, SolverMuJoCo
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.coupling import coupling_kernels as kernels
-from softmode.deformables.coupling.rigid_solver import dropping_overflows, mujoco_warnings, second_half
+from softmode.deformables.coupling.rigid_solver import Halves, dropping_overflows, mujoco_warnings
 from softmode.deformables.model.declare import WRENCH
 from softmode.deformables.model.neighbours import warn_foreign_deformables
 from softmode.deformables.model.rigid_dofs import RigidDofs
@@ -95,7 +95,7 @@ class SolverCoupledReduced(ReducedSolver):
         warn_foreign_deformables(model, self.tables.layout)
         device, count = model.device, model.joint_dof_count
         self.predicted_state = model.state()
-        self._from_forces_on, self._dropping = second_half(self.rigid), dropping_overflows()
+        self._halves, self._dropping = Halves(self.rigid), dropping_overflows()
         self._joint_S = wp.zeros(count, dtype=WRENCH, device=device)
         self._body_f = wp.zeros(model.body_count, dtype=WRENCH, device=device)
         self._damping = wp.zeros(count, dtype=float, device=device)
@@ -205,17 +205,34 @@ class SolverCoupledReduced(ReducedSolver):
         of_rigid = None if observables is None else observables.rigid
         data = self.rigid.mjw_data
         wp.copy(self._activation, data.act)
-        self.rigid.step(state_in, self.predicted_state, control, contacts, dt, observables=of_rigid)
+        with self._predicting(state_in, control, dt):
+            self.rigid.step(state_in, self.predicted_state, control, contacts, dt, observables=of_rigid)
         wp.copy(self._warmstart, data.qacc_warmstart)
 
-        couple = partial(self._couple, state_in, dt)
-        self.reduced.advance(state_in, state_out, self.reduced.targets(control), dt, couple=couple)
+        self._couple(state_in, dt)
+        self.reduced.minimise(dt)
+        self.reduced.finish(state_out, dt)
 
         self._find_pushed()
         arguments = {"control": control, "contacts": contacts, "dt": dt, "observables": of_rigid}
         self._branch(self._any_pushed, self._correct, state_in=state_in, state_out=state_out, **arguments)
         self._keep_prediction(state_out)
         self.reduced.report(observables)
+
+    @contextmanager
+    def _predicting(self, state: newton.State, control: newton.Control | None, dt: float) -> Generator[None]:
+        """Predict the soft bodies and detect their contacts; on CUDA beside the first half of MuJoCo's step, within."""
+        beside = self.tables.beside
+        with beside:
+            self.reduced.begin(state, control, dt)
+            self.reduced.detect(state, control, dt, prescribed=False)
+            if self.model.device.is_cuda:
+                newton.eval_jacobian(self.model, state, self.tables.rigid.table.jacobian, joint_S_s=self._joint_S)
+        if not self.model.device.is_cuda:
+            yield
+            return
+        with self._halves.both(between=beside.join):
+            yield
 
     def _branch(self, condition: wp.array, body: Callable[..., None], **arguments: Any) -> None:
         """Do what is needed only if ``condition`` holds; on CUDA always.
@@ -239,7 +256,8 @@ class SolverCoupledReduced(ReducedSolver):
         """Evaluate Jacobians and the effective inertia at the start of the step."""
         model, t, dofs = self.model, self.tables, self.tables.rigid
         table, worlds = dofs.table, self.world_count
-        newton.eval_jacobian(model, state, table.jacobian, joint_S_s=self._joint_S)
+        if not model.device.is_cuda:  # there they have been evaluated beside MuJoCo's step, see ``_predicting``
+            newton.eval_jacobian(model, state, table.jacobian, joint_S_s=self._joint_S)
         drives = (model.joint_target_mode, model.joint_target_kd, model.joint_damping)
         t.launch(kernels.drive_damping, model.joint_dof_count, *drives, self._damping)
         start = (state.body_q, state.joint_qd, self.predicted_state.joint_qd, wp.float64(dt))
@@ -271,7 +289,7 @@ class SolverCoupledReduced(ReducedSolver):
         wp.copy(self.rigid.mjw_data.act, self._activation)
         wp.copy(self._body_f, present(state_in.body_f))
         self.tables.launch(kernels.add_wrench, self.model.body_count, self.body_wrench, state_in.body_f)
-        with self._from_forces_on():
+        with self._halves.second():
             self.rigid.step(state_in, state_out, control, contacts, dt, observables=observables)
         wp.copy(present(state_in.body_f), self._body_f)
 

@@ -22,6 +22,9 @@ from softmode.deformables.solver.step_tables import StepTables
 def minimise(tables: StepTables, dt: float) -> None:
     """Find the coordinates, and the rigid unknowns, at the end of a step of ``dt`` [s]."""
     t, worlds, step = tables, tables.layout.world_count, tables.newton_step(dt)
+    if t.rounds:
+        t.newton.level_count.zero_()
+        t.launch(rounds.expect_iterations, worlds, step)
     t.launch(kernels.begin_newton, worlds, step)
     t.launch(kernels.extrapolate, t.unknowns, step)
     if t.model.shape_count:
@@ -29,16 +32,27 @@ def minimise(tables: StepTables, dt: float) -> None:
     if t.options.carry_stiffness:
         t.launch_teams(search.reuse_hessians, worlds, step, t.team)
     if t.rounds:
-        t.launch(rounds.start_trials, (worlds, max(3 * t.layout.block_count, t.rigid.count_max)), step, t.rounds)
-        for _ in range(min(t.rounds, rounds.ALWAYS)):
+        dim = (worlds, max(3 * t.layout.block_count, t.rigid.count_max))
+        always = min(t.rounds, rounds.ALWAYS)
+        t.launch(rounds.start_trials, dim, step, t.rounds - always, int(rounds.BESIDE * t.held))
+        with t.beside:
+            _go_on_to_the_end(t, dt, only_aside=True)
+        for _ in range(always):
             _take_round(t, dt)
+        t.beside.join()
         _count_left(t, dt)
         wp.capture_while(t.newton.any_left, _take_another_round, tables=t, dt=dt)
     if t.one_launch:
-        team = t.world_team
-        t.launch(t.fused_kernel, (worlds, team), step, t.system.unit, team, t.system.relation, block_dim=team)
+        _go_on_to_the_end(t, dt, only_aside=False)
     else:
         wp.capture_while(t.newton.any_active, _iterate, tables=t, dt=dt)
+
+
+def _go_on_to_the_end(tables: StepTables, dt: float, *, only_aside: bool) -> None:
+    """Take every world that is not done through all iterations that it still needs, in one launch."""
+    t, team = tables, tables.world_team
+    known = (t.newton_step(dt), t.system.unit, team, t.system.relation, int(only_aside))
+    t.launch(t.fused_kernel, (t.layout.world_count, team), *known, block_dim=team)
 
 
 def _take_round(tables: StepTables, dt: float) -> None:

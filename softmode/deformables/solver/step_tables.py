@@ -15,6 +15,7 @@ from softmode.deformables.contact.dents import dent_lengths
 from softmode.deformables.contact.detection_kernels import Shapes
 from softmode.deformables.contact.pairs import SoftPairs
 from softmode.deformables.contact.shape_tables import candidate_shapes, shape_table
+from softmode.deformables.model.beside import Beside
 from softmode.deformables.model.declare import WRENCH, Kernel, launch, launch_teams
 from softmode.deformables.model.lane_kernels import LANES, WARP, team_size
 from softmode.deformables.model.layout import Layout, lay_out, lay_out_bases, lay_out_instances, surface_stiffness
@@ -37,6 +38,7 @@ from softmode.deformables.solver.assembly_cpu_kernels import cache_slabs
 from softmode.deformables.solver.factor import BlockCholesky
 from softmode.deformables.solver.fused_system_kernels import shared_bytes
 from softmode.deformables.solver.iteration_kernels import NewtonArrays, NewtonOptions, NewtonStep
+from softmode.deformables.solver.newton_round_kernels import LEVELS
 from softmode.deformables.solver.options import SolverReducedOptions
 from softmode.deformables.solver.spin_kernels import Spin
 from softmode.deformables.solver.systems import join_systems
@@ -76,6 +78,7 @@ _NEWTON = {
     "cached_q": "instance unknown",
     "cached_key": "instance",
     "any_active any_searching any_left rounds_left": "1",
+    "level_count": f"{LEVELS}",
 }
 _ARRAYS = {
     "": "instance unknown",
@@ -158,6 +161,8 @@ class StepTables:
     """Most rounds of launches before it, which take worlds through their first iterations; 0 where there are none."""
     held: int
     """Worlds that the one launch takes at a time: no more rounds where no more worlds are left."""
+    beside: Beside
+    """Takes launches that do not wait for those which follow them."""
     shared: bool
     """Whether the systems of that launch are assembled and solved in shared memory."""
     tiled: bool
@@ -338,6 +343,7 @@ def allocate_tables(
         shared=shared,
         rounds=rounds,
         held=fused.held_at_a_time(world_team, device),
+        beside=Beside(device),
         tiled=tiled,
     )
 
