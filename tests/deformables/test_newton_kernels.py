@@ -136,7 +136,7 @@ def test_slowest_worlds_go_beside_the_rounds() -> None:
         state.iteration.assign(iterations)
         state.level_count.zero_()
         tables.launch(newton_round_kernels.expect_iterations, 6, step)
-        tables.launch(newton_round_kernels.start_trials, (6, 1), step, 0, room)
+        tables.launch(newton_round_kernels.start_trials, (6, 1), step, 0, 3, room)
         return state.aside.numpy().tolist()
 
     assert chosen([1, 2, 3, 5, 9, 20], 6) == [0, 0, 1, 1, 1, 1]

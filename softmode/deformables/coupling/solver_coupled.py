@@ -34,6 +34,7 @@ from newton.solvers import SolverBase, SolverMuJoCo
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.coupling import coupling_kernels as kernels
 from softmode.deformables.coupling.rigid_solver import Halves, dropping_overflows, mujoco_warnings
+from softmode.deformables.model.beside import Beside
 from softmode.deformables.model.declare import WRENCH
 from softmode.deformables.model.neighbours import warn_foreign_deformables
 from softmode.deformables.model.rigid_dofs import RigidDofs
@@ -101,6 +102,7 @@ class SolverCoupledReduced(ReducedSolver):
         self._damping = wp.zeros(count, dtype=float, device=device)
         self._any_coupled, self._any_pushed = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
         self._pushed = wp.zeros(self.world_count, dtype=int, device=device)
+        self._beside = Beside(device)
         self._lay_out_joints()
         self._bind()
 
@@ -222,16 +224,20 @@ class SolverCoupledReduced(ReducedSolver):
     @contextmanager
     def _predicting(self, state: newton.State, control: newton.Control | None, dt: float) -> Generator[None]:
         """Predict the soft bodies and detect their contacts; on CUDA beside the first half of MuJoCo's step, within."""
-        beside = self.tables.beside
-        with beside:
+        with self.tables.beside:
             self.reduced.begin(state, control, dt)
             self.reduced.detect(state, control, dt, prescribed=False)
-            if self.model.device.is_cuda:
-                newton.eval_jacobian(self.model, state, self.tables.rigid.table.jacobian, joint_S_s=self._joint_S)
         if not self.model.device.is_cuda:
             yield
             return
-        with self._halves.both(between=beside.join):
+        with self._beside:
+            newton.eval_jacobian(self.model, state, self.tables.rigid.table.jacobian, joint_S_s=self._joint_S)
+
+        def join() -> None:
+            self.tables.beside.join()
+            self._beside.join()
+
+        with self._halves.both(between=join):
             yield
 
     def _branch(self, condition: wp.array, body: Callable[..., None], **arguments: Any) -> None:

@@ -64,6 +64,8 @@ LARGE_TEAM = 256
 """where every world has a multiprocessor to itself,"""
 TEAM = 128
 """and elsewhere. All are measured, see ``docs/performance.md``."""
+TAIL_TEAM = 192
+"""Threads that share a world where rounds of launches take most worlds to their end."""
 FEW_POINTS = 128
 """Most points that count as few."""
 THREADS = 384
@@ -120,6 +122,9 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
         n = step.rigid.count[w]
         tasks = 3 * blocks * blocks + 3 * (blocks * blocks + blocks) / 2
         chunks = step.arrays.gradient_chunk.shape[1]
+        parts = chunks
+        if wp.static(shared):
+            parts = wp.max(team / WARP, 1)
         stiffness_chunks = step.arrays.stiffness.shape[1]
         rigid_max = step.options.rigid_max
         columns = rigid_max + 1
@@ -181,7 +186,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
                     else:
                         for k in range(member, 3 * LANES * blocks, team):
                             rolled()
-                            gradient_number(step, i, k)
+                            gradient_number(step, parts, i, k)
                 barrier()
                 check_convergence(step, potential, team, w, member)
                 barrier()

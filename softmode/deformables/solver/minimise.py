@@ -34,7 +34,7 @@ def minimise(tables: StepTables, dt: float) -> None:
     if t.rounds:
         dim = (worlds, max(3 * t.layout.block_count, t.rigid.count_max))
         always = min(t.rounds, rounds.ALWAYS)
-        t.launch(rounds.start_trials, dim, step, t.rounds - always, int(rounds.BESIDE * t.held))
+        t.launch(rounds.start_trials, dim, step, t.rounds - always, rounds.SLOW, int(rounds.BESIDE * t.held))
         with t.beside:
             _go_on_to_the_end(t, dt, only_aside=True)
         for _ in range(always):
@@ -57,7 +57,7 @@ def _go_on_to_the_end(tables: StepTables, dt: float, *, only_aside: bool) -> Non
 
 def _take_round(tables: StepTables, dt: float) -> None:
     """Check the trials of all worlds that are not done, and find directions and next trials where they are accepted."""
-    t, step, worlds, team = tables, tables.newton_step(dt), tables.layout.world_count, tables.world_team
+    t, step, worlds, team = tables, tables.newton_step(dt), tables.layout.world_count, tables.round_team
     points, constraints, threads = rounds.tasks(t.layout.point_max, t.constraints.row.shape[1], t.rigid.row_max)
     t.launch(rounds.evaluate_trials, (worlds, threads), step, points, constraints, block_dim=rounds.BLOCK)
     t.launch(rounds.check_kernel(team), (worlds, team), step, team, block_dim=team)

@@ -62,7 +62,7 @@ BESIDE = 0.5
 """Share of the worlds that the one launch takes at a time of which so many go beside the rounds at most."""
 LEVELS = 16
 """Numbers of iterations that are told apart where worlds are ordered by what is expected of them."""
-SLOW = wp.constant(3)
+SLOW = 2
 """Fewest expected iterations with which a world goes beside the rounds."""
 FADE = wp.constant(0.5)
 """Iterations by which fewer are expected after a step that took fewer."""
@@ -84,11 +84,11 @@ def expect_iterations(step: NewtonStep):
 
 
 @wp.func
-def least_of_slow(level_count: wp.array[int], room: int):
-    """Return the least level of which, with all above it, there are no more than ``room`` worlds."""
+def least_of_slow(level_count: wp.array[int], slow: int, room: int):
+    """Return the least level from ``slow`` on of which, with all above it, there are no more than ``room`` worlds."""
     least = int(LEVELS)
     count = int(0)
-    while least > SLOW:
+    while least > slow:
         count += level_count[least - 1]
         if count > room:
             break
@@ -97,16 +97,20 @@ def least_of_slow(level_count: wp.array[int], room: int):
 
 
 @wp.kernel
-def start_trials(step: NewtonStep, more: int, room: int):
-    """Let the first trial of every world be where Newton starts, and choose at most ``room`` that go beside the rounds.
+def start_trials(step: NewtonStep, more: int, slow: int, room: int):
+    """Let the first trial of every world be where Newton starts, and choose which worlds go beside the rounds.
 
-    ``more`` is how many rounds there may be besides those that are always taken.
+    Args:
+        step: Newton's tables.
+        more: Rounds that there may be besides those which are always taken.
+        slow: Fewest iterations that are expected of a world which goes beside.
+        room: Most worlds that do.
     """
     w, e = wp.tid()
     if w == 0 and e == 0:
         step.state.rounds_left[0] = more
     if e == 0:
-        least = least_of_slow(step.state.level_count, room)
+        least = least_of_slow(step.state.level_count, slow, room)
         step.state.aside[w] = wp.where(level_of(step.state.expected[w]) >= least, 1, 0)
         step.state.solving[w] = 0
     i = step.state.instance_start[w]
@@ -225,7 +229,7 @@ def check_kernel(team: int) -> Kernel:
         barrier()
         for k in range(member, LANES * width, team):
             rolled()
-            gradient_number(step, i, k)
+            gradient_number(step, wp.max(team / WARP, 1), i, k)
         barrier()
         check_convergence(step, potential, team, w, member)
         if member == 0:

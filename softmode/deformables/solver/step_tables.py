@@ -157,6 +157,8 @@ class StepTables:
     """The kernel of that launch."""
     world_team: int
     """Threads of that team."""
+    round_team: int
+    """Threads of the team that takes a world through a round."""
     rounds: int
     """Most rounds of launches before it, which take worlds through their first iterations; 0 where there are none."""
     held: int
@@ -260,13 +262,14 @@ def allocate_tables(
     one_launch = device.is_cpu or (not joined and blocks <= ONE_LAUNCH_BLOCKS)
     one_each = count == layout.world_count and layout.pin_max == 0
     driven = any(body.driven_count for body in layout.bodies)
-    world_team = fused.team_of(layout.point_max, layout.world_count, device)
+    round_team = fused.team_of(layout.point_max, layout.world_count, device)
     size = (3 * layout.stride, 3 * layout.stride + 4 * -(-(rigid.count_max + 1) // 4))
     shared = device.is_cuda and one_launch and one_each and not driven
     shared = shared and fits_in_shared_memory(device.max_shared_memory_per_block, *size)
     tiled = device.is_cuda and not one_launch and layout.stride >= TILE
     few = tiled and count <= FEW_WORLDS
     rounds = ROUNDS if shared and layout.world_count >= ROUND_WORLDS * device.sm_count else 0
+    world_team = fused.TAIL_TEAM if rounds else round_team
 
     def chunks(threads: int, tasks: int) -> int:
         """Return into how many parts sums over points are split where a kernel has so many threads, a body tasks."""
@@ -285,7 +288,7 @@ def allocate_tables(
         "team": LARGE_TEAM if few else team_size(device),
         "constraint": room + layout.pin_max,
         "rigid": rigid.count_max,
-        "gradient_chunk": world_team // WARP if shared else chunks(count * blocks, blocks),
+        "gradient_chunk": max(world_team, round_team) // WARP if shared else chunks(count * blocks, blocks),
         "stiffness_chunk": chunk_count(count, layout.stride)
         if tiled
         else chunks(count * square, square + (square + 3 * blocks) // 2),
@@ -340,6 +343,7 @@ def allocate_tables(
             system.unit.dtype, *(size if shared else ()), team=world_team, joined=joined and device.is_cpu
         ),
         world_team=world_team,
+        round_team=round_team,
         shared=shared,
         rounds=rounds,
         held=fused.held_at_a_time(world_team, device),
