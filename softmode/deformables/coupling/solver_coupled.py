@@ -102,7 +102,7 @@ class SolverCoupledReduced(ReducedSolver):
         self._damping = wp.zeros(count, dtype=float, device=device)
         self._any_coupled, self._any_pushed = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
         self._pushed = wp.zeros(self.world_count, dtype=int, device=device)
-        self._beside = Beside(device)
+        self._beside = (Beside(device, first=False), Beside(device, first=False))
         self._lay_out_joints()
         self._bind()
 
@@ -224,18 +224,19 @@ class SolverCoupledReduced(ReducedSolver):
     @contextmanager
     def _predicting(self, state: newton.State, control: newton.Control | None, dt: float) -> Generator[None]:
         """Predict the soft bodies and detect their contacts; on CUDA beside the first half of MuJoCo's step, within."""
-        with self.tables.beside:
+        predicting, evaluating = self._beside
+        with predicting:
             self.reduced.begin(state, control, dt)
             self.reduced.detect(state, control, dt, prescribed=False)
         if not self.model.device.is_cuda:
             yield
             return
-        with self._beside:
+        with evaluating:
             newton.eval_jacobian(self.model, state, self.tables.rigid.table.jacobian, joint_S_s=self._joint_S)
 
         def join() -> None:
-            self.tables.beside.join()
-            self._beside.join()
+            predicting.join()
+            evaluating.join()
 
         with self._halves.both(between=join):
             yield

@@ -16,12 +16,12 @@ class Beside:
 
     Args:
         device: Where.
+        first: Whether its blocks of threads are started before those of the stream beside which it is.
     """
 
-    def __init__(self, device: wp.Device) -> None:
+    def __init__(self, device: wp.Device, *, first: bool = True) -> None:
         """Make the stream."""
-        # what goes beside is what would be waited for longest: its blocks of threads go first
-        self._stream: Any = wp.Stream(device, priority=-1) if device.is_cuda else None
+        self._stream: Any = wp.Stream(device, priority=-int(first)) if device.is_cuda else None
         self._apart = False
 
     def __enter__(self) -> None:

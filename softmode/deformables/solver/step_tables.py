@@ -38,7 +38,7 @@ from softmode.deformables.solver.assembly_cpu_kernels import cache_slabs
 from softmode.deformables.solver.factor import BlockCholesky
 from softmode.deformables.solver.fused_system_kernels import shared_bytes
 from softmode.deformables.solver.iteration_kernels import NewtonArrays, NewtonOptions, NewtonStep
-from softmode.deformables.solver.newton_round_kernels import LEVELS
+from softmode.deformables.solver.newton_round_kernels import BESIDE, LEVELS
 from softmode.deformables.solver.options import SolverReducedOptions
 from softmode.deformables.solver.spin_kernels import Spin
 from softmode.deformables.solver.systems import join_systems
@@ -76,9 +76,9 @@ _CONSTRAINTS = {
 _NEWTON = {
     "": "world",
     "cached_q": "instance unknown",
-    "cached_key": "instance",
+    "cached_key impact": "instance",
     "any_active any_searching any_left rounds_left": "1",
-    "level_count": f"{LEVELS}",
+    "level_count": f"{LEVELS + 1}",
 }
 _ARRAYS = {
     "": "instance unknown",
@@ -163,8 +163,10 @@ class StepTables:
     """Most rounds of launches before it, which take worlds through their first iterations; 0 where there are none."""
     held: int
     """Worlds that the one launch takes at a time: no more rounds where no more worlds are left."""
-    beside: Beside
-    """Takes launches that do not wait for those which follow them."""
+    beside: tuple[Beside, Beside]
+    """Take launches that do not wait for those which follow them."""
+    room: int
+    """Most worlds that go beside the rounds for one reason."""
     shared: bool
     """Whether the systems of that launch are assembled and solved in shared memory."""
     tiled: bool
@@ -269,7 +271,7 @@ def allocate_tables(
     tiled = device.is_cuda and not one_launch and layout.stride >= TILE
     few = tiled and count <= FEW_WORLDS
     rounds = ROUNDS if shared and layout.world_count >= ROUND_WORLDS * device.sm_count else 0
-    world_team = fused.TAIL_TEAM if rounds else round_team
+    world_team = fused.TAIL_TEAM if rounds and round_team == fused.SMALL_TEAM else round_team
 
     def chunks(threads: int, tasks: int) -> int:
         """Return into how many parts sums over points are split where a kernel has so many threads, a body tasks."""
@@ -347,7 +349,8 @@ def allocate_tables(
         shared=shared,
         rounds=rounds,
         held=fused.held_at_a_time(world_team, device),
-        beside=Beside(device),
+        beside=(Beside(device), Beside(device)),
+        room=BESIDE * device.sm_count if device.is_cuda else 0,
         tiled=tiled,
     )
 
