@@ -95,7 +95,7 @@ def test_slow_bodies_start_as_they_fly():
 
 @pytest.mark.parametrize("room", [0, 2])
 def test_rounds_of_launches_take_impacts(room):
-    """Worlds have their start before the rounds or, where there is room, beside them: 2e-4 of the cube in three steps."""
+    """Worlds have their start before the rounds or, where there is room, beside them: within 2e-4 of the cube."""
     alone, after = falling(world_count=2), falling(world_count=2)
     after.reduced.tables = dataclasses.replace(after.reduced.tables, rounds=40, room=room, held=0)
     beside = 0

@@ -23,7 +23,7 @@ ratios of M + dt C to M; and contacts that MuJoCo will only detect in the next s
 """
 
 from collections.abc import Callable, Generator, Iterable, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import newton
@@ -103,6 +103,8 @@ class SolverCoupledReduced(ReducedSolver):
         self._any_coupled, self._any_pushed = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
         self._pushed = wp.zeros(self.world_count, dtype=int, device=device)
         self._beside = (Beside(device, first=False), Beside(device, first=False))
+        # the detection of contacts between soft bodies has branches, see ``Beside``
+        self._apart = device.is_cuda and self.tables.pairs is None
         self._lay_out_joints()
         self._bind()
 
@@ -225,14 +227,14 @@ class SolverCoupledReduced(ReducedSolver):
     def _predicting(self, state: newton.State, control: newton.Control | None, dt: float) -> Generator[None]:
         """Predict the soft bodies and detect their contacts; on CUDA beside the first half of MuJoCo's step, within."""
         predicting, evaluating = self._beside
-        with predicting:
+        with predicting if self._apart else nullcontext():
             self.reduced.begin(state, control, dt)
             self.reduced.detect(state, control, dt, prescribed=False)
-        if not self.model.device.is_cuda:
+        if not self._apart:
             yield
             return
         with evaluating:
-            newton.eval_jacobian(self.model, state, self.tables.rigid.table.jacobian, joint_S_s=self._joint_S)
+            self._evaluate_jacobian(state)
 
         def join() -> None:
             predicting.join()
@@ -240,6 +242,10 @@ class SolverCoupledReduced(ReducedSolver):
 
         with self._halves.both(between=join):
             yield
+
+    def _evaluate_jacobian(self, state: newton.State) -> None:
+        """Evaluate how the bodies move with the joint dofs, at the start of the step."""
+        newton.eval_jacobian(self.model, state, self.tables.rigid.table.jacobian, joint_S_s=self._joint_S)
 
     def _branch(self, condition: wp.array, body: Callable[..., None], **arguments: Any) -> None:
         """Do what is needed only if ``condition`` holds; on CUDA always.
@@ -260,11 +266,11 @@ class SolverCoupledReduced(ReducedSolver):
         self._branch(self._any_coupled, self._linearise, state=state, dt=dt)
 
     def _linearise(self, state: newton.State, dt: float) -> None:
-        """Evaluate Jacobians and the effective inertia at the start of the step."""
+        """Evaluate the effective inertia, and Jacobians if they are not yet known, at the start of the step."""
         model, t, dofs = self.model, self.tables, self.tables.rigid
         table, worlds = dofs.table, self.world_count
-        if not model.device.is_cuda:  # there they have been evaluated beside MuJoCo's step, see ``_predicting``
-            newton.eval_jacobian(model, state, table.jacobian, joint_S_s=self._joint_S)
+        if not self._apart:
+            self._evaluate_jacobian(state)
         drives = (model.joint_target_mode, model.joint_target_kd, model.joint_damping)
         t.launch(kernels.drive_damping, model.joint_dof_count, *drives, self._damping)
         start = (state.body_q, state.joint_qd, self.predicted_state.joint_qd, wp.float64(dt))
