@@ -29,6 +29,7 @@ def grasp(
     shared: bool = False,
     rounds: int = 0,
     room: int = 0,
+    teams: tuple[int, int] | None = None,
     worlds: int = 2,
     eager: bool = False,
 ) -> dict[str, np.ndarray]:
@@ -40,6 +41,7 @@ def grasp(
         shared: Whether that solves in shared memory.
         rounds: Rounds of launches before it.
         room: Most worlds that may go beside the rounds.
+        teams: Threads that share a world in the one launch and in rounds; None for what is usual.
         worlds: How many.
         eager: Whether one more step is taken without a graph at the end.
     """
@@ -47,8 +49,11 @@ def grasp(
     reduced = scene.solver.reduced
     system = reduced.tables.system
     size = (system.size, system.scalars.shape[2]) if shared else ()
-    kernel = newton_kernel(system.unit.dtype, *size, team=reduced.tables.world_team)  # as the solver compiles it
-    ways = {
+    team, round_team = teams or (reduced.tables.world_team, reduced.tables.round_team)
+    kernel = newton_kernel(system.unit.dtype, *size, team=team)  # as the solver compiles it
+    ways: dict[str, Any] = {
+        "world_team": team,
+        "round_team": round_team,
         "one_launch": one_launch,
         "shared": shared,
         "rounds": rounds,
@@ -196,7 +201,8 @@ def one_by_one(make: Any, options: dict[str, Any]) -> Any:
 def test_one_launch_on_cuda(shared: bool, rounds: int, room: int) -> None:
     """Sums have another order: coordinates agree within the solve's tolerance, 1e-4 of 0.1 m, forces within 1e-3."""
     apart = grasp("cuda:0", one_launch=False)
-    at_once = grasp("cuda:0", one_launch=True, shared=shared, rounds=rounds, room=room)
+    teams = (192, 96) if room else None  # as thousands of worlds have
+    at_once = grasp("cuda:0", one_launch=True, shared=shared, rounds=rounds, room=room, teams=teams)
     for name in ("q", "joint_q"):
         np.testing.assert_allclose(at_once[name], apart[name], atol=1.0e-5)
     np.testing.assert_allclose(at_once["force"], apart["force"], atol=1.0e-3 * np.abs(apart["force"]).max())
