@@ -1,7 +1,5 @@
 """Impacts: Newton's start from the motion of a rigid body, finite rotations along a step, iterations, stiff pivots."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,6 @@ from benchmarks.impacts import drop
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.model.lane_kernels import from_blocks, to_blocks
-from softmode.deformables.model.struct_kernels import HIT
 from softmode.deformables.solver import rigid_start_kernels, search_kernels
 from softmode.deformables.solver import step_kernels as kernels
 from softmode.deformables.solver.evaluate import evaluate
@@ -63,8 +60,7 @@ def test_start_is_a_rigid_motion_to_a_lower_potential():
     step = t.newton_step(scene.dt)
     t.launch(kernels.begin_newton, 1, step)
     flight, high = iterate(scene), potential(scene)
-    t.launch_teams(rigid_start_kernels.find_impacts, 1, step, t.team)
-    t.launch_teams(rigid_start_kernels.start_rigidly, 1, step, t.samples, 0, t.team)
+    t.launch_teams(rigid_start_kernels.start_rigidly, 1, step, t.samples, t.team)
     start, low = iterate(scene), potential(scene)
     np.testing.assert_allclose(strain(start), strain(flight), atol=1e-6)
     kinetic = scene.kinetic_energy()
@@ -88,24 +84,8 @@ def test_slow_bodies_start_as_they_fly():
     scene.reduced.begin(scene.state, None, scene.dt)
     scene.reduced.detect(scene.state, None, scene.dt, prescribed=True)
     before = iterate(scene)
-    t.launch_teams(rigid_start_kernels.find_impacts, 1, t.newton_step(scene.dt), t.team)
-    t.launch_teams(rigid_start_kernels.start_rigidly, 1, t.newton_step(scene.dt), t.samples, 0, t.team)
+    t.launch_teams(rigid_start_kernels.start_rigidly, 1, t.newton_step(scene.dt), t.samples, t.team)
     np.testing.assert_array_equal(iterate(scene), before)
-
-
-@pytest.mark.parametrize("room", [0, 2])
-def test_rounds_of_launches_take_impacts(room):
-    """Worlds have their start before the rounds or, where there is room, beside them: within 2e-4 of the cube."""
-    alone, after = falling(world_count=2), falling(world_count=2)
-    after.reduced.tables = dataclasses.replace(after.reduced.tables, rounds=40, room=room, held=0)
-    beside = 0
-    for _ in range(3):
-        alone.step()
-        after.step()
-        beside = max(beside, after.reduced.tables.newton.aside.numpy().max())
-        np.testing.assert_allclose(after.q(), alone.q(), atol=2e-5)
-        np.testing.assert_allclose(after.qd(), alone.qd(), atol=2e-3)
-    assert beside == (HIT if room else 0)
 
 
 @pytest.mark.parametrize("alpha", [0.25, 1.0, 2.0])

@@ -14,7 +14,8 @@ integrator shows to an external force (joint damping D and drive damping K_d are
 
 Where no soft body is near a rigid one that moves, the joint dofs stay out of the solve; where none pushes one, the
 prediction is the step: on the CPU the second MuJoCo step is taken only if some world needs it, and a world that does
-not need it is left as the prediction has it.
+not need it is left as the prediction has it. On CUDA the soft bodies are predicted and their contacts found beside the
+first half of step 1, on a stream of their own: neither needs anything of the other.
 
 MuJoCo's integrator damps after the constraints are solved: it answers forces by (M + dt C)^-1 M (M + J^T D J)^-1. The
 solve has (M + dt C + J^T D' J)^-1, D' such that both are the same for one row and a force along it (see

@@ -20,10 +20,6 @@ VANISHING = wp.constant(1.0e-6)
 leaves 1e-15."""
 SLOTS = 2
 """What a surface sample may touch at a time: the deepest two shapes, and the nearest two other soft bodies."""
-SLOW = wp.constant(1)
-"""What is said of a world that goes its whole way beside the rounds because many iterations are expected of it,"""
-HIT = wp.constant(2)
-"""and of one that does because its body hits something."""
 vec6 = wp.types.vector(length=6, dtype=float)
 mat23d: Any = wp.types.matrix(shape=(SLOTS, 3), dtype=wp.float64)
 
@@ -208,10 +204,9 @@ class NewtonState:
     any_searching: wp.array[int]  # (1,)
     any_left: wp.array[int]  # (1,), whether another round of launches is worth it
     rounds_left: wp.array[int]  # (1,), how many more there may be
-    impact: wp.array[int]  # (instance_count,), whether Newton starts with a rigid motion
     expected: wp.array[float]  # iterations that a world is expected to take, from those of the steps before
-    level_count: wp.array[int]  # (LEVELS + 1,), how many worlds are expected to take so many; behind them, impacts
-    aside: wp.array[int]  # whether the world goes its whole way beside the rounds of launches: 0, SLOW or HIT
+    level_count: wp.array[int]  # (LEVELS,), how many worlds are expected to take so many
+    aside: wp.array[int]  # whether the world goes its whole way beside the rounds of launches
 
 
 @wp.func

@@ -22,8 +22,7 @@ def finish(tables: StepTables, state: newton.State, dt: float, *, prescribed: bo
     """
     t, out, worlds, step = tables, soft(state), tables.layout.world_count, tables.newton_step(dt)
     t.launch_teams(kernels.check_state, worlds, step, t.team)
-    beside = t.beside[0]
-    with beside:
+    with t.beside:
         if t.model.shape_count:
             sticking = (t.instances, t.shapes, t.samples, t.constraints, int(prescribed))
             t.launch(
@@ -37,11 +36,11 @@ def finish(tables: StepTables, state: newton.State, dt: float, *, prescribed: bo
     t.launch(kernels.end_step, every, step, t.spin, out.q, out.qd, out.q_before, out.qd_before, out.dt_before)
     t.launch(dent_kernels.leave_dents, t.samples.position.shape, t.instances, t.samples, t.constraints, out.dent)
     if t.pairs is not None:
-        beside.join()
+        t.beside.join()
         t.pairs.remember(t.motion, t.newton, t.constraints, out)
         t.pairs.leave_dents(t.constraints, out)
     move_particles(t, state)
-    beside.join()
+    t.beside.join()
 
 
 def move_particles(tables: StepTables, state: newton.State) -> None:

@@ -108,13 +108,13 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
         unit: wp.array3d[unit_type],  # the systems in units of ``factor_width`` columns
         team: int,
         relation: wp.array3d[int],  # (system_count, part_count, part_count), which bodies of a system touch
-        only: int,  # the worlds that take part, as ``NewtonState.aside`` says; 0 for all
+        only_aside: int,  # whether only the worlds take part that go beside the rounds of launches
     ):
         """Minimise the incremental potential of every world by Newton with a line search."""
         w, member = wp.tid()
         if wp.static(dynamic > 0):
             _room = wp.tile_empty(shape=wp.static(dynamic), dtype=float, storage="shared")
-        if only != 0 and step.state.aside[w] != only:
+        if only_aside != 0 and step.state.aside[w] == 0:
             return
         begin = step.state.instance_start[w]
         end = instance_end(step.instances, step.state.instance_start, w)

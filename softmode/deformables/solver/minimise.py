@@ -4,7 +4,6 @@ import warp as wp
 
 from softmode.deformables.model.declare import launch_teams
 from softmode.deformables.model.lane_kernels import LANES
-from softmode.deformables.model.struct_kernels import HIT, SLOW
 from softmode.deformables.solver import newton_round_kernels as rounds
 from softmode.deformables.solver import rigid_start_kernels
 from softmode.deformables.solver import search_kernels as search
@@ -23,13 +22,13 @@ from softmode.deformables.solver.step_tables import StepTables
 def minimise(tables: StepTables, dt: float) -> None:
     """Find the coordinates, and the rigid unknowns, at the end of a step of ``dt`` [s]."""
     t, worlds, step = tables, tables.layout.world_count, tables.newton_step(dt)
-    if t.model.shape_count:
-        t.launch_teams(rigid_start_kernels.find_impacts, t.layout.instance_count, step, t.team)
     if t.rounds:
-        _choose_aside(t, dt)
+        t.newton.level_count.zero_()
+        t.launch(rounds.expect_iterations, worlds, step)
     t.launch(kernels.begin_newton, worlds, step)
     t.launch(kernels.extrapolate, t.unknowns, step)
-    _start_rigidly(t, dt, beside=False)
+    if t.model.shape_count:
+        t.launch_teams(rigid_start_kernels.start_rigidly, t.layout.instance_count, step, t.samples, t.team)
     if t.options.carry_stiffness:
         t.launch_teams(search.reuse_hessians, worlds, step, t.team)
     if t.rounds:
@@ -40,46 +39,24 @@ def minimise(tables: StepTables, dt: float) -> None:
         wp.capture_while(t.newton.any_active, _iterate, tables=t, dt=dt)
 
 
-def _choose_aside(tables: StepTables, dt: float) -> None:
-    """Choose the worlds that go their whole way beside the rounds of the others."""
-    t, worlds, step = tables, tables.layout.world_count, tables.newton_step(dt)
-    t.newton.level_count.zero_()
-    t.launch(rounds.expect_iterations, worlds, step)
-    t.launch(rounds.choose_aside, worlds, step, rounds.FEWEST, t.room)
-
-
-def _start_rigidly(tables: StepTables, dt: float, *, beside: bool) -> None:
-    """Move the first iterate of bodies that hit something, of the worlds beside the rounds or of the others."""
-    t = tables
-    if t.model.shape_count:
-        known = (t.newton_step(dt), t.samples, int(beside), t.team)
-        t.launch_teams(rigid_start_kernels.start_rigidly, t.layout.instance_count, *known)
-
-
 def _take_rounds(tables: StepTables, dt: float) -> None:
-    """Take most worlds through their first iterations, all at once, and those that are chosen to their end."""
-    t, worlds = tables, tables.layout.world_count
-    always = min(t.rounds, rounds.ALWAYS)
-    dim = (worlds, max(3 * t.layout.block_count, t.rigid.count_max))
-    t.launch(rounds.start_trials, dim, t.newton_step(dt), t.rounds - always)
-    slow, hit = t.beside
-    with slow:
-        _go_on_to_the_end(t, dt, only=int(SLOW))
-    with hit:
-        _start_rigidly(t, dt, beside=True)
-        _go_on_to_the_end(t, dt, only=int(HIT))
+    """Take most worlds through their first iterations, all at once, and beside them the slowest to their end."""
+    t, always = tables, min(tables.rounds, rounds.ALWAYS)
+    dim = (t.layout.world_count, max(3 * t.layout.block_count, t.rigid.count_max))
+    t.launch(rounds.start_trials, dim, t.newton_step(dt), t.rounds - always, t.room)
+    with t.beside:
+        _go_on_to_the_end(t, dt, only_aside=True)
     for _ in range(always):
         _take_round(t, dt)
-    for beside in t.beside:
-        beside.join()
+    t.beside.join()
     _count_left(t, dt)
     wp.capture_while(t.newton.any_left, _take_another_round, tables=t, dt=dt)
 
 
-def _go_on_to_the_end(tables: StepTables, dt: float, *, only: int = 0) -> None:
-    """Take every world that is not done, or only those that are aside as this says, through all further iterations."""
+def _go_on_to_the_end(tables: StepTables, dt: float, *, only_aside: bool = False) -> None:
+    """Take every world that is not done, or only those beside the rounds, through all further iterations."""
     t, team = tables, tables.world_team
-    known = (t.newton_step(dt), t.system.unit, team, t.system.relation, only)
+    known = (t.newton_step(dt), t.system.unit, team, t.system.relation, int(only_aside))
     t.launch(t.fused_kernel, (t.layout.world_count, team), *known, block_dim=team)
 
 

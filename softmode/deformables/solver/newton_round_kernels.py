@@ -14,8 +14,7 @@ registers as its hungriest phase; a launch of a round has its own. A round with 
 rounds go on while more worlds are left than the one launch holds at a time, and it takes each of those to its end.
 
 The slowest world is what all wait for, and worlds that were slow will mostly be slow again. So those of which most
-iterations are expected go their whole way in the one launch, beside the rounds of the others; and so do those whose
-bodies hit something, once they have their start, see ``rigid_start_kernels``.
+iterations are expected go their whole way in the one launch, beside the rounds of the others.
 """
 
 from functools import cache
@@ -26,7 +25,6 @@ from softmode.deformables.materials.hessian_kernels import hessian
 from softmode.deformables.model.declare import Kernel
 from softmode.deformables.model.deformation_kernels import elastic_gradient
 from softmode.deformables.model.lane_kernels import LANES, WARP, barrier, copy_blocks, rolled, team_sum
-from softmode.deformables.model.struct_kernels import HIT, SLOW
 from softmode.deformables.solver.assembly_kernels import inertia_of, stiffness_block
 from softmode.deformables.solver.fused_system_kernels import dynamic_floats, shared_direction_of, sum_forces_of
 from softmode.deformables.solver.iteration_kernels import TRIAL, NewtonStep
@@ -60,10 +58,10 @@ TEAMS = 672
 ALWAYS = 5
 """Rounds that are taken however few worlds are left."""
 BESIDE = 2
-"""Most worlds for each multiprocessor that go beside the rounds because of that, and most that do because of a hit."""
+"""Most worlds for each multiprocessor that go their whole way beside the rounds."""
 LEVELS = 16
 """Numbers of iterations that are told apart where worlds are ordered by what is expected of them."""
-FEWEST = 2
+FEWEST = wp.constant(2)
 """Fewest expected iterations with which a world goes beside the rounds."""
 FADE = wp.constant(0.5)
 """Iterations by which fewer are expected after a step that took fewer."""
@@ -75,33 +73,21 @@ def level_of(expected: float):
     return wp.min(int(expected), LEVELS - 1)
 
 
-@wp.func
-def hits(step: NewtonStep, w: int):
-    """Return whether a body of the world hits something."""
-    hit = bool(False)
-    for i in range(step.state.instance_start[w], step.state.instance_start[w + 1]):
-        hit = hit or step.state.impact[i] != 0
-    return hit
-
-
 @wp.kernel
 def expect_iterations(step: NewtonStep):
     """Expect of each world the iterations of its last step, or little fewer than were expected then; count worlds."""
     w = wp.tid()
     expected = wp.max(float(step.state.iteration[w]), step.state.expected[w] - FADE)
     step.state.expected[w] = expected
-    level = level_of(expected)
-    if hits(step, w):
-        level = LEVELS
-    wp.atomic_add(step.state.level_count, level, 1)
+    wp.atomic_add(step.state.level_count, level_of(expected), 1)
 
 
 @wp.func
-def least_of_slow(level_count: wp.array[int], fewest: int, room: int):
-    """Return the least level from ``fewest`` on of which, with all above it, there are no more than ``room`` worlds."""
+def least_aside(level_count: wp.array[int], room: int):
+    """Return the least level, FEWEST at the least, of which, with all above it, there are at most ``room`` worlds."""
     least = int(LEVELS)
     count = int(0)
-    while least > fewest:
+    while least > FEWEST:
         count += level_count[least - 1]
         if count > room:
             break
@@ -110,36 +96,20 @@ def least_of_slow(level_count: wp.array[int], fewest: int, room: int):
 
 
 @wp.kernel
-def choose_aside(step: NewtonStep, fewest: int, room: int):
-    """Choose which worlds go beside the rounds: where a body hits something, and where many iterations are expected.
-
-    Args:
-        step: Newton's tables.
-        fewest: Fewest iterations that are expected of the latter.
-        room: Most worlds of each kind.
-    """
-    w = wp.tid()
-    aside = int(0)
-    if hits(step, w):
-        if step.state.level_count[LEVELS] <= room:
-            aside = HIT
-    elif level_of(step.state.expected[w]) >= least_of_slow(step.state.level_count, fewest, room):
-        aside = SLOW
-    step.state.aside[w] = aside
-
-
-@wp.kernel
-def start_trials(step: NewtonStep, more: int):
-    """Let the first trial of every world be where Newton starts.
+def start_trials(step: NewtonStep, more: int, room: int):
+    """Let the first trial of every world be where Newton starts, and choose which worlds go beside the rounds.
 
     Args:
         step: Newton's tables.
         more: Rounds that there may be besides those which are always taken.
+        room: Most worlds that go beside them.
     """
     w, e = wp.tid()
     if w == 0 and e == 0:
         step.state.rounds_left[0] = more
     if e == 0:
+        least = least_aside(step.state.level_count, room)
+        step.state.aside[w] = wp.where(level_of(step.state.expected[w]) >= least, 1, 0)
         step.state.solving[w] = 0
     i = step.state.instance_start[w]
     if e < step.arrays.q.shape[1]:

@@ -15,7 +15,6 @@ import warp as wp
 from softmode.deformables.contact.penalty_kernels import contact_potential, slip_potential
 from softmode.deformables.model.lane_kernels import team_sum, team_sum3, team_sum33, vec8d
 from softmode.deformables.model.struct_kernels import (
-    HIT,
     Instances,
     PointConstraints,
     Rigid,
@@ -172,17 +171,19 @@ def rigid_potential(
 
 
 @wp.kernel
-def find_impacts(step: NewtonStep, team: int):
-    """Say which bodies would fly into what they hit: those that contact would give more energy than they have."""
+def start_rigidly(step: NewtonStep, samples: Samples, team: int):
+    """Move the first iterate of a body that would fly into what it hits."""
     i, member = wp.tid()
-    if member == 0:
-        step.state.impact[i] = 0
     count = step.constraints.count[i] - step.constraints.pair_count[i]
     if not has_contacts(step.instances, step.constraints, i):
         return
     if count == 0 or step.instances.pin_count[i] > 0 or step.instances.driven_count[i] > 0:
         return
     dt = step.options.dt
+    a = step.instances.asset[i]
+    n = step.instances.function_count[i]
+    blocks = blocks_of(n)
+    weight = step.instances.mass[i] / (dt * dt)
     moved = square_share(step.motion.qd_start, i, member, team)
     moved = dt * dt * team_sum(moved)
     least = IMPACT_MOTION * wp.float64(step.instances.size[i])
@@ -196,32 +197,8 @@ def find_impacts(step: NewtonStep, team: int):
         psi, _slope, _curvature = contact_potential(step.constraints, smoothing, penetration, i, e)
         stored += step.constraints.stiffness[i, e] * psi
     stored = team_sum(stored)
-    if member == 0 and not (stored < wp.float64(0.5) * step.instances.mass[i] / (dt * dt) * moved):
-        step.state.impact[i] = 1
-
-
-@wp.kernel
-def start_rigidly(step: NewtonStep, samples: Samples, beside: int, team: int):
-    """Move the first iterate of bodies that hit something, see ``find_impacts``; their elastic Hessian is then renewed.
-
-    Args:
-        step: Newton's tables.
-        samples: Surface samples.
-        beside: Whether of the worlds that go beside the rounds of launches, or of the others.
-        team: Threads that share a body.
-    """
-    i, member = wp.tid()
-    w = step.instances.world[i]
-    if step.state.impact[i] == 0 or wp.where(step.state.aside[w] == HIT, 1, 0) != beside:
+    if stored < wp.float64(0.5) * weight * moved:
         return
-    if member == 0:
-        step.state.refresh[w] = 1
-    count = step.constraints.count[i] - step.constraints.pair_count[i]
-    dt = step.options.dt
-    a = step.instances.asset[i]
-    n = step.instances.function_count[i]
-    blocks = blocks_of(n)
-    weight = step.instances.mass[i] / (dt * dt)
 
     X = centre_of_mass(step.basis, step.arrays.q, a, n, i, member, team)
     target = centre_of_mass(step.basis, step.motion.q_inertial, a, n, i, member, team)

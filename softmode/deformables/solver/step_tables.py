@@ -76,9 +76,9 @@ _CONSTRAINTS = {
 _NEWTON = {
     "": "world",
     "cached_q": "instance unknown",
-    "cached_key impact": "instance",
+    "cached_key": "instance",
     "any_active any_searching any_left rounds_left": "1",
-    "level_count": f"{LEVELS + 1}",
+    "level_count": f"{LEVELS}",
 }
 _ARRAYS = {
     "": "instance unknown",
@@ -163,10 +163,10 @@ class StepTables:
     """Most rounds of launches before it, which take worlds through their first iterations; 0 where there are none."""
     held: int
     """Worlds that the one launch takes at a time: no more rounds where no more worlds are left."""
-    beside: tuple[Beside, Beside]
-    """Take launches that do not wait for those which follow them."""
+    beside: Beside
+    """Takes launches that do not wait for those which follow them."""
     room: int
-    """Most worlds that go beside the rounds for one reason."""
+    """Most worlds that go beside the rounds."""
     shared: bool
     """Whether the systems of that launch are assembled and solved in shared memory."""
     tiled: bool
@@ -349,7 +349,7 @@ def allocate_tables(
         shared=shared,
         rounds=rounds,
         held=fused.held_at_a_time(world_team, device),
-        beside=(Beside(device), Beside(device)),
+        beside=Beside(device),
         room=BESIDE * device.sm_count if device.is_cuda else 0,
         tiled=tiled,
     )
