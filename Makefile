@@ -82,7 +82,7 @@ test-slow: $(VENV)/.dev  ## run all tests, slow ones included
 lint: $(VENV)/.dev  ## ruff, pyright, and words that may not come back
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright
+	$(BIN)/pyright --threads $(WORKERS)
 	$(BIN)/python -m pytest tests/test_words.py
 
 dist: $(VENV)/.dev  ## build sdist and wheel

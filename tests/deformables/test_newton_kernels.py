@@ -23,7 +23,15 @@ CLOSE = np.array([0.0, 0.0, -1.0, 0.0, 1.0], np.float32)
 
 
 def grasp(
-    device: str, *, one_launch: bool, shared: bool = False, rounds: int = 0, worlds: int = 2, eager: bool = False
+    device: str,
+    *,
+    one_launch: bool,
+    shared: bool = False,
+    rounds: int = 0,
+    room: int = 0,
+    teams: tuple[int, int] | None = None,
+    worlds: int = 2,
+    eager: bool = False,
 ) -> dict[str, np.ndarray]:
     """Lower the open gripper over the object, close it until both fingers press, and return where everything is.
 
@@ -32,6 +40,8 @@ def grasp(
         one_launch: Whether all Newton iterations of a world are one launch.
         shared: Whether that solves in shared memory.
         rounds: Rounds of launches before it.
+        room: Most worlds that may go beside the rounds.
+        teams: Threads that share a world in the one launch and in rounds; None for what is usual.
         worlds: How many.
         eager: Whether one more step is taken without a graph at the end.
     """
@@ -39,20 +49,32 @@ def grasp(
     reduced = scene.solver.reduced
     system = reduced.tables.system
     size = (system.size, system.scalars.shape[2]) if shared else ()
-    kernel = newton_kernel(system.unit.dtype, *size, team=reduced.tables.world_team)  # as the solver compiles it
-    ways = {"one_launch": one_launch, "shared": shared, "rounds": rounds, "held": 0, "fused_kernel": kernel}
+    team, round_team = teams or (reduced.tables.world_team, reduced.tables.round_team)
+    kernel = newton_kernel(system.unit.dtype, *size, team=team)  # as the solver compiles it
+    ways: dict[str, Any] = {
+        "world_team": team,
+        "round_team": round_team,
+        "one_launch": one_launch,
+        "shared": shared,
+        "rounds": rounds,
+        "room": room,
+        "held": 0,
+        "fused_kernel": kernel,
+    }
     reduced.tables = dataclasses.replace(reduced.tables, **ways)
+    aside = np.zeros(worlds, bool)
     for step in range(32):
         height = scene.controller.target_position.numpy()[0, 2]
         down = np.clip((scene.soft.height - height) / 0.015, -1.0, 1.0)
         grip = 1.0 if step < 16 else max(1.0 - 0.08 * (step - 15), -0.3)
         scene.step(np.tile(np.array([0.0, 0.0, down, 0.0, grip], np.float32), (worlds, 1)))
+        aside |= reduced.tables.newton.aside.numpy() != 0
     if eager:
         scene.control_step()
     assert (np.linalg.norm(scene.finger_force.numpy(), axis=2) > 0.5).all()
     assert not scene.status.any()
     arrays = {"q": scene.state.softmode.q, "joint_q": scene.state.joint_q, "force": scene.finger_force}
-    return {name: array.numpy() for name, array in arrays.items()}
+    return {"aside": aside} | {name: array.numpy() for name, array in arrays.items()}
 
 
 def test_one_launch_equals_launches_per_phase() -> None:
@@ -104,16 +126,36 @@ def test_packed_system_grasps_as_the_launches_do() -> None:
     np.testing.assert_allclose(packed["force"], apart["force"], atol=1.0e-5 * np.abs(apart["force"]).max())
 
 
-@pytest.mark.parametrize("rounds", [1, 40])
-def test_rounds_of_launches_grasp_as_the_one_launch_does(rounds: int) -> None:
-    """Worlds go on in the one launch from wherever a round left them, or, since it holds none here, end in the rounds.
+@pytest.mark.parametrize("rounds, room", [(1, 0), (40, 0), (40, 2)])
+def test_rounds_of_launches_grasp_as_the_one_launch_does(rounds: int, room: int) -> None:
+    """Worlds go on in the one launch from wherever a round left them, end in the rounds, or go beside them.
 
     Sums have another order, and the one launch evaluates in lanes: both stop within 1e-3 of the forces.
     """
-    alone, after = (grasp("cpu", one_launch=True, rounds=count) for count in (0, rounds))
+    alone, after = (grasp("cpu", one_launch=True, rounds=count, room=room) for count in (0, rounds))
+    assert (after["aside"] == (room > 0)).all()
     for name in ("q", "joint_q"):
         np.testing.assert_allclose(after[name], alone[name], atol=1.0e-7)
     np.testing.assert_allclose(after["force"], alone["force"], atol=1.0e-5 * np.abs(alone["force"]).max())
+
+
+def test_slowest_worlds_go_beside_the_rounds() -> None:
+    """They are those with most iterations in the last steps, half an iteration less per step, two at the least."""
+    tables = TableScene(rl_scene(), world_count=6, device="cpu").solver.reduced.tables
+    step, state = tables.newton_step(0.01), tables.newton
+
+    def chosen(iterations: list[int], room: int) -> list[int]:
+        state.iteration.assign(iterations)
+        state.level_count.zero_()
+        tables.launch(newton_round_kernels.expect_iterations, 6, step)
+        tables.launch(newton_round_kernels.start_trials, (6, 1), step, 0, room)
+        return state.aside.numpy().tolist()
+
+    assert chosen([1, 2, 3, 5, 9, 20], 6) == [0, 1, 1, 1, 1, 1]
+    assert chosen([1, 2, 3, 5, 9, 20], 2) == [0, 0, 0, 0, 1, 1]
+    assert chosen([1, 1, 1, 1, 1, 1], 6) == [0, 0, 1, 1, 1, 1]  # of the last four 2.5, 4.5, 8.5 and 19.5 are expected
+    assert chosen([1, 1, 1, 8, 1, 1], 2) == [0, 0, 0, 0, 0, 1]  # there is no room for all of which 8 are expected
+    assert chosen([1, 1, 1, 1, 1, 1], 0) == [0] * 6
 
 
 @pytest.mark.slow
@@ -150,11 +192,14 @@ def one_by_one(make: Any, options: dict[str, Any]) -> Any:
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a GPU")
-@pytest.mark.parametrize("shared, rounds", [(False, 0), (True, 0), (True, 1), (True, 5), (True, 40)])
-def test_one_launch_on_cuda(shared: bool, rounds: int) -> None:
+@pytest.mark.parametrize(
+    "shared, rounds, room", [(False, 0, 0), (True, 0, 0), (True, 1, 0), (True, 40, 0), (True, 5, 2)]
+)
+def test_one_launch_on_cuda(shared: bool, rounds: int, room: int) -> None:
     """Sums have another order: coordinates agree within the solve's tolerance, 1e-4 of 0.1 m, forces within 1e-3."""
     apart = grasp("cuda:0", one_launch=False)
-    at_once = grasp("cuda:0", one_launch=True, shared=shared, rounds=rounds)
+    teams = (192, 96) if room else None  # as thousands of worlds have
+    at_once = grasp("cuda:0", one_launch=True, shared=shared, rounds=rounds, room=room, teams=teams)
     for name in ("q", "joint_q"):
         np.testing.assert_allclose(at_once[name], apart[name], atol=1.0e-5)
     np.testing.assert_allclose(at_once["force"], apart["force"], atol=1.0e-3 * np.abs(apart["force"]).max())

@@ -264,7 +264,7 @@ def march(
     return out
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(256, 2))
 def find_contacts(
     instances: Instances,
     basis: Basis,
@@ -478,7 +478,8 @@ def gather_contacts(
 ):
     """Compact the slots of an instance behind its pins, in sample order: touching contacts first, then near ones.
 
-    Each thread of a team counts its own run of samples, then writes where the counts before it end.
+    Each thread of a team counts its own run of samples, then says where the counts before it end. Contacts lie close to
+    each other, in few of the runs: so what there is to say of each is written by the threads in turns.
     """
     i, member = wp.tid()
     count = instances.sample_count[i]
@@ -508,58 +509,66 @@ def gather_contacts(
                 at_touching += 1
             else:
                 at_close += 1
-            if e >= constraint_max:
-                continue
-            samples.constraint[i, s, slot] = e
-            # of unit length in float64: what is left of the gap in the slip must not count against the stick range
-            normal = wp.normalize(wp.vec3d(samples.normal[i, s, slot]))
-            # both bodies feel the force at the sample, not the shape at its own surface: a pair of forces on two
-            # points would make angular momentum out of friction times penetration
-            point = wp.vec3(samples.position[i, s])
-            drift = wp.vec3()
-            arm = wp.vec3()
-            body = shapes.body[shape]
-            if body >= 0:
-                arm = point - wp.transform_point(shapes.body_q[body], shapes.body_com[body])
-                if prescribed != 0:
-                    twist = shapes.body_qd[body]
-                    drift = dt * wp.spatial_top(twist) + turn(dt * wp.spatial_bottom(twist), arm)
-            row = instances.row_start[i] + s
-            constraints.row[i, e] = row
-            constraints.dof_begin[i, e] = 0
-            constraints.dof_end[i, e] = 0
-            constraints.shape[i, e] = shape
-            constraints.body[i, e] = body
-            constraints.arm[i, e] = arm
-            constraints.normal[i, e] = normal
-            partner_mass = float(0.0)
-            if body >= 0 and prescribed == 0:
-                partner_mass = shapes.body_mass[body]
-            relative = relative_stiffness[row]
-            partner_area = shape_area(shapes, shape)
-            kappa = stiffness_per_area(instances, i, BULK_FACTOR, relative, partner_mass, partner_area, dt)
-            shear = stiffness_per_area(instances, i, SHEAR_FACTOR, relative, partner_mass, partner_area, dt)
-            area = wp.max(sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
-            stiffness = wp.float64(kappa * area)
-            compliance = dent_compliance(instances, i, relative, dent_length[row]) / area
-            slip, anchor = remembered_slip(
-                shapes,
-                shape,
-                samples.position[i, s],
-                normal,
-                stick_shape,
-                stick_point,
-                instances.particle_start[i] + s,
-                prescribed,
-            )
-            # d enters as offset + displacement, with the gap along the normal and the shape's own motion taken off
-            constraints.offset[i, e] = gap * normal + slip - wp.vec3d(drift)
-            constraints.anchor[i, e] = anchor
-            constraints.stick[i, e] = stick_ratio * wp.float64(shear * area)
-            constraints.stiffness[i, e] = stiffness
-            constraints.dent_compliance[i, e] = wp.float64(compliance)
-            constraints.dent_depth[i, e] = wp.float64(dent_depth(instances, i, dent_length[row]))
-            constraints.friction[i, e] = wp.float64(wp.sqrt(instances.friction[i] * shapes.friction[shape]))
+            if e < constraint_max:
+                samples.constraint[i, s, slot] = e
+                constraints.row[i, e] = instances.row_start[i] + s
+    barrier()
+    for e in range(instances.pin_count[i] + member, wp.min(total, constraint_max), team):
+        row = constraints.row[i, e]
+        s = row - instances.row_start[i]
+        slot = int(0)
+        for k in range(SLOTS):
+            if samples.constraint[i, s, k] == e:
+                slot = k
+        shape = samples.shape[i, s, slot]
+        gap = wp.max(samples.gap[i, s, slot], -wp.float64(OVERLAP * instances.size[i]))
+        # of unit length in float64: what is left of the gap in the slip must not count against the stick range
+        normal = wp.normalize(wp.vec3d(samples.normal[i, s, slot]))
+        # both bodies feel the force at the sample, not the shape at its own surface: a pair of forces on two
+        # points would make angular momentum out of friction times penetration
+        point = wp.vec3(samples.position[i, s])
+        drift = wp.vec3()
+        arm = wp.vec3()
+        body = shapes.body[shape]
+        if body >= 0:
+            arm = point - wp.transform_point(shapes.body_q[body], shapes.body_com[body])
+            if prescribed != 0:
+                twist = shapes.body_qd[body]
+                drift = dt * wp.spatial_top(twist) + turn(dt * wp.spatial_bottom(twist), arm)
+        constraints.dof_begin[i, e] = 0
+        constraints.dof_end[i, e] = 0
+        constraints.shape[i, e] = shape
+        constraints.body[i, e] = body
+        constraints.arm[i, e] = arm
+        constraints.normal[i, e] = normal
+        partner_mass = float(0.0)
+        if body >= 0 and prescribed == 0:
+            partner_mass = shapes.body_mass[body]
+        relative = relative_stiffness[row]
+        partner_area = shape_area(shapes, shape)
+        kappa = stiffness_per_area(instances, i, BULK_FACTOR, relative, partner_mass, partner_area, dt)
+        shear = stiffness_per_area(instances, i, SHEAR_FACTOR, relative, partner_mass, partner_area, dt)
+        area = wp.max(sample_area(instances.scale[i], basis.row_area[row]), 1.0e-30)
+        stiffness = wp.float64(kappa * area)
+        compliance = dent_compliance(instances, i, relative, dent_length[row]) / area
+        slip, anchor = remembered_slip(
+            shapes,
+            shape,
+            samples.position[i, s],
+            normal,
+            stick_shape,
+            stick_point,
+            instances.particle_start[i] + s,
+            prescribed,
+        )
+        # d enters as offset + displacement, with the gap along the normal and the shape's own motion taken off
+        constraints.offset[i, e] = gap * normal + slip - wp.vec3d(drift)
+        constraints.anchor[i, e] = anchor
+        constraints.stick[i, e] = stick_ratio * wp.float64(shear * area)
+        constraints.stiffness[i, e] = stiffness
+        constraints.dent_compliance[i, e] = wp.float64(compliance)
+        constraints.dent_depth[i, e] = wp.float64(dent_depth(instances, i, dent_length[row]))
+        constraints.friction[i, e] = wp.float64(wp.sqrt(instances.friction[i] * shapes.friction[shape]))
 
 
 @wp.kernel

@@ -3,7 +3,7 @@
 import importlib
 import warnings
 from collections.abc import Callable, Generator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import Any
 
 import newton
@@ -60,47 +60,83 @@ def mujoco_warnings() -> Generator[None]:
             warnings.warn(f"MuJoCo: {message}", RuntimeWarning, stacklevel=4)
 
 
-def second_half(rigid: SolverMuJoCo) -> Callable[[], AbstractContextManager[None]]:
-    """Return contexts within which ``rigid.step`` starts from MuJoCo's forces on, after a whole step from that state.
+class Halves:
+    """MuJoCo's own split of a step, for ``rigid.step``.
 
-    Positions, inertia and constraint rows are then those of the whole step: MuJoCo's own split of a step, in
-    ``mujoco_warp.step1`` and ``step2``. Newton offers none; a public hook would be an argument of
-    ``SolverMuJoCo.step`` that says from which stage on MuJoCo computes, or a method that calls ``step2`` alone. Until
-    then this function alone touches two private names of ``SolverMuJoCo``: the method ``_mujoco_warp_step``, replaced
-    while a context lasts, and the flag ``_use_speculative_contacts``, with which that method does more than a step.
-    Both are checked here, once; without them, and with integrators or options whose step has no such halves, a context
-    changes nothing and the whole step is taken again.
+    ``mujoco_warp.step1`` finds positions, inertia, constraint rows and what follows from velocities, ``step2`` forces
+    and accelerations. Newton offers no split; a public hook would be an argument of ``SolverMuJoCo.step`` that says
+    which stages MuJoCo computes. Until then this class alone touches two private names of ``SolverMuJoCo``: the method
+    ``_mujoco_warp_step``, replaced while a context lasts, and the flag ``_use_speculative_contacts``, with which that
+    method does more than a step. Both are checked here, once; without them, and with integrators or options whose step
+    has no such halves, every step is a whole one.
+
+    Args:
+        rigid: The solver whose steps are split.
 
     Warns:
         RuntimeWarning: If this version of Newton has not the names.
     """
-    import mujoco_warp
 
-    speculative = getattr(rigid, "_use_speculative_contacts", None)
-    if not callable(getattr(rigid, "_mujoco_warp_step", None)) or not isinstance(speculative, bool):
-        warnings.warn(
-            "this version of Newton steps MuJoCo in another way than the one that softmode knows; steps in which soft "
-            "bodies push rigid ones take two whole MuJoCo steps",
-            RuntimeWarning,
-            stacklevel=4,
-        )
-        return nullcontext
+    def __init__(self, rigid: SolverMuJoCo) -> None:
+        """Check the names."""
+        self._rigid = rigid
+        speculative = getattr(rigid, "_use_speculative_contacts", None)
+        known = callable(getattr(rigid, "_mujoco_warp_step", None)) and isinstance(speculative, bool)
+        self._whole = not known or bool(speculative)
+        if not known:
+            warnings.warn(
+                "this version of Newton steps MuJoCo in another way than the one that softmode knows; steps in which "
+                "soft bodies push rigid ones take two whole MuJoCo steps",
+                RuntimeWarning,
+                stacklevel=4,
+            )
+
+    @property
+    def known(self) -> bool:
+        """Whether a step has halves, with MuJoCo's present options."""
+        import mujoco_warp
+
+        options, integrators = self._rigid.mjw_model.opt, mujoco_warp.IntegratorType
+        sleeps = bool(options.enableflags & mujoco_warp.EnableBit.SLEEP)
+        in_halves = options.integrator in (integrators.EULER, integrators.IMPLICIT, integrators.IMPLICITFAST)
+        return in_halves and not sleeps and not self._whole
 
     @contextmanager
-    def from_forces_on() -> Generator[None]:
-        model, known = rigid.mjw_model, mujoco_warp.IntegratorType
-        sleeps = bool(model.opt.enableflags & mujoco_warp.EnableBit.SLEEP)
-        in_halves = model.opt.integrator in (known.EULER, known.IMPLICIT, known.IMPLICITFAST)
-        whole = sleeps or not in_halves or speculative
-        if not whole:
-            vars(rigid)["_mujoco_warp_step"] = lambda: mujoco_warp.step2(model, rigid.mjw_data)
+    def both(self, between: Callable[[], None]) -> Generator[None]:
+        """Within it ``rigid.step`` calls ``between`` between the halves; where there are none, that is called first."""
+        import mujoco_warp
+
+        def halves() -> None:
+            mujoco_warp.step1(self._rigid.mjw_model, self._rigid.mjw_data)
+            between()
+            mujoco_warp.step2(self._rigid.mjw_model, self._rigid.mjw_data)
+
+        if not self.known:
+            between()
+            yield
+            return
+        with self._stepping_by(halves):
+            yield
+
+    @contextmanager
+    def second(self) -> Generator[None]:
+        """Within it ``rigid.step`` starts from MuJoCo's forces on, after a whole step from the same state."""
+        import mujoco_warp
+
+        if not self.known:
+            yield
+            return
+        with self._stepping_by(lambda: mujoco_warp.step2(self._rigid.mjw_model, self._rigid.mjw_data)):
+            yield
+
+    @contextmanager
+    def _stepping_by(self, step: Callable[[], None]) -> Generator[None]:
+        """Let ``rigid.step`` call this for MuJoCo's step."""
+        vars(self._rigid)["_mujoco_warp_step"] = step
         try:
             yield
         finally:
-            if not whole:
-                del vars(rigid)["_mujoco_warp_step"]
-
-    return from_forces_on
+            del vars(self._rigid)["_mujoco_warp_step"]
 
 
 def dropping_overflows() -> int:

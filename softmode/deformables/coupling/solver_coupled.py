@@ -14,7 +14,8 @@ integrator shows to an external force (joint damping D and drive damping K_d are
 
 Where no soft body is near a rigid one that moves, the joint dofs stay out of the solve; where none pushes one, the
 prediction is the step: on the CPU the second MuJoCo step is taken only if some world needs it, and a world that does
-not need it is left as the prediction has it.
+not need it is left as the prediction has it. On CUDA the soft bodies are predicted and their contacts found beside the
+first half of step 1, on a stream of their own: neither needs anything of the other.
 
 MuJoCo's integrator damps after the constraints are solved: it answers forces by (M + dt C)^-1 M (M + J^T D J)^-1. The
 solve has (M + dt C + J^T D' J)^-1, D' such that both are the same for one row and a force along it (see
@@ -22,8 +23,8 @@ solve has (M + dt C + J^T D' J)^-1, D' such that both are the same for one row a
 ratios of M + dt C to M; and contacts that MuJoCo will only detect in the next step.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import newton
@@ -33,7 +34,8 @@ from newton.solvers import SolverBase, SolverMuJoCo
 
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.coupling import coupling_kernels as kernels
-from softmode.deformables.coupling.rigid_solver import dropping_overflows, mujoco_warnings, second_half
+from softmode.deformables.coupling.rigid_solver import Halves, dropping_overflows, mujoco_warnings
+from softmode.deformables.model.beside import Beside
 from softmode.deformables.model.declare import WRENCH
 from softmode.deformables.model.neighbours import warn_foreign_deformables
 from softmode.deformables.model.rigid_dofs import RigidDofs
@@ -95,12 +97,15 @@ class SolverCoupledReduced(ReducedSolver):
         warn_foreign_deformables(model, self.tables.layout)
         device, count = model.device, model.joint_dof_count
         self.predicted_state = model.state()
-        self._from_forces_on, self._dropping = second_half(self.rigid), dropping_overflows()
+        self._halves, self._dropping = Halves(self.rigid), dropping_overflows()
         self._joint_S = wp.zeros(count, dtype=WRENCH, device=device)
         self._body_f = wp.zeros(model.body_count, dtype=WRENCH, device=device)
         self._damping = wp.zeros(count, dtype=float, device=device)
         self._any_coupled, self._any_pushed = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
         self._pushed = wp.zeros(self.world_count, dtype=int, device=device)
+        self._beside = (Beside(device, first=False), Beside(device, first=False))
+        # the detection of contacts between soft bodies has branches, see ``Beside``
+        self._apart = device.is_cuda and self.tables.pairs is None
         self._lay_out_joints()
         self._bind()
 
@@ -205,17 +210,43 @@ class SolverCoupledReduced(ReducedSolver):
         of_rigid = None if observables is None else observables.rigid
         data = self.rigid.mjw_data
         wp.copy(self._activation, data.act)
-        self.rigid.step(state_in, self.predicted_state, control, contacts, dt, observables=of_rigid)
+        with self._predicting(state_in, control, dt):
+            self.rigid.step(state_in, self.predicted_state, control, contacts, dt, observables=of_rigid)
         wp.copy(self._warmstart, data.qacc_warmstart)
 
-        couple = partial(self._couple, state_in, dt)
-        self.reduced.advance(state_in, state_out, self.reduced.targets(control), dt, couple=couple)
+        self._couple(state_in, dt)
+        self.reduced.minimise(dt)
+        self.reduced.finish(state_out, dt)
 
         self._find_pushed()
         arguments = {"control": control, "contacts": contacts, "dt": dt, "observables": of_rigid}
         self._branch(self._any_pushed, self._correct, state_in=state_in, state_out=state_out, **arguments)
         self._keep_prediction(state_out)
         self.reduced.report(observables)
+
+    @contextmanager
+    def _predicting(self, state: newton.State, control: newton.Control | None, dt: float) -> Generator[None]:
+        """Predict the soft bodies and detect their contacts; on CUDA beside the first half of MuJoCo's step, within."""
+        predicting, evaluating = self._beside
+        with predicting if self._apart else nullcontext():
+            self.reduced.begin(state, control, dt)
+            self.reduced.detect(state, control, dt, prescribed=False)
+        if not self._apart:
+            yield
+            return
+        with evaluating:
+            self._evaluate_jacobian(state)
+
+        def join() -> None:
+            predicting.join()
+            evaluating.join()
+
+        with self._halves.both(between=join):
+            yield
+
+    def _evaluate_jacobian(self, state: newton.State) -> None:
+        """Evaluate how the bodies move with the joint dofs, at the start of the step."""
+        newton.eval_jacobian(self.model, state, self.tables.rigid.table.jacobian, joint_S_s=self._joint_S)
 
     def _branch(self, condition: wp.array, body: Callable[..., None], **arguments: Any) -> None:
         """Do what is needed only if ``condition`` holds; on CUDA always.
@@ -236,10 +267,11 @@ class SolverCoupledReduced(ReducedSolver):
         self._branch(self._any_coupled, self._linearise, state=state, dt=dt)
 
     def _linearise(self, state: newton.State, dt: float) -> None:
-        """Evaluate Jacobians and the effective inertia at the start of the step."""
+        """Evaluate the effective inertia, and Jacobians if they are not yet known, at the start of the step."""
         model, t, dofs = self.model, self.tables, self.tables.rigid
         table, worlds = dofs.table, self.world_count
-        newton.eval_jacobian(model, state, table.jacobian, joint_S_s=self._joint_S)
+        if not self._apart:
+            self._evaluate_jacobian(state)
         drives = (model.joint_target_mode, model.joint_target_kd, model.joint_damping)
         t.launch(kernels.drive_damping, model.joint_dof_count, *drives, self._damping)
         start = (state.body_q, state.joint_qd, self.predicted_state.joint_qd, wp.float64(dt))
@@ -271,7 +303,7 @@ class SolverCoupledReduced(ReducedSolver):
         wp.copy(self.rigid.mjw_data.act, self._activation)
         wp.copy(self._body_f, present(state_in.body_f))
         self.tables.launch(kernels.add_wrench, self.model.body_count, self.body_wrench, state_in.body_f)
-        with self._from_forces_on():
+        with self._halves.second():
             self.rigid.step(state_in, state_out, control, contacts, dt, observables=observables)
         wp.copy(present(state_in.body_f), self._body_f)
 

@@ -204,6 +204,9 @@ class NewtonState:
     any_searching: wp.array[int]  # (1,)
     any_left: wp.array[int]  # (1,), whether another round of launches is worth it
     rounds_left: wp.array[int]  # (1,), how many more there may be
+    expected: wp.array[float]  # iterations that a world is expected to take, from those of the steps before
+    level_count: wp.array[int]  # (LEVELS,), how many worlds are expected to take so many
+    aside: wp.array[int]  # whether the world goes its whole way beside the rounds of launches
 
 
 @wp.func

@@ -22,20 +22,25 @@ def finish(tables: StepTables, state: newton.State, dt: float, *, prescribed: bo
     """
     t, out, worlds, step = tables, soft(state), tables.layout.world_count, tables.newton_step(dt)
     t.launch_teams(kernels.check_state, worlds, step, t.team)
+    with t.beside:
+        if t.model.shape_count:
+            sticking = (t.instances, t.shapes, t.samples, t.constraints, int(prescribed))
+            t.launch(
+                memory_kernels.remember_slip, t.samples.position.shape, *sticking, out.stick_shape, out.stick_point
+            )
+        t.body_wrench.zero_()
+        reactions = (t.body_wrench, t.instance_force)
+        t.launch(penalty_kernels.sum_reactions, worlds, t.instances, t.newton, t.constraints, *reactions)
     t.launch_teams(spin_kernels.end_spin, t.layout.instance_count, step, t.team, t.spin)
     every = (t.layout.instance_count, t.layout.block_count)
     t.launch(kernels.end_step, every, step, t.spin, out.q, out.qd, out.q_before, out.qd_before, out.dt_before)
-    if t.model.shape_count:
-        sticking = (t.instances, t.shapes, t.samples, t.constraints, int(prescribed))
-        t.launch(memory_kernels.remember_slip, t.samples.position.shape, *sticking, out.stick_shape, out.stick_point)
     t.launch(dent_kernels.leave_dents, t.samples.position.shape, t.instances, t.samples, t.constraints, out.dent)
     if t.pairs is not None:
+        t.beside.join()
         t.pairs.remember(t.motion, t.newton, t.constraints, out)
         t.pairs.leave_dents(t.constraints, out)
-    t.body_wrench.zero_()
-    reactions = (t.body_wrench, t.instance_force)
-    t.launch(penalty_kernels.sum_reactions, worlds, t.instances, t.newton, t.constraints, *reactions)
     move_particles(t, state)
+    t.beside.join()
 
 
 def move_particles(tables: StepTables, state: newton.State) -> None:

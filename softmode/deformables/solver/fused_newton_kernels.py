@@ -64,6 +64,8 @@ LARGE_TEAM = 256
 """where every world has a multiprocessor to itself,"""
 TEAM = 128
 """and elsewhere. All are measured, see ``docs/performance.md``."""
+TAIL_TEAM = 192
+"""Threads that share a world of few points where rounds of launches take most worlds to their end."""
 FEW_POINTS = 128
 """Most points that count as few."""
 THREADS = 384
@@ -106,17 +108,23 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
         unit: wp.array3d[unit_type],  # the systems in units of ``factor_width`` columns
         team: int,
         relation: wp.array3d[int],  # (system_count, part_count, part_count), which bodies of a system touch
+        only_aside: int,  # whether only the worlds take part that go beside the rounds of launches
     ):
         """Minimise the incremental potential of every world by Newton with a line search."""
         w, member = wp.tid()
         if wp.static(dynamic > 0):
             _room = wp.tile_empty(shape=wp.static(dynamic), dtype=float, storage="shared")
+        if only_aside != 0 and step.state.aside[w] == 0:
+            return
         begin = step.state.instance_start[w]
         end = instance_end(step.instances, step.state.instance_start, w)
         blocks = step.basis.row.shape[1]
         n = step.rigid.count[w]
         tasks = 3 * blocks * blocks + 3 * (blocks * blocks + blocks) / 2
         chunks = step.arrays.gradient_chunk.shape[1]
+        parts = chunks
+        if wp.static(shared):
+            parts = wp.max(team / WARP, 1)
         stiffness_chunks = step.arrays.stiffness.shape[1]
         rigid_max = step.options.rigid_max
         columns = rigid_max + 1
@@ -178,7 +186,7 @@ def newton_kernel(unit_type: Any, size: int = 0, width: int = 0, *, team: int = 
                     else:
                         for k in range(member, 3 * LANES * blocks, team):
                             rolled()
-                            gradient_number(step, i, k)
+                            gradient_number(step, parts, i, k)
                 barrier()
                 check_convergence(step, potential, team, w, member)
                 barrier()

@@ -589,7 +589,7 @@ def shared_direction_of(size: int, width: int) -> Any:
     int fetched_row[held];
 #define SOFTMODE_WARP
 #endif
-    const int parts = arrays.gradient_chunk.shape[1];
+    const int parts = team < 32 ? 1 : team / 32;
     const int lanes = team / parts;
     const int part = member / lanes;
     const int lane = member - part * lanes;
@@ -597,7 +597,7 @@ def shared_direction_of(size: int, width: int) -> Any:
     int* here_row = fetched_row + part * held;
     const char* start = (const char*)basis.gradient_across.data;
     start += (size_t)instances.point_start.data[i] * by_point;
-    double* out = (double*)arrays.gradient_chunk.data + ((size_t)i * parts + part) * 3 * n;
+    double* out = (double*)arrays.gradient_chunk.data + ((size_t)i * arrays.gradient_chunk.shape[1] + part) * 3 * n;
     for (int base = 0; base < n; base += lanes) {
         const int k = base + lane < n ? base + lane : n - 1;
         const char* G = start + (k / 8) * by_block + (k % 8) * sizeof(float);

@@ -22,6 +22,9 @@ from softmode.deformables.solver.step_tables import StepTables
 def minimise(tables: StepTables, dt: float) -> None:
     """Find the coordinates, and the rigid unknowns, at the end of a step of ``dt`` [s]."""
     t, worlds, step = tables, tables.layout.world_count, tables.newton_step(dt)
+    if t.rounds:
+        t.newton.level_count.zero_()
+        t.launch(rounds.expect_iterations, worlds, step)
     t.launch(kernels.begin_newton, worlds, step)
     t.launch(kernels.extrapolate, t.unknowns, step)
     if t.model.shape_count:
@@ -29,21 +32,37 @@ def minimise(tables: StepTables, dt: float) -> None:
     if t.options.carry_stiffness:
         t.launch_teams(search.reuse_hessians, worlds, step, t.team)
     if t.rounds:
-        t.launch(rounds.start_trials, (worlds, max(3 * t.layout.block_count, t.rigid.count_max)), step, t.rounds)
-        for _ in range(min(t.rounds, rounds.ALWAYS)):
-            _take_round(t, dt)
-        _count_left(t, dt)
-        wp.capture_while(t.newton.any_left, _take_another_round, tables=t, dt=dt)
+        _take_rounds(t, dt)
     if t.one_launch:
-        team = t.world_team
-        t.launch(t.fused_kernel, (worlds, team), step, t.system.unit, team, t.system.relation, block_dim=team)
+        _go_on_to_the_end(t, dt)
     else:
         wp.capture_while(t.newton.any_active, _iterate, tables=t, dt=dt)
 
 
+def _take_rounds(tables: StepTables, dt: float) -> None:
+    """Take most worlds through their first iterations, all at once, and beside them the slowest to their end."""
+    t, always = tables, min(tables.rounds, rounds.ALWAYS)
+    dim = (t.layout.world_count, max(3 * t.layout.block_count, t.rigid.count_max))
+    t.launch(rounds.start_trials, dim, t.newton_step(dt), t.rounds - always, t.room)
+    with t.beside:
+        _go_on_to_the_end(t, dt, only_aside=True)
+    for _ in range(always):
+        _take_round(t, dt)
+    t.beside.join()
+    _count_left(t, dt)
+    wp.capture_while(t.newton.any_left, _take_another_round, tables=t, dt=dt)
+
+
+def _go_on_to_the_end(tables: StepTables, dt: float, *, only_aside: bool = False) -> None:
+    """Take every world that is not done, or only those beside the rounds, through all further iterations."""
+    t, team = tables, tables.world_team
+    known = (t.newton_step(dt), t.system.unit, team, t.system.relation, int(only_aside))
+    t.launch(t.fused_kernel, (t.layout.world_count, team), *known, block_dim=team)
+
+
 def _take_round(tables: StepTables, dt: float) -> None:
     """Check the trials of all worlds that are not done, and find directions and next trials where they are accepted."""
-    t, step, worlds, team = tables, tables.newton_step(dt), tables.layout.world_count, tables.world_team
+    t, step, worlds, team = tables, tables.newton_step(dt), tables.layout.world_count, tables.round_team
     points, constraints, threads = rounds.tasks(t.layout.point_max, t.constraints.row.shape[1], t.rigid.row_max)
     t.launch(rounds.evaluate_trials, (worlds, threads), step, points, constraints, block_dim=rounds.BLOCK)
     t.launch(rounds.check_kernel(team), (worlds, team), step, team, block_dim=team)

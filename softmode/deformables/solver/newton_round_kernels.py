@@ -12,6 +12,9 @@ Within a round one world may try a shorter step while another takes the next. Th
 of ``fused_newton_kernels``. That launch has several times more code than the instruction cache holds, and as many
 registers as its hungriest phase; a launch of a round has its own. A round with few worlds left is slow, though: so
 rounds go on while more worlds are left than the one launch holds at a time, and it takes each of those to its end.
+
+The slowest world is what all wait for, and worlds that were slow will mostly be slow again. So those of which most
+iterations are expected go their whole way in the one launch, beside the rounds of the others.
 """
 
 from functools import cache
@@ -52,16 +55,62 @@ BLOCK = 128
 TEAMS = 672
 """Threads of teams that a multiprocessor takes at a time: what registers are given out for. All measured, see
 ``docs/performance.md``."""
-ALWAYS = 2
+ALWAYS = 5
 """Rounds that are taken however few worlds are left."""
+BESIDE = 2
+"""Most worlds for each multiprocessor that go their whole way beside the rounds."""
+LEVELS = 16
+"""Numbers of iterations that are told apart where worlds are ordered by what is expected of them."""
+FEWEST = wp.constant(2)
+"""Fewest expected iterations with which a world goes beside the rounds."""
+FADE = wp.constant(0.5)
+"""Iterations by which fewer are expected after a step that took fewer."""
+
+
+@wp.func
+def level_of(expected: float):
+    """Return among which worlds one is counted of which so many iterations are expected."""
+    return wp.min(int(expected), LEVELS - 1)
 
 
 @wp.kernel
-def start_trials(step: NewtonStep, rounds: int):
-    """Let the first trial of every world be where Newton starts; ``rounds`` is how many may be taken."""
+def expect_iterations(step: NewtonStep):
+    """Expect of each world the iterations of its last step, or little fewer than were expected then; count worlds."""
+    w = wp.tid()
+    expected = wp.max(float(step.state.iteration[w]), step.state.expected[w] - FADE)
+    step.state.expected[w] = expected
+    wp.atomic_add(step.state.level_count, level_of(expected), 1)
+
+
+@wp.func
+def least_aside(level_count: wp.array[int], room: int):
+    """Return the least level, FEWEST at the least, of which, with all above it, there are at most ``room`` worlds."""
+    least = int(LEVELS)
+    count = int(0)
+    while least > FEWEST:
+        count += level_count[least - 1]
+        if count > room:
+            break
+        least -= 1
+    return least
+
+
+@wp.kernel
+def start_trials(step: NewtonStep, more: int, room: int):
+    """Let the first trial of every world be where Newton starts, and choose which worlds go beside the rounds.
+
+    Args:
+        step: Newton's tables.
+        more: Rounds that there may be besides those which are always taken.
+        room: Most worlds that go beside them.
+    """
     w, e = wp.tid()
     if w == 0 and e == 0:
-        step.state.rounds_left[0] = rounds - ALWAYS
+        step.state.rounds_left[0] = more
+    if e == 0:
+        least = least_aside(step.state.level_count, room)
+        step.state.aside[w] = wp.where(level_of(step.state.expected[w]) >= least, 1, 0)
+        step.state.solving[w] = 0
     i = step.state.instance_start[w]
     if e < step.arrays.q.shape[1]:
         step.arrays.q_trial[i, e] = step.arrays.q[i, e]
@@ -73,7 +122,7 @@ def start_trials(step: NewtonStep, rounds: int):
 def evaluate_trials(step: NewtonStep, points: int, constraints: int):
     """Evaluate points and rows at the trials, contacts where a step is searched for; see ``tasks`` for the threads."""
     w, t = wp.tid()
-    if step.state.active[w] == 0:
+    if step.state.active[w] == 0 or step.state.aside[w] != 0:
         return
     i = step.state.instance_start[w]
     q = step.arrays.q_trial
@@ -126,7 +175,7 @@ def check_kernel(team: int) -> Kernel:
         Says in ``solving`` which worlds need a direction.
         """
         w, member = wp.tid()
-        if step.state.active[w] == 0:
+        if step.state.active[w] == 0 or step.state.aside[w] != 0:
             return
         i = step.state.instance_start[w]
         q = step.arrays.q_trial
@@ -178,7 +227,7 @@ def check_kernel(team: int) -> Kernel:
         barrier()
         for k in range(member, LANES * width, team):
             rolled()
-            gradient_number(step, i, k)
+            gradient_number(step, wp.max(team / WARP, 1), i, k)
         barrier()
         check_convergence(step, potential, team, w, member)
         if member == 0:
@@ -205,7 +254,7 @@ def direct_kernel(size: int, width: int, team: int) -> Kernel:
         w, member = wp.tid()
         if wp.static(dynamic > 0):
             _room = wp.tile_empty(shape=wp.static(dynamic), dtype=float, storage="shared")
-        if step.state.active[w] != 0 and step.state.solving[w] != 0:
+        if step.state.solving[w] != 0:
             i = step.state.instance_start[w]
             q = step.arrays.q_trial
             r = step.rigid.trial
@@ -230,6 +279,8 @@ def direct_kernel(size: int, width: int, team: int) -> Kernel:
             alpha = step.state.step_length[w]
             if searching == 0:
                 accept_step(step, team, w, member)
+                if member == 0:
+                    step.state.solving[w] = step.state.active[w]
             if alpha > wp.float64(0.0):
                 move_functions(step.instances, step.basis, step.arrays, alpha, i, member, team, q)
                 for j in range(member, step.rigid.count[w], team):

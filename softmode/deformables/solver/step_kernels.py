@@ -578,8 +578,8 @@ def gradient_block(step: NewtonStep, i: int, e: int):
 
 
 @wp.func
-def gradient_number(step: NewtonStep, i: int, k: int):
-    """Compute number ``k`` of the same, of an active world."""
+def gradient_number(step: NewtonStep, parts: int, i: int, k: int):
+    """Compute number ``k`` of the same, of an active world, from so many parts of the sums over points."""
     dt = step.options.dt
     function = k % (LANES * step.basis.row.shape[1])
     if function >= step.instances.function_count[i]:
@@ -590,7 +590,7 @@ def gradient_number(step: NewtonStep, i: int, k: int):
     g = rate * (q - number_of(step.motion.q_inertial, i, k)) + damping * (q - number_of(step.motion.q_rate, i, k))
     g = step.instances.mass[i] * rate * g - number_of(step.motion.force, i, k)
     row = i * step.arrays.gradient_chunk.shape[1]
-    for part in range(step.arrays.gradient_chunk.shape[1]):
+    for part in range(parts):
         g = g + chunk_number(step.arrays.gradient_chunk, row + part, k)
     reaction = wp.float64(0.0)
     if function < step.instances.driven_count[i]:

@@ -15,6 +15,7 @@ from softmode.deformables.contact.dents import dent_lengths
 from softmode.deformables.contact.detection_kernels import Shapes
 from softmode.deformables.contact.pairs import SoftPairs
 from softmode.deformables.contact.shape_tables import candidate_shapes, shape_table
+from softmode.deformables.model.beside import Beside
 from softmode.deformables.model.declare import WRENCH, Kernel, launch, launch_teams
 from softmode.deformables.model.lane_kernels import LANES, WARP, team_size
 from softmode.deformables.model.layout import Layout, lay_out, lay_out_bases, lay_out_instances, surface_stiffness
@@ -37,6 +38,7 @@ from softmode.deformables.solver.assembly_cpu_kernels import cache_slabs
 from softmode.deformables.solver.factor import BlockCholesky
 from softmode.deformables.solver.fused_system_kernels import shared_bytes
 from softmode.deformables.solver.iteration_kernels import NewtonArrays, NewtonOptions, NewtonStep
+from softmode.deformables.solver.newton_round_kernels import BESIDE, LEVELS
 from softmode.deformables.solver.options import SolverReducedOptions
 from softmode.deformables.solver.spin_kernels import Spin
 from softmode.deformables.solver.systems import join_systems
@@ -76,6 +78,7 @@ _NEWTON = {
     "cached_q": "instance unknown",
     "cached_key": "instance",
     "any_active any_searching any_left rounds_left": "1",
+    "level_count": f"{LEVELS}",
 }
 _ARRAYS = {
     "": "instance unknown",
@@ -154,10 +157,16 @@ class StepTables:
     """The kernel of that launch."""
     world_team: int
     """Threads of that team."""
+    round_team: int
+    """Threads of the team that takes a world through a round."""
     rounds: int
     """Most rounds of launches before it, which take worlds through their first iterations; 0 where there are none."""
     held: int
     """Worlds that the one launch takes at a time: no more rounds where no more worlds are left."""
+    beside: Beside
+    """Takes launches that do not wait for those which follow them."""
+    room: int
+    """Most worlds that go beside the rounds."""
     shared: bool
     """Whether the systems of that launch are assembled and solved in shared memory."""
     tiled: bool
@@ -255,13 +264,14 @@ def allocate_tables(
     one_launch = device.is_cpu or (not joined and blocks <= ONE_LAUNCH_BLOCKS)
     one_each = count == layout.world_count and layout.pin_max == 0
     driven = any(body.driven_count for body in layout.bodies)
-    world_team = fused.team_of(layout.point_max, layout.world_count, device)
+    round_team = fused.team_of(layout.point_max, layout.world_count, device)
     size = (3 * layout.stride, 3 * layout.stride + 4 * -(-(rigid.count_max + 1) // 4))
     shared = device.is_cuda and one_launch and one_each and not driven
     shared = shared and fits_in_shared_memory(device.max_shared_memory_per_block, *size)
     tiled = device.is_cuda and not one_launch and layout.stride >= TILE
     few = tiled and count <= FEW_WORLDS
     rounds = ROUNDS if shared and layout.world_count >= ROUND_WORLDS * device.sm_count else 0
+    world_team = fused.TAIL_TEAM if rounds and round_team == fused.SMALL_TEAM else round_team
 
     def chunks(threads: int, tasks: int) -> int:
         """Return into how many parts sums over points are split where a kernel has so many threads, a body tasks."""
@@ -280,7 +290,7 @@ def allocate_tables(
         "team": LARGE_TEAM if few else team_size(device),
         "constraint": room + layout.pin_max,
         "rigid": rigid.count_max,
-        "gradient_chunk": world_team // WARP if shared else chunks(count * blocks, blocks),
+        "gradient_chunk": max(world_team, round_team) // WARP if shared else chunks(count * blocks, blocks),
         "stiffness_chunk": chunk_count(count, layout.stride)
         if tiled
         else chunks(count * square, square + (square + 3 * blocks) // 2),
@@ -335,9 +345,12 @@ def allocate_tables(
             system.unit.dtype, *(size if shared else ()), team=world_team, joined=joined and device.is_cpu
         ),
         world_team=world_team,
+        round_team=round_team,
         shared=shared,
         rounds=rounds,
         held=fused.held_at_a_time(world_team, device),
+        beside=Beside(device),
+        room=BESIDE * device.sm_count if device.is_cuda else 0,
         tiled=tiled,
     )
 
