@@ -493,18 +493,17 @@ def gather_contacts(
         constraints.count[i] = wp.min(total, constraint_max)
         if total > constraint_max:
             wp.atomic_or(status, instances.world[i], WORLD_CONTACT_OVERFLOW)
+    deepest = -wp.float64(OVERLAP * instances.size[i])
     for s in range(begin, end):
         for slot in range(SLOTS):
             shape = samples.shape[i, s, slot]
             samples.constraint[i, s, slot] = -1
             if shape < 0:
                 continue
-            deepest = -wp.float64(OVERLAP * instances.size[i])
             if samples.gap[i, s, slot] < deepest:
                 wp.atomic_or(status, instances.world[i], WORLD_PENETRATION)
-            gap = wp.max(samples.gap[i, s, slot], deepest)
             e = at_close
-            if gap <= wp.float64(0.0):
+            if samples.gap[i, s, slot] <= wp.float64(0.0):
                 e = at_touching
                 at_touching += 1
             else:
@@ -521,7 +520,7 @@ def gather_contacts(
             if samples.constraint[i, s, k] == e:
                 slot = k
         shape = samples.shape[i, s, slot]
-        gap = wp.max(samples.gap[i, s, slot], -wp.float64(OVERLAP * instances.size[i]))
+        gap = wp.max(samples.gap[i, s, slot], deepest)
         # of unit length in float64: what is left of the gap in the slip must not count against the stick range
         normal = wp.normalize(wp.vec3d(samples.normal[i, s, slot]))
         # both bodies feel the force at the sample, not the shape at its own surface: a pair of forces on two

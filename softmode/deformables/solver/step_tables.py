@@ -290,7 +290,7 @@ def allocate_tables(
         "team": LARGE_TEAM if few else team_size(device),
         "constraint": room + layout.pin_max,
         "rigid": rigid.count_max,
-        "gradient_chunk": max(world_team, round_team) // WARP if shared else chunks(count * blocks, blocks),
+        "gradient_chunk": world_team // WARP if shared else chunks(count * blocks, blocks),
         "stiffness_chunk": chunk_count(count, layout.stride)
         if tiled
         else chunks(count * square, square + (square + 3 * blocks) // 2),
