@@ -65,7 +65,7 @@ def test_points(model: MaterialModel, project: int) -> None:
     step, one, eight = t.newton_step(0.004), (1, 125), (1, 16)
     t.launch(step_kernels.start_points, one, step)
     start = t.points.start.numpy().copy()
-    t.launch(step_kernels.evaluate_points, one, step, t.newton.active, t.arrays.q, int(ALL))
+    t.launch(step_kernels.evaluate_points, (*one, 1), step, t.newton.active, t.arrays.q, int(ALL), 1)
     names = {"energy": DOUBLE, "stress": DOUBLE, "volume_ratio": SINGLE, "hessian": SINGLE}
     expected = {name: getattr(t.points, name).numpy().copy() for name in names}
     for name in (*names, "start"):
@@ -184,9 +184,9 @@ def test_constraints(iteration: int, memory: str, pins: int) -> None:
     r = wp.array(1.0e-4 * rng.normal(size=t.rigid.table.r.shape), dtype=wp.float64, device="cpu")
     for derivatives, evaluated in ((0, 0), (1, 0), (1, 1)):
         found = []
-        for kernel, dim in (
-            (step_kernels.evaluate_constraints, shape),
-            (constraint_cpu_kernels.evaluate_constraints, 1),
+        for kernel, dim, lanes in (
+            (step_kernels.evaluate_constraints, (*shape, 1), (1,)),
+            (constraint_cpu_kernels.evaluate_constraints, 1, ()),
         ):
             for name in names:
                 getattr(c, name).fill_(7.0)
@@ -194,13 +194,13 @@ def test_constraints(iteration: int, memory: str, pins: int) -> None:
             for name, value in values.items():
                 getattr(c, name).assign(np.asarray(value))
             t.newton.evaluated.fill_(evaluated)
-            t.launch(kernel, dim, step, t.newton.active, t.arrays.q, r, derivatives)
+            t.launch(kernel, dim, step, t.newton.active, t.arrays.q, r, derivatives, *lanes)
             found.append({name: getattr(c, name).numpy().copy() for name in names})
-        expected, lanes = found
+        expected, eights = found
         for name in names:
             rounding = SINGLE if name in ("hessian", "coupling") else DOUBLE
-            agree(lanes[name][:, :count], expected[name][:, :count], rounding)
-            np.testing.assert_array_equal(lanes[name][:, count:], expected[name][:, count:])  # which are left alone
+            agree(eights[name][:, :count], expected[name][:, :count], rounding)
+            np.testing.assert_array_equal(eights[name][:, count:], expected[name][:, count:])  # which are left alone
         forces = np.abs(expected["force"][0, pins:count]).max(-1)
         assert 0 < (forces > 0.0).sum() < count - pins
 

@@ -19,7 +19,7 @@ wp.set_module_options({"enable_backward": False})
     struct alignas(16) Two { double v[2]; };
     double g[9] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
     #pragma unroll 2
-    for (int k = 0; k < function_count; k += 4) {
+    for (int k = 4 * lane; k < function_count; k += 4 * lanes) {
         const char* at = start + (size_t)(k / 8) * gradient.strides[0] + (k % 8) * sizeof(float);
         const Four a = *(const Four*)at;
         const Four b = *(const Four*)(at + gradient.strides[2]);
@@ -38,21 +38,38 @@ wp.set_module_options({"enable_backward": False})
             }
         }
     }
+    #if defined(__CUDA_ARCH__)
+    if (lanes > 1)
+        #pragma unroll
+        for (int k = 0; k < 9; ++k)
+            for (int offset = 16; offset > 0; offset >>= 1) g[k] += __shfl_xor_sync(0xffffffff, g[k], offset);
+    #endif
     return wp::mat_t<3, 3, double>(g[0], g[1], g[2], g[3], g[4], g[5], g[6], g[7], g[8]);
 """
 )
 def displacement_gradient_by_fours(
-    gradient: wp.array3d[vec8], q: wp.array2d[vec8d], i: int, point: int, function_count: int
+    gradient: wp.array3d[vec8], q: wp.array2d[vec8d], i: int, point: int, function_count: int, lane: int, lanes: int
 ) -> wp.mat33d:  # pyright: ignore[reportReturnType]
-    """Return the same as ``displacement_gradient``, with few registers, of functions four at a time."""
+    """Return the same as ``displacement_gradient``, with few registers, of functions four at a time.
+
+    The threads of a warp, which know their ``lane``, may share it if all 32 call this with ``lanes`` 32; else it is 1.
+    """
     ...
 
 
 @wp.func
-def displacement_gradient(gradient: wp.array3d[vec8], q: wp.array2d[vec8d], i: int, point: int, function_count: int):
+def displacement_gradient(
+    gradient: wp.array3d[vec8],
+    q: wp.array2d[vec8d],
+    i: int,
+    point: int,
+    function_count: int,
+    lane: int = 0,
+    lanes: int = 1,
+):
     """Return G = F - I = sum_k q_k (grad b_k)^T, with gradients of shape (block_count, point_count, 3)."""
     if by_eights() == 0:
-        return displacement_gradient_by_fours(gradient, q, i, point, function_count)
+        return displacement_gradient_by_fours(gradient, q, i, point, function_count, lane, lanes)
     stride = q.shape[1] / 3
     G = wp.mat33d()
     for b in range(blocks_of(function_count)):
@@ -69,10 +86,17 @@ def displacement_gradient(gradient: wp.array3d[vec8], q: wp.array2d[vec8d], i: i
 
 @wp.func
 def elastic_gradient(
-    gradient: wp.array3d[vec8], q: wp.array2d[vec8d], i: int, point: int, function_count: int, scale: wp.float64
+    gradient: wp.array3d[vec8],
+    q: wp.array2d[vec8d],
+    i: int,
+    point: int,
+    function_count: int,
+    scale: wp.float64,
+    lane: int = 0,
+    lanes: int = 1,
 ):
     """Return F / s - I, the displacement gradient by the rest shape s X of a body of scale s."""
-    G = displacement_gradient(gradient, q, i, point, function_count)
+    G = displacement_gradient(gradient, q, i, point, function_count, lane, lanes)
     if scale != wp.float64(1.0):
         excess = scale - wp.float64(1.0)
         G = wp.float64(1.0) / scale * (G - wp.diag(wp.vec3d(excess, excess, excess)))

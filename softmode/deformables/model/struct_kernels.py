@@ -308,7 +308,7 @@ def interpolate(row: wp.array2d[vec8], r: int, q: wp.array2d[vec8d], i: int, fun
     struct alignas(16) Two { double v[2]; };
     double sum[6] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
     #pragma unroll 2
-    for (int k = 0; k < function_count; k += 4) {
+    for (int k = 4 * lane; k < function_count; k += 4 * lanes) {
         const Four b = *(const Four*)(values + k * sizeof(float));
         #pragma unroll
         for (int axis = 0; axis < 3; ++axis) {
@@ -322,23 +322,46 @@ def interpolate(row: wp.array2d[vec8], r: int, q: wp.array2d[vec8d], i: int, fun
             }
         }
     }
+    #if defined(__CUDA_ARCH__)
+    if (lanes > 1)
+        #pragma unroll
+        for (int k = 0; k < 6; ++k)
+            for (int offset = 16; offset > 0; offset >>= 1) sum[k] += __shfl_xor_sync(0xffffffff, sum[k], offset);
+    #endif
     return wp::vec_t<3, double>(sum[0] + sum[3], sum[1] + sum[4], sum[2] + sum[5]);
 """
 )
 def interpolate_change_by_fours(
-    row: wp.array2d[vec8], r: int, q: wp.array2d[vec8d], q_from: wp.array2d[vec8d], i: int, function_count: int
+    row: wp.array2d[vec8],
+    r: int,
+    q: wp.array2d[vec8d],
+    q_from: wp.array2d[vec8d],
+    i: int,
+    function_count: int,
+    lane: int,
+    lanes: int,
 ) -> wp.vec3d:  # pyright: ignore[reportReturnType]
-    """Return the same as ``interpolate_change``, with few registers, of functions four at a time."""
+    """Return the same as ``interpolate_change``, with few registers, of functions four at a time.
+
+    The threads of a warp, which know their ``lane``, may share it if all 32 call this with ``lanes`` 32; else it is 1.
+    """
     ...
 
 
 @wp.func
 def interpolate_change(
-    row: wp.array2d[vec8], r: int, q: wp.array2d[vec8d], q_from: wp.array2d[vec8d], i: int, function_count: int
+    row: wp.array2d[vec8],
+    r: int,
+    q: wp.array2d[vec8d],
+    q_from: wp.array2d[vec8d],
+    i: int,
+    function_count: int,
+    lane: int = 0,
+    lanes: int = 1,
 ):
     """Return sum_k b_k (q_k - q_from_k) at a row."""
     if by_eights() == 0:
-        return interpolate_change_by_fours(row, r, q, q_from, i, function_count)
+        return interpolate_change_by_fours(row, r, q, q_from, i, function_count, lane, lanes)
     stride = row.shape[1]
     x = vec8d()
     y = vec8d()

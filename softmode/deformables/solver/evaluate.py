@@ -42,8 +42,9 @@ def _evaluate(
     """Evaluate the selected worlds at (q, r): of points and rows what ``found`` says, of contacts forces or not."""
     step = t.newton_step(dt)
     if t.model.device.is_cuda:
-        t.launch(kernels.evaluate_points, t.point_tasks, step, selected, q, found)
-        t.launch(kernels.evaluate_constraints, t.constraints.row.shape, step, selected, q, r, int(forces))
+        points, constraints = (*t.point_tasks, t.lanes), (*t.constraints.row.shape, t.lanes)
+        t.launch(kernels.evaluate_points, points, step, selected, q, found, t.lanes)
+        t.launch(kernels.evaluate_constraints, constraints, step, selected, q, r, int(forces), t.lanes)
     else:
         t.launch(eights.evaluate_eights, t.point_tasks, step, selected, q, found)
         t.launch(constraint_cpu.evaluate_constraints, t.layout.instance_count, step, selected, q, r, int(forces))

@@ -369,11 +369,13 @@ def evaluate_point(
     derivatives: int,
     i: int,
     p: int,
+    lane: int = 0,
+    lanes: int = 1,
 ):
     """Evaluate V_p Psi(F_p) and, where asked, its derivatives by F_p at every cubature point.
 
     A body of scale s has V_p s^3 and the elastic F_p / s: each derivative takes one s off. ``derivatives`` is one of
-    ENERGIES, ALL and TRIAL.
+    ENERGIES, ALL and TRIAL. A warp may share a point: each of its 32 threads is a ``lane`` of them.
     """
     dt = step.options.dt
     w = step.instances.world[i]
@@ -386,7 +388,9 @@ def evaluate_point(
     s = wp.float64(step.instances.scale[i])
     weight = s * step.basis.point_weight[point]
 
-    G = elastic_gradient(step.basis.gradient, q, i, point, step.instances.function_count[i], s)
+    G = elastic_gradient(step.basis.gradient, q, i, point, step.instances.function_count[i], s, lane, lanes)
+    if lane != 0:
+        return
     G_start = G
     if step.instances.viscosity[i] > 0.0:
         G_start = step.points.start[i, p]
@@ -399,7 +403,7 @@ def evaluate_point(
         store_hessian(C, i, p, step.points.hessian)
 
 
-evaluate_points = kernel_over(evaluate_point, "evaluate_points", "i", "p")
+evaluate_points = kernel_over(evaluate_point, "evaluate_points", "i", "p", "lane")
 
 
 @wp.func
@@ -412,10 +416,13 @@ def evaluate_constraint(
     derivatives: int,
     i: int,
     e: int,
+    lane: int = 0,
+    lanes: int = 1,
 ):
     """Evaluate pins and contacts at displacement d = sum_k b_k (q_k - q_nk) - J r, less that of a soft partner.
 
-    A contact of two soft bodies is a constraint of each, which has one half of its energy and all of its force.
+    A contact of two soft bodies is a constraint of each, which has one half of its energy and all of its force. A warp
+    may share a constraint: each of its 32 threads is a ``lane`` of them.
     """
     w = step.instances.world[i]
     if selected[w] == 0 or e >= step.constraints.count[i]:
@@ -424,7 +431,8 @@ def evaluate_constraint(
     known = derivatives != 0 and step.state.evaluated[w] != 0
     d = step.constraints.displacement[i, e]
     if not known:
-        d = interpolate_change(step.basis.row, row, q, step.motion.q_start, i, step.instances.function_count[i])
+        count = step.instances.function_count[i]
+        d = interpolate_change(step.basis.row, row, q, step.motion.q_start, i, count, lane, lanes)
     smoothing = step.instances.smoothing[i]
     share = wp.float64(1.0)
     if e >= step.constraints.count[i] - step.constraints.pair_count[i]:
@@ -433,9 +441,11 @@ def evaluate_constraint(
             if not known:
                 row = step.constraints.partner_row[i, e]
                 count = step.instances.function_count[j]
-                d -= interpolate_change(step.basis.row, row, q, step.motion.q_start, j, count)
+                d -= interpolate_change(step.basis.row, row, q, step.motion.q_start, j, count, lane, lanes)
             smoothing = wp.min(smoothing, step.instances.smoothing[j])
             share = wp.float64(0.5)
+    if lane != 0:
+        return
     if not known:
         for k in range(step.constraints.dof_begin[i, e], step.constraints.dof_end[i, e]):
             d -= r[w, k] * wp.vec3d(step.constraints.jacobian[i, e, k])
@@ -486,7 +496,7 @@ def evaluate_constraint(
             step.constraints.coupling[i, e, k] = wp.mat33(H) * step.constraints.jacobian[i, e, k]
 
 
-evaluate_constraints = kernel_over(evaluate_constraint, "evaluate_constraints", "i", "e")
+evaluate_constraints = kernel_over(evaluate_constraint, "evaluate_constraints", "i", "e", "lane")
 
 
 @wp.func

@@ -54,8 +54,10 @@ ROUND_WORLDS = 12
 """Worlds for each multiprocessor from which on they are many."""
 FEW_WORLDS = 64
 """Bodies up to which those of many functions get larger teams, and more and smaller blocks of threads, on CUDA."""
-LARGE_TEAM = 128
-"""Threads of these teams and blocks."""
+LARGE_TEAM = 256
+"""Threads of these teams."""
+LARGE_BLOCK = 128
+"""Threads of these blocks."""
 RESERVED_BYTES = 12 * 1024
 """Shared memory that the one launch needs besides its system, with what CUDA keeps for itself."""
 
@@ -149,6 +151,8 @@ class StepTables:
     """The mask that selects all worlds, bool (world_count + 1,)."""
     team: int
     """Threads that share one system."""
+    lanes: int
+    """Threads that share a point or a constraint in a launch per phase: one, or on CUDA a warp."""
     block: int
     """Threads of a block on CUDA where a launch does not say."""
     one_launch: bool
@@ -339,7 +343,8 @@ def allocate_tables(
         parameter_flags=wp.zeros(count, dtype=int, device=device),
         every_world=wp.full(layout.world_count + 1, True, dtype=bool, device=device),
         team=sizes["team"],
-        block=LARGE_TEAM if few else 256,
+        lanes=WARP if few else 1,
+        block=LARGE_BLOCK if few else 256,
         one_launch=one_launch,
         fused_kernel=fused.newton_kernel(
             system.unit.dtype, *(size if shared else ()), team=world_team, joined=joined and device.is_cpu
