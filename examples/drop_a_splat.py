@@ -87,7 +87,7 @@ def main(arguments: list[str] | None = None) -> None:
         f"{drop.thing.visible_splats.count} splats, {1e3 * drop.weight / GRAVITY:.1f} g, falls {100 * drop.fall:.0f} cm"
     )
     with Film(given.video) as film:
-        rows = drop.run(film, 120)
+        rows = drop.run(film, 150)
         film.publish()
     for t, lowest, centre, kinetic in rows[::7]:
         print(
