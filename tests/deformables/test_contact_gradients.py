@@ -134,13 +134,14 @@ def stiff_landing() -> Landing:
 def test_frictionless_contact(youngs_modulus: float) -> None:
     """DL/d(E, nu, rho, scale, v_0) within 1e-3 of differences at the default contact stiffness.
 
-    It follows the mass for E up to 1e5 here, and E and nu for the two others.
+    It follows the mass for E up to 1e5 here, and E and nu for the two others. Over steps of 1e-3 a contact may come or
+    go between the two runs.
     """
     case = stiff_landing() if youngs_modulus == 2.0e6 else Landing(youngs_modulus)
     gradients = case.gradients()
     for name in ("youngs_modulus", "poissons_ratio", "density", "scale", "qd"):
         found = case.gradient(gradients, name)
-        assert found == pytest.approx(case.difference(name, 1.0e-3), rel=1.0e-3), name
+        assert found == pytest.approx(case.difference(name, 3.0e-4), rel=1.0e-3), name
     assert gradients["grad_residual"].max() < 1.0e-10
 
 

@@ -53,6 +53,7 @@ class Press:
         poissons_ratio: nu.
         scale: Of the bodies.
         stiffness: Contact stiffness per area [Pa/m]; None for the one that follows the body.
+        damping: Mass damping [1/s].
     """
 
     def __init__(
@@ -66,6 +67,7 @@ class Press:
         poissons_ratio: float = RATIO,
         scale: float = 1.0,
         stiffness: float | None = None,
+        damping: float = 50.0,
     ) -> None:
         """Build the scene."""
         self.half, self.count = scale * half_height, count
@@ -74,7 +76,7 @@ class Press:
             poissons_ratio=poissons_ratio,
             density=300.0,
             friction=0.0,
-            mass_damping=50.0,
+            mass_damping=damping,
         )
 
         def populate(world: newton.ModelBuilder) -> None:
@@ -127,12 +129,15 @@ def test_hertz(youngs_modulus: float) -> None:
 
 
 def test_follows_parameters() -> None:
-    """The force goes with E as it is now, and at equal d / R with the square of the scale; to what float32 leaves."""
-    press, depth = Press(ball(), RADIUS), 0.04 * RADIUS
+    """The force goes with E as it is now, and at equal d / R with the square of the scale; to what float32 leaves.
+
+    Damped so that it does not turn before it rests: between its samples the force differs by 0.2 %.
+    """
+    press, depth = Press(ball(), RADIUS, damping=200.0), 0.04 * RADIUS
     force = press.force(depth)
     press.scene.set_parameter("youngs_modulus", 3.0e6)
     assert press.force(depth) == pytest.approx(3.0 * force, rel=1.0e-3)
-    half = Press(ball(), RADIUS, scale=0.5)
+    half = Press(ball(), RADIUS, scale=0.5, damping=200.0)
     assert half.force(0.5 * depth) == pytest.approx(0.25 * force, rel=1.0e-3)
 
 
