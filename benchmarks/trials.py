@@ -25,8 +25,6 @@ from softmode.scenes import capture
 class Unrecorded:
     """Launches that are called, where a recording would repeat them."""
 
-    operation_count = 0
-
     def __init__(self, launches: Callable[[], None], _device: wp.DeviceLike) -> None:
         """Keep the launches."""
         self.launch = launches

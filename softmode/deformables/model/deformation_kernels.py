@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from softmode.deformables.model.lane_kernels import by_eights, sum8d, vec8, vec8d
+from softmode.deformables.model.lane_kernels import by_eights, sum8d, sum_of_lanes, vec8, vec8d
 from softmode.deformables.model.struct_kernels import blocks_of
 
 wp.set_module_options({"enable_backward": False})
@@ -38,13 +38,9 @@ wp.set_module_options({"enable_backward": False})
             }
         }
     }
-    #if defined(__CUDA_ARCH__)
-    if (lanes > 1)
-        #pragma unroll
-        for (int k = 0; k < 9; ++k)
-            for (int offset = 16; offset > 0; offset >>= 1) g[k] += __shfl_xor_sync(0xffffffff, g[k], offset);
-    #endif
-    return wp::mat_t<3, 3, double>(g[0], g[1], g[2], g[3], g[4], g[5], g[6], g[7], g[8]);
+"""
+    + sum_of_lanes("g", 9)
+    + """    return wp::mat_t<3, 3, double>(g[0], g[1], g[2], g[3], g[4], g[5], g[6], g[7], g[8]);
 """
 )
 def displacement_gradient_by_fours(

@@ -252,6 +252,17 @@ def team_rank(flag: int) -> int:  # pyright: ignore[reportReturnType]
     ...
 
 
+def sum_of_lanes(name: str, count: int) -> str:
+    """Return native code that sums ``count`` numbers ``name[k]`` over a warp on CUDA, if ``lanes`` is more than one."""
+    return f"""    #if defined(__CUDA_ARCH__)
+    if (lanes > 1)
+        #pragma unroll
+        for (int k = 0; k < {count}; ++k)
+            for (int offset = 16; offset > 0; offset >>= 1) {name}[k] += __shfl_xor_sync(0xffffffff, {name}[k], offset);
+    #endif
+"""
+
+
 def to_blocks(q: np.ndarray, block_count: int) -> np.ndarray:
     """Return coordinates (..., n, 3) in the layout of the kernels, (..., 3 block_count, 8), padded with zeros."""
     n = q.shape[-2]

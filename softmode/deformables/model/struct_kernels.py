@@ -10,7 +10,7 @@ from typing import Any
 import warp as wp
 
 from softmode.deformables.model.declare import struct
-from softmode.deformables.model.lane_kernels import by_eights, sum8d, vec8, vec8d
+from softmode.deformables.model.lane_kernels import by_eights, sum8d, sum_of_lanes, vec8, vec8d
 
 OVERLAP = wp.constant(0.05)
 """Deepest gap that a step starts from, as a fraction of the body's size: what overlaps more, as when it was placed
@@ -322,13 +322,9 @@ def interpolate(row: wp.array2d[vec8], r: int, q: wp.array2d[vec8d], i: int, fun
             }
         }
     }
-    #if defined(__CUDA_ARCH__)
-    if (lanes > 1)
-        #pragma unroll
-        for (int k = 0; k < 6; ++k)
-            for (int offset = 16; offset > 0; offset >>= 1) sum[k] += __shfl_xor_sync(0xffffffff, sum[k], offset);
-    #endif
-    return wp::vec_t<3, double>(sum[0] + sum[3], sum[1] + sum[4], sum[2] + sum[5]);
+"""
+    + sum_of_lanes("sum", 6)
+    + """    return wp::vec_t<3, double>(sum[0] + sum[3], sum[1] + sum[4], sum[2] + sum[5]);
 """
 )
 def interpolate_change_by_fours(
