@@ -32,6 +32,8 @@ SIZE = (1100, 480)
 """Width and height of the page [px]; the panel lies beside the gizmos."""
 ARROW = 0.22
 """Length of the arrows of a corner over the object's diagonal."""
+PATIENCE = 600_000
+"""Longest wait for what ends by itself [ms]: on two busy cores, drawn in software, a body is built for two minutes."""
 
 
 class Hand:
@@ -100,10 +102,10 @@ def test_gizmos_in_a_browser_prepare_what_is_shown(tmp_path: Path) -> None:
             browser = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
             page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
             page.goto(f"http://127.0.0.1:{port}/?fixedDpr=1")
-            page.locator(".mantine-Notification-closeButton").first.click(timeout=30_000)
-            page.get_by_role("button", name="prepare").click(timeout=30_000)
+            page.locator(".mantine-Notification-closeButton").first.click(timeout=PATIENCE)
+            page.get_by_role("button", name="prepare").click(timeout=PATIENCE)
             repeat, hand = page.locator("textarea").first, Hand(page, twin)
-            repeat.wait_for(timeout=60_000)
+            repeat.wait_for(timeout=PATIENCE)
             time.sleep(5.0)  # the gizmos are drawn
             for axis, angle, up in ((0, -90.0, "-y"), (1, -90.0, "+x")):
                 before = repeat.input_value()
@@ -119,7 +121,7 @@ def test_gizmos_in_a_browser_prepare_what_is_shown(tmp_path: Path) -> None:
             time.sleep(1.0)
             told = repeat.input_value()
             page.get_by_role("button", name="build").click()
-            page.get_by_role("button", name="prepare").wait_for(timeout=180_000)
+            page.get_by_role("button", name="prepare").wait_for(timeout=PATIENCE)
             with PageClient(f"http://127.0.0.1:{port}") as client:
                 shown = client.splats()[0][:, :3].copy().view(np.float32)
             browser.close()
