@@ -6,7 +6,7 @@ import contextlib
 import mmap
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -156,11 +156,16 @@ def bar_interval() -> float:
 
 
 class BuildBar:
-    """A progress bar over the build of a body, on stderr; it appears with the first report."""
+    """A progress bar over the build of a body, on stderr; it appears with the first report.
 
-    def __init__(self) -> None:
+    Args:
+        also: Told each stage and fraction too.
+    """
+
+    def __init__(self, also: Callable[[str, float], None] | None = None) -> None:
         """Show nothing yet."""
         self._bar: Any = None
+        self._also = also
 
     def __deepcopy__(self, memo: object) -> BuildBar:
         """Return itself: Gymnasium copies what an environment was made with, and a terminal cannot be copied."""
@@ -178,6 +183,8 @@ class BuildBar:
             self._bar = tqdm(total=100, desc="building the body", unit="%", mininterval=bar_interval())
         self._bar.set_postfix_str(stage, refresh=False)
         self._bar.update(round(100.0 * fraction) - self._bar.n)
+        if self._also is not None:
+            self._also(stage, fraction)
 
     def __exit__(self, *_: object) -> None:
         """Leave the bar as it is."""

@@ -7,6 +7,7 @@ import dataclasses
 import os
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -14,7 +15,7 @@ from softmode import ENVIRONMENTS
 from softmode.checks import require_number
 from softmode.cli.common import BuildBar, own_object, quiet_warp, same_fields, warn_of, warp_device
 from softmode.cli.object_options import ObjectOptions
-from softmode.errors import AssetError, ConfigError
+from softmode.errors import AssetError, ConfigError, SoftmodeError
 from softmode.learning.config_values import split_config
 from softmode.learning.players import trained_policy
 from softmode.mpm.run import is_morph
@@ -77,17 +78,16 @@ class View:
         if len(self.target) == 1 and is_morph(self.target[0]):
             return _played(self, served)
         with quiet_warp():
-            shown = _prepared(self, served) if self.prepare else self
-            while shown is not None and _serve(shown, served):
-                shown = _prepared(shown, served)
+            shown = _prepared(self, served) if self.prepare else (self, _session(self))
+            while shown is not None and _serve(*shown, served):
+                shown = _prepared(shown[0], served)
         return 0
 
 
-def _serve(options: View, served: ViewOptions) -> bool:
+def _serve(options: View, session: LiveSession, served: ViewOptions) -> bool:
     """Serve a session until it ends; return whether somebody asked to prepare its capture instead."""
     from softmode.view.app import ViewApp
 
-    session = _session(options)
     try:
         with ViewApp(session, served, capture=_is_capture(_file(options))) as app:
             print(f"softmode: open {app.url} in a browser; Ctrl-C ends it", flush=True)
@@ -139,8 +139,12 @@ def _played(options: View, served: ViewOptions) -> int:
     return 0
 
 
-def _prepared(options: View, served: ViewOptions) -> View | None:
-    """Return the options with what a person made of a splat file on a page; None if they did not build it."""
+def _prepared(options: View, served: ViewOptions) -> tuple[View, LiveSession] | None:
+    """Return the options with what a person made of a splat file on a page, and what was built; None without a build.
+
+    The page says how far the build is, and why there is none. It stays until there is one, as Chromium delays a page
+    that is refused for half a minute by more than the second after which viser's page gives up and tries again.
+    """
     from softmode.view.prepare import PreparePage
 
     toy, file = options.toy, _file(options)
@@ -153,13 +157,18 @@ def _prepared(options: View, served: ViewOptions) -> View | None:
         if options.open:
             _open(page.url)
         try:
-            if not page.wait(options.duration):
-                return None
+            while page.wait(options.duration):
+                page.show_progress("the body", 0.0)
+                print(f"softmode: to do this again: {page.command}", flush=True)
+                made = dataclasses.replace(options, toy=dataclasses.replace(toy, up=page.up, crop=page.crop))
+                try:
+                    return made, _session(made, page.show_progress)
+                except SoftmodeError as error:
+                    page.refuse(error)
+                    print(f"softmode: {error}", file=sys.stderr)
         except KeyboardInterrupt:
             print("softmode: stopped", file=sys.stderr)
-            return None
-        print(f"softmode: to do this again: {page.command}", flush=True)
-        return dataclasses.replace(options, toy=dataclasses.replace(toy, up=page.up, crop=page.crop))
+        return None
 
 
 def _words(options: View) -> list[str]:
@@ -177,8 +186,8 @@ def _words(options: View) -> list[str]:
     return words
 
 
-def _session(options: View) -> LiveSession:
-    """Make the session that was asked for."""
+def _session(options: View, show_progress: Callable[[str, float], None] | None = None) -> LiveSession:
+    """Make the session that was asked for; `show_progress` is told stages and fractions beside the terminal."""
     from gymnasium.envs.registration import registry
 
     from softmode.envs.catalogue import env_class, registered_id
@@ -191,7 +200,7 @@ def _session(options: View) -> LiveSession:
     if len(options.target) > 1:
         raise ConfigError(f"{len(options.target)} things to show: {', '.join(options.target)}", hint="name one")
     device, target = warp_device(options.device), next(iter(options.target), None)
-    with BuildBar() as progress:
+    with BuildBar(show_progress) as progress:
         missing = target is not None and target not in PRESETS and not Path(target).exists()
         if target is not None and missing and (target.startswith("softmode/") or ":" in target or target in registry):
             registered_id(target)

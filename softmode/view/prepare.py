@@ -11,7 +11,7 @@ from typing import Any, get_args
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from softmode.errors import ConfigError
+from softmode.errors import ConfigError, SoftmodeError
 from softmode.splats.formats import read_splats
 from softmode.splats.splats import UpAxis, up_rotation
 from softmode.view.app import ViewOptions, aim
@@ -80,6 +80,17 @@ class PreparePage(Page):
         """Ask for the build, as the button does; may be called from any thread."""
         self._done.set()
 
+    def show_progress(self, stage: str, fraction: float) -> None:
+        """Say how far a stage of the build is, 0..1; nothing can be pressed or pulled in the meantime."""
+        self._button.disabled, self._gizmos.visible = True, False
+        self._told.content = f"building: {stage}, {100.0 * fraction:.0f} %"
+
+    def refuse(self, error: SoftmodeError) -> None:
+        """Say why there is no build, and take the next press."""
+        self._done.clear()
+        self._told.content = f"**{error}**"
+        self._button.disabled, self._gizmos.visible = False, True
+
     @property
     def crop(self) -> Crop | None:
         """The box, to four digits; None where nobody has pulled at it."""
@@ -107,9 +118,9 @@ class PreparePage(Page):
         gui.add_markdown(HELP)
         self._command = gui.add_text("repeat", "", multiline=True, hint="the command that builds the same, to copy")
         self._told = gui.add_markdown("")
-        build = gui.add_button("build")
+        self._button = gui.add_button("build")
 
-        @build.on_click
+        @self._button.on_click
         async def _(_: Any) -> None:
             self.press()
 
