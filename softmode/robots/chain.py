@@ -19,6 +19,8 @@ from softmode.errors import ConfigError
 from softmode.robots.description import RobotDescription, ToolPose
 
 Array = NDArray[np.float64]
+STILL = 1.0e-13
+"""Motion of an iteration of the inverse that is rounding [rad or m]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,6 +59,10 @@ class SerialChain:
     def jacobian(self, q: Array) -> Array:
         """Return d(position, rotation)/dq in the base frame, shape (B, 6, n)."""
         position, _, axes, anchors = self._sweep(q)
+        return self._slopes(position, axes, anchors)
+
+    def _slopes(self, position: Array, axes: Array, anchors: Array) -> Array:
+        """Return the Jacobian where the tool, and axes and anchors of all joints, are these."""
         lever = np.cross(axes, position[:, None] - anchors)
         linear = np.where(self.slide[:, None], axes, lever)
         angular = np.where(self.slide[:, None], 0.0, axes)
@@ -83,11 +89,13 @@ class SerialChain:
     ) -> tuple[Array, Array]:
         """Return coordinates that bring the tool to poses, by damped least squares within the limits.
 
+        A row is done when it moves by no more than `STILL`.
+
         Args:
             position: Wanted positions [m], shape (B, 3).
             rotation: Wanted rotation matrices, shape (B, 3, 3).
             start: Where the iteration begins, shape (n,).
-            iterations: How many steps.
+            iterations: How many steps at most.
             length: By how much a rotation error counts [m/rad].
 
         Returns:
@@ -96,20 +104,21 @@ class SerialChain:
         low, high = self.span
         q = np.tile(np.clip(start, low, high), (len(position), 1))
         weight = np.array([1.0] * 3 + [length] * 3)[:, None]
+        moving = np.arange(len(q))
         for _ in range(iterations):
-            error = self._error(q, position, rotation, length)
-            jacobian = weight * self.jacobian(q)
+            at, turned, axes, anchors = self._sweep(q[moving])
+            error = _pose_error(at, turned, position[moving], rotation[moving], length)
+            jacobian = weight * self._slopes(at, axes, anchors)
             size = np.linalg.norm(error, axis=1)
             damping = (0.05 * np.minimum(1.0, size / 0.05) + 1.0e-4) ** 2
             normal = jacobian @ jacobian.transpose(0, 2, 1) + damping[:, None, None] * np.eye(6)
             step = np.einsum("bij,bi->bj", jacobian, np.linalg.solve(normal, error[..., None])[..., 0])
-            q = np.clip(q + np.clip(step, -0.4, 0.4), low, high)
-        return q, np.linalg.norm(self._error(q, position, rotation, length), axis=1)
-
-    def _error(self, q: Array, position: Array, rotation: Array, length: float) -> Array:
-        at, turned = self.forward(q)
-        turn = Rotation.from_matrix(rotation @ turned.transpose(0, 2, 1)).as_rotvec()
-        return np.concatenate([position - at, length * turn], axis=1)
+            before = q[moving]
+            q[moving] = np.clip(before + np.clip(step, -0.4, 0.4), low, high)
+            moving = moving[np.abs(q[moving] - before).max(axis=1) > STILL]
+            if not len(moving):
+                break
+        return q, np.linalg.norm(_pose_error(*self.forward(q), position, rotation, length), axis=1)
 
     @functools.cached_property
     def reach(self) -> float:
@@ -136,6 +145,12 @@ class SerialChain:
                     improved |= bool(better.any())
             step = step if improved else 0.5 * step
         return float(best.max())
+
+
+def _pose_error(at: Array, turned: Array, position: Array, rotation: Array, length: float) -> Array:
+    """Return what is missing from a pose to a wanted one, position and rotation vector times a length, (B, 6) [m]."""
+    turn = Rotation.from_matrix(rotation @ turned.transpose(0, 2, 1)).as_rotvec()
+    return np.concatenate([position - at, length * turn], axis=1)
 
 
 def serial_chain(robot: RobotDescription, frame: ToolPose = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)) -> SerialChain:

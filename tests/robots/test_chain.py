@@ -51,6 +51,21 @@ def test_jacobian_by_differences(tmp_path: Path) -> None:
         np.testing.assert_allclose(jacobian[3:, k], [spin[2, 1], spin[0, 2], spin[1, 0]], atol=10 * h**2)
 
 
+def test_inverse_of_each_pose_is_its_own(tmp_path: Path) -> None:
+    """Poses that the arm has are found; one out of reach keeps its error and leaves the others' bits as they are."""
+    chain = serial_chain(robots.load(write_arm5(tmp_path)))
+    q = np.array([0.3, 0.4, 1.1, 0.9, -0.5]) + 0.2 * np.random.default_rng(2).uniform(-1.0, 1.0, (6, 5))
+    position, rotation = chain.forward(q)
+    position[3] += [3.0, 0.0, 0.0]
+    found, error = chain.inverse(position, rotation, np.array([0.3, 0.4, 1.1, 0.9, -0.5]))
+    there = np.arange(6) != 3
+    assert error[there].max() < 1e-9 and error[3] > 2.0
+    np.testing.assert_allclose(chain.forward(found)[0][there], position[there], atol=1e-9)
+    for k in range(6):
+        alone, _ = chain.inverse(position[k, None], rotation[k, None], np.array([0.3, 0.4, 1.1, 0.9, -0.5]))
+        np.testing.assert_array_equal(alone[0], found[k])
+
+
 def test_reach_is_the_straight_arm_s(tmp_path: Path) -> None:
     """From the first joint, half the turn column up, to the tool of the straight arm: sums of lengths."""
     chain = serial_chain(robots.load(write_arm5(tmp_path)))
