@@ -54,15 +54,15 @@ def test_jacobian_by_differences(tmp_path: Path) -> None:
 def test_inverse_of_each_pose_is_its_own(tmp_path: Path) -> None:
     """Poses that the arm has are found; one out of reach keeps its error and leaves the others' bits as they are."""
     chain = serial_chain(robots.load(write_arm5(tmp_path)))
-    q = np.array([0.3, 0.4, 1.1, 0.9, -0.5]) + 0.2 * np.random.default_rng(2).uniform(-1.0, 1.0, (6, 5))
-    position, rotation = chain.forward(q)
+    start = np.array([0.3, 0.4, 1.1, 0.9, -0.5])
+    position, rotation = chain.forward(start + 0.2 * np.random.default_rng(2).uniform(-1.0, 1.0, (6, 5)))
     position[3] += [3.0, 0.0, 0.0]
-    found, error = chain.inverse(position, rotation, np.array([0.3, 0.4, 1.1, 0.9, -0.5]))
+    found, error = chain.inverse(position, rotation, start)
     there = np.arange(6) != 3
     assert error[there].max() < 1e-9 and error[3] > 2.0
     np.testing.assert_allclose(chain.forward(found)[0][there], position[there], atol=1e-9)
     for k in range(6):
-        alone, _ = chain.inverse(position[k, None], rotation[k, None], np.array([0.3, 0.4, 1.1, 0.9, -0.5]))
+        alone, _ = chain.inverse(position[k, None], rotation[k, None], start)
         np.testing.assert_array_equal(alone[0], found[k])
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import shlex
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -21,7 +20,7 @@ from softmode.cli.main import main
 from softmode.objects import ObjectConfig
 from softmode.objects.source import object_source
 from softmode.splats import make_plush, read_splats, write_splats
-from softmode.view.app import ViewOptions
+from softmode.view.app import ViewOptions, _free_port
 
 pytest.importorskip("viser", reason="the extra viz is not installed")
 from websockets.exceptions import WebSocketException
@@ -95,50 +94,65 @@ def test_only_splat_files_are_prepared(tmp_path: Path, capsys: pytest.CaptureFix
     assert "Give a splat file" in capsys.readouterr().err
 
 
+def press(client: PageClient, label: str, ends: float) -> None:
+    """Press a button of the page that a client is shown."""
+    while time.monotonic() < ends:
+        for message in client.receive(10.0)[0]:
+            if message["type"] == "GuiButtonMessage" and message["props"]["label"] == label:
+                client.send({"type": "GuiUpdateMessage", "uuid": message["uuid"], "updates": {"value": True}})
+                return
+    raise TimeoutError
+
+
+def told_until(client: PageClient, ends: float, last: str | None) -> list[str]:
+    """Return what the page says from now on, until its server ends or it says `last`."""
+    told: list[str] = []
+    with contextlib.suppress(WebSocketException):
+        while time.monotonic() < ends and not (last and any(last in text for text in told)):
+            with contextlib.suppress(TimeoutError):
+                told += [str(one.get("updates", "")) for one in client.receive(1.0)[0]]
+    return told
+
+
 def pressed(url: str, label: str, last: str | None = None) -> list[str]:
     """Press a button of the page that is, or soon will be, at an address; viser's own page connects again likewise.
 
     Returns what the page says from then on, until its server ends or it says `last`.
     """
-    said: list[str] = []
     ends = time.monotonic() + 120.0
     while time.monotonic() < ends:
         with contextlib.suppress(OSError, WebSocketException, TimeoutError), PageClient(url) as client:
-            while time.monotonic() < ends:
-                for message in client.receive(10.0)[0]:
-                    if message["type"] == "GuiButtonMessage" and message["props"]["label"] == label:
-                        client.send({"type": "GuiUpdateMessage", "uuid": message["uuid"], "updates": {"value": True}})
-                        with contextlib.suppress(WebSocketException):
-                            while time.monotonic() < ends and not (last and any(last in text for text in said)):
-                                with contextlib.suppress(TimeoutError):
-                                    said += [str(one.get("updates", "")) for one in client.receive(1.0)[0]]
-                        return said
+            press(client, label, ends)
+            return told_until(client, ends, last)
         time.sleep(0.2)
     raise TimeoutError(f"no button {label!r} at {url}")
 
 
-def test_a_running_page_is_prepared_by_its_button(capture: Path) -> None:
-    """A page that shows a capture has a button for the gizmos, at the same address; theirs brings the object back."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    words = ["view", str(capture), "--size", "0.08", "--up=+x", "--port", str(port), "--no-open"]
-    command = [sys.executable, "-m", "softmode", *words]
+@contextlib.contextmanager
+def viewed(*words: str, **pipes: int) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """Run `softmode view` at a free port, which is returned too."""
+    port = _free_port("127.0.0.1", 0)
     with subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
+        [sys.executable, "-m", "softmode", "view", *words, "--port", str(port), "--no-open"],
         text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a job in the background ignores it
+        **pipes,
     ) as running:
         try:
-            for label in ("prepare", "build", "prepare"):
-                told = pressed(f"http://127.0.0.1:{port}", label)
-                # Chromium would not come back to a server that is gone for as long as a build takes.
-                assert any("building" in text for text in told) == (label == "build")
-            running.send_signal(signal.SIGINT)
-            said, _ = running.communicate(timeout=60.0)
+            yield running, port
         finally:
             running.kill()  # a page that is still open would keep the test waiting for ever
+
+
+def test_a_running_page_is_prepared_by_its_button(capture: Path) -> None:
+    """A page that shows a capture has a button for the gizmos, at the same address; theirs brings the object back."""
+    with viewed(str(capture), "--size", "0.08", "--up=+x", stdout=subprocess.PIPE) as (running, port):
+        for label in ("prepare", "build", "prepare"):
+            told = pressed(f"http://127.0.0.1:{port}", label)
+            # Chromium would not come back to a server that is gone for as long as a build takes.
+            assert any("building" in text for text in told) == (label == "build")
+        running.send_signal(signal.SIGINT)
+        said, _ = running.communicate(timeout=60.0)
     assert running.returncode in (0, 130)  # interrupted on the last page, or before it was up
     assert said.count(f"open http://127.0.0.1:{port}") >= 3  # the object, the gizmos, the object
     assert f"to do this again: softmode view {shlex.quote(str(capture))} --up=+x --port {port} --no-open" in said
@@ -147,25 +161,12 @@ def test_a_running_page_is_prepared_by_its_button(capture: Path) -> None:
 
 def test_a_box_without_splats_is_refused_on_the_page(capture: Path) -> None:
     """What cannot be built is said on the page, which goes on, and on the console."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
     crop = ["--crop", *"10 10 10 11 11 11".split()]
-    words = ["view", str(capture), "--prepare", "--port", str(port), "--no-open", *crop]
-    with subprocess.Popen(
-        [sys.executable, "-m", "softmode", *words],
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    ) as running:
-        try:
-            for _ in range(2):
-                assert any(
-                    "lies inside crop" in text for text in pressed(f"http://127.0.0.1:{port}", "build", "no splat")
-                )
-            running.send_signal(signal.SIGINT)
-            said = running.communicate(timeout=60.0)[1]
-        finally:
-            running.kill()
+    with viewed(str(capture), "--prepare", *crop, stderr=subprocess.PIPE) as (running, port):
+        for _ in range(2):
+            told = pressed(f"http://127.0.0.1:{port}", "build", "no splat")
+            assert any("lies inside crop" in text for text in told)
+        running.send_signal(signal.SIGINT)
+        _, said = running.communicate(timeout=60.0)
     assert running.returncode == 0
     assert said.count("no splat") == 2

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import socket
 import subprocess
 import sys
 import time
@@ -19,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from softmode.objects import ObjectConfig
 from softmode.objects.source import object_source
 from softmode.splats import make_plush, write_splats
-from softmode.view.app import ViewOptions
+from softmode.view.app import ViewOptions, _free_port
 
 pytest.importorskip("viser", reason="the extra viz is not installed")
 
@@ -33,7 +32,7 @@ SIZE = (1100, 480)
 ARROW = 0.22
 """Length of the arrows of a corner over the object's diagonal."""
 PATIENCE = 600_000
-"""Longest wait for what ends by itself [ms]: on two busy cores, drawn in software, a body is built for two minutes."""
+"""Longest wait for a build [ms]: beside a page drawn in software, two busy cores took two minutes for one."""
 
 
 class Hand:
@@ -86,9 +85,7 @@ def test_gizmos_in_a_browser_prepare_what_is_shown(tmp_path: Path) -> None:
     file, bear = tmp_path / "toy bear.ply", make_plush(count=800)
     away = bear.means + np.float32([0.3, 0.0, 0.2])  # captures lie far from the file's origin
     write_splats(file, replace(bear, means=away), up="+x")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = _free_port("127.0.0.1", 0)
     words = ["view", str(file), "--size", "0.08", "--up=+x", "--port", str(port), "--no-open", "--frame-rate", "5"]
     command = [sys.executable, "-m", "softmode", *words]
     with (
@@ -102,10 +99,10 @@ def test_gizmos_in_a_browser_prepare_what_is_shown(tmp_path: Path) -> None:
             browser = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
             page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
             page.goto(f"http://127.0.0.1:{port}/?fixedDpr=1")
-            page.locator(".mantine-Notification-closeButton").first.click(timeout=PATIENCE)
-            page.get_by_role("button", name="prepare").click(timeout=PATIENCE)
+            page.locator(".mantine-Notification-closeButton").first.click(timeout=30_000)
+            page.get_by_role("button", name="prepare").click(timeout=30_000)
             repeat, hand = page.locator("textarea").first, Hand(page, twin)
-            repeat.wait_for(timeout=PATIENCE)
+            repeat.wait_for(timeout=60_000)
             time.sleep(5.0)  # the gizmos are drawn
             for axis, angle, up in ((0, -90.0, "-y"), (1, -90.0, "+x")):
                 before = repeat.input_value()
