@@ -1,7 +1,8 @@
 # softmode: set-up, tests and the demo. Needs python3 >= 3.11 and make; everything is installed into .venv.
 #   make demo            the arm lifts a soft object; writes out/lift.mp4
 #   make test-fast       a sharp minute: a few tests of every room
-#   make test            all tests but the slow ones (what CI runs, after make lint)
+#   make test            of every property the cheapest tests that show it
+#   make test-rest       what that leaves out, but for the slow ones (CI runs lint, test and test-rest)
 #   make dist            sdist and wheel in dist/; make smoke installs the wheel into an environment of its own and steps
 SHELL  := /bin/bash
 PYTHON ?= python3
@@ -9,8 +10,8 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 UV     := $(BIN)/uv
 ARGS   ?=
-# Processes that run tests, each a file of them at a time, with up to 4 GB; the longest files come first, as tests/conftest.py
-# sorts them, or a process would wait at the end for the other's long one.
+# Processes that run tests, each a file of them at a time, with up to 4 GB; the longest files come first, by the seconds
+# that tests/processor_seconds.py has recorded, or a process would wait at the end for the other's long one.
 WORKERS ?= 2
 FILES   := --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 
@@ -29,7 +30,7 @@ unexport PYTHONDONTWRITEBYTECODE
 unexport VIRTUAL_ENV
 
 .DEFAULT_GOAL := help
-.PHONY: help lock resolve demo test test-fast test-slow lint docs dist smoke bench accuracy baselines clean coupling
+.PHONY: help lock resolve demo test test-fast test-rest test-slow lint docs dist smoke bench accuracy baselines clean coupling
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -73,8 +74,11 @@ demo: $(VENV)/.demo  ## play the scripted lift and write out/lift.mp4
 test-fast: $(VENV)/.dev  ## run a few quick tests of every room
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal -m fast $(ARGS)
 
-test: $(VENV)/.dev  ## run all tests but the slow ones
+test: $(VENV)/.dev  ## run of every property the cheapest tests that show it
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(FILES) $(ARGS)
+
+test-rest: $(VENV)/.dev  ## run what `make test` leaves out: deeper repetitions, sphinx, the browser; not the slow ones
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(FILES) -m '(rest or sphinx or browser) and not slow' $(ARGS)
 
 test-slow: $(VENV)/.dev  ## run all tests, slow ones included
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(FILES) -m 'slow or not slow' $(ARGS)

@@ -21,9 +21,10 @@ from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.envs.tasks.lift_soft.scripted import ScriptedLift
 from softmode.envs.tasks.lift_soft.task import LiftSoftEnv
 from tests import reference
+from tests.bodies import cube
 from tests.deformables.test_coupling import grasp, impact, totals
 from tests.deformables.test_friction import MU, incline
-from tests.scenes import GRAVITY, Scene, cube
+from tests.scenes import GRAVITY, Scene
 
 FRICTION = {"remembers": SolverReducedOptions(), "smoothed": SolverReducedOptions(stick_ratio=0.0)}
 

@@ -19,7 +19,8 @@ from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body, register_custom_attributes
 from tests import reference
-from tests.scenes import cube, rotation
+from tests.bodies import cube
+from tests.scenes import rotation
 
 SchemeName = Literal["joint", "proxy x1", "proxy x3", "VBD x1", "VBD x3"]
 SCHEMES: tuple[SchemeName, ...] = ("joint", "proxy x1", "proxy x3", "VBD x1", "VBD x3")

@@ -15,7 +15,8 @@ from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import BuildOptions
 from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_sphere
-from tests.deformables.test_dents import RADIUS, RATIO, Press, ball, hertz
+from tests.bodies import smooth_ball as ball
+from tests.deformables.test_dents import RADIUS, RATIO, Press, hertz
 
 DEPTHS = (0.01, 0.02, 0.04, 0.08, 0.11)
 """Over the radius."""

@@ -20,7 +20,8 @@ from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_pins, add_reduced_body
 from softmode.deformables.model.status import status_reasons
 from softmode.deformables.solver.options import Integrator, SolverReducedOptions
-from tests.scenes import GRAVITY, Scene, bar, cube, rotation
+from tests.bodies import bar, cube
+from tests.scenes import GRAVITY, Scene, rotation
 
 TUMBLING = (9.0, 5.0, 3.0)
 """Angular velocity of the drops [rad/s]."""

@@ -28,7 +28,8 @@ from softmode.deformables.model import status as bits
 from softmode.deformables.model.authoring import add_pins, add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from tests import reference
-from tests.scenes import GRAVITY, Scene, bar
+from tests.bodies import bar
+from tests.scenes import GRAVITY, Scene
 
 MODULI = (1.0e3, 1.0e5, 1.0e7, 1.0e9)
 """Young's moduli [Pa], one world each."""

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.build_sources import sources_hash
 from tests.compile_once import compile_once
 
 gc.disable()  # until all tests are collected: it takes a quarter of the time, and imports leave next to no garbage
@@ -18,10 +19,12 @@ gc.disable()  # until all tests are collected: it takes a quarter of the time, a
 _TESTS = Path(__file__).resolve().parent
 _CACHE = _TESTS.parent / ".cache"
 os.environ.setdefault("WARP_CACHE_PATH", str(_CACHE / "warp"))
-os.environ.setdefault("SOFTMODE_CACHE", str(_CACHE / "softmode"))
+_BODIES = Path(os.environ.get("SOFTMODE_CACHE", _CACHE / "softmode"))
+if _BODIES.name != (_NAME := f"tests-{sources_hash()}"):  # as a process of this run has set it
+    os.environ["SOFTMODE_CACHE"] = str(_BODIES / _NAME)  # a body does not outlive the sources that built it
 
 # softmode's plug-in registers itself where softmode is installed, and not where a checkout is on the path alone.
-pytest_plugins = ["pytester"]
+pytest_plugins = ["pytester", "tests.processor_seconds"]
 if not entry_points(group="pytest11", name="softmode"):
     pytest_plugins.append("softmode.testing.plugin")
 
@@ -82,23 +85,6 @@ _FAST = {
 }
 """Tests of `make test-fast`: quick ones of every room, by file; all of a file where none is named."""
 
-_LONGEST = (
-    *("test_examples.py", "documentation/test_site.py", "oracle/test_modes.py", "deformables/test_quadrature.py"),
-    *("deformables/test_cut.py", "deformables/test_elastic_functions.py", "deformables/test_cubature.py"),
-    *("testing/test_plugin.py", "test_cli_objects.py", "documentation/test_snippets.py", "envs/test_lift_soft.py"),
-    *("envs/test_env_state.py", "view/test_app.py", "view/test_prepare_browser.py", "envs/test_scripted.py"),
-    *("usd/test_import_scene.py", "envs/test_vector_contract.py", "mpm/test_planner.py", "view/test_session.py"),
-    *("usd/test_import_newton.py", "envs/test_object_sets.py", "test_cli_body.py", "envs/test_object_resets.py"),
-    *("robots/test_grasp_planner.py", "test_cli.py", "deformables/test_body_report.py", "test_cli_new.py"),
-    *("usd/test_damage.py", "deformables/test_grasps.py", "mpm/test_follow.py", "viz/test_morph_film.py"),
-    *("deformables/test_pairs.py", "test_packaging.py", "viz/test_rerun_logger.py", "test_quiet.py"),
-    *("envs/test_robot_tasks.py", "envs/test_soft_vector_env.py", "envs/test_several_objects.py"),
-    *("view/test_prepare.py", "view/test_browser.py"),
-)
-"""Files that take more than 20 s, in the order in which they start, before all others: a long one that started last
-would leave the other processes waiting. The first compiles what an environment needs, the next six next to nothing, so
-that two processes do not compile the same kernels at the same time."""
-
 
 def _is_fast(item: pytest.Item) -> bool:
     """Return whether `make test-fast` runs a test; slow parameters of one are left out.
@@ -113,7 +99,7 @@ def _is_fast(item: pytest.Item) -> bool:
         if not hasattr(item.module, f"test_{name}"):
             raise pytest.UsageError(f"tests/conftest.py names test_{name}, which {item.path.name} does not have")
     wanted = not names or item.function.__name__.removeprefix("test_") in names.split()
-    return wanted and not item.get_closest_marker("slow")
+    return wanted and not any(item.get_closest_marker(mark) for mark in ("slow", "rest", "sphinx", "browser"))
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
@@ -136,12 +122,10 @@ def playbot() -> Path:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Sort the files, mark the tests of `make test-fast`, skip tests marked `gpu` where no CUDA device is found."""
-    gone = [file for file in (*_FAST, *_LONGEST) if not (_TESTS / file).is_file()]
+    """Mark the tests of `make test-fast`, skip tests marked `gpu` where no CUDA device is found."""
+    gone = [file for file in _FAST if not (_TESTS / file).is_file()]
     if gone:
         raise pytest.UsageError(f"tests/conftest.py names files that are not there: {', '.join(gone)}")
-    rank = {_TESTS / file: k for k, file in enumerate(_LONGEST)}
-    items.sort(key=lambda item: rank.get(item.path, len(rank)))
     for item in items:
         if _is_fast(item):
             item.add_marker("fast")

@@ -14,7 +14,7 @@ from softmode.deformables.solver.attachments import attach
 from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.deformables.tools.grips import Grips, add_grip_slots
 from softmode.deformables.tools.sensing import ContactSensor, SurfacePressure
-from tests.scenes import cube
+from tests.bodies import cube
 
 pytestmark = pytest.mark.gpu
 

@@ -8,9 +8,7 @@ import functools
 import numpy as np
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
+from tests.bodies import two_modes
 
 
 @functools.cache
@@ -19,8 +17,7 @@ def affine_cube(edge: float = 1.0) -> ReducedBody:
 
     The kinetic energy of x = F X is rho V edge^2 / 24 |dF/dt|^2 up to the error of the quadrature.
     """
-    quadrature = quadrature_from_box((edge,) * 3, point_count=1000, surface_count=96)
-    body = build_body(quadrature, BuildOptions(mode_count=2, kernel_count=64, cubature_count=8), name=f"affine {edge}")
+    body = two_modes(edge)
     names = ("mean_basis", "linear_coordinates")
     changes = {name: np.ascontiguousarray(getattr(body, name)[:4]) for name in names}
     names = ("grad_basis", "surface_basis", "transform")

@@ -7,10 +7,6 @@ import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.body.regions import Region
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.gradients.adjoint import AdjointOptions, AdjointReduced
 from softmode.deformables.gradients.adjoint_torch import rollout
 from softmode.deformables.materials.material import Material
@@ -20,7 +16,8 @@ from softmode.deformables.model.rigid_dofs import RigidDofs
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.deformables.tools.markers import Markers
 from softmode.errors import ConfigError, SolverDiverged
-from tests.scenes import GRAVITY, Scene, cube
+from tests.bodies import cube, held_cube
+from tests.scenes import GRAVITY, Scene
 
 EXACT = SolverReducedOptions(tolerance=1.0e-13, force_tolerance=1.0e-12, iteration_max=100, stick_ratio=0.0)
 """Solved to rounding: central differences divide what is left by their step."""
@@ -32,15 +29,6 @@ ACCURACY = 1.0e-7
 FLOAT32 = float(np.finfo(np.float32).eps)
 MATERIAL = Material(youngs_modulus=3.0e4, poissons_ratio=0.4, density=500.0, viscosity=0.004, mass_damping=0.5)
 PARAMETERS = ("youngs_modulus", "poissons_ratio", "density", "viscosity", "mass_damping")
-
-
-@functools.cache
-def held_cube():
-    """Return a small cube whose top is held exactly, by driven functions."""
-    quadrature = quadrature_from_box((0.1,) * 3, point_count=1000, surface_count=100)
-    top = Region(name="top", box=[[-np.inf, -np.inf, 0.035], [np.inf] * 3])
-    options = BuildOptions(mode_count=4, kernel_count=150, cubature_count=128)
-    return build_body(quadrature, options, regions=(top,), progress=False)
 
 
 class Rollout:

@@ -12,7 +12,8 @@ from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.attachments import attach
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.errors import ConfigError
-from tests.scenes import GRAVITY, Scene, add_free_box, cube, rotation
+from tests.bodies import cube
+from tests.scenes import GRAVITY, Scene, add_free_box, rotation
 
 DOWN = (0.0, 0.0, -GRAVITY)
 EDGE = 0.1

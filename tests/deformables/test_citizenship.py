@@ -19,7 +19,8 @@ from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_pins, add_reduced_body, register_custom_attributes
 from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.errors import ConfigError
-from tests.scenes import GRAVITY, add_free_box, cube
+from tests.bodies import cube
+from tests.scenes import GRAVITY, add_free_box
 
 DT = 0.004
 EDGE = 0.1

@@ -15,9 +15,10 @@ from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.model.struct_kernels import OVERLAP
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from tests import reference
+from tests.bodies import cube
 from tests.deformables.probe_kernels import evaluate_potentials
 from tests.deformables.test_coupling import impact, totals
-from tests.scenes import GRAVITY, Scene, cube, rotation
+from tests.scenes import GRAVITY, Scene, rotation
 
 FLOAT32 = float(np.finfo(np.float32).eps)
 EDGE = 0.1

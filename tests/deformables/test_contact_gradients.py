@@ -13,7 +13,8 @@ from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.errors import ConfigError, SolverDiverged
-from tests.scenes import GRAVITY, Scene, cube
+from tests.bodies import cube
+from tests.scenes import GRAVITY, Scene
 
 EXACT = SolverReducedOptions(tolerance=1.0e-12, force_tolerance=1.0e-12, iteration_max=100, friction_lag=100)
 """Solved to rounding, the normal force of friction too: central differences divide what is left by their step."""

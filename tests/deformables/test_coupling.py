@@ -17,7 +17,8 @@ from softmode.deformables.solver.minimise import check_convergence
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.errors import ConfigError
 from tests import reference
-from tests.scenes import GRAVITY, GRIPPER, RIGID_GAP, Scene, add_free_box, add_gripper, cube
+from tests.bodies import cube
+from tests.scenes import GRAVITY, GRIPPER, RIGID_GAP, Scene, add_free_box, add_gripper
 
 FLOAT32 = float(np.finfo(np.float32).eps)
 EDGE = 0.1

@@ -22,8 +22,9 @@ from softmode.deformables.solver import (
 )
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient, solve
 from softmode.deformables.solver.iteration_kernels import ALL
+from tests.bodies import cube
 from tests.deformables.test_fused_system import loaded
-from tests.scenes import Scene, cube, random_rotation
+from tests.scenes import Scene, random_rotation
 
 DOUBLE, SINGLE = 1.0e-12, 4.0e-7
 """Relative rounding of sums in double precision in another order, and of results that are kept in single precision."""

@@ -1,7 +1,5 @@
 """Dents: what a contact gives beyond the functions of the body, against Hertz, punches and conservation of energy."""
 
-import functools
-
 import newton
 import numpy as np
 import pytest
@@ -9,14 +7,14 @@ import pytest
 from softmode.deformables.body.reduced_body import ReducedBody
 from softmode.deformables.build.build_body import build_body
 from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_sphere
+from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.contact.dents import DENT_FACTOR, WALL_SHARE, dent_lengths, dent_weights, resolved_size
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from tests import reference
-from tests.deformables.test_driven import held_bar
-from tests.scenes import GRAVITY, Scene, cube
+from tests.bodies import cube, held_bar, smooth_ball
+from tests.scenes import GRAVITY, Scene
 
 RADIUS, RATIO = 0.05, 0.3
 SHAPE = 0.02
@@ -25,14 +23,6 @@ MANY = SolverReducedOptions(contact_max=2048)
 FINITE = ((0.0, 0.01, 0.02, 0.04, 0.08, 0.11), (1.0, 1.02, 1.10, 1.12, 1.18, 1.23))
 """Force of a sphere between plates over Hertz's by depth over radius: 2,600 kernels, linear elasticity; the far field
 of each contact moves the centre."""
-
-
-@functools.cache
-def ball(mode_count: int = 8, surface_count: int = 1500) -> ReducedBody:
-    """Return a sphere of few functions and many samples."""
-    quadrature = quadrature_from_sphere(RADIUS, point_count=3000, surface_count=surface_count)
-    options = BuildOptions(mode_count=mode_count, kernel_count=250, cubature_count=300)
-    return build_body(quadrature, options, name="ball")
 
 
 def hertz(depth: float, youngs_modulus: float, poissons_ratio: float = RATIO) -> float:
@@ -122,7 +112,7 @@ def test_hertz(youngs_modulus: float) -> None:
 
     32 functions alone press 1.6 to 3.6 times as hard there.
     """
-    press = Press(ball(), RADIUS, youngs_modulus=youngs_modulus)
+    press = Press(smooth_ball(), RADIUS, youngs_modulus=youngs_modulus)
     for share in (0.02, 0.04, 0.08, 0.11):
         depth = share * RADIUS
         assert press.force(depth) == pytest.approx(hertz(depth, youngs_modulus), rel=0.15), share
@@ -133,11 +123,11 @@ def test_follows_parameters() -> None:
 
     Damped so that it does not turn before it rests: between its samples the force differs by 0.2 %.
     """
-    press, depth = Press(ball(), RADIUS, damping=200.0), 0.04 * RADIUS
+    press, depth = Press(smooth_ball(), RADIUS, damping=200.0), 0.04 * RADIUS
     force = press.force(depth)
     press.scene.set_parameter("youngs_modulus", 3.0e6)
     assert press.force(depth) == pytest.approx(3.0 * force, rel=1.0e-3)
-    half = Press(ball(), RADIUS, scale=0.5, damping=200.0)
+    half = Press(smooth_ball(), RADIUS, scale=0.5, damping=200.0)
     assert half.force(0.5 * depth) == pytest.approx(0.25 * force, rel=1.0e-3)
 
 
@@ -147,8 +137,8 @@ def test_two_spheres() -> None:
     To what their samples differ, which do not mirror each other.
     """
     depth = 0.03 * RADIUS
-    single = Press(ball(8, 400), RADIUS).force(depth)
-    assert Press(ball(8, 400), RADIUS, count=2).force(depth, steps=8) == pytest.approx(single, rel=0.15)
+    single = Press(smooth_ball(8, 400), RADIUS).force(depth)
+    assert Press(smooth_ball(8, 400), RADIUS, count=2).force(depth, steps=8) == pytest.approx(single, rel=0.15)
 
 
 def test_patch() -> None:
@@ -169,7 +159,7 @@ def test_patch() -> None:
 
 def test_given_stiffness_has_no_dent() -> None:
     """A contact stiffness that is given is the whole law: no dent, and the functions alone press twice too hard."""
-    press, depth = Press(ball(), RADIUS, stiffness=3.0e9), 0.04 * RADIUS
+    press, depth = Press(smooth_ball(), RADIUS, stiffness=3.0e9), 0.04 * RADIUS
     assert press.force(depth) > 1.5 * hertz(depth, 1.0e6)
     assert not press.scene.reduced.view.constraints.dent_compliance.numpy().any()
 
@@ -215,7 +205,7 @@ def test_weights() -> None:
 
     Points of the other side of a thin sheet do not count.
     """
-    body = ball(8, 400)
+    body = smooth_ball(8, 400)
     found = dent_weights(body, body.surface_points)
     np.testing.assert_array_equal(found.samples[:, 0], np.arange(body.surface_count))
     np.testing.assert_allclose(
@@ -247,7 +237,7 @@ def test_skin_stays_out() -> None:
 
     What is left is the onset of the penalty. In two worlds both have the bits of one alone.
     """
-    body, material = ball(8, 400), Material(youngs_modulus=2.0e4, density=300.0, mass_damping=20.0)
+    body, material = smooth_ball(8, 400), Material(youngs_modulus=2.0e4, density=300.0, mass_damping=20.0)
 
     def populate(world: newton.ModelBuilder) -> None:
         add_reduced_body(world, body, material=material, position=(0.0, 0.0, RADIUS))
@@ -271,7 +261,7 @@ def test_skin_stays_out() -> None:
 
 def test_soft_bodies_share_their_dents() -> None:
     """Two spheres in a row of which one is four times as stiff: the dents between them go as their compliances."""
-    press = Press(ball(8, 400), RADIUS, count=2)
+    press = Press(smooth_ball(8, 400), RADIUS, count=2)
     press.scene.set_parameter("youngs_modulus", (1.0e6, 4.0e6))
     press.force(0.02 * RADIUS)
     dent = press.scene.state.softmode.dent.numpy().reshape(2, -1, 3)

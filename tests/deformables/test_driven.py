@@ -1,16 +1,10 @@
 """Regions of a body that are held or moved: exactly, as driven coordinates, or softly, by pins."""
 
-import functools
-
 import newton
 import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.body.regions import Region
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.contact.dents import dent_lengths
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body, drive_regions
@@ -18,6 +12,7 @@ from softmode.deformables.model.lane_kernels import from_blocks
 from softmode.deformables.solver.attachments import attach
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.errors import ConfigError
+from tests.bodies import held_bar
 from tests.scenes import GRAVITY, Scene, rotation
 
 LENGTH, EDGE = 0.4, 0.1
@@ -25,18 +20,6 @@ DOWN = (0.0, 0.0, -GRAVITY)
 MATERIAL = Material(youngs_modulus=2.0e5, mass_damping=20.0)
 FINE = SolverReducedOptions(tolerance=1.0e-8)
 FLOAT32 = float(np.finfo(np.float32).eps)
-
-
-@functools.cache
-def held_bar(stiffness=None, ends=1):
-    """Return a bar whose first (and last) 5 cm are a region."""
-    half, width = 0.5 * LENGTH, 0.05
-    low, high = np.array([-np.inf] * 3), np.array([np.inf] * 3)
-    left = Region(name="left", box=np.array([low, [-half + width, np.inf, np.inf]]), stiffness=stiffness)
-    right = Region(name="right", box=np.array([[half - width, -np.inf, -np.inf], high]), stiffness=stiffness)
-    quadrature = quadrature_from_box((LENGTH, EDGE, EDGE), point_count=2000, surface_count=150)
-    options = BuildOptions(mode_count=2, kernel_count=200, cubature_count=200)
-    return build_body(quadrature, options, regions=(left, right)[:ends], name="held bar")
 
 
 def scene_of(body, **options):

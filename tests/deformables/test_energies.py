@@ -14,7 +14,8 @@ from softmode.deformables.solver.energies import SoftEnergies
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.errors import ConfigError
 from tests import reference
-from tests.scenes import GRAVITY, Scene, cube, rotation
+from tests.bodies import cube
+from tests.scenes import GRAVITY, Scene, rotation
 
 EDGE = 0.1
 DOWN = (0.0, 0.0, -GRAVITY)

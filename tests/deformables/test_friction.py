@@ -9,9 +9,10 @@ from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from tests import reference
+from tests.bodies import cube
 from tests.deformables.probe_kernels import evaluate_stick
 from tests.deformables.test_coupling import grasp
-from tests.scenes import GRAVITY, Scene, add_free_box, cube, rotation
+from tests.scenes import GRAVITY, Scene, add_free_box, rotation
 
 EDGE = 0.1
 DOWN = (0.0, 0.0, -GRAVITY)

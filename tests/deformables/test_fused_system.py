@@ -17,7 +17,8 @@ from softmode.deformables.solver.fused_system_kernels import (
 )
 from softmode.deformables.solver.iteration_kernels import NewtonArrays
 from softmode.deformables.solver.step_tables import ONE_LAUNCH_BLOCKS, fits_in_shared_memory, newton_notes
-from tests.scenes import GRAVITY, Scene, cube
+from tests.bodies import cube
+from tests.scenes import GRAVITY, Scene
 
 EDGE = 0.1
 H100 = 227 * 1024

@@ -15,7 +15,8 @@ from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.model.compile_ahead import compile_launches
 from softmode.deformables.solver.fused_newton_kernels import newton_kernel
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
-from tests.scenes import GRAVITY, GRIPPER, Scene, add_gripper, cube
+from tests.bodies import cube
+from tests.scenes import GRAVITY, GRIPPER, Scene, add_gripper
 
 EDGE = 0.06
 RAMP = 10

@@ -11,7 +11,8 @@ from softmode.deformables.solver.parameters import set_parameters
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.deformables.tools.grips import Grips, add_grip_slots
 from softmode.errors import ConfigError
-from tests.scenes import GRAVITY, Scene, add_free_box, cube, rotation
+from tests.bodies import cube
+from tests.scenes import GRAVITY, Scene, add_free_box, rotation
 
 DOWN = (0.0, 0.0, -GRAVITY)
 EDGE = 0.1

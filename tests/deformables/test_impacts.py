@@ -11,7 +11,8 @@ from softmode.deformables.solver import rigid_start_kernels, search_kernels
 from softmode.deformables.solver import step_kernels as kernels
 from softmode.deformables.solver.evaluate import evaluate
 from tests import reference
-from tests.scenes import GRAVITY, Scene, cube, rotation
+from tests.bodies import cube
+from tests.scenes import GRAVITY, Scene, rotation
 
 
 def falling(modulus=1.0e7, *, friction=0.5, world_count=1):

@@ -8,7 +8,8 @@ from softmode.deformables.model.authoring import add_pins, add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.errors import ConfigError
 from tests import reference
-from tests.scenes import Scene, cube
+from tests.bodies import cube
+from tests.scenes import Scene
 
 STIFF = Material(youngs_modulus=1.0e7, viscosity=0.0)
 

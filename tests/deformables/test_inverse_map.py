@@ -2,34 +2,23 @@
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 import pytest
 import warp as wp
 
 from softmode.deformables import (
-    BuildOptions,
     InverseMap,
-    ReducedBody,
     SolverReduced,
     add_reduced_body,
-    build_body,
-    quadrature_from_box,
 )
 from softmode.deformables.contact.dents import dent_weights
 from softmode.deformables.tools.inverse_map import FOLDED, FOUND, OUTSIDE
 from softmode.errors import ConfigError
-from tests.scenes import Scene, cube
+from tests.bodies import cube, long_bar
+from tests.scenes import Scene
 
 SIZE = (1.0, 0.2, 0.2)
 LENGTH = float(np.linalg.norm(SIZE))
-
-
-@functools.cache
-def bar() -> ReducedBody:
-    """Return a bar along X, 1 m long."""
-    return build_body(quadrature_from_box(SIZE), BuildOptions(function_count=48, cubature_count=None))
 
 
 def bent(x, angle):
@@ -46,18 +35,18 @@ def twisted(x, angle):
 
 def coordinates(moved, *parameters):
     """Return the coordinates of the bar that are nearest to a deformation."""
-    return bar().project(lambda x: moved(x, *parameters) - x)
+    return long_bar().project(lambda x: moved(x, *parameters) - x)
 
 
 def places(q, count=2000, *, share=1.0):
     """Return random rest points of the bar, or of its middle, and where coordinates take them."""
     rest = share * np.random.default_rng(0).uniform(-0.5, 0.5, (count, 3)) * SIZE
-    return rest, rest + bar().evaluate(rest)[0] @ q
+    return rest, rest + long_bar().evaluate(rest)[0] @ q
 
 
 def map_of(q, **options) -> InverseMap:
     """Return the inverse map of the bar at coordinates."""
-    made = InverseMap(None, bar(), device="cpu", **options)
+    made = InverseMap(None, long_bar(), device="cpu", **options)
     made.move(wp.array(q, dtype=wp.vec3d, device="cpu"))
     return made
 
@@ -84,7 +73,7 @@ def test_places_have_dents():
 
     With the true step to 0.05 mm. A map that knows nothing of the dent is off by 0.5 mm, both ways.
     """
-    q, body = coordinates(*DEFORMED["bent"]), bar()
+    q, body = coordinates(*DEFORMED["bent"]), long_bar()
     samples = body.surface_points
     near = np.exp(-((samples - [0.1, 0.0, 0.1]) ** 2).sum(axis=1) / 0.15**2) * (samples[:, 2] > 0.09)
     dent = (4e-3 * near[:, None] * [0.3, 0.0, -1.0]).astype(np.float32)
@@ -117,7 +106,7 @@ def test_matrix_of_the_papers_warp():
     """
     q, step = coordinates(*DEFORMED["bent"]), 1e-4
     rest, moved = places(q, 20, share=0.8)
-    gradient = lambda x: np.einsum("nkj,ki->nij", bar().evaluate(x)[1], q)  # noqa: E731
+    gradient = lambda x: np.einsum("nkj,ki->nij", long_bar().evaluate(x)[1], q)  # noqa: E731
     F = np.eye(3) + gradient(rest)
     shifts = step * np.eye(3)
     bend = np.stack([(gradient(rest + s) - gradient(rest - s)) / (2.0 * step) for s in shifts], axis=-1)
@@ -125,7 +114,7 @@ def test_matrix_of_the_papers_warp():
     for reach in (0.01, 0.005):  # halved from 0.02 on the error falls by 5.6, 6.7 and 7.3
         away = reach * np.random.default_rng(1).uniform(-1.0, 1.0, rest.shape)
         there = rest + away
-        apart = there + bar().evaluate(there)[0] @ q - moved
+        apart = there + long_bar().evaluate(there)[0] @ q - moved
         found = [offset_by_warp(*row) for row in zip(F, bend, apart, strict=True)]
         errors.append(np.linalg.norm(np.array(found) - away, axis=1).max())
     assert errors[0] < 1e-3 * LENGTH and errors[1] < errors[0] / 6.0
@@ -138,7 +127,7 @@ def test_matrix_of_the_papers_warp():
 def test_affine_motion_is_exact():
     """Under x = A X + t the lattice interpolates exactly: float32 rounding of places a metre away."""
     matrix = np.array([[1.2, 0.3, 0.0], [-0.2, 0.9, 0.1], [0.1, 0.0, 1.1]])
-    q = bar().affine(matrix, (0.5, -1.0, 0.7))
+    q = long_bar().affine(matrix, (0.5, -1.0, 0.7))
     rest, moved = places(q)
     found, flags = map_of(q).rest_points(moved)
     assert (flags == FOUND).all()
@@ -153,9 +142,9 @@ def test_nodes_of_the_grid():
     index = np.stack(np.meshgrid(*map(np.arange, size), indexing="ij"), axis=-1).reshape(-1, 3)
     place = grid.low.numpy()[0] + grid.edge.numpy()[0] * index
     flag, rest = grid.flag.numpy()[0, : len(index)], grid.rest.numpy()[0, : len(index)].astype(float)
-    known = (flag == FOUND) & bar().covers(rest)
+    known = (flag == FOUND) & long_bar().covers(rest)
     assert known.sum() > 1000
-    back = rest[known] + bar().evaluate(rest[known])[0] @ q
+    back = rest[known] + long_bar().evaluate(rest[known])[0] @ q
     assert np.linalg.norm(back - place[known], axis=1).max() < 3e-3 * LENGTH
     # the rotation of F: that of the arc
     middle = known & (np.abs(rest) < (0.4, 0.1, 0.1)).all(axis=1)
@@ -181,14 +170,14 @@ def test_folds_are_flagged():
     ends, middle = np.abs(rest[:, 0]) > 0.47, np.abs(rest[:, 0]) < 0.3
     assert (flags[ends] == FOLDED).mean() > 0.8
     assert (flags[middle] == FOUND).mean() > 0.95
-    mirror = bar().affine(np.diag([1.0, 1.0, -1.0]))
+    mirror = long_bar().affine(np.diag([1.0, 1.0, -1.0]))
     assert (map_of(mirror).rest_points(places(mirror)[1])[1] == FOLDED).all()
 
 
 def test_worlds_and_graphs():
     """World i of three is the single world, and a captured frame is the eager one, to the bit."""
-    states = [coordinates(bent, 0.7), coordinates(twisted, 1.0), bar().affine(np.eye(3), (0.0, 2.0, 0.0))]
-    together = InverseMap(None, bar(), world_count=3, device="cpu")
+    states = [coordinates(bent, 0.7), coordinates(twisted, 1.0), long_bar().affine(np.eye(3), (0.0, 2.0, 0.0))]
+    together = InverseMap(None, long_bar(), world_count=3, device="cpu")
     q = wp.array(np.concatenate(states), dtype=wp.vec3d, device="cpu")
     together.move(q)
     for i, state in enumerate(states):
@@ -236,7 +225,7 @@ def box_distance(x):
 
 def test_signed_distance_and_picking():
     """Across a stretched, shifted bar: z distances doubled with the stretch; rays stop at its top and at its bend."""
-    q = bar().affine(np.diag([1.0, 1.0, 2.0]), (0.0, 0.0, 1.0))
+    q = long_bar().affine(np.diag([1.0, 1.0, 2.0]), (0.0, 0.0, 1.0))
     inverse = map_of(q)
     height = np.array([1.05, 1.15, 1.21])
     x = np.stack([np.full(3, 0.1), np.zeros(3), height], axis=1)
@@ -255,19 +244,19 @@ def test_signed_distance_and_picking():
 
 def test_states_that_are_no_numbers():
     """A body that is nowhere has no rest points."""
-    q = np.full((bar().function_count, 3), np.nan)
+    q = np.full((long_bar().function_count, 3), np.nan)
     assert (map_of(q).rest_points(np.zeros((3, 3)))[1] == OUTSIDE).all()
 
 
 def test_bad_input():
     """What cannot be is refused by name."""
     with pytest.raises(ConfigError, match="nodes"):
-        InverseMap(None, bar(), nodes=2)
+        InverseMap(None, long_bar(), nodes=2)
     with pytest.raises(ConfigError, match="within"):
-        InverseMap(None, bar(), within=lambda x: np.zeros(len(x), dtype=bool), device="cpu")
+        InverseMap(None, long_bar(), within=lambda x: np.zeros(len(x), dtype=bool), device="cpu")
     with pytest.raises(ConfigError, match="solver"):
         InverseMap(None, 0)
-    inverse = map_of(bar().affine(np.eye(3)))
+    inverse = map_of(long_bar().affine(np.eye(3)))
     with pytest.raises(ConfigError, match="points"):
         inverse.rest_points([[0.0, np.inf, 0.0]])
     one, two = (wp.zeros((1, n), dtype=wp.vec3, device="cpu") for n in (1, 2))
@@ -280,6 +269,6 @@ def test_cuda_agrees():
     """CUDA gives the rest points of the CPU to float32 rounding."""
     q = coordinates(bent, np.pi / 2)
     moved = places(q)[1]
-    made = InverseMap(None, bar(), device="cuda:0")
+    made = InverseMap(None, long_bar(), device="cuda:0")
     made.move(wp.array(q, dtype=wp.vec3d, device="cuda:0"))
     np.testing.assert_allclose(made.rest_points(moved)[0], map_of(q).rest_points(moved)[0], atol=1e-5)

@@ -4,22 +4,18 @@ On a CPU the same code runs with one thread; the marker ``gpu`` runs it on CUDA.
 """
 
 import dataclasses
-import functools
 
 import newton
 import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.model.authoring import add_pins, add_reduced_body
 from softmode.deformables.model.compile_ahead import compile_launches
 from softmode.deformables.solver.evaluate import assemble, evaluate, gather_gradient, solve
 from softmode.deformables.solver.step_tables import newton_notes
 from softmode.deformables.solver.tile_kernels import TILE, assemble_tiles, chunk_count, tile_count
+from tests.bodies import many_functions
 from tests.scenes import GRAVITY, Scene
 
 CUDA = pytest.param("cuda:0", marks=[pytest.mark.gpu, pytest.mark.skipif(not wp.is_cuda_available(), reason="no GPU")])
@@ -28,17 +24,9 @@ pytestmark = pytest.mark.filterwarnings("ignore:pins hold")
 SIZE = (0.3, 0.1, 0.1)
 
 
-@functools.cache
-def block(function_count: int) -> ReducedBody:
-    """Return a bar of so many functions of FreeForm's, about."""
-    quadrature = quadrature_from_box(SIZE, point_count=1500, surface_count=120)
-    options = BuildOptions(mode_count=-(-function_count // 4), kernel_count=300, cubature_count=160)
-    return build_body(quadrature, options, name=f"bar of {function_count}")
-
-
 def scene_of(*counts: int, device: str = "cpu", worlds: int = 1) -> Scene:
     """Return bars above each other, pinned at one end, that bend under their weight."""
-    bodies = [block(count) for count in counts]
+    bodies = [many_functions(count) for count in counts]
 
     def populate(world: newton.ModelBuilder) -> None:
         for level, body in enumerate(bodies):

@@ -1,35 +1,21 @@
 """Several bodies per world and worlds that differ: each moves as it would alone, with parameters of its own."""
 
-import functools
-
 import newton
 import numpy as np
 import pytest
 import warp as wp
 
-from softmode.deformables.body.regions import Region
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model.authoring import add_pins, add_reduced_body, drive_regions, register_custom_attributes
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
-from tests.scenes import GRAVITY, Scene, bar, cube, rotation
+from tests.bodies import bar, clamped, cube
+from tests.scenes import GRAVITY, Scene, rotation
 
 DOWN = (0.0, 0.0, -GRAVITY)
 FACE = np.array([[-0.2, y, z] for y in (-0.05, 0.05) for z in (-0.05, 0.05)])
 """Corners of one end of the bar [m]."""
 BDF2 = SolverReducedOptions(integrator="bdf2")
-
-
-@functools.cache
-def clamped():
-    """Return a short bar whose first 3 cm are held exactly."""
-    box = np.array([[-np.inf] * 3, [-0.07, np.inf, np.inf]])
-    quadrature = quadrature_from_box((0.2, 0.08, 0.06), point_count=1000, surface_count=120)
-    options = BuildOptions(mode_count=3, kernel_count=150, cubature_count=160)
-    return build_body(quadrature, options, regions=(Region(name="clamp", box=box),), name="clamped")
 
 
 # Each world differs from the others in its bodies, their number, materials and pins.

@@ -9,8 +9,9 @@ from newton.solvers import SolverMuJoCo
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.errors import ConfigError
+from tests.bodies import cube
 from tests.deformables.test_coupling import Potential
-from tests.scenes import GRAVITY, GRIPPER, Scene, add_free_box, add_gripper, cube
+from tests.scenes import GRAVITY, GRIPPER, Scene, add_free_box, add_gripper
 
 EDGE = 0.1
 DOWN = (0.0, 0.0, -GRAVITY)

@@ -8,10 +8,6 @@ import pytest
 import warp as wp
 from scipy.spatial import ConvexHull
 
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_sphere
-from softmode.deformables.build.quadrature_implicit import quadrature_from_implicit
 from softmode.deformables.contact.pairs import thickness
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model import status as bits
@@ -22,28 +18,12 @@ from softmode.deformables.solver.evaluate import assemble, evaluate, gather_grad
 from softmode.deformables.solver.minimise import check_convergence
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from tests import reference
-from tests.deformables.test_driven import held_bar
-from tests.scenes import GRAVITY, RIGID_GAP, Scene, add_free_box, cube, rotation
+from tests.bodies import ball, cube, held_bar, ring, sheet, slab
+from tests.scenes import GRAVITY, RIGID_GAP, Scene, add_free_box, rotation
 
 EDGE = 0.1
 DOWN = (0.0, 0.0, -GRAVITY)
 FLOAT32 = float(np.finfo(np.float32).eps)
-
-
-@functools.cache
-def ball(radius=0.03, surface_count=150):
-    """Return a ball."""
-    quadrature = quadrature_from_sphere(radius, point_count=800, surface_count=surface_count)
-    options = BuildOptions(mode_count=3, kernel_count=120, cubature_count=100)
-    return build_body(quadrature, options, name=f"ball {surface_count}")
-
-
-@functools.cache
-def sheet(thickness=0.004):
-    """Return a thin square sheet."""
-    quadrature = quadrature_from_box((0.12, 0.12, thickness), point_count=2000, surface_count=400)
-    options = BuildOptions(mode_count=6, kernel_count=150, cubature_count=150)
-    return build_body(quadrature, options, name="sheet")
 
 
 def two(first, second, position, *, materials=(None, None), velocity=(0.0, 0.0, 0.0), options=None, **kw):
@@ -546,15 +526,15 @@ def test_friction_between_soft_bodies(tangent):
     mu, dt = 0.4, 0.004
     angle = np.arctan(tangent)
     material = Material(youngs_modulus=5.0e5, friction=mu)
-    slab = build_slab()
+    bed = slab()
 
     def populate(world):
-        i = add_reduced_body(world, slab, material=material)
-        attach(world, i, slab, box=((-1.0, -1.0, -1.0), (1.0, 1.0, -0.0099)))
+        i = add_reduced_body(world, bed, material=material)
+        attach(world, i, bed, box=((-1.0, -1.0, -1.0), (1.0, 1.0, -0.0099)))
         add_reduced_body(world, cube(0.06), material=material, position=(-0.05, 0.0, 0.04 + RIGID_GAP))
 
     gravity = GRAVITY * np.array([np.sin(angle), 0.0, -np.cos(angle)])
-    scene = Scene(populate, [slab, cube(0.06)], gravity=gravity, dt=dt)
+    scene = Scene(populate, [bed, cube(0.06)], gravity=gravity, dt=dt)
     scene.step(50)
     x, v = scene.centre(1)[0], scene.momentum(1)[0][0] / scene.mass(1)
     scene.step(25)
@@ -633,30 +613,7 @@ def test_contact_radius():
 # -- self contact ------------------------------------------------------------------------------------------------------
 
 
-@functools.cache
-def build_slab():
-    """Return a slab of 24 x 12 x 2 cm."""
-    quadrature = quadrature_from_box((0.24, 0.12, 0.02), point_count=2000, surface_count=500)
-    options = BuildOptions(mode_count=3, kernel_count=150, cubature_count=120)
-    return build_body(quadrature, options, name="slab")
-
-
-@functools.cache
-def ring(opening=0.01):
-    """Return a ring of square section about Z, cut open at +X by twice ``opening`` [m]; 0 leaves it closed."""
-
-    def distance(x):
-        d = np.maximum(np.abs(np.hypot(x[:, 0], x[:, 1]) - 0.05) - 0.012, np.abs(x[:, 2]) - 0.015)
-        cut = np.maximum(np.abs(x[:, 1]) - opening, -x[:, 0])
-        return np.maximum(d, -cut) if opening > 0.0 else d
-
-    bounds = np.array([[-0.07, -0.07, -0.02], [0.07, 0.07, 0.02]])
-    quadrature = quadrature_from_implicit(distance, bounds, point_count=2000, surface_count=400)
-    options = BuildOptions(mode_count=6, kernel_count=250, cubature_count=200)
-    return build_body(quadrature, options, name=f"ring {opening}")
-
-
-@pytest.mark.parametrize("body", [cube, ball, sheet, ring, functools.partial(ring, 0.0), build_slab])
+@pytest.mark.parametrize("body", [cube, ball, sheet, ring, functools.partial(ring, 0.0), slab])
 def test_at_rest_nothing_touches_itself(body):
     """A body at rest has no contact with itself, nor one that turns, and it stays at rest."""
     shape = body()

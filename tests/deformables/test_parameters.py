@@ -10,8 +10,8 @@ from softmode.deformables.model import status as bits
 from softmode.deformables.model.authoring import MATERIAL_FIELDS, add_pins, add_reduced_body
 from softmode.deformables.solver.parameters import PARAMETER_FLAGS, PARAMETER_LIMITS, ShapeFriction, set_parameters
 from softmode.errors import ConfigError
-from tests.deformables.test_many_bodies import clamped
-from tests.scenes import GRAVITY, Scene, add_gripper, cube, rotation
+from tests.bodies import clamped, cube
+from tests.scenes import GRAVITY, Scene, add_gripper, rotation
 
 DOWN = (0.0, 0.0, -GRAVITY)
 EDGE = 0.1

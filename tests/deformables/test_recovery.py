@@ -13,7 +13,8 @@ from softmode.deformables.materials.material import Material
 from softmode.deformables.materials.material_kernels import MaterialModel
 from softmode.deformables.model.authoring import add_reduced_body
 from tests import reference
-from tests.scenes import Scene, cube
+from tests.bodies import cube
+from tests.scenes import Scene
 
 SIZE = 0.1 * np.sqrt(3.0)
 """Diagonal of the cube [m]."""

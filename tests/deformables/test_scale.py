@@ -21,11 +21,10 @@ from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from softmode.deformables.tools.markers import Markers
 from softmode.deformables.tools.sensing import ContactSensor, SurfacePressure
 from softmode.errors import ConfigError
+from tests.bodies import clamped, cube, ring
 from tests.deformables.affine_body import affine_cube, mean_gradient
 from tests.deformables.test_adjoint import EXACT
-from tests.deformables.test_many_bodies import clamped
-from tests.deformables.test_pairs import ring
-from tests.scenes import GRAVITY, GRIPPER, Scene, add_gripper, cube, rotation
+from tests.scenes import GRAVITY, GRIPPER, Scene, add_gripper, rotation
 
 FLOAT32 = float(np.finfo(np.float32).eps)
 EDGE = 0.1

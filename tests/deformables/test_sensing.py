@@ -10,9 +10,10 @@ from softmode.deformables.solver.attachments import Attachment, attach
 from softmode.deformables.tools.sensing import ContactSensor, ForceTorqueSensor, SurfacePressure
 from softmode.errors import ConfigError
 from tests import reference
+from tests.bodies import cube
 from tests.deformables.test_attachments import joined
 from tests.deformables.test_coupling import grasp, impact
-from tests.scenes import GRAVITY, GRIPPER, Scene, add_free_box, cube
+from tests.scenes import GRAVITY, GRIPPER, Scene, add_free_box
 
 FLOAT32 = float(np.finfo(np.float32).eps)
 EDGE = 0.1

@@ -16,8 +16,8 @@ from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.errors import ConfigError
 from tests import reference
+from tests.bodies import cube
 from tests.deformables.probe_kernels import query_points
-from tests.scenes import cube
 
 FLOAT32 = float(np.finfo(np.float32).eps)
 KIND = newton.GeoType

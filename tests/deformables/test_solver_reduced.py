@@ -17,7 +17,8 @@ from softmode.deformables.solver.evaluate import assemble, evaluate, gather_grad
 from softmode.deformables.solver.solver_reduced import SolverReduced, SolverReducedOptions
 from softmode.errors import ConfigError
 from tests import reference
-from tests.scenes import GRAVITY, Scene, bar, cube, random_rotation, rotation
+from tests.bodies import bar, cube
+from tests.scenes import GRAVITY, Scene, random_rotation, rotation
 
 FLOAT32 = float(np.finfo(np.float32).eps)
 FLOAT64 = float(np.finfo(np.float64).eps)

@@ -1,36 +1,19 @@
 """Steps that follow a body's rotation: free spins and tumbles, rolling, impacts, what falls back, gradients."""
 
-import functools
-
 import numpy as np
 import pytest
 
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box, quadrature_from_sphere
 from softmode.deformables.gradients.adjoint import AdjointReduced
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.solver_reduced import SolverReducedOptions
 from tests import reference
-from tests.scenes import GRAVITY, Scene, bar, cube, rotation
+from tests.bodies import ball, bar, brick, cube, smooth_ball
+from tests.scenes import GRAVITY, Scene, rotation
 
 DT = 1.0 / 60.0
 STIFF = Material(youngs_modulus=1.0e7, viscosity=0.0)
 FLOAT32 = float(np.finfo(np.float32).eps)
-OPTIONS = BuildOptions(mode_count=4, kernel_count=150, cubature_count=128)
-
-
-@functools.cache
-def ball(surface_count=150):
-    """Return a ball of 50 mm radius."""
-    return build_body(quadrature_from_sphere(0.05, point_count=1000, surface_count=surface_count), OPTIONS)
-
-
-@functools.cache
-def brick():
-    """Return a box of three different moments of inertia."""
-    return build_body(quadrature_from_box((0.2, 0.12, 0.06), point_count=1000, surface_count=150), OPTIONS)
 
 
 def scene_of(body, *, spin, material=STIFF, dt=DT, options=None, **given):
@@ -176,10 +159,10 @@ def test_ball_rolls():
 
     def populate(world):
         material = Material(youngs_modulus=1.0e5, viscosity=0.0)
-        add_reduced_body(world, ball(1500), material=material, position=(0.0, 0.0, 0.0499))
+        add_reduced_body(world, smooth_ball(), material=material, position=(0.0, 0.0, 0.0499))
 
     gravity = (GRAVITY * np.sin(slope), 0.0, -GRAVITY * np.cos(slope))
-    scene = Scene(populate, [ball(1500)], gravity=gravity, ground=1.0, dt=1.0 / 240.0)
+    scene = Scene(populate, [smooth_ball()], gravity=gravity, ground=1.0, dt=1.0 / 240.0)
     scene.step(36)
     first = scene.momentum()[0][0]
     scene.step(132)

@@ -11,7 +11,8 @@ from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.attachments import attach
 from softmode.deformables.solver.solver_reduced import SolverReduced
 from softmode.errors import ConfigError
-from tests.scenes import Scene, add_free_box, cube
+from tests.bodies import cube
+from tests.scenes import Scene, add_free_box
 
 DT = 1.0 / 240.0
 

@@ -11,7 +11,8 @@ from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.solver.options import SolverReducedOptions
 from softmode.envs.presets import RL_SOLVER
-from tests.scenes import GRAVITY, GRIPPER, Scene, add_gripper, cube
+from tests.bodies import cube
+from tests.scenes import GRAVITY, GRIPPER, Scene, add_gripper
 
 EDGE = 0.1
 DOWN = (0.0, 0.0, -GRAVITY)

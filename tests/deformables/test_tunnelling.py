@@ -11,7 +11,8 @@ from softmode.deformables.model.authoring import add_reduced_body
 from softmode.deformables.model.inner_offsets import inner_offsets
 from softmode.deformables.solver.solver_reduced import SolverReduced
 from tests import reference
-from tests.scenes import GRAVITY, Scene, add_free_box, cube, rotation_of
+from tests.bodies import cube
+from tests.scenes import GRAVITY, Scene, add_free_box, rotation_of
 
 EDGE = 0.1
 THIN = 0.001

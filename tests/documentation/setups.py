@@ -31,7 +31,8 @@ def _coupling(folder: Path) -> dict[str, Any]:
     from newton.solvers import SolverMuJoCo
 
     from softmode.deformables import add_reduced_body
-    from tests.scenes import Scene, add_gripper, cube
+    from tests.bodies import cube
+    from tests.scenes import Scene, add_gripper
 
     body, fingers = cube(0.06), []
 
@@ -59,7 +60,7 @@ def _sensing(folder: Path) -> dict[str, Any]:
     import warp as wp
 
     from softmode.deformables import SolverCoupledReduced, add_reduced_body, attach
-    from tests.scenes import cube
+    from tests.bodies import cube
 
     body = cube()
     world = newton.ModelBuilder()
@@ -91,7 +92,7 @@ def _gradients(folder: Path) -> dict[str, Any]:
     import newton
 
     from softmode.deformables import add_reduced_body
-    from tests.scenes import bar
+    from tests.bodies import bar
 
     body = bar()
     world = newton.ModelBuilder()

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import functools
-import os
 from collections.abc import Callable
-from pathlib import Path
 
 import gymnasium as gym
 import pytest
@@ -18,11 +16,6 @@ __all__ = ["Episodes", "MakeEnv"]
 
 MakeEnv = Callable[..., gym.Env]
 """Type of the fixture `soft_env`."""
-
-ROOT = Path(__file__).resolve().parents[2]
-
-# Before the first body is built: the cache lies in the checkout, so that a run leaves nothing outside it.
-os.environ.setdefault("SOFTMODE_CACHE", str(ROOT / ".cache" / "softmode"))
 
 
 @pytest.fixture(scope="session")

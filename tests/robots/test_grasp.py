@@ -11,7 +11,8 @@ import warp as wp
 from softmode import robots
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
-from tests.scenes import GRAVITY, Scene, cube
+from tests.bodies import cube
+from tests.scenes import GRAVITY, Scene
 
 EDGE, DT = 0.04, 0.004
 LIFT = (0.0, 0.0, -0.12, 0.0, 0.12, 0.0, 0.0, 0.0)

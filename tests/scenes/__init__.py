@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,9 +11,6 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from softmode.deformables.body.reduced_body import ReducedBody
-from softmode.deformables.build.build_body import build_body
-from softmode.deformables.build.options import BuildOptions
-from softmode.deformables.build.quadrature import quadrature_from_box
 from softmode.deformables.contact.dents import contact_dents
 from softmode.deformables.coupling.solver_coupled import SolverCoupledReduced
 from softmode.deformables.model.authoring import register_custom_attributes
@@ -24,22 +20,6 @@ GRAVITY = 9.81
 """Standard gravity of every scene that has any [m/s^2]."""
 RIGID_GAP = 1.0e-4
 """Distance at which bodies that are about to touch are placed [m]."""
-
-
-@functools.cache
-def cube(edge: float = 0.1, mode_count: int = 4, surface_count: int = 150) -> ReducedBody:
-    """Return a small cube: few functions and points, so that a step costs little; built once per session."""
-    quadrature = quadrature_from_box((edge,) * 3, point_count=1000, surface_count=surface_count)
-    options = BuildOptions(mode_count=mode_count, kernel_count=150, cubature_count=128)
-    return build_body(quadrature, options, name=f"cube {edge}")
-
-
-@functools.cache
-def bar(length: float = 0.4, edge: float = 0.1) -> ReducedBody:
-    """Return a bar along X of square section."""
-    quadrature = quadrature_from_box((length, edge, edge), point_count=2000, surface_count=200)
-    options = BuildOptions(mode_count=6, kernel_count=200, cubature_count=200)
-    return build_body(quadrature, options, name="bar")
 
 
 class Scene:

@@ -16,7 +16,8 @@ from newton.viewer import Picking, ViewerFile, ViewerNull, ViewerUSD
 
 from softmode.deformables.materials.material import Material
 from softmode.deformables.model.authoring import add_reduced_body
-from tests.scenes import GRAVITY, Scene, cube
+from tests.bodies import cube
+from tests.scenes import GRAVITY, Scene
 
 EDGE = 0.1
 SOFT = Material(youngs_modulus=2.0e5, density=200.0)
