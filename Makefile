@@ -20,6 +20,12 @@ FILES   := --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 # CUDA libraries: point PIP_EXTRA_INDEX_URL at PyTorch's index of CPU wheels to avoid that.
 TORCH ?= torch==2.13.0
 
+# Tests as another processor runs them, such as haswell, which has no AVX-512: its linear algebra, kernels for it.
+ifdef PROCESSOR
+export OPENBLAS_CORETYPE := $(PROCESSOR)
+export SOFTMODE_TEST_PROCESSOR := $(PROCESSOR)
+endif
+
 # Compiled kernels and built bodies stay inside the checkout.
 export WARP_CACHE_PATH ?= $(CURDIR)/.cache/warp
 export SOFTMODE_CACHE  ?= $(CURDIR)/.cache/softmode

@@ -27,6 +27,8 @@ from softmode.deformables.build.quadrature_implicit import quadrature_from_impli
 Given = ParamSpec("Given")
 BODIES: dict[str, Callable[..., ReducedBody]] = {}
 """The functions that return a body, by name."""
+RECIPES: dict[str, Callable[..., Recipe]] = {}
+"""The functions that return its recipe."""
 EVERYWHERE = np.array([[-np.inf] * 3, [np.inf] * 3])
 
 
@@ -62,7 +64,7 @@ def kept(recipe: Callable[Given, Recipe]) -> Callable[Given, ReducedBody]:
         key = {f.name: getattr(made, f.name) for f in dataclasses.fields(made)} | {"shape": made.shape.__name__}
         return cached_body(("bodies of the tests", Path(__file__), key), made.build)
 
-    BODIES[recipe.__name__] = body
+    BODIES[recipe.__name__], RECIPES[recipe.__name__] = body, recipe
     return body
 
 

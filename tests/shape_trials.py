@@ -4,6 +4,8 @@ The pull needs a domain that both methods share exactly, so the shape's voxel re
 grid that it fills enough. Finite elements use these cells as quadratic hexahedra; the reduced body is built from
 quadrature points inside them. Its lowest layers are held exactly in both, and both answer to the same two loads, small
 enough to be linear: gravity in an oblique direction, and forces on the surface samples of the opposite end.
+
+Builds one body for every shape: the build has to stand all of them.
 """
 
 from __future__ import annotations

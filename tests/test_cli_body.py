@@ -1,4 +1,7 @@
-"""The command ``softmode body``: what it writes, what it says, how it fails."""
+"""The command ``softmode body``: what it writes, what it says, how it fails.
+
+Builds bodies by the command, which is what it tests.
+"""
 
 from __future__ import annotations
 

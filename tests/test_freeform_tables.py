@@ -1,4 +1,7 @@
-"""The protocols of FreeForm's tables on small cases: same domain and springs in both methods, descent, kernels."""
+"""The protocols of FreeForm's tables on small cases: same domain and springs in both methods, descent, kernels.
+
+Builds the bodies of the paper's tables.
+"""
 
 from __future__ import annotations
 

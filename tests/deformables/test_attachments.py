@@ -1,4 +1,7 @@
-"""Attachments: held by a link or the world, two-way, released and held again, and the errors."""
+"""Attachments: held by a link or the world, two-way, released and held again, and the errors.
+
+Builds one cube with the default options, whose own samples are attached.
+"""
 
 import newton
 import numpy as np

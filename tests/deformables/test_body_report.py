@@ -1,4 +1,7 @@
-"""The report on a body: good bodies are clean, every kind of defect is named, measures agree with closed forms."""
+"""The report on a body: good bodies are clean, every kind of defect is named, measures agree with closed forms.
+
+Builds bodies with the faults that a report names.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Cubature: exact volume, non-negative weights, small force error on poses it has not seen."""
+"""Cubature: exact volume, non-negative weights, small force error on poses it has not seen.
+
+Builds bodies with numbers of cubature points, which is what it tests.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Cuts: parts that conserve mass and momentum, fall, store no energy, slits that open, what is refused."""
+"""Cuts: parts that conserve mass and momentum, fall, store no energy, slits that open, what is refused.
+
+Builds bodies that are cut, with the sources that a cut needs.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Dents: what a contact gives beyond the functions of the body, against Hertz, punches and conservation of energy."""
+"""Dents: what a contact gives beyond the functions of the body, against Hertz, punches and conservation of energy.
+
+Builds two thin sheets and a cube with samples as fine as contact patches need.
+"""
 
 import newton
 import numpy as np

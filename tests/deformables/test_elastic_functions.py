@@ -1,4 +1,7 @@
-"""Functions chosen by elastic energy: nested, exact for affine motion, as accurate as they say, the same every time."""
+"""Functions chosen by elastic energy: nested, exact for affine motion, as accurate as they say, the same every time.
+
+Builds bodies of functions chosen by elastic energy, which is what it tests.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Clamps told late: the body that a build told of the region gives, its motion, its sources in a file, the warning."""
+"""Clamps told late: the body that a build told of the region gives, its motion, its sources in a file, the warning.
+
+Builds bodies that were told of a region, to compare with those held later.
+"""
 
 from __future__ import annotations
 

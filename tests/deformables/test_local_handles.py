@@ -1,4 +1,7 @@
-"""Local handles: weights that are local along the material, through the build, regions, solver, files and exports."""
+"""Local handles: weights that are local along the material, through the build, regions, solver, files and exports.
+
+Builds bodies of local handles, which is what it tests.
+"""
 
 from __future__ import annotations
 

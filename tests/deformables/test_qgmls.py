@@ -1,4 +1,7 @@
-"""Functions of Q-GMLS: quadratic fields, derivatives, the printed equations that fail, and bodies of them."""
+"""Functions of Q-GMLS: quadratic fields, derivatives, the printed equations that fail, and bodies of them.
+
+Builds bodies of Q-GMLS functions, which is what it tests.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Quadrature of densities: mass, disks and integrator points; the equations as printed in PIE-NeRF fail."""
+"""Quadrature of densities: mass, disks and integrator points; the equations as printed in PIE-NeRF fail.
+
+Builds one body from a density's points on a grid and one from scattered points.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Regions: distances, envelopes and blends, sampling, and bodies whose regions are held or moved exactly."""
+"""Regions: distances, envelopes and blends, sampling, and bodies whose regions are held or moved exactly.
+
+Builds bodies with regions of every kind, which is what it tests.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,13 @@ def quadrature() -> Quadrature:
 
 
 @pytest.fixture(
-    scope="module", params=[(case, kind) for kind in ("freeform", "chosen") for case in CASES], ids="-".join
+    scope="module",
+    params=[
+        pytest.param((case, kind), marks=[pytest.mark.rest] if (kind == "chosen") != (case in ("two", "mixed")) else [])
+        for kind in ("freeform", "chosen")
+        for case in CASES
+    ],
+    ids="-".join,
 )
 def body(request, quadrature: Quadrature) -> ReducedBody:
     """Bodies with one exact region, two, an exact and a soft one, and a soft one, of both kinds of functions."""
@@ -200,35 +209,20 @@ def test_region_volumes(quadrature: Quadrature) -> None:
         assert w @ x[:, 0] / w.sum() == pytest.approx(0.5 * (cut - 0.2), rel=0.01)
 
 
-def test_two_builds_are_bitwise_equal_and_files_round_trip(body: ReducedBody, tmp_path: Path) -> None:
-    """One set of inputs gives one body; save and load give every field back, and the same values."""
+def test_files_round_trip(body: ReducedBody, tmp_path: Path) -> None:
+    """Save and load give every field back, and the same values."""
     file = tmp_path / "body.npz"
     body.save(file)
     loaded = ReducedBody.load(file)
-    quadrature = quadrature_from_box((0.4, 0.1, 0.08), point_count=1500, surface_count=60)
-    regions = next(case for case in CASES.values() if tuple(r.name for r in case) == body.region_names)
-    options = CHOSEN if body.provenance["option_function_count"] else OPTIONS
-    again = build_body(quadrature, options, regions=regions, progress=False)
     for f in dataclasses.fields(body):
-        value = getattr(body, f.name)
-        for other in (getattr(loaded, f.name), getattr(again, f.name)):
-            if isinstance(value, np.ndarray):
-                np.testing.assert_array_equal(value, other, err_msg=f.name)
-            elif f.name == "sources":
-                assert value.keys() == other.keys() and all(np.array_equal(value[name], other[name]) for name in value)
-            elif f.name not in ("provenance", "build_seconds"):
-                assert value == other, f.name
+        value, other = getattr(body, f.name), getattr(loaded, f.name)
+        if isinstance(value, np.ndarray):
+            np.testing.assert_array_equal(value, other, err_msg=f.name)
+        elif f.name == "sources":
+            assert value.keys() == other.keys() and all(np.array_equal(value[name], other[name]) for name in value)
+        else:
+            assert value == other, f.name
     np.testing.assert_array_equal(body.evaluate(body.points)[0], loaded.evaluate(body.points)[0])
-
-
-def test_fingerprint_follows_regions(quadrature: Quadrature) -> None:
-    """Name, place, radius and stiffness of a region all count."""
-    moved = Region(name="left", box=((-INF, -INF, -INF), (-0.12, INF, INF)))
-    soft = dataclasses.replace(LEFT, stiffness=10.0)
-    wide = dataclasses.replace(LEFT, radius=0.01)
-    cases = [(), (LEFT,), (dataclasses.replace(LEFT, name="other"),), (moved,), (soft,), (wide,), (LEFT, RIGHT)]
-    found = {build_body(quadrature, OPTIONS, regions=case).fingerprint for case in cases}
-    assert len(found) == len(cases)
 
 
 def test_check_refuses_inconsistent_region_fields(quadrature: Quadrature) -> None:

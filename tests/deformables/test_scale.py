@@ -1,4 +1,7 @@
-"""A body of scale s: equal to the body built at that size, in statics, impact, contact, grasps and gradients."""
+"""A body of scale s: equal to the body built at that size, in statics, impact, contact, grasps and gradients.
+
+Builds one body at twice the size, to compare with the enlarged one.
+"""
 
 import dataclasses
 

@@ -1,4 +1,7 @@
-"""Objects of very different form: builds against exact moments, pulls against finite elements, falls in pieces."""
+"""Objects of very different form: builds against exact moments, pulls against finite elements, falls in pieces.
+
+Builds bodies of many shapes: the build has to stand all of them.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Static responses and harmonic weights: closed forms, stationarity, the accuracy they buy."""
+"""Static responses and harmonic weights: closed forms, stationarity, the accuracy they buy.
+
+Builds bodies with and without static responses, which is what it tests.
+"""
 
 from __future__ import annotations
 

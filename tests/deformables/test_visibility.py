@@ -1,4 +1,7 @@
-"""Kernels see distances through the material: not across gaps and cuts, and around inner corners."""
+"""Kernels see distances through the material: not across gaps and cuts, and around inner corners.
+
+Builds forks whose prongs see each other or not, which is what it tests.
+"""
 
 from __future__ import annotations
 

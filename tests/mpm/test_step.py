@@ -1,4 +1,7 @@
-"""A step of the material point method: identities, conservation, closed forms, bits."""
+"""A step of the material point method: identities, conservation, closed forms, bits.
+
+Builds one coarse box, since particles are made from what a body was built from.
+"""
 
 from __future__ import annotations
 

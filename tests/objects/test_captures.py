@@ -1,4 +1,7 @@
-"""Captures of known solids: do they come out whole?"""
+"""Captures of known solids: do they come out whole?
+
+Builds captures, which is what it tests.
+"""
 
 from __future__ import annotations
 

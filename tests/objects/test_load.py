@@ -1,4 +1,7 @@
-"""`load`: whatever describes an object gives the same object; `Placed`: where it is."""
+"""`load`: whatever describes an object gives the same object; `Placed`: where it is.
+
+Builds objects, which is what it tests.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Painted materials: fields by label, colour, file and brush; what is refused; what a body keeps."""
+"""Painted materials: fields by label, colour, file and brush; what is refused; what a body keeps.
+
+Builds bars from painted fields, since paint is a field of the build.
+"""
 
 from __future__ import annotations
 

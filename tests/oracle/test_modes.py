@@ -1,4 +1,7 @@
-"""Free frequencies of bodies as users build them, beside finite elements on the same domain."""
+"""Free frequencies of bodies as users build them, beside finite elements on the same domain.
+
+Builds the bodies that finite elements have the answers for.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""A radiance field that several test files share, bodies of its solid, and pictures of it."""
+"""A radiance field that several test files share, bodies of its solid, and pictures of it.
+
+Builds a body from a radiance field's density.
+"""
 
 from __future__ import annotations
 

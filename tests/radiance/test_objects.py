@@ -1,4 +1,7 @@
-"""Soft objects of radiance fields: loaded, built, simulated and drawn, as splats and as fields."""
+"""Soft objects of radiance fields: loaded, built, simulated and drawn, as splats and as fields.
+
+Builds objects from fields, which is what it tests.
+"""
 
 from __future__ import annotations
 

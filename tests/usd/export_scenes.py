@@ -1,4 +1,7 @@
-"""Bodies, splats and states that the tests of the export share."""
+"""Bodies, splats and states that the tests of the export share.
+
+Builds three bars of 48 points, one for each kind of handles that a stage can hold.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`add_usd`: a stage with robot, prop and soft bodies becomes a model that steps; nothing twice, nothing lost."""
+"""`add_usd`: a stage with robot, prop and soft bodies becomes a model that steps; nothing twice, nothing lost.
+
+Builds what an import must give, to compare fingerprints.
+"""
 
 from __future__ import annotations
 

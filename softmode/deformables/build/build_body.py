@@ -131,7 +131,7 @@ def _build(
     start = time.perf_counter()
     stiffness = positive_field("stiffness_scale", stiffness_scale, quadrature.points)
     density = positive_field("density_scale", density_scale, quadrature.points)
-    fingerprint = fingerprint_of(FORMAT_VERSION, quadrature, options, name, list(regions), stiffness, density)
+    fingerprint = body_fingerprint(quadrature, options, name, regions, stiffness, density)
     sources = Sources(
         quadrature=quadrature,
         options=options,
@@ -245,6 +245,20 @@ def _build(
         provenance=provenance,
         build_seconds=time.perf_counter() - start,
     )
+
+
+def body_fingerprint(
+    quadrature: Quadrature,
+    options: BuildOptions,
+    name: str,
+    regions: Sequence[Region] = (),
+    stiffness: Array | None = None,
+    density: Array | None = None,
+) -> str:
+    """Return the fingerprint of all that a body is built from; a field has a value per point, None stands for ones."""
+    ones = np.ones(len(quadrature.points))
+    fields = (ones if field is None else field for field in (stiffness, density))
+    return fingerprint_of(FORMAT_VERSION, quadrature, options, name, list(regions), *fields)
 
 
 def _cubature(volumes: Array, basis: BodyBasis, stiffness: Array, options: BuildOptions, *, quick: bool) -> Cubature:
