@@ -16,7 +16,7 @@ WITHOUT_ADJOINTS = (
 """Modules of Newton that nothing here differentiates through: the first two take 5 s to compile instead of 17."""
 
 PROCESSOR = "SOFTMODE_TEST_PROCESSOR"
-"""Environment variable that names the processor that kernels are compiled for, such as haswell, which has no AVX-512."""
+"""Environment variable that names the processor that kernels are compiled for: haswell, for one, has no AVX-512."""
 
 WAIT = 120.0
 """Longest time that one process waits for another's compilation before it does its own [s]."""
@@ -32,7 +32,7 @@ def compile_once() -> None:
     import warp as wp
 
     if (other := os.environ.get(PROCESSOR)) and wp.config.cpu_compiler_flags:
-        wp.config.cpu_compiler_flags = wp.config.cpu_compiler_flags.replace("-march=native", f"-march={other}")
+        wp.config.cpu_compiler_flags = wp.config.cpu_compiler_flags.replace("-march=native", f"-target-cpu {other}")
     for name in WITHOUT_ADJOINTS:
         if name in sys.modules and not wp.get_module(name).execs:
             wp.set_module_options({"enable_backward": False}, module=sys.modules[name])
